@@ -1,0 +1,1 @@
+"""Maths of cameras, surfels and scenes: torch and numpy only, no nerfstudio."""

@@ -1,0 +1,59 @@
+"""The camera as the method sees it: OpenCV axes, full K, pixel centres at + 0.5 (method, section 0)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One pinhole view.
+
+    viewmat: [4, 4] float, world to camera; x right, y down, z forward (OpenCV); rigid.
+    K: [3, 3] float, pixels; any cx, cy. Pixel (i, j) has its centre at (i + 0.5, j + 0.5).
+    width, height: pixels.
+    """
+
+    viewmat: Tensor
+    K: Tensor
+    width: int
+    height: int
+
+    @property
+    def rotation(self) -> Tensor:
+        """[3, 3] world-to-camera rotation W."""
+        return self.viewmat[:3, :3]
+
+    @property
+    def translation(self) -> Tensor:
+        """[3] world-to-camera translation t."""
+        return self.viewmat[:3, 3]
+
+    @property
+    def center(self) -> Tensor:
+        """[3] the camera's position in the world."""
+        return -self.rotation.T @ self.translation
+
+    def to(self, *args) -> Camera:
+        """As ``Tensor.to``, for both matrices."""
+        return Camera(self.viewmat.to(*args), self.K.to(*args), self.width, self.height)
+
+
+def viewmat_from_opengl(camera_to_world: Tensor) -> Tensor:
+    """World-to-camera matrix in OpenCV axes from a camera-to-world matrix in OpenGL axes (nerfstudio's).
+
+    This is the one place where the two conventions meet.
+
+    camera_to_world: [..., 3 or 4, 4]; x right, y up, z backward.
+    Returns [..., 4, 4] of the same dtype.
+    """
+    rotation = camera_to_world[..., :3, :3] * camera_to_world.new_tensor([1.0, -1.0, -1.0])
+    world_to_camera = rotation.transpose(-1, -2)
+    viewmat = torch.zeros(*camera_to_world.shape[:-2], 4, 4, dtype=camera_to_world.dtype, device=camera_to_world.device)
+    viewmat[..., :3, :3] = world_to_camera
+    viewmat[..., :3, 3:] = -world_to_camera @ camera_to_world[..., :3, 3:]
+    viewmat[..., 3, 3] = 1.0
+    return viewmat

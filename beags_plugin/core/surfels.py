@@ -1,0 +1,36 @@
+"""A 2D-Gaussian-splatting scene: a set of flat Gaussians (surfels)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Surfels:
+    """Parameters of N surfels, as they are optimised (method, section 0).
+
+    means: [N, 3] world positions.
+    quats: [N, 4] wxyz, of any length but zero; normalised where they are used.
+    log_scales: [N, 2] logs of the two scales, world units.
+    opacity_logits: [N] logits of the opacity.
+    sh: [N, (degree + 1)^2, 3] spherical-harmonic coefficients of the colour, band 0 first.
+    """
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    opacity_logits: Tensor
+    sh: Tensor
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def __getitem__(self, selection) -> Surfels:
+        """The surfels that a mask [N] bool, an index [M] int64 or a slice selects."""
+        return Surfels(**{field.name: getattr(self, field.name)[selection] for field in fields(self)})
+
+    def detach(self) -> Surfels:
+        """The same values, without gradients."""
+        return Surfels(**{field.name: getattr(self, field.name).detach() for field in fields(self)})

@@ -1,0 +1,15 @@
+"""The losses, each a registered component (entry points: ``beags.losses``)."""
+
+from beags_plugin.registry import Registry
+
+LOSSES = Registry(
+    "loss",
+    "beags.losses",
+    {
+        "photometric": "beags_plugin.losses.photometric:PhotometricLoss",
+        "normal": "beags_plugin.losses.normal:NormalConsistencyLoss",
+        "distortion": "beags_plugin.losses.distortion:DistortionLoss",
+        "boundary": "beags_plugin.losses.boundary:BoundaryLoss",
+        "occupancy": "beags_plugin.losses.occupancy:OccupancyLoss",
+    },
+)

@@ -1,0 +1,66 @@
+"""What a loss is: a name, a weight, the steps it is active in, and pure maths."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.rasterizers.interface import RasterOutputs
+
+if TYPE_CHECKING:
+    from beags_plugin.occupancy.grid import VisibilityGrid
+
+
+@dataclass(frozen=True)
+class LossInputs:
+    """All that a loss may look at in one training step; each uses what it needs.
+
+    step: training step, from 0.
+    seed: of the run; with the step it decides every random number.
+    surfels: the scene, N surfels, with gradients.
+    camera: the view that was drawn.
+    render: what was drawn (with what ``Loss.needs`` names).
+    image: [H, W, 3] the photograph, in 0..1.
+    labels: [H, W] int32 class ids M' of the view, or IGNORE; None if the view has none.
+    class_ids: [N] int32, phi; None before assignment.
+    grid: the visibility voxel grids; None before refinement.
+    """
+
+    step: int
+    seed: int
+    surfels: Surfels
+    camera: Camera
+    render: RasterOutputs
+    image: Tensor
+    labels: Tensor | None = None
+    class_ids: Tensor | None = None
+    grid: VisibilityGrid | None = None
+
+
+@dataclass(frozen=True)
+class Loss(ABC):
+    """One term of the training loss; final classes add their own options as dataclass fields.
+
+    weight: factor in the sum.
+    start, stop: active at steps start <= step < stop; stop None means to the end.
+    """
+
+    needs: ClassVar[frozenset[str]] = frozenset()
+    """What the rasterizer must supply: any of "geometry", "distortion", "boundary"."""
+
+    weight: float = 1.0
+    start: int = 0
+    stop: int | None = None
+
+    def active(self, step: int) -> bool:
+        """Whether the term counts at this step."""
+        return self.weight != 0.0 and self.start <= step and (self.stop is None or step < self.stop)
+
+    @abstractmethod
+    def value(self, inputs: LossInputs) -> Tensor:
+        """The unweighted term: a scalar with gradients towards what it supervises."""

@@ -1,0 +1,137 @@
+"""What every rasterizer takes and returns (method, sections 1 and 4; E1 to E4, E6, E7)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+
+IGNORE = 65535  # class id of an unlabelled pixel: it neither votes nor is penalised
+MIN_ALPHA = 1.0 / 255.0  # weaker contributions are skipped: they are invisible in 8 bits
+MAX_ALPHA = 0.99  # keeps 1 - alpha, a divisor in the backward, away from 0
+MIN_TRANSMITTANCE = 1e-4  # compositing stops before the surfel that would take T below this
+
+
+@dataclass(frozen=True)
+class RasterSettings:
+    """What to compute, and the scene's depth range.
+
+    near, far: world units; they scale with the scene. Hits nearer than ``near`` are skipped; both enter the
+        distortion's depth mapping m(d) = far / (far - near) * (1 - near / d).
+    geometry: whether depth, median depth and normal are wanted; left out, they are None and cost nothing.
+    distortion: whether the distortion is wanted.
+    """
+
+    near: float
+    far: float
+    geometry: bool = True
+    distortion: bool = False
+
+
+@dataclass(frozen=True)
+class SurfelInputs:
+    """What is drawn: N surfels with one colour each, for one view; all floats of one dtype (float32 or float64).
+
+    means [N, 3], quats [N, 4] wxyz, log_scales [N, 2], opacity_logits [N]: as in ``core.surfels.Surfels``.
+    colors: [N, 3] linear RGB as seen from this view.
+    class_ids: [N] int32, phi, or None; needed with ``target``.
+    """
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    opacity_logits: Tensor
+    colors: Tensor
+    class_ids: Tensor | None = None
+
+    def checked(self) -> SurfelInputs:
+        """Itself, contiguous, after checking shapes and dtypes by name; raises ``ValueError``."""
+        n, dtype = self.means.shape[0], self.means.dtype
+        if dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"means must be float32 or float64, not {dtype}")
+        shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 2), "opacity_logits": (n,), "colors": (n, 3)}
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if tuple(value.shape) != shape or value.dtype != dtype:
+                raise ValueError(f"{name} must be {list(shape)} {dtype}, not {list(value.shape)} {value.dtype}")
+        if self.class_ids is not None and (tuple(self.class_ids.shape) != (n,) or self.class_ids.dtype != torch.int32):
+            raise ValueError(f"class_ids must be [{n}] int32, not {list(self.class_ids.shape)} {self.class_ids.dtype}")
+        tensors = {name: getattr(self, name).contiguous() for name in shapes}
+        return replace(self, **tensors, class_ids=None if self.class_ids is None else self.class_ids.contiguous())
+
+
+@dataclass(frozen=True)
+class RasterOutputs:
+    """What is seen (E4). H, W are the camera's; floats have the inputs' dtype.
+
+    color: [H, W, 3] sum_i w_i c_i + T_end * background.
+    alpha: [H, W] A = sum_i w_i.
+    depth: [H, W] expected depth sum_i w_i d_i / A, world units along z; 0 where A = 0. None if not asked for.
+    median_depth: [H, W] depth of the hit at which T passes 0.5; 0 where it never does. No gradient but to that hit.
+    normal: [H, W, 3] sum_i w_i n_i in camera space, turned towards the camera (so n . p <= 0); not normalised.
+    distortion: [H, W] sum_{j<i} w_i w_j (m_i - m_j)^2, or None.
+    boundary: [H, W] B(u) = sum_i w_i [phi_i != M'(u)], 0 at IGNORE (E7), or None without a target.
+    visible: [N] bool, survived culling and reaches at least one tile; what densification counts as seen.
+    num_nonfinite: number of surfels dropped because a parameter is NaN or infinite.
+    """
+
+    color: Tensor
+    alpha: Tensor
+    depth: Tensor | None
+    median_depth: Tensor | None
+    normal: Tensor | None
+    distortion: Tensor | None
+    boundary: Tensor | None
+    visible: Tensor
+    num_nonfinite: int
+
+
+class Rasterizer(ABC):
+    """One backend. Every method draws the same surfels with the same weights w_i.
+
+    Instances hold no scene; they may be kept for the life of the program.
+    """
+
+    @classmethod
+    @abstractmethod
+    def unavailable(cls) -> str | None:
+        """None if this backend can run here, else one sentence: why not and what to install."""
+
+    @abstractmethod
+    def rasterize(
+        self,
+        inputs: SurfelInputs,
+        camera: Camera,
+        settings: RasterSettings,
+        background: Tensor,  # [3]
+        target: Tensor | None = None,  # [H, W] int32 class ids M', or IGNORE
+    ) -> RasterOutputs:
+        """Draw; differentiable in all float inputs and ``background``. Raises ``ValueError`` on a wrong shape."""
+
+    @abstractmethod
+    def class_contributions(
+        self,
+        inputs: SurfelInputs,
+        camera: Camera,
+        settings: RasterSettings,
+        labels: Tensor,  # [H, W] int32 class ids, or IGNORE
+        num_classes: int,
+    ) -> Tensor:
+        """C[i, c] of this view: [N, num_classes], sum of w_i(u) over pixels u with labels(u) = c (E6). No gradient."""
+
+    @abstractmethod
+    def class_map(
+        self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
+    ) -> tuple[Tensor, Tensor]:
+        """Class of every pixel: argmax_c sum_i w_i [phi_i = c] (section 5), ties to the lower id. No gradient.
+
+        Returns ([H, W] int32, background 0 where nothing is drawn; [H, W] float, the winner's share of A, 0 there).
+        """
+
+    @abstractmethod
+    def heaviest(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
+        """[H, W] int32, index of the surfel with the largest w_i (ties to the nearer); -1 where none. For picking."""
