@@ -1,0 +1,9 @@
+"""Class maps, and ways to make them consistent between views (entry points: ``beags.reprojections``)."""
+
+from beags_plugin.registry import Registry
+
+REPROJECTIONS = Registry(
+    "reprojection",
+    "beags.reprojections",
+    {"pairwise": "beags_plugin.masks.reprojection:reproject_pairwise"},
+)

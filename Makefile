@@ -1,0 +1,40 @@
+# make setup | test | demo [DATA=folder] | lint | format | clean
+# BEAGS_VENV names the environment; clones may share one. PYTHON names the interpreter that makes it.
+BEAGS_VENV ?= .venv
+BIN := $(BEAGS_VENV)/bin
+CXX_FILES = $(shell git ls-files --cached --others --exclude-standard '*.cpp' '*.cc' '*.h' '*.hpp' '*.inl' '*.cu')
+
+# With passive waiting, idle OpenMP threads leave the cores to torch's other threads.
+export OMP_WAIT_POLICY = PASSIVE
+
+.PHONY: help setup test demo lint format clean
+
+help:
+	@sed -n '1,2p' Makefile
+
+# Compares digests kept in the environment with this clone's files; a second run takes no time.
+setup:
+	@bash scripts/setup_env.sh "$(BEAGS_VENV)"
+
+test: setup
+	"$(BIN)/python" -m pytest -q
+
+demo: setup
+	"$(BIN)/beags" demo $(if $(DATA),--data "$(DATA)")
+
+lint: setup
+	"$(BIN)/ruff" check .
+	"$(BIN)/ruff" format --check .
+	"$(BIN)/pyright" --pythonpath "$(BIN)/python"
+	$(if $(strip $(CXX_FILES)),"$(BIN)/clang-format" --dry-run --Werror $(CXX_FILES))
+
+format: setup
+	"$(BIN)/ruff" check --fix .
+	"$(BIN)/ruff" format .
+	$(if $(strip $(CXX_FILES)),"$(BIN)/clang-format" -i $(CXX_FILES))
+
+# Leaves the environment (it may be shared), but makes the next setup build again.
+clean:
+	rm -rf build dist .pytest_cache .ruff_cache .hypothesis
+	find . -path ./.venv -prune -o -name __pycache__ -type d -exec rm -rf {} +
+	rm -f "$(BEAGS_VENV)/.beags-source"

@@ -1,0 +1,70 @@
+"""The class of each Gaussian: the one to which it contributes most (method, section 3; E6)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.errors import UserError
+from beags_plugin.rasterizers.drawing import geometry_inputs
+from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """Classes of N Gaussians, fixed from now on.
+
+    class_ids: [N] int32, phi; background (0) where never seen.
+    margin: [N] float32 in 0..1, the class's share of the Gaussian's contributions; 0 where never seen.
+    never_seen: [N] bool, contributes to no labelled pixel of any view.
+    """
+
+    class_ids: Tensor
+    margin: Tensor
+    never_seen: Tensor
+
+
+def assign_classes(
+    surfels: Surfels,
+    cameras: Sequence[Camera],
+    labels: Sequence[Tensor | None],
+    rasterizer: Rasterizer,
+    settings: RasterSettings,
+    num_classes: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> Assignment:
+    """phi_i = argmax_c C[i, c], C[i, c] = sum over views and pixels with M' = c of w_i (E6); ties to the lower id.
+
+    surfels: N surfels. labels: per camera [H, W] int32 class ids below ``num_classes`` or IGNORE; None for no mask.
+    Raises ``UserError`` for ids out of range.
+    """
+    settings = replace(settings, geometry=False, distortion=False)
+    inputs = geometry_inputs(surfels)
+    # float64: thousands of small weights of many views are added up.
+    total = torch.zeros(len(surfels), num_classes, dtype=torch.float64, device=surfels.means.device)
+    for index, (camera, mask) in enumerate(zip(cameras, labels, strict=True)):
+        if mask is not None:
+            _check(mask, index, num_classes)
+            with torch.no_grad():
+                total += rasterizer.class_contributions(inputs, camera, settings, mask, num_classes).double()
+        if progress:
+            progress(index + 1, len(cameras))
+    class_ids = total.argmax(dim=1).int()  # of equal values, the first
+    top, everything = total.max(dim=1).values, total.sum(dim=1)
+    never_seen = everything <= 0
+    margin = torch.where(never_seen, 0.0, top / everything.masked_fill(never_seen, 1.0))
+    return Assignment(class_ids.masked_fill(never_seen, 0), margin.float(), never_seen)
+
+
+def _check(mask: Tensor, index: int, num_classes: int) -> None:
+    known = mask[mask != IGNORE]
+    if known.numel() and (int(known.min()) < 0 or int(known.max()) >= num_classes):
+        raise UserError(
+            f"the mask of view {index} holds class ids {int(known.min())}..{int(known.max())}, but only "
+            f"0..{num_classes - 1} are known: name all classes."
+        )

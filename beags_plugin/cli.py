@@ -1,0 +1,112 @@
+"""The command line: ``beags demo | sample | extract | doctor``."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from beags_plugin.errors import UserError
+
+CONSOLE = Console(soft_wrap=True, highlight=False)
+
+
+@dataclass
+class Demo:
+    """Train, extract and measure: on the sample that ships with the code, or on a folder of your own."""
+
+    data: Path | None = None
+    """Folder with images, poses and masks; the generated sample if left out."""
+    output: Path | None = None
+    """Where everything goes; outputs/demo, or outputs/<name of the data folder>."""
+    preset: str = "beags-tiny"
+    """What to train with: a preset of method_configs/."""
+    downscale: float | None = None
+    """Divide the image size by this; chosen for a quick run if left out (a folder of your own only)."""
+    seed: int = 0
+    """Seed of the generated sample."""
+    fresh: bool = False
+    """Train again even if the same demo has been trained before."""
+
+    def run(self) -> None:
+        from beags_plugin.demo import run_demo
+
+        run_demo(self.data, self.output, self.preset, self.downscale, self.seed, self.fresh)
+
+
+@dataclass
+class Sample:
+    """Generate a scene with exact ground truth: photos, damaged masks, silhouettes, depth."""
+
+    output: Path = Path("outputs/sample")
+    """Folder to write."""
+    seed: int = 0
+    """Another seed gives another arrangement."""
+    width: int = 256
+    """Pixels."""
+    height: int = 192
+    """Pixels."""
+    degradation: str = "mild"
+    """How masks are damaged: none, mild or strong."""
+
+    def run(self) -> None:
+        from beags_plugin.demo import make_sample
+
+        make_sample(self.output, self.seed, self.width, self.height, self.degradation)
+        CONSOLE.print(f"sample: {self.output}")
+
+
+@dataclass
+class Extract:
+    """Write a run folder and a .ply per object; ns-viewer, ns-render and ns-export work on each run."""
+
+    load_config: Path
+    """config.yml of a trained run."""
+    object: tuple[str, ...] = ()
+    """Names of the objects; all but the background if left out."""
+    remove: bool = False
+    """Keep everything but the object."""
+    output: Path | None = None
+    """Folder for the runs; extracted/ beside config.yml if left out."""
+
+    def run(self) -> None:
+        from beags_plugin.plugin.extract import extract_objects
+
+        for done in extract_objects(self.load_config, self.object, self.remove, self.output):
+            CONSOLE.print(f"{done.name}: {done.gaussians} Gaussians\n  {done.ply}\n  ns-viewer --load-config {done.config}")
+
+
+@dataclass
+class Doctor:
+    """Say what this installation can do, and what is missing."""
+
+    def run(self) -> None:
+        from beags_plugin.doctor import diagnose, print_report
+
+        print_report(diagnose())
+
+
+Command = (
+    Annotated[Demo, tyro.conf.subcommand(name="demo")]
+    | Annotated[Sample, tyro.conf.subcommand(name="sample")]
+    | Annotated[Extract, tyro.conf.subcommand(name="extract")]
+    | Annotated[Doctor, tyro.conf.subcommand(name="doctor")]
+)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point of the command ``beags``; a user's mistake prints one sentence and ends with exit code 2."""
+    command = tyro.cli(Command, args=arguments, description="BEA-GS: clean objects out of Gaussian-splat scenes.")
+    try:
+        command.run()
+    except UserError as error:
+        CONSOLE.print(f"[bold red]beags:[/bold red] {error}")
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

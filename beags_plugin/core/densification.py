@@ -1,0 +1,168 @@
+"""How a scene grows and thins out while its base trains (method, section 1)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.rotations import rotation_from_quat
+from beags_plugin.core.sh import num_sh_bases
+from beags_plugin.core.surfels import Surfels
+
+SPLIT_SHRINK = 1.6  # both halves of a split surfel are this much smaller (official value)
+INITIAL_OPACITY = 0.1
+SH_C0 = 0.28209479177387814  # value of the constant basis function
+COINCIDENT = 1e-7  # smallest initial scale relative to the cloud's size: coincident points have no neighbour distance
+
+
+@dataclass(frozen=True)
+class DensifyConfig:
+    """When and how the scene grows; lengths are relative to the scene's extent.
+
+    every, start, stop: densify at multiples of ``every`` within (start, stop].
+    grad_threshold: mean screen gradient from which a surfel is cloned or split.
+    clone_scale: a larger surfel is split, a smaller one cloned.
+    prune_opacity: fainter surfels go. prune_scale: larger ones go, after step ``prune_scale_after``.
+    reset_every: opacities are set to at most ``reset_opacity`` so often; 0 never.
+    max_surfels: the scene grows no further than this; 0 sets no bound.
+    """
+
+    every: int = 100
+    start: int = 500
+    stop: int = 15_000
+    grad_threshold: float = 2e-4
+    clone_scale: float = 0.01
+    prune_opacity: float = 0.05
+    prune_scale: float = 0.1
+    prune_scale_after: int = 3_000
+    reset_every: int = 3_000
+    reset_opacity: float = 0.01
+    max_surfels: int = 0
+
+
+@dataclass(frozen=True)
+class Densified:
+    """The edited scene: M surfels, for each the index [M] it came from and whether it is fresh [M] bool."""
+
+    surfels: Surfels
+    source: Tensor
+    fresh: Tensor
+
+
+class GradientStatistics:
+    """Mean screen gradient of N surfels over the views that saw them."""
+
+    def __init__(self, count: int) -> None:
+        self.total = torch.zeros(count)
+        self.views = torch.zeros(count)
+
+    def add(self, gradient: Tensor, visible: Tensor) -> None:
+        """Add one view: gradient [N], counted where visible [N] bool."""
+        seen = visible & torch.isfinite(gradient)
+        self.total += torch.where(seen, gradient, 0.0).to(self.total)
+        self.views += seen.to(self.views)
+
+    def mean(self) -> Tensor:
+        """[N]; 0 for a surfel that no view saw."""
+        return self.total / self.views.clamp_min(1.0)
+
+
+def screen_gradient(mean_grads: Tensor, means: Tensor, camera: Camera) -> Tensor:
+    """How strongly the loss pulls each surfel across the screen.
+
+    Moving the projected centre c by one pixel parallel to the image plane moves the mean by p_z / f, so
+    dL/dc = (W dL/dmean) p_z / f; half the image size turns pixels into the units the threshold is stated in.
+
+    mean_grads, means: [N, 3] world. Returns [N]; 0 behind the camera.
+    """
+    in_camera = mean_grads @ camera.rotation.T
+    depth = (means @ camera.rotation.T + camera.translation)[:, 2]
+    x = in_camera[:, 0] * depth / camera.K[0, 0] * (0.5 * camera.width)
+    y = in_camera[:, 1] * depth / camera.K[1, 1] * (0.5 * camera.height)
+    return torch.where(depth > 0, torch.hypot(x, y), torch.zeros_like(depth))
+
+
+def densify(
+    surfels: Surfels, mean_gradient: Tensor, extent: float, config: DensifyConfig, step: int, generator: torch.Generator
+) -> Densified:
+    """Clone, split, prune.
+
+    surfels: N surfels without gradients. mean_gradient: [N]. extent: world units. step: for ``prune_scale_after``.
+    At least one surfel always remains.
+    """
+    size = surfels.log_scales.exp().amax(dim=-1)
+    chosen = _within_budget(mean_gradient >= config.grad_threshold, mean_gradient, config.max_surfels)
+    small = size <= config.clone_scale * extent
+    clones = (chosen & small).nonzero()[:, 0]
+    splits = (chosen & ~small).nonzero()[:, 0]
+    kept = (~(chosen & ~small)).nonzero()[:, 0]
+
+    # a clone is the copy; a split replaces the surfel by two, so it leaves the kept ones
+    source = torch.cat([kept, clones, splits, splits])
+    fresh = torch.zeros(source.shape[0], dtype=torch.bool)
+    fresh[kept.shape[0] :] = True
+    grown = surfels[source]
+    halves = slice(kept.shape[0] + clones.shape[0], None)
+    grown.means[halves] += _offsets(grown[halves], generator)
+    grown.log_scales[halves] -= math.log(SPLIT_SHRINK)
+
+    keep = torch.sigmoid(grown.opacity_logits) >= config.prune_opacity
+    if step > config.prune_scale_after:
+        keep &= grown.log_scales.exp().amax(dim=-1) <= config.prune_scale * extent
+    if not bool(keep.any()):
+        keep[grown.opacity_logits.argmax()] = True
+    return Densified(grown[keep], source[keep], fresh[keep])
+
+
+def _within_budget(chosen: Tensor, gradient: Tensor, max_surfels: int) -> Tensor:
+    """At most so many chosen, largest gradients first, that the scene stays within ``max_surfels`` (0: no bound)."""
+    room = max(max_surfels - chosen.shape[0], 0)
+    if max_surfels <= 0 or int(chosen.sum()) <= room:
+        return chosen
+    order = torch.where(chosen, gradient, -1.0).argsort(descending=True, stable=True)[:room]
+    limited = torch.zeros_like(chosen)
+    limited[order] = True
+    return limited
+
+
+def _offsets(surfels: Surfels, generator: torch.Generator) -> Tensor:
+    """[M, 3] a draw from each surfel's own Gaussian, in its plane."""
+    normal = torch.randn(len(surfels), 2, generator=generator).to(surfels.means)
+    local = normal * surfels.log_scales.exp()
+    axes = rotation_from_quat(surfels.quats)[:, :, :2]
+    return (axes @ local[:, :, None])[:, :, 0]
+
+
+def reset_opacity(surfels: Surfels, config: DensifyConfig) -> Tensor:
+    """[N] opacity logits, lowered to at most ``reset_opacity``."""
+    ceiling = math.log(config.reset_opacity / (1.0 - config.reset_opacity))
+    return surfels.opacity_logits.clamp_max(ceiling)
+
+
+def initial_surfels(points: Tensor, colors: Tensor, sh_degree: int, generator: torch.Generator) -> Surfels:
+    """One surfel per seed point: as large as its neighbours are far, faint, turned at random.
+
+    points: [N, 3] world. colors: [N, 3] in 0..1. Returns N surfels in float32 without gradients.
+    """
+    from scipy.spatial import cKDTree
+
+    count = points.shape[0]
+    cloud = points.double().cpu().numpy()
+    neighbours = min(4, count)
+    distances = torch.from_numpy(cKDTree(cloud).query(cloud, k=neighbours)[0]).reshape(count, neighbours)[:, 1:]
+    spread = float((points - points.mean(dim=0)).norm(dim=-1).max()) if count > 1 else 1.0
+    squared = distances.square().mean(dim=-1) if neighbours > 1 else torch.ones(count, dtype=torch.float64)
+    scale = squared.sqrt().clamp_min(COINCIDENT * max(spread, 1e-30))
+    sh = torch.zeros(count, num_sh_bases(sh_degree), 3)
+    sh[:, 0] = (colors.float() - 0.5) / SH_C0
+    return Surfels(
+        means=points.float().clone(),
+        quats=torch.nn.functional.normalize(torch.randn(count, 4, generator=generator), dim=-1),
+        log_scales=scale.log().float()[:, None].repeat(1, 2),
+        opacity_logits=torch.full((count,), math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY))),
+        sh=sh,
+    )

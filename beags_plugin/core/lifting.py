@@ -1,0 +1,52 @@
+"""Between pixels with a depth and points in the world (method, sections 0 and 2)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+
+
+def pixel_rays(camera: Camera, like: Tensor) -> Tensor:
+    """Camera-space points at depth 1 under the pixel centres: K^-1 (i + 0.5, j + 0.5, 1).
+
+    like: any tensor; gives dtype and device. Returns [H, W, 3]; the last component is 1.
+    """
+    K = camera.K.to(like)
+    x = torch.arange(camera.width, dtype=like.dtype, device=like.device) + 0.5
+    y = torch.arange(camera.height, dtype=like.dtype, device=like.device) + 0.5
+    ray_y = (y - K[1, 2]) / K[1, 1]
+    ray_x = (x[None, :] - K[0, 2] - K[0, 1] * ray_y[:, None]) / K[0, 0]  # K[0, 1] is the skew, mostly 0
+    return torch.stack([ray_x, ray_y[:, None].expand_as(ray_x), torch.ones_like(ray_x)], dim=-1)
+
+
+def lift(depth: Tensor, camera: Camera) -> Tensor:
+    """World points of all pixels of a view.
+
+    depth: [H, W] float, world units along z (not along the ray). Returns [H, W, 3] of the same dtype;
+    a pixel without depth (0) gives the camera's position.
+    """
+    if tuple(depth.shape) != (camera.height, camera.width):
+        raise ValueError(f"depth must be [{camera.height}, {camera.width}], not {list(depth.shape)}")
+    points = pixel_rays(camera, depth) * depth[..., None] - camera.translation.to(depth)
+    return _times(points, camera.rotation.to(depth))  # rows times W = W^T (x - t)
+
+
+def project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Pixel coordinates and depths of world points.
+
+    points: [P, 3] float. Returns (xy [P, 2] pixels, z [P] world units along z) of the same dtype. Only where z > 0
+    does xy mean anything (at z = 0 it is not finite).
+    """
+    in_camera = _times(points, camera.rotation.to(points).T) + camera.translation.to(points)
+    homogeneous = _times(in_camera, camera.K.to(points).T)
+    z = in_camera[..., 2]
+    return homogeneous[..., :2] / z[..., None], z
+
+
+def _times(rows: Tensor, matrix: Tensor) -> Tensor:
+    """[..., 3] rows times [3, 3], in a fixed order of operations: a library's product may differ between machines
+    and numbers of threads."""
+    x, y, z = rows.unbind(-1)
+    return torch.stack([x * matrix[0, c] + y * matrix[1, c] + z * matrix[2, c] for c in range(3)], dim=-1)

@@ -1,0 +1,140 @@
+"""``beags demo``: sample, training, extraction, measurement, one table and one picture."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from beags_plugin.errors import UserError
+from beags_plugin.progress import progress_bar
+
+CONSOLE = Console(soft_wrap=True, highlight=False)
+QUICK_PIXELS = 50_000  # a folder of the user's is scaled down to at most so many pixels a view, to end in minutes
+SHEET_VIEWS = 3  # held-out views in the picture
+
+
+def make_sample(folder: Path, seed: int, width: int, height: int, degradation: str) -> None:
+    """Generate the sample in ``folder`` unless the same one lies there already."""
+    from beags_plugin.sample.writer import SampleConfig, write_sample
+
+    config = SampleConfig(seed=seed, width=width, height=height, degradation=degradation)
+    with progress_bar("Tracing the sample") as progress:
+        write_sample(folder, config, progress)
+
+
+def run_demo(
+    data: Path | None, output: Path | None, preset: str, downscale: float | None, seed: int, fresh: bool
+) -> None:
+    """Do the whole job in ``output`` and print the table; see ``cli.Demo`` for the arguments."""
+    seconds: dict[str, float] = {}
+    if data is None:
+        output = output or Path("outputs/demo")
+        data = output / "sample"
+        with _Timer(seconds, "sample"):
+            make_sample(data, seed, 256, 192, "mild")
+        downscale = downscale or 1.0
+    elif not data.is_dir():
+        raise UserError(f"{data} is no folder: name one with images, poses and masks.")
+    else:
+        output = output or Path("outputs") / data.resolve().name
+        downscale = downscale or quick_downscale(data)
+    run = output / "run"
+    request = {"data": str(data.resolve()), "preset": preset, "downscale": downscale, "seed": seed}
+    if fresh or not _trained(output, request):
+        shutil.rmtree(run, ignore_errors=True)
+        train(data, run, preset, downscale)
+        (output / "trained.json").write_text(json.dumps(request))
+    else:
+        CONSOLE.print(f"Trained before: {run} (add --fresh to train again).")
+    measure(run, output, seconds)
+
+
+def quick_downscale(data: Path) -> float:
+    """Whole factor that brings the images of ``data`` to ``QUICK_PIXELS`` or less."""
+    from PIL import Image
+
+    images = sorted(path for path in data.glob("images*/*") if path.suffix.lower() in {".jpg", ".jpeg", ".png"})
+    if not images:
+        return 1.0  # the data parser names what is missing
+    width, height = Image.open(images[0]).size
+    factor = 1
+    while width * height / factor**2 > QUICK_PIXELS:
+        factor += 1
+    return float(factor)
+
+
+def _trained(output: Path, request: dict[str, Any]) -> bool:
+    stamp = output / "trained.json"
+    return stamp.exists() and json.loads(stamp.read_text()) == request and (output / "run" / "training.json").exists()
+
+
+def train(data: Path, run: Path, preset: str, downscale: float) -> None:
+    """Run ns-train in a process of its own, as a user would."""
+    command = [
+        str(Path(sys.executable).parent / "ns-train"), preset, "--data", str(data), "--run-dir", str(run.absolute()),
+        "--vis", "tensorboard", "--pipeline.datamanager.dataparser.downscale-factor", str(downscale),
+    ]  # fmt: skip
+    CONSOLE.print("$ " + " ".join(command))
+    code = subprocess.run(command).returncode
+    if code != 0:
+        raise UserError(f"training ended with exit code {code}; what it printed above says why.")
+
+
+def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
+    """Compare assignment alone with refinement, extract every object, write summary.json and the picture."""
+    from beags_plugin.evaluation.contact_sheet import draw_rows, write_contact_sheet
+    from beags_plugin.evaluation.run_metrics import evaluate_scene
+    from beags_plugin.evaluation.table import RunReport, print_table, summary_json
+    from beags_plugin.plugin.evaluate import held_out_views, raster_settings
+    from beags_plugin.plugin.extract import extract_objects, load_scene
+    from beags_plugin.rasterizers import make_rasterizer
+
+    base, refined = load_scene(run / "base" / "config.yml"), load_scene(run / "config.yml")
+    class_ids, classes = refined.state["class_ids"], refined.classes
+    settings = raster_settings(refined)
+    rasterizer = make_rasterizer(refined.config.pipeline.model.rasterizer)
+    views = held_out_views(refined.config, classes)
+    with _Timer(seconds, "evaluation"), progress_bar("Evaluating") as progress:
+        before, after = (
+            evaluate_scene(scene.surfels(), class_ids, rasterizer, settings, views, classes, progress=progress)
+            for scene in (base, refined)
+        )
+    with _Timer(seconds, "extraction"):
+        extracted = extract_objects(run / "config.yml")
+    picture = output / "contact_sheet.png"
+    with _Timer(seconds, "picture"):
+        shown = views[:: max(1, len(views) // SHEET_VIEWS)][:SHEET_VIEWS]
+        objects = [index for index in classes if index != 0]
+        rows = draw_rows(
+            shown, base.surfels(), refined.surfels(), class_ids, objects, rasterizer, settings
+        )
+        write_contact_sheet(picture, rows, classes)
+    training = json.loads((run / "training.json").read_text())
+    stages = {"sample": seconds.pop("sample", 0.0), **training["seconds"], **seconds}
+    report = RunReport(classes, before, after, stages, training["peak_memory_mb"])
+    (output / "summary.json").write_text(json.dumps(summary_json(report), indent=2))
+    print_table(report, CONSOLE)
+    CONSOLE.print(f"objects: {', '.join(str(item.ply) for item in extracted)}")
+    CONSOLE.print(f"figures: {output / 'summary.json'}")
+    CONSOLE.print(f"picture: {picture}")
+    CONSOLE.print(f"look:    ns-viewer --load-config {run / 'config.yml'}")
+
+
+@dataclass
+class _Timer:
+    seconds: dict[str, float]
+    name: str
+
+    def __enter__(self) -> None:
+        self.start = time.perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self.seconds[self.name] = time.perf_counter() - self.start

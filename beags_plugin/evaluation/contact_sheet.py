@@ -1,0 +1,239 @@
+"""One picture of a run: views against renders, and every object alone before and after refinement."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.errors import UserError
+from beags_plugin.evaluation.metrics import resize_nearest
+from beags_plugin.evaluation.run_metrics import EvalView, extracted_truth
+from beags_plugin.extraction.select import select_class
+from beags_plugin.rasterizers.drawing import surfel_inputs
+from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
+
+_CAPTION = 18  # pixels of text above each cell
+_GAP = 4  # pixels between cells
+_MARGIN = 0.15  # of the crop, around the object: rims spread outside it
+_FAINT = 0.1  # alpha from which a stray splat widens the crop
+_CHECKER = (200, 236)  # two greys behind cut-out objects
+_CHECKER_SIDE = 8
+
+
+@dataclass(frozen=True)
+class SheetRow:
+    """One view of the sheet.
+
+    name: of the view. photo, render: [H, W, 3] uint8; photo may be None. labels: [H, W] integer class ids or None.
+    before, after: object id to [H, W, 4] uint8, the object alone with straight alpha. focus: object id to [H, W]
+    bool, what the crop must hold besides the object's pixels.
+    """
+
+    name: str
+    photo: np.ndarray | None
+    labels: np.ndarray | None
+    render: np.ndarray
+    before: Mapping[int, np.ndarray]
+    after: Mapping[int, np.ndarray]
+    focus: Mapping[int, np.ndarray] = field(default_factory=dict)
+
+
+def draw_rows(
+    views: Sequence[EvalView],
+    before: Surfels,
+    after: Surfels,
+    class_ids: Tensor,
+    objects: Sequence[int],
+    rasterizer: Rasterizer,
+    settings: RasterSettings,
+    *,
+    background: Tensor | None = None,
+) -> list[SheetRow]:
+    """Draw the views and one novel view, half-way between the first two.
+
+    before, after: the N surfels with assignment alone and after refinement. class_ids: [N] int32, phi, of both.
+    objects: ids to show alone. background: [3], black if None. No gradients.
+    """
+    if len(views) >= 2:
+        camera = interpolate_cameras(views[0].camera, views[1].camera, 0.5)
+        views = [*views, EvalView(camera, None, name="novel view")]
+    settings = replace(settings, geometry=False, distortion=False)
+    if background is None:
+        background = after.means.new_zeros(3)
+    rows = []
+    with torch.no_grad():
+        for view in views:
+            inputs = surfel_inputs(after.detach(), view.camera)
+            render = _bytes(rasterizer.rasterize(inputs, view.camera, settings, background).color)
+            size = render.shape[:2]
+            truths = {c: extracted_truth(view, c) for c in objects}
+            row = SheetRow(
+                name=view.name,
+                photo=None if view.image is None else _bytes(view.image),
+                labels=None if view.visible is None else resize_nearest(view.visible.cpu().numpy(), *size),
+                render=render,
+                before={c: _alone(before, class_ids, c, view.camera, rasterizer, settings) for c in objects},
+                after={c: _alone(after, class_ids, c, view.camera, rasterizer, settings) for c in objects},
+                focus={c: resize_nearest(t[1].cpu().numpy(), *size) for c, t in truths.items() if t is not None},
+            )
+            rows.append(row)
+    return rows
+
+
+def _alone(
+    surfels: Surfels, class_ids: Tensor, class_id: int, camera: Camera, rasterizer: Rasterizer, settings: RasterSettings
+) -> np.ndarray:
+    """[H, W, 4] uint8: one object's surfels drawn alone, straight alpha."""
+    part = select_class(surfels.detach(), class_ids, class_id)[0]
+    if len(part) == 0:
+        return np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
+    drawn = rasterizer.rasterize(surfel_inputs(part, camera), camera, settings, part.means.new_zeros(3))
+    alpha = drawn.alpha[..., None]
+    # Under 1/255 alpha is written as 0, so the bound only keeps the quotient finite.
+    return _bytes(torch.cat([drawn.color / alpha.clamp(min=1 / 255), alpha], dim=-1))
+
+
+def _bytes(image: Tensor) -> np.ndarray:
+    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+
+
+def interpolate_cameras(first: Camera, second: Camera, fraction: float) -> Camera:
+    """The camera between two: centre and K linear, rotation along the shortest turn; the first one's image size.
+
+    fraction: 0 gives the first camera, 1 the second's pose.
+    """
+    start, end = first.viewmat.double(), second.viewmat.double()
+    turn = torch.matrix_exp(fraction * _rotation_log(end[:3, :3] @ start[:3, :3].T))
+    rotation = turn @ start[:3, :3]
+    center = torch.lerp(first.center.double(), second.center.double(), fraction)
+    viewmat = torch.eye(4, dtype=torch.float64, device=start.device)
+    viewmat[:3, :3] = rotation
+    viewmat[:3, 3] = -rotation @ center
+    size_ratio = first.K.new_tensor([[first.width / second.width], [first.height / second.height], [1.0]])
+    return Camera(
+        viewmat.to(first.viewmat.dtype),
+        torch.lerp(first.K, second.K * size_ratio, fraction),
+        first.width,
+        first.height,
+    )
+
+
+def _rotation_log(rotation: Tensor) -> Tensor:
+    """[3, 3] skew matrix whose exponential is ``rotation`` [3, 3]; zero for a half turn, which has no shortest way."""
+    skew = 0.5 * (rotation - rotation.T)
+    sine = torch.stack([skew[2, 1], skew[0, 2], skew[1, 0]]).norm()
+    if sine < 1e-9:  # angle 0 (or 180 degrees): angle / sine would be 0 / 0
+        return torch.zeros_like(skew)
+    return skew * (torch.atan2(sine, 0.5 * (rotation.trace() - 1)) / sine)
+
+
+def contact_sheet(rows: Sequence[SheetRow], classes: Mapping[int, str], cell_height: int = 220) -> np.ndarray:
+    """Put the rows into one picture; objects are cropped alike before and after, and enlarged.
+
+    classes: object id to name. cell_height: pixels of each cell.
+    Returns [H, W, 3] uint8. Raises ``ValueError`` without rows.
+    """
+    from beags_plugin.masks.classes import colorize
+
+    if not rows:
+        raise ValueError("a contact sheet needs at least one row")
+    objects = sorted(rows[0].before)
+    lines = []
+    for row in rows:
+        height, width = row.render.shape[:2]
+        size = (max(1, round(cell_height * width / height)), cell_height)
+        blank = np.full((height, width, 3), 255, dtype=np.uint8)
+        photo = blank if row.photo is None else row.photo
+        overlay = blank if row.labels is None else _overlay(photo, row.labels, colorize(row.labels))
+        cells = [
+            _cell(photo, size, f"{row.name}: photo" if row.photo is not None else row.name),
+            _cell(overlay, size, "mask" if row.labels is not None else "no mask"),
+            _cell(row.render, size, "render"),
+        ]
+        for class_id in objects:
+            name = classes.get(class_id, f"object {class_id}")
+            window = _window(row, class_id)
+            for stage, image in (("before", row.before[class_id]), ("after", row.after[class_id])):
+                cells.append(
+                    _cell(_cut_out(image, window, cell_height), (cell_height, cell_height), f"{name}, {stage}")
+                )
+        lines.append(np.concatenate([part for cell in cells for part in (cell, _space(cell))], axis=1))
+    widest = max(line.shape[1] for line in lines)
+    padded = [np.pad(line, ((0, _GAP), (0, widest - line.shape[1]), (0, 0)), constant_values=255) for line in lines]
+    return np.concatenate(padded, axis=0)
+
+
+def write_contact_sheet(path: str | Path, rows: Sequence[SheetRow], classes: Mapping[int, str]) -> None:
+    """Write ``contact_sheet`` as a PNG; raises ``UserError`` if it cannot be written."""
+    from PIL import Image
+
+    picture = contact_sheet(rows, classes)
+    try:
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(picture).save(path)
+    except (OSError, ValueError) as error:
+        raise UserError(f"the picture {path} cannot be written: {error}.") from error
+
+
+def _overlay(photo: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.ndarray:
+    """The photo in half its strength under the mask colours; background and IGNORE stay as they are."""
+    if photo.shape[:2] != labels.shape:
+        photo = np.stack([resize_nearest(photo[..., i], *labels.shape) for i in range(3)], axis=-1)
+    mixed = (photo.astype(np.uint16) + colors) // 2
+    shown = (labels != 0) & (labels != IGNORE)
+    return np.where(shown[..., None], mixed, photo).astype(np.uint8)
+
+
+def _window(row: SheetRow, class_id: int) -> tuple[int, int, int]:
+    """(top, left, side) of the square that holds the object before, after and in truth; it may leave the image."""
+    height, width = row.render.shape[:2]
+    shown = np.zeros((height, width), dtype=bool)
+    for image in (row.before[class_id], row.after[class_id]):
+        shown |= image[..., 3] > 255 * _FAINT
+    if class_id in row.focus:
+        shown |= row.focus[class_id]
+    if not shown.any():
+        return 0, 0, max(height, width)
+    ys, xs = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
+    side = int(max(ys[-1] - ys[0], xs[-1] - xs[0]) + 1)
+    side = max(8, round(side * (1 + 2 * _MARGIN)))
+    return int((ys[0] + ys[-1] + 1 - side) // 2), int((xs[0] + xs[-1] + 1 - side) // 2), side
+
+
+def _cut_out(image: np.ndarray, window: tuple[int, int, int], size: int) -> np.ndarray:
+    """[size, size, 3] uint8: the window of an [H, W, 4] image, enlarged, over a checkerboard."""
+    top, left, side = window
+    crop = np.zeros((side, side, 4), dtype=np.uint8)
+    y0, x0 = max(top, 0), max(left, 0)
+    y1, x1 = min(top + side, image.shape[0]), min(left + side, image.shape[1])
+    if y1 > y0 and x1 > x0:
+        crop[y0 - top : y1 - top, x0 - left : x1 - left] = image[y0:y1, x0:x1]
+    large = np.stack([resize_nearest(crop[..., i], size, size) for i in range(4)], axis=-1).astype(np.float64)
+    y, x = np.mgrid[:size, :size] // _CHECKER_SIDE
+    board = np.where((x + y) % 2, *_CHECKER)[..., None]
+    alpha = large[..., 3:] / 255
+    return (large[..., :3] * alpha + board * (1 - alpha)).round().astype(np.uint8)
+
+
+def _cell(image: np.ndarray, size: tuple[int, int], caption: str) -> np.ndarray:
+    """[height + caption, width, 3] uint8: the image resized to (width, height) under its caption."""
+    from PIL import Image, ImageDraw
+
+    width, height = size
+    enlarged = image.shape[1] < width  # enlarged pixels stay sharp, so that rims can be judged
+    resample = Image.Resampling.NEAREST if enlarged else Image.Resampling.BOX
+    cell = Image.new("RGB", (width, height + _CAPTION), "white")
+    cell.paste(Image.fromarray(image).resize(size, resample), (0, _CAPTION))
+    ImageDraw.Draw(cell).text((2, 3), caption.encode("latin-1", "replace").decode("latin-1"), fill="black")
+    return np.asarray(cell)
+
+
+def _space(cell: np.ndarray) -> np.ndarray:
+    return np.full((cell.shape[0], _GAP, 3), 255, dtype=np.uint8)

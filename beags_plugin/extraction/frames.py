@@ -1,0 +1,125 @@
+"""Back from nerfstudio's normalised frame to the frame of the input data."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.sh import sh_colors
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.errors import UserError
+
+# Orthonormality is checked to this: the matrices are written as float32 by way of JSON.
+_ORTHONORMAL_TOLERANCE = 1e-4
+
+
+def to_input_frame(surfels: Surfels, transform: Tensor, scale: float) -> Surfels:
+    """Undo x' = scale (R x + t): the same surfels, seen the same, in the frame of the input poses.
+
+    Positions p = R^T (x' / scale - t), rotations R^T R', scales divided by ``scale``; colours keep their look: the
+    spherical harmonics turn along.
+
+    surfels: N surfels in the frame of x'. transform: [3, 4] float, R | t; R a rotation. scale: positive.
+    Returns N surfels of the same dtype and device. Raises ``UserError`` if R is no rotation or scale is not positive.
+    """
+    matrix = transform.detach().to(device=surfels.means.device, dtype=torch.float64)
+    if matrix.shape != (3, 4):
+        raise ValueError(f"transform must be [3, 4], not {list(matrix.shape)}")
+    rotation, translation = matrix[:, :3], matrix[:, 3]
+    identity = torch.eye(3, dtype=torch.float64, device=matrix.device)
+    if (rotation @ rotation.T - identity).abs().max() > _ORTHONORMAL_TOLERANCE or torch.linalg.det(rotation) < 0:
+        raise UserError("the run's dataparser transform is not a rotation and a shift: export without a frame change.")
+    if not scale > 0:
+        raise UserError(
+            f"the run's dataparser scale is {scale}, but it must be positive: export without a frame change."
+        )
+
+    dtype = surfels.means.dtype
+    means = (surfels.means.detach().double() / scale - translation) @ rotation  # rows: R^T (x' / scale - t)
+    turn = quat_from_rotation(rotation.T)
+    degree = round(surfels.sh.shape[1] ** 0.5) - 1
+    return Surfels(
+        means=means.to(dtype),
+        quats=quat_product(turn, surfels.quats.detach().double()).to(dtype),
+        log_scales=surfels.log_scales.detach() - math.log(scale),
+        opacity_logits=surfels.opacity_logits.detach(),
+        sh=rotate_sh(surfels.sh.detach(), rotation.T, degree),
+    )
+
+
+def quat_product(first: Tensor, second: Tensor) -> Tensor:
+    """The quaternion of "second, then first": first [..., 4] and second [..., 4], wxyz; broadcast. Returns [..., 4]."""
+    w1, x1, y1, z1 = first.unbind(-1)
+    w2, x2, y2, z2 = second.unbind(-1)
+    return torch.stack(
+        [
+            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        ],
+        dim=-1,
+    )
+
+
+def quat_from_rotation(rotation: Tensor) -> Tensor:
+    """The unit quaternion [4] wxyz of a rotation matrix [3, 3].
+
+    q q^T is linear in the matrix, so q is the column of largest diagonal, normalised: no division by a small number.
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
+    outer = rotation.new_tensor(
+        [
+            [1 + xx + yy + zz, zy - yz, xz - zx, yx - xy],
+            [zy - yz, 1 + xx - yy - zz, xy + yx, xz + zx],
+            [xz - zx, xy + yx, 1 - xx + yy - zz, yz + zy],
+            [yx - xy, xz + zx, yz + zy, 1 - xx - yy + zz],
+        ]
+    )  # 4 q q^T
+    column = outer[:, int(outer.diagonal().argmax())]
+    return column / column.norm()
+
+
+def rotate_sh(sh: Tensor, rotation: Tensor, degree: int) -> Tensor:
+    """Coefficients of the turned colour function g(r d) = f(d), r = ``rotation``.
+
+    Each band maps to itself linearly; its matrix is the least-squares solution over many directions (exact up to
+    rounding, since the turned band lies in the span of the band).
+
+    sh: [N, (degree + 1)^2, 3], band 0 first. rotation: [3, 3] float64. Returns the same shape and dtype.
+    """
+    turned = sh.clone()
+    directions = _sphere(64).to(rotation)
+    before = _basis(directions, degree)
+    after = _basis(directions @ rotation.T, degree)
+    for band in range(1, degree + 1):
+        columns = slice(band**2, (band + 1) ** 2)
+        # after @ g = before @ f at every direction
+        matrix = torch.linalg.lstsq(after[:, columns], before[:, columns]).solution
+        turned[:, columns] = torch.einsum("ij,njc->nic", matrix, sh[:, columns].double()).to(sh.dtype)
+    return turned
+
+
+def _sphere(count: int) -> Tensor:
+    """[count, 3] float64 unit directions on a spiral: evenly spread, so that the fit is well conditioned."""
+    step = torch.arange(count, dtype=torch.float64) + 0.5
+    z = 1 - 2 * step / count
+    angle = step * (torch.pi * (3 - 5**0.5))
+    radius = torch.sqrt(1 - z * z)
+    return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle), z], dim=-1)
+
+
+def _basis(directions: Tensor, degree: int) -> Tensor:
+    """[D, (degree + 1)^2] the basis functions at unit directions [D, 3], taken from the renderer's own colours.
+
+    Read off ``sh_colors`` so that order and signs are the renderer's. The factor 0.1 keeps the
+    colour, 0.1 * basis + 0.5, off the clamp at 0.
+    """
+    count, bases = directions.shape[0], (degree + 1) ** 2
+    sh = 0.1 * torch.eye(bases, dtype=directions.dtype, device=directions.device)[:, :, None].expand(-1, -1, 3)
+    colors = sh_colors(
+        sh.repeat(count, 1, 1), directions.repeat_interleave(bases, 0), torch.zeros_like(directions[0]), degree
+    )
+    return ((colors[:, 0] - 0.5) / 0.1).reshape(count, bases)

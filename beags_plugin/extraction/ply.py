@@ -1,0 +1,126 @@
+"""Gaussian splats as .ply files, in the layout that 3DGS and 2DGS viewers read."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.core.rotations import rotation_from_quat
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.errors import UserError
+from beags_plugin.extraction.frames import to_input_frame
+
+THICKNESS = 1e-3
+"""Written third scale, relative to the smaller of the two: flat, yet no viewer divides by 0."""
+
+
+def write_ply(
+    path: str | Path,
+    surfels: Surfels,
+    class_ids: Tensor | None = None,
+    transform: tuple[Tensor, float] | None = None,
+) -> None:
+    """Write surfels as a binary splat .ply: 3DGS's columns, then ``class_id`` (int32) if there are class ids.
+
+    Columns: x y z; nx ny nz, the surfel's normal; f_dc_0..2; f_rest_* channel-major (all red coefficients, then
+    green, then blue); opacity as a logit; scale_0..2 as logs, the third ``THICKNESS`` times the smaller of the two (a
+    viewer for 3D Gaussians needs one; a surfel has none); rot_0..3 wxyz, unit length.
+
+    surfels: N surfels. class_ids: [N] integer, phi. transform: the dataparser's ([3, 4], scale); with it the
+    file is in the frame of the input poses, without it in the surfels' own. Raises ``UserError`` if the file cannot be
+    written.
+    """
+    from plyfile import PlyData, PlyElement
+
+    if transform is not None:
+        surfels = to_input_frame(surfels, *transform)
+    columns = _columns(surfels)
+    if class_ids is not None:
+        if class_ids.shape != (len(surfels),):
+            raise ValueError(f"class_ids must be [{len(surfels)}], not {list(class_ids.shape)}")
+        columns["class_id"] = class_ids.detach().cpu().numpy().astype("<i4")
+    table = np.empty(len(surfels), dtype=[(name, values.dtype) for name, values in columns.items()])
+    for name, values in columns.items():
+        table[name] = values
+    try:
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        # Written beside and moved: a program that has the old file mapped must not lose the ground under it.
+        part = Path(path).with_name(Path(path).name + ".part")
+        PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(str(part))
+        os.replace(part, path)
+    except OSError as error:
+        raise UserError(f"{path} cannot be written ({error.strerror}): choose another place.") from error
+
+
+def _columns(surfels: Surfels) -> dict[str, np.ndarray]:
+    quats = torch.nn.functional.normalize(surfels.quats.detach(), dim=-1)
+    normals = rotation_from_quat(quats)[:, :, 2]
+    log_scales = surfels.log_scales.detach()
+    thin = log_scales.amin(dim=-1, keepdim=True) + float(np.log(THICKNESS))
+    sh = surfels.sh.detach()
+    rest = sh[:, 1:].transpose(1, 2).flatten(1)  # channel-major
+    blocks = {
+        ("x", "y", "z"): surfels.means.detach(),
+        ("nx", "ny", "nz"): normals,
+        _numbered("f_dc", 3): sh[:, 0],
+        _numbered("f_rest", rest.shape[1]): rest,
+        ("opacity",): surfels.opacity_logits.detach()[:, None],
+        _numbered("scale", 3): torch.cat([log_scales, thin], dim=-1),
+        _numbered("rot", 4): quats,
+    }
+    return {
+        name: values[:, i].cpu().numpy().astype("<f4")
+        for names, values in blocks.items()
+        for i, name in enumerate(names)
+    }
+
+
+def _numbered(prefix: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{prefix}_{i}" for i in range(count))
+
+
+def read_ply(path: str | Path) -> tuple[Surfels, Tensor | None]:
+    """Read a surfel .ply: one that ``write_ply`` wrote, or a 2DGS one with two scales.
+
+    Returns (N surfels in float32, class_ids [N] int32 or None if the file has none). Raises ``UserError`` if
+    the file is missing, is no splat .ply, or holds Gaussians that are not flat along their third axis.
+    """
+    from plyfile import PlyData, PlyParseError
+
+    try:
+        vertex = PlyData.read(str(path), mmap=False)["vertex"]
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror}): name an existing .ply file.") from error
+    except (PlyParseError, KeyError, ValueError) as error:
+        raise UserError(f"{path} is not a splat .ply file: {error}.") from error
+    present = {prop.name for prop in vertex.properties}
+    needed = {"x", "y", "z", "opacity", *_numbered("f_dc", 3), *_numbered("scale", 2), *_numbered("rot", 4)}
+    if missing := sorted(needed - present):
+        raise UserError(f"{path} is not a splat .ply file: it has no column {missing[0]!r}.")
+
+    def take(*names: str) -> Tensor:
+        return torch.from_numpy(np.stack([np.asarray(vertex[name], dtype=np.float32) for name in names], axis=-1))
+
+    log_scales = take(*_numbered("scale", 2))
+    if "scale_2" in present and bool((take("scale_2") > log_scales.amin(dim=-1, keepdim=True)).any()):
+        raise UserError(f"{path} holds 3D Gaussians, not surfels: their third scale is not the smallest.")
+    rest_count = sum(name.startswith("f_rest_") for name in present)
+    if rest_count not in (0, 9, 24, 45):
+        raise UserError(f"{path} has {rest_count} f_rest columns, but 0, 9, 24 or 45 make whole colour bands.")
+    sh = take(*_numbered("f_dc", 3))[:, None]
+    if rest_count:
+        rest = take(*_numbered("f_rest", rest_count)).reshape(len(sh), 3, rest_count // 3)
+        sh = torch.cat([sh, rest.transpose(1, 2)], dim=1)
+    surfels = Surfels(
+        means=take("x", "y", "z"),
+        quats=take(*_numbered("rot", 4)),
+        log_scales=log_scales,
+        opacity_logits=take("opacity")[:, 0],
+        sh=sh.contiguous(),
+    )
+    class_ids = torch.from_numpy(np.array(vertex["class_id"], dtype=np.int32)) if "class_id" in present else None
+    return surfels, class_ids

@@ -1,0 +1,172 @@
+"""Multiview mask reprojection: every view's labels voted by all views (method, section 2; paper 3.2; E5)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.errors import UserError
+from beags_plugin.rasterizers.interface import IGNORE
+
+_CHUNK_PIXELS = 1 << 16  # source pixels projected at a time: their temporaries stay in the cache
+_DENSE_COUNTERS = 1 << 26  # up to this many (pixel, class) pairs a view's votes are counted in one array (256 MiB)
+
+
+@dataclass(frozen=True)
+class ReprojectedMask:
+    """One view's consistent labels M'.
+
+    labels: [H, W] int32 class ids, or IGNORE where nothing is known.
+    confidence: [H, W] float32 in 0..1, votes of the winner / all votes; 0 where there is no vote.
+    """
+
+    labels: Tensor
+    confidence: Tensor
+
+
+def reproject_pairwise(
+    depths: Sequence[Tensor],
+    cameras: Sequence[Camera],
+    labels: Sequence[Tensor | None],
+    num_classes: int,
+    tau: float = 0.02,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[ReprojectedMask]:
+    """Give every pixel of every view the class that most lifted pixels of all views put there (E5).
+
+    depths: V x [H, W] float, world units along z; 0 where nothing is drawn. Views may differ in size.
+    labels: V x [H, W] int32 class ids below ``num_classes`` or IGNORE; None for a view without a mask.
+    tau: a vote counts only if its point is visible, |z - D_i| <= tau z; ``inf`` counts all (the paper's literal text).
+    IGNORE pixels and pixels without depth do not vote; a view votes in itself too. A tie or no vote keeps the original
+    label; a view without a mask counts as all IGNORE, so there it leaves IGNORE (an ambiguous pixel is better left
+    unlabelled than guessed). Cost O(V^2 pixels), memory O(pixels of one view x classes).
+    Raises ``UserError`` for a mask of the wrong size or with ids out of range.
+    """
+    _check(depths, cameras, labels, num_classes, tau)
+    voting = [j for j, mask in enumerate(labels) if mask is not None]
+    results = []
+    for i, camera in enumerate(cameras):
+        votes = _Votes(camera.height * camera.width, num_classes, depths[i].device)
+        for j in voting:
+            _cast(votes, depths[j], labels[j], depths[i], _pixel_map(cameras[j], camera, same=i == j), tau)
+        results.append(_decide(votes, labels[i], camera))
+        if progress:
+            progress(i + 1, len(cameras))
+    return results
+
+
+def _check(depths, cameras, labels, num_classes: int, tau: float) -> None:
+    if not len(depths) == len(cameras) == len(labels):
+        raise ValueError(f"{len(depths)} depths, {len(cameras)} cameras and {len(labels)} masks do not belong together")
+    if not tau >= 0:
+        raise UserError(f"tau is {tau}: it must be 0 or more (inf counts every vote).")
+    for index, (depth, camera, mask) in enumerate(zip(depths, cameras, labels, strict=True)):
+        size = (camera.height, camera.width)
+        if tuple(depth.shape) != size:
+            raise ValueError(f"depth {index} must be {list(size)}, not {list(depth.shape)}")
+        if mask is None:
+            continue
+        if tuple(mask.shape) != size:
+            raise UserError(
+                f"the mask of view {index} is {mask.shape[1]} x {mask.shape[0]} pixels but its image is "
+                f"{camera.width} x {camera.height}: give both the same size."
+            )
+        known = mask[mask != IGNORE]
+        if known.numel() and (int(known.min()) < 0 or int(known.max()) >= num_classes):
+            raise UserError(
+                f"the mask of view {index} holds class ids {int(known.min())}..{int(known.max())}, but only "
+                f"0..{num_classes - 1} are known: name all classes."
+            )
+
+
+def _pixel_map(source: Camera, target: Camera, same: bool) -> tuple[Tensor, Tensor]:
+    """A [3, 3] and b [3], float64: a source pixel (x, y) at depth d projects to d A (x, y, 1) + b = z (x', y', 1).
+
+    This is lifting and projecting in one step, so that no point has to be kept.
+    """
+    if same:  # exactly the identity, whatever the rounding of the matrices
+        return torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    source, target = source.to("cpu", torch.float64), target.to("cpu", torch.float64)
+    turn = target.rotation @ source.rotation.T
+    return (
+        target.K @ turn @ torch.linalg.inv(source.K),
+        target.K @ (target.translation - turn @ source.translation),
+    )
+
+
+def _cast(votes: _Votes, depth: Tensor, mask: Tensor, target_depth: Tensor, pixel_map, tau: float) -> None:
+    """Add the votes of one view (``depth``, ``mask``) in another (``target_depth``)."""
+    height, width = depth.shape
+    target_height, target_width = target_depth.shape
+    A, b = (value.to(depth) for value in pixel_map)
+    x = torch.arange(width, dtype=depth.dtype, device=depth.device) + 0.5
+    rows = max(1, _CHUNK_PIXELS // width)
+    for top in range(0, height, rows):
+        d, label = depth[top : top + rows], mask[top : top + rows]
+        y = torch.arange(top, top + d.shape[0], dtype=depth.dtype, device=depth.device)[:, None] + 0.5
+        hx, hy, z = (d * (A[r, 0] * x + (A[r, 1] * y + A[r, 2])) + b[r] for r in range(3))
+        # Written as products so that z = 0, infinite and NaN points simply fail.
+        lands = (z > 0) & (hx >= 0) & (hy >= 0) & (hx < target_width * z) & (hy < target_height * z)
+        hx, hy, z, label = (value[lands & (d > 0) & (label != IGNORE)] for value in (hx, hy, z, label))
+        # The quotient may round up to the border itself.
+        column = (hx / z).long().clamp_(max=target_width - 1)
+        row = (hy / z).long().clamp_(max=target_height - 1)
+        pixel = row * target_width + column
+        if not math.isinf(tau):
+            visible = (z - target_depth.reshape(-1)[pixel]).abs() <= tau * z
+            pixel, label = pixel[visible], label[visible]
+        votes.add(pixel, label)
+
+
+class _Votes:
+    """Counts per (pixel, class) of one view: one array, or the pairs that occur where that would be too large."""
+
+    def __init__(self, num_pixels: int, num_classes: int, device: torch.device) -> None:
+        self.num_pixels, self.num_classes = num_pixels, num_classes
+        self.dense = num_pixels * num_classes <= _DENSE_COUNTERS
+        size = num_pixels * num_classes if self.dense else 0
+        self.counts = torch.zeros(size, dtype=torch.int32, device=device)
+        self.keys = torch.zeros(0, dtype=torch.int64, device=device)  # sorted; used where not dense
+
+    def add(self, pixel: Tensor, label: Tensor) -> None:
+        """One vote for ``label`` [M] int32 at each ``pixel`` [M] int64. Determinism: sums of integers have no order."""
+        key = pixel * self.num_classes + label.long()
+        if self.dense:
+            self.counts.scatter_add_(0, key, torch.ones_like(key, dtype=torch.int32))
+            return
+        fresh, counts = torch.unique(key, return_counts=True)
+        self.keys, inverse = torch.unique(torch.cat([self.keys, fresh]), return_inverse=True)
+        both = torch.cat([self.counts, counts.int()])
+        self.counts = torch.zeros_like(self.keys, dtype=torch.int32).scatter_add_(0, inverse, both)
+
+    def winners(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Per pixel [num_pixels]: the winner's id int64, its votes, how many classes have as many, all votes."""
+        if self.dense:
+            counts = self.counts.view(self.num_pixels, self.num_classes)
+            most, winner = counts.max(dim=1)
+            return winner, most, (counts == most[:, None]).sum(1), counts.sum(1)
+        pixel = self.keys // self.num_classes
+        zeros = torch.zeros(self.num_pixels, dtype=torch.int32, device=self.keys.device)
+        total = zeros.scatter_add(0, pixel, self.counts)
+        most = zeros.scatter_reduce(0, pixel, self.counts, "amax")
+        best = self.counts == most[pixel]
+        leaders = zeros.scatter_add(0, pixel, best.int())
+        winner = zeros.long()
+        winner[pixel[best]] = self.keys[best] % self.num_classes  # where two lead, the label is not used
+        return winner, most, leaders, total
+
+
+def _decide(votes: _Votes, original: Tensor | None, camera: Camera) -> ReprojectedMask:
+    winner, most, leaders, total = votes.winners()
+    size = (camera.height, camera.width)
+    if original is None:
+        original = torch.full(size, IGNORE, dtype=torch.int32, device=winner.device)
+    clear = (most > 0) & (leaders == 1)
+    labels = torch.where(clear, winner.int(), original.reshape(-1).int())
+    confidence = most.float() / total.clamp(min=1).float()
+    return ReprojectedMask(labels.view(size), confidence.view(size))

@@ -1,0 +1,121 @@
+// The Python module: plain arrays in and out. Arguments are checked once, in rasterizers/native.py and interface.py.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+
+#include "frame.h"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace beags {
+namespace {
+
+template <class T>
+using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
+using Labels = Array<const int32_t>;
+
+// The array's numbers, or null for None.
+template <class T>
+T* data(const Array<T>& array) {
+  return array.is_valid() ? array.data() : nullptr;
+}
+
+View make_view(const Array<const double>& viewmat, const Array<const double>& k, int width, int height, double near_plane,
+               double far_plane) {
+  View view{};
+  for (int row = 0; row < 3; ++row) {
+    for (int column = 0; column < 3; ++column) view.rotation[3 * row + column] = viewmat.data()[4 * row + column];
+    view.translation[row] = viewmat.data()[4 * row + 3];
+    view.kx[row] = k.data()[row];
+    view.ky[row] = k.data()[3 + row];
+  }
+  view.width = width;
+  view.height = height;
+  view.near_plane = near_plane;
+  view.far_plane = far_plane;
+  return view;
+}
+
+template <class T>
+void bind(nb::module_& m, const char* name) {
+  using In = Array<const T>;
+  using Out = Array<T>;
+  nb::class_<Frame<T>>(m, name)
+      .def(
+          "__init__",
+          [](Frame<T>* self, In means, In quats, In log_scales, In opacity_logits, In colors, Labels class_ids,
+             Array<const double> viewmat, Array<const double> k, int width, int height, double near_plane,
+             double far_plane, Array<bool> visible, int threads) {
+            const View view = make_view(viewmat, k, width, height, near_plane, far_plane);
+            const Inputs<T> inputs{static_cast<int64_t>(means.shape(0)), means.data(), quats.data(), log_scales.data(),
+                                   opacity_logits.data(), colors.data(), data(class_ids)};
+            nb::gil_scoped_release release;
+            new (self) Frame<T>(view, inputs, visible.data(), threads);
+          },
+          "means"_a, "quats"_a, "log_scales"_a, "opacity_logits"_a, "colors"_a, "class_ids"_a.none(), "viewmat"_a, "K"_a,
+          "width"_a, "height"_a, "near"_a, "far"_a, "visible"_a, "threads"_a)
+      .def_prop_ro("num_nonfinite", &Frame<T>::num_nonfinite)
+      .def_prop_ro("num_pairs", &Frame<T>::num_pairs)
+      .def(
+          "forward",
+          [](Frame<T>& self, In background, Labels target, Out color, Out alpha, Out depth, Out median_depth, Out normal,
+             Out distortion, Out boundary, int threads) {
+            nb::gil_scoped_release release;
+            self.forward({data(color), data(alpha), data(depth), data(median_depth), data(normal), data(distortion),
+                          data(boundary)},
+                         background.data(), data(target), threads);
+          },
+          "background"_a, "target"_a.none(), "color"_a, "alpha"_a, "depth"_a.none(), "median_depth"_a.none(),
+          "normal"_a.none(), "distortion"_a.none(), "boundary"_a.none(), "threads"_a)
+      .def(
+          "backward",
+          [](Frame<T>& self, In means, In quats, In log_scales, In opacity_logits, In colors, Labels target, In color,
+             In alpha, In depth, In median_depth, In normal, In distortion, In boundary, Out g_means, Out g_quats,
+             Out g_log_scales, Out g_opacity_logits, Out g_colors, Out g_background, int threads) {
+            const Inputs<T> inputs{static_cast<int64_t>(means.shape(0)), means.data(), quats.data(), log_scales.data(),
+                                   opacity_logits.data(), colors.data(), nullptr};
+            nb::gil_scoped_release release;
+            self.backward(inputs, data(target),
+                          {data(color), data(alpha), data(depth), data(median_depth), data(normal), data(distortion),
+                           data(boundary)},
+                          {g_means.data(), g_quats.data(), g_log_scales.data(), g_opacity_logits.data(), g_colors.data(),
+                           g_background.data()},
+                          threads);
+          },
+          "means"_a, "quats"_a, "log_scales"_a, "opacity_logits"_a, "colors"_a, "target"_a.none(), "color"_a.none(),
+          "alpha"_a.none(), "depth"_a.none(), "median_depth"_a.none(), "normal"_a.none(), "distortion"_a.none(),
+          "boundary"_a.none(), "g_means"_a, "g_quats"_a, "g_log_scales"_a, "g_opacity_logits"_a, "g_colors"_a,
+          "g_background"_a, "threads"_a)
+      .def(
+          "class_contributions",
+          [](const Frame<T>& self, Labels labels, int num_classes, Out out, int threads) {
+            nb::gil_scoped_release release;
+            self.class_contributions(labels.data(), num_classes, out.data(), threads);
+          },
+          "labels"_a, "num_classes"_a, "out"_a, "threads"_a)
+      .def(
+          "class_map",
+          [](const Frame<T>& self, int num_classes, Array<int32_t> classes, Out share, int threads) {
+            nb::gil_scoped_release release;
+            self.class_map(num_classes, classes.data(), share.data(), threads);
+          },
+          "num_classes"_a, "classes"_a, "share"_a, "threads"_a)
+      .def(
+          "heaviest",
+          [](const Frame<T>& self, Array<int32_t> indices, int threads) {
+            nb::gil_scoped_release release;
+            self.heaviest(indices.data(), threads);
+          },
+          "indices"_a, "threads"_a);
+}
+
+}  // namespace
+}  // namespace beags
+
+NB_MODULE(_native, m) {
+  nb::set_leak_warnings(false);  // an image that is alive at exit keeps its frame, through autograd
+  m.doc() = "The compiled CPU rasterizer; use it through beags_plugin.rasterizers.native.";
+  m.def("instruction_set", &beags::instruction_set, "The kernels in use: avx2 or baseline.");
+  beags::bind<float>(m, "FrameF32");
+  beags::bind<double>(m, "FrameF64");
+}

@@ -1,0 +1,101 @@
+"""Build the visibility voxel grids from what the training views show (method, section 5; paper 3.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.lifting import lift
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.errors import UserError
+from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.occupancy.voxel_size import reference_indices, voxel_size_of_reference
+from beags_plugin.rasterizers.drawing import geometry_inputs
+from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+
+MIN_ALPHA_LIFTED = 0.5  # pixels with less alpha are not lifted
+
+
+@dataclass(frozen=True)
+class _View:
+    """What one view shows: pixel [P] int32 (row-major), depth [P] float, class_id [P] int16 or int32."""
+
+    camera: Camera
+    pixel: Tensor
+    depth: Tensor
+    class_id: Tensor
+
+    def points(self) -> Tensor:
+        """[P, 3] world."""
+        depth = self.depth.new_zeros(self.camera.height * self.camera.width)
+        depth[self.pixel.long()] = self.depth
+        shape = (self.camera.height, self.camera.width)
+        return lift(depth.view(shape), self.camera).view(-1, 3)[self.pixel.long()]
+
+
+def build_visibility_grid(
+    surfels: Surfels,
+    class_ids: Tensor,
+    cameras: Sequence[Camera],
+    rasterizer: Rasterizer,
+    settings: RasterSettings,
+    num_classes: int,
+    k: int = 2000,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> VisibilityGrid:
+    """Render depth and class of every view, lift the pixels with A >= 0.5, and voxelise them per class.
+
+    surfels: N surfels. class_ids: [N] int32, phi. k: sets the voxel size (E8); seed: of the points that measure it.
+    Keeps a pixel's number, depth and class (10 bytes) of all views, and lifts them view by view.
+    Raises ``UserError`` if no pixel of any view reaches an alpha of 0.5.
+    """
+    settings = replace(settings, geometry=True, distortion=False)
+    views = []
+    for index, camera in enumerate(cameras):
+        views.append(_render(surfels, class_ids, camera, rasterizer, settings, num_classes))
+        if progress:
+            progress(index + 1, len(cameras))
+    reference, total = _reference_cloud(views, k, seed)
+    if total == 0:
+        raise UserError("no training view shows anything solid (alpha >= 0.5): train the base for more steps.")
+    size = voxel_size_of_reference(reference, total, k, seed)
+    origin = torch.from_numpy(reference.min(0).astype(np.float64)).to(surfels.means.device)
+    clouds = ((view.points(), view.class_id) for view in views)
+    return VisibilityGrid.from_points(clouds, size, origin, num_classes)
+
+
+def _render(surfels, class_ids, camera, rasterizer, settings, num_classes: int) -> _View:
+    inputs = geometry_inputs(surfels, class_ids)
+    with torch.no_grad():
+        drawn = rasterizer.rasterize(inputs, camera, settings, surfels.means.new_zeros(3))
+        classes, _ = rasterizer.class_map(inputs, camera, settings, num_classes)
+    solid = ((drawn.alpha >= MIN_ALPHA_LIFTED) & torch.isfinite(drawn.depth) & (drawn.depth > 0)).reshape(-1)
+    pixel = torch.nonzero(solid)[:, 0]
+    small = torch.int16 if num_classes <= 1 << 15 else torch.int32
+    return _View(camera, pixel.int(), drawn.depth.reshape(-1)[pixel], classes.reshape(-1)[pixel].to(small))
+
+
+def _reference_cloud(views: Sequence[_View], k: int, seed: int) -> tuple[np.ndarray, int]:
+    """The thinned cloud of all classes [R, 3], and how many points there are in all."""
+    counts = [len(view.pixel) for view in views]
+    chosen = reference_indices(sum(counts), k, seed)
+    pieces = [_piece(view, chosen, first, count) for view, first, count in _spans(views, counts)]
+    return np.concatenate([np.zeros((0, 3), dtype=np.float32), *pieces]), sum(counts)
+
+
+def _spans(views: Sequence[_View], counts: Sequence[int]) -> Iterator[tuple[_View, int, int]]:
+    first = 0
+    for view, count in zip(views, counts, strict=True):
+        yield view, first, count
+        first += count
+
+
+def _piece(view: _View, chosen: np.ndarray, first: int, count: int) -> np.ndarray:
+    start, stop = np.searchsorted(chosen, [first, first + count])
+    return view.points()[torch.from_numpy(chosen[start:stop] - first).to(view.pixel.device)].cpu().numpy()

@@ -1,0 +1,206 @@
+"""The per-class visibility voxel grids V_phi and how many voxels around a point are occupied (method, section 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from beags_plugin.errors import UserError
+
+DENSE_BYTES = 256 * 2**20  # up to this size, validity is kept as one byte per class and voxel
+_BITS = 21  # of each of the three voxel indices in a key
+_HALF = 1 << (_BITS - 1)
+
+
+class VisibilityGrid:
+    """Voxels that hold lifted points of one class and of no other, for all classes at once.
+
+    D_occ(x, V_phi) is the number of occupied voxels of V_phi among the 27 around x. A class whose grid is empty (it
+    is seen nowhere, or collides everywhere) has D_occ = 0 everywhere: all of it is penalised.
+
+    voxel_size: world units. origin: [3] float64, corner of voxel (0, 0, 0), world. num_classes: ids are 0..num_classes-1.
+    keys: [M] int64, sorted, unique: the occupied voxels, 21 bits per axis. classes: [M] int32, the class of each.
+    dense_bytes: see ``DENSE_BYTES``; 0 forces sorted keys. It changes the speed of ``valid``, never its result.
+    """
+
+    def __init__(
+        self, voxel_size: float, origin: Tensor, num_classes: int, keys: Tensor, classes: Tensor,
+        dense_bytes: int = DENSE_BYTES,
+    ) -> None:  # fmt: skip
+        if not voxel_size > 0:
+            raise ValueError(f"the voxel size must be positive, not {voxel_size}")
+        self.voxel_size = float(voxel_size)
+        self.origin = origin.to(torch.float64)
+        self.num_classes = num_classes
+        self.keys, self.classes = keys, classes
+        self._prepare_valid(dense_bytes)
+
+    @classmethod
+    def from_points(
+        cls, clouds: Iterable[tuple[Tensor, Tensor]], voxel_size: float, origin: Tensor, num_classes: int,
+        dense_bytes: int = DENSE_BYTES,
+    ) -> VisibilityGrid:  # fmt: skip
+        """The grid of lifted points; a voxel in which classes collide is empty in all (section 5).
+
+        clouds: pairs (points [P, 3] float, class_ids [P] int), taken one by one, e.g. one per view.
+        Raises ``UserError`` if the cloud spans more than 2^21 voxels along an axis.
+        """
+        origin = origin.to(torch.float64)
+        keys = torch.zeros(0, dtype=torch.int64, device=origin.device)
+        classes = torch.zeros(0, dtype=torch.int32, device=origin.device)
+        for points, class_ids in clouds:
+            fresh = _pack(_voxels(points, origin, voxel_size))
+            keys, classes = _unique_pairs(torch.cat([keys, fresh]), torch.cat([classes, class_ids.int()]), num_classes)
+        keys, inverse, counts = torch.unique(keys, return_inverse=True, return_counts=True)
+        alone = counts == 1
+        of_key = torch.zeros_like(keys, dtype=torch.int32)
+        of_key[inverse] = classes  # meaningful where one class was there
+        return cls(voxel_size, origin, num_classes, keys[alone], of_key[alone], dense_bytes)
+
+    def count(self, points: Tensor, class_ids: Tensor) -> Tensor:
+        """D_occ exactly: [P] int64 in 0..27; the plain definition, for checks and display.
+
+        points: [P, 3] float, world. class_ids: [P] int.
+        """
+        points, usable = self._usable(points)
+        voxels = _voxels(points, self.origin, self.voxel_size)
+        total = torch.zeros(len(points), dtype=torch.int64, device=points.device)
+        for offset in _offsets(points.device):
+            neighbour = voxels + offset
+            known = ((neighbour >= -_HALF) & (neighbour < _HALF)).all(-1) & usable
+            key = _pack(neighbour.clamp(-_HALF, _HALF - 1))
+            position = torch.searchsorted(self.keys, key).clamp_(max=max(len(self.keys) - 1, 0))
+            if len(self.keys):
+                total += known & (self.keys[position] == key) & (self.classes[position] == class_ids)
+        return total
+
+    def valid(self, points: Tensor, class_ids: Tensor) -> Tensor:
+        """Whether D_occ > 0: [P] bool, one look-up per point.
+
+        points: [P, 3] float, world; a point that is not finite is not valid. class_ids: [P] int.
+        """
+        voxels = _scaled(points, self.origin, self.voxel_size) - self._base.to(points)
+        return self._member(voxels, class_ids)
+
+    def disc_inside(self, means: Tensor, axes_u: Tensor, axes_v: Tensor, class_ids: Tensor) -> Tensor:
+        """Discs that surely lie in valid voxels: [N] bool; True only if every point of the disc is valid.
+
+        means: [N, 3] centres, world. axes_u, axes_v: [N, 3], the two half axes, from the centre to the rim, world.
+        class_ids: [N] int. The test looks at the disc's axis-aligned box; one over more than two voxels along an axis
+        gives False.
+        """
+        half = torch.sqrt(axes_u * axes_u + axes_v * axes_v)
+        # The samples and this box round differently: a few units in the last place of the largest coordinate.
+        rounding = 16 * torch.finfo(means.dtype).eps
+        half = half * (1 + rounding) + rounding * (means.abs() + self.origin.to(means).abs())
+        base = self._base.to(means)
+        low = _scaled(means - half, self.origin, self.voxel_size) - base
+        high = _scaled(means + half, self.origin, self.voxel_size) - base
+        inside = ((high - low) <= 1).all(-1)  # False for NaN
+        low, high, class_ids = low[inside], high[inside], class_ids[inside]
+        every = torch.ones(len(low), dtype=torch.bool, device=means.device)
+        for corner in range(8):
+            pick = torch.tensor([corner >> axis & 1 for axis in range(3)], dtype=torch.bool, device=means.device)
+            every &= self._member(torch.where(pick, high, low), class_ids)
+        inside[inside.clone()] = every
+        return inside
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """All that makes the grid, as tensors."""
+        return {
+            "voxel_size": torch.tensor(self.voxel_size, dtype=torch.float64),
+            "origin": self.origin,
+            "num_classes": torch.tensor(self.num_classes),
+            "keys": self.keys,
+            "classes": self.classes,
+        }
+
+    @classmethod
+    def from_state_dict(cls, state: dict[str, Tensor], dense_bytes: int = DENSE_BYTES) -> VisibilityGrid:
+        """The grid of which ``state_dict`` gave ``state``."""
+        size, num_classes = float(state["voxel_size"]), int(state["num_classes"])
+        return cls(size, state["origin"], num_classes, state["keys"], state["classes"], dense_bytes)
+
+    def _usable(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        usable = (_scaled(points, self.origin, self.voxel_size).abs() < _HALF).all(-1)
+        return torch.where(usable[:, None], points, self.origin.to(points)), usable
+
+    def _prepare_valid(self, dense_bytes: int) -> None:
+        """The valid voxels, i.e. those next to an occupied one, cropped to a box with a rim of invalid voxels."""
+        voxels = _unpack(self.keys)
+        device = voxels.device
+        low = voxels.amin(0) if len(voxels) else torch.zeros(3, dtype=torch.int64, device=device)
+        high = voxels.amax(0) if len(voxels) else low
+        self._base = low - 2  # one voxel for the dilation, one for the rim
+        dims = high - low + 5
+        self._last = (dims - 1).tolist()
+        x, y, z = dims.tolist()
+        if x * y * z * self.num_classes >= 1 << 63:
+            raise UserError(f"the views span {x} x {y} x {z} voxels, which is too many: raise k to get larger voxels.")
+        self._strides = (y * z, z, 1)
+        self._per_class = x * y * z
+        linear = self.classes.long() * self._per_class
+        for axis, stride in enumerate(self._strides):
+            linear = linear + (voxels[:, axis] - self._base[axis]) * stride
+        for stride in self._strides:  # the 27 neighbours, axis by axis; the rim keeps them inside the box
+            linear = torch.unique(torch.cat([linear - stride, linear, linear + stride]))
+        self._valid_keys = linear
+        self._volume: Tensor | None = None
+        if self.num_classes * self._per_class <= dense_bytes:
+            self._volume = torch.zeros(self.num_classes * self._per_class, dtype=torch.bool, device=device)
+            self._volume[linear] = True
+            self._valid_keys = linear[:0]
+
+    def _member(self, voxels: Tensor, class_ids: Tensor) -> Tensor:
+        """Validity of voxels given as whole floats [P, 3] relative to the box; those outside are moved to its rim."""
+        linear = class_ids.long() * self._per_class
+        for axis, stride in enumerate(self._strides):
+            # nan_to_num: NaN goes to the rim too
+            index = voxels[:, axis].nan_to_num(nan=0.0).clamp(0, self._last[axis])
+            linear = linear + index.long() * stride
+        if self._volume is not None:
+            return self._volume[linear]
+        if len(self._valid_keys) == 0:
+            return torch.zeros_like(linear, dtype=torch.bool)
+        position = torch.searchsorted(self._valid_keys, linear).clamp_(max=len(self._valid_keys) - 1)
+        return self._valid_keys[position] == linear
+
+
+def _scaled(points: Tensor, origin: Tensor, size: float) -> Tensor:
+    """Voxel indices as whole floats. Each step is monotonic, which ``disc_inside`` relies on."""
+    return torch.floor((points - origin.to(points)) / size)
+
+
+def _voxels(points: Tensor, origin: Tensor, size: float) -> Tensor:
+    scaled = _scaled(points, origin, size)
+    if not bool((scaled.abs() < _HALF).all()):
+        raise UserError(
+            f"points of the views lie more than {_HALF} voxels of size {size:.4g} apart or are not finite: "
+            "raise k to get larger voxels, or train the base longer."
+        )
+    return scaled.long()
+
+
+def _pack(voxels: Tensor) -> Tensor:
+    """[P, 3] int64 indices in -2^20..2^20-1 to [P] int64 keys."""
+    x, y, z = (voxels + _HALF).unbind(-1)
+    return (x << 2 * _BITS) | (y << _BITS) | z
+
+
+def _unpack(keys: Tensor) -> Tensor:
+    mask = (1 << _BITS) - 1
+    return torch.stack([keys >> 2 * _BITS, (keys >> _BITS) & mask, keys & mask], dim=-1) - _HALF
+
+
+def _unique_pairs(keys: Tensor, classes: Tensor, num_classes: int) -> tuple[Tensor, Tensor]:
+    """The different (key, class) pairs; a pair does not fit in 64 bits, a key's rank with a class does."""
+    voxels, rank = torch.unique(keys, return_inverse=True)
+    pairs = torch.unique(rank * num_classes + classes)
+    return voxels[pairs // num_classes], (pairs % num_classes).int()
+
+
+def _offsets(device: torch.device) -> list[Tensor]:
+    steps = (-1, 0, 1)
+    return [torch.tensor([x, y, z], device=device) for x in steps for y in steps for z in steps]

@@ -1,0 +1,87 @@
+"""The base config that every preset overrides, and the trainer config that it is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+
+from beags_plugin.plugin import nerfstudio_patches  # noqa: F401  (lets torch load nerfstudio's own checkpoints)
+from beags_plugin.plugin.datamanager import BeagsDataManagerConfig
+from beags_plugin.plugin.dataparser import BeagsDataParserConfig
+from beags_plugin.plugin.model import BeagsModelConfig, LossSpec
+from beags_plugin.plugin.trainer import BeagsTrainer
+
+
+@dataclass
+class BeagsTrainerConfig(TrainerConfig):
+    """A nerfstudio trainer config whose paths are absolute once it is saved."""
+
+    _target: type = field(default_factory=lambda: BeagsTrainer)
+    run_dir: Path | None = None
+    """Folder of this run; None puts it where nerfstudio does (output_dir/experiment/method/timestamp)."""
+    max_num_iterations: int = 0
+    """Stop after so many steps of the schedule; 0 runs base_steps + refine_steps."""
+
+    def get_base_dir(self) -> Path:
+        """Folder of the run."""
+        return self.run_dir if self.run_dir is not None else super().get_base_dir()
+
+    def save_config(self) -> None:
+        """Save config.yml with absolute paths, so that every command finds the run from any folder."""
+        self.output_dir = Path(self.output_dir).absolute()
+        for holder in (self, self.pipeline.datamanager, self.pipeline.datamanager.dataparser):
+            if getattr(holder, "data", None) is not None:
+                holder.data = Path(holder.data).absolute()
+        super().save_config()
+
+
+def base_config() -> BeagsTrainerConfig:
+    """The documented base: the full schedule of method sections 1 and 7 (33,000 steps).
+
+    Learning rates, losses and schedules are those of the 2DGS and BEA-GS papers; a preset states what it changes.
+    """
+    return BeagsTrainerConfig(
+        method_name="beags",
+        steps_per_eval_batch=0,
+        steps_per_eval_image=500,
+        steps_per_eval_all_images=0,
+        steps_per_save=2000,
+        pipeline=VanillaPipelineConfig(
+            datamanager=BeagsDataManagerConfig(
+                dataparser=BeagsDataParserConfig(),
+                cache_images="gpu",  # nerfstudio's word for "on the model's device"; "cpu" would pin memory
+                cache_images_type="uint8",
+            ),
+            model=BeagsModelConfig(
+                losses={
+                    "photometric": LossSpec(options={"ssim_weight": 0.2}),
+                    "distortion": LossSpec(weight=0.0, start=3_000),
+                    "normal": LossSpec(weight=0.05, start=7_000),
+                    "boundary": LossSpec(weight=0.5, phase="refine"),
+                    "occupancy": LossSpec(weight=10.0, phase="refine", options={"samples": 20}),
+                },
+            ),
+        ),
+        optimizers={
+            # positions follow BeagsModelConfig.position_lr; the rate here is only what Adam is built with
+            name: {"optimizer": AdamOptimizerConfig(lr=rate, eps=1e-15), "scheduler": None}
+            for name, rate in {
+                "means": 1.6e-4,
+                "features_dc": 2.5e-3,
+                "features_rest": 1.25e-4,
+                "opacities": 0.05,
+                "scales": 0.005,
+                "quats": 0.001,
+            }.items()
+        },
+        # the compiled rasterizer runs on CPUs; the device changes here once there is a CUDA backend to use
+        machine=MachineConfig(device_type="cpu"),
+        logging=LoggingConfig(steps_per_log=10),
+        viewer=ViewerConfig(websocket_host="127.0.0.1", quit_on_train_completion=True),
+        vis="viewer+tensorboard",
+    )

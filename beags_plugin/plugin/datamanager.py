@@ -1,0 +1,175 @@
+"""Data manager: full images, with the class map of each view undistorted like its image."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from torch import Tensor
+
+import beags_plugin.plugin.nerfstudio_patches  # noqa: F401  (checkpoints load again)
+from beags_plugin.core.cameras import Camera
+from beags_plugin.plugin.cameras import camera_from_nerfstudio
+from beags_plugin.plugin.dataparser import BeagsDataParserConfig, absolute
+from beags_plugin.plugin.dataset import BeagsDataset
+from beags_plugin.rasterizers.interface import IGNORE
+
+OWN_KEYS = ("class_map", "original_class_map")
+
+
+@dataclass
+class BeagsDataManagerConfig(FullImageDatamanagerConfig):
+    """Options of the data manager."""
+
+    _target: type = field(default_factory=lambda: BeagsDataManager)
+    dataparser: AnnotatedDataParserUnion = field(default_factory=BeagsDataParserConfig)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        """Keep ``data`` absolute, so that a saved config.yml works from any folder."""
+        super().__setattr__(name, absolute(value) if name == "data" else value)
+
+
+@dataclass(frozen=True)
+class View:
+    """One undistorted view, on the data manager's device.
+
+    image: [H, W, 3] float32 in 0..1. labels: [H, W] int32 class ids or IGNORE; None if the view has no mask.
+    name: the stem of the image file.
+    """
+
+    camera: Camera
+    image: Tensor
+    labels: Tensor | None
+    name: str
+
+
+class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
+    """nerfstudio's data manager of full images, for CPUs too, with class maps in every batch.
+
+    Batches hold ``image`` [H, W, 3], ``class_map`` [H, W] uint16 and, once the class maps were replaced,
+    ``original_class_map``, all on the device; a training camera's metadata holds its ``class_map`` too. Training
+    views come in a random order without repetition within a round, given by ``train_cameras_sampling_seed`` alone.
+    """
+
+    config: BeagsDataManagerConfig
+    train_dataset: BeagsDataset
+    eval_dataset: BeagsDataset
+
+    def __init__(self, config: BeagsDataManagerConfig, *args, **kwargs) -> None:
+        super().__init__(config, *args, **kwargs)
+        # nerfstudio draws evaluation views from Python's global generator, which others use too.
+        self._eval_order = random.Random(config.train_cameras_sampling_seed)
+
+    def _load_images(self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]) -> list[dict]:
+        dataset = self.train_dataset if split == "train" else self.eval_dataset
+        distorted = deepcopy(dataset.cameras)  # nerfstudio overwrites intrinsics and sizes while it undistorts
+        # "cpu" pins memory, which needs CUDA; "gpu" means self.device, whatever that is.
+        on_cpu = torch.device(self.device).type == "cpu"
+        cache = super()._load_images(split, cache_images_device="gpu" if on_cpu else cache_images_device)
+        for index, data in enumerate(cache):
+            class_map = undistort_class_map(data["class_map"].numpy(), distorted, index)
+            if class_map.shape != tuple(data["image"].shape[:2]):
+                raise RuntimeError(f"class map {class_map.shape} and image {data['image'].shape} differ in size")
+            data["class_map"] = torch.from_numpy(class_map)
+            if on_cpu or cache_images_device == "gpu":
+                data["class_map"] = data["class_map"].to(self.device)
+        return cache
+
+    def next_train(self, step: int) -> tuple[Cameras, dict]:
+        camera, data = super().next_train(step)
+        data = self._on_device(data)
+        # the boundary is computed inside the rasterizer, which sees the camera only: the mask travels with it
+        camera.metadata = {**(camera.metadata or {}), "class_map": data["class_map"]}
+        return camera, data
+
+    def next_eval_image(self, step: int) -> tuple[Cameras, dict]:
+        index = self.eval_unseen_cameras.pop(self._eval_order.randrange(len(self.eval_unseen_cameras)))
+        if not self.eval_unseen_cameras:
+            self.eval_unseen_cameras = list(range(len(self.eval_dataset)))
+        data = self.cached_eval[index].copy()  # before the camera: loading undistorts the cameras
+        data["image"] = data["image"].to(self.device)
+        return self.eval_dataset.cameras[index : index + 1].to(self.device), self._on_device(data)
+
+    @property
+    def fixed_indices_eval_dataloader(self) -> list[tuple[Cameras, dict]]:
+        """All evaluation views in order, as nerfstudio's evaluation reads them."""
+        return [(camera, self._on_device(data)) for camera, data in super().fixed_indices_eval_dataloader]
+
+    def views(self, split: Literal["train", "val", "test", "eval"], original: bool = False) -> list[View]:
+        """All views of the training or (any other name) the evaluation split, in name order.
+
+        original: give the labels of the mask files also after ``replace_class_maps``.
+        """
+        if split not in ("train", "val", "test", "eval"):
+            raise ValueError(f"unknown split {split!r}")
+        cache = self.cached_train if split == "train" else self.cached_eval
+        dataset = self.train_dataset if split == "train" else self.eval_dataset
+        return [self._view(dataset, data, index, original) for index, data in enumerate(cache)]
+
+    def replace_class_maps(self, class_maps: Sequence[Tensor]) -> None:
+        """Train on ``class_maps``, one [H, W] integer tensor per training view, instead of the mask files.
+
+        The first call keeps the class maps of the files as ``original_class_map``. Raises ``ValueError`` if their
+        number, a size or an id (0..IGNORE) is wrong.
+        """
+        if len(class_maps) != len(self.cached_train):
+            raise ValueError(f"{len(class_maps)} class maps for {len(self.cached_train)} training views")
+        for data, labels in zip(self.cached_train, class_maps, strict=True):
+            if labels.shape != data["class_map"].shape:
+                raise ValueError(f"class map {tuple(labels.shape)} for a view of {tuple(data['class_map'].shape)}")
+            if labels.numel() and not 0 <= int(labels.min()) <= int(labels.max()) <= IGNORE:
+                raise ValueError(f"class ids must lie in 0..{IGNORE}")
+        for data, labels in zip(self.cached_train, class_maps, strict=True):
+            data.setdefault("original_class_map", data["class_map"])
+            data["class_map"] = labels.detach().to(torch.uint16).to(data["class_map"].device, copy=True)
+
+    def _view(self, dataset: BeagsDataset, data: dict, index: int, original: bool) -> View:
+        image = data["image"].to(self.device)
+        image = image.float() / 255.0 if image.dtype == torch.uint8 else image
+        replaced = "original_class_map" in data and not original
+        labels = None
+        if replaced or dataset.metadata["class_map_filenames"][index] is not None:
+            key = "original_class_map" if original and "original_class_map" in data else "class_map"
+            labels = data[key].to(self.device).to(torch.int32)
+        camera = camera_from_nerfstudio(dataset.cameras, index).to(self.device)
+        return View(camera, image[..., :3], labels, Path(dataset.image_filenames[index]).stem)
+
+    def _on_device(self, data: dict) -> dict:
+        return {key: value.to(self.device) if key in OWN_KEYS else value for key, value in data.items()}
+
+
+def undistort_class_map(class_map: np.ndarray, cameras: Cameras, index: int) -> np.ndarray:
+    """Remove the lens distortion from a class map [H, W] as nerfstudio does from the image; pixels outside: IGNORE.
+
+    cameras: as they were before the images were undistorted. The nearest id is taken: ids never blend.
+    """
+    parameters = cameras.distortion_params[index].double().numpy()
+    if not np.any(parameters):
+        return class_map
+    height, width = class_map.shape
+    K = cameras.get_intrinsics_matrices()[index].double().numpy()
+    K[:2, 2] -= 0.5  # OpenCV's pixel centres are at whole numbers
+    if int(cameras.camera_type[index]) == CameraType.FISHEYE.value:
+        coefficients = parameters[:4]
+        new_K = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
+            K, coefficients, (width, height), np.eye(3), balance=0
+        )
+        maps = cv2.fisheye.initUndistortRectifyMap(K, coefficients, np.eye(3), new_K, (width, height), cv2.CV_32FC1)
+        x, y, w, h = 0, 0, width, height
+    else:
+        k1, k2, k3, _, p1, p2 = parameters  # nerfstudio's order; OpenCV wants k1, k2, p1, p2, k3
+        coefficients = np.array([k1, k2, p1, p2, k3])
+        new_K, (x, y, w, h) = cv2.getOptimalNewCameraMatrix(K, coefficients, (width, height), 0)
+        maps = cv2.initUndistortRectifyMap(K, coefficients, None, new_K, (width, height), cv2.CV_32FC1)
+    straight = cv2.remap(class_map, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=IGNORE)
+    return np.ascontiguousarray(straight[y : y + h, x : x + w])

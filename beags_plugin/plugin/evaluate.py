@@ -1,0 +1,45 @@
+"""Held-out views of a run with their ground truth, as the nerfstudio-free evaluation wants them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from beags_plugin.evaluation.run_metrics import EvalView
+from beags_plugin.masks.classes import read_class_map
+from beags_plugin.rasterizers.interface import RasterSettings
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.config import BeagsTrainerConfig
+    from beags_plugin.plugin.extract import SavedScene
+
+
+def raster_settings(scene: SavedScene) -> RasterSettings:
+    """Depth range of a saved scene."""
+    extent, model = float(scene.state["extent"]), scene.config.pipeline.model
+    return RasterSettings(model.near * extent, model.far * extent)
+
+
+def held_out_views(config: BeagsTrainerConfig, classes: dict[int, str]) -> list[EvalView]:
+    """The test views of the run's data, with exact masks and silhouettes where the data has ``ground_truth/``.
+
+    Without it, the data's own masks of those views serve as visible masks.
+    """
+    manager = config.pipeline.datamanager.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
+    folder = Path(config.pipeline.datamanager.dataparser.data or config.pipeline.datamanager.data) / "ground_truth"
+    views = []
+    for view in manager.views("test"):
+        exact = folder / "masks" / f"{view.name}.png"
+        visible = view.labels
+        if exact.exists():
+            visible = torch.from_numpy(read_class_map(exact).astype(np.int32))
+        silhouettes = {
+            index: torch.from_numpy(read_class_map(path) > 0)
+            for index, name in classes.items()
+            if (path := folder / "silhouettes" / name / f"{view.name}.png").exists()
+        }
+        views.append(EvalView(view.camera, view.image, visible, silhouettes or None, view.name))
+    return views

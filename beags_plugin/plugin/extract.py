@@ -1,0 +1,134 @@
+"""Extraction as runs: for each object a run folder of its own, and a .ply in the input's world frame (section 8)."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+import yaml
+from torch import Tensor
+
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.errors import UserError
+from beags_plugin.extraction.ply import write_ply
+from beags_plugin.plugin.runs import TRANSFORM_FILE, newest_checkpoint, write_run
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.config import BeagsTrainerConfig
+
+
+@dataclass(frozen=True)
+class Extracted:
+    """One extracted run: its name, the paths of its config.yml and .ply, and its number of Gaussians."""
+
+    name: str
+    config: Path
+    ply: Path
+    gaussians: int
+
+
+@dataclass(frozen=True)
+class SavedScene:
+    """A trained run as it lies on disk: config, model state (tensors by name), step and class names."""
+
+    config: BeagsTrainerConfig
+    state: dict[str, Any]
+    step: int
+    classes: dict[int, str]
+
+    def surfels(self) -> Surfels:
+        """The scene's N surfels."""
+        state = {name: self.state[f"gauss_params.{name}"] for name in ("means", "quats", "scales", "opacities")}
+        dc, rest = self.state["gauss_params.features_dc"], self.state["gauss_params.features_rest"]
+        sh = torch.cat([dc[:, None], rest], dim=1)
+        return Surfels(state["means"], state["quats"], state["scales"], state["opacities"][:, 0], sh)
+
+
+def load_run_config(config_path: Path) -> BeagsTrainerConfig:
+    """The config of a run of ours; raises ``UserError`` if the file is none."""
+    from beags_plugin.plugin.config import BeagsTrainerConfig
+
+    try:
+        config = yaml.load(config_path.read_text("utf8"), Loader=yaml.Loader)
+    except OSError as error:
+        raise UserError(f"{config_path} cannot be read ({error.strerror}): name the config.yml of a run.") from error
+    except Exception as error:  # yaml raises whatever the named classes raise
+        raise UserError(f"{config_path} is not a readable run config ({type(error).__name__}: {error}).") from error
+    if not isinstance(config, BeagsTrainerConfig):
+        raise UserError(f"{config_path} is not a run of ns-train beags: name the config.yml of one.")
+    return config
+
+
+def load_scene(config_path: Path) -> SavedScene:
+    """Read a run's newest checkpoint; raises ``UserError`` if the run is incomplete or no class was assigned."""
+    config = load_run_config(config_path)
+    checkpoint = torch.load(newest_checkpoint(config.get_checkpoint_dir()), map_location="cpu", weights_only=True)
+    prefix = "_model."
+    state = {name[len(prefix) :]: value for name, value in checkpoint["pipeline"].items() if name.startswith(prefix)}
+    if not bool(state["assigned"]):
+        raise UserError(
+            f"{config_path.parent} is a base without classes: refine it first "
+            f"(ns-train beags-refine --load-dir {config.get_checkpoint_dir()})."
+        )
+    return SavedScene(config, state, checkpoint["step"], state["_extra_state"]["classes"])
+
+
+def extract_objects(
+    config_path: Path, objects: Sequence[str] = (), remove: bool = False, output: Path | None = None
+) -> list[Extracted]:
+    """Write a run and a .ply per object.
+
+    config_path: config.yml of a refined (or assigned) run. objects: names; none means every object but the background.
+    remove: keep all but the object instead. output: folder for the runs; ``extracted/`` in the run by default.
+    Raises ``UserError`` for an unknown name, before anything is written.
+    """
+    scene = load_scene(config_path)
+    ids = {name: index for index, name in scene.classes.items()}
+    if unknown := [name for name in objects if name not in ids]:
+        raise UserError(f"there is no object {unknown[0]!r} in {config_path.parent}: choose of {', '.join(ids)}.")
+    names = list(objects) or [name for name, index in ids.items() if index != 0]
+    run = config_path.parent
+    transform = read_transform(run)
+    written = []
+    for name in names:
+        class_ids = scene.state["class_ids"]
+        keep = class_ids != ids[name] if remove else class_ids == ids[name]
+        title = f"without_{file_name(name)}" if remove else file_name(name)
+        if not bool(keep.any()):
+            raise UserError(f"no Gaussian belongs to {name!r}: its masks cover too little of the scene.")
+        folder = (output or run / "extracted") / title
+        written.append(_write_selection(scene, keep, folder, title, transform))
+    return written
+
+
+def _write_selection(
+    scene: SavedScene, keep: Tensor, folder: Path, title: str, transform: tuple[Tensor, float] | None
+) -> Extracted:
+    per_surfel = {"class_ids", "class_margin"}
+    state = {
+        name: value[keep] if name in per_surfel or name.startswith("gauss_params.") else value
+        for name, value in scene.state.items()
+    }
+    config = write_run(scene.config, folder, state, scene.step)
+    ply = folder / f"{title}.ply"
+    write_ply(ply, scene.surfels()[keep], scene.state["class_ids"][keep], transform)
+    return Extracted(title, config, ply, int(keep.sum()))
+
+
+def read_transform(run: Path) -> tuple[Tensor, float] | None:
+    """The data parser's transform ([3, 4], scale) that a run was trained in; None if the run has not kept it."""
+    path = run / TRANSFORM_FILE
+    if not path.exists():
+        return None
+    content = json.loads(path.read_text("utf8"))
+    return torch.tensor(content["transform"], dtype=torch.float64), float(content["scale"])
+
+
+def file_name(name: str) -> str:
+    """A class name as part of a path: anything unusual becomes an underscore."""
+    return re.sub(r"[^\w.-]+", "_", name).strip("._") or "object"

@@ -1,0 +1,349 @@
+"""The nerfstudio model: a 2D-Gaussian-splatting scene with classes, trained by the losses its config lists."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
+from nerfstudio.models.base_model import Model, ModelConfig
+from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.viewer.viewer_elements import ViewerDropdown
+from torch import Tensor, nn
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.densification import DensifyConfig, initial_surfels
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.losses import LOSSES
+from beags_plugin.losses.base import Loss, LossInputs
+from beags_plugin.losses.photometric import ssim
+from beags_plugin.masks.classes import colorize
+from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.plugin.cameras import camera_from_nerfstudio
+from beags_plugin.plugin.schedule import PhaseSchedule
+from beags_plugin.plugin.training import training_callbacks
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.drawing import geometry_inputs, surfel_inputs
+from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
+from beags_plugin.refiners.preparation import PreparationConfig
+
+PARAMETER_GROUPS = ("means", "features_dc", "features_rest", "opacities", "scales", "quats")
+EVERYTHING = "everything"  # the viewer's choice that hides no object
+FLATNESS = 1e-3  # exported third scale, relative to the smaller of the two: flat, yet no viewer divides by 0
+
+
+@dataclass
+class LossSpec:
+    """One term of the training loss, as a config lists it."""
+
+    weight: float = 1.0
+    """Factor in the sum; 0 switches the term off."""
+    phase: Literal["base", "refine", "both"] = "both"
+    """Where the term may act."""
+    start: int = 0
+    """First step of the term, counted from the first step of the run (or of the refinement, for phase "refine")."""
+    options: dict[str, float] = field(default_factory=dict)
+    """Options of the loss itself, e.g. ssim_weight or samples."""
+
+    def build(self, name: str, schedule: PhaseSchedule) -> Loss:
+        """The loss, with its steps made absolute."""
+        first = schedule.base_steps if self.phase == "refine" else 0
+        last = schedule.base_steps if self.phase == "base" else None
+        return LOSSES.get(name)(weight=self.weight, start=first + self.start, stop=last, **self.options)
+
+
+@dataclass
+class BeagsModelConfig(ModelConfig):
+    """Options of the scene and of its two training phases."""
+
+    _target: type = field(default_factory=lambda: BeagsModel)
+    rasterizer: str = "auto"
+    """Backend: auto, native, torch, or one that another package registers."""
+    sh_degree: int = 3
+    """Highest degree of the colour's spherical harmonics (0..3)."""
+    sh_degree_interval: int = 1000
+    """A degree is added every so many steps."""
+    background_color: Literal["black", "white", "random"] = "black"
+    """Background behind the scene in training; "random" draws one per step."""
+    base_steps: int = 30_000
+    """Steps of base training; 0 for a refinement that starts from a loaded base."""
+    refine_steps: int = 3_000
+    """Steps of refinement; 0 trains a base only."""
+    refiner: str = "bea"
+    """What happens after class assignment: bea (this method), none (assignment alone), or a registered one."""
+    losses: dict[str, LossSpec] = field(default_factory=dict)
+    """The terms of the training loss by name."""
+    densify: DensifyConfig = field(default_factory=DensifyConfig)
+    """When and how the base grows and prunes its Gaussians."""
+    prepare: PreparationConfig = field(default_factory=PreparationConfig)
+    """Options of mask reprojection and of the voxel grids."""
+    position_lr: tuple[float, float] = (1.6e-4, 1.6e-6)
+    """First and last learning rate of the positions, log-linear, times the scene's extent."""
+    near: float = 0.01
+    """Near plane in units of the scene's extent."""
+    far: float = 100.0
+    """Far plane in units of the scene's extent."""
+
+
+class BeagsModel(SplatfactoModel):
+    """A scene of surfels with classes.
+
+    It derives from nerfstudio's ``SplatfactoModel`` because ns-export and the viewer ask for that type, but shares
+    none of its training: parameters, rendering, losses and callbacks are all its own.
+    """
+
+    config: BeagsModelConfig
+
+    def populate_modules(self) -> None:
+        """Build the surfels from the seed points that the data supplies."""
+        Model.populate_modules(self)  # not SplatfactoModel's: that one loads weights and calls .cuda()
+        self.collider = None
+        if self.seed_points is None:
+            raise ValueError("the data supplies no seed points; use the data parser beags-data, which always does")
+        generator = torch.Generator().manual_seed(torch.initial_seed() % 2**63)
+        points, colors = (values.detach().cpu().float() for values in self.seed_points)
+        surfels = initial_surfels(points, colors / 255.0, self.config.sh_degree, generator)
+        self.gauss_params = nn.ParameterDict(
+            {
+                "means": nn.Parameter(surfels.means),
+                "features_dc": nn.Parameter(surfels.sh[:, 0].contiguous()),
+                "features_rest": nn.Parameter(surfels.sh[:, 1:].contiguous()),
+                "opacities": nn.Parameter(surfels.opacity_logits[:, None].contiguous()),
+                "scales": nn.Parameter(surfels.log_scales),
+                "quats": nn.Parameter(surfels.quats),
+            }
+        )
+        self.register_buffer("class_ids", torch.zeros(len(surfels), dtype=torch.int32))
+        self.register_buffer("class_margin", torch.zeros(len(surfels)))
+        self.register_buffer("assigned", torch.tensor(False))
+        self.register_buffer("extent", torch.tensor(1.0))
+        metadata = self.kwargs.get("metadata") or {}
+        self.classes: dict[int, str] = dict(metadata.get("classes") or {0: "background"})
+        self.schedule = PhaseSchedule(self.config.base_steps, self.config.refine_steps)
+        self.losses = {name: spec.build(name, self.schedule) for name, spec in self.config.losses.items()}
+        self.rasterizer: Rasterizer = make_rasterizer(self.config.rasterizer)
+        self.grid: VisibilityGrid | None = None
+        self.step = 0
+        self.seed = 0
+        self.frozen = False
+        self.prepared_seconds: dict[str, float] = {}
+        self.refining_since = 0.0
+        self.crop_box: OrientedBox | None = None
+        self.background_color = torch.zeros(3)
+        self.drawn: tuple[Camera, RasterOutputs] | None = None
+        self.object_choice = ViewerDropdown("Object", EVERYTHING, [EVERYTHING, *self._object_names()])
+
+    def _object_names(self) -> list[str]:
+        return [name for _, name in sorted(self.classes.items())]
+
+    # -- the scene ---------------------------------------------------------------------------------------------------
+
+    @property
+    def scales(self) -> Tensor:
+        """[N, 3] logs of the scales as exporters want them: the third is thin; the parameter itself has two."""
+        flat = self.gauss_params["scales"]
+        thin = flat.min(dim=-1, keepdim=True).values + torch.log(flat.new_tensor(FLATNESS))
+        return torch.cat([flat, thin], dim=-1)
+
+    def surfels(self) -> Surfels:
+        """The scene, sharing storage (and gradients) with the parameters."""
+        sh = torch.cat([self.gauss_params["features_dc"][:, None], self.gauss_params["features_rest"]], dim=1)
+        return Surfels(
+            means=self.gauss_params["means"],
+            quats=self.gauss_params["quats"],
+            log_scales=self.gauss_params["scales"],
+            opacity_logits=self.gauss_params["opacities"][:, 0],
+            sh=sh,
+        )
+
+    def set_surfels(self, surfels: Surfels) -> None:
+        """Replace all values in place, so that optimizers keep their parameters; N may change (classes are reset)."""
+        values = {
+            "means": surfels.means,
+            "features_dc": surfels.sh[:, 0],
+            "features_rest": surfels.sh[:, 1:],
+            "opacities": surfels.opacity_logits[:, None],
+            "scales": surfels.log_scales,
+            "quats": surfels.quats,
+        }
+        for name, value in values.items():
+            parameter = self.gauss_params[name]
+            parameter.data = value.detach().to(parameter).contiguous().clone()
+            parameter.grad = None
+        if self.class_ids.shape[0] != len(surfels):
+            self.class_ids = torch.zeros(len(surfels), dtype=torch.int32, device=self.device)
+            self.class_margin = torch.zeros(len(surfels), device=self.device)
+
+    def load_state_dict(self, state: Mapping[str, Any], **kwargs) -> Any:
+        """Load a checkpoint of any number of surfels; parameters are resized in place (optimizers hold them)."""
+        count = state["gauss_params.means"].shape[0]
+        for name, parameter in self.gauss_params.items():
+            parameter.data = torch.zeros_like(state[f"gauss_params.{name}"], device=self.device)
+        self.class_ids = torch.zeros(count, dtype=torch.int32, device=self.device)
+        self.class_margin = torch.zeros(count, device=self.device)
+        return nn.Module.load_state_dict(self, state, **kwargs)  # type: ignore[arg-type]
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What a checkpoint keeps besides tensors: the class names."""
+        return {"classes": dict(self.classes)}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Take the class names of a checkpoint."""
+        self.classes = {int(index): str(name) for index, name in state["classes"].items()}
+
+    def update_to_step(self, step: int) -> None:
+        """Called with a checkpoint's step before it is loaded."""
+        self.step = step
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        """One optimizer group per kind of parameter."""
+        return {name: [self.gauss_params[name]] for name in PARAMETER_GROUPS}
+
+    # -- rendering ---------------------------------------------------------------------------------------------------
+
+    def settings(self, geometry: bool = True, distortion: bool = False) -> RasterSettings:
+        """Depth range of the scene and what to compute."""
+        extent = float(self.extent)
+        return RasterSettings(self.config.near * extent, self.config.far * extent, geometry, distortion)
+
+    def active_sh_degree(self) -> int:
+        """Degrees grow one by one while the base trains; a scene that is only looked at shows them all."""
+        if not self.training:
+            return self.config.sh_degree
+        return min(self.step // max(self.config.sh_degree_interval, 1), self.config.sh_degree)
+
+    def active_losses(self) -> dict[str, Loss]:
+        """The terms that count at the current step."""
+        if self.frozen:
+            return {}
+        return {name: loss for name, loss in self.losses.items() if loss.active(self.step)}
+
+    def get_outputs(self, camera: Cameras) -> dict[str, Any]:
+        """Render one view: what training needs while training, everything a viewer shows otherwise."""
+        if self.training:
+            return self._training_outputs(camera)
+        with torch.no_grad():
+            return self._viewer_outputs(camera_from_nerfstudio(camera, 0).to(self.device))
+
+    def _training_outputs(self, cameras: Cameras) -> dict[str, Any]:
+        camera = camera_from_nerfstudio(cameras, 0).to(self.device)
+        needs = frozenset().union(*(loss.needs for loss in self.active_losses().values()))
+        target = (cameras.metadata or {}).get("class_map") if "boundary" in needs else None
+        background = self._training_background()
+        render = self.rasterizer.rasterize(
+            surfel_inputs(
+                self.surfels(), camera, self.active_sh_degree(), self.class_ids if target is not None else None
+            ),
+            camera,
+            self.settings(geometry="geometry" in needs, distortion="distortion" in needs),
+            background,
+            None if target is None else target.to(self.device, torch.int32),
+        )
+        self.drawn = (camera, render)
+        outputs = {"rgb": render.color, "accumulation": render.alpha[..., None], "background": background}
+        if render.depth is not None:
+            outputs["depth"] = render.depth[..., None]
+        return outputs
+
+    def _training_background(self) -> Tensor:
+        if self.config.background_color == "random":
+            generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.step)
+            return torch.rand(3, generator=generator).to(self.device)
+        value = 1.0 if self.config.background_color == "white" else 0.0
+        return torch.full((3,), value, device=self.device)
+
+    def shown(self) -> Tensor:
+        """[N] bool, the surfels that the viewer's choices leave visible."""
+        shown = torch.ones(self.num_points, dtype=torch.bool, device=self.device)
+        chosen = {name: index for index, name in self.classes.items()}.get(self.object_choice.value)
+        if chosen is not None:
+            shown &= self.class_ids == chosen
+        if self.crop_box is not None:
+            shown &= self.crop_box.within(self.means).reshape(-1)
+        return shown
+
+    def _viewer_outputs(self, camera: Camera) -> dict[str, Tensor]:
+        shown = self.shown()
+        surfels, class_ids = self.surfels()[shown], self.class_ids[shown]
+        background = self.background_color.to(self.device)
+        settings = self.settings()
+        render = self.rasterizer.rasterize(
+            surfel_inputs(surfels, camera, self.active_sh_degree()), camera, settings, background
+        )
+        outputs = {
+            "rgb": render.color.clamp(0.0, 1.0),
+            "depth": render.depth[..., None],
+            "normal": 0.5 - 0.5 * render.normal,  # towards the camera looks bluish, as in other viewers
+            "accumulation": render.alpha[..., None],
+            "background": background.expand(camera.height, camera.width, 3),
+        }
+        if bool(self.assigned):
+            inputs = geometry_inputs(surfels, class_ids)
+            classes, confidence = self.rasterizer.class_map(inputs, camera, settings, max(self.classes) + 1)
+            colors = torch.from_numpy(colorize(classes.cpu().numpy().astype(np.uint16)))
+            outputs["class_map"] = colors.to(self.device).float() / 255.0
+            outputs["class_confidence"] = confidence[..., None].float()
+        return outputs
+
+    # -- losses and metrics --------------------------------------------------------------------------------------------
+
+    def _truth(self, batch: dict[str, Any], background: Tensor) -> Tensor:
+        return self.composite_with_background(self.get_gt_img(batch["image"]), background)
+
+    def get_gt_img(self, image: Tensor) -> Tensor:
+        """[H, W, C] float in 0..1 on the model's device; never downscaled."""
+        return (image.float() / 255.0 if image.dtype == torch.uint8 else image).to(self.device)
+
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
+        """PSNR of the drawn view and the number of Gaussians."""
+        with torch.no_grad():
+            error = (outputs["rgb"] - self._truth(batch, outputs["background"])).square().mean()
+        return {"psnr": -10.0 * torch.log10(error.clamp_min(1e-10)), "gaussian_count": self.num_points}
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
+    ) -> dict[str, Tensor]:
+        """Each active term by name, weighted."""
+        image = self._truth(batch, outputs["background"])
+        if not self.training or self.drawn is None:
+            return {"photometric": (outputs["rgb"] - image).abs().mean()}
+        camera, render = self.drawn
+        class_map = batch.get("class_map")
+        inputs = LossInputs(
+            step=self.step,
+            seed=self.seed,
+            surfels=self.surfels(),
+            camera=camera,
+            render=render,
+            image=image,
+            labels=None if class_map is None else class_map.to(self.device, torch.int32),
+            class_ids=self.class_ids,
+            grid=self.grid,
+        )
+        terms = {name: loss.weight * loss.value(inputs) for name, loss in self.active_losses().items()}
+        # a frozen scene still needs something to call backward on; no parameter hangs on it, so none moves
+        return terms or {"none": torch.zeros((), device=self.device, requires_grad=True)}
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Any], batch: dict[str, Any]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """PSNR and SSIM of an evaluation view, and pictures for tensorboard."""
+        image = self._truth(batch, outputs["background"])
+        error = (outputs["rgb"] - image).square().mean()
+        metrics = {
+            "psnr": float(-10.0 * torch.log10(error.clamp_min(1e-10))),
+            "ssim": float(ssim(outputs["rgb"], image)),
+        }
+        images = {"img": torch.cat([image, outputs["rgb"]], dim=1)}
+        if "class_map" in outputs:
+            images["class_map"] = outputs["class_map"]
+        return metrics, images
+
+    def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+        """Schedules, densification and the switch to refinement: see ``plugin.training``."""
+        return training_callbacks(self, training_callback_attributes)

@@ -1,0 +1,87 @@
+"""Presets: the files of method_configs/, each a short list of overrides of the base config."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Any
+
+from nerfstudio.plugins.types import MethodSpecification
+
+from beags_plugin.errors import UserError
+from beags_plugin.plugin.config import BeagsTrainerConfig, base_config
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def preset_folder() -> Path:
+    """Where the preset files lie: inside the installed package, or beside it in a source checkout."""
+    installed = _PACKAGE / "method_configs"
+    return installed if installed.is_dir() else _PACKAGE.parent / "method_configs"
+
+
+def preset_names() -> list[str]:
+    """Names of all presets."""
+    return sorted(path.stem for path in preset_folder().glob("*.toml"))
+
+
+def load_preset(name: str, folder: Path | None = None) -> MethodSpecification:
+    """The method that ``<folder>/<name>.toml`` describes.
+
+    The file has a ``description`` and a table ``[overrides]`` of dotted config keys. Raises ``UserError`` for a file
+    that cannot be read and for a key that the base config does not have.
+    """
+    path = (folder or preset_folder()) / f"{name}.toml"
+    try:
+        content = tomllib.loads(path.read_text("utf8"))
+    except (OSError, tomllib.TOMLDecodeError) as error:
+        raise UserError(f"the preset {path} cannot be read: {error}.") from error
+    if unknown := set(content) - {"description", "overrides"}:
+        raise UserError(f"the preset {path} has unknown entries {sorted(unknown)}: only description and overrides.")
+    config = base_config()
+    config.method_name = name
+    for key, value in content.get("overrides", {}).items():
+        override(config, key, value, path)
+    return MethodSpecification(config=config, description=content["description"])
+
+
+def override(config: BeagsTrainerConfig, key: str, value: Any, source: Path) -> None:
+    """Set the dotted ``key`` of ``config``; raises ``UserError`` if there is no such key or its type differs."""
+    *parents, last = key.split(".")
+    holder: Any = config
+    for name in parents:
+        holder = _child(holder, name, key, source)
+    current = _child(holder, last, key, source)
+    if isinstance(current, tuple):
+        value = tuple(value)
+    if isinstance(current, float) and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if current is not None and type(value) is not type(current):
+        raise UserError(
+            f"{source}: {key} must be {type(current).__name__}, not {type(value).__name__} ({value!r})."
+        )
+    if isinstance(holder, dict):
+        holder[last] = value
+    elif type(holder).__dataclass_params__.frozen:
+        *grandparents, parent = parents
+        outer: Any = config
+        for name in grandparents:
+            outer = _child(outer, name, key, source)
+        setattr(outer, parent, dataclasses.replace(holder, **{last: value}))
+    else:
+        setattr(holder, last, value)
+
+
+def _child(holder: Any, name: str, key: str, source: Path) -> Any:
+    if isinstance(holder, dict):
+        if name in holder:
+            return holder[name]
+    elif dataclasses.is_dataclass(holder) and name in {field.name for field in dataclasses.fields(holder)}:
+        return getattr(holder, name)
+    raise UserError(f"{source}: there is no config key {key!r} ({name!r} is unknown).")

@@ -1,0 +1,131 @@
+"""The switch from base training to refinement, and what of it is kept on disk for resuming."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from beags_plugin.masks.classes import read_class_map, write_class_map
+from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.plugin.runs import write_run
+from beags_plugin.progress import progress_bar
+from beags_plugin.refiners import REFINERS
+from beags_plugin.refiners.preparation import Preparation, prepare
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.datamanager import BeagsDataManager
+    from beags_plugin.plugin.model import BeagsModel
+
+BASE_SNAPSHOT = "base"  # folder of the run that keeps the scene as it was when refinement started
+PREPARED = "prepared"  # folder of the run that keeps masks, grids and what was found
+
+
+class RefinementSwitch:
+    """Prepares refinement once the base is trained, or takes it up again in a resumed run."""
+
+    def __init__(self, model: BeagsModel, trainer: Any, datamanager: BeagsDataManager) -> None:
+        self.model = model
+        self.trainer = trainer
+        self.datamanager = datamanager
+        self.refiner = REFINERS.get(model.config.refiner)()
+        self.ready = False
+
+    @property
+    def wanted(self) -> bool:
+        """Whether this run refines at all."""
+        return self.model.config.refine_steps > 0
+
+    def before_step(self, step: int) -> None:
+        """Take up refinement that a checkpoint was in, or start it where no base step precedes it."""
+        if not self.wanted or self.ready or not self.model.schedule.refining(step):
+            return
+        if bool(self.model.assigned) and (self._folder() / "grid.pt").exists():
+            self._take_up()
+        else:
+            self._switch(step - 1)
+
+    def after_step(self, step: int) -> None:
+        """Switch right after the last base step, so that a run that ends there has its classes too."""
+        if self.wanted and not self.ready and step + 1 == self.model.schedule.base_steps:
+            self._switch(step)
+
+    def _folder(self) -> Path:
+        return self.trainer.base_dir / PREPARED
+
+    def _switch(self, step: int) -> None:
+        model = self.model
+        views = self.datamanager.views("train")
+        CONSOLE.rule("Preparing refinement")
+        prepared = prepare(
+            model.surfels(),
+            [view.camera for view in views],
+            [view.labels for view in views],
+            model.classes,
+            model.rasterizer,
+            model.settings(),
+            self.refiner,
+            model.config.prepare,
+            seed=model.seed,
+            stage=progress_bar,
+        )
+        for finding in prepared.findings:
+            CONSOLE.print(f"  {finding}", highlight=False)
+        model.class_ids.copy_(prepared.assignment.class_ids)
+        model.class_margin.copy_(prepared.assignment.margin)
+        model.assigned.fill_(True)
+        self._save(prepared, [view.name for view in views])
+        self._start(prepared.grid, prepared.labels)
+        model.prepared_seconds = prepared.seconds
+        write_run(self.trainer.config, self.trainer.base_dir / BASE_SNAPSHOT, model.state_dict(), max(step, 0))
+        CONSOLE.print(f"  base kept in {self.trainer.base_dir / BASE_SNAPSHOT}", highlight=False, soft_wrap=True)
+
+    def _start(self, grid: VisibilityGrid | None, labels: list[torch.Tensor]) -> None:
+        self.datamanager.replace_class_maps(labels)
+        self.model.grid = grid
+        self.model.frozen = not self.refiner.trains
+        self.model.refining_since = time.perf_counter()
+        self.ready = True
+
+    def _save(self, prepared: Preparation, names: list[str]) -> None:
+        """Keep what refinement needs; grid.pt is written last, so its presence says that all is there."""
+        folder = self._folder()
+        (folder / "masks").mkdir(parents=True, exist_ok=True)
+        (folder / "confidence").mkdir(exist_ok=True)
+        for index, name in enumerate(names):
+            write_class_map(folder / "masks" / f"{name}.png", prepared.labels[index].cpu().numpy().astype(np.uint16))
+            if prepared.confidence is not None:
+                _write_grey(folder / "confidence" / f"{name}.png", prepared.confidence[index])
+        report = {"findings": prepared.findings, "seconds": prepared.seconds, "peak_memory_mb": peak_memory_mb()}
+        (folder / "report.json").write_text(json.dumps(report, indent=2))
+        state = {} if prepared.grid is None else prepared.grid.state_dict()
+        torch.save(state, folder / "grid.pt.part")
+        os.replace(folder / "grid.pt.part", folder / "grid.pt")
+
+    def _take_up(self) -> None:
+        folder = self._folder()
+        state = torch.load(folder / "grid.pt", weights_only=True)
+        labels = [
+            torch.from_numpy(read_class_map(folder / "masks" / f"{view.name}.png").astype(np.int32))
+            for view in self.datamanager.views("train")
+        ]
+        self._start(VisibilityGrid.from_state_dict(state) if state else None, labels)
+        CONSOLE.print(f"  refinement taken up from {folder}", highlight=False, soft_wrap=True)
+
+
+def peak_memory_mb() -> float:
+    """Largest resident memory of this process so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def _write_grey(path: Path, share: torch.Tensor) -> None:
+    import cv2
+
+    cv2.imwrite(str(path), (share.cpu().numpy() * 255.0 + 0.5).astype(np.uint8))

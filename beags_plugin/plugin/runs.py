@@ -1,0 +1,63 @@
+"""Runs on disk: a folder with config.yml and a checkpoint, on which every ns-* command works."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from copy import deepcopy
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+import yaml
+from torch import Tensor
+
+from beags_plugin.errors import UserError
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.config import BeagsTrainerConfig
+
+
+TRANSFORM_FILE = "dataparser_transforms.json"  # nerfstudio's name for how the poses were normalised
+
+
+def save_atomically(content: Any, path: Path) -> None:
+    """``torch.save`` that leaves either the old file or the whole new one, never half of one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    with open(part, "wb") as file:
+        torch.save(content, file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(part, path)
+
+
+def write_run(config: BeagsTrainerConfig, folder: Path, model_state: dict[str, Tensor], step: int) -> Path:
+    """Write a run of its own that holds ``model_state``; returns the path of its config.yml.
+
+    config: of the run it comes from; model_state: of a ``BeagsModel``; step: as stored in the checkpoint.
+    """
+    folder = folder.absolute()
+    own = deepcopy(config)
+    own.run_dir = folder
+    own.load_dir = own.load_checkpoint = own.load_config = own.load_step = None
+    state = {
+        f"_model.{name}": value.detach().cpu() if isinstance(value, Tensor) else value
+        for name, value in model_state.items()
+    }
+    checkpoint = {"step": step, "pipeline": state, "optimizers": {}, "schedulers": {}, "scalers": {}}
+    save_atomically(checkpoint, folder / own.relative_model_dir / f"step-{step:09d}.ckpt")
+    config_path = folder / "config.yml"
+    config_path.write_text(yaml.dump(own), "utf8")
+    transform = config.get_base_dir() / TRANSFORM_FILE
+    if transform.exists() and transform.parent != folder:
+        shutil.copyfile(transform, folder / TRANSFORM_FILE)
+    return config_path
+
+
+def newest_checkpoint(folder: Path) -> Path:
+    """The checkpoint of the highest step in ``folder`` (a nerfstudio_models folder); raises ``UserError`` if none."""
+    checkpoints = sorted(folder.glob("step-*.ckpt")) if folder.is_dir() else []
+    if not checkpoints:
+        raise UserError(f"{folder} holds no checkpoint (step-….ckpt): train longer, or name another run.")
+    return checkpoints[-1]

@@ -1,0 +1,37 @@
+"""When each phase runs and how the learning rates move (method, sections 1 and 7)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+REFINE_SCHEDULE_FROM = 0.9  # refinement repeats the learning rates of the last tenth (27,000..30,000) of the base
+
+
+@dataclass(frozen=True)
+class PhaseSchedule:
+    """Steps of the two phases: base is [0, base_steps), refinement [base_steps, base_steps + refine_steps)."""
+
+    base_steps: int
+    refine_steps: int
+
+    @property
+    def total(self) -> int:
+        """Steps of the whole run."""
+        return self.base_steps + self.refine_steps
+
+    def refining(self, step: int) -> bool:
+        """Whether ``step`` belongs to refinement."""
+        return step >= self.base_steps
+
+    def progress(self, step: int) -> float:
+        """Position in the base's learning-rate schedule, 0..1; refinement runs from 0.9 to 1 again."""
+        if not self.refining(step):
+            return step / max(self.base_steps, 1)
+        done = (step - self.base_steps) / max(self.refine_steps, 1)
+        return REFINE_SCHEDULE_FROM + (1.0 - REFINE_SCHEDULE_FROM) * min(done, 1.0)
+
+
+def log_linear(first: float, last: float, progress: float) -> float:
+    """Learning rate at ``progress`` (0..1) of a straight line in the logarithm."""
+    return math.exp(math.log(first) * (1.0 - progress) + math.log(last) * progress)

@@ -1,0 +1,134 @@
+"""The trainer: nerfstudio's, with schedules that end where they should and checkpoints that survive a crash."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from typing import TYPE_CHECKING, Any
+
+from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils.decorators import check_main_thread
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from beags_plugin.errors import UserError
+from beags_plugin.plugin.refinement import peak_memory_mb
+from beags_plugin.plugin.runs import newest_checkpoint, save_atomically
+from beags_plugin.plugin.schedule import PhaseSchedule
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.config import BeagsTrainerConfig
+
+QUICK_PRESET = "beags-tiny"
+LONG_RUN_SECONDS = 20 * 60  # a run that is expected to take longer says which preset is quicker
+ESTIMATE_STEPS = (20, 120)  # the estimate is the mean step between these: after warm-up, soon enough to matter
+
+
+class BeagsTrainer(Trainer):
+    """Trains a ``BeagsModel`` through its two phases."""
+
+    config: BeagsTrainerConfig
+
+    def __init__(self, config: BeagsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
+        self.schedule = PhaseSchedule(config.pipeline.model.base_steps, config.pipeline.model.refine_steps)
+        self.last_step = config.max_num_iterations or self.schedule.total
+        config.max_num_iterations = self.last_step
+        self._started = 0.0
+        super().__init__(config, local_rank, world_size)
+
+    def setup(self, test_mode: Any = "val") -> None:
+        """Load data, build the model, load a checkpoint; a user's mistake ends here, with one sentence."""
+        try:
+            super().setup(test_mode)
+        except UserError as error:
+            _stop(error)
+
+    def train(self) -> None:
+        """Train to the end of the schedule, also after a resume (nerfstudio would train that many steps more)."""
+        self.config.max_num_iterations = max(self.last_step - self._start_step, 0)
+        if self.config.max_num_iterations == 0:
+            _stop(UserError(f"this run is complete ({self._start_step} steps): nothing is left to train."))
+        self._started = time.perf_counter()
+        try:
+            super().train()
+        except UserError as error:
+            _stop(error)
+
+    def train_iteration(self, step: int) -> Any:
+        """One step; after some of them, says how long the run will take."""
+        done = step - self._start_step
+        if done == ESTIMATE_STEPS[0]:
+            self._estimate_from = time.perf_counter()
+        if done == ESTIMATE_STEPS[1]:
+            self._say_duration((time.perf_counter() - self._estimate_from) / (ESTIMATE_STEPS[1] - ESTIMATE_STEPS[0]))
+        return super().train_iteration(step)
+
+    def _say_duration(self, seconds_per_step: float) -> None:
+        left = (self.last_step - self._start_step) * seconds_per_step
+        message = (
+            f"About {_duration(left)} for {self.last_step - self._start_step} steps at the present speed "
+            f"({1000 * seconds_per_step:.0f} ms a step; it slows down as Gaussians are added)."
+        )
+        if left > LONG_RUN_SECONDS and self.config.method_name != QUICK_PRESET:
+            message += f" Quicker: ns-train {QUICK_PRESET}, or --pipeline.datamanager.dataparser.downscale-factor 2."
+        CONSOLE.print(message, highlight=False)
+
+    def _load_checkpoint(self) -> None:
+        config = self.config
+        if config.load_dir is not None and config.load_step is None:
+            config.load_checkpoint = newest_checkpoint(config.load_dir)
+            config.load_dir = None
+        if config.load_checkpoint is None and self.schedule.base_steps == 0:
+            raise UserError(
+                f"{config.method_name} starts from a trained base: add --load-dir <run>/nerfstudio_models of one "
+                "(or <run>/base/nerfstudio_models)."
+            )
+        super()._load_checkpoint()
+        if self.schedule.base_steps == 0 and not self._resumes_refinement():
+            self._start_step = 0  # a base that was loaded: refinement counts its own steps
+
+    def _resumes_refinement(self) -> bool:
+        """Whether the checkpoint is one of this very method's (it has refined before), not a base."""
+        return bool(self.pipeline.model.assigned) and (self.base_dir / "prepared" / "grid.pt").exists()
+
+    @check_main_thread
+    def save_checkpoint(self, step: int) -> None:
+        """Save model and optimizers; the file appears whole or not at all, and only then are older ones removed."""
+        path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
+        content = {
+            "step": step,
+            "pipeline": self.pipeline.state_dict(),
+            "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()},
+            "schedulers": {},
+            "scalers": self.grad_scaler.state_dict(),
+        }
+        save_atomically(content, path)
+        if self.config.save_only_latest_checkpoint:
+            for old in self.checkpoint_dir.glob("*.ckpt"):
+                if old != path:
+                    old.unlink()
+
+    def _after_train(self) -> None:
+        report = {"seconds": self._stage_seconds(), "peak_memory_mb": peak_memory_mb()}
+        self.base_dir.mkdir(parents=True, exist_ok=True)
+        (self.base_dir / "training.json").write_text(json.dumps(report, indent=2))
+        super()._after_train()
+
+    def _stage_seconds(self) -> dict[str, float]:
+        """Wall time of base training, each preparation stage and refinement in this process."""
+        total = time.perf_counter() - self._started
+        prepared = self.pipeline.model.prepared_seconds
+        refining = time.perf_counter() - self.pipeline.model.refining_since if prepared else 0.0
+        return {"base training": total - sum(prepared.values()) - refining, **prepared, "refinement": refining}
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def _stop(error: UserError) -> None:
+    CONSOLE.print(f"[bold red]beags:[/bold red] {error}", highlight=False, soft_wrap=True)
+    sys.exit(2)
+

@@ -1,0 +1,126 @@
+"""What happens around training steps: schedules, densification, and the switch to refinement."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from beags_plugin.core.densification import GradientStatistics, densify, reset_opacity, screen_gradient
+from beags_plugin.plugin.refinement import RefinementSwitch
+from beags_plugin.plugin.schedule import log_linear
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.model import BeagsModel
+
+EXTENT_MARGIN = 1.1  # the scene's extent is 1.1 x the largest distance of a camera from their mean (section 1)
+
+
+def training_callbacks(model: BeagsModel, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+    """The callbacks of one run, in the order in which nerfstudio calls them."""
+    trainer, pipeline = attributes.trainer, attributes.pipeline
+    assert trainer is not None and attributes.optimizers is not None
+    optimizers = attributes.optimizers.optimizers
+    model.seed = trainer.config.machine.seed
+    model.extent = camera_extent(pipeline.datamanager.train_dataset.cameras.camera_to_worlds).to(model.device)
+    densifier = Densifier(model, optimizers)
+    switch = RefinementSwitch(model, trainer, pipeline.datamanager)
+
+    def before(step: int) -> None:
+        model.step = step
+        switch.before_step(step)
+        set_learning_rates(model, optimizers, trainer.config.optimizers, step)
+
+    def after(step: int) -> None:
+        densifier.after_step(step)
+        switch.after_step(step)
+
+    return [
+        TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before),
+        TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], after),
+    ]
+
+
+def camera_extent(camera_to_worlds: Tensor) -> Tensor:
+    """Size of the scene: 1.1 x the largest distance of a camera [V, 3, 4] from the mean of all; 1 for a single one."""
+    centers = camera_to_worlds[..., :3, 3].float()
+    extent = EXTENT_MARGIN * (centers - centers.mean(dim=0)).norm(dim=-1).max()
+    return extent if float(extent) > 0 else torch.ones(())
+
+
+def set_learning_rates(model: BeagsModel, optimizers: dict, configs: dict, step: int) -> None:
+    """Set every group's rate for this step, so that nothing depends on what a checkpoint last held."""
+    first, last = model.config.position_lr
+    for name, optimizer in optimizers.items():
+        rate = configs[name]["optimizer"].lr
+        if name == "means":
+            rate = log_linear(first, last, model.schedule.progress(step)) * float(model.extent)
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+
+
+class Densifier:
+    """Grows and prunes the base by the screen gradients that it gathers."""
+
+    def __init__(self, model: BeagsModel, optimizers: dict) -> None:
+        self.model = model
+        self.config = model.config.densify
+        self.optimizers = optimizers
+        self.statistics = GradientStatistics(model.num_points)
+
+    def after_step(self, step: int) -> None:
+        """Gather; densify and reset opacities when their step has come."""
+        model, config = self.model, self.config
+        if step >= min(config.stop, model.schedule.base_steps) or model.drawn is None:
+            return
+        camera, render = model.drawn
+        means = model.gauss_params["means"]
+        if means.grad is not None:
+            gradient = screen_gradient(means.grad.detach(), means.detach(), camera)
+            self.statistics.add(gradient, render.visible)
+        done = step + 1
+        if done > config.start and done % config.every == 0:
+            self._densify(done)
+        if config.reset_every > 0 and done % config.reset_every == 0 and done < config.stop:
+            self._reset_opacity()
+
+    def _densify(self, step: int) -> None:
+        model = self.model
+        # drawn from (seed, step), so that a resumed run draws what the uninterrupted one did
+        generator = torch.Generator().manual_seed(model.seed * 1_000_003 + step)
+        surfels = model.surfels().detach()
+        edited = densify(surfels, self.statistics.mean(), float(model.extent), self.config, step, generator)
+        model.set_surfels(edited.surfels)
+        for name, optimizer in self.optimizers.items():
+            move_adam_state(optimizer, model.gauss_params[name], edited.source, edited.fresh)
+        self.statistics = GradientStatistics(model.num_points)
+        model.drawn = None
+
+    def _reset_opacity(self) -> None:
+        model = self.model
+        logits = reset_opacity(model.surfels().detach(), self.config)
+        parameter = model.gauss_params["opacities"]
+        parameter.data = logits[:, None].contiguous()
+        everyone = torch.arange(logits.shape[0])
+        move_adam_state(self.optimizers["opacities"], parameter, everyone, torch.ones_like(everyone, dtype=torch.bool))
+
+
+def move_adam_state(optimizer: torch.optim.Optimizer, parameter: Tensor, source: Tensor, fresh: Tensor) -> None:
+    """Let Adam's moments follow their surfels.
+
+    source: [M] int64, the former index of each surfel; fresh: [M] bool, new ones, whose moments start at 0.
+    """
+    state = optimizer.state.get(parameter, {})
+    for name in ("exp_avg", "exp_avg_sq"):
+        if name in state:
+            moved = state[name][source.to(state[name].device)].clone()
+            moved[fresh.to(moved.device)] = 0.0
+            state[name] = moved
+
+
+def note(message: str) -> None:
+    """A line for the reader of the terminal."""
+    CONSOLE.print(message, highlight=False)

@@ -1,0 +1,134 @@
+"""One autograd function for every backend that brings a forward and a backward kernel."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings, SurfelInputs
+
+
+class Images(NamedTuple):
+    """The float images of ``RasterOutputs`` (same names, shapes and dtypes), or gradients towards them; None: absent."""
+
+    color: Tensor | None
+    alpha: Tensor | None
+    depth: Tensor | None
+    median_depth: Tensor | None
+    normal: Tensor | None
+    distortion: Tensor | None
+    boundary: Tensor | None
+
+
+class InputGradients(NamedTuple):
+    """Gradients towards the float fields of ``SurfelInputs`` and the background, of the same shapes and dtypes."""
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    opacity_logits: Tensor
+    colors: Tensor
+    background: Tensor
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What one call draws; tensors are checked, contiguous and carry no gradient.
+
+    inputs, camera, settings: as in ``Rasterizer.rasterize``.
+    background: [3] of the inputs' dtype.
+    target: [H, W] int32 class ids or IGNORE, or None: no boundary.
+    """
+
+    inputs: SurfelInputs
+    camera: Camera
+    settings: RasterSettings
+    background: Tensor
+    target: Tensor | None
+
+
+class Forward(NamedTuple):
+    """What a forward kernel returns: the images, visible [N] bool, num_nonfinite, and a state for its own backward."""
+
+    images: Images
+    visible: Tensor
+    num_nonfinite: int
+    state: Any
+
+
+def check_image(name: str, value: Tensor, camera: Camera) -> Tensor:
+    """``value``, contiguous, if it is an int32 class map of the camera's size; else raises ``ValueError``."""
+    shape = (camera.height, camera.width)
+    if tuple(value.shape) != shape or value.dtype != torch.int32:
+        raise ValueError(f"{name} must be {list(shape)} int32, not {list(value.shape)} {value.dtype}")
+    return value.contiguous()
+
+
+class KernelRasterizer(Rasterizer):
+    """A backend made of two kernels; all float images are differentiable in all float inputs and the background.
+
+    Cameras get no gradient, and there are no second derivatives.
+    """
+
+    @abstractmethod
+    def forward_kernel(self, drawing: Drawing) -> Forward:
+        """Draw. depth, median_depth and normal are None without ``settings.geometry``, and so on."""
+
+    @abstractmethod
+    def backward_kernel(self, drawing: Drawing, state: Any, gradients: Images) -> InputGradients:
+        """The way back. None among ``gradients`` means zero; the others are contiguous."""
+
+    def rasterize(
+        self,
+        inputs: SurfelInputs,
+        camera: Camera,
+        settings: RasterSettings,
+        background: Tensor,
+        target: Tensor | None = None,
+    ) -> RasterOutputs:
+        """See ``Rasterizer.rasterize``."""
+        inputs = inputs.checked()
+        if tuple(background.shape) != (3,) or background.dtype != inputs.means.dtype:
+            expected, got = inputs.means.dtype, f"{list(background.shape)} {background.dtype}"
+            raise ValueError(f"background must be [3] {expected}, not {got}")
+        if target is not None:
+            target = check_image("target", target, camera)
+            if inputs.class_ids is None:
+                raise ValueError("class_ids must be given together with target")
+        fixed = (self, camera, settings, inputs.class_ids, target)
+        floats = (inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits, inputs.colors)
+        *images, visible, num_nonfinite = _Rasterize.apply(fixed, *floats, background.contiguous())  # type: ignore
+        return RasterOutputs(*images, visible=visible, num_nonfinite=num_nonfinite)
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, fixed, means, quats, log_scales, opacity_logits, colors, background):
+        rasterizer, camera, settings, class_ids, target = fixed
+        floats = (value.detach() for value in (means, quats, log_scales, opacity_logits, colors))
+        drawing = Drawing(SurfelInputs(*floats, class_ids=class_ids), camera, settings, background.detach(), target)
+        images, visible, num_nonfinite, state = rasterizer.forward_kernel(drawing)
+        # The inputs are saved through autograd, which notices it if they are changed in place before the backward.
+        ctx.save_for_backward(means, quats, log_scales, opacity_logits, colors, background)
+        ctx.fixed, ctx.state = (rasterizer, replace(drawing, inputs=None, background=None)), state
+        ctx.mark_non_differentiable(visible)
+        ctx.set_materialize_grads(False)  # None tells the kernel what it need not compute
+        return *images, visible, num_nonfinite
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *gradients):
+        rasterizer, drawing = ctx.fixed
+        *floats, background = (value.detach() for value in ctx.saved_tensors)
+        drawing = replace(drawing, inputs=SurfelInputs(*floats), background=background)
+        images = Images(*(None if g is None else g.contiguous() for g in gradients[:-2]))
+        if all(g is None for g in images):
+            return (None,) * 7
+        found = rasterizer.backward_kernel(drawing, ctx.state, images)
+        return None, *(g if needed else None for g, needed in zip(found, ctx.needs_input_grad[1:], strict=True))

@@ -1,0 +1,30 @@
+"""From a scene to what a rasterizer draws."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.sh import sh_colors
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.rasterizers.interface import SurfelInputs
+
+
+def surfel_inputs(
+    surfels: Surfels, camera: Camera, sh_degree: int | None = None, class_ids: Tensor | None = None
+) -> SurfelInputs:
+    """The scene with its colours as ``camera`` sees them; differentiable.
+
+    surfels: N surfels. sh_degree: degrees to use, all if None. class_ids: [N] int32, phi, or None.
+    """
+    degree = round(surfels.sh.shape[1] ** 0.5) - 1 if sh_degree is None else sh_degree
+    colors = sh_colors(surfels.sh, surfels.means, camera.center, degree)
+    return SurfelInputs(surfels.means, surfels.quats, surfels.log_scales, surfels.opacity_logits, colors, class_ids)
+
+
+def geometry_inputs(surfels: Surfels, class_ids: Tensor | None = None) -> SurfelInputs:
+    """The scene without colours and gradients: for depth and the gradient-free products."""
+    bare = surfels.detach()
+    colors = torch.zeros_like(bare.means)
+    return SurfelInputs(bare.means, bare.quats, bare.log_scales, bare.opacity_logits, colors, class_ids)

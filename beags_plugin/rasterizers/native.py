@@ -1,0 +1,134 @@
+"""The compiled CPU rasterizer: checks and allocates here, computes in ``beags_plugin._native``."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+import torch  # before _native, which shares the OpenMP library that torch loads
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.errors import UserError
+from beags_plugin.rasterizers.autograd import (
+    Drawing,
+    Forward,
+    Images,
+    InputGradients,
+    KernelRasterizer,
+    check_image,
+)
+from beags_plugin.rasterizers.interface import RasterSettings, SurfelInputs
+
+_FLOATS = ("means", "quats", "log_scales", "opacity_logits", "colors")
+
+
+@cache
+def _load() -> tuple[ModuleType | None, str | None]:
+    """The compiled module, or one sentence on why it is not there."""
+    try:
+        return import_module("beags_plugin._native"), None
+    except ModuleNotFoundError:
+        return None, "the compiled module beags_plugin._native was not built; install a C++ compiler and reinstall beags."
+    except ImportError as error:
+        return None, f"the compiled module beags_plugin._native does not load ({error}); reinstall beags."
+
+
+def _threads() -> int:
+    return torch.get_num_threads()
+
+
+class NativeRasterizer(KernelRasterizer):
+    """Float32 and float64 on the CPU, on ``torch.get_num_threads()`` threads; the same bits for any number of them."""
+
+    @classmethod
+    def unavailable(cls) -> str | None:
+        """See ``Rasterizer.unavailable``."""
+        return _load()[1]
+
+    def forward_kernel(self, drawing: Drawing) -> Forward:
+        """See ``KernelRasterizer.forward_kernel``."""
+        inputs, camera, settings = drawing.inputs, drawing.camera, drawing.settings
+        frame, visible = _frame(inputs, camera, settings)
+
+        def image(wanted: bool, *channels: int) -> Tensor | None:
+            return inputs.means.new_empty(camera.height, camera.width, *channels) if wanted else None
+
+        geometry = settings.geometry
+        images = Images(
+            color=image(True, 3),
+            alpha=image(True),
+            depth=image(geometry),
+            median_depth=image(geometry),
+            normal=image(geometry, 3),
+            distortion=image(settings.distortion),
+            boundary=image(drawing.target is not None),
+        )
+        frame.forward(drawing.background, drawing.target, *images, _threads())
+        return Forward(images, visible, frame.num_nonfinite, frame)
+
+    def backward_kernel(self, drawing: Drawing, state: Any, gradients: Images) -> InputGradients:
+        """See ``KernelRasterizer.backward_kernel``."""
+        floats = [getattr(drawing.inputs, name) for name in _FLOATS]
+        found = InputGradients(*(torch.zeros_like(value) for value in (*floats, drawing.background)))
+        state.backward(*floats, drawing.target, *gradients, *found, _threads())
+        return found
+
+    @torch.no_grad()
+    def class_contributions(
+        self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, labels: Tensor, num_classes: int
+    ) -> Tensor:
+        """See ``Rasterizer.class_contributions``."""
+        inputs = _detached(inputs.checked())
+        labels = check_image("labels", labels, camera)
+        frame, _ = _frame(inputs, camera, settings)
+        out = inputs.means.new_zeros(inputs.means.shape[0], num_classes)
+        frame.class_contributions(labels, num_classes, out, _threads())
+        return out
+
+    @torch.no_grad()
+    def class_map(
+        self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
+    ) -> tuple[Tensor, Tensor]:
+        """See ``Rasterizer.class_map``."""
+        inputs = _detached(inputs.checked())
+        ids = inputs.class_ids
+        if ids is None:
+            raise ValueError("class_ids must be given for a class map")
+        if ids.numel() and not (0 <= int(ids.min()) and int(ids.max()) < num_classes):
+            raise ValueError(f"class_ids must lie in 0..{num_classes - 1}, not {int(ids.min())}..{int(ids.max())}")
+        frame, _ = _frame(inputs, camera, settings)
+        classes = torch.empty(camera.height, camera.width, dtype=torch.int32)
+        share = inputs.means.new_empty(camera.height, camera.width)
+        frame.class_map(num_classes, classes, share, _threads())
+        return classes, share
+
+    @torch.no_grad()
+    def heaviest(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
+        """See ``Rasterizer.heaviest``."""
+        frame, _ = _frame(_detached(inputs.checked()), camera, settings)
+        indices = torch.empty(camera.height, camera.width, dtype=torch.int32)
+        frame.heaviest(indices, _threads())
+        return indices
+
+
+def _detached(inputs: SurfelInputs) -> SurfelInputs:
+    return SurfelInputs(*(getattr(inputs, name).detach() for name in _FLOATS), class_ids=inputs.class_ids)
+
+
+def _frame(inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> tuple[Any, Tensor]:
+    """The compiled module's frame (surfels projected and sorted into tiles), and visible [N] bool."""
+    module, reason = _load()
+    if module is None:
+        raise UserError(f"the rasterizer 'native' cannot run here: {reason}")
+    if inputs.means.device.type != "cpu":
+        raise ValueError(f"the native rasterizer takes CPU tensors, not {inputs.means.device}")
+    make = module.FrameF32 if inputs.means.dtype == torch.float32 else module.FrameF64
+    matrices = [m.detach().to("cpu", torch.float64).contiguous() for m in (camera.viewmat, camera.K)]
+    visible = torch.empty(inputs.means.shape[0], dtype=torch.bool)
+    floats = [getattr(inputs, name) for name in _FLOATS]
+    size = (camera.width, camera.height)
+    frame = make(*floats, inputs.class_ids, *matrices, *size, settings.near, settings.far, visible, _threads())
+    return frame, visible

@@ -1,0 +1,133 @@
+"""Surfels in front of a camera and their hits with pixel rays, equation by equation (method, section 1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.rotations import rotation_from_quat
+from beags_plugin.rasterizers.interface import MAX_ALPHA, MIN_ALPHA, RasterSettings, SurfelInputs
+
+
+@dataclass(frozen=True)
+class ProjectedSurfels:
+    """K surfels that survived culling, nearest first.
+
+    index: [K] int64, their places among the inputs.
+    A, B, C: [K, 3] the ray-splat cross product is q = dx A + dy B + C, with (dx, dy) the pixel minus ``center``.
+    det: [K] determinant of M; the plane's depth along a ray is det / q_z.
+    center: [K, 2] pixels, the projected mean c. depth: [K] its depth p_z.
+    normal: [K, 3] camera space, towards the camera. opacity: [K]. box: [K, 4] x0, y0, x1, y1 in pixels.
+    """
+
+    index: Tensor
+    A: Tensor
+    B: Tensor
+    C: Tensor
+    det: Tensor
+    center: Tensor
+    depth: Tensor
+    normal: Tensor
+    opacity: Tensor
+    box: Tensor
+
+
+@dataclass(frozen=True)
+class Hits:
+    """P pixels by K surfels: alpha [P, K], 0 where skipped, and the hit's depth [P, K] (the centre's where skipped)."""
+
+    alpha: Tensor
+    depth: Tensor
+
+
+def finite_surfels(inputs: SurfelInputs) -> Tensor:
+    """[N] bool: all parameters are finite and the quaternion has a length."""
+    floats = (inputs.means, inputs.quats, inputs.log_scales, inputs.colors, inputs.opacity_logits[:, None])
+    finite = torch.stack([torch.isfinite(value.detach()).all(dim=-1) for value in floats]).all(dim=0)
+    return finite & (inputs.quats.detach().norm(dim=-1) > 0)
+
+
+def project(inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> ProjectedSurfels:
+    """Cull, project and sort N surfels; differentiable."""
+    index = finite_surfels(inputs).nonzero()[:, 0]
+    p = inputs.means[index] @ camera.rotation.T + camera.translation
+    opacity = torch.sigmoid(inputs.opacity_logits[index])
+    keep = (p[:, 2] > settings.near) & (opacity >= MIN_ALPHA)
+    keep = keep.detach().nonzero()[:, 0]
+    keep = keep[p.detach()[keep, 2].argsort(stable=True)]  # by centre depth, ties by index
+    index, p, opacity = index[keep], p[keep], opacity[keep]
+
+    axes = camera.rotation @ rotation_from_quat(inputs.quats[index])
+    scales = inputs.log_scales[index].exp()
+    a, b, n = scales[:, :1] * axes[:, :, 0], scales[:, 1:] * axes[:, :, 1], axes[:, :, 2]
+    n = torch.where((n * p).sum(dim=-1, keepdim=True) > 0, -n, n)  # towards the camera
+    M = camera.K @ torch.stack([a, b, p], dim=-1)  # (E1)
+    center = M[:, :2, 2] / M[:, 2:, 2]
+    # With the pixel counted from c, large coordinates no longer cancel:
+    # (dx Mw - Mx') x (dy Mw - My') is affine in dx, dy, because Mw x Mw = 0. (E2)
+    Mw = M[:, 2]
+    Mx, My = M[:, 0] - center[:, :1] * Mw, M[:, 1] - center[:, 1:] * Mw
+    C = torch.linalg.cross(Mx, My)
+    return ProjectedSurfels(
+        index=index,
+        A=torch.linalg.cross(My, Mw),
+        B=torch.linalg.cross(Mw, Mx),
+        C=C,
+        det=(Mw * C).sum(dim=-1),
+        center=center,
+        depth=p[:, 2],
+        normal=n,
+        opacity=opacity,
+        box=_screen_box(M.detach(), center.detach(), opacity.detach(), camera),
+    )
+
+
+def _screen_box(M: Tensor, center: Tensor, opacity: Tensor, camera: Camera) -> Tensor:
+    """[K, 4] pixels: where alpha can reach 1/255, the disc's conic united with the low-pass disc."""
+    level = 2.0 * torch.log(opacity / MIN_ALPHA)
+    signs = torch.stack([level, level, -torch.ones_like(level)], dim=-1)
+    d = (signs * M[:, 2] ** 2).sum(dim=-1)
+    f = signs / torch.where(d < 0, d, -torch.ones_like(d))[:, None]
+    conic_center = (f[:, None] * M[:, :2] * M[:, 2:]).sum(dim=-1)
+    half = (conic_center**2 - (f[:, None] * M[:, :2] ** 2).sum(dim=-1)).clamp_min(0.0).sqrt()
+    low_pass = (0.5 * level).clamp_min(0.0).sqrt()[:, None]  # 2 r^2 = 2 ln(255 o)
+    low = torch.minimum(conic_center - half, center - low_pass)
+    high = torch.maximum(conic_center + half, center + low_pass)
+    box = torch.cat([low, high], dim=-1)
+    screen = box.new_tensor([0.0, 0.0, camera.width, camera.height])
+    # a disc that crosses the camera plane has no conic: it may be anywhere on the screen
+    return torch.where((d < 0)[:, None] & torch.isfinite(box).all(dim=-1, keepdim=True), box, screen)
+
+
+def on_screen(projected: ProjectedSurfels, x0: float, y0: float, x1: float, y1: float) -> Tensor:
+    """[K] bool: the surfel's box touches the rectangle (pixels)."""
+    low, high = projected.box[:, :2], projected.box[:, 2:]
+    return (low[:, 0] < x1) & (high[:, 0] > x0) & (low[:, 1] < y1) & (high[:, 1] > y0)
+
+
+def hits(projected: ProjectedSurfels, chosen: Tensor, pixels: Tensor, near: float, smooth_cutoff: bool) -> Hits:
+    """Alpha and depth of the chosen surfels [S] at pixel centres [P, 2].
+
+    smooth_cutoff: fade alpha out above 1/255 instead of cutting it there, so that finite differences hold (tests).
+    """
+    dx, dy = (pixels[:, None] - projected.center[chosen]).unbind(-1)
+    dx, dy = dx[..., None], dy[..., None]
+    q = dx * projected.A[chosen] + dy * projected.B[chosen] + projected.C[chosen]  # (E2)
+    # q_z = 0: the ray runs along the plane and meets it nowhere; 1 is a stand-in that `hit` discards
+    hit = q[..., 2] != 0
+    q_z = torch.where(hit, q[..., 2], torch.ones_like(q[..., 2]))
+    rho3d = (q[..., 0] / q_z) ** 2 + (q[..., 1] / q_z) ** 2
+    rho2d = 2.0 * (dx[..., 0] ** 2 + dy[..., 0] ** 2)
+    on_disc = hit & (rho3d <= rho2d)
+    rho = torch.where(on_disc, rho3d, rho2d)
+    center_depth = projected.depth[chosen].expand_as(rho)
+    depth = torch.where(on_disc, projected.det[chosen] / q_z, center_depth)
+    alpha = (projected.opacity[chosen] * torch.exp(-0.5 * rho)).clamp_max(MAX_ALPHA)  # (E3)
+    if smooth_cutoff:
+        fade = ((alpha - MIN_ALPHA) / MIN_ALPHA).clamp(0.0, 1.0)
+        alpha = alpha * fade * fade * (3.0 - 2.0 * fade)
+    drawn = (depth >= near) & (alpha >= (0.0 if smooth_cutoff else MIN_ALPHA))
+    return Hits(torch.where(drawn, alpha, torch.zeros_like(alpha)), torch.where(drawn, depth, center_depth))

@@ -1,0 +1,217 @@
+"""The reference rasterizer: plain differentiable PyTorch, to be read beside the equations (method, sections 1, 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.rasterizers.interface import (
+    IGNORE,
+    MIN_TRANSMITTANCE,
+    Rasterizer,
+    RasterOutputs,
+    RasterSettings,
+    SurfelInputs,
+)
+from beags_plugin.rasterizers.reference_geometry import ProjectedSurfels, finite_surfels, hits, on_screen, project
+
+BLOCK = 16  # pixels are drawn in squares of this side, each with the surfels that reach it
+
+
+@dataclass(frozen=True)
+class _Block:
+    """P pixels of a square, S surfels that reach it, nearest first.
+
+    rows, columns: slices of the image. index: [S] int64 places among the inputs; chosen: [S] among the projected.
+    weights: [P, S] w_i. depth: [P, S]. remaining: [P] T_end. before, after: [P, S] transmittance around each surfel.
+    """
+
+    rows: slice
+    columns: slice
+    index: Tensor
+    chosen: Tensor
+    weights: Tensor
+    depth: Tensor
+    remaining: Tensor
+    before: Tensor
+    after: Tensor
+
+
+class TorchRasterizer(Rasterizer):
+    """Autograd through dense blocks: slow, exact in float64, on any device.
+
+    smooth_cutoff: fade alpha out at 1/255 instead of cutting it, so that finite differences hold; for tests.
+    """
+
+    def __init__(self, smooth_cutoff: bool = False) -> None:
+        self.smooth_cutoff = smooth_cutoff
+
+    @classmethod
+    def unavailable(cls) -> str | None:
+        return None
+
+    def rasterize(
+        self,
+        inputs: SurfelInputs,
+        camera: Camera,
+        settings: RasterSettings,
+        background: Tensor,
+        target: Tensor | None = None,
+    ) -> RasterOutputs:
+        inputs = inputs.checked()
+        camera = camera.to(inputs.means)
+        if target is not None and inputs.class_ids is None:
+            raise ValueError("a target needs class_ids")
+        projected = project(inputs, camera, settings)
+        rows = _Rows(camera.height, camera.width)
+        for block in self._blocks(projected, camera, settings):
+            rows.put(block, _composite(block, inputs, projected, settings, background, target))
+        images = rows.join()
+        visible = torch.zeros(inputs.means.shape[0], dtype=torch.bool, device=inputs.means.device)
+        visible[projected.index] = on_screen(projected, 0, 0, camera.width, camera.height)
+        return RasterOutputs(
+            color=images["color"],
+            alpha=images["alpha"][..., 0],
+            depth=images["depth"][..., 0] if settings.geometry else None,
+            median_depth=images["median"][..., 0] if settings.geometry else None,
+            normal=images["normal"] if settings.geometry else None,
+            distortion=images["distortion"][..., 0] if settings.distortion else None,
+            boundary=images["boundary"][..., 0] if target is not None else None,
+            visible=visible,
+            num_nonfinite=int((~finite_surfels(inputs)).sum()),
+        )
+
+    @torch.no_grad()
+    def class_contributions(
+        self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, labels: Tensor, num_classes: int
+    ) -> Tensor:
+        inputs, camera = inputs.checked(), camera.to(inputs.means)
+        projected = project(inputs, camera, settings)
+        total = inputs.means.new_zeros(inputs.means.shape[0], num_classes)
+        for block in self._blocks(projected, camera, settings):
+            here = labels[block.rows, block.columns].reshape(-1).long()
+            one_hot = (here[:, None] == torch.arange(num_classes, device=here.device)).to(block.weights)
+            total[block.index] += block.weights.T @ one_hot  # (E6); IGNORE matches no class
+        return total
+
+    @torch.no_grad()
+    def class_map(
+        self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
+    ) -> tuple[Tensor, Tensor]:
+        inputs, camera = inputs.checked(), camera.to(inputs.means)
+        if inputs.class_ids is None:
+            raise ValueError("a class map needs class_ids")
+        projected = project(inputs, camera, settings)
+        rows = _Rows(camera.height, camera.width)
+        for block in self._blocks(projected, camera, settings):
+            classes = inputs.class_ids[block.index].long()
+            one_hot = (classes[:, None] == torch.arange(num_classes, device=classes.device)).to(block.weights)
+            per_class = block.weights @ one_hot
+            best = per_class.argmax(dim=-1)  # the first of equals, so ties go to the lower id
+            alpha = block.weights.sum(dim=-1)
+            share = per_class.gather(1, best[:, None])[:, 0] / torch.where(alpha > 0, alpha, torch.ones_like(alpha))
+            rows.put(block, {"class": best[:, None].to(per_class), "share": share[:, None]})
+        images = rows.join()
+        return images["class"][..., 0].to(torch.int32), images["share"][..., 0]
+
+    @torch.no_grad()
+    def heaviest(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
+        inputs, camera = inputs.checked(), camera.to(inputs.means)
+        projected = project(inputs, camera, settings)
+        image = torch.full((camera.height, camera.width), -1, dtype=torch.int32, device=inputs.means.device)
+        for block in self._blocks(projected, camera, settings):
+            if block.index.shape[0] == 0:
+                continue
+            weight, place = block.weights.max(dim=-1)
+            winner = torch.where(weight > 0, block.index[place], torch.full_like(place, -1)).to(torch.int32)
+            image[block.rows, block.columns] = winner.reshape(image[block.rows, block.columns].shape)
+        return image
+
+    def _blocks(self, projected: ProjectedSurfels, camera: Camera, settings: RasterSettings) -> Iterator[_Block]:
+        for y in range(0, camera.height, BLOCK):
+            for x in range(0, camera.width, BLOCK):
+                rows, columns = slice(y, min(y + BLOCK, camera.height)), slice(x, min(x + BLOCK, camera.width))
+                yield self._block(projected, rows, columns, settings)
+
+    def _block(self, projected: ProjectedSurfels, rows: slice, columns: slice, settings: RasterSettings) -> _Block:
+        like = projected.depth
+        ys = torch.arange(rows.start, rows.stop, dtype=like.dtype, device=like.device) + 0.5
+        xs = torch.arange(columns.start, columns.stop, dtype=like.dtype, device=like.device) + 0.5
+        pixels = torch.stack(torch.meshgrid(xs, ys, indexing="xy"), dim=-1).reshape(-1, 2)
+        chosen = on_screen(projected, columns.start, rows.start, columns.stop, rows.stop).nonzero()[:, 0]
+        hit = hits(projected, chosen, pixels, settings.near, self.smooth_cutoff)
+        after = torch.cumprod(1.0 - hit.alpha, dim=-1)
+        before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=-1)[:, : after.shape[1]]
+        # `after` never grows, so all surfels from the one that would take it below the bound on are left out
+        drawn = after.detach() >= MIN_TRANSMITTANCE
+        weights = torch.where(drawn, hit.alpha * before, torch.zeros_like(before))
+        remaining = torch.where(drawn, 1.0 - hit.alpha, torch.ones_like(before)).prod(dim=-1)
+        after = torch.where(drawn, after, torch.ones_like(after))
+        return _Block(
+            rows, columns, projected.index[chosen], chosen, weights, hit.depth, remaining, before, after
+        )
+
+
+def _composite(
+    block: _Block,
+    inputs: SurfelInputs,
+    projected: ProjectedSurfels,
+    settings: RasterSettings,
+    background: Tensor,
+    target: Tensor | None,
+) -> dict[str, Tensor]:
+    """All outputs of a block's P pixels, [P, channels] each (E4)."""
+    w = block.weights
+    alpha = w.sum(dim=-1, keepdim=True)
+    images = {
+        "color": w @ inputs.colors[block.index] + block.remaining[:, None] * background,
+        "alpha": alpha,
+    }
+    if settings.geometry:
+        images["normal"] = w @ projected.normal[block.chosen]
+        nothing = alpha <= 0
+        depth = (w * block.depth).sum(dim=-1, keepdim=True) / torch.where(nothing, torch.ones_like(alpha), alpha)
+        images["depth"] = depth
+        passes = (w > 0) & (block.before > 0.5) & (block.after <= 0.5)
+        images["median"] = torch.where(passes, block.depth, torch.zeros_like(w)).sum(dim=-1, keepdim=True)
+    if settings.distortion:
+        m = settings.far / (settings.far - settings.near) * (1.0 - settings.near / block.depth)
+        # sum_{j<i} w_i w_j (m_i - m_j)^2 by sums over all nearer surfels
+        w0, w1, w2 = (_sum_before(w * m**power) for power in range(3))
+        images["distortion"] = (w * (m * m * w0 - 2.0 * m * w1 + w2)).sum(dim=-1, keepdim=True)
+    if target is not None:
+        assert inputs.class_ids is not None
+        labels = target[block.rows, block.columns].reshape(-1, 1)
+        wrong = (inputs.class_ids[block.index][None] != labels) & (labels != IGNORE)
+        images["boundary"] = (w * wrong.to(w)).sum(dim=-1, keepdim=True)  # (E7)
+    return images
+
+
+def _sum_before(values: Tensor) -> Tensor:
+    """[P, S] sum over the entries before each along the last axis."""
+    return torch.cumsum(values, dim=-1) - values
+
+
+class _Rows:
+    """Puts square blocks together again, without writing into tensors that autograd watches."""
+
+    def __init__(self, height: int, width: int) -> None:
+        self.height, self.width = height, width
+        self._rows: dict[str, list[list[Tensor]]] = {}
+
+    def put(self, block: _Block, images: dict[str, Tensor]) -> None:
+        """Add a block; blocks come row by row, left to right."""
+        shape = (block.rows.stop - block.rows.start, block.columns.stop - block.columns.start, -1)
+        for name, image in images.items():
+            rows = self._rows.setdefault(name, [])
+            if block.columns.start == 0:
+                rows.append([])
+            rows[-1].append(image.reshape(shape))
+
+    def join(self) -> dict[str, Tensor]:
+        """[H, W, channels] each."""
+        return {name: torch.cat([torch.cat(row, dim=1) for row in rows]) for name, rows in self._rows.items()}

@@ -1,0 +1,155 @@
+"""From a trained base and raw masks to all that refinement needs (method, sections 2, 3 and 5), stage by stage."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from beags_plugin.assignment.assignment import Assignment, assign_classes
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.errors import UserError
+from beags_plugin.masks import REPROJECTIONS
+from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.rasterizers.drawing import geometry_inputs
+from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
+from beags_plugin.refiners.base import AssignedScene, Progress, Refiner
+
+Stage = Callable[[str], AbstractContextManager[Progress | None]]
+"""Opens a named stage and gives its progress callback; a command line draws a bar with it."""
+
+
+@dataclass(frozen=True)
+class PreparationConfig:
+    """Options of the stages between base training and refinement.
+
+    reprojection: how masks are made consistent: a name of ``masks.REPROJECTIONS``, or "none" to keep them.
+    tau: a vote counts if its point is visible: |z - D| <= tau z; infinity counts every vote (E5).
+    k: neighbours that set the voxel size (E8).
+    """
+
+    reprojection: str = "pairwise"
+    tau: float = 0.02
+    k: int = 2000
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """What the stages made.
+
+    labels: per training view [H, W] int32, M'.
+    confidence: per training view [H, W] float32, share of the winning votes; None where nothing was reprojected.
+    assignment: the class of every surfel and its margin.
+    grid: the visibility voxel grids, or None if the refiner needs none.
+    findings: one line for a reader per stage.
+    seconds: wall time per stage.
+    """
+
+    labels: list[Tensor]
+    confidence: list[Tensor] | None
+    assignment: Assignment
+    grid: VisibilityGrid | None
+    findings: list[str] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def prepare(
+    surfels: Surfels,
+    cameras: Sequence[Camera],
+    labels: Sequence[Tensor | None],
+    class_names: dict[int, str],
+    rasterizer: Rasterizer,
+    settings: RasterSettings,
+    refiner: Refiner,
+    config: PreparationConfig,
+    seed: int = 0,
+    stage: Stage = lambda name: nullcontext(),
+) -> Preparation:
+    """Make masks consistent, assign classes, build the voxel grids.
+
+    surfels: the trained base, N surfels.
+    cameras: V training views; labels: per view [H, W] int32 class ids or IGNORE, None where there is no mask.
+    class_names: id to name, background (0) included.
+    Raises ``UserError`` if no view has a mask or no mask names an object.
+    """
+    if not any(mask is not None and bool(((mask > 0) & (mask != IGNORE)).any()) for mask in labels):
+        raise UserError(
+            "no mask names an object: put id images into masks/<image name>.png, or train the preset beags-base, "
+            "which needs none."
+        )
+    surfels = surfels.detach()
+    num_classes = max(class_names) + 1
+    findings, seconds = [], {}
+
+    def timed(name: str, start: float, finding: str) -> None:
+        seconds[name] = time.perf_counter() - start
+        findings.append(finding)
+
+    start = time.perf_counter()
+    confidence = None
+    if config.reprojection == "none":
+        consistent = [_or_ignore(mask, camera) for mask, camera in zip(labels, cameras, strict=True)]
+        timed("reprojection", start, "reprojection: off, masks used as they are")
+    else:
+        with stage("Rendering depth") as progress:
+            depths = _render_depths(surfels, cameras, rasterizer, settings, progress)
+        with stage("Reprojecting masks") as progress:
+            reproject = REPROJECTIONS.get(config.reprojection)
+            refined = reproject(depths, cameras, labels, num_classes, tau=config.tau, progress=progress)
+        consistent = [mask.labels for mask in refined]
+        confidence = [mask.confidence for mask in refined]
+        timed("reprojection", start, _reprojection_finding(labels, consistent))
+
+    start = time.perf_counter()
+    with stage("Assigning classes") as progress:
+        assignment = assign_classes(surfels, cameras, consistent, rasterizer, settings, num_classes, progress=progress)
+    timed("assignment", start, _assignment_finding(assignment, class_names))
+
+    start = time.perf_counter()
+    scene = AssignedScene(
+        surfels, assignment.class_ids, cameras, consistent, num_classes, rasterizer, settings, seed
+    )
+    with stage("Building voxel grids") as progress:
+        grid = refiner.build_grid(scene, config.k, progress)
+    if grid is not None:
+        timed("voxel grids", start, f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {config.k})")
+    return Preparation(consistent, confidence, assignment, grid, findings, seconds)
+
+
+def _render_depths(surfels, cameras, rasterizer, settings, progress) -> list[Tensor]:
+    depths = []
+    with torch.no_grad():
+        for index, camera in enumerate(cameras):
+            background = surfels.means.new_zeros(3)
+            depths.append(rasterizer.rasterize(geometry_inputs(surfels), camera, settings, background).depth)
+            if progress:
+                progress(index + 1, len(cameras))
+    return depths
+
+
+def _or_ignore(mask: Tensor | None, camera: Camera) -> Tensor:
+    if mask is not None:
+        return mask
+    return torch.full((camera.height, camera.width), IGNORE, dtype=torch.int32)
+
+
+def _reprojection_finding(before: Sequence[Tensor | None], after: Sequence[Tensor]) -> str:
+    known = [(old, new) for old, new in zip(before, after, strict=True) if old is not None]
+    changed = sum(int((old != new).sum()) for old, new in known)
+    pixels = sum(old.numel() for old, _ in known)
+    filled = len(before) - len(known)
+    return (
+        f"reprojection: {changed} of {pixels} labelled pixels changed ({100 * changed / max(pixels, 1):.2f} %), "
+        f"{filled} views without a mask got one"
+    )
+
+
+def _assignment_finding(assignment: Assignment, class_names: dict[int, str]) -> str:
+    counts = torch.bincount(assignment.class_ids.long(), minlength=max(class_names) + 1)
+    per_class = ", ".join(f"{name} {int(counts[index])}" for index, name in sorted(class_names.items()))
+    return f"assignment: Gaussians per class: {per_class}; never seen: {int(assignment.never_seen.sum())}"

@@ -1,0 +1,229 @@
+"""The sample's still life: seven textured objects that touch, stand on and hide one another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beags_plugin.sample.solids import Ball, Cone, Solid, Tube, slab, turned
+from beags_plugin.sample.textures import (
+    Noise,
+    Texture,
+    bands,
+    blotches,
+    checks,
+    linear_from_hsv,
+    marble,
+    sectors,
+)
+
+DOME_RADIUS = 5.0
+"""World units; the ground is the disc z = 0 of this radius, closed by the half-dome above it."""
+
+
+@dataclass(frozen=True)
+class Thing:
+    """One object: world = rotation @ local + position.
+
+    rotation: [3, 3]; position: [3], world units, z up.
+    """
+
+    name: str
+    solid: Solid
+    rotation: np.ndarray
+    position: np.ndarray
+    texture: Texture
+
+    def to_local(self, points: np.ndarray) -> np.ndarray:
+        """World points [N, 3] in the object's frame."""
+        return turned(points - self.position, self.rotation)
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """[N] bound of the signed distance of world points [N, 3] (sign and zeros exact)."""
+        return self.solid.distance(self.to_local(points))
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A world point [3] on the surfaces of both objects; 0 is the ground, i the object of class id i."""
+
+    first: int
+    second: int
+    point: np.ndarray
+
+
+@dataclass(frozen=True)
+class Still:
+    """The whole scene: object i has class id i + 1; the ground and the dome around it are class 0.
+
+    sun: [3] unit vector towards the light. noise: of the ground and the dome. palette: [4, 3] linear RGB of both.
+    """
+
+    things: tuple[Thing, ...]
+    contacts: tuple[Contact, ...]
+    sun: np.ndarray
+    noise: Noise
+    palette: np.ndarray
+
+    @property
+    def class_names(self) -> dict[int, str]:
+        """Class id to name, the background included."""
+        return {0: "background", **{i: thing.name for i, thing in enumerate(self.things, start=1)}}
+
+
+def _turn_z(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _textures(names: list[str], generator: np.random.Generator) -> dict[str, Texture]:
+    noise = Noise(generator)
+    # Hues evenly apart, dealt out at random: the objects stay distinct for every seed.
+    hues = (generator.permutation(len(names)) + generator.uniform(0.0, 1.0)) / len(names)
+    patterns = {
+        "box": checks(6.5),
+        "cone": bands(7.0, twist=1.0),
+        "cylinder": sectors(6, slant=9.0),
+        "ring": sectors(9),
+        "bowl": blotches(noise, 10.0),
+        "ball": marble(noise, 4.5),
+        "plank": bands(6.0),
+    }
+    textures = {}
+    for name, hue in zip(names, hues, strict=True):
+        textures[name] = Texture(
+            pattern=patterns[name],
+            light=linear_from_hsv(hue + 0.02, 0.42, 0.98),
+            dark=linear_from_hsv(hue - 0.02, 0.88, 0.70),
+            fleck=linear_from_hsv(hue + 0.09, 0.65, 0.45),
+            noise=noise,
+        )
+    return textures
+
+
+def make_still(seed: int) -> Still:
+    """The scene of a seed: sizes, places, turn, handedness, colours, textures and light all depend on it.
+
+    It is built about a box at the origin that the others touch (its faces are x = +-hx and y = +-hy), then moved to
+    the middle, mirrored or not, and turned.
+    """
+    generator = np.random.default_rng([seed, 1])
+
+    def about(value: float, spread: float = 0.08) -> float:
+        return float(value * generator.uniform(1.0 - spread, 1.0 + spread))
+
+    solids: dict[str, Solid] = {}
+    poses: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    contacts: list[tuple[str, str, np.ndarray]] = []
+
+    def place(name: str, solid: Solid, position: list[float], rotation: np.ndarray | None = None) -> None:
+        solids[name] = solid
+        poses[name] = (_turn_z(0.0) if rotation is None else rotation, np.array(position))
+
+    def touch(first: str, second: str, point: list[float]) -> None:
+        contacts.append((first, second, np.array(point)))
+
+    hx, hy, top = about(0.25), about(0.20), about(0.50, 0.05)
+    box = (*slab(0, -hx, hx), *slab(1, -hy, hy), *slab(2, -top / 2, top / 2))
+    place("box", Solid(box, bound=float(np.linalg.norm([hx, hy, top / 2]))), [0.0, 0.0, top / 2])
+    touch("box", "ground", [0.0, 0.0, 0.0])
+
+    radius, height = about(0.15), about(0.36)
+    x, y = generator.uniform(-0.05, 0.05), generator.uniform(-0.03, 0.03)
+    cone = Solid((Cone(radius, height), *slab(2, 0.0, height)), bound=max(radius, height))
+    place("cone", cone, [x, y, top], _turn_z(generator.uniform(0.0, 2.0 * np.pi)))
+    touch("cone", "box", [x, y, top])
+
+    # The can stands against the face x = hx.
+    radius, height = about(0.165), about(0.66)
+    y = generator.uniform(-0.08, 0.08)
+    can = Solid((Tube(radius), *slab(2, -height / 2, height / 2)), bound=float(np.hypot(radius, height / 2)))
+    place("cylinder", can, [hx + radius, y, height / 2], _turn_z(generator.uniform(0.0, 2.0 * np.pi)))
+    touch("cylinder", "box", [hx, y, top / 2])
+    touch("cylinder", "ground", [hx + radius, y, 0.0])
+
+    # The ring stands on its edge, its plane at an angle to the normal of the face x = -hx that its rim touches.
+    radius, half, angle = about(0.27), about(0.055), generator.uniform(0.15, 0.5)
+    ring = Solid((Tube(radius), *slab(2, -half, half)), (Tube(0.78 * radius),), float(np.hypot(radius, half)))
+    across = np.array([np.cos(angle), np.sin(angle), 0.0])
+    axis = np.array([-np.sin(angle), np.cos(angle), 0.0])
+    reach = radius * across - half * axis
+    centre = np.array([-hx, generator.uniform(-0.05, 0.05), radius]) - reach
+    place("ring", ring, list(centre), np.stack([across, np.array([0.0, 0.0, -1.0]), axis], axis=1))
+    touch("ring", "box", list(centre + reach))
+    touch("ring", "ground", [centre[0], centre[1], 0.0])
+
+    # The bowl is widest at its ball's centre, where it touches the face y = -hy; its foot is the flat below.
+    radius = about(0.33, 0.05)
+    inner = 0.9 * radius
+    foot = inner + 0.02
+    x = generator.uniform(-0.06, 0.06)
+    bowl_at = np.array([x, -hy - radius, foot])
+    bowl = Solid((Ball(radius), *slab(2, -foot, 0.1 * radius)), (Ball(inner),), radius)
+    place("bowl", bowl, list(bowl_at))
+    touch("bowl", "box", [x, -hy, foot])
+    touch("bowl", "ground", [x, bowl_at[1], 0.0])
+
+    # The ball lies in it, a little off the bottom's middle.
+    radius = about(0.74, 0.04) * inner
+    lean, way = generator.uniform(0.05, 0.2), generator.uniform(0.0, 2.0 * np.pi)
+    down = np.array([np.sin(lean) * np.cos(way), np.sin(lean) * np.sin(way), -np.cos(lean)])
+    place("ball", Solid((Ball(radius),), bound=radius), list(bowl_at + (inner - radius) * down))
+    touch("ball", "bowl", list(bowl_at + inner * down))
+
+    # The plank leans with its upper edge against the face y = hy.
+    wide, thick, long, tilt = about(0.17), 0.018, about(0.21), generator.uniform(0.35, 0.55)
+    c, s = np.cos(tilt), np.sin(tilt)
+    x = generator.uniform(-0.06, 0.06)
+    y = hy + thick * c + long * s
+    plank = Solid(
+        (*slab(0, -wide, wide), *slab(1, -thick, thick), *slab(2, -long, long)),
+        bound=float(np.hypot(wide, long) + thick),
+    )
+    place("plank", plank, [x, y, thick * s + long * c], np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]))
+    touch("plank", "box", [x, hy, 2.0 * long * c])
+    touch("plank", "ground", [x, y - thick * c + long * s, 0.0])
+
+    return _finish(solids, poses, contacts, generator)
+
+
+def _finish(
+    solids: dict[str, Solid],
+    poses: dict[str, tuple[np.ndarray, np.ndarray]],
+    contacts: list[tuple[str, str, np.ndarray]],
+    generator: np.random.Generator,
+) -> Still:
+    """Moves the scene to the middle, mirrors and turns it, and gives it colours and light."""
+    # All solids are symmetric about their own y = 0, so mirroring a pose (M R M, M t) mirrors the object exactly.
+    mirror = np.diag([1.0, generator.choice([-1.0, 1.0]), 1.0])
+    turn = _turn_z(generator.uniform(0.0, 2.0 * np.pi))
+    shift = np.array([0.08, 0.18, 0.0])
+    names = list(solids)
+    textures = _textures(names, generator)
+    things = tuple(
+        Thing(
+            name,
+            solids[name],
+            turn @ mirror @ poses[name][0] @ mirror,
+            turn @ mirror @ (poses[name][1] + shift),
+            textures[name],
+        )
+        for name in names
+    )
+    ids = {"ground": 0, **{name: i for i, name in enumerate(names, start=1)}}
+    hue, height, azimuth = generator.uniform(), generator.uniform(0.70, 0.85), generator.uniform(0.0, 2.0 * np.pi)
+    return Still(
+        things=things,
+        contacts=tuple(Contact(ids[a], ids[b], turn @ mirror @ (p + shift)) for a, b, p in contacts),
+        sun=np.array([np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth), np.sin(height)]),
+        noise=Noise(generator),
+        palette=np.stack(
+            [
+                linear_from_hsv(hue, 0.09, 0.88),
+                linear_from_hsv(hue + 0.06, 0.16, 0.62),
+                linear_from_hsv(hue + 0.5, 0.22, 0.80),
+                linear_from_hsv(hue + 0.58, 0.34, 0.52),
+            ]
+        ),
+    )

@@ -1,0 +1,121 @@
+"""Colours of surface points: diffuse, a soft-edged sun, sky light; the same from every view."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beags_plugin.sample.arrangement import DOME_RADIUS, Still
+from beags_plugin.sample.solids import dot, turned
+from beags_plugin.sample.tracing import DOME, GROUND, seen_share
+
+SUN = np.array([1.22, 1.13, 1.0])
+SKY = np.array([0.36, 0.39, 0.44])
+SUN_RADIUS = 0.10  # radians: the width of penumbras
+LIFT = 1e-4  # world units off the surface, so that shadow rays do not hit where they start
+TILES = 2.5  # tiles of the ground per unit
+MAP_EXTENT, MAP_CELLS = 2.0, 160
+"""The ground's light is baked over |x|, |y| <= 2.0 units; no shadow reaches farther."""
+
+
+def _sun_directions(sun: np.ndarray, count: int) -> np.ndarray:
+    """[count, 3] unit vectors spread evenly (a golden-angle spiral) over the sun's disc."""
+    side = np.cross(sun, [0.0, 0.0, 1.0])
+    side /= np.linalg.norm(side)
+    up = np.cross(side, sun)
+    radius = SUN_RADIUS * np.sqrt((np.arange(count) + 0.5) / count)
+    angle = 2.399963 * np.arange(count)
+    spread = sun + (radius * np.cos(angle))[:, None] * side + (radius * np.sin(angle))[:, None] * up
+    return spread / np.linalg.norm(spread, axis=1, keepdims=True)
+
+
+def _sky_directions(count: int) -> np.ndarray:
+    """[count, 3] unit vectors about +z, their density proportional to the cosine."""
+    radius = np.sqrt((np.arange(count) + 0.5) / count)
+    angle = 2.399963 * np.arange(count)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - radius**2)], axis=1)
+
+
+class Light:
+    """The light of a scene, with the ground's share baked into a map once."""
+
+    def __init__(self, still: Still, object_samples: int = 8, ground_samples: int = 24) -> None:
+        self.still = still
+        self._suns = _sun_directions(still.sun, object_samples)
+        axis = np.linspace(-MAP_EXTENT, MAP_EXTENT, MAP_CELLS)
+        x, y = np.meshgrid(axis, axis, indexing="ij")
+        points = np.stack([x.ravel(), y.ravel(), np.full(x.size, LIFT)], axis=1)
+
+        self._sun_map = seen_share(still, points, _sun_directions(still.sun, ground_samples)).reshape(x.shape)
+        self._sky_map = seen_share(still, points, _sky_directions(2 * ground_samples)).reshape(x.shape)
+
+    def _read(self, table: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Bilinear lookup of the baked map; the border's value outside it."""
+        place = np.clip((points[:, :2] / MAP_EXTENT + 1.0) * 0.5 * (MAP_CELLS - 1), 0.0, MAP_CELLS - 1.001)
+        low = place.astype(np.int64)
+        fx, fy = (place - low).T
+        i, j = low.T
+        return (table[i, j] * (1 - fy) + table[i, j + 1] * fy) * (1 - fx) + (
+            table[i + 1, j] * (1 - fy) + table[i + 1, j + 1] * fy
+        ) * fx
+
+    def _lit(self, albedo: np.ndarray, sun: np.ndarray, sky: np.ndarray) -> np.ndarray:
+        return albedo * (sun[:, None] * SUN + sky[:, None] * SKY)
+
+    def _ground(self, points: np.ndarray) -> np.ndarray:
+        """Tiles of mottled stone; their pattern fades outwards, where small images would alias."""
+        palette, noise = self.still.palette, self.still.noise
+        tile = points[:, :2] * TILES
+        cell = np.floor(tile)
+        flat = np.zeros_like(points)
+        flat[:, :2] = cell * 3.7 + 0.5
+        shade = noise(flat)  # constant over a tile
+        flat[:, :2] = points[:, :2] * 7.0
+        stone = noise(flat)
+        flat[:, :2] = points[:, :2] * 2.3 + 9.1
+        patch = noise(flat)
+        fade = np.clip((DOME_RADIUS - np.hypot(points[:, 0], points[:, 1])) / (DOME_RADIUS - 1.0), 0.0, 1.0)
+        odd = 0.5 + fade * ((cell[:, 0] + cell[:, 1]) % 2 - 0.5)
+        albedo = palette[0] + odd[:, None] * (palette[1] - palette[0])
+        albedo = albedo * (0.34 + 0.33 * fade * shade + 0.48 * stone + 0.33 * patch)[:, None]
+        joint = fade * (np.max(np.abs(tile - cell - 0.5), axis=1) > 0.465)
+        albedo = albedo * (1.0 - 0.5 * joint)[:, None]
+        sun = self._read(self._sun_map, points) * self.still.sun[2]
+        sky = 0.15 + 0.85 * self._read(self._sky_map, points)  # some light is thrown back everywhere
+        return self._lit(albedo, sun, sky)
+
+    def _dome(self, points: np.ndarray) -> np.ndarray:
+        """A curtain of soft folds with clouds of colour; it shines by itself, so it has no shading."""
+        palette, noise = self.still.palette, self.still.noise
+        height = points[:, 2] / DOME_RADIUS
+        cloud = noise(points * 1.1) * 0.6 + noise(points * 2.7 + 5.0) * 0.4
+        weight = 0.5 + 0.5 * np.tanh(7.0 * (cloud - 0.5))
+        azimuth = np.arctan2(points[:, 1], points[:, 0])
+        fold = np.tanh(1.5 * np.sin(18.0 * azimuth + 5.0 * noise(points * 0.7 + 11.0)))
+        colour = palette[2] + weight[:, None] * (palette[3] - palette[2])
+        return colour * (0.62 + 0.4 * height + 0.2 * fold)[:, None]
+
+    def _object(self, class_id: int, points: np.ndarray) -> np.ndarray:
+        thing = self.still.things[class_id - 1]
+        local = thing.to_local(points)
+        normals = turned(thing.solid.normals(local), thing.rotation.T)
+        cosine = dot(normals, self.still.sun[None])
+        sun = np.zeros(len(points))
+        bright = np.flatnonzero(cosine > 0.0)
+        lifted = points[bright] + LIFT * normals[bright]
+        sun[bright] = cosine[bright] * seen_share(self.still, lifted, self._suns)
+        # Sky light by tilt, dimmed close to the ground: a cheap stand-in for ambient occlusion.
+        sky = (0.62 + 0.38 * normals[:, 2]) * (0.55 + 0.45 * np.clip(points[:, 2] / 0.25, 0.0, 1.0))
+        return self._lit(thing.texture(local), sun, sky)
+
+    def colours(self, points: np.ndarray, surface: np.ndarray) -> np.ndarray:
+        """[N, 3] linear RGB (may exceed 1) of world points [N, 3] on surfaces [N] as ``Hits.surface`` names them."""
+        colours = np.empty_like(points)
+        for which in np.unique(surface):
+            chosen = np.flatnonzero(surface == which)
+            if which == DOME:
+                colours[chosen] = self._dome(points[chosen])
+            elif which == GROUND:
+                colours[chosen] = self._ground(points[chosen])
+            else:
+                colours[chosen] = self._object(int(which), points[chosen])
+        return colours

@@ -1,0 +1,144 @@
+"""The sample's cameras, and what each of them sees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beags_plugin.sample.arrangement import Still
+from beags_plugin.sample.lighting import Light
+from beags_plugin.sample.solids import turned
+from beags_plugin.sample.tracing import CHUNK, first_hits
+
+ELEVATIONS = (0.34, 0.66, 1.02)
+"""Radians above the ground of the three rounds of cameras."""
+TARGET = np.array([0.0, 0.0, 0.26])
+
+
+@dataclass(frozen=True)
+class View:
+    """One pinhole camera.
+
+    name: file stem. split: "train" or "test".
+    camera_to_world: [4, 4] float64, OpenGL axes (x right, y up, z backward), world z up.
+    focal, cx, cy: pixels; pixel (i, j) has its centre at (i + 0.5, j + 0.5).
+    """
+
+    name: str
+    split: str
+    camera_to_world: np.ndarray
+    focal: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    @property
+    def center(self) -> np.ndarray:
+        """[3] the camera's position in the world."""
+        return self.camera_to_world[:3, 3]
+
+    def directions(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """[N, 3] world directions through image points x, y [N] (pixels), of depth 1 along the optical axis."""
+        camera = np.stack([(x - self.cx) / self.focal, -(y - self.cy) / self.focal, -np.ones_like(x)], axis=1)
+        return turned(camera, self.camera_to_world[:3, :3].T)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What a view sees.
+
+    image: [H, W, 3] uint8 sRGB, antialiased by supersampling. The rest is exact at the pixel centres:
+    labels: [H, W] uint8 visible class ids. depth: [H, W] float32 z along the optical axis (there is always a hit).
+    silhouettes: [L, H, W] bool, object i + 1 as if it were alone.
+    """
+
+    image: np.ndarray
+    labels: np.ndarray
+    depth: np.ndarray
+    silhouettes: np.ndarray
+
+
+def make_views(seed: int, width: int, height: int, num_train: int, num_test: int) -> list[View]:
+    """Three rounds about the scene at rising height, jittered, test views spread evenly between the train views."""
+    generator = np.random.default_rng([seed, 2])
+    total = num_train + num_test
+    tests = {int((i + 0.5) * total / num_test) for i in range(num_test)}
+    start = generator.uniform(0.0, 2.0 * np.pi)
+    views = []
+    for i in range(total):
+        progress = i * len(ELEVATIONS) / total
+        azimuth = start + 2.0 * np.pi * progress + generator.uniform(-0.05, 0.05)
+        elevation = ELEVATIONS[int(progress)] + generator.uniform(-0.06, 0.06)
+        radius = (2.3 + 0.12 * int(progress)) * generator.uniform(0.94, 1.06)
+        way = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+        target = TARGET + generator.uniform(-0.06, 0.06, 3)
+        views.append(
+            View(
+                name=f"view_{i:03d}",
+                split="test" if i in tests else "train",
+                camera_to_world=_look_at(target + radius * way, target, generator.uniform(-0.04, 0.04)),
+                # One lens for all views: 48 degrees across, its axis a little off the middle of the image.
+                focal=1.12 * width,
+                cx=0.5 * width + 0.015 * width,
+                cy=0.5 * height - 0.011 * height,
+                width=width,
+                height=height,
+            )
+        )
+    return views
+
+
+def _look_at(position: np.ndarray, target: np.ndarray, roll: float) -> np.ndarray:
+    back = position - target
+    back = back / np.linalg.norm(back)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right = right / np.linalg.norm(right)
+    up = np.cross(back, right)
+    pose = np.eye(4)
+    pose[:3, 0] = np.cos(roll) * right + np.sin(roll) * up
+    pose[:3, 1] = np.cos(roll) * up - np.sin(roll) * right
+    pose[:3, 2], pose[:3, 3] = back, position
+    return pose
+
+
+def _grid(view: View, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Image points [H * W * samples^2]: per pixel, row by row, the centres of samples x samples equal squares."""
+    offset = (np.arange(samples) + 0.5) / samples
+    x = (np.arange(view.width)[:, None] + offset).ravel()
+    y = (np.arange(view.height)[:, None] + offset).ravel()
+    yy, xx = np.meshgrid(y, x, indexing="ij")
+    shape = (view.height, samples, view.width, samples)
+    return tuple(a.reshape(shape).transpose(0, 2, 1, 3).reshape(-1) for a in (xx, yy))  # type: ignore[return-value]
+
+
+def render_image(still: Still, light: Light, view: View, samples: int) -> np.ndarray:
+    """[H, W, 3] uint8 sRGB, the mean in linear light over samples x samples rays per pixel."""
+    x, y = _grid(view, samples)
+    per_pixel = samples * samples
+    chunk = CHUNK // per_pixel * per_pixel
+    pieces = []
+    for start in range(0, len(x), chunk):
+        directions = view.directions(x[start : start + chunk], y[start : start + chunk])
+        hits, _ = first_hits(still, view.center, directions)
+        colours = light.colours(view.center + hits.t[:, None] * directions, hits.surface)
+        pieces.append(np.minimum(colours, 1.0).reshape(-1, per_pixel, 3).mean(axis=1))
+    linear = np.concatenate(pieces).reshape(view.height, view.width, 3)
+    return np.floor(255.0 * linear ** (1.0 / 2.2) + 0.5).astype(np.uint8)
+
+
+def render_view(still: Still, light: Light, view: View, samples: int = 2) -> Picture:
+    """The picture of a view, with ``samples`` x ``samples`` rays per pixel for the image."""
+    x, y = _grid(view, 1)
+    hits, silhouettes = first_hits(still, view.center, view.directions(x, y))
+    masks = np.zeros((len(still.things), len(x)), dtype=bool)
+    for mask, rays in zip(masks, silhouettes, strict=True):
+        mask[rays] = True
+    shape = (view.height, view.width)
+    return Picture(
+        image=render_image(still, light, view, samples),
+        labels=np.maximum(hits.surface, 0).astype(np.uint8).reshape(shape),
+        depth=hits.t.astype(np.float32).reshape(shape),  # directions have depth 1, so t is z
+        silhouettes=masks.reshape(-1, *shape),
+    )

@@ -1,0 +1,201 @@
+"""Writes the sample scene as a nerfstudio folder with masks and ground truth."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beags_plugin.errors import UserError
+from beags_plugin.sample.arrangement import make_still
+from beags_plugin.sample.degrade import Degradation, degrade_mask, dropped_views, resolve_degradation
+from beags_plugin.sample.lighting import Light
+from beags_plugin.sample.points import seed_points, write_ply
+from beags_plugin.sample.views import Picture, View, make_views, render_view
+
+VERSION = 1
+"""Raise it whenever the same config would give other files: older samples are then rebuilt."""
+POINT_NOISE = 0.004
+"""World units, about one pixel's width at 640 x 480."""
+SAMPLE_FILE = "sample.json"
+
+
+@dataclass(frozen=True)
+class SampleConfig:
+    """What decides every byte of the sample.
+
+    seed: of arrangement, sizes, colours, textures, light, camera jitter, mask degradation.
+    width, height: pixels. num_train, num_test: views.
+    degradation: of the train masks: "none", "mild", "strong", or a ``Degradation``.
+    num_points: seed points. antialias: rays per pixel and direction for the images.
+    """
+
+    seed: int = 0
+    width: int = 320
+    height: int = 240
+    num_train: int = 60
+    num_test: int = 12
+    degradation: str | Degradation = "mild"
+    num_points: int = 6000
+    antialias: int = 2
+
+    def check(self) -> None:
+        """Raises ``UserError`` for a value that makes no scene."""
+        least = {"seed": 0, "width": 16, "height": 16, "num_train": 1, "num_test": 1, "num_points": 1, "antialias": 1}
+        for name, low in least.items():
+            if getattr(self, name) < low:
+                raise UserError(f"the sample's {name} is {getattr(self, name)}: give at least {low}.")
+        resolve_degradation(self.degradation)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The content of sample.json; presets are written out, so that a changed preset is another sample."""
+        return {"version": VERSION, **asdict(self), "degradation": asdict(resolve_degradation(self.degradation))}
+
+
+def is_sample(folder: Path, config: SampleConfig) -> bool:
+    """Whether ``folder`` holds the complete sample of this very config."""
+    return _read_config(folder) == config.as_dict()
+
+
+def _read_config(folder: Path) -> Any:
+    """What sample.json says; None if there is none or it is damaged."""
+    try:
+        return json.loads((folder / SAMPLE_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+
+
+def write_sample(
+    folder: str | os.PathLike[str],
+    config: SampleConfig | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Write the sample scene into ``folder``, unless it holds that sample already; returns the folder.
+
+    Layout: transforms.json (OpenGL camera-to-world, world z up), images/<stem>.png, masks/<stem>.png (ids; degraded
+    for train views, none for dropped ones, exact for test views), classes.json, seed_points.ply, and under
+    ground_truth/ the exact masks/<stem>.png, silhouettes/<object>/<stem>.png (0 or 255) and depth/<stem>.npy (float32,
+    z along the optical axis); masks and depth are those of the pixel centres. sample.json is the config.
+
+    All is written into a temporary folder beside it and renamed at the end: an interrupted run leaves no ``folder``.
+    A folder that holds another sample is replaced.
+    progress: called as ``progress(done, total)`` after each view.
+    Raises ``UserError`` for a bad config, or if ``folder`` holds something that is no sample.
+    """
+    config = config or SampleConfig()
+    config.check()
+    target = Path(folder).absolute()
+    if is_sample(target, config):
+        return target
+    old = target.exists()
+    if old and (not target.is_dir() or (any(target.iterdir()) and not (target / SAMPLE_FILE).is_file())):
+        raise UserError(f"{target} exists and is no sample scene: choose another folder or empty it.")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=f".{target.name}.partial-", dir=target.parent))
+    except OSError as error:
+        raise UserError(f"{target} cannot be written ({error.strerror}): choose another folder.") from error
+    try:
+        built = partial / "new"
+        _build(built, config, progress)
+        if old:
+            target.rename(partial / "old")
+        built.rename(target)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return target
+
+
+def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], None] | None) -> None:
+    still = make_still(config.seed)
+    light = Light(still)
+    views = make_views(config.seed, config.width, config.height, config.num_train, config.num_test)
+    degradation = resolve_degradation(config.degradation)
+    train = [view.name for view in views if view.split == "train"]
+    dropped = dropped_views(train, config.seed, degradation.dropped)
+    shares = dict(zip(train, _even_shares(config.num_points, len(train)), strict=True))
+    names = still.class_names
+    for sub in ("images", "masks", *_truth_folders(names)):
+        (folder / sub).mkdir(parents=True)
+    points = []
+    for done, view in enumerate(views, start=1):
+        picture = render_view(still, light, view, config.antialias)
+        _write_truth(folder, view, picture, names)
+        _write_png(folder / "images" / f"{view.name}.png", picture.image)
+        mask = picture.labels
+        if view.split == "train":
+            mask = degrade_mask(mask, len(names), degradation, config.seed, view.name)
+            # One generator per view, so that no view's points depend on another's picture.
+            generator = np.random.default_rng([config.seed, 6, done])
+            points.append(seed_points(view, picture, shares[view.name], POINT_NOISE, generator))
+        if view.name not in dropped:
+            _write_png(folder / "masks" / f"{view.name}.png", mask)
+        if progress is not None:
+            progress(done, len(views))
+    write_ply(folder / "seed_points.ply", np.concatenate(points))
+    _write_json(folder / "classes.json", {str(i): name for i, name in names.items()})
+    _write_json(folder / "transforms.json", transforms(views))
+    _write_json(folder / SAMPLE_FILE, config.as_dict())
+
+
+def transforms(views: list[View]) -> dict[str, Any]:
+    """nerfstudio's transforms.json: one lens, frames sorted by name, and which of them are for training."""
+    lens = views[0]
+
+    def of(split: str) -> list[str]:
+        return [f"images/{view.name}.png" for view in views if view.split == split]
+
+    return {
+        "camera_model": "OPENCV",
+        "fl_x": lens.focal,
+        "fl_y": lens.focal,
+        "cx": lens.cx,
+        "cy": lens.cy,
+        "w": lens.width,
+        "h": lens.height,
+        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
+        "ply_file_path": "seed_points.ply",
+        "train_filenames": of("train"),
+        # nerfstudio asks for "val" while training and refuses a file that names some splits but not that one.
+        "val_filenames": of("test"),
+        "test_filenames": of("test"),
+        "frames": [
+            {"file_path": f"images/{view.name}.png", "transform_matrix": view.camera_to_world.tolist()}
+            for view in views
+        ],
+    }
+
+
+def _even_shares(total: int, parts: int) -> list[int]:
+    return [total * (i + 1) // parts - total * i // parts for i in range(parts)]
+
+
+def _truth_folders(names: dict[int, str]) -> list[str]:
+    objects = [f"ground_truth/silhouettes/{name}" for class_id, name in names.items() if class_id]
+    return ["ground_truth/masks", "ground_truth/depth", *objects]
+
+
+def _write_truth(folder: Path, view: View, picture: Picture, names: dict[int, str]) -> None:
+    truth = folder / "ground_truth"
+    _write_png(truth / "masks" / f"{view.name}.png", picture.labels)
+    np.save(truth / "depth" / f"{view.name}.npy", picture.depth)
+    for class_id, silhouette in enumerate(picture.silhouettes, start=1):
+        _write_png(truth / "silhouettes" / names[class_id] / f"{view.name}.png", np.uint8(255) * silhouette)
+
+
+def _write_png(path: Path, pixels: np.ndarray) -> None:
+    """[H, W] uint8 grey or [H, W, 3] uint8 RGB."""
+    from PIL import Image
+
+    Image.fromarray(pixels).save(path)
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,101 @@
+"""Small scenes that every rasterizer is tested on; they cross tiles and blocks, with an off-centre principal point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.rasterizers.interface import IGNORE, RasterSettings, SurfelInputs
+
+FLOATS = ("means", "quats", "log_scales", "opacity_logits", "colors")
+CLASSES = 4
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What ``Rasterizer.rasterize`` takes."""
+
+    inputs: SurfelInputs
+    camera: Camera
+    settings: RasterSettings
+    background: Tensor
+    target: Tensor
+
+    def to(self, dtype: torch.dtype) -> Scene:
+        """The same scene in another precision."""
+        floats = {name: getattr(self.inputs, name).to(dtype) for name in FLOATS}
+        return replace(
+            self, inputs=replace(self.inputs, **floats), camera=self.camera.to(dtype), background=self.background.to(dtype)
+        )
+
+    def draw(self, rasterizer, **changes):
+        """Draw, with some of the inputs replaced (``background`` among them)."""
+        background = changes.pop("background", self.background)
+        return rasterizer.rasterize(replace(self.inputs, **changes), self.camera, self.settings, background, self.target)
+
+
+def make_scene(
+    count: int = 40, width: int = 37, height: int = 29, seed: int = 0, opacity: float = 0.0, size: float = -1.4
+) -> Scene:
+    """Random surfels in float64 in front of an odd-sized camera: three tiles by two."""
+    g = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+    inputs = SurfelInputs(
+        means=normal(count, 3) * torch.tensor([1.1, 0.8, 0.6], dtype=torch.float64) + torch.tensor([0.1, 0.0, 4.0]),
+        quats=normal(count, 4),
+        log_scales=size + 0.4 * normal(count, 2),
+        opacity_logits=opacity + normal(count),
+        colors=torch.rand(count, 3, generator=g, dtype=torch.float64),
+        class_ids=torch.randint(0, CLASSES, (count,), generator=g, dtype=torch.int32),
+    )
+    angle = torch.tensor(0.2, dtype=torch.float64)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[0, 0] = viewmat[2, 2] = torch.cos(angle)
+    viewmat[0, 2], viewmat[2, 0] = torch.sin(angle), -torch.sin(angle)
+    viewmat[:3, 3] = torch.tensor([-0.6, 0.05, 0.3])
+    K = torch.tensor([[41.0, 0.0, 15.3], [0.0, 43.0, 16.2], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    target = torch.randint(0, CLASSES, (height, width), generator=g, dtype=torch.int32)
+    target[::5, ::3] = IGNORE
+    return Scene(
+        inputs,
+        Camera(viewmat, K, width, height),
+        RasterSettings(near=0.2, far=50.0, distortion=True),
+        torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64),
+        target,
+    )
+
+
+def opaque_layers() -> Scene:
+    """Many opaque surfels behind one another: compositing stops early."""
+    return make_scene(count=150, seed=5, opacity=4.0, size=-0.9)
+
+
+def awkward() -> Scene:
+    """Surfels edge-on, crossing the camera plane, beside and behind the camera, tiny and huge."""
+    scene = make_scene(count=24, seed=7)
+    means, quats, log_scales = (getattr(scene.inputs, name).clone() for name in ("means", "quats", "log_scales"))
+    turned = torch.tensor([0.70710678, 0.0, 0.70710678, 0.0], dtype=torch.float64)
+    quats[0] = turned  # nearly edge-on
+    quats[1] = turned + 1e-6
+    means[2], log_scales[2], quats[2] = torch.tensor([0.3, 0.2, 0.6]), torch.tensor([0.7, 0.7]), turned
+    means[3] = torch.tensor([0.0, 0.0, -2.0])
+    log_scales[4] = torch.tensor([-12.0, -12.0])
+    log_scales[5] = torch.tensor([2.0, -6.0])
+    return replace(scene, inputs=replace(scene.inputs, means=means, quats=quats, log_scales=log_scales))
+
+
+def empty() -> Scene:
+    """No surfel at all."""
+    scene = make_scene()
+    floats = {name: getattr(scene.inputs, name)[:0] for name in FLOATS}
+    return replace(scene, inputs=replace(scene.inputs, **floats, class_ids=scene.inputs.class_ids[:0]))
+
+
+SCENES = {"small": make_scene, "opaque": opaque_layers, "awkward": awkward, "empty": empty}
+OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion", "boundary")

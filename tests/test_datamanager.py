@@ -1,0 +1,192 @@
+from __future__ import annotations
+
+import random
+
+import numpy as np
+import pytest
+import torch
+from data_folders import CX, CY, FX, FY, HEIGHT, WIDTH, noise, write_image, write_transforms
+
+from beags_plugin.plugin.datamanager import BeagsDataManager, BeagsDataManagerConfig
+from beags_plugin.plugin.dataparser import BeagsDataParserConfig
+from beags_plugin.rasterizers.interface import IGNORE
+
+LARGE_W, LARGE_H = 160, 120
+LENS = dict(w=LARGE_W, h=LARGE_H, fl_x=110.0, fl_y=118.0, cx=71.5, cy=66.25)
+BROWN = dict(k1=-0.22, k2=0.05, p1=0.01, p2=-0.008)
+FISHEYE = dict(k1=-0.03, k2=0.01, k3=0.002, k4=-0.004)
+
+
+def manager(root, parser=(), **options) -> BeagsDataManager:
+    config = BeagsDataManagerConfig(dataparser=BeagsDataParserConfig(data=root, **dict(parser)), **options)
+    return config.setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
+
+
+def distort(model: str, x: float, y: float) -> tuple[float, float]:
+    """Pixel (centres at + 0.5) of the ray (x, y, 1) in the distorted image, from the lens models' formulas."""
+    r2 = x * x + y * y
+    if model == "OPENCV":
+        k1, k2, p1, p2 = BROWN.values()
+        radial = 1 + k1 * r2 + k2 * r2 * r2
+        u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    else:
+        theta = np.arctan(np.sqrt(r2))
+        powers = [theta ** (2 * i) for i in range(5)]
+        coefficients = [1.0, *(FISHEYE.values() if model == "OPENCV_FISHEYE" else (0,) * 4)]
+        scale = theta * np.dot(coefficients, powers) / np.sqrt(r2)
+        u, v = x * scale, y * scale
+    return LENS["fl_x"] * u + LENS["cx"], LENS["fl_y"] * v + LENS["cy"]
+
+
+def write_distorted(root, model: str, rays) -> np.ndarray:
+    """A scene whose view 1 shows a disc at each ray, drawn alike in the image and, with ids 1.., in the class map."""
+    lens = {"OPENCV": BROWN, "OPENCV_FISHEYE": FISHEYE, "equidistant": {}}[model]
+    kind = "OPENCV" if model == "OPENCV" else "OPENCV_FISHEYE"
+    write_transforms(root, **{**LENS, **lens, "camera_model": kind})
+    for index in range(9):
+        write_image(root / f"images/v{index:02d}.png", noise(index, LARGE_W, LARGE_H))
+    ids = np.zeros((LARGE_H, LARGE_W), np.uint8)
+    rows, columns = np.mgrid[:LARGE_H, :LARGE_W] + 0.5
+    for number, ray in enumerate(rays, 1):
+        u, v = distort(model, *ray)
+        ids[(columns - u) ** 2 + (rows - v) ** 2 < 6.0**2] = number
+    write_image(root / "masks/v01.png", ids)
+    write_image(root / "images/v01.png", np.repeat((ids > 0)[..., None] * np.uint8(255), 3, axis=2))
+    return ids
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE", "equidistant"])
+def test_class_map_is_undistorted_like_its_image(tmp_path, model):
+    rays = [(-0.45, -0.3), (0.1, 0.05), (0.42, -0.28), (-0.3, 0.3), (0.4, 0.22)]
+    distorted = write_distorted(tmp_path, model, rays)
+    view = manager(tmp_path).views("train")[0]
+    assert view.name == "v01" and view.labels is not None
+    assert view.image.shape[:2] == view.labels.shape == (view.camera.height, view.camera.width)
+
+    def differing(labels) -> float:
+        known = labels != IGNORE
+        return float((((labels > 0) & known) != (view.image[..., 0] > 0.5))[known].float().mean())
+
+    assert differing(view.labels) < 0.005  # the discs' rims, where the image is interpolated
+    assert differing(view.labels.roll(1, dims=1)) > 4 * differing(view.labels)
+    if view.labels.shape == distorted.shape:
+        assert differing(torch.from_numpy(distorted).int()) > 4 * differing(view.labels)
+
+    # The new pinhole camera sees each ray where its disc has gone (K's half pixels included).
+    rows, columns = torch.meshgrid(*(torch.arange(n) + 0.5 for n in view.labels.shape), indexing="ij")
+    for number, (x, y) in enumerate(rays, 1):
+        disc = view.labels == number
+        expected = view.camera.K @ torch.tensor([x, y, 1.0])
+        found = torch.stack([columns[disc].mean(), rows[disc].mean()])
+        # A disc's centroid moves a little under a lens that stretches its far side.
+        torch.testing.assert_close(found, expected[:2], atol=0.35, rtol=0)
+        weights = view.image[..., 0] * ((columns - found[0]).abs() < 12) * ((rows - found[1]).abs() < 12)
+        image_centre = torch.stack([(weights * columns).sum(), (weights * rows).sum()]) / weights.sum()
+        torch.testing.assert_close(found, image_centre, atol=0.1, rtol=0)
+
+
+def test_undistorted_cameras_stay_readable_by_the_viewer(tmp_path):
+    write_distorted(tmp_path, "OPENCV", [(0.1, 0.1)])
+    data = manager(tmp_path)
+    data.views("train")
+    assert data.train_dataset[0]["image"].shape == (LARGE_H, LARGE_W, 3)  # files keep their size
+
+
+def test_views_without_distortion_are_the_files(tmp_path):
+    write_transforms(tmp_path)
+    write_image(tmp_path / "masks/v02.png", np.full((HEIGHT, WIDTH), 3, np.uint8))
+    data = manager(tmp_path)
+    train, evaluation = data.views("train"), data.views("test")
+    assert [view.name for view in train] == [f"v{i:02d}" for i in range(1, 8)]
+    assert [view.name for view in evaluation] == ["v00", "v08"]
+    assert [view.labels is not None for view in train] == [False, True] + [False] * 5
+    assert train[1].labels.dtype == torch.int32 and (train[1].labels == 3).all()
+    np.testing.assert_allclose(train[2].image.numpy(), noise(3) / 255.0, atol=1e-6)
+    expected = [[FX, 0, CX], [0, FY, CY], [0, 0, 1]]
+    np.testing.assert_allclose(train[0].camera.K.numpy(), expected)
+    with pytest.raises(ValueError, match="unknown split"):
+        data.views("tests")
+
+
+@pytest.mark.parametrize("cache", ["cpu", "gpu"])
+@pytest.mark.parametrize("kind", ["uint8", "float32"])
+def test_batches_on_a_cpu(tmp_path, cache, kind):
+    write_transforms(tmp_path)
+    data = manager(tmp_path, cache_images=cache, cache_images_type=kind)
+    camera, batch = data.next_train(0)
+    assert batch["image"].dtype == getattr(torch, kind)
+    assert batch["class_map"].shape == (HEIGHT, WIDTH) and batch["class_map"].dtype == torch.uint16
+    assert camera.metadata["class_map"] is batch["class_map"] and "mask" not in batch
+    assert data.next_eval_image(0)[1]["class_map"].shape == (HEIGHT, WIDTH)
+    batches = data.fixed_indices_eval_dataloader
+    assert len(batches) == 2 and all("class_map" in batch for _, batch in batches)
+    assert data.views("train")[0].image.dtype == torch.float32 and data.views("train")[0].image.max() <= 1
+
+
+def test_order_of_views_follows_the_seed_alone(tmp_path):
+    write_transforms(tmp_path)
+
+    def orders(seed: int) -> tuple[list[int], list[int]]:
+        random.seed()  # whatever state others leave
+        data = manager(tmp_path, train_cameras_sampling_seed=seed)
+        state = random.getstate()
+        train = [data.next_train(step)[1]["image_idx"] for step in range(21)]
+        evaluation = [data.next_eval_image(step)[1]["image_idx"] for step in range(6)]
+        assert random.getstate() == state
+        return train, evaluation
+
+    first = orders(1)
+    assert orders(1) == first and orders(2) != first
+    assert all(sorted(first[0][i : i + 7]) == list(range(7)) for i in (0, 7, 14))
+
+
+def test_replaced_class_maps_reach_batches_and_views(tmp_path):
+    write_transforms(tmp_path)
+    write_image(tmp_path / "masks/v01.png", np.full((HEIGHT, WIDTH), 1, np.uint8))
+    data = manager(tmp_path)
+    new = [torch.full((HEIGHT, WIDTH), 5 + index, dtype=torch.int32) for index in range(7)]
+    data.replace_class_maps(new)
+    for step in range(7):
+        camera, batch = data.next_train(step)
+        assert (batch["class_map"].int() == 5 + batch["image_idx"]).all()
+        assert torch.equal(camera.metadata["class_map"], batch["class_map"])
+        assert (batch["original_class_map"].int() == (1 if batch["image_idx"] == 0 else IGNORE)).all()
+    assert all(torch.equal(view.labels, labels) for view, labels in zip(data.views("train"), new, strict=True))
+    originals = [view.labels for view in data.views("train", original=True)]
+    assert (originals[0] == 1).all() and originals[1:] == [None] * 6
+
+    new[0].fill_(9)  # the manager keeps its own copy
+    data.replace_class_maps([labels + 1 for labels in new])
+    assert (data.views("train", original=True)[0].labels == 1).all()
+    assert (data.views("train")[0].labels == 10).all()
+
+
+@pytest.mark.parametrize(
+    ("maps", "message"),
+    [
+        ([torch.zeros(HEIGHT, WIDTH)] * 6, "6 class maps for 7"),
+        ([torch.zeros(WIDTH, HEIGHT)] * 7, "for a view of"),
+        ([torch.full((HEIGHT, WIDTH), -1)] * 7, "must lie in"),
+    ],
+)
+def test_wrong_class_maps_are_refused(tmp_path, maps, message):
+    write_transforms(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        manager(tmp_path).replace_class_maps(maps)
+
+
+def test_paths_of_the_configuration_are_absolute(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_transforms(tmp_path / "scene")
+    config = BeagsDataManagerConfig()
+    config.data = "scene"
+    assert config.data == tmp_path / "scene"
+    config.setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
+    assert config.dataparser.data == tmp_path / "scene"
+
+
+def test_checkpoints_with_numpy_scalars_load(tmp_path):
+    state = {"lr": np.float64(0.25), "base": np.float32(0.5)}
+    torch.save(state, tmp_path / "state.ckpt")
+    assert torch.load(tmp_path / "state.ckpt", weights_only=True) == state

@@ -1,0 +1,166 @@
+"""The whole job through the command lines a user types: ns-train, ns-eval, beags extract, ns-export, ns-render."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("nerfstudio")
+plyfile = pytest.importorskip("plyfile")
+yaml = pytest.importorskip("yaml")
+
+from beags_plugin.sample.writer import SampleConfig, write_sample
+
+BIN = Path(sys.executable).parent
+
+
+def run(*command, **options):
+    environment = {**os.environ, "OMP_WAIT_POLICY": "PASSIVE", "COLUMNS": "200"}
+    done = subprocess.run(
+        [str(BIN / command[0]), *map(str, command[1:])],
+        capture_output=True, text=True, env=environment, timeout=900, **options,
+    )  # fmt: skip
+    return done.returncode, done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data") / "sample"
+    write_sample(folder, SampleConfig(seed=3, width=96, height=72, num_train=16, num_test=3))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(data, tmp_path_factory):
+    """A very short run of beags-tiny, both phases."""
+    folder = tmp_path_factory.mktemp("outputs") / "run"
+    code, text = run(
+        "ns-train", "beags-tiny", "--data", data, "--run-dir", folder, "--vis", "tensorboard",
+        "--pipeline.model.base-steps", 220, "--pipeline.model.refine-steps", 40, "--steps-per-save", 100,
+        "--pipeline.model.prepare.k", 200, "--steps-per-eval-image", 100,
+    )  # fmt: skip
+    assert code == 0, text[-4000:]
+    return folder, text
+
+
+def test_training_reports_what_it_found(trained):
+    folder, text = trained
+    for words in ("reprojection:", "assignment: Gaussians per class", "voxel size", "never seen"):
+        assert words in text
+    assert (folder / "config.yml").exists()
+    assert sorted(path.name for path in (folder / "nerfstudio_models").iterdir()) == ["step-000000259.ckpt"]
+    report = json.loads((folder / "prepared" / "report.json").read_text())
+    assert set(report["seconds"]) == {"reprojection", "assignment", "voxel grids"}
+
+
+def test_each_loss_has_its_own_curve(trained):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    folder, _ = trained
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    tags = events.Tags()["scalars"]
+    for name in ("photometric", "boundary", "occupancy"):
+        assert any(name in tag for tag in tags), tags
+    boundary = next(tag for tag in tags if "boundary" in tag)
+    assert all(event.step >= 220 for event in events.Scalars(boundary))
+    assert all(np.isfinite(event.value) for event in events.Scalars(boundary))
+
+
+def test_the_base_is_kept_apart_and_has_classes(trained):
+    from beags_plugin.plugin.extract import load_scene
+
+    folder, _ = trained
+    base, refined = load_scene(folder / "base" / "config.yml"), load_scene(folder / "config.yml")
+    assert base.state["gauss_params.means"].shape == refined.state["gauss_params.means"].shape
+    assert (base.state["class_ids"] == refined.state["class_ids"]).all()
+    assert not (base.state["gauss_params.means"] == refined.state["gauss_params.means"]).all()
+    assert len(base.classes) >= 6
+    assert (base.state["class_ids"] > 0).any()
+
+
+def test_ns_eval(trained, tmp_path):
+    folder, _ = trained
+    code, text = run("ns-eval", "--load-config", folder / "config.yml", "--output-path", tmp_path / "eval.json")
+    assert code == 0, text[-3000:]
+    assert json.loads((tmp_path / "eval.json").read_text())["results"]["psnr"] > 10
+
+
+@pytest.fixture(scope="module")
+def extracted(trained):
+    folder, _ = trained
+    code, text = run("beags", "extract", "--load-config", folder / "config.yml")
+    assert code == 0, text[-3000:]
+    return sorted(folder.glob("extracted/*/config.yml"))
+
+
+def test_extraction_writes_a_run_and_a_ply_per_object(trained, extracted):
+    from beags_plugin.plugin.extract import load_scene
+
+    folder, _ = trained
+    whole = load_scene(folder / "config.yml")
+    assert len(extracted) >= 5
+    for config in extracted:
+        scene = load_scene(config)
+        (index,) = scene.state["class_ids"].unique().tolist()
+        keep = whole.state["class_ids"] == index
+        assert (scene.state["gauss_params.quats"] == whole.state["gauss_params.quats"][keep]).all()
+        (ply,) = config.parent.glob("*.ply")
+        vertex = plyfile.PlyData.read(str(ply))["vertex"]
+        assert len(vertex) == int(keep.sum())
+        assert (np.asarray(vertex["class_id"]) == index).all()
+        assert {"scale_0", "scale_1", "scale_2"} <= {prop.name for prop in vertex.properties}
+
+
+def test_nerfstudio_commands_work_on_an_extracted_run(extracted, tmp_path):
+    config = extracted[0]
+    code, text = run("ns-export", "gaussian-splat", "--load-config", config, "--output-dir", tmp_path / "export")
+    assert code == 0, text[-3000:]
+    (ply,) = (tmp_path / "export").glob("*.ply")
+    assert len(plyfile.PlyData.read(str(ply))["vertex"]) > 0
+    code, text = run(
+        "ns-render", "dataset", "--load-config", config, "--output-path", tmp_path / "render",
+        "--rendered-output-names", "rgb", "--split", "test",
+    )  # fmt: skip
+    assert code == 0, text[-3000:]
+    assert len(list((tmp_path / "render").rglob("*.jpg"))) == 3
+
+
+def test_removing_an_object_keeps_the_rest(trained):
+    from beags_plugin.plugin.extract import extract_objects, load_scene
+
+    folder, _ = trained
+    whole = load_scene(folder / "config.yml")
+    name = whole.classes[1]
+    (rest,) = extract_objects(folder / "config.yml", [name], remove=True)
+    assert rest.gaussians == int((whole.state["class_ids"] != 1).sum())
+
+
+def test_mistakes_get_one_sentence(trained, tmp_path):
+    folder, _ = trained
+    for command, words in [
+        (("beags", "extract", "--load-config", tmp_path / "no.yml"), "cannot be read"),
+        (("beags", "extract", "--load-config", folder / "config.yml", "--object", "unicorn"), "unicorn"),
+        (("ns-train", "beags-refine", "--data", tmp_path, "--run-dir", tmp_path / "r"), "beags:"),
+    ]:
+        code, text = run(*command)
+        assert code == 2, text[-2000:]
+        assert words in text and "Traceback" not in text
+
+
+def test_refine_starts_from_a_base_run(trained, data, tmp_path):
+    folder, _ = trained
+    code, text = run(
+        "ns-train", "beags-refine", "--data", data, "--run-dir", tmp_path / "refined", "--vis", "tensorboard",
+        "--load-dir", folder / "base" / "nerfstudio_models", "--pipeline.model.refine-steps", 5,
+        "--pipeline.model.sh-degree", 1, "--pipeline.model.prepare.k", 200,
+    )  # fmt: skip
+    assert code == 0, text[-4000:]
+    assert "assignment: Gaussians per class" in text
+    assert (tmp_path / "refined" / "nerfstudio_models" / "step-000000004.ckpt").exists()

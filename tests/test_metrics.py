@@ -1,0 +1,155 @@
+"""Mask metrics against counts done by hand and by brute force."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from beags_plugin.evaluation.metrics import (
+    MaskMetrics,
+    MetricTable,
+    band_width,
+    boundary_band,
+    erode,
+    mask_metrics,
+    psnr,
+    resize_nearest,
+)
+
+
+def mask(*rows: str) -> np.ndarray:
+    return np.array([[c == "#" for c in row] for row in rows])
+
+
+def brute_erode(image: np.ndarray, times: int) -> np.ndarray:
+    """The definition, word for word: 3x3, repeated, False outside."""
+    for _ in range(times):
+        out = np.zeros_like(image)
+        for i in range(image.shape[0]):
+            for j in range(image.shape[1]):
+                out[i, j] = all(
+                    0 <= i + a < image.shape[0] and 0 <= j + b < image.shape[1] and image[i + a, j + b]
+                    for a in (-1, 0, 1)
+                    for b in (-1, 0, 1)
+                )
+        image = out
+    return image
+
+
+def test_hand_computed():
+    truth = mask("#####", "#####", "#####", "#####", "#####")
+    predicted = mask("#####", "#####", "#####", "#####", ".....")
+    # d = 1: the truth's band is all but the 3x3 middle (16 pixels), the prediction's all but a 2x3 one (20 - 6 = 14);
+    # they share the top row (5), rows 1 and 2 at both ends (4) and row 3 at both ends (2): 11 of 16 + 14 - 11 = 19.
+    found = mask_metrics(predicted, truth)
+    assert found == MaskMetrics(acc=20 / 25, iou=20 / 25, biou=11 / 19)
+
+
+def test_hand_computed_disjoint_and_partial():
+    truth = mask("##..", "##..", "....", "....")
+    predicted = mask(".##.", ".##.", "....", "....")
+    assert mask_metrics(predicted, truth) == MaskMetrics(acc=12 / 16, iou=2 / 6, biou=2 / 6)
+    assert mask_metrics(np.zeros_like(truth), truth) == MaskMetrics(acc=12 / 16, iou=0.0, biou=0.0)
+
+
+def test_perfect_and_empty():
+    truth = mask("....", ".##.", ".##.", "....")
+    empty = np.zeros_like(truth)
+    assert mask_metrics(truth, truth) == MaskMetrics(1.0, 1.0, 1.0)
+    assert mask_metrics(empty, empty) == MaskMetrics(1.0, 1.0, 1.0)
+    assert mask_metrics(truth, empty) == MaskMetrics(12 / 16, 0.0, 0.0)
+
+
+def test_ignored_pixels_leave_every_count():
+    truth = mask("##..", "##..", "....", "....")
+    predicted = mask("###.", "##..", "....", "...#")
+    ignore = mask("..#.", "....", "....", "...#")
+    assert mask_metrics(predicted, truth, ignore) == MaskMetrics(1.0, 1.0, 1.0)
+    assert mask_metrics(predicted, truth).iou == 4 / 6
+    everything = np.ones_like(truth)
+    assert mask_metrics(predicted, truth, everything) == MaskMetrics(1.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("times", [1, 2, 3])
+def test_erosion_and_band_match_brute_force(seed, times):
+    generator = np.random.default_rng(seed)
+    image = generator.random((17, 23)) < 0.97
+    image[:9, :12] = True  # touches the image border, where the outside erodes it
+    expected = brute_erode(image, times)
+    assert expected.any() and not expected.all()
+    assert np.array_equal(erode(image, times), expected)
+    assert np.array_equal(boundary_band(image, times), image & ~expected)
+
+
+def test_erosion_of_a_mask_smaller_than_the_window():
+    assert not erode(np.ones((3, 4), bool), 5).any()
+    assert np.array_equal(boundary_band(np.ones((3, 4), bool), 5), np.ones((3, 4), bool))
+
+
+def test_biou_matches_brute_force_on_a_larger_image():
+    generator = np.random.default_rng(7)
+    y, x = np.mgrid[:90, :120]
+    truth = (y - 45) ** 2 + (x - 60) ** 2 < 30**2
+    predicted = (y - 43) ** 2 + (x - 64) ** 2 < 28**2
+    predicted ^= generator.random(predicted.shape) < 0.001
+    assert band_width(90, 120) == 3  # 0.02 * 150
+    a, b = (m & ~brute_erode(m, 3) for m in (predicted, truth))
+    assert mask_metrics(predicted, truth).biou == (a & b).sum() / (a | b).sum()
+
+
+def test_band_width_is_at_least_one():
+    assert band_width(4, 4) == 1
+    assert band_width(240, 320) == 8
+    assert band_width(1080, 1920) == 44
+
+
+def test_resize_is_nearest_and_to_the_truth():
+    small = mask("#.", ".#")
+    assert np.array_equal(resize_nearest(small, 4, 6), np.kron(small, np.ones((2, 3), bool)))
+    assert np.array_equal(resize_nearest(np.kron(small, np.ones((2, 3), bool)), 2, 2), small)
+    truth = np.kron(small, np.ones((5, 5), bool))
+    assert mask_metrics(small, truth) == MaskMetrics(1.0, 1.0, 1.0)
+    # Centres of 3 pixels over 5: 0.83, 2.5, 4.17.
+    assert np.array_equal(resize_nearest(np.arange(5)[None], 1, 3), [[0, 2, 4]])
+
+
+def test_tensors_and_arrays_agree():
+    truth = mask("##..", "##..", "....", "....")
+    predicted = mask(".##.", ".##.", "....", "....")
+    assert mask_metrics(torch.from_numpy(predicted), torch.from_numpy(truth)) == mask_metrics(predicted, truth)
+
+
+def test_wrong_shapes_are_refused():
+    with pytest.raises(ValueError, match="ignore"):
+        mask_metrics(np.ones((2, 2), bool), np.ones((2, 2), bool), np.ones((3, 3), bool))
+    with pytest.raises(ValueError, match=r"\[H, W\]"):
+        mask_metrics(np.ones((2, 2, 1), bool), np.ones((2, 2), bool))
+    with pytest.raises(ValueError, match="compared"):
+        psnr(np.zeros((2, 2)), np.zeros((2, 3)))
+
+
+def test_psnr():
+    a = torch.zeros(4, 5, 3)
+    assert psnr(a, a) == math.inf
+    assert psnr(a, a + 0.1) == pytest.approx(20.0, abs=1e-5)
+    b = a.clone()
+    b[0, 0, 0] = 1.0
+    assert psnr(a, b) == pytest.approx(10 * math.log10(60))
+
+
+def test_table_weighs_objects_not_masks():
+    table = MetricTable()
+    table.add("cup", "a", MaskMetrics(1.0, 0.5, 0.2))
+    table.add("cup", "b", MaskMetrics(0.5, 0.7, 0.4))
+    table.add("ball", "a", MaskMetrics(0.25, 0.1, 0.0))
+    found = table.as_dict()
+    assert found["objects"]["cup"] == pytest.approx({"acc": 0.75, "iou": 0.6, "biou": 0.3, "masks": 2})
+    assert found["objects"]["ball"]["masks"] == 1
+    assert found["mean"] == pytest.approx({"acc": 0.5, "iou": 0.35, "biou": 0.15})
+    assert MetricTable().as_dict() == {"objects": {}}
+    with pytest.raises(ValueError, match="no metrics"):
+        MetricTable().mean()

@@ -1,0 +1,74 @@
+"""Presets: every file loads, every key is checked, and nerfstudio gets what it expects."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("nerfstudio")
+
+from beags_plugin.errors import UserError
+from beags_plugin.losses import LOSSES
+from beags_plugin.plugin import methods
+from beags_plugin.plugin.config import BeagsTrainerConfig, base_config
+from beags_plugin.plugin.presets import load_preset, override, preset_names
+from beags_plugin.refiners import REFINERS
+
+
+def write(folder, text):
+    (folder / "mine.toml").write_text(text)
+    return folder
+
+
+def test_the_four_presets_exist():
+    assert {"beags", "beags-base", "beags-refine", "beags-tiny"} <= set(preset_names())
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_every_preset_loads_and_names_itself(name):
+    spec = load_preset(name)
+    assert isinstance(spec.config, BeagsTrainerConfig)
+    assert spec.config.method_name == name
+    assert spec.description
+    model = spec.config.pipeline.model
+    assert set(model.losses) <= set(LOSSES.names())
+    assert model.refiner in REFINERS.names()
+    assert model.base_steps + model.refine_steps > 0
+    groups = {"means", "features_dc", "features_rest", "opacities", "scales", "quats"}
+    assert set(spec.config.optimizers) == groups
+
+
+def test_entry_points_give_the_presets():
+    assert methods.beags_tiny.config.method_name == "beags-tiny"
+    assert methods.beags.config.pipeline.model.base_steps == 30_000
+
+
+def test_presets_do_not_share_state():
+    first, second = load_preset("beags"), load_preset("beags")
+    first.config.pipeline.model.losses["boundary"].weight = 7.0
+    assert second.config.pipeline.model.losses["boundary"].weight == 0.5
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('description="x"\n[overrides]\n"pipeline.model.no_such" = 1', "no_such"),
+        ('description="x"\n[overrides]\n"pipeline.model.losses.nothing.weight" = 1.0', "nothing"),
+        ('description="x"\n[overrides]\n"pipeline.model.base_steps" = "many"', "must be int"),
+        ('description="x"\nextra=1', "unknown entries"),
+        ("description=", "cannot be read"),
+    ],
+)
+def test_a_wrong_preset_is_refused_in_one_sentence(tmp_path, text, words):
+    with pytest.raises(UserError, match=words):
+        load_preset("mine", write(tmp_path, text))
+
+
+def test_override_reaches_frozen_and_nested_configs(tmp_path):
+    config = base_config()
+    override(config, "pipeline.model.prepare.k", 50, tmp_path)
+    override(config, "pipeline.model.losses.boundary.weight", 1, tmp_path)
+    override(config, "optimizers.means.optimizer.lr", 0.5, tmp_path)
+    assert config.pipeline.model.prepare.k == 50
+    assert config.pipeline.model.losses["boundary"].weight == 1.0
+    assert config.optimizers["means"]["optimizer"].lr == 0.5
+    assert base_config().pipeline.model.prepare.k == 2000
