@@ -202,10 +202,13 @@ def test_the_table_shows_both_stages():
     from rich.console import Console
 
     out = io.StringIO()
-    print_table(report(), Console(file=out, width=160))
-    text = out.getvalue()
-    for part in ("cup", "80.0 → 90.0", "70.0 → 80.0", "– → –", "base 12.3", "812 MB", "silhouettes"):
-        assert part in text
+    print_table(report(), Console(file=out, width=80))
+    cells = [line.split() for line in out.getvalue().splitlines()]
+    assert ["cup", "assigned", "80.0", "70.0", "60.0", "80.0", "80.0", "80.0"] in cells
+    assert ["refined", "90.0", "80.0", "70.0", "90.0", "90.0", "90.0"] in cells
+    assert ["box", "assigned", *6 * ["–"]] in cells
+    for part in ("PSNR, dB: 30.00 → –", "base 12.3", "812 MB", "silhouettes"):
+        assert part in out.getvalue()
 
 
 def test_half_way_between_two_cameras():

@@ -86,21 +86,28 @@ def _finite(value: float | None) -> float | None:
 
 
 def render_table(report: RunReport) -> RenderableType:
-    """The report for a terminal: masks per object in percent, then PSNR, seconds and memory."""
+    """The report for a terminal: masks per object and stage in percent, then PSNR, seconds and memory."""
+    from rich.box import SIMPLE
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text
 
     summary = summary_json(report)
-    table = Table(title="Masks, % (assignment alone → after refinement)", title_justify="left")
+    stages = _STAGES if report.refined is not None else _STAGES[:1]
+    table = Table(
+        title="Masks, % (assigned: assignment alone; refined: after refinement)", title_justify="left", box=SIMPLE
+    )
     table.add_column("object")
+    table.add_column("stage")
     for kind in _KINDS:
-        for name in ("Acc", "IoU", "BIoU"):
-            table.add_column(f"{kind}\n{name}", justify="right")
-    for name, row in summary["objects"].items():
-        table.add_row(Text(name), *_cells(row))
-    table.add_section()
-    table.add_row("mean", *_cells(summary["mean"]), style="bold")
+        for title in (f"{kind}\nAcc", "\nIoU", "\nBIoU"):
+            table.add_column(title, justify="right")
+    for name, row in [*summary["objects"].items(), ("mean", summary["mean"])]:
+        for stage in stages:
+            title = Text(name) if stage == stages[0] else ""
+            figures = (row[kind][stage][metric] for kind in _KINDS for metric in _METRICS)
+            table.add_row(title, stage, *(_number(figure, 1, 100) for figure in figures))
+        table.add_section()
 
     psnr = summary["psnr"]
     lines = [f"PSNR, dB: {_number(psnr['before'], 2)} → {_number(psnr['after'], 2)}"]
@@ -113,16 +120,8 @@ def render_table(report: RunReport) -> RenderableType:
     return Group(table, *(Text(line) for line in lines))
 
 
-def _cells(row: dict[str, Any]) -> list[str]:
-    return [
-        " → ".join(_number(None if (value := row[kind][stage][name]) is None else 100 * value, 1) for stage in _STAGES)
-        for kind in _KINDS
-        for name in _METRICS
-    ]
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"
+def _number(value: float | None, digits: int, factor: float = 1.0) -> str:
+    return "–" if value is None else f"{factor * value:.{digits}f}"
 
 
 def print_table(report: RunReport, console: Console | None = None) -> None:

@@ -64,10 +64,12 @@ unsigned row_bits(Extent::Columns columns, int first) {
   return columns.first > columns.last || low > high ? 0u : ((2u << (high - low)) - 1u) << low;
 }
 
+// Adds the tiles that the surfel reaches; returns whether it is on the screen.
 template <class T>
-void reach(const View& view, const Splat<T>& splat, int32_t index, int tiles_x, std::vector<Reach>& out) {
+bool reach(const View& view, const Splat<T>& splat, int32_t index, std::vector<Reach>& out) {
   const Extent extent(view, splat);
-  if (extent.first_row() > extent.last_row()) return;
+  const int tiles_x = tiles_along(view.width);
+  if (extent.first_row() > extent.last_row()) return extent.on_screen();
   for (int tile_y = extent.first_row() / kTile; tile_y <= extent.last_row() / kTile; ++tile_y) {
     Extent::Columns columns[kGroup][2];
     int first = view.width, last = -1;
@@ -92,12 +94,13 @@ void reach(const View& view, const Splat<T>& splat, int32_t index, int tiles_x, 
       if (mask) out.push_back({tile_y * tiles_x + tile_x, index, static_cast<uint16_t>(mask)});
     }
   }
+  return extent.on_screen();
 }
 
 }  // namespace
 
 template <class T>
-Bins bin(const View& view, const Splat<T>* splats, std::vector<int32_t> drawn, int tiles_x, int tiles_y, int threads) {
+Bins bin(const View& view, const Splat<T>* splats, std::vector<int32_t> drawn, bool* visible, int threads) {
   Bins bins;
   sort_by_depth(splats, drawn);
   bins.order = std::move(drawn);
@@ -108,13 +111,14 @@ Bins bin(const View& view, const Splat<T>* splats, std::vector<int32_t> drawn, i
   for (int64_t chunk = 0; chunk < chunks; ++chunk) {
     for (int64_t rank = chunk * kChunk; rank < std::min(n, (chunk + 1) * kChunk); ++rank) {
       const size_t before = reached[chunk].size();
-      reach(view, splats[bins.order[rank]], bins.order[rank], tiles_x, reached[chunk]);
+      const int32_t index = bins.order[rank];
+      visible[index] = reach(view, splats[index], index, reached[chunk]);
       bins.record_start[rank + 1] = static_cast<int64_t>(reached[chunk].size() - before);
     }
   }
   for (int64_t rank = 0; rank < n; ++rank) bins.record_start[rank + 1] += bins.record_start[rank];
 
-  bins.tile_start.assign(static_cast<size_t>(tiles_x) * tiles_y + 1, 0);
+  bins.tile_start.assign(static_cast<size_t>(tiles_along(view.width)) * tiles_along(view.height) + 1, 0);
   for (const auto& chunk : reached) {
     for (const Reach& at : chunk) ++bins.tile_start[at.tile + 1];
   }
@@ -128,7 +132,7 @@ Bins bin(const View& view, const Splat<T>* splats, std::vector<int32_t> drawn, i
   return bins;
 }
 
-template Bins bin(const View&, const Splat<float>*, std::vector<int32_t>, int, int, int);
-template Bins bin(const View&, const Splat<double>*, std::vector<int32_t>, int, int, int);
+template Bins bin(const View&, const Splat<float>*, std::vector<int32_t>, bool*, int);
+template Bins bin(const View&, const Splat<double>*, std::vector<int32_t>, bool*, int);
 
 }  // namespace beags

@@ -15,9 +15,9 @@ struct Bins {
   std::vector<Pair> pairs;            // by tile, then by rank
 };
 
-// drawn: indices of the surfels that were not culled, rising.
+// drawn: indices of the surfels that were not culled, rising. visible: [N], set to true for those on the screen.
 // Determinism: the surfels are split in chunks of a fixed size, so nothing depends on the number of threads.
 template <class T>
-Bins bin(const View& view, const Splat<T>* splats, std::vector<int32_t> drawn, int tiles_x, int tiles_y, int threads);
+Bins bin(const View& view, const Splat<T>* splats, std::vector<int32_t> drawn, bool* visible, int threads);
 
 }  // namespace beags

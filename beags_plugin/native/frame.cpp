@@ -48,10 +48,10 @@ SurfelParameters parameters(const Inputs<T>& inputs, int64_t i) {
 // Rounds to T; false if that overflows.
 template <class T>
 bool narrow(const Splat<double>& from, int32_t class_id, Splat<T>& to) {
-  const double numbers[] = {from.cx,  from.cy, from.u_x,         from.u_y,    from.v_x,    from.v_y, from.w_x, from.w_y,
-                            from.w_0, from.det, from.z, from.log_opacity, from.tilt_u, from.tilt_v};
-  T* fields[] = {&to.cx,  &to.cy, &to.u_x,         &to.u_y,    &to.v_x,    &to.v_y, &to.w_x, &to.w_y,
-                 &to.w_0, &to.det, &to.z, &to.log_opacity, &to.tilt_u, &to.tilt_v};
+  const double numbers[] = {from.cx,  from.cy,  from.u_x, from.u_y, from.v_x,         from.v_y,    from.w_x,
+                            from.w_y, from.w_0, from.det, from.z,   from.log_opacity, from.tilt_u, from.tilt_v};
+  T* fields[] = {&to.cx,  &to.cy,  &to.u_x, &to.u_y, &to.v_x,         &to.v_y,    &to.w_x,
+                 &to.w_y, &to.w_0, &to.det, &to.z,   &to.log_opacity, &to.tilt_u, &to.tilt_v};
   bool finite = true;
   for (size_t i = 0; i < sizeof numbers / sizeof *numbers; ++i) {
     *fields[i] = static_cast<T>(numbers[i]);
@@ -72,8 +72,8 @@ const char* instruction_set() { return use_avx2() ? "avx2" : "baseline"; }
 template <class T>
 Frame<T>::Frame(const View& view, const Inputs<T>& inputs, bool* visible, int threads)
     : view_(view),
-      tiles_x_((view.width + kTile - 1) / kTile),
-      tiles_y_((view.height + kTile - 1) / kTile),
+      tiles_x_(tiles_along(view.width)),
+      tiles_y_(tiles_along(view.height)),
       num_surfels_(inputs.count),
       splats_(new Splat<T>[inputs.count]) {
   std::vector<Fate> fates(inputs.count);
@@ -93,10 +93,7 @@ Frame<T>::Frame(const View& view, const Inputs<T>& inputs, bool* visible, int th
     if (fates[i] == Fate::kDrawn) drawn.push_back(static_cast<int32_t>(i));
     visible[i] = false;
   }
-  bins_ = bin(view_, splats_.get(), std::move(drawn), tiles_x_, tiles_y_, team);
-  for (size_t rank = 0; rank < bins_.order.size(); ++rank) {
-    visible[bins_.order[rank]] = bins_.record_start[rank + 1] > bins_.record_start[rank];
-  }
+  bins_ = bin(view_, splats_.get(), std::move(drawn), visible, team);
 }
 
 template <class T>

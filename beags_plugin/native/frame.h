@@ -41,7 +41,7 @@ const char* instruction_set();
 template <class T>
 class Frame {
  public:
-  // visible: [N], set to whether a surfel reaches a tile.
+  // visible: [N], set to whether a surfel was drawn and its box touches the image.
   Frame(const View& view, const Inputs<T>& inputs, bool* visible, int threads);
 
   int64_t num_nonfinite() const { return num_nonfinite_; }
@@ -52,8 +52,8 @@ class Frame {
   // Keeps what `backward` needs. background: [3]; target: [height, width] or null.
   void forward(const Images<T>& images, const T* background, const int32_t* target, int threads);
   // Once after `forward`, with the same inputs and target.
-  void backward(const Inputs<T>& inputs, const int32_t* target, const ImageGradients<T>& from, const InputGradients<T>& to,
-                int threads);
+  void backward(const Inputs<T>& inputs, const int32_t* target, const ImageGradients<T>& from,
+                const InputGradients<T>& to, int threads);
 
   // labels: [height, width]; out: [N, num_classes], zero on entry; labels outside 0 .. num_classes - 1 do not count.
   void class_contributions(const int32_t* labels, int num_classes, T* out, int threads) const;

@@ -20,8 +20,8 @@ T* data(const Array<T>& array) {
   return array.is_valid() ? array.data() : nullptr;
 }
 
-View make_view(const Array<const double>& viewmat, const Array<const double>& k, int width, int height, double near_plane,
-               double far_plane) {
+View make_view(const Array<const double>& viewmat, const Array<const double>& k, int width, int height,
+               double near_plane, double far_plane) {
   View view{};
   for (int row = 0; row < 3; ++row) {
     for (int column = 0; column < 3; ++column) view.rotation[3 * row + column] = viewmat.data()[4 * row + column];
@@ -47,19 +47,24 @@ void bind(nb::module_& m, const char* name) {
              Array<const double> viewmat, Array<const double> k, int width, int height, double near_plane,
              double far_plane, Array<bool> visible, int threads) {
             const View view = make_view(viewmat, k, width, height, near_plane, far_plane);
-            const Inputs<T> inputs{static_cast<int64_t>(means.shape(0)), means.data(), quats.data(), log_scales.data(),
-                                   opacity_logits.data(), colors.data(), data(class_ids)};
+            const Inputs<T> inputs{static_cast<int64_t>(means.shape(0)),
+                                   means.data(),
+                                   quats.data(),
+                                   log_scales.data(),
+                                   opacity_logits.data(),
+                                   colors.data(),
+                                   data(class_ids)};
             nb::gil_scoped_release release;
             new (self) Frame<T>(view, inputs, visible.data(), threads);
           },
-          "means"_a, "quats"_a, "log_scales"_a, "opacity_logits"_a, "colors"_a, "class_ids"_a.none(), "viewmat"_a, "K"_a,
-          "width"_a, "height"_a, "near"_a, "far"_a, "visible"_a, "threads"_a)
+          "means"_a, "quats"_a, "log_scales"_a, "opacity_logits"_a, "colors"_a, "class_ids"_a.none(), "viewmat"_a,
+          "K"_a, "width"_a, "height"_a, "near"_a, "far"_a, "visible"_a, "threads"_a)
       .def_prop_ro("num_nonfinite", &Frame<T>::num_nonfinite)
       .def_prop_ro("num_pairs", &Frame<T>::num_pairs)
       .def(
           "forward",
-          [](Frame<T>& self, In background, Labels target, Out color, Out alpha, Out depth, Out median_depth, Out normal,
-             Out distortion, Out boundary, int threads) {
+          [](Frame<T>& self, In background, Labels target, Out color, Out alpha, Out depth, Out median_depth,
+             Out normal, Out distortion, Out boundary, int threads) {
             nb::gil_scoped_release release;
             self.forward({data(color), data(alpha), data(depth), data(median_depth), data(normal), data(distortion),
                           data(boundary)},
@@ -72,14 +77,19 @@ void bind(nb::module_& m, const char* name) {
           [](Frame<T>& self, In means, In quats, In log_scales, In opacity_logits, In colors, Labels target, In color,
              In alpha, In depth, In median_depth, In normal, In distortion, In boundary, Out g_means, Out g_quats,
              Out g_log_scales, Out g_opacity_logits, Out g_colors, Out g_background, int threads) {
-            const Inputs<T> inputs{static_cast<int64_t>(means.shape(0)), means.data(), quats.data(), log_scales.data(),
-                                   opacity_logits.data(), colors.data(), nullptr};
+            const Inputs<T> inputs{static_cast<int64_t>(means.shape(0)),
+                                   means.data(),
+                                   quats.data(),
+                                   log_scales.data(),
+                                   opacity_logits.data(),
+                                   colors.data(),
+                                   nullptr};
             nb::gil_scoped_release release;
             self.backward(inputs, data(target),
                           {data(color), data(alpha), data(depth), data(median_depth), data(normal), data(distortion),
                            data(boundary)},
-                          {g_means.data(), g_quats.data(), g_log_scales.data(), g_opacity_logits.data(), g_colors.data(),
-                           g_background.data()},
+                          {g_means.data(), g_quats.data(), g_log_scales.data(), g_opacity_logits.data(),
+                           g_colors.data(), g_background.data()},
                           threads);
           },
           "means"_a, "quats"_a, "log_scales"_a, "opacity_logits"_a, "colors"_a, "target"_a.none(), "color"_a.none(),

@@ -1,7 +1,7 @@
 // The products of one tile that need no gradient (sections 3 and 5). Included once for each instruction set.
 #pragma once
 
-#include "tiles.h"
+#include "composite.h"
 
 namespace beags {
 namespace BEAGS_ISA {
@@ -27,8 +27,8 @@ void class_contributions(const Job<T>& job, const Product<T>& product, int tile)
             });
 }
 
-// Each pixel's class: the largest sum of w; of equal ones the lowest. `product.sums` holds, for each class of the tile in
-// rising order, 256 pixels; `product.slots` maps a class to its place, `product.labels` a place to its class.
+// Each pixel's class: the largest sum of w; of equal ones the lowest. `product.sums` holds, for each class of the tile
+// in rising order, 256 pixels; `product.slots` maps a class to its place, `product.labels` a place to its class.
 template <class T>
 void class_map(const Job<T>& job, const Product<T>& product, int tile) {
   Real<T> transmittance[kTilePacks<T>];
@@ -74,11 +74,6 @@ void heaviest(const Job<T>& job, const Product<T>& product, int tile) {
     const int64_t k = pair[pack][lane];
     product.classes[at] = k < 0 ? -1 : job.pairs[job.tile_start[tile] + k].splat;
   });
-}
-
-template <class T>
-constexpr Kernels<T> kernels() {
-  return {forward<T>, backward<T>, class_contributions<T>, class_map<T>, heaviest<T>};
 }
 
 }  // namespace BEAGS_ISA

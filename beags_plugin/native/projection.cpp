@@ -28,13 +28,13 @@ bool finite(const SurfelParameters& s) {
 
 // The surfel in camera space (E1), its centre's depth divided out: a, b, p over p_z.
 struct Placement {
-  double length, unit[4];                    // of the quaternion
-  double axis_u[3], axis_v[3], axis_n[3];    // columns of R
+  double length, unit[4];                  // of the quaternion
+  double axis_u[3], axis_v[3], axis_n[3];  // columns of R
   double scale_u, scale_v;
   double z, a[3], b[3], p[3];
-  double cx, cy;                             // projected centre
-  double mu[2], mv[2];                       // first two columns of the recentred rows Mx, My; their third is 0
-  double normal[3], facing;                  // facing: +1 or -1, turns the normal towards the camera
+  double cx, cy;             // projected centre
+  double mu[2], mv[2];       // first two columns of the recentred rows Mx, My; their third is 0
+  double normal[3], facing;  // facing: +1 or -1, turns the normal towards the camera
 };
 
 void place(const View& view, const SurfelParameters& s, Placement& at) {
@@ -153,11 +153,10 @@ SurfelGradients project_backward(const View& view, const SurfelParameters& s, co
     v[i] *= at.scale_v;
   }
   const double w = at.unit[0], x = at.unit[1], y = at.unit[2], z = at.unit[3];
-  const double g_unit[4] = {
-      2 * (z * (u[1] - v[0]) + y * (n[0] - u[2]) + x * (v[2] - n[1])),
-      2 * (y * (u[1] + v[0]) + z * (u[2] + n[0]) + w * (v[2] - n[1]) - 2 * x * (v[1] + n[2])),
-      2 * (x * (u[1] + v[0]) + z * (v[2] + n[1]) + w * (n[0] - u[2]) - 2 * y * (u[0] + n[2])),
-      2 * (x * (u[2] + n[0]) + y * (v[2] + n[1]) + w * (u[1] - v[0]) - 2 * z * (u[0] + v[1]))};
+  const double g_unit[4] = {2 * (z * (u[1] - v[0]) + y * (n[0] - u[2]) + x * (v[2] - n[1])),
+                            2 * (y * (u[1] + v[0]) + z * (u[2] + n[0]) + w * (v[2] - n[1]) - 2 * x * (v[1] + n[2])),
+                            2 * (x * (u[1] + v[0]) + z * (v[2] + n[1]) + w * (n[0] - u[2]) - 2 * y * (u[0] + n[2])),
+                            2 * (x * (u[2] + n[0]) + y * (v[2] + n[1]) + w * (u[1] - v[0]) - 2 * z * (u[0] + v[1]))};
   const double along = at.unit[0] * g_unit[0] + dot(at.unit + 1, g_unit + 1);
   for (int i = 0; i < 4; ++i) out.quat[i] = (g_unit[i] - at.unit[i] * along) / at.length;
   out.opacity_logit = g[kLogOpacity] / (1.0 + std::exp(s.opacity_logit));  // d log sigmoid = 1 - sigmoid
@@ -178,6 +177,15 @@ Extent::Extent(const View& view, const Splat<T>& s) : width_(view.width), height
   everywhere_ = !(ww < -1e-3);
   first_row_ = 0;
   last_row_ = height_ - 1;
+  if (!(ww < 0)) return;
+  const double half_x = std::sqrt(std::max(0.0, xw * xw - xx * ww)) / -ww;
+  const double half_y = std::sqrt(std::max(0.0, yw * yw - yy * ww)) / -ww;
+  left_ = xw / ww - half_x;
+  right_ = xw / ww + half_x;
+  top_ = yw / ww - half_y;
+  bottom_ = yw / ww + half_y;
+  on_screen_ = cx_ + std::min(left_, -disc_) < width_ && cx_ + std::max(right_, disc_) > 0 &&
+               cy_ + std::min(top_, -disc_) < height_ && cy_ + std::max(bottom_, disc_) > 0;
   if (everywhere_) return;
 
   a_ = static_cast<double>(s.u_x) * s.u_x + static_cast<double>(s.v_x) * s.v_x - r2 * s.w_x * s.w_x;
@@ -186,12 +194,6 @@ Extent::Extent(const View& view, const Splat<T>& s) : width_(view.width), height
   d_ = -r2 * s.w_x * s.w_0;
   e_ = -r2 * s.w_y * s.w_0;
   f_ = -r2 * s.w_0 * s.w_0;
-  const double half_x = std::sqrt(std::max(0.0, xw * xw - xx * ww)) / -ww;
-  const double half_y = std::sqrt(std::max(0.0, yw * yw - yy * ww)) / -ww;
-  left_ = xw / ww - half_x;
-  right_ = xw / ww + half_x;
-  top_ = yw / ww - half_y;
-  bottom_ = yw / ww + half_y;
   // The tangent x = right touches at the pole C* (1, 0, -right); likewise on the left.
   y_left_ = half_x > 0 ? (xy - left_ * yw) / (half_x * ww) : yw / ww;
   y_right_ = half_x > 0 ? (xy - right_ * yw) / (-half_x * ww) : yw / ww;

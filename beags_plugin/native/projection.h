@@ -7,10 +7,10 @@
 namespace beags {
 
 struct View {
-  double rotation[9];     // world to camera, row-major
+  double rotation[9];  // world to camera, row-major
   double translation[3];
-  double kx[3], ky[3];    // first two rows of K; the third is (0, 0, 1)
-  int width, height;      // pixels
+  double kx[3], ky[3];  // first two rows of K; the third is (0, 0, 1)
+  int width, height;    // pixels
   double near_plane, far_plane;
 };
 
@@ -36,6 +36,8 @@ class Extent {
   template <class T>
   Extent(const View& view, const Splat<T>& splat);
 
+  // Whether its box touches the image; a surfel may do so and yet reach no pixel's centre.
+  bool on_screen() const { return on_screen_; }
   // First and last row of pixels (inside the image; first > last: none).
   int first_row() const { return first_row_; }
   int last_row() const { return last_row_; }
@@ -51,8 +53,9 @@ class Extent {
   double edge(double y, double side) const;
 
   int width_, height_, first_row_, last_row_;
-  bool everywhere_;       // the surfel's disc crosses the camera plane
-  double cx_, cy_, disc_;  // pixels; the disc's radius
+  bool on_screen_ = true;
+  bool everywhere_;               // the surfel's disc crosses the camera plane
+  double cx_, cy_, disc_;         // pixels; the disc's radius
   double a_, b_, c_, d_, e_, f_;  // conic a x^2 + 2 b x y + c y^2 + 2 d x + 2 e y + f <= 0 around (cx, cy)
   double left_, right_, top_, bottom_, y_left_, y_right_;  // its box, and where it touches the box's sides
 };

@@ -65,7 +65,8 @@ BEAGS_INLINE bool any(M mask) {
 #endif
 }
 
-// e^x for -87 < x <= 0, to 2e-7 (lanes outside hold garbage): e^x = 2^i 2^f with |f| <= 1/2, and a minimax polynomial for 2^f.
+// e^x for -87 < x <= 0, to 2e-7 (lanes outside hold garbage): e^x = 2^i 2^f with |f| <= 1/2, and a minimax polynomial
+// for 2^f.
 BEAGS_INLINE Real<float> exponential(Real<float> x) {
   const Real<float> y = x * 1.44269504088896341f;
   const Real<float> shifted = y + 12582912.0f;  // 1.5 * 2^23: the lowest bits now hold y, rounded

@@ -1,6 +1,6 @@
 // The tile kernels for any processor.
 #define BEAGS_ISA baseline
-#include "products.h"
+#include "tiles.h"
 
 namespace beags {
 namespace BEAGS_ISA {

@@ -5,11 +5,12 @@
 
 namespace beags {
 
-constexpr int kTile = 16;                // pixels along a tile's side
-constexpr int kGroup = 4;                // pixels along a group's side; a tile has 4 x 4 groups, one mask bit each
+constexpr int kTile = 16;  // pixels along a tile's side
+constexpr int kGroup = 4;  // pixels along a group's side; a tile has 4 x 4 groups, one mask bit each
 constexpr int kTilePixels = kTile * kTile;
 constexpr int kGroupPixels = kGroup * kGroup;
-constexpr double kMinAlpha = 1.0 / 255.0;          // as in rasterizers/interface.py
+constexpr int tiles_along(int pixels) { return (pixels + kTile - 1) / kTile; }
+constexpr double kMinAlpha = 1.0 / 255.0;            // as in rasterizers/interface.py
 constexpr double kLogMinAlpha = -5.541263545158426;  // log(1 / 255)
 constexpr double kMaxAlpha = 0.99;
 constexpr double kMinTransmittance = 1e-4;
@@ -20,15 +21,15 @@ constexpr int kIgnore = 65535;
 //   q0 = u_x dx + u_y dy,  q1 = v_x dx + v_y dy,  q2 = w_x dx + w_y dy + w_0,  depth = det / q2.
 template <class T>
 struct Splat {
-  T cx, cy;            // c, pixels
+  T cx, cy;  // c, pixels
   T u_x, u_y, v_x, v_y;
   T w_x, w_y, w_0;
   T det;
-  T z;                 // depth of the centre, world units
+  T z;  // depth of the centre, world units
   T log_opacity;
-  T tilt_u, tilt_v;    // depth of t_u and t_v over the centre's: (a_z, b_z) / p_z
+  T tilt_u, tilt_v;  // depth of t_u and t_v over the centre's: (a_z, b_z) / p_z
   T color[3];
-  T normal[3];         // camera space, turned towards the camera
+  T normal[3];  // camera space, turned towards the camera
   int32_t class_id;
 };
 
@@ -41,10 +42,19 @@ struct Pair {
 
 // The sums over pixels that the backward keeps for each pair: the gradient towards the fields of a Splat.
 enum Record {
-  kQ0, kQ0x, kQ0y,  // sum of dL/dq0, and of that times dx and dy
-  kQ1, kQ1x, kQ1y,
-  kQ2, kQ2x, kQ2y,
-  kDet, kZ, kCx, kCy,  // kCx, kCy: through the low-pass disc only
+  kQ0,
+  kQ0x,
+  kQ0y,  // sum of dL/dq0, and of that times dx and dy
+  kQ1,
+  kQ1x,
+  kQ1y,
+  kQ2,
+  kQ2x,
+  kQ2y,
+  kDet,
+  kZ,
+  kCx,
+  kCy,  // kCx, kCy: through the low-pass disc only
   kLogOpacity,
   kColor,
   kNormal = kColor + 3,
@@ -69,14 +79,14 @@ struct Job {
   T *color, *alpha, *depth, *median_depth, *normal, *distortion_out, *boundary;
 
   T* end_transmittance;
-  int32_t* last;               // one past the last contributing pair, counted in the tile
-  int32_t* median_pair;        // the pair at which T passes 0.5, or -1
-  T *depth_sum;                // sum of w d
+  int32_t* last;                               // one past the last contributing pair, counted in the tile
+  int32_t* median_pair;                        // the pair at which T passes 0.5, or -1
+  T* depth_sum;                                // sum of w d
   T *first_inverse_depth, *moment1, *moment2;  // distortion: 1 / d of the first hit, sums of w m and w m^2 from there
 
   const T *g_color, *g_alpha, *g_depth, *g_median_depth, *g_normal, *g_distortion, *g_boundary;  // null: no gradient
-  T* records;       // [pairs, kRecordSize]
-  T* g_background;  // [tiles, 3]
+  T* records;                                                                                    // [pairs, kRecordSize]
+  T* g_background;                                                                               // [tiles, 3]
 };
 
 // The products without gradients (sections 3 and 5).

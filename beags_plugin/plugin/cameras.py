@@ -47,11 +47,21 @@ def downscaled_size(sizes: Tensor, factor: float) -> Tensor:
 
 def concatenate_cameras(parts: Sequence[Cameras]) -> Cameras:
     """One batch [N] from several one-dimensional batches."""
-    tensors = {
-        name: torch.cat([getattr(part, name) for part in parts])
-        for name in ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height", "distortion_params", "camera_type")
-    }
-    return Cameras(**tensors)
+
+    def joined(name: str) -> Tensor:
+        return torch.cat([getattr(part, name) for part in parts])
+
+    return Cameras(
+        camera_to_worlds=joined("camera_to_worlds"),
+        fx=joined("fx"),
+        fy=joined("fy"),
+        cx=joined("cx"),
+        cy=joined("cy"),
+        width=joined("width"),
+        height=joined("height"),
+        distortion_params=joined("distortion_params"),
+        camera_type=joined("camera_type"),
+    )
 
 
 def check_cameras(cameras: Cameras, images: Sequence[Path]) -> None:
@@ -69,6 +79,7 @@ def check_cameras(cameras: Cameras, images: Sequence[Path]) -> None:
             raise UserError(f"the pose of {path} is not a rotation and a translation: correct its transform_matrix.")
     fisheye = cameras.camera_type[:, 0] == CameraType.FISHEYE.value
     parameters = cameras.distortion_params
+    assert parameters is not None  # both of nerfstudio's parsers give them, zeros for no distortion
     if (parameters[~fisheye, 3] != 0).any():
         raise UserError(f"the cameras have k4 != 0, which cannot be undone: undistort {images[0].parent} first.")
     # nerfstudio takes all-zero parameters for "no distortion", which is wrong for an equidistant fisheye: it has to be

@@ -153,9 +153,9 @@ def undistort_class_map(class_map: np.ndarray, cameras: Cameras, index: int) -> 
 
     cameras: as they were before the images were undistorted. The nearest id is taken: ids never blend.
     """
-    parameters = cameras.distortion_params[index].double().numpy()
-    if not np.any(parameters):
+    if cameras.distortion_params is None or not cameras.distortion_params[index].any():
         return class_map
+    parameters = cameras.distortion_params[index].double().numpy()
     height, width = class_map.shape
     K = cameras.get_intrinsics_matrices()[index].double().numpy()
     K[:2, 2] -= 0.5  # OpenCV's pixel centres are at whole numbers
@@ -164,12 +164,16 @@ def undistort_class_map(class_map: np.ndarray, cameras: Cameras, index: int) -> 
         new_K = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
             K, coefficients, (width, height), np.eye(3), balance=0
         )
-        maps = cv2.fisheye.initUndistortRectifyMap(K, coefficients, np.eye(3), new_K, (width, height), cv2.CV_32FC1)
+        map_x, map_y = cv2.fisheye.initUndistortRectifyMap(
+            K, coefficients, np.eye(3), new_K, (width, height), cv2.CV_32FC1
+        )
         x, y, w, h = 0, 0, width, height
     else:
         k1, k2, k3, _, p1, p2 = parameters  # nerfstudio's order; OpenCV wants k1, k2, p1, p2, k3
         coefficients = np.array([k1, k2, p1, p2, k3])
         new_K, (x, y, w, h) = cv2.getOptimalNewCameraMatrix(K, coefficients, (width, height), 0)
-        maps = cv2.initUndistortRectifyMap(K, coefficients, None, new_K, (width, height), cv2.CV_32FC1)
-    straight = cv2.remap(class_map, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=IGNORE)
+        map_x, map_y = cv2.initUndistortRectifyMap(K, coefficients, np.eye(3), new_K, (width, height), cv2.CV_32FC1)
+    straight = cv2.remap(
+        class_map, map_x, map_y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=(IGNORE,)
+    )
     return np.ascontiguousarray(straight[y : y + h, x : x + w])

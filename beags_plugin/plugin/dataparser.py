@@ -263,17 +263,19 @@ class BeagsDataParser(DataParser):
 
     def _fit_cameras(self, scene: _Scene, sizes: Sequence[tuple[int, int]]) -> None:
         """Cameras of the size the images will have once loaded: that of the files, divided by the downscale factor."""
-        for path, (width, height), camera in zip(scene.images, sizes, scene.cameras, strict=True):
+        cameras = scene.cameras
+        camera_sizes = torch.cat([cameras.width, cameras.height], 1).tolist()
+        for path, (width, height), (camera_width, camera_height) in zip(scene.images, sizes, camera_sizes, strict=True):
             # A smaller copy of the images rounds each side by up to a pixel; more is another picture.
-            expected = width * int(camera.height) / int(camera.width)
+            expected = width * camera_height / camera_width
             if abs(expected - height) > 1.0 + expected / width:
                 raise UserError(
-                    f"the image {path} is {width}x{height} pixels but its camera is "
-                    f"{int(camera.width)}x{int(camera.height)}: use the images that the poses were made from."
+                    f"the image {path} is {width}x{height} pixels but its camera is {camera_width}x{camera_height}: "
+                    f"use the images that the poses were made from."
                 )
         actual = torch.tensor(sizes).to(torch.int64)
         size = downscaled_size(actual, self.config.downscale_factor)
-        resize_cameras(scene.cameras, size[:, :1], size[:, 1:])
+        resize_cameras(cameras, size[:, :1], size[:, 1:])
 
     def _views_of_split(self, scene: _Scene, split: str) -> list[int]:
         if split not in ("train", "val", "test"):

@@ -125,7 +125,11 @@ class BeagsModel(SplatfactoModel):
         metadata = self.kwargs.get("metadata") or {}
         self.classes: dict[int, str] = dict(metadata.get("classes") or {0: "background"})
         self.schedule = PhaseSchedule(self.config.base_steps, self.config.refine_steps)
-        self.losses = {name: spec.build(name, self.schedule) for name, spec in self.config.losses.items()}
+        self.losses = {
+            name: spec.build(name, self.schedule)
+            for name, spec in self.config.losses.items()
+            if spec.weight != 0.0 and (spec.phase != "refine" or self.schedule.refine_steps > 0)
+        }
         self.rasterizer: Rasterizer = make_rasterizer(self.config.rasterizer)
         self.grid: VisibilityGrid | None = None
         self.step = 0
@@ -161,8 +165,11 @@ class BeagsModel(SplatfactoModel):
             sh=sh,
         )
 
-    def set_surfels(self, surfels: Surfels) -> None:
-        """Replace all values in place, so that optimizers keep their parameters; N may change (classes are reset)."""
+    def replace_surfels(self, surfels: Surfels) -> None:
+        """Put new parameters in place of all, of any number; classes are reset.
+
+        New ones, since autograd still knows the size of those that the last step's graph holds.
+        """
         values = {
             "means": surfels.means,
             "features_dc": surfels.sh[:, 0],
@@ -172,12 +179,9 @@ class BeagsModel(SplatfactoModel):
             "quats": surfels.quats,
         }
         for name, value in values.items():
-            parameter = self.gauss_params[name]
-            parameter.data = value.detach().to(parameter).contiguous().clone()
-            parameter.grad = None
-        if self.class_ids.shape[0] != len(surfels):
-            self.class_ids = torch.zeros(len(surfels), dtype=torch.int32, device=self.device)
-            self.class_margin = torch.zeros(len(surfels), device=self.device)
+            self.gauss_params[name] = nn.Parameter(value.detach().to(self.device).contiguous())
+        self.class_ids = torch.zeros(len(surfels), dtype=torch.int32, device=self.device)
+        self.class_margin = torch.zeros(len(surfels), device=self.device)
 
     def load_state_dict(self, state: Mapping[str, Any], **kwargs) -> Any:
         """Load a checkpoint of any number of surfels; parameters are resized in place (optimizers hold them)."""
@@ -344,6 +348,8 @@ class BeagsModel(SplatfactoModel):
             images["class_map"] = outputs["class_map"]
         return metrics, images
 
-    def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
         """Schedules, densification and the switch to refinement: see ``plugin.training``."""
         return training_callbacks(self, training_callback_attributes)

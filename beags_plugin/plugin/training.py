@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from beags_plugin.core.densification import GradientStatistics, densify, reset_opacity, screen_gradient
@@ -93,9 +92,10 @@ class Densifier:
         generator = torch.Generator().manual_seed(model.seed * 1_000_003 + step)
         surfels = model.surfels().detach()
         edited = densify(surfels, self.statistics.mean(), float(model.extent), self.config, step, generator)
-        model.set_surfels(edited.surfels)
+        former = dict(model.gauss_params.items())
+        model.replace_surfels(edited.surfels)
         for name, optimizer in self.optimizers.items():
-            move_adam_state(optimizer, model.gauss_params[name], edited.source, edited.fresh)
+            move_adam_state(optimizer, former[name], model.gauss_params[name], edited.source, edited.fresh)
         self.statistics = GradientStatistics(model.num_points)
         model.drawn = None
 
@@ -105,22 +105,24 @@ class Densifier:
         parameter = model.gauss_params["opacities"]
         parameter.data = logits[:, None].contiguous()
         everyone = torch.arange(logits.shape[0])
-        move_adam_state(self.optimizers["opacities"], parameter, everyone, torch.ones_like(everyone, dtype=torch.bool))
+        start_anew = torch.ones_like(everyone, dtype=torch.bool)
+        move_adam_state(self.optimizers["opacities"], parameter, parameter, everyone, start_anew)
 
 
-def move_adam_state(optimizer: torch.optim.Optimizer, parameter: Tensor, source: Tensor, fresh: Tensor) -> None:
-    """Let Adam's moments follow their surfels.
+def move_adam_state(
+    optimizer: torch.optim.Optimizer, former: Tensor, parameter: Tensor, source: Tensor, fresh: Tensor
+) -> None:
+    """Let an optimizer go on with ``parameter`` in place of ``former``; Adam's moments follow their surfels.
 
     source: [M] int64, the former index of each surfel; fresh: [M] bool, new ones, whose moments start at 0.
     """
-    state = optimizer.state.get(parameter, {})
+    state = optimizer.state.pop(former, {})
     for name in ("exp_avg", "exp_avg_sq"):
         if name in state:
-            moved = state[name][source.to(state[name].device)].clone()
+            moved = state[name][source.to(state[name].device)]
             moved[fresh.to(moved.device)] = 0.0
             state[name] = moved
+    optimizer.state[parameter] = state
+    for group in optimizer.param_groups:
+        group["params"] = [parameter if held is former else held for held in group["params"]]
 
-
-def note(message: str) -> None:
-    """A line for the reader of the terminal."""
-    CONSOLE.print(message, highlight=False)

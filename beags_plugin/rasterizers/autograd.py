@@ -15,7 +15,7 @@ from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, Raster
 
 
 class Images(NamedTuple):
-    """The float images of ``RasterOutputs`` (same names, shapes and dtypes), or gradients towards them; None: absent."""
+    """The float images of ``RasterOutputs`` (names, shapes, dtypes), or gradients towards them; None: absent."""
 
     color: Tensor | None
     alpha: Tensor | None

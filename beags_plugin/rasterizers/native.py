@@ -31,9 +31,12 @@ def _load() -> tuple[ModuleType | None, str | None]:
     try:
         return import_module("beags_plugin._native"), None
     except ModuleNotFoundError:
-        return None, "the compiled module beags_plugin._native was not built; install a C++ compiler and reinstall beags."
+        return (
+            None,
+            "the compiled module beags_plugin._native was not built; install a C++ compiler and reinstall beags.",
+        )
     except ImportError as error:
-        return None, f"the compiled module beags_plugin._native does not load ({error}); reinstall beags."
+        return None, f"beags_plugin._native does not load ({error}); reinstall beags."
 
 
 def _threads() -> int:
@@ -97,7 +100,7 @@ class NativeRasterizer(KernelRasterizer):
         ids = inputs.class_ids
         if ids is None:
             raise ValueError("class_ids must be given for a class map")
-        if ids.numel() and not (0 <= int(ids.min()) and int(ids.max()) < num_classes):
+        if ids.numel() and not (int(ids.min()) >= 0 and int(ids.max()) < num_classes):
             raise ValueError(f"class_ids must lie in 0..{num_classes - 1}, not {int(ids.min())}..{int(ids.max())}")
         frame, _ = _frame(inputs, camera, settings)
         classes = torch.empty(camera.height, camera.width, dtype=torch.int32)
