@@ -63,19 +63,19 @@ if [ "$packages_now" != "$packages_before" ]; then
     pins=()
   fi
   rm -f "$env/.beags-packages" "$env/.beags-source"
-  pip install --quiet "${pins[@]}" scikit-build-core nanobind ninja 'setuptools<81'
-  if ! command -v cmake >/dev/null; then pip install --quiet cmake; fi
+  pip install -qq "${pins[@]}" scikit-build-core nanobind ninja 'setuptools<81'
+  if ! command -v cmake >/dev/null; then pip install -qq cmake; fi
   # The build tools are in the environment by now, so the build needs no isolated copy of them.
-  pip install --quiet --no-build-isolation "${pins[@]}" -e '.[dev]'
+  pip install -qq --no-build-isolation "${pins[@]}" -e '.[dev]'
   # nerfstudio brings plain opencv, which shares the folder cv2/ with contrib: the one written last wins.
   if ! contrib_works; then
-    pip install --quiet "${pins[@]}" --force-reinstall --no-deps "$opencv"
+    pip install -qq "${pins[@]}" --force-reinstall --no-deps "$opencv"
     contrib_works || fail "cv2.ximgproc.guidedFilter is missing after installing $opencv: delete $env and run make setup again."
   fi
   echo "$packages_now" >"$env/.beags-packages"
   echo "$source_now" >"$env/.beags-source"
 elif [ "$source_now" != "$source_before" ]; then
   rm -f "$env/.beags-source"
-  pip install --quiet --no-deps --no-build-isolation -e .
+  pip install -qq --no-deps --no-build-isolation -e .
   echo "$source_now" >"$env/.beags-source"
 fi

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -92,7 +93,7 @@ def read_ply(path: str | Path) -> tuple[Surfels, Tensor | None]:
     from plyfile import PlyData, PlyParseError
 
     try:
-        vertex = PlyData.read(str(path), mmap=False)["vertex"]
+        vertex = PlyData.read(BytesIO(Path(path).read_bytes()))["vertex"]
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror}): name an existing .ply file.") from error
     except (PlyParseError, KeyError, ValueError) as error:

@@ -10,8 +10,8 @@ constexpr int kGroup = 4;  // pixels along a group's side; a tile has 4 x 4 grou
 constexpr int kTilePixels = kTile * kTile;
 constexpr int kGroupPixels = kGroup * kGroup;
 constexpr int tiles_along(int pixels) { return (pixels + kTile - 1) / kTile; }
-constexpr double kMinAlpha = 1.0 / 255.0;            // as in rasterizers/interface.py
-constexpr double kLogMinAlpha = -5.541263545158426;  // log(1 / 255)
+constexpr double kLogMinAlpha =
+    -5.541263545158426;  // log(1 / 255); this and the next two as in rasterizers/interface.py
 constexpr double kMaxAlpha = 0.99;
 constexpr double kMinTransmittance = 1e-4;
 constexpr int kIgnore = 65535;
