@@ -1,4 +1,4 @@
-"""The 2D boundary loss: Gaussians must not be seen where the mask says another class (paper 3.3; E7)."""
+"""The 2D boundary loss: no Gaussian shows where the mask is of another class (method, section 4; paper 3.3; E7)."""
 
 from __future__ import annotations
 
@@ -8,18 +8,22 @@ from typing import ClassVar
 from torch import Tensor
 
 from beags_plugin.losses.base import Loss, LossInputs
+from beags_plugin.losses.reduction import ordered_sum
 from beags_plugin.rasterizers.interface import IGNORE
 
 
 @dataclass(frozen=True)
 class BoundaryLoss(Loss):
-    """Mean over labelled pixels of B(u) = sum_i w_i(u) [phi_i != M'(u)]; 0 if no pixel is labelled."""
+    """Mean over the labelled pixels of B(u) = sum_i w_i [phi_i != M'(u)]; 0 for a view without labels (E7)."""
 
     needs: ClassVar[frozenset[str]] = frozenset({"boundary"})
 
     weight: float = 0.5
 
     def value(self, inputs: LossInputs) -> Tensor:
-        assert inputs.render.boundary is not None and inputs.labels is not None
-        labelled = (inputs.labels != IGNORE).sum().clamp_min(1)  # no labelled pixel: B is 0 everywhere, and 0 / 1 = 0
-        return inputs.render.boundary.sum() / labelled  # B is 0 at IGNORE pixels already
+        if inputs.labels is None:
+            return inputs.render.color.new_zeros(())
+        if inputs.render.boundary is None:
+            raise ValueError("the boundary loss needs a render with a target")
+        labelled = int((inputs.labels != IGNORE).sum())
+        return ordered_sum(inputs.render.boundary) / max(labelled, 1)  # B is 0 at IGNORE

@@ -1,4 +1,4 @@
-"""Depth distortion: gathers the weights along a ray (2DGS paper, section 5)."""
+"""Depth distortion: the surfels along a ray draw together (method, section 1; E4)."""
 
 from __future__ import annotations
 
@@ -8,17 +8,19 @@ from typing import ClassVar
 from torch import Tensor
 
 from beags_plugin.losses.base import Loss, LossInputs
+from beags_plugin.losses.reduction import ordered_mean
 
 
 @dataclass(frozen=True)
 class DistortionLoss(Loss):
-    """Mean over pixels of the rendered distortion (E4)."""
+    """Mean over the pixels of sum_{j<i} w_i w_j (m_i - m_j)^2; off by default."""
 
     needs: ClassVar[frozenset[str]] = frozenset({"distortion"})
 
     weight: float = 0.0
-    start: int = 3_000
+    start: int = 3000
 
     def value(self, inputs: LossInputs) -> Tensor:
-        assert inputs.render.distortion is not None
-        return inputs.render.distortion.mean()
+        if inputs.render.distortion is None:
+            raise ValueError("the distortion loss needs a render with distortion")
+        return ordered_mean(inputs.render.distortion)

@@ -1,4 +1,4 @@
-"""Normal consistency: surfels lie in the surface that their own depth describes (2DGS paper, section 5)."""
+"""Normal consistency: the drawn normals agree with the slope of the drawn depth (method, section 1)."""
 
 from __future__ import annotations
 
@@ -9,41 +9,56 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.lifting import pixel_rays
 from beags_plugin.losses.base import Loss, LossInputs
-
-FLAT = 1e-20  # added under the root: a depth image without slope (nothing drawn) has no normal, and 0 no derivative
-
-
-def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
-    """Normals of a depth image by central differences of the back-projected points.
-
-    depth: [H, W] world units. Returns [H - 2, W - 2, 3] in camera space, unit length, towards the camera; 0 where the
-    depth gives no surface. The border, which lacks neighbours, is left out.
-    """
-    height, width = depth.shape
-    x = (torch.arange(width, dtype=depth.dtype, device=depth.device) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
-    y = (torch.arange(height, dtype=depth.dtype, device=depth.device) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
-    points = torch.stack([depth * x, depth * y[:, None], depth], dim=-1)
-    right = points[1:-1, 2:] - points[1:-1, :-2]
-    down = points[2:, 1:-1] - points[:-2, 1:-1]
-    # y down x x right points to -z, which is towards the camera
-    normal = torch.linalg.cross(down, right, dim=-1)
-    return normal / (normal.square().sum(dim=-1, keepdim=True) + FLAT).sqrt()
+from beags_plugin.losses.reduction import ordered_sum
 
 
 @dataclass(frozen=True)
 class NormalConsistencyLoss(Loss):
-    """Mean over inner pixels of sum_i w_i (1 - n_i . n_depth); n_depth is weighted by the (constant) alpha as well."""
+    """Mean over the inner pixels of A (1 - n . n_depth), with A held constant.
+
+    n is the drawn normal sum w n (not normalised) in camera space. The 2DGS paper has sum w (1 - n . n_depth); holding
+    A constant, as its authors' program does, keeps the term from thinning out surfaces just to lower the loss. Pixels
+    at the border, and those that lack depth themselves or at one of their four neighbours, count as 0.
+    """
 
     needs: ClassVar[frozenset[str]] = frozenset({"geometry"})
 
     weight: float = 0.05
-    start: int = 7_000
+    start: int = 7000
 
     def value(self, inputs: LossInputs) -> Tensor:
         render = inputs.render
-        assert render.depth is not None and render.normal is not None
-        alpha = render.alpha[1:-1, 1:-1].detach()
-        expected = depth_normals(render.depth, inputs.camera) * alpha[..., None]
-        agreement = (render.normal[1:-1, 1:-1] * expected).sum(dim=-1)
-        return (1.0 - agreement).mean()
+        if render.depth is None or render.normal is None:
+            raise ValueError("the normal loss needs a render with geometry")
+        slope, known = depth_normals(render.depth, inputs.camera)
+        error = 1.0 - (render.normal[1:-1, 1:-1] * slope).sum(-1)
+        error = torch.where(known, render.alpha.detach()[1:-1, 1:-1] * error, 0.0)
+        return ordered_sum(error) / max(error.numel(), 1)
+
+
+def depth_normals(depth: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Normals of a depth image, from central differences of the points under the pixel centres.
+
+    depth: [H, W] float, along z, 0 where unknown. Returns (normals [H-2, W-2, 3], of unit length, camera space, turned
+    towards the camera; known [H-2, W-2] bool). Gradients are finite everywhere; where unknown, the normal is constant.
+    """
+    points = depth[..., None] * pixel_rays(camera, depth)
+    inner = points[1:-1, 1:-1]
+    scale = depth.detach()[1:-1, 1:-1, None]
+    seen = depth > 0
+    known = seen[1:-1, 1:-1] & seen[1:-1, 2:] & seen[1:-1, :-2] & seen[2:, 1:-1] & seen[:-2, 1:-1]
+    # Dividing by the depth makes the product independent of the scene's scale; the direction stays the same.
+    scale = torch.where(known[..., None], scale, 1.0)
+    across = (points[1:-1, 2:] - points[1:-1, :-2]) / scale
+    down = (points[2:, 1:-1] - points[:-2, 1:-1]) / scale
+    normal = torch.linalg.cross(down, across)
+    normal = torch.where((normal * inner).sum(-1, keepdim=True) > 0, -normal, normal)
+    squared = (normal * normal).sum(-1)
+    known = known & (squared.detach() > torch.finfo(depth.dtype).tiny)
+    # Where unknown, a constant takes the place before the root, whose gradient at 0 is not finite.
+    towards = torch.tensor([0.0, 0.0, -1.0], dtype=depth.dtype, device=depth.device)
+    normal = torch.where(known[..., None], normal, towards)
+    length = torch.where(known, squared, 1.0).sqrt()
+    return normal / length[..., None], known

@@ -1,29 +1,114 @@
-"""0.8 L1 + 0.2 (1 - SSIM)."""
+"""The image loss of the base training: (1 - w) L1 + w (1 - SSIM), w = 0.2 (method, section 1)."""
+
 from __future__ import annotations
+
 from dataclasses import dataclass
+from functools import lru_cache
+
 import torch
 from torch import Tensor
+
 from beags_plugin.losses.base import Loss, LossInputs
+from beags_plugin.losses.reduction import ordered_mean
 
-
-def ssim(a: Tensor, b: Tensor) -> Tensor:
-    x = torch.arange(11, dtype=a.dtype) - 5
-    w = torch.exp(-x * x / 4.5)
-    w = w / w.sum()
-    def blur(i):
-        c = i.shape[1]
-        i = torch.nn.functional.conv2d(i, w.view(1, 1, 1, 11).expand(c, 1, 1, 11), padding=(0, 5), groups=c)
-        return torch.nn.functional.conv2d(i, w.view(1, 1, 11, 1).expand(c, 1, 11, 1), padding=(5, 0), groups=c)
-    a, b = a.permute(2, 0, 1)[None], b.permute(2, 0, 1)[None]
-    ma, mb, aa, bb, ab = blur(torch.cat([a, b, a * a, b * b, a * b], 1)).chunk(5, 1)
-    va, vb, cov = aa - ma * ma, bb - mb * mb, ab - ma * mb
-    return (((2 * ma * mb + 1e-4) * (2 * cov + 9e-4)) / ((ma * ma + mb * mb + 1e-4) * (va + vb + 9e-4))).mean()
+WINDOW = 11
+SIGMA = 1.5
+_REACH = WINDOW // 2
+_C1, _C2 = 0.01**2, 0.03**2  # the constants of SSIM for values in 0..1; they keep flat regions from dividing by 0
+_BLOCK = 32  # pixels filtered by one small matrix product; measured best of 16, 32, 64
 
 
 @dataclass(frozen=True)
 class PhotometricLoss(Loss):
+    """(1 - ssim_weight) L1 + ssim_weight (1 - SSIM) between the drawn image and the photograph."""
+
     ssim_weight: float = 0.2
 
     def value(self, inputs: LossInputs) -> Tensor:
-        l1 = (inputs.render.color - inputs.image).abs().mean()
-        return (1 - self.ssim_weight) * l1 + self.ssim_weight * (1 - ssim(inputs.render.color, inputs.image))
+        drawn, photo = inputs.render.color, inputs.image.to(inputs.render.color)
+        absolute = ordered_mean((drawn - photo).abs())
+        if self.ssim_weight == 0.0:
+            return absolute
+        return (1.0 - self.ssim_weight) * absolute + self.ssim_weight * (1.0 - ssim(drawn, photo))
+
+
+def ssim(image: Tensor, reference: Tensor) -> Tensor:
+    """Mean structural similarity: Gaussian window of 11 pixels, sigma 1.5, zeros outside the image as in 3DGS.
+
+    image, reference: [H, W, C] float of one dtype, in 0..1. Returns a scalar in -1..1; its gradient goes to ``image``
+    only. Raises ``ValueError`` if the shapes differ or ``reference`` wants a gradient.
+    """
+    if image.ndim != 3 or image.shape != reference.shape:
+        raise ValueError(f"two images [H, W, C] are needed, not {list(image.shape)} and {list(reference.shape)}")
+    if reference.requires_grad:
+        raise ValueError("the reference gets no gradient: detach it, or swap the two images")
+    return _Ssim.apply(image, reference)
+
+
+class _Ssim(torch.autograd.Function):
+    """SSIM with its gradient in closed form: three blurs in the backward instead of what autograd would keep."""
+
+    @staticmethod
+    def forward(ctx, image: Tensor, reference: Tensor) -> Tensor:
+        x = image.permute(2, 0, 1).contiguous()
+        y = reference.permute(2, 0, 1).contiguous()
+        # Only the sum of the two variances is needed, so four blurs do for the usual five.
+        m_x, m_y, squares, product = blur(torch.cat([x, y, x * x + y * y, x * y])).chunk(4)
+        m_xx_yy, m_xy = m_x * m_x + m_y * m_y, m_x * m_y
+        a1, a2 = 2 * m_xy + _C1, 2 * (product - m_xy) + _C2
+        b1, b2 = m_xx_yy + _C1, squares - m_xx_yy + _C2
+        inverse = 1.0 / (b1 * b2)
+        index = a1 * a2 * inverse
+        if ctx.needs_input_grad[0]:
+            d_product = 2 * a1 * inverse
+            d_squares = -index / b2
+            d_mean = 2 * (m_y * (a2 - a1) + m_x * index * (b1 - b2)) * inverse
+            # A symmetric window with zeros outside is its own adjoint.
+            g_mean, g_squares, g_product = blur(torch.cat([d_mean, d_squares, d_product])).chunk(3)
+            gradient = (g_mean + 2 * x * g_squares + y * g_product) / image.numel()
+            ctx.save_for_backward(gradient.permute(1, 2, 0))
+        return ordered_mean(index)
+
+    @staticmethod
+    def backward(ctx, *grad_outputs: Tensor):
+        (gradient,) = ctx.saved_tensors
+        return grad_outputs[0] * gradient, None
+
+
+def blur(maps: Tensor) -> Tensor:
+    """Filter with the SSIM window, zeros outside; [M, H, W] float.
+
+    Rows and columns are cut into blocks of 32 and each is multiplied by a banded 42 x 32 matrix: 4 times the arithmetic
+    of a convolution, but as matrix products, which makes it 3 times faster on a CPU than a library's convolution.
+    """
+    count, height, width = maps.shape
+    band = _band(maps.dtype, maps.device)
+    span = _BLOCK + 2 * _REACH
+
+    # Columns: all maps under each other, with at least one block of zeros between them.
+    padded_height = (-(-height // _BLOCK) + 1) * _BLOCK
+    column = maps.new_zeros(count * padded_height + 2 * _REACH, width)
+    column[: count * padded_height].view(count, padded_height, width)[:, _REACH : _REACH + height] = maps
+    blocks = count * padded_height // _BLOCK
+    windows = column.as_strided((blocks, span, width), (_BLOCK * width, width, 1))
+    down = torch.bmm(band.T.expand(blocks, _BLOCK, span), windows).view(count, padded_height, width)[:, :height]
+
+    # Rows: all rows behind each other, likewise.
+    padded_width = (-(-width // _BLOCK) + 1) * _BLOCK
+    rows = count * height * padded_width
+    row = maps.new_zeros(rows + 2 * _REACH)
+    row[:rows].view(count, height, padded_width)[:, :, _REACH : _REACH + width] = down
+    across = row.as_strided((rows // _BLOCK, span), (_BLOCK, 1)) @ band
+    return across.view(count, height, padded_width)[:, :, :width]
+
+
+@lru_cache(maxsize=8)
+def _band(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """[42, 32]: column o holds the normalised window from row o on."""
+    offsets = torch.arange(WINDOW, dtype=torch.float64) - _REACH
+    window = torch.exp(-0.5 * (offsets / SIGMA) ** 2)
+    window /= window.sum()
+    band = torch.zeros(_BLOCK + 2 * _REACH, _BLOCK, dtype=torch.float64)
+    for output in range(_BLOCK):
+        band[output : output + WINDOW, output] = window
+    return band.to(device, dtype)

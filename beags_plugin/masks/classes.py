@@ -57,7 +57,9 @@ def write_class_map(path: Path | str, array: np.ndarray) -> None:
     if array.ndim != 2 or array.dtype.kind not in "iu" or array.size == 0:
         raise UserError(f"the class map for {path} must be [H, W] integers, not {list(array.shape)} {array.dtype}.")
     if array.min() < 0 or array.max() > IGNORE:
-        raise UserError(f"the class map for {path} holds ids {array.min()}..{array.max()}: only 0..{IGNORE} can be saved.")
+        raise UserError(
+            f"the class map for {path} holds ids {array.min()}..{array.max()}: only 0..{IGNORE} can be saved."
+        )
     try:
         Image.fromarray(array.astype(np.uint8 if array.max() <= 255 else np.uint16)).save(path, format="PNG")
     except OSError as error:
@@ -81,7 +83,9 @@ def read_classes(path: Path | str | None, ids_present: Iterable[int] | None = No
             names.setdefault(int(class_id), f"class_{int(class_id)}")
     repeated = {name for name in names.values() if list(names.values()).count(name) > 1}
     if repeated:
-        raise UserError(f"{path or 'classes.json'} gives the name {min(repeated)!r} to two classes: rename one of them.")
+        raise UserError(
+            f"{path or 'classes.json'} gives the name {min(repeated)!r} to two classes: rename one of them."
+        )
     return dict(sorted(names.items()))
 
 

@@ -20,7 +20,7 @@ class VisibilityGrid:
     D_occ(x, V_phi) is the number of occupied voxels of V_phi among the 27 around x. A class whose grid is empty (it
     is seen nowhere, or collides everywhere) has D_occ = 0 everywhere: all of it is penalised.
 
-    voxel_size: world units. origin: [3] float64, corner of voxel (0, 0, 0), world. num_classes: ids are 0..num_classes-1.
+    voxel_size: world units. origin: [3] float64, corner of voxel (0, 0, 0), world. num_classes: ids lie below it.
     keys: [M] int64, sorted, unique: the occupied voxels, 21 bits per axis. classes: [M] int32, the class of each.
     dense_bytes: see ``DENSE_BYTES``; 0 forces sorted keys. It changes the speed of ``valid``, never its result.
     """

@@ -49,7 +49,8 @@ def sample_words(seed: int, step: int, gaussians: Tensor, samples: Tensor) -> Te
 def disc_points(words: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """(u, v), uniform in the disc of radius 3, from 64 random bits each.
 
-    words: int64 of any shape. Returns two tensors of that shape: the same points in float32 and float64, up to rounding.
+    words: int64 of any shape. Returns two tensors of that shape; float32 and float64 give the same points, up to
+    rounding.
     """
     # 24 bits a coordinate (what float32 holds); the two halves of the word are independent.
     radial = _logical_shift(words, 40).to(dtype) * 2.0**-24

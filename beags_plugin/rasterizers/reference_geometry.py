@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -21,6 +21,7 @@ class ProjectedSurfels:
     det: [K] determinant of M; the plane's depth along a ray is det / q_z.
     center: [K, 2] pixels, the projected mean c. depth: [K] its depth p_z.
     normal: [K, 3] camera space, towards the camera. opacity: [K]. box: [K, 4] x0, y0, x1, y1 in pixels.
+    num_nonfinite: how many of the inputs were dropped because they, or what they project to, are not finite.
     """
 
     index: Tensor
@@ -33,6 +34,7 @@ class ProjectedSurfels:
     normal: Tensor
     opacity: Tensor
     box: Tensor
+    num_nonfinite: int = 0
 
 
 @dataclass(frozen=True)
@@ -52,14 +54,28 @@ def finite_surfels(inputs: SurfelInputs) -> Tensor:
 
 def project(inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> ProjectedSurfels:
     """Cull, project and sort N surfels; differentiable."""
-    index = finite_surfels(inputs).nonzero()[:, 0]
+    with torch.no_grad():
+        finite = finite_surfels(inputs)
+        depth = inputs.means @ camera.rotation[2] + camera.translation[2]
+        opacity = torch.sigmoid(inputs.opacity_logits)
+        index = (finite & (depth > settings.near) & (opacity >= MIN_ALPHA)).nonzero()[:, 0]
+        index = index[depth[index].argsort(stable=True)]  # by centre depth, ties by index
+        sound = _is_finite(_project(inputs, index, camera))
+        dropped = int((~finite).sum()) + int((~sound).sum())
+    # Projected anew without those that overflow: in the backward even a discarded infinity makes its surfel's gradient NaN.
+    return replace(_project(inputs, index[sound], camera), num_nonfinite=dropped)
+
+
+def _is_finite(projected: ProjectedSurfels) -> Tensor:
+    """[K] bool: nothing overflowed on the way to the screen; the box may be infinite."""
+    fields = (projected.A, projected.B, projected.C, projected.center, projected.det[:, None], projected.depth[:, None])
+    return torch.isfinite(torch.cat(fields, dim=-1)).all(dim=-1)
+
+
+def _project(inputs: SurfelInputs, index: Tensor, camera: Camera) -> ProjectedSurfels:
+    """Project the surfels ``index``; differentiable."""
     p = inputs.means[index] @ camera.rotation.T + camera.translation
     opacity = torch.sigmoid(inputs.opacity_logits[index])
-    keep = (p[:, 2] > settings.near) & (opacity >= MIN_ALPHA)
-    keep = keep.detach().nonzero()[:, 0]
-    keep = keep[p.detach()[keep, 2].argsort(stable=True)]  # by centre depth, ties by index
-    index, p, opacity = index[keep], p[keep], opacity[keep]
-
     axes = camera.rotation @ rotation_from_quat(inputs.quats[index])
     scales = inputs.log_scales[index].exp()
     a, b, n = scales[:, :1] * axes[:, :, 0], scales[:, 1:] * axes[:, :, 1], axes[:, :, 2]
@@ -116,12 +132,13 @@ def hits(projected: ProjectedSurfels, chosen: Tensor, pixels: Tensor, near: floa
     dx, dy = (pixels[:, None] - projected.center[chosen]).unbind(-1)
     dx, dy = dx[..., None], dy[..., None]
     q = dx * projected.A[chosen] + dy * projected.B[chosen] + projected.C[chosen]  # (E2)
-    # q_z = 0: the ray runs along the plane and meets it nowhere; 1 is a stand-in that `hit` discards
-    hit = q[..., 2] != 0
-    q_z = torch.where(hit, q[..., 2], torch.ones_like(q[..., 2]))
-    rho3d = (q[..., 0] / q_z) ** 2 + (q[..., 1] / q_z) ** 2
     rho2d = 2.0 * (dx[..., 0] ** 2 + dy[..., 0] ** 2)
-    on_disc = hit & (rho3d <= rho2d)
+    with torch.no_grad():
+        # Decided first: where the low-pass wins q_z may be 0 (the ray runs along the plane) or so small that rho3d
+        # overflows, and then the branch not taken would still send NaN back.
+        on_disc = (q[..., 2] != 0) & ((q[..., :2] / q[..., 2:]).square().sum(dim=-1) <= rho2d)
+    q_z = torch.where(on_disc, q[..., 2], torch.ones_like(q[..., 2]))
+    rho3d = (q[..., 0] / q_z) ** 2 + (q[..., 1] / q_z) ** 2
     rho = torch.where(on_disc, rho3d, rho2d)
     center_depth = projected.depth[chosen].expand_as(rho)
     depth = torch.where(on_disc, projected.det[chosen] / q_z, center_depth)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.rasterizers.interface import (
@@ -17,8 +18,9 @@ from beags_plugin.rasterizers.interface import (
     RasterSettings,
     SurfelInputs,
 )
-from beags_plugin.rasterizers.reference_geometry import ProjectedSurfels, finite_surfels, hits, on_screen, project
+from beags_plugin.rasterizers.reference_geometry import ProjectedSurfels, hits, on_screen, project
 
+KEPT_PER_PAIR = 40  # numbers that autograd keeps per pixel and surfel, as measured
 BLOCK = 16  # pixels are drawn in squares of this side, each with the surfels that reach it
 
 
@@ -45,10 +47,12 @@ class TorchRasterizer(Rasterizer):
     """Autograd through dense blocks: slow, exact in float64, on any device.
 
     smooth_cutoff: fade alpha out at 1/255 instead of cutting it, so that finite differences hold; for tests.
+    memory_limit: bytes; a drawing that would keep more for its backward computes each block twice instead.
     """
 
-    def __init__(self, smooth_cutoff: bool = False) -> None:
+    def __init__(self, smooth_cutoff: bool = False, memory_limit: float = 4e9) -> None:
         self.smooth_cutoff = smooth_cutoff
+        self.memory_limit = memory_limit
 
     @classmethod
     def unavailable(cls) -> str | None:
@@ -67,10 +71,7 @@ class TorchRasterizer(Rasterizer):
         if target is not None and inputs.class_ids is None:
             raise ValueError("a target needs class_ids")
         projected = project(inputs, camera, settings)
-        rows = _Rows(camera.height, camera.width)
-        for block in self._blocks(projected, camera, settings):
-            rows.put(block, _composite(block, inputs, projected, settings, background, target))
-        images = rows.join()
+        images = self._draw(projected, inputs, camera, settings, background, target)
         visible = torch.zeros(inputs.means.shape[0], dtype=torch.bool, device=inputs.means.device)
         visible[projected.index] = on_screen(projected, 0, 0, camera.width, camera.height)
         return RasterOutputs(
@@ -82,7 +83,7 @@ class TorchRasterizer(Rasterizer):
             distortion=images["distortion"][..., 0] if settings.distortion else None,
             boundary=images["boundary"][..., 0] if target is not None else None,
             visible=visible,
-            num_nonfinite=int((~finite_surfels(inputs)).sum()),
+            num_nonfinite=projected.num_nonfinite,
         )
 
     @torch.no_grad()
@@ -114,7 +115,7 @@ class TorchRasterizer(Rasterizer):
             best = per_class.argmax(dim=-1)  # the first of equals, so ties go to the lower id
             alpha = block.weights.sum(dim=-1)
             share = per_class.gather(1, best[:, None])[:, 0] / torch.where(alpha > 0, alpha, torch.ones_like(alpha))
-            rows.put(block, {"class": best[:, None].to(per_class), "share": share[:, None]})
+            rows.put(block.rows, block.columns, {"class": best[:, None].to(per_class), "share": share[:, None]})
         images = rows.join()
         return images["class"][..., 0].to(torch.int32), images["share"][..., 0]
 
@@ -131,11 +132,35 @@ class TorchRasterizer(Rasterizer):
             image[block.rows, block.columns] = winner.reshape(image[block.rows, block.columns].shape)
         return image
 
+    def _draw(
+        self,
+        projected: ProjectedSurfels,
+        inputs: SurfelInputs,
+        camera: Camera,
+        settings: RasterSettings,
+        background: Tensor,
+        target: Tensor | None,
+    ) -> dict[str, Tensor]:
+        """All images, differentiable, block by block."""
+
+        def draw_block(rows: slice, columns: slice) -> dict[str, Tensor]:
+            block = self._block(projected, rows, columns, settings)
+            return _composite(block, inputs, projected, settings, background, target)
+
+        # What autograd keeps grows with the scene: beyond the limit each block is drawn again in the backward instead.
+        again = torch.is_grad_enabled() and _kept_bytes(projected, camera) > self.memory_limit
+        images = _Rows(camera.height, camera.width)
+        for rows, columns in _squares(camera):
+            if again:
+                drawn = checkpoint(draw_block, rows, columns, use_reentrant=False, preserve_rng_state=False)
+            else:
+                drawn = draw_block(rows, columns)
+            images.put(rows, columns, drawn)
+        return images.join()
+
     def _blocks(self, projected: ProjectedSurfels, camera: Camera, settings: RasterSettings) -> Iterator[_Block]:
-        for y in range(0, camera.height, BLOCK):
-            for x in range(0, camera.width, BLOCK):
-                rows, columns = slice(y, min(y + BLOCK, camera.height)), slice(x, min(x + BLOCK, camera.width))
-                yield self._block(projected, rows, columns, settings)
+        for rows, columns in _squares(camera):
+            yield self._block(projected, rows, columns, settings)
 
     def _block(self, projected: ProjectedSurfels, rows: slice, columns: slice, settings: RasterSettings) -> _Block:
         like = projected.depth
@@ -154,6 +179,22 @@ class TorchRasterizer(Rasterizer):
         return _Block(
             rows, columns, projected.index[chosen], chosen, weights, hit.depth, remaining, before, after
         )
+
+
+def _squares(camera: Camera) -> Iterator[tuple[slice, slice]]:
+    """The image cut into squares, row by row: slices of its rows and columns."""
+    for y in range(0, camera.height, BLOCK):
+        for x in range(0, camera.width, BLOCK):
+            yield slice(y, min(y + BLOCK, camera.height)), slice(x, min(x + BLOCK, camera.width))
+
+
+def _kept_bytes(projected: ProjectedSurfels, camera: Camera) -> float:
+    """About how much autograd keeps of a drawing: so many numbers per pixel and surfel in the blocks that a box meets."""
+    low, high = projected.box.clamp_min(0.0).unflatten(1, (2, 2)).unbind(1)
+    high = torch.minimum(high, high.new_tensor([camera.width, camera.height]))
+    sides = ((high / BLOCK).ceil() - (low / BLOCK).floor()).clamp_min(0.0) * BLOCK
+    pairs = float(sides.double().prod(dim=-1).sum())
+    return pairs * KEPT_PER_PAIR * projected.depth.element_size()
 
 
 def _composite(
@@ -203,14 +244,14 @@ class _Rows:
         self.height, self.width = height, width
         self._rows: dict[str, list[list[Tensor]]] = {}
 
-    def put(self, block: _Block, images: dict[str, Tensor]) -> None:
+    def put(self, rows: slice, columns: slice, images: dict[str, Tensor]) -> None:
         """Add a block; blocks come row by row, left to right."""
-        shape = (block.rows.stop - block.rows.start, block.columns.stop - block.columns.start, -1)
+        shape = (rows.stop - rows.start, columns.stop - columns.start, -1)
         for name, image in images.items():
-            rows = self._rows.setdefault(name, [])
-            if block.columns.start == 0:
-                rows.append([])
-            rows[-1].append(image.reshape(shape))
+            lines = self._rows.setdefault(name, [])
+            if columns.start == 0:
+                lines.append([])
+            lines[-1].append(image.reshape(shape))
 
     def join(self) -> dict[str, Tensor]:
         """[H, W, channels] each."""
