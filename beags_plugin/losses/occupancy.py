@@ -24,11 +24,15 @@ class OccupancyLoss(Loss):
     not finite count as 0. Memory does not depend on ``samples``.
 
     samples: Z, points per Gaussian and step, uniform in its UV disc of radius 3.
+    background: whether the background's Gaussians are held to its voxels too, as in the paper. Its far parts are sampled
+        thinly, so that one voxel size for all leaves holes there; without it the background keeps its look, and steps
+        are quicker (our choice for short runs).
     """
 
     weight: float = 10.0
 
     samples: int = 20
+    background: bool = True
 
     def value(self, inputs: LossInputs) -> Tensor:
         surfels, grid, class_ids = inputs.surfels, inputs.grid, inputs.class_ids
@@ -36,13 +40,15 @@ class OccupancyLoss(Loss):
             raise ValueError("the occupancy loss needs class ids and a visibility grid")
         num_samples = int(self.samples)
         active = _outside(surfels.means, surfels.quats, surfels.log_scales, surfels.opacity_logits, class_ids, grid)
+        if not self.background:
+            active = active[class_ids[active] != 0]
         rotation = rotation_from_quat(surfels.quats[active])
         per_gaussian = _Occupancy.apply(
             surfels.means[active],
             rotation[..., 0],
             rotation[..., 1],
-            surfels.log_scales[active].exp(),
-            surfels.opacity_logits[active].sigmoid(),
+            surfels.log_scales[active],
+            surfels.opacity_logits[active],
             class_ids[active],
             grid,
             (inputs.seed, inputs.step, active, num_samples),
@@ -68,7 +74,10 @@ class _Occupancy(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, means, r0, r1, scales, opacities, class_ids, grid, counters) -> Tensor:
+    def forward(ctx, means, r0, r1, log_scales, opacity_logits, class_ids, grid, counters) -> Tensor:
+        scales = log_scales.exp()
+        # Determinism: torch.sigmoid rounds the ends of each thread's share differently.
+        opacities = 1.0 / (1.0 + torch.exp(-opacity_logits))
         s_u, s_v = scales[:, :1], scales[:, 1:]
         sums = _sums(means, s_u * r0, s_v * r1, class_ids, grid, *counters)
         g, gu, gv, guu, gvv, guv = sums[..., None].unbind(0)
@@ -77,8 +86,8 @@ class _Occupancy(torch.autograd.Function):
             o * (gu / s_u * r0 + gv / s_v * r1),  # dG/dp = G (u / s_u R0 + v / s_v R1)
             -o * (guu * r0 + guv * (s_v / s_u) * r1),  # dG/dR0 = -G u (x - p) / s_u, x - p = u s_u R0 + v s_v R1
             -o * (guv * (s_u / s_v) * r0 + gvv * r1),  # dG/dR1 = -G v (x - p) / s_v
-            o * torch.cat([guu / s_u, gvv / s_v], dim=1),  # dG/ds_u = G u^2 / s_u
-            sums[0],
+            o * torch.cat([guu, gvv], dim=1),  # dG/ds_u = G u^2 / s_u, so dG/d(log s_u) = G u^2
+            opacities * (1.0 - opacities) * sums[0],
         )
         return opacities * sums[0]
 

@@ -48,10 +48,11 @@ def voxel_size_of_reference(
     # d grows with the cube root of k; this undoes the rounding of k / f only.
     rounding = (k * kept / neighbours) ** (1 / 3)
     if neighbours > available:
-        warnings.warn(
-            f"the voxel size wants {neighbours} neighbours, the views show {available}: all of them are taken.",
-            stacklevel=2,
-        )
+        if available:
+            warnings.warn(
+                f"the voxel size wants {neighbours} neighbours, the views show {available}: all of them are taken.",
+                stacklevel=2,
+            )
         neighbours, rounding = max(available, 1), 1.0
     rng = np.random.default_rng([seed, 1])
     queries = reference[np.sort(rng.choice(len(reference), size=min(num_queries, len(reference)), replace=False))]

@@ -63,7 +63,7 @@ def base_config() -> BeagsTrainerConfig:
                     "distortion": LossSpec(weight=0.0, start=3_000),
                     "normal": LossSpec(weight=0.05, start=7_000),
                     "boundary": LossSpec(weight=0.5, phase="refine"),
-                    "occupancy": LossSpec(weight=10.0, phase="refine", options={"samples": 20}),
+                    "occupancy": LossSpec(weight=10.0, phase="refine", options={"samples": 20, "background": True}),
                 },
             ),
         ),

@@ -47,7 +47,7 @@ class LossSpec:
     """Where the term may act."""
     start: int = 0
     """First step of the term, counted from the first step of the run (or of the refinement, for phase "refine")."""
-    options: dict[str, float] = field(default_factory=dict)
+    options: dict[str, bool | int | float] = field(default_factory=dict)
     """Options of the loss itself, e.g. ssim_weight or samples."""
 
     def build(self, name: str, schedule: PhaseSchedule) -> Loss:

@@ -62,7 +62,7 @@ def project(inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> P
         index = index[depth[index].argsort(stable=True)]  # by centre depth, ties by index
         sound = _is_finite(_project(inputs, index, camera))
         dropped = int((~finite).sum()) + int((~sound).sum())
-    # Projected anew without those that overflow: in the backward even a discarded infinity makes its surfel's gradient NaN.
+    # Projected anew without those that overflow: in the backward even a discarded infinity would turn into NaN.
     return replace(_project(inputs, index[sound], camera), num_nonfinite=dropped)
 
 

@@ -176,9 +176,7 @@ class TorchRasterizer(Rasterizer):
         weights = torch.where(drawn, hit.alpha * before, torch.zeros_like(before))
         remaining = torch.where(drawn, 1.0 - hit.alpha, torch.ones_like(before)).prod(dim=-1)
         after = torch.where(drawn, after, torch.ones_like(after))
-        return _Block(
-            rows, columns, projected.index[chosen], chosen, weights, hit.depth, remaining, before, after
-        )
+        return _Block(rows, columns, projected.index[chosen], chosen, weights, hit.depth, remaining, before, after)
 
 
 def _squares(camera: Camera) -> Iterator[tuple[slice, slice]]:
@@ -189,7 +187,7 @@ def _squares(camera: Camera) -> Iterator[tuple[slice, slice]]:
 
 
 def _kept_bytes(projected: ProjectedSurfels, camera: Camera) -> float:
-    """About how much autograd keeps of a drawing: so many numbers per pixel and surfel in the blocks that a box meets."""
+    """About how much autograd keeps of a drawing: numbers per pixel and surfel in the blocks that a box meets."""
     low, high = projected.box.clamp_min(0.0).unflatten(1, (2, 2)).unbind(1)
     high = torch.minimum(high, high.new_tensor([camera.width, camera.height]))
     sides = ((high / BLOCK).ceil() - (low / BLOCK).floor()).clamp_min(0.0) * BLOCK

@@ -20,7 +20,7 @@ from beags_plugin.sample.lighting import Light
 from beags_plugin.sample.points import seed_points, write_ply
 from beags_plugin.sample.views import Picture, View, make_views, render_view
 
-VERSION = 1
+VERSION = 2
 """Raise it whenever the same config would give other files: older samples are then rebuilt."""
 POINT_NOISE = 0.004
 """World units, about one pixel's width at 640 x 480."""

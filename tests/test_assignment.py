@@ -1,0 +1,102 @@
+"""Assignment (E6): sums over views, ties, never seen; and the reference rasterizer's contributions on a small scene."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from raster_scenes import CLASSES, make_scene
+
+from beags_plugin.assignment.assignment import assign_classes
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.errors import UserError
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.drawing import geometry_inputs
+from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
+
+SETTINGS = RasterSettings(near=0.1, far=100.0)
+
+
+class _Stub:
+    """Gives contributions that were written down, one table per camera."""
+
+    def class_contributions(self, inputs, camera, settings, labels, num_classes):
+        assert not settings.geometry and not settings.distortion
+        assert inputs.means.requires_grad is False
+        return torch.tensor(camera.table, dtype=torch.float32)
+
+
+def _surfels(count: int) -> Surfels:
+    return Surfels(
+        torch.zeros(count, 3, requires_grad=True),
+        torch.ones(count, 4),
+        torch.zeros(count, 2),
+        torch.zeros(count),
+        torch.zeros(count, 1, 3),
+    )
+
+
+def test_sums_over_views_with_ties_to_the_lower_id():
+    cameras = [
+        SimpleNamespace(table=[[0, 3, 1], [0, 0, 0], [0, 2, 2], [1, 0, 0]]),
+        SimpleNamespace(table=[[0, 0, 4], [0, 0, 0], [0, 1, 1], [0, 0, 3]]),
+        SimpleNamespace(table=None),
+    ]
+    mask, calls = torch.zeros(2, 2, dtype=torch.int32), []
+    result = assign_classes(
+        _surfels(4), cameras, [mask, mask, None], _Stub(), SETTINGS, 3, progress=lambda *state: calls.append(state)
+    )
+    assert result.class_ids.dtype == torch.int32
+    assert result.class_ids.tolist() == [2, 0, 1, 2]
+    assert result.margin.tolist() == pytest.approx([5 / 8, 0.0, 0.5, 0.75])
+    assert result.never_seen.tolist() == [False, True, False, False]
+    assert calls == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_small_weights_of_many_views_are_not_lost():
+    cameras = [SimpleNamespace(table=[[1e8, 0.0]])] + [SimpleNamespace(table=[[0.0, 1.0]])] * 3
+    result = assign_classes(_surfels(1), cameras, [torch.zeros(1, 1, dtype=torch.int32)] * 4, _Stub(), SETTINGS, 2)
+    assert result.margin.item() == pytest.approx(1e8 / (1e8 + 3), abs=1e-7)
+
+
+def test_contributions_are_image_derivatives():
+    """C[i, c] summed over classes is d(sum of the image over labelled pixels) / d(colour of i)."""
+    scene = make_scene()
+    inputs = scene.inputs
+    surfels = Surfels(
+        inputs.means,
+        inputs.quats,
+        inputs.log_scales,
+        inputs.opacity_logits,
+        torch.zeros(len(inputs.means), 1, 3).double(),
+    )
+    rasterizer = make_rasterizer("torch")
+    result = assign_classes(surfels, [scene.camera] * 2, [scene.target, None], rasterizer, scene.settings, CLASSES)
+    colors = torch.zeros_like(inputs.means).requires_grad_()
+    bare = geometry_inputs(surfels)
+    drawn = rasterizer.rasterize(
+        type(bare)(bare.means, bare.quats, bare.log_scales, bare.opacity_logits, colors),
+        scene.camera,
+        scene.settings,
+        torch.zeros(3, dtype=torch.float64),
+    ).color[..., 0]
+    table = torch.stack(
+        [
+            torch.autograd.grad(drawn[scene.target == c].sum(), colors, retain_graph=True)[0][:, 0]
+            for c in range(CLASSES)
+        ],
+        1,
+    )
+    seen = table.sum(1) > 0
+    assert 0 < seen.sum() < len(seen)
+    assert torch.equal(result.never_seen, ~seen)
+    assert torch.equal(result.class_ids[seen].long(), table.argmax(1)[seen])
+    assert (result.class_ids[~seen] == 0).all() and (result.margin[~seen] == 0).all()
+    assert torch.allclose(result.margin[seen], (table.max(1).values / table.sum(1))[seen].float())
+
+
+def test_ids_out_of_range_are_told():
+    mask = torch.tensor([[0, IGNORE, 5]], dtype=torch.int32)
+    with pytest.raises(UserError, match="view 0 holds class ids 0..5"):
+        assign_classes(_surfels(1), [SimpleNamespace(table=[[1.0]])], [mask], _Stub(), SETTINGS, 3)

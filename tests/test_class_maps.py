@@ -1,0 +1,132 @@
+"""Class maps and class names on disk: what is read back, and what a user is told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from beags_plugin.errors import UserError
+from beags_plugin.masks.classes import colorize, read_class_map, read_classes, write_class_map
+from beags_plugin.rasterizers.interface import IGNORE
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32, np.int64])
+def test_written_maps_come_back(tmp_path, dtype):
+    ids = np.arange(12).reshape(3, 4).astype(dtype)
+    write_class_map(tmp_path / "a.png", ids)
+    with Image.open(tmp_path / "a.png") as image:
+        assert image.mode == "L"
+    back = read_class_map(tmp_path / "a.png")
+    assert back.dtype == np.uint16 and np.array_equal(back, ids)
+
+
+def test_sixteen_bits_keep_large_ids_and_ignore(tmp_path):
+    ids = np.array([[0, 1, 300], [IGNORE, 65534, 255]], dtype=np.int32)
+    write_class_map(tmp_path / "a.png", ids)
+    assert np.array_equal(read_class_map(tmp_path / "a.png"), ids)
+    assert np.array_equal(read_class_map(str(tmp_path / "a.png"), ignore_ids=[255]), ids)  # for 8-bit files only
+
+
+def test_ignore_ids_of_eight_bit_files(tmp_path):
+    write_class_map(tmp_path / "a.png", np.array([[0, 1, 254, 255]]))
+    assert read_class_map(tmp_path / "a.png", ignore_ids=[255, 254]).tolist() == [[0, 1, IGNORE, IGNORE]]
+    assert read_class_map(tmp_path / "a.png").tolist() == [[0, 1, 254, 255]]
+
+
+def test_palette_images_give_indices_not_colours(tmp_path):
+    image = Image.fromarray(np.array([[0, 2], [1, 2]], dtype=np.uint8), mode="P")
+    image.putpalette([0, 0, 0, 200, 10, 10, 10, 200, 10])
+    image.save(tmp_path / "a.png")
+    assert read_class_map(tmp_path / "a.png").tolist() == [[0, 2], [1, 2]]
+
+
+def test_one_bit_images_are_ids_0_and_1(tmp_path):
+    Image.fromarray(np.array([[True, False]])).save(tmp_path / "a.png")
+    assert read_class_map(tmp_path / "a.png").tolist() == [[1, 0]]
+
+
+@pytest.mark.parametrize("shape", [(4, 4, 3), (4, 4, 4)])
+def test_colour_images_are_refused(tmp_path, shape):
+    Image.fromarray(np.zeros(shape, dtype=np.uint8)).save(tmp_path / "a.png")
+    with pytest.raises(UserError, match="a.png has colours"):
+        read_class_map(tmp_path / "a.png")
+
+
+def test_unreadable_missing_and_lossy_files_are_refused(tmp_path):
+    (tmp_path / "broken.png").write_bytes(b"no image")
+    write_class_map(tmp_path / "whole.png", np.arange(10000).reshape(100, 100))
+    (tmp_path / "cut.png").write_bytes((tmp_path / "whole.png").read_bytes()[:500])
+    Image.fromarray(np.zeros((4, 4), dtype=np.uint8)).save(tmp_path / "a.jpg")
+    for name, message in [
+        ("broken.png", "cannot be read"),
+        ("cut.png", "cannot be read"),
+        ("none.png", "does not exist"),
+        ("a.jpg", "JPEG"),
+    ]:
+        with pytest.raises(UserError, match=f"{name}.*{message}"):
+            read_class_map(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (np.zeros((2, 2)), "integers"),
+        (np.zeros((2, 2, 3), dtype=np.uint8), "integers"),
+        (np.array([[-1]]), "-1"),
+        (np.array([[65536]]), "65536"),
+    ],
+)
+def test_only_ids_can_be_written(tmp_path, array, message):
+    with pytest.raises(UserError, match=message):
+        write_class_map(tmp_path / "a.png", array)
+
+
+def test_names(tmp_path):
+    path = tmp_path / "classes.json"
+    path.write_text('{"10": "cup", "2": " saucer "}')
+    assert list(read_classes(path).items()) == [(0, "background"), (2, "saucer"), (10, "cup")]
+    assert read_classes(path, [0, 2, 3, IGNORE]) == {0: "background", 2: "saucer", 3: "class_3", 10: "cup"}
+    assert read_classes(tmp_path / "none.json", [1]) == {0: "background", 1: "class_1"}
+    assert read_classes(None, [1]) == {0: "background", 1: "class_1"}
+    path.write_text('{"0": "table"}')
+    assert read_classes(path) == {0: "table"}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "cannot be read as JSON"),
+        ("[1, 2]", "one JSON object"),
+        ('{"cup": 1}', "'cup'"),
+        ('{"-1": "cup"}', "'-1'"),
+        ('{"65535": "cup"}', "'65535'"),
+        ('{"1": 2}', "no name"),
+        ('{"1": ""}', "no name"),
+        ('{"1": {"name": "cup"}}', "no name"),
+        ('{"1": "cup", "1": "mug"}', "twice"),
+        ('{"1": "cup", "2": "cup"}', "'cup' to two"),
+    ],
+)
+def test_wrong_names_are_told(tmp_path, text, message):
+    (tmp_path / "classes.json").write_text(text)
+    with pytest.raises(UserError, match=message):
+        read_classes(tmp_path / "classes.json")
+
+
+def test_missing_names_are_told(tmp_path):
+    with pytest.raises(UserError, match="do not exist"):
+        read_classes(tmp_path / "classes.json")
+    with pytest.raises(UserError, match="70000"):
+        read_classes(None, [70000])
+
+
+def test_colours_are_stable_and_distinct():
+    ids = np.arange(64).reshape(8, 8)
+    colors = colorize(ids)
+    assert colors.dtype == np.uint8 and colors.shape == (8, 8, 3)
+    assert len(np.unique(colors.reshape(-1, 3), axis=0)) == 64
+    assert colors[0, 0].tolist() == [0, 0, 0]
+    assert np.array_equal(colorize(ids[3:5, 2:4]), colors[3:5, 2:4])
+    assert colorize(np.array([[IGNORE]], dtype=np.uint16)).tolist() == [[[128, 128, 128]]]
+    assert colorize(np.zeros((0, 4), dtype=np.uint16)).shape == (0, 4, 3)

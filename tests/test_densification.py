@@ -1,0 +1,176 @@
+"""How the scene grows and thins out, on a handful of surfels whose fate is known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.densification import (
+    DensifyConfig,
+    GradientStatistics,
+    densify,
+    initial_surfels,
+    reset_opacity,
+    screen_gradient,
+)
+from beags_plugin.core.rotations import rotation_from_quat
+from beags_plugin.core.sh import sh_colors
+from beags_plugin.core.surfels import Surfels
+
+EXTENT = 2.0
+CONFIG = DensifyConfig()
+LOW, HIGH = CONFIG.grad_threshold * 0.99, CONFIG.grad_threshold * 1.01
+SMALL, MIDDLE, HUGE = 0.5 * 0.01 * EXTENT, 3 * 0.01 * EXTENT, 2 * 0.1 * EXTENT
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def scene(scales, opacities) -> Surfels:
+    """Surfels whose larger scale and opacity are given, turned at random."""
+    count, g = len(scales), generator(3)
+    larger = torch.tensor(scales).log()
+    return Surfels(
+        means=torch.randn(count, 3, generator=g),
+        quats=torch.randn(count, 4, generator=g),
+        log_scales=torch.stack([larger - 0.7, larger], dim=-1),
+        opacity_logits=torch.logit(torch.tensor(opacities)),
+        sh=torch.randn(count, 4, 3, generator=g),
+    )
+
+
+def run(surfels, gradients, step=1000, config=CONFIG, seed=0):
+    return densify(surfels, torch.tensor(gradients), EXTENT, config, step, generator(seed))
+
+
+def test_a_quiet_scene_stays_as_it_is():
+    surfels = scene([SMALL, MIDDLE], [0.5, 0.5])
+    edited = run(surfels, [LOW, LOW])
+    assert edited.source.tolist() == [0, 1] and not edited.fresh.any()
+    assert all(torch.equal(getattr(edited.surfels, f), getattr(surfels, f)) for f in vars(surfels))
+
+
+def test_a_small_surfel_is_cloned_and_a_large_one_split():
+    surfels = scene([SMALL, MIDDLE, MIDDLE], [0.5, 0.6, 0.7])
+    edited = run(surfels, [HIGH, HIGH, LOW])
+    assert sorted(edited.source.tolist()) == [0, 0, 1, 1, 2]
+    kept = edited.source[~edited.fresh]
+    assert kept.tolist() == [0, 2]  # the split surfel itself is gone, the cloned one stays
+    clone = edited.surfels[(edited.source == 0) & edited.fresh]
+    assert torch.equal(clone.means[0], surfels.means[0]) and torch.equal(clone.log_scales[0], surfels.log_scales[0])
+    halves = edited.surfels[edited.source == 1]
+    torch.testing.assert_close(halves.log_scales, (surfels.log_scales[1] - math.log(1.6)).expand(2, 2))
+    assert torch.equal(halves.sh, surfels.sh[1].expand(2, -1, -1))
+    offset = halves.means - surfels.means[1]
+    normal = rotation_from_quat(surfels.quats[1])[:, 2]
+    assert (offset.norm(dim=-1) > 0).all() and not torch.equal(*offset)
+    torch.testing.assert_close(offset @ normal, torch.zeros(2), rtol=0, atol=1e-6)  # in the surfel's own plane
+
+
+def test_halves_are_spread_like_the_surfel_they_replace():
+    count = 4000
+    surfels = scene([MIDDLE], [0.5])[torch.zeros(count, dtype=torch.int64)]
+    edited = run(surfels, [HIGH] * count)
+    local = (edited.surfels.means - surfels.means[0]) @ rotation_from_quat(surfels.quats[0])
+    spread = local[:, :2].std(dim=0) / surfels.log_scales[0].exp()
+    torch.testing.assert_close(spread, torch.ones(2), rtol=0, atol=0.05)  # 8000 draws: standard error 0.008
+
+
+def test_faint_surfels_go_at_once_and_huge_ones_after_the_given_step():
+    surfels = scene([SMALL, HUGE, MIDDLE], [0.04, 0.5, 0.5])
+    assert run(surfels, [LOW] * 3, step=CONFIG.prune_scale_after).source.tolist() == [1, 2]
+    assert run(surfels, [LOW] * 3, step=CONFIG.prune_scale_after + 1).source.tolist() == [2]
+
+
+def test_growth_stops_at_the_bound_and_prefers_large_gradients():
+    surfels = scene([SMALL, MIDDLE, SMALL, SMALL], [0.5] * 4)
+    config = replace(CONFIG, max_surfels=6)
+    edited = run(surfels, [HIGH, 3 * HIGH, 2 * HIGH, HIGH], config=config)
+    assert sorted(edited.source.tolist()) == [0, 1, 1, 2, 2, 3]
+    assert run(surfels, [HIGH] * 4, config=replace(CONFIG, max_surfels=3)).source.tolist() == [0, 1, 2, 3]
+
+
+def test_a_gradient_that_is_not_a_number_counts_for_nothing():
+    assert run(scene([SMALL], [0.5]), [math.nan]).source.tolist() == [0]
+
+
+def test_one_surfel_always_remains():
+    edited = run(scene([SMALL, SMALL, SMALL], [0.01, 0.03, 0.02]), [LOW] * 3)
+    assert edited.source.tolist() == [1]
+
+
+def test_the_seed_alone_decides():
+    surfels = scene([MIDDLE] * 3, [0.5] * 3)
+    first, again, other = (run(surfels, [HIGH] * 3, seed=seed).surfels.means for seed in (1, 1, 2))
+    assert torch.equal(first, again) and not torch.equal(first, other)
+
+
+def test_the_scale_of_the_scene_changes_nothing():
+    surfels = scene([SMALL, MIDDLE, HUGE], [0.5] * 3)
+    factor = 2.0**17
+    larger = replace(surfels, means=surfels.means * factor, log_scales=surfels.log_scales + math.log(factor))
+    gradients, step = torch.tensor([HIGH] * 3), 5000
+    small = densify(surfels, gradients, EXTENT, CONFIG, step, generator())
+    large = densify(larger, gradients, EXTENT * factor, CONFIG, step, generator())
+    assert torch.equal(small.source, large.source)
+    torch.testing.assert_close(large.surfels.means / factor, small.surfels.means, rtol=1e-5, atol=1e-6)
+
+
+def test_screen_gradient_is_that_of_moving_the_centre_across_the_image():
+    """By the chain rule with the projection's own Jacobian, for a loss that sees only the projected centre."""
+    g = generator(5)
+    quat = torch.randn(4, generator=g, dtype=torch.float64)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = rotation_from_quat(quat)
+    viewmat[:3, 3] = torch.tensor([0.1, -0.2, 6.0])
+    K = torch.tensor([[50.0, 0, 20], [0, 70.0, 11], [0, 0, 1]], dtype=torch.float64)
+    camera = Camera(viewmat, K, 48, 32)
+    means = torch.randn(6, 3, generator=g, dtype=torch.float64).requires_grad_()
+    pulls = torch.randn(6, 2, generator=g, dtype=torch.float64)  # dL/dc, per pixel
+    p = means @ camera.rotation.T + camera.translation
+    (pulls * (p @ K.T)[:, :2] / p[:, 2:]).sum().backward()
+    expected = (pulls * torch.tensor([24.0, 16.0])).norm(dim=-1)
+    torch.testing.assert_close(screen_gradient(means.grad, means.detach(), camera), expected)
+    behind = -20 * camera.rotation[2][None]
+    assert screen_gradient(torch.ones(1, 3, dtype=torch.float64), behind, camera).item() == 0.0
+
+
+def test_statistics_average_over_the_views_that_saw_a_surfel():
+    statistics = GradientStatistics(3)
+    statistics.add(torch.tensor([1.0, 5.0, math.inf]), torch.tensor([True, False, True]))
+    statistics.add(torch.tensor([3.0, 7.0, 4.0]), torch.tensor([True, False, True]))
+    assert statistics.mean().tolist() == [2.0, 0.0, 4.0]
+
+
+def test_reset_only_lowers_opacity():
+    logits = reset_opacity(scene([SMALL] * 2, [0.9, 0.001]), CONFIG)
+    torch.testing.assert_close(torch.sigmoid(logits), torch.tensor([CONFIG.reset_opacity, 0.001]))
+
+
+@pytest.mark.parametrize("factor", [1e-4, 1.0, 1e6])
+def test_initial_surfels_are_as_large_as_their_neighbours_are_far(factor):
+    g = generator(7)
+    points, colors = factor * torch.randn(20, 3, generator=g), torch.rand(20, 3, generator=g)
+    surfels = initial_surfels(points, colors, 3, generator())
+    squared = np.sort(torch.cdist(points.double(), points.double()).numpy() ** 2, axis=1)[:, 1:4].mean(axis=1)
+    expected = torch.from_numpy(np.sqrt(squared)).float()[:, None].expand(-1, 2)
+    torch.testing.assert_close(surfels.log_scales.exp(), expected, rtol=1e-4, atol=0)
+    torch.testing.assert_close(surfels.quats.norm(dim=-1), torch.ones(20))
+    torch.testing.assert_close(torch.sigmoid(surfels.opacity_logits), torch.full((20,), 0.1))
+    assert surfels.sh.shape == (20, 16, 3)
+    seen = sh_colors(surfels.sh, surfels.means, torch.zeros(3), 3)
+    torch.testing.assert_close(seen, colors, rtol=1e-5, atol=1e-6)
+
+
+def test_coincident_and_few_points_give_finite_surfels():
+    cloud = torch.cat([torch.zeros(5, 3), torch.ones(1, 3)])
+    for points in (cloud, cloud[:1], cloud[4:]):
+        surfels = initial_surfels(points, torch.full_like(points, 0.5), 0, generator())
+        assert all(torch.isfinite(value).all() for value in vars(surfels).values())
+        assert (surfels.log_scales.exp() > 0).all()

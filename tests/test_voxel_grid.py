@@ -1,0 +1,329 @@
+"""The voxel size (E8), the visibility grids, and how they are built from views."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import warnings
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.lifting import lift
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.errors import UserError
+from beags_plugin.occupancy.build import build_visibility_grid
+from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.occupancy.voxel_size import voxel_size
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.interface import RasterSettings
+
+E8 = (4 * math.pi / 3) ** (1 / 3)  # 1.612
+
+
+# ---------------------------------------------------------------- voxel size
+
+
+def _cube_cloud(count: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).random((count, 3))
+
+
+def test_size_of_a_uniform_cloud_is_that_of_k_points():
+    """A voxel holds k points of a uniform cloud: s = (k / rho)^(1/3). Rims make the mean a little larger."""
+    count, k = 60_000, 30
+    assert voxel_size(_cube_cloud(count), k=k) == pytest.approx((k / count) ** (1 / 3), rel=0.06)
+
+
+def test_size_is_1612_times_the_distance_by_brute_force():
+    points = np.random.default_rng(1).normal(size=(300, 3))
+    distances = np.sort(np.linalg.norm(points[:, None] - points[None], axis=-1), axis=1)
+    for k in (1, 7, 50):
+        assert voxel_size(points, k=k) == pytest.approx(E8 * distances[:, k].mean(), rel=1e-12)
+
+
+def test_sampling_the_queries_changes_little():
+    points = _cube_cloud(20_000)
+    assert voxel_size(points, k=200, num_queries=2000) == pytest.approx(
+        voxel_size(points, k=200, num_queries=20_000), rel=0.02
+    )
+
+
+@pytest.mark.parametrize("kept", [20_000, 4_000, 3_100])
+def test_thinning_the_cloud_does_not_change_the_size(kept):
+    points = _cube_cloud(40_000)
+    assert voxel_size(points, k=400, max_reference=kept) == pytest.approx(voxel_size(points, k=400), rel=0.03)
+
+
+def test_small_k_is_not_thinned_away():
+    points = _cube_cloud(20_000)
+    assert voxel_size(points, k=4, max_reference=100) == voxel_size(points, k=4)
+
+
+def test_size_is_deterministic_and_scales():
+    points = _cube_cloud(10_000)
+    size = voxel_size(points, k=100, seed=3, max_reference=2000)
+    assert size == voxel_size(points, k=100, seed=3, max_reference=2000)
+    for factor in (1e-4, 1e6):
+        assert voxel_size(factor * points, k=100, seed=3, max_reference=2000) == pytest.approx(factor * size, rel=1e-9)
+
+
+def test_fewer_points_than_k():
+    points = np.random.default_rng(2).normal(size=(20, 3))
+    with pytest.warns(UserWarning, match="wants 2000 neighbours, the views show 19"):
+        size = voxel_size(points)
+    farthest = np.linalg.norm(points[:, None] - points[None], axis=-1).max(1).mean()
+    assert size == pytest.approx(E8 * farthest)
+
+
+def test_coincident_points():
+    points = np.repeat(np.random.default_rng(3).normal(size=(10, 3)), 50, axis=0)
+    with pytest.warns(UserWarning, match="20 nearest neighbours coincide"):
+        assert voxel_size(points, k=20) > 0
+    for count in (1, 30):
+        with pytest.warns(UserWarning, match="all points of the views coincide"):
+            assert voxel_size(np.full((count, 3), 2.0), k=20) == pytest.approx(2e-3)
+    with pytest.warns(UserWarning):
+        assert voxel_size(np.zeros((4, 3)), k=2) > 0
+    with pytest.raises(ValueError, match="empty"):
+        voxel_size(np.zeros((0, 3)))
+
+
+# ---------------------------------------------------------------- grid
+
+SIZE, CLASSES = 0.25, 3
+
+
+def _clouds(seed: int = 0, count: int = 60):
+    g = torch.Generator().manual_seed(seed)
+    return [(torch.rand(count, 3, generator=g) * 2 - 0.7, torch.randint(0, CLASSES, (count,), generator=g).int())] * 2
+
+
+def _grid(dense_bytes: int = 1 << 28, seed: int = 0, origin=(0.1, 0.0, -0.1)) -> VisibilityGrid:
+    return VisibilityGrid.from_points(
+        _clouds(seed), SIZE, torch.tensor(origin, dtype=torch.float64), CLASSES, dense_bytes
+    )
+
+
+def _by_sets(clouds, origin) -> dict[int, set]:
+    """V_phi as Python sets of voxels: collisions are empty in all."""
+    voxels: dict[int, set] = {c: set() for c in range(CLASSES)}
+    for points, ids in clouds:
+        for point, c in zip(points.tolist(), ids.tolist(), strict=True):
+            voxels[c].add(tuple(math.floor((x - o) / SIZE) for x, o in zip(point, origin, strict=True)))
+    return {c: voxels[c].difference(*(voxels[o] for o in voxels if o != c)) for c in voxels}
+
+
+def _queries(count: int = 3000, seed: int = 9):
+    g = torch.Generator().manual_seed(seed)
+    return torch.rand(count, 3, generator=g) * 5 - 2.0, torch.randint(0, CLASSES, (count,), generator=g).int()
+
+
+@pytest.mark.parametrize("dense_bytes", [1 << 28, 0])
+def test_count_and_valid_equal_sets(dense_bytes):
+    origin = (0.1, 0.0, -0.1)
+    grid, sets = _grid(dense_bytes), _by_sets(_clouds(), origin)
+    assert (grid._volume is None) == (dense_bytes == 0)
+    points, ids = _queries()
+    expected = []
+    for point, c in zip(points.tolist(), ids.tolist(), strict=True):
+        voxel = [math.floor((x - o) / SIZE) for x, o in zip(point, origin, strict=True)]
+        expected.append(
+            sum(
+                tuple(v + d for v, d in zip(voxel, step, strict=True)) in sets[c]
+                for step in itertools.product((-1, 0, 1), repeat=3)
+            )
+        )
+    count = grid.count(points, ids)
+    assert count.tolist() == expected and max(expected) >= 3
+    assert torch.equal(grid.valid(points, ids), count > 0)
+    assert 0.05 < (count > 0).float().mean() < 0.95
+
+
+def test_colliding_classes_leave_a_voxel_empty():
+    points = torch.tensor([[0.5, 0.5, 0.5], [0.6, 0.6, 0.6], [5.5, 0.5, 0.5], [5.6, 0.5, 0.5]])
+    ids = torch.tensor([1, 2, 1, 1], dtype=torch.int32)
+    clouds = [(points[:1], ids[:1]), (points[1:], ids[1:])]  # in two views
+    grid = VisibilityGrid.from_points(clouds, 1.0, torch.zeros(3), 3)
+    assert len(grid.keys) == 1 and grid.classes.tolist() == [1]
+    assert grid.count(points, ids).tolist() == [0, 0, 1, 1]
+    # class 2 collided everywhere: its grid is empty, and so is D_occ
+    far = torch.rand(100, 3, generator=torch.Generator().manual_seed(0)) * 10
+    assert not grid.valid(far, torch.full((100,), 2)).any() and not grid.valid(far, torch.zeros(100).int()).any()
+
+
+@pytest.mark.parametrize("dense_bytes", [1 << 28, 0])
+def test_empty_grid_and_wild_points(dense_bytes):
+    none = VisibilityGrid.from_points([], 1.0, torch.zeros(3), 2, dense_bytes)
+    points = torch.tensor(
+        [[0.0, 0, 0], [math.nan, 0, 0], [math.inf, 0, 0], [-math.inf, 0, 0], [1e30, 0, 0], [-3e9, 0, 0]]
+    )
+    ids = torch.ones(6, dtype=torch.int32)
+    assert not none.valid(points, ids).any() and not none.count(points, ids).any()
+    one = VisibilityGrid.from_points([(torch.zeros(1, 3), ids[:1])], 1.0, torch.zeros(3), 2, dense_bytes)
+    assert one.valid(points, ids).tolist() == [True] + [False] * 5
+    assert one.count(points, ids).tolist() == [1] + [0] * 5
+
+
+def test_one_voxel_reaches_exactly_its_27_neighbours():
+    for dense_bytes in (1 << 28, 0):
+        grid = VisibilityGrid.from_points(
+            [(torch.full((1, 3), 0.5), torch.ones(1).int())], 1.0, torch.zeros(3), 2, dense_bytes
+        )
+        steps = torch.tensor(list(itertools.product(range(-3, 4), repeat=3)))
+        valid = grid.valid(steps + 0.5, torch.ones(len(steps)).int())
+        assert torch.equal(valid, (steps.abs() <= 1).all(1))
+
+
+@pytest.mark.parametrize("factor", [1e-4, 1e6])
+def test_grids_scale(factor):
+    points, ids = _queries()
+    scaled = VisibilityGrid.from_points(
+        [((p.double() * factor), c) for p, c in _clouds()],
+        SIZE * factor,
+        torch.tensor([0.1, 0.0, -0.1], dtype=torch.float64) * factor,
+        CLASSES,
+    )
+    agree = scaled.count(points.double() * factor, ids) == _grid().count(points, ids)
+    assert agree.float().mean() > 0.998  # a point on a voxel's face may round to either side
+
+
+def test_state_dict_round_trip(tmp_path):
+    grid = _grid()
+    torch.save(grid.state_dict(), tmp_path / "grid.pt")
+    back = VisibilityGrid.from_state_dict(torch.load(tmp_path / "grid.pt", weights_only=True))
+    points, ids = _queries()
+    assert back.voxel_size == grid.voxel_size and torch.equal(back.count(points, ids), grid.count(points, ids))
+    assert torch.equal(back.valid(points, ids), grid.valid(points, ids))
+
+
+def test_too_many_voxels_are_told():
+    points = torch.tensor([[0.0, 0, 0], [3e6, 0, 0]])
+    with pytest.raises(UserError, match="raise k"):
+        VisibilityGrid.from_points([(points, torch.ones(2).int())], 1.0, torch.zeros(3), 2)
+
+
+@pytest.mark.parametrize("dense_bytes", [1 << 28, 0])
+@pytest.mark.parametrize("origin", [(0.1, 0.0, -0.1), (1000.1, -500.0, 0.0)])
+def test_disc_inside_is_never_wrong(dense_bytes, origin):
+    """Every one of many points of every disc that is called inside is valid; float32 far from 0 as well."""
+    g = torch.Generator().manual_seed(4)
+    shift = torch.tensor(origin) - torch.tensor([0.1, 0.0, -0.1])
+    clouds = [(torch.rand(3000, 3, generator=g) * 1.5 + shift, torch.ones(3000).int())]
+    grid = VisibilityGrid.from_points(clouds, SIZE, torch.tensor(origin, dtype=torch.float64), 2, dense_bytes)
+    count = 4000
+    means = torch.rand(count, 3, generator=g) * 2.6 - 0.5 + shift
+    axes = torch.randn(count, 2, 3, generator=g) * (0.3 * torch.rand(count, 1, 1, generator=g))
+    ids = torch.ones(count).int()
+    inside = grid.disc_inside(means, axes[:, 0], axes[:, 1], ids)
+    assert 0.05 < inside.float().mean() < 0.9
+    angle = torch.linspace(0, 2 * math.pi, 181)
+    every = torch.ones(count, dtype=torch.bool)
+    for a in angle:
+        for radius in (1.0, 0.5, 0.0):
+            every &= grid.valid(means + radius * (a.cos() * axes[:, 0] + a.sin() * axes[:, 1]), ids)
+    assert not (inside & ~every).any()
+    assert not grid.disc_inside(means, axes[:, 0], axes[:, 1], 0 * ids).any()
+
+
+def test_large_and_broken_discs_are_not_inside():
+    clouds = [(torch.rand(20000, 3, generator=torch.Generator().manual_seed(5)) * 10, torch.ones(20000).int())]
+    grid = VisibilityGrid.from_points(clouds, 1.0, torch.zeros(3), 2)
+    means = torch.tensor([[5.0, 5, 5], [5.0, 5, 5], [math.nan, 5, 5], [5.0, 5, 5]])
+    u = torch.tensor([[0.1, 0, 0], [2.0, 0, 0], [0.1, 0, 0], [math.inf, 0, 0]])
+    v = torch.tensor([[0.0, 0.1, 0]]).expand(4, 3)
+    assert grid.disc_inside(means, u, v, torch.ones(4).int()).tolist() == [True, False, False, False]
+
+
+# ---------------------------------------------------------------- building
+
+
+class _Stub:
+    """Draws images that were written down."""
+
+    def rasterize(self, inputs, camera, settings, background, target=None):
+        assert settings.geometry and not inputs.means.requires_grad
+        return SimpleNamespace(alpha=camera.alpha, depth=camera.depth)
+
+    def class_map(self, inputs, camera, settings, num_classes):
+        return camera.classes, camera.alpha
+
+
+class _View(Camera):
+    pass
+
+
+def _view(seed: int, width: int = 24, height: int = 18) -> _View:
+    g = torch.Generator().manual_seed(seed)
+    viewmat = torch.eye(4)
+    viewmat[:3, 3] = torch.randn(3, generator=g) * 0.1
+    view = _View(viewmat, torch.tensor([[20.0, 0, 12.2], [0, 20.0, 8.7], [0, 0, 1]]), width, height)
+    for name, value in {
+        "alpha": torch.rand(height, width, generator=g),
+        "depth": 2 + torch.rand(height, width, generator=g),
+        "classes": torch.randint(0, CLASSES, (height, width), generator=g).int(),
+    }.items():
+        object.__setattr__(view, name, value)
+    return view
+
+
+def _surfels(count: int = 1) -> Surfels:
+    return Surfels(*(torch.zeros(shape) for shape in [(count, 3), (count, 4), (count, 2), (count,), (count, 1, 3)]))
+
+
+SETTINGS = RasterSettings(near=0.1, far=100.0, geometry=False)
+
+
+def test_build_lifts_solid_pixels_of_all_views():
+    views, calls = [_view(0), _view(1, 30, 20), _view(2)], []
+    grid = build_visibility_grid(
+        _surfels(), torch.zeros(1).int(), views, _Stub(), SETTINGS, CLASSES, k=3, progress=lambda *s: calls.append(s)
+    )
+    solid = [view.alpha >= 0.5 for view in views]
+    points = torch.cat([lift(v.depth, v)[s] for v, s in zip(views, solid, strict=True)])
+    ids = torch.cat([v.classes[s] for v, s in zip(views, solid, strict=True)])
+    assert grid.voxel_size == pytest.approx(voxel_size(points.numpy(), k=3))  # of all classes together
+    expected = VisibilityGrid.from_points([(points, ids)], grid.voxel_size, grid.origin, CLASSES)
+    assert len(expected.keys) > 10
+    assert torch.equal(grid.keys, expected.keys) and torch.equal(grid.classes, expected.classes)
+    assert calls == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_build_skips_depths_that_cannot_be_lifted():
+    view = _view(3)
+    view.depth[2, :] = math.nan
+    view.depth[3, :] = 0.0
+    grid = build_visibility_grid(_surfels(), torch.zeros(1).int(), [view], _Stub(), SETTINGS, CLASSES, k=5)
+    assert math.isfinite(grid.voxel_size)
+
+
+def test_build_says_when_nothing_is_solid():
+    view = _view(4)
+    view.alpha.fill_(0.3)
+    with pytest.raises(UserError, match="nothing solid|anything solid"):
+        build_visibility_grid(_surfels(), torch.zeros(1).int(), [view], _Stub(), SETTINGS, CLASSES)
+
+
+def test_build_with_the_reference_rasterizer():
+    """Two patches of surfels side by side: each patch is valid for its own class only."""
+    x, y = torch.meshgrid(torch.linspace(-1, 1, 8), torch.linspace(-0.6, 0.6, 6), indexing="xy")
+    means = torch.stack([x, y, torch.full_like(x, 4.0)], -1).view(-1, 3)
+    count = len(means)
+    surfels = Surfels(
+        means,
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        torch.full((count, 2), math.log(0.15)),
+        torch.full((count,), 4.0),
+        torch.zeros(count, 1, 3),
+    )
+    ids = (means[:, 0] > 0).int() + 1
+    camera = Camera(torch.eye(4), torch.tensor([[40.0, 0, 16], [0, 40.0, 12], [0, 0, 1]]), 32, 24)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        grid = build_visibility_grid(surfels, ids, [camera], make_rasterizer("torch"), SETTINGS, 3, k=10)
+    assert grid.valid(means, ids).float().mean() > 0.95
+    outer = means[:, 0].abs() > 3 * grid.voxel_size
+    assert outer.any() and not grid.valid(means[outer], 3 - ids[outer]).any()
+    assert not grid.valid(means - torch.tensor([0.0, 0.0, 3.0]), ids).any()
