@@ -77,7 +77,9 @@ class Extract:
         from beags_plugin.plugin.extract import extract_objects
 
         for done in extract_objects(self.load_config, self.object, self.remove, self.output):
-            CONSOLE.print(f"{done.name}: {done.gaussians} Gaussians\n  {done.ply}\n  ns-viewer --load-config {done.config}")
+            CONSOLE.print(
+                f"{done.name}: {done.gaussians} Gaussians\n  {done.ply}\n  ns-viewer --load-config {done.config}"
+            )
 
 
 @dataclass

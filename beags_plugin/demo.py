@@ -100,7 +100,7 @@ def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
     base, refined = load_scene(run / "base" / "config.yml"), load_scene(run / "config.yml")
     class_ids, classes = refined.state["class_ids"], refined.classes
     settings = raster_settings(refined)
-    rasterizer = make_rasterizer(refined.config.pipeline.model.rasterizer)
+    rasterizer = make_rasterizer(refined.config.model_config.rasterizer)
     views = held_out_views(refined.config, classes)
     with _Timer(seconds, "evaluation"), progress_bar("Evaluating") as progress:
         before, after = (
@@ -113,9 +113,7 @@ def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
     with _Timer(seconds, "picture"):
         shown = views[:: max(1, len(views) // SHEET_VIEWS)][:SHEET_VIEWS]
         objects = [index for index in classes if index != 0]
-        rows = draw_rows(
-            shown, base.surfels(), refined.surfels(), class_ids, objects, rasterizer, settings
-        )
+        rows = draw_rows(shown, base.surfels(), refined.surfels(), class_ids, objects, rasterizer, settings)
         write_contact_sheet(picture, rows, classes)
     training = json.loads((run / "training.json").read_text())
     stages = {"sample": seconds.pop("sample", 0.0), **training["seconds"], **seconds}

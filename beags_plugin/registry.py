@@ -35,7 +35,9 @@ class Registry:
         """Add ``name``; raises ``UserError`` if the name is taken by another spec."""
         known = self._specs.setdefault(name, spec)
         if known != spec:
-            raise UserError(f"two {self.kind}s are called {name!r} ({known} and {spec}): rename or uninstall one of them.")
+            raise UserError(
+                f"two {self.kind}s are called {name!r} ({known} and {spec}): rename or uninstall one of them."
+            )
 
     def names(self) -> list[str]:
         """The registered names, sorted; imports none of them."""

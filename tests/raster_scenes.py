@@ -28,13 +28,18 @@ class Scene:
         """The same scene in another precision."""
         floats = {name: getattr(self.inputs, name).to(dtype) for name in FLOATS}
         return replace(
-            self, inputs=replace(self.inputs, **floats), camera=self.camera.to(dtype), background=self.background.to(dtype)
+            self,
+            inputs=replace(self.inputs, **floats),
+            camera=self.camera.to(dtype),
+            background=self.background.to(dtype),
         )
 
     def draw(self, rasterizer, **changes):
         """Draw, with some of the inputs replaced (``background`` among them)."""
         background = changes.pop("background", self.background)
-        return rasterizer.rasterize(replace(self.inputs, **changes), self.camera, self.settings, background, self.target)
+        return rasterizer.rasterize(
+            replace(self.inputs, **changes), self.camera, self.settings, background, self.target
+        )
 
 
 def make_scene(

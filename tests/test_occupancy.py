@@ -313,3 +313,12 @@ def test_importing_the_packages_stays_light():
     root = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=False)
     assert result.returncode == 0, result.stderr
+
+
+def test_the_background_can_be_left_out():
+    surfels, ids = _surfels(), _ids()
+    objects = surfels[ids != 0]
+    value = OccupancyLoss(background=False, samples=4000).value(_inputs(surfels))
+    alone = OccupancyLoss(samples=4000).value(_inputs(objects, ids=ids[ids != 0]))
+    assert float(value) == pytest.approx(float(alone) * len(objects) / COUNT, rel=0.05)  # other points, same mean
+    assert all(not gradient[ids == 0].any() for gradient in _gradients(value, surfels))

@@ -148,7 +148,7 @@ def initial_surfels(points: Tensor, colors: Tensor, sh_degree: int, generator: t
 
     points: [N, 3] world. colors: [N, 3] in 0..1. Returns N surfels in float32 without gradients.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
 
     count = points.shape[0]
     cloud = points.double().cpu().numpy()

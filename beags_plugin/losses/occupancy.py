@@ -24,9 +24,9 @@ class OccupancyLoss(Loss):
     not finite count as 0. Memory does not depend on ``samples``.
 
     samples: Z, points per Gaussian and step, uniform in its UV disc of radius 3.
-    background: whether the background's Gaussians are held to its voxels too, as in the paper. Its far parts are sampled
-        thinly, so that one voxel size for all leaves holes there; without it the background keeps its look, and steps
-        are quicker (our choice for short runs).
+    background: whether the background's Gaussians are held to its voxels too, as in the paper. Its far parts are
+        sampled thinly, so that one voxel size for all leaves holes there; without it the background keeps its look,
+        and steps are quicker (our choice for short runs).
     """
 
     weight: float = 10.0

@@ -48,12 +48,12 @@ def reproject_pairwise(
     Raises ``UserError`` for a mask of the wrong size or with ids out of range.
     """
     _check(depths, cameras, labels, num_classes, tau)
-    voting = [j for j, mask in enumerate(labels) if mask is not None]
+    voting = [(j, mask) for j, mask in enumerate(labels) if mask is not None]
     results = []
     for i, camera in enumerate(cameras):
         votes = _Votes(camera.height * camera.width, num_classes, depths[i].device)
-        for j in voting:
-            _cast(votes, depths[j], labels[j], depths[i], _pixel_map(cameras[j], camera, same=i == j), tau)
+        for j, mask in voting:
+            _cast(votes, depths[j], mask, depths[i], _pixel_map(cameras[j], camera, same=i == j), tau)
         results.append(_decide(votes, labels[i], camera))
         if progress:
             progress(i + 1, len(cameras))

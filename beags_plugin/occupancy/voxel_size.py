@@ -35,7 +35,7 @@ def voxel_size_of_reference(
     reference: np.ndarray, total: int, k: int = 2000, seed: int = 0, num_queries: int = 2000
 ) -> float:
     """``voxel_size`` of a cloud of ``total`` points of which only ``reference`` [R, 3] was kept, evenly at random."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
 
     if k < 1:
         raise ValueError(f"k must be at least 1, not {k}")

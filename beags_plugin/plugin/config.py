@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import cast
 
 from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
@@ -27,6 +28,16 @@ class BeagsTrainerConfig(TrainerConfig):
     max_num_iterations: int = 0
     """Stop after so many steps of the schedule; 0 runs base_steps + refine_steps."""
 
+    @property
+    def model_config(self) -> BeagsModelConfig:
+        """Options of the model; nerfstudio's field promises no more than a ``ModelConfig``."""
+        return cast(BeagsModelConfig, self.pipeline.model)
+
+    @property
+    def data_config(self) -> BeagsDataManagerConfig:
+        """Options of the data manager; nerfstudio's field promises no more than a ``DataManagerConfig``."""
+        return cast(BeagsDataManagerConfig, self.pipeline.datamanager)
+
     def get_base_dir(self) -> Path:
         """Folder of the run."""
         return self.run_dir if self.run_dir is not None else super().get_base_dir()
@@ -34,9 +45,9 @@ class BeagsTrainerConfig(TrainerConfig):
     def save_config(self) -> None:
         """Save config.yml with absolute paths, so that every command finds the run from any folder."""
         self.output_dir = Path(self.output_dir).absolute()
-        for holder in (self, self.pipeline.datamanager, self.pipeline.datamanager.dataparser):
-            if getattr(holder, "data", None) is not None:
-                holder.data = Path(holder.data).absolute()
+        for holder in (self, self.data_config, self.data_config.dataparser):
+            if (data := getattr(holder, "data", None)) is not None:
+                holder.data = Path(data).absolute()
         super().save_config()
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def raster_settings(scene: SavedScene) -> RasterSettings:
     """Depth range of a saved scene."""
-    extent, model = float(scene.state["extent"]), scene.config.pipeline.model
+    extent, model = float(scene.state["extent"]), scene.config.model_config
     return RasterSettings(model.near * extent, model.far * extent)
 
 
@@ -28,8 +28,8 @@ def held_out_views(config: BeagsTrainerConfig, classes: dict[int, str]) -> list[
 
     Without it, the data's own masks of those views serve as visible masks.
     """
-    manager = config.pipeline.datamanager.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
-    folder = Path(config.pipeline.datamanager.dataparser.data or config.pipeline.datamanager.data) / "ground_truth"
+    manager = config.data_config.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
+    folder = Path(config.data_config.dataparser.data or config.data_config.data) / "ground_truth"
     views = []
     for view in manager.views("test"):
         exact = folder / "masks" / f"{view.name}.png"

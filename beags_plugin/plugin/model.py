@@ -98,6 +98,11 @@ class BeagsModel(SplatfactoModel):
     """
 
     config: BeagsModelConfig
+    # buffers, for type checkers; the surfels are N
+    class_ids: Tensor  # [N] int32
+    class_margin: Tensor  # [N] float32
+    assigned: Tensor  # [] bool
+    extent: Tensor  # [] float32, world units
 
     def populate_modules(self) -> None:
         """Build the surfels from the seed points that the data supplies."""
@@ -279,6 +284,7 @@ class BeagsModel(SplatfactoModel):
         render = self.rasterizer.rasterize(
             surfel_inputs(surfels, camera, self.active_sh_degree()), camera, settings, background
         )
+        assert render.depth is not None and render.normal is not None  # the settings ask for geometry
         outputs = {
             "rgb": render.color.clamp(0.0, 1.0),
             "depth": render.depth[..., None],

@@ -15,7 +15,7 @@ from beags_plugin.plugin.config import BeagsTrainerConfig, base_config
 if sys.version_info >= (3, 11):
     import tomllib
 else:
-    import tomli as tomllib
+    import tomli as tomllib  # pyright: ignore[reportMissingImports]  (installed on Python 3.10 only)
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -63,9 +63,7 @@ def override(config: BeagsTrainerConfig, key: str, value: Any, source: Path) -> 
     if isinstance(current, float) and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if current is not None and type(value) is not type(current):
-        raise UserError(
-            f"{source}: {key} must be {type(current).__name__}, not {type(value).__name__} ({value!r})."
-        )
+        raise UserError(f"{source}: {key} must be {type(current).__name__}, not {type(value).__name__} ({value!r}).")
     if isinstance(holder, dict):
         holder[last] = value
     elif type(holder).__dataclass_params__.frozen:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.decorators import check_main_thread
@@ -18,6 +18,7 @@ from beags_plugin.plugin.schedule import PhaseSchedule
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
+    from beags_plugin.plugin.model import BeagsModel
 
 QUICK_PRESET = "beags-tiny"
 LONG_RUN_SECONDS = 20 * 60  # a run that is expected to take longer says which preset is quicker
@@ -30,11 +31,15 @@ class BeagsTrainer(Trainer):
     config: BeagsTrainerConfig
 
     def __init__(self, config: BeagsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
-        self.schedule = PhaseSchedule(config.pipeline.model.base_steps, config.pipeline.model.refine_steps)
+        self.schedule = PhaseSchedule(config.model_config.base_steps, config.model_config.refine_steps)
         self.last_step = config.max_num_iterations or self.schedule.total
         config.max_num_iterations = self.last_step
         self._started = 0.0
         super().__init__(config, local_rank, world_size)
+
+    @property
+    def _model(self) -> BeagsModel:
+        return cast("BeagsModel", self.pipeline.model)
 
     def setup(self, test_mode: Any = "val") -> None:
         """Load data, build the model, load a checkpoint; a user's mistake ends here, with one sentence."""
@@ -89,7 +94,7 @@ class BeagsTrainer(Trainer):
 
     def _resumes_refinement(self) -> bool:
         """Whether the checkpoint is one of this very method's (it has refined before), not a base."""
-        return bool(self.pipeline.model.assigned) and (self.base_dir / "prepared" / "grid.pt").exists()
+        return bool(self._model.assigned) and (self.base_dir / "prepared" / "grid.pt").exists()
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
@@ -117,8 +122,8 @@ class BeagsTrainer(Trainer):
     def _stage_seconds(self) -> dict[str, float]:
         """Wall time of base training, each preparation stage and refinement in this process."""
         total = time.perf_counter() - self._started
-        prepared = self.pipeline.model.prepared_seconds
-        refining = time.perf_counter() - self.pipeline.model.refining_since if prepared else 0.0
+        prepared = self._model.prepared_seconds
+        refining = time.perf_counter() - self._model.refining_since if prepared else 0.0
         return {"base training": total - sum(prepared.values()) - refining, **prepared, "refinement": refining}
 
 
@@ -131,4 +136,3 @@ def _duration(seconds: float) -> str:
 def _stop(error: UserError) -> None:
     CONSOLE.print(f"[bold red]beags:[/bold red] {error}", highlight=False, soft_wrap=True)
     sys.exit(2)
-

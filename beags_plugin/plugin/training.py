@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
@@ -13,6 +13,7 @@ from beags_plugin.plugin.refinement import RefinementSwitch
 from beags_plugin.plugin.schedule import log_linear
 
 if TYPE_CHECKING:
+    from beags_plugin.plugin.datamanager import BeagsDataManager
     from beags_plugin.plugin.model import BeagsModel
 
 EXTENT_MARGIN = 1.1  # the scene's extent is 1.1 x the largest distance of a camera from their mean (section 1)
@@ -21,12 +22,13 @@ EXTENT_MARGIN = 1.1  # the scene's extent is 1.1 x the largest distance of a cam
 def training_callbacks(model: BeagsModel, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
     """The callbacks of one run, in the order in which nerfstudio calls them."""
     trainer, pipeline = attributes.trainer, attributes.pipeline
-    assert trainer is not None and attributes.optimizers is not None
+    assert trainer is not None and pipeline is not None and attributes.optimizers is not None
+    datamanager = cast("BeagsDataManager", pipeline.datamanager)
     optimizers = attributes.optimizers.optimizers
     model.seed = trainer.config.machine.seed
-    model.extent = camera_extent(pipeline.datamanager.train_dataset.cameras.camera_to_worlds).to(model.device)
+    model.extent = camera_extent(datamanager.train_dataset.cameras.camera_to_worlds).to(model.device)
     densifier = Densifier(model, optimizers)
-    switch = RefinementSwitch(model, trainer, pipeline.datamanager)
+    switch = RefinementSwitch(model, trainer, datamanager)
 
     def before(step: int) -> None:
         model.step = step
@@ -125,4 +127,3 @@ def move_adam_state(
     optimizer.state[parameter] = state
     for group in optimizer.param_groups:
         group["params"] = [parameter if held is former else held for held in group["params"]]
-

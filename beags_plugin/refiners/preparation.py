@@ -111,9 +111,7 @@ def prepare(
     timed("assignment", start, _assignment_finding(assignment, class_names))
 
     start = time.perf_counter()
-    scene = AssignedScene(
-        surfels, assignment.class_ids, cameras, consistent, num_classes, rasterizer, settings, seed
-    )
+    scene = AssignedScene(surfels, assignment.class_ids, cameras, consistent, num_classes, rasterizer, settings, seed)
     with stage("Building voxel grids") as progress:
         grid = refiner.build_grid(scene, config.k, progress)
     if grid is not None:

@@ -37,7 +37,10 @@ def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
     Determinism: written out, since a BLAS product may differ in its last bit with the number of threads.
     """
-    return sum((a[:, i] * b[:, i] for i in range(1, a.shape[1])), a[:, 0] * b[:, 0])
+    total = a[:, 0] * b[:, 0]
+    for i in range(1, a.shape[1]):
+        total = total + a[:, i] * b[:, i]
+    return total
 
 
 def turned(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
