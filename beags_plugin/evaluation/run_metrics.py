@@ -29,6 +29,8 @@ class EvalView:
     visible: [h, w] integer class ids of what is seen, or IGNORE; None if there are no masks. May differ in size from
         the camera: predictions are resized to it.
     silhouettes: object id to [h, w] bool, what the object covers when nothing stands before it; None if unknown.
+    seen: object id to [h, w] bool, the part of the silhouette whose surface some training photo shows; the rest
+        cannot be known and is left out of the extracted metrics. None counts whole silhouettes.
     """
 
     camera: Camera
@@ -36,6 +38,7 @@ class EvalView:
     visible: Tensor | None = None
     silhouettes: Mapping[int, Tensor] | None = None
     name: str = ""
+    seen: Mapping[int, Tensor] | None = None
 
 
 @dataclass(frozen=True)
@@ -131,7 +134,9 @@ def extracted_truth(view: EvalView, class_id: int) -> tuple[str, Tensor, Tensor 
     kind: "silhouette", or "visible", where pixels of other objects and IGNORE pixels are left out.
     """
     if view.silhouettes is not None and class_id in view.silhouettes:
-        return "silhouette", view.silhouettes[class_id], None
+        silhouette = view.silhouettes[class_id]
+        known = None if view.seen is None else view.seen.get(class_id)
+        return "silhouette", silhouette, None if known is None else silhouette & ~known
     if view.visible is None:
         return None
     return "visible", view.visible == class_id, (view.visible != class_id) & (view.visible != 0)

@@ -36,10 +36,17 @@ def held_out_views(config: BeagsTrainerConfig, classes: dict[int, str]) -> list[
         visible = view.labels
         if exact.exists():
             visible = torch.from_numpy(read_class_map(exact).astype(np.int32))
-        silhouettes = {
-            index: torch.from_numpy(read_class_map(path) > 0)
-            for index, name in classes.items()
-            if (path := folder / "silhouettes" / name / f"{view.name}.png").exists()
-        }
-        views.append(EvalView(view.camera, view.image, visible, silhouettes or None, view.name))
+        silhouettes = _per_object(folder / "silhouettes", classes, view.name)
+        seen = _per_object(folder / "seen", classes, view.name)
+        views.append(EvalView(view.camera, view.image, visible, silhouettes, view.name, seen))
     return views
+
+
+def _per_object(folder: Path, classes: dict[int, str], view: str) -> dict[int, torch.Tensor] | None:
+    """Object id to the [h, w] bool mask ``<folder>/<object>/<view>.png``; None if there is none."""
+    masks = {
+        index: torch.from_numpy(read_class_map(path) > 0)
+        for index, name in classes.items()
+        if (path := folder / name / f"{view}.png").exists()
+    }
+    return masks or None

@@ -21,6 +21,9 @@ from beags_plugin.sample.textures import (
 DOME_RADIUS = 5.0
 """World units; the ground is the disc z = 0 of this radius, closed by the half-dome above it."""
 
+HUE_RANGE = 0.25
+"""Share of the colour circle that the objects' hues cover."""
+
 
 @dataclass(frozen=True)
 class Thing:
@@ -79,8 +82,8 @@ def _turn_z(angle: float) -> np.ndarray:
 
 def _textures(names: list[str], generator: np.random.Generator) -> dict[str, Texture]:
     noise = Noise(generator)
-    # Hues evenly apart, dealt out at random: the objects stay distinct for every seed.
-    hues = (generator.permutation(len(names)) + generator.uniform(0.0, 1.0)) / len(names)
+    # Related hues, dealt out at random: colour alone does not tell where one object ends and the next begins.
+    hues = generator.uniform() + HUE_RANGE * (generator.permutation(len(names)) / len(names) - 0.5)
     patterns = {
         "box": checks(6.5),
         "cone": bands(7.0, twist=1.0),
@@ -129,8 +132,7 @@ def make_still(seed: int) -> Still:
     place("box", Solid(box, bound=float(np.linalg.norm([hx, hy, top / 2]))), [0.0, 0.0, top / 2])
     touch("box", "ground", [0.0, 0.0, 0.0])
 
-    # Its foot is small: what it hides of the box's top, no photo shows, and no method can know.
-    radius, height = about(0.12), about(0.36)
+    radius, height = about(0.15), about(0.36)
     x, y = generator.uniform(-0.05, 0.05), generator.uniform(-0.03, 0.03)
     cone = Solid((Cone(radius, height), *slab(2, 0.0, height)), bound=max(radius, height))
     place("cone", cone, [x, y, top], _turn_z(generator.uniform(0.0, 2.0 * np.pi)))
@@ -155,26 +157,26 @@ def make_still(seed: int) -> Still:
     touch("ring", "box", list(centre + reach))
     touch("ring", "ground", [centre[0], centre[1], 0.0])
 
-    # The bowl stands free before the face y = -hy, so that it hides the box only from some sides; its foot is flat.
+    # The bowl is widest at its ball's centre, where it touches the face y = -hy; its foot is the flat below.
     radius = about(0.33, 0.05)
     inner = 0.9 * radius
     foot = inner + 0.02
-    bowl_at = np.array([generator.uniform(-0.06, 0.06), -hy - radius - about(0.22), foot])
+    x = generator.uniform(-0.06, 0.06)
+    bowl_at = np.array([x, -hy - radius, foot])
     bowl = Solid((Ball(radius), *slab(2, -foot, 0.1 * radius)), (Ball(inner),), radius)
     place("bowl", bowl, list(bowl_at))
-    touch("bowl", "ground", [bowl_at[0], bowl_at[1], 0.0])
+    touch("bowl", "box", [x, -hy, foot])
+    touch("bowl", "ground", [x, bowl_at[1], 0.0])
 
-    # The ball lies on the ground against the bowl, on the side away from the can.
-    small = about(0.17)
-    way = generator.uniform(-2.7, -2.2)
-    apart = np.sqrt((radius + small) ** 2 - (foot - small) ** 2)
-    ball_at = np.array([bowl_at[0] + apart * np.cos(way), bowl_at[1] + apart * np.sin(way), small])
-    place("ball", Solid((Ball(small),), bound=small), list(ball_at))
-    touch("ball", "bowl", list(bowl_at + (ball_at - bowl_at) * radius / (radius + small)))
-    touch("ball", "ground", [ball_at[0], ball_at[1], 0.0])
+    # The ball lies in it, a little off the bottom's middle.
+    radius = about(0.74, 0.04) * inner
+    lean, way = generator.uniform(0.05, 0.2), generator.uniform(0.0, 2.0 * np.pi)
+    down = np.array([np.sin(lean) * np.cos(way), np.sin(lean) * np.sin(way), -np.cos(lean)])
+    place("ball", Solid((Ball(radius),), bound=radius), list(bowl_at + (inner - radius) * down))
+    touch("ball", "bowl", list(bowl_at + inner * down))
 
     # The plank leans with its upper edge against the face y = hy.
-    wide, thick, long, tilt = about(0.17), 0.018, about(0.21), generator.uniform(0.60, 0.75)
+    wide, thick, long, tilt = about(0.17), 0.018, about(0.21), generator.uniform(0.35, 0.55)
     c, s = np.cos(tilt), np.sin(tilt)
     x = generator.uniform(-0.06, 0.06)
     y = hy + thick * c + long * s
@@ -199,7 +201,7 @@ def _finish(
     # All solids are symmetric about their own y = 0, so mirroring a pose (M R M, M t) mirrors the object exactly.
     mirror = np.diag([1.0, generator.choice([-1.0, 1.0]), 1.0])
     turn = _turn_z(generator.uniform(0.0, 2.0 * np.pi))
-    shift = np.array([0.08, 0.34, 0.0])
+    shift = np.array([0.08, 0.18, 0.0])
     names = list(solids)
     textures = _textures(names, generator)
     things = tuple(

@@ -18,9 +18,10 @@ from beags_plugin.sample.arrangement import make_still
 from beags_plugin.sample.degrade import Degradation, degrade_mask, dropped_views, resolve_degradation
 from beags_plugin.sample.lighting import Light
 from beags_plugin.sample.points import seed_points, write_ply
+from beags_plugin.sample.seen import seen_part, visible_surface
 from beags_plugin.sample.views import Picture, View, make_views, render_view
 
-VERSION = 2
+VERSION = 3
 """Raise it whenever the same config would give other files: older samples are then rebuilt."""
 POINT_NOISE = 0.004
 """World units, about one pixel's width at 640 x 480."""
@@ -81,7 +82,8 @@ def write_sample(
 
     Layout: transforms.json (OpenGL camera-to-world, world z up), images/<stem>.png, masks/<stem>.png (ids; degraded
     for train views, none for dropped ones, exact for test views), classes.json, seed_points.ply, and under
-    ground_truth/ the exact masks/<stem>.png, silhouettes/<object>/<stem>.png (0 or 255) and depth/<stem>.npy (float32,
+    ground_truth/ the exact masks/<stem>.png, silhouettes/<object>/<stem>.png (0 or 255), for test views
+    seen/<object>/<stem>.png (the part of the silhouette whose surface training photos show) and depth/<stem>.npy (float32,
     z along the optical axis); masks and depth are those of the pixel centres. sample.json is the config.
 
     All is written into a temporary folder beside it and renamed at the end: an interrupted run leaves no ``folder``.
@@ -125,12 +127,18 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
     for sub in ("images", "masks", *_truth_folders(names)):
         (folder / sub).mkdir(parents=True)
     points = []
+    surfaces: list[list[np.ndarray]] = [[] for _ in still.things]
+    silhouettes: dict[str, np.ndarray] = {}
     for done, view in enumerate(views, start=1):
         picture = render_view(still, light, view, config.antialias)
         _write_truth(folder, view, picture, names)
         _write_png(folder / "images" / f"{view.name}.png", picture.image)
         mask = picture.labels
-        if view.split == "train":
+        if view.split == "test":
+            silhouettes[view.name] = picture.silhouettes
+        else:
+            for surface, part in zip(surfaces, visible_surface(view, picture), strict=True):
+                surface.append(part)
             mask = degrade_mask(mask, len(names), degradation, config.seed, view.name)
             # One generator per view, so that no view's points depend on another's picture.
             generator = np.random.default_rng([config.seed, 6, done])
@@ -139,6 +147,10 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
             _write_png(folder / "masks" / f"{view.name}.png", mask)
         if progress is not None:
             progress(done, len(views))
+    whole = [np.concatenate(surface) for surface in surfaces]
+    for view in views:
+        if view.name in silhouettes:
+            _write_seen(folder, view, whole, silhouettes[view.name], names)
     write_ply(folder / "seed_points.ply", np.concatenate(points))
     _write_json(folder / "classes.json", {str(i): name for i, name in names.items()})
     _write_json(folder / "transforms.json", transforms(views))
@@ -178,7 +190,8 @@ def _even_shares(total: int, parts: int) -> list[int]:
 
 
 def _truth_folders(names: dict[int, str]) -> list[str]:
-    objects = [f"ground_truth/silhouettes/{name}" for class_id, name in names.items() if class_id]
+    kinds = ("silhouettes", "seen")
+    objects = [f"ground_truth/{kind}/{name}" for kind in kinds for class_id, name in names.items() if class_id]
     return ["ground_truth/masks", "ground_truth/depth", *objects]
 
 
@@ -188,6 +201,14 @@ def _write_truth(folder: Path, view: View, picture: Picture, names: dict[int, st
     np.save(truth / "depth" / f"{view.name}.npy", picture.depth)
     for class_id, silhouette in enumerate(picture.silhouettes, start=1):
         _write_png(truth / "silhouettes" / names[class_id] / f"{view.name}.png", np.uint8(255) * silhouette)
+
+
+def _write_seen(
+    folder: Path, view: View, surfaces: list[np.ndarray], silhouettes: np.ndarray, names: dict[int, str]
+) -> None:
+    for class_id, (surface, silhouette) in enumerate(zip(surfaces, silhouettes, strict=True), start=1):
+        seen = np.uint8(255) * seen_part(view, surface, silhouette)
+        _write_png(folder / "ground_truth" / "seen" / names[class_id] / f"{view.name}.png", seen)
 
 
 def _write_png(path: Path, pixels: np.ndarray) -> None:
