@@ -74,8 +74,8 @@ def mask_metrics(prediction: Any, truth: Any, ignore: Any = None) -> MaskMetrics
     """Acc, IoU and BIoU of a mask; where a ratio has nothing to count, it is 1.
 
     prediction: [H', W'] bool array or tensor, resized (nearest) to the truth if the sizes differ.
-    truth: [H, W] bool. ignore: [H, W] bool or None; True pixels are left out of every count. The bands are those
-    of the whole masks, so an ignored region makes no boundary of its own.
+    truth: [H, W] bool. ignore: [H, W] bool or None; True pixels are left out of every count, and the prediction
+    is taken to be right there, so that a hole in an ignored region makes no boundary around it.
     Raises ``ValueError`` for masks that are not two-dimensional or an ``ignore`` of another size than the truth.
     Source: method, section 8.
     """
@@ -87,6 +87,7 @@ def mask_metrics(prediction: Any, truth: Any, ignore: Any = None) -> MaskMetrics
         raise ValueError(f"the ignore mask is {counted.shape} but the truth is {true.shape}.")
     if predicted.shape != true.shape:
         predicted = resize_nearest(predicted, *true.shape)
+    predicted = np.where(counted, predicted, true)
     total = np.count_nonzero(counted)
     d = band_width(*true.shape)
     return MaskMetrics(

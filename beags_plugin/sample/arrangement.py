@@ -132,19 +132,28 @@ def make_still(seed: int) -> Still:
     place("box", Solid(box, bound=float(np.linalg.norm([hx, hy, top / 2]))), [0.0, 0.0, top / 2])
     touch("box", "ground", [0.0, 0.0, 0.0])
 
-    radius, height = about(0.15), about(0.36)
+    # Contacts are points and lines where they can be: what a contact hides, no photo shows, and no method can know.
+    radius, height = about(0.11), about(0.34)
     x, y = generator.uniform(-0.05, 0.05), generator.uniform(-0.03, 0.03)
     cone = Solid((Cone(radius, height), *slab(2, 0.0, height)), bound=max(radius, height))
     place("cone", cone, [x, y, top], _turn_z(generator.uniform(0.0, 2.0 * np.pi)))
     touch("cone", "box", [x, y, top])
 
-    # The can stands against the face x = hx.
+    # The can stands against the upright edge (hx, hy).
     radius, height = about(0.165), about(0.66)
-    y = generator.uniform(-0.08, 0.08)
+    way = generator.uniform(0.6, 0.95)
+    can_at = np.array([hx + radius * np.cos(way), hy + radius * np.sin(way), height / 2])
     can = Solid((Tube(radius), *slab(2, -height / 2, height / 2)), bound=float(np.hypot(radius, height / 2)))
-    place("cylinder", can, [hx + radius, y, height / 2], _turn_z(generator.uniform(0.0, 2.0 * np.pi)))
-    touch("cylinder", "box", [hx, y, top / 2])
-    touch("cylinder", "ground", [hx + radius, y, 0.0])
+    place("cylinder", can, list(can_at), _turn_z(generator.uniform(0.0, 2.0 * np.pi)))
+    touch("cylinder", "box", [hx, hy, top / 2])
+    touch("cylinder", "ground", [can_at[0], can_at[1], 0.0])
+
+    # The ball lies against the can, away from the box.
+    small, way = about(0.17), generator.uniform(-0.5, -0.1)
+    ball_at = np.array([*(can_at[:2] + (radius + small) * np.array([np.cos(way), np.sin(way)])), small])
+    place("ball", Solid((Ball(small),), bound=small), list(ball_at))
+    touch("ball", "cylinder", [*(can_at[:2] + radius * np.array([np.cos(way), np.sin(way)])), small])
+    touch("ball", "ground", [ball_at[0], ball_at[1], 0.0])
 
     # The ring stands on its edge, its plane at an angle to the normal of the face x = -hx that its rim touches.
     radius, half, angle = about(0.27), about(0.055), generator.uniform(0.15, 0.5)
@@ -157,36 +166,31 @@ def make_still(seed: int) -> Still:
     touch("ring", "box", list(centre + reach))
     touch("ring", "ground", [centre[0], centre[1], 0.0])
 
-    # The bowl is widest at its ball's centre, where it touches the face y = -hy; its foot is the flat below.
-    radius = about(0.33, 0.05)
+    # The bowl stands free before the face y = -hy; its foot is flat.
+    radius = about(0.31, 0.05)
     inner = 0.9 * radius
     foot = inner + 0.02
-    x = generator.uniform(-0.06, 0.06)
-    bowl_at = np.array([x, -hy - radius, foot])
+    bowl_at = [generator.uniform(-0.06, 0.06), -hy - radius - about(0.2), foot]
     bowl = Solid((Ball(radius), *slab(2, -foot, 0.1 * radius)), (Ball(inner),), radius)
-    place("bowl", bowl, list(bowl_at))
-    touch("bowl", "box", [x, -hy, foot])
-    touch("bowl", "ground", [x, bowl_at[1], 0.0])
+    place("bowl", bowl, bowl_at)
+    touch("bowl", "ground", [bowl_at[0], bowl_at[1], 0.0])
 
-    # The ball lies in it, a little off the bottom's middle.
-    radius = about(0.74, 0.04) * inner
-    lean, way = generator.uniform(0.05, 0.2), generator.uniform(0.0, 2.0 * np.pi)
-    down = np.array([np.sin(lean) * np.cos(way), np.sin(lean) * np.sin(way), -np.cos(lean)])
-    place("ball", Solid((Ball(radius),), bound=radius), list(bowl_at + (inner - radius) * down))
-    touch("ball", "bowl", list(bowl_at + inner * down))
-
-    # The plank leans with its upper edge against the face y = hy.
-    wide, thick, long, tilt = about(0.17), 0.018, about(0.21), generator.uniform(0.35, 0.55)
+    # The plank leans with the middle of its upper edge against the upright edge (-hx, hy).
+    wide, thick, long, tilt = about(0.15), 0.018, about(0.21), generator.uniform(0.5, 0.65)
+    way = generator.uniform(2.15, 2.55)
+    out, along = np.array([np.cos(way), np.sin(way), 0.0]), np.array([np.sin(way), -np.cos(way), 0.0])
     c, s = np.cos(tilt), np.sin(tilt)
-    x = generator.uniform(-0.06, 0.06)
-    y = hy + thick * c + long * s
+    up = c * np.array([0.0, 0.0, 1.0]) - s * out
+    normal = s * np.array([0.0, 0.0, 1.0]) + c * out
+    leans = np.array([-hx, hy, 2.0 * long * c])
     plank = Solid(
         (*slab(0, -wide, wide), *slab(1, -thick, thick), *slab(2, -long, long)),
         bound=float(np.hypot(wide, long) + thick),
     )
-    place("plank", plank, [x, y, thick * s + long * c], np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]))
-    touch("plank", "box", [x, hy, 2.0 * long * c])
-    touch("plank", "ground", [x, y - thick * c + long * s, 0.0])
+    centre = leans - long * up + thick * normal
+    place("plank", plank, list(centre), np.stack([along, normal, up], axis=1))
+    touch("plank", "box", list(leans))
+    touch("plank", "ground", list(centre - long * up - thick * normal))
 
     return _finish(solids, poses, contacts, generator)
 
@@ -201,7 +205,7 @@ def _finish(
     # All solids are symmetric about their own y = 0, so mirroring a pose (M R M, M t) mirrors the object exactly.
     mirror = np.diag([1.0, generator.choice([-1.0, 1.0]), 1.0])
     turn = _turn_z(generator.uniform(0.0, 2.0 * np.pi))
-    shift = np.array([0.08, 0.18, 0.0])
+    shift = np.array([0.0, 0.14, 0.0])
     names = list(solids)
     textures = _textures(names, generator)
     things = tuple(

@@ -1,7 +1,7 @@
-"""Which part of an object's silhouette rests on surface that some training photo shows.
+"""Which part of an object's silhouette rests on surface that the training photos show.
 
-Where an object touches another, or lies in one, no photo shows its surface. What it looks like there cannot be known, so
-an evaluation may leave those pixels of the silhouette out.
+Where an object touches another, or lies in one, photos show its surface nowhere or only through a gap. What it looks like
+there cannot be known, so an evaluation may leave those pixels of the silhouette out.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ import numpy as np
 
 from beags_plugin.sample.views import Picture, View
 
+MIN_VIEWS = 6  # photos that must show a patch of surface; fewer, through a gap and at a slant, do not place it in space
+PATCH = 0.03  # side of a patch, world units: a few pixels, so that every photo that shows one has points in it
 GAP = 1  # pixels: points of neighbouring pixels of one photo lie at most so far apart in another, seen at like distance
 
 
@@ -22,10 +24,22 @@ def visible_surface(view: View, picture: Picture) -> list[np.ndarray]:
     return [points[labels == class_id] for class_id in range(1, len(picture.silhouettes) + 1)]
 
 
+def well_seen(parts: list[np.ndarray], min_views: int = MIN_VIEWS) -> np.ndarray:
+    """Points [P, 3] of all ``parts`` ([P_i, 3], one per photo) whose patch at least ``min_views`` photos show."""
+    points = np.concatenate(parts)
+    photo = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    cells = np.floor(points / PATCH).astype(np.int64)
+    _, patch = np.unique(cells, axis=0, return_inverse=True)
+    patch = patch.ravel()
+    pairs = np.unique(patch * len(parts) + photo)
+    views = np.bincount(pairs // len(parts), minlength=patch.max(initial=0) + 1)
+    return points[views[patch] >= min_views]
+
+
 def seen_part(view: View, surface: np.ndarray, silhouette: np.ndarray) -> np.ndarray:
     """[H, W] bool, the pixels of ``silhouette`` whose ray meets the object's seen surface, on the near or far side.
 
-    surface: [P, 3] world points of the object that training photos show. silhouette: [H, W] bool.
+    surface: [P, 3] world points of the object, as ``well_seen`` gives them. silhouette: [H, W] bool.
     """
     rotation = view.camera_to_world[:3, :3]
     local = (surface - view.center) @ rotation

@@ -18,10 +18,10 @@ from beags_plugin.sample.arrangement import make_still
 from beags_plugin.sample.degrade import Degradation, degrade_mask, dropped_views, resolve_degradation
 from beags_plugin.sample.lighting import Light
 from beags_plugin.sample.points import seed_points, write_ply
-from beags_plugin.sample.seen import seen_part, visible_surface
+from beags_plugin.sample.seen import seen_part, visible_surface, well_seen
 from beags_plugin.sample.views import Picture, View, make_views, render_view
 
-VERSION = 3
+VERSION = 4
 """Raise it whenever the same config would give other files: older samples are then rebuilt."""
 POINT_NOISE = 0.004
 """World units, about one pixel's width at 640 x 480."""
@@ -147,7 +147,7 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
             _write_png(folder / "masks" / f"{view.name}.png", mask)
         if progress is not None:
             progress(done, len(views))
-    whole = [np.concatenate(surface) for surface in surfaces]
+    whole = [well_seen(surface) for surface in surfaces]
     for view in views:
         if view.name in silhouettes:
             _write_seen(folder, view, whole, silhouettes[view.name], names)
