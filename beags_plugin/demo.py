@@ -80,7 +80,7 @@ def train(data: Path, run: Path, preset: str, downscale: float) -> None:
     """Run ns-train in a process of its own, as a user would."""
     command = [
         str(Path(sys.executable).parent / "ns-train"), preset, "--data", str(data), "--run-dir", str(run.absolute()),
-        "--vis", "tensorboard", "--pipeline.datamanager.dataparser.downscale-factor", str(downscale),
+        "--vis", "tensorboard", "beags-data", "--downscale-factor", str(downscale),
     ]  # fmt: skip
     CONSOLE.print("$ " + " ".join(command))
     code = subprocess.run(command).returncode

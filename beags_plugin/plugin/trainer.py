@@ -75,7 +75,7 @@ class BeagsTrainer(Trainer):
             f"({1000 * seconds_per_step:.0f} ms a step; it slows down as Gaussians are added)."
         )
         if left > LONG_RUN_SECONDS and self.config.method_name != QUICK_PRESET:
-            message += f" Quicker: ns-train {QUICK_PRESET}, or --pipeline.datamanager.dataparser.downscale-factor 2."
+            message += f" Quicker: ns-train {QUICK_PRESET}, or end the command with: beags-data --downscale-factor 2."
         CONSOLE.print(message, highlight=False)
 
     def _load_checkpoint(self) -> None:

@@ -133,11 +133,22 @@ def make_still(seed: int) -> Still:
     touch("box", "ground", [0.0, 0.0, 0.0])
 
     # Contacts are points and lines where they can be: what a contact hides, no photo shows, and no method can know.
-    radius, height = about(0.11), about(0.34)
-    x, y = generator.uniform(-0.05, 0.05), generator.uniform(-0.03, 0.03)
+    # The ring stands upright on the box.
+    radius, half, angle = about(0.17), about(0.045), generator.uniform(0.0, np.pi)
+    ring = Solid((Tube(radius), *slab(2, -half, half)), (Tube(0.76 * radius),), float(np.hypot(radius, half)))
+    across = np.array([np.cos(angle), np.sin(angle), 0.0])
+    axis = np.array([-np.sin(angle), np.cos(angle), 0.0])
+    x, y = generator.uniform(-0.04, 0.04), generator.uniform(-0.03, 0.03)
+    place("ring", ring, [x, y, top + radius], np.stack([across, np.array([0.0, 0.0, -1.0]), axis], axis=1))
+    touch("ring", "box", [x, y, top])
+
+    # The cone stands before the face x = -hx and touches it with its rim.
+    radius, height = about(0.16), about(0.40)
+    y = generator.uniform(-0.08, 0.08)
     cone = Solid((Cone(radius, height), *slab(2, 0.0, height)), bound=max(radius, height))
-    place("cone", cone, [x, y, top], _turn_z(generator.uniform(0.0, 2.0 * np.pi)))
-    touch("cone", "box", [x, y, top])
+    place("cone", cone, [-hx - radius, y, 0.0], _turn_z(generator.uniform(0.0, 2.0 * np.pi)))
+    touch("cone", "box", [-hx, y, 0.0])
+    touch("cone", "ground", [-hx - radius, y, 0.0])
 
     # The can stands against the upright edge (hx, hy).
     radius, height = about(0.165), about(0.66)
@@ -149,22 +160,11 @@ def make_still(seed: int) -> Still:
     touch("cylinder", "ground", [can_at[0], can_at[1], 0.0])
 
     # The ball lies against the can, away from the box.
-    small, way = about(0.17), generator.uniform(-0.5, -0.1)
+    small, way = about(0.13), generator.uniform(-0.5, -0.1)
     ball_at = np.array([*(can_at[:2] + (radius + small) * np.array([np.cos(way), np.sin(way)])), small])
     place("ball", Solid((Ball(small),), bound=small), list(ball_at))
     touch("ball", "cylinder", [*(can_at[:2] + radius * np.array([np.cos(way), np.sin(way)])), small])
     touch("ball", "ground", [ball_at[0], ball_at[1], 0.0])
-
-    # The ring stands on its edge, its plane at an angle to the normal of the face x = -hx that its rim touches.
-    radius, half, angle = about(0.27), about(0.055), generator.uniform(0.15, 0.5)
-    ring = Solid((Tube(radius), *slab(2, -half, half)), (Tube(0.78 * radius),), float(np.hypot(radius, half)))
-    across = np.array([np.cos(angle), np.sin(angle), 0.0])
-    axis = np.array([-np.sin(angle), np.cos(angle), 0.0])
-    reach = radius * across - half * axis
-    centre = np.array([-hx, generator.uniform(-0.05, 0.05), radius]) - reach
-    place("ring", ring, list(centre), np.stack([across, np.array([0.0, 0.0, -1.0]), axis], axis=1))
-    touch("ring", "box", list(centre + reach))
-    touch("ring", "ground", [centre[0], centre[1], 0.0])
 
     # The bowl stands free before the face y = -hy; its foot is flat.
     radius = about(0.31, 0.05)
