@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 import subprocess
@@ -34,6 +35,8 @@ def run_demo(
     data: Path | None, output: Path | None, preset: str, downscale: float | None, seed: int, fresh: bool
 ) -> None:
     """Do the whole job in ``output`` and print the table; see ``cli.Demo`` for the arguments."""
+    from beags_plugin.plugin.presets import preset_names
+
     seconds: dict[str, float] = {}
     if data is None:
         output = output or Path("outputs/demo")
@@ -46,8 +49,10 @@ def run_demo(
     else:
         output = output or Path("outputs") / data.resolve().name
         downscale = downscale or quick_downscale(data)
+    if preset not in preset_names():
+        raise UserError(f"there is no preset {preset!r}: choose one of {', '.join(preset_names())}.")
     run = output / "run"
-    request = {"data": str(data.resolve()), "preset": preset, "downscale": downscale, "seed": seed}
+    request = {"preset": preset, "downscale": downscale, "inputs": _digest(data, preset)}
     if fresh or not _trained(output, request):
         shutil.rmtree(run, ignore_errors=True)
         train(data, run, preset, downscale)
@@ -69,6 +74,19 @@ def quick_downscale(data: Path) -> float:
     while width * height / factor**2 > QUICK_PIXELS:
         factor += 1
     return float(factor)
+
+
+def _digest(data: Path, preset: str) -> str:
+    """Changes with the preset, the version of the code and any file of the data (by name, size and time)."""
+    from beags_plugin import __version__
+    from beags_plugin.plugin.presets import preset_folder
+
+    digest = hashlib.sha256(f"{__version__} {data.resolve()}".encode())
+    digest.update((preset_folder() / f"{preset}.toml").read_bytes())
+    for path in sorted(path for path in data.rglob("*") if path.is_file()):
+        stat = path.stat()
+        digest.update(f"{path.relative_to(data)} {stat.st_size} {stat.st_mtime_ns}".encode())
+    return digest.hexdigest()
 
 
 def _trained(output: Path, request: dict[str, Any]) -> bool:

@@ -142,12 +142,13 @@ def test_removing_an_object_keeps_the_rest(trained):
     assert rest.gaussians == int((whole.state["class_ids"] != 1).sum())
 
 
-def test_mistakes_get_one_sentence(trained, tmp_path):
+def test_mistakes_get_one_sentence(trained, data, tmp_path):
     folder, _ = trained
     for command, words in [
         (("beags", "extract", "--load-config", tmp_path / "no.yml"), "cannot be read"),
         (("beags", "extract", "--load-config", folder / "config.yml", "--object", "unicorn"), "unicorn"),
-        (("ns-train", "beags-refine", "--data", tmp_path, "--run-dir", tmp_path / "r"), "beags:"),
+        (("ns-train", "beags-refine", "--data", data, "--run-dir", tmp_path / "r"), "starts from a trained base"),
+        (("beags", "demo", "--data", tmp_path / "nowhere"), "is no folder"),
     ]:
         code, text = run(*command)
         assert code == 2, text[-2000:]
@@ -158,9 +159,76 @@ def test_refine_starts_from_a_base_run(trained, data, tmp_path):
     folder, _ = trained
     code, text = run(
         "ns-train", "beags-refine", "--data", data, "--run-dir", tmp_path / "refined", "--vis", "tensorboard",
-        "--load-dir", folder / "base" / "nerfstudio_models", "--pipeline.model.refine-steps", 5,
-        "--pipeline.model.sh-degree", 1, "--pipeline.model.prepare.k", 200,
+        "--load-dir", folder / "base" / "nerfstudio_models", "--pipeline.model.refine-steps", 12,
+        "--steps-per-eval-image", 10, "--pipeline.model.prepare.k", 200,
     )  # fmt: skip
     assert code == 0, text[-4000:]
     assert "assignment: Gaussians per class" in text
-    assert (tmp_path / "refined" / "nerfstudio_models" / "step-000000004.ckpt").exists()
+    assert (tmp_path / "refined" / "nerfstudio_models" / "step-000000011.ckpt").exists()
+
+
+def test_refiner_none_leaves_the_scene_as_it_is(trained, data, tmp_path):
+    from beags_plugin.plugin.extract import load_scene
+
+    folder, _ = trained
+    code, text = run(
+        "ns-train", "beags-refine", "--data", data, "--run-dir", tmp_path / "none", "--vis", "tensorboard",
+        "--load-dir", folder / "base" / "nerfstudio_models", "--pipeline.model.refine-steps", 3,
+        "--pipeline.model.refiner", "none",
+    )  # fmt: skip
+    assert code == 0, text[-4000:]
+    base, kept = load_scene(folder / "base" / "config.yml"), load_scene(tmp_path / "none" / "config.yml")
+    for name in ("means", "quats", "scales", "opacities", "features_dc", "features_rest"):
+        assert (base.state[f"gauss_params.{name}"] == kept.state[f"gauss_params.{name}"]).all(), name
+
+
+def test_a_run_that_was_refining_is_resumed_with_its_classes_and_masks(trained, data, tmp_path):
+    from beags_plugin.plugin.extract import load_scene
+
+    folder, _ = trained
+    code, text = run(
+        "ns-train", "beags-tiny", "--data", data, "--run-dir", tmp_path / "resumed", "--vis", "tensorboard",
+        "--load-dir", folder / "nerfstudio_models",
+        "--pipeline.model.base-steps", 220, "--pipeline.model.refine-steps", 44, "--pipeline.model.prepare.k", 200,
+    )  # fmt: skip
+    assert code == 0, text[-4000:]
+    assert "refinement taken up" in text and "Gaussians per class" not in text
+    before, after = load_scene(folder / "config.yml"), load_scene(tmp_path / "resumed" / "config.yml")
+    assert after.step == 263 and int(after.state["refined_steps"]) == 44
+    assert (before.state["class_ids"] == after.state["class_ids"]).all()
+    assert (tmp_path / "resumed" / "base" / "config.yml").exists()
+
+
+def test_the_viewer_shows_single_objects_and_crops(trained):
+    import torch
+    from nerfstudio.data.scene_box import OrientedBox
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    folder, _ = trained
+    _, pipeline, _, _ = eval_setup(folder / "config.yml", test_mode="test")
+    model = pipeline.model
+    camera = pipeline.datamanager.eval_dataset.cameras[:1]
+    whole = model.get_outputs_for_camera(camera)
+    assert {"rgb", "depth", "normal", "accumulation", "class_map"} <= set(whole)
+    assert all(value.dtype == torch.float32 and value.shape[-1] in (1, 3) for value in whole.values())
+    model.object_choice.value = model.classes[1]
+    alone = model.get_outputs_for_camera(camera)
+    assert 0 < float(alone["accumulation"].sum()) < 0.5 * float(whole["accumulation"].sum())
+    model.object_choice.value = "everything"
+    box = OrientedBox.from_params((9.0, 9.0, 9.0), (0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
+    assert float(model.get_outputs_for_camera(camera, obb_box=box)["accumulation"].sum()) == 0.0
+
+
+def test_demo_on_a_folder_writes_table_figures_and_picture(trained, tmp_path, monkeypatch):
+    """The measuring half of the demo, on the run that is there."""
+    from beags_plugin.demo import measure
+
+    folder, _ = trained
+    measure(folder, tmp_path, {})
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert set(summary) == {"mean", "objects", "psnr", "seconds", "peak_memory_mb"}
+    for kind in ("extracted", "rendered"):
+        for stage in ("assigned", "refined"):
+            assert all(0.0 <= summary["mean"][kind][stage][name] <= 1.0 for name in ("acc", "iou", "biou"))
+    assert len(summary["objects"]) >= 5 and summary["psnr"]["after"] > 10
+    assert (tmp_path / "contact_sheet.png").stat().st_size > 10_000

@@ -322,3 +322,39 @@ def test_the_background_can_be_left_out():
     alone = OccupancyLoss(samples=4000).value(_inputs(objects, ids=ids[ids != 0]))
     assert float(value) == pytest.approx(float(alone) * len(objects) / COUNT, rel=0.05)  # other points, same mean
     assert all(not gradient[ids == 0].any() for gradient in _gradients(value, surfels))
+
+
+def test_a_gaussian_that_no_ray_sees_learns_position_scale_rotation_and_opacity():
+    """Behind an opaque wall the image gives no gradient at all; the occupancy loss reaches every kind of parameter."""
+    from beags_plugin.core.cameras import Camera
+    from beags_plugin.rasterizers import make_rasterizer
+    from beags_plugin.rasterizers.drawing import surfel_inputs
+    from beags_plugin.rasterizers.interface import RasterSettings
+
+    wall = 20  # opaque layers, each large, before the camera's whole view
+    means = torch.cat([torch.tensor([[0.0, 0.0, 2.0]]).repeat(wall, 1), torch.tensor([[0.05, 0.02, 4.0]])])
+    means[:wall, 2] += torch.linspace(0, 0.5, wall)
+    log_scales = torch.full((wall + 1, 2), 2.0)
+    log_scales[-1] = torch.tensor([-1.5, -2.0])
+    quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(wall + 1, 1)
+    quats[-1] = torch.tensor([0.9, 0.2, 0.3, 0.1])
+    logits = torch.full((wall + 1,), 8.0)
+    sh = torch.zeros(wall + 1, 1, 3)
+    leaves = [value.requires_grad_() for value in (means, quats, log_scales, logits)]
+    surfels = Surfels(*leaves, sh)
+    camera = Camera(torch.eye(4), torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 16, 16)
+    render = make_rasterizer("torch").rasterize(
+        surfel_inputs(surfels, camera), camera, RasterSettings(0.1, 10.0), torch.ones(3)
+    )
+    (render.color.sum() + render.depth.sum()).backward()
+    assert all(not leaf.grad[-1].any() for leaf in leaves)
+
+    # valid space covers a part of the hidden disc only, so that its pull has a direction
+    points = torch.tensor([[0.05 - 0.1, 0.02, 4.0]])
+    grid = VisibilityGrid.from_points([(points, torch.tensor([1]))], 0.1, torch.zeros(3), 2)
+    class_ids = torch.ones(wall + 1, dtype=torch.int32)
+    for leaf in leaves:
+        leaf.grad = None
+    inputs = LossInputs(0, 0, surfels, camera, render, torch.zeros(16, 16, 3), class_ids=class_ids, grid=grid)
+    OccupancyLoss(samples=50).value(inputs).backward()
+    assert all(leaf.grad[-1].any() and torch.isfinite(leaf.grad).all() for leaf in leaves)

@@ -47,7 +47,7 @@ class BeagsDataParserConfig(DataParserConfig):
     masks_path: Path = Path("masks")
     """Folder of the id images <stem>.png; some or all may be missing."""
     classes_path: Path = Path("classes.json")
-    """File {"id": "name"} of the classes; without it they are called object_<id>."""
+    """File {"id": "name"} of the classes; without it they are called class_<id>."""
     ground_truth_path: Path = Path("ground_truth")
     """Folder with exact masks for evaluation: masks/<stem>.png, silhouettes/<object>/<stem>.png; may be missing."""
     ignore_ids: tuple[int, ...] = ()

@@ -29,7 +29,8 @@ def held_out_views(config: BeagsTrainerConfig, classes: dict[int, str]) -> list[
     Without it, the data's own masks of those views serve as visible masks.
     """
     manager = config.data_config.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
-    folder = Path(config.data_config.dataparser.data or config.data_config.data) / "ground_truth"
+    parser = manager.dataparser.config
+    folder = Path(parser.data) / parser.ground_truth_path
     views = []
     for view in manager.views("test"):
         exact = folder / "masks" / f"{view.name}.png"

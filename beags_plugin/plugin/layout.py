@@ -121,7 +121,7 @@ def check_same_size(masks: Sequence[Path | None], sizes: Sequence[tuple[int, int
 
 
 def read_class_names(classes_file: Path, masks: Sequence[Path], ignore_ids: Sequence[int]) -> dict[int, str]:
-    """Names of the classes: of ``classes_file``, or ``object_<id>`` for the ids in the masks where it does not exist.
+    """Names of the classes: of ``classes_file``, or ``class_<id>`` for the ids in the masks where it does not exist.
 
     Raises ``UserError`` if a mask holds an id that an existing ``classes_file`` does not name. Reads all masks once.
     """

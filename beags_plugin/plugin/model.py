@@ -52,9 +52,11 @@ class LossSpec:
 
     def build(self, name: str, schedule: PhaseSchedule) -> Loss:
         """The loss, with its steps made absolute."""
-        first = schedule.base_steps if self.phase == "refine" else 0
+        first = schedule.base_steps + self.start if self.phase == "refine" else self.start
+        if self.phase != "refine" and schedule.base_steps == 0:
+            first = 0  # the base was trained elsewhere: its terms have long started
         last = schedule.base_steps if self.phase == "base" else None
-        return LOSSES.get(name)(weight=self.weight, start=first + self.start, stop=last, **self.options)
+        return LOSSES.get(name)(weight=self.weight, start=first, stop=last, **self.options)
 
 
 @dataclass
@@ -127,6 +129,7 @@ class BeagsModel(SplatfactoModel):
         self.register_buffer("class_margin", torch.zeros(len(surfels)))
         self.register_buffer("assigned", torch.tensor(False))
         self.register_buffer("extent", torch.tensor(1.0))
+        self.register_buffer("refined_steps", torch.tensor(0))
         metadata = self.kwargs.get("metadata") or {}
         self.classes: dict[int, str] = dict(metadata.get("classes") or {0: "background"})
         self.schedule = PhaseSchedule(self.config.base_steps, self.config.refine_steps)
@@ -191,6 +194,8 @@ class BeagsModel(SplatfactoModel):
     def load_state_dict(self, state: Mapping[str, Any], **kwargs) -> Any:
         """Load a checkpoint of any number of surfels; parameters are resized in place (optimizers hold them)."""
         count = state["gauss_params.means"].shape[0]
+        # colours are shown as they were trained, whatever degree this config asks for
+        self.config.sh_degree = round((state["gauss_params.features_rest"].shape[1] + 1) ** 0.5) - 1
         for name, parameter in self.gauss_params.items():
             parameter.data = torch.zeros_like(state[f"gauss_params.{name}"], device=self.device)
         self.class_ids = torch.zeros(count, dtype=torch.int32, device=self.device)
@@ -222,7 +227,7 @@ class BeagsModel(SplatfactoModel):
 
     def active_sh_degree(self) -> int:
         """Degrees grow one by one while the base trains; a scene that is only looked at shows them all."""
-        if not self.training:
+        if not self.training or self.schedule.refining(self.step):
             return self.config.sh_degree
         return min(self.step // max(self.config.sh_degree_interval, 1), self.config.sh_degree)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import shutil
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ import numpy as np
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from beags_plugin.errors import UserError
 from beags_plugin.masks.classes import read_class_map, write_class_map
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.runs import write_run
@@ -43,14 +45,26 @@ class RefinementSwitch:
         """Whether this run refines at all."""
         return self.model.config.refine_steps > 0
 
+    def check_masks(self) -> None:
+        """Raise ``UserError`` at the start of a run that would find no mask when it comes to refine."""
+        masks = self.datamanager.train_dataset.metadata["class_map_filenames"]
+        if self.wanted and all(path is None for path in masks):
+            raise UserError(
+                "no training view has a mask: put id images into masks/<image name>.png, or train the preset "
+                "beags-base, which needs none."
+            )
+
     def before_step(self, step: int) -> None:
         """Take up refinement that a checkpoint was in, or start it where no base step precedes it."""
-        if not self.wanted or self.ready or not self.model.schedule.refining(step):
+        model = self.model
+        if not self.wanted or not model.schedule.refining(step):
             return
-        if bool(self.model.assigned) and (self._folder() / "grid.pt").exists():
-            self._take_up()
-        else:
-            self._switch(step - 1)
+        if not self.ready:
+            if int(model.refined_steps) > 0:
+                self._take_up()
+            else:
+                self._switch(step - 1)
+        model.refined_steps += 1
 
     def after_step(self, step: int) -> None:
         """Switch right after the last base step, so that a run that ends there has its classes too."""
@@ -81,10 +95,11 @@ class RefinementSwitch:
         model.class_ids.copy_(prepared.assignment.class_ids)
         model.class_margin.copy_(prepared.assignment.margin)
         model.assigned.fill_(True)
+        # the snapshot first: what _save writes last says that everything is there
+        write_run(self.trainer.config, self.trainer.base_dir / BASE_SNAPSHOT, model.state_dict(), max(step, 0))
         self._save(prepared, [view.name for view in views])
         self._start(prepared.grid, prepared.labels)
         model.prepared_seconds = prepared.seconds
-        write_run(self.trainer.config, self.trainer.base_dir / BASE_SNAPSHOT, model.state_dict(), max(step, 0))
         CONSOLE.print(f"  base kept in {self.trainer.base_dir / BASE_SNAPSHOT}", highlight=False, soft_wrap=True)
 
     def _start(self, grid: VisibilityGrid | None, labels: list[torch.Tensor]) -> None:
@@ -110,7 +125,18 @@ class RefinementSwitch:
         os.replace(folder / "grid.pt.part", folder / "grid.pt")
 
     def _take_up(self) -> None:
+        """Go on with the masks and grids of the run that the checkpoint came from, and keep them with this one."""
         folder = self._folder()
+        former = self.trainer.loaded_run
+        if former is not None and former != self.trainer.base_dir:
+            for name in (PREPARED, BASE_SNAPSHOT):
+                if (former / name).is_dir():
+                    shutil.copytree(former / name, self.trainer.base_dir / name, dirs_exist_ok=True)
+        if not (folder / "grid.pt").exists():
+            raise UserError(
+                f"{former} was refining, but its folder {PREPARED} with masks and voxel grids is missing: restore it, or "
+                f"refine again from {BASE_SNAPSHOT}/nerfstudio_models."
+            )
         state = torch.load(folder / "grid.pt", weights_only=True)
         labels = [
             torch.from_numpy(read_class_map(folder / "masks" / f"{view.name}.png").astype(np.int32))
@@ -121,8 +147,8 @@ class RefinementSwitch:
 
 
 def peak_memory_mb() -> float:
-    """Largest resident memory of this process so far."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    """Largest resident memory of this process so far, MB of 10^6 bytes."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
 
 
 def _write_grey(path: Path, share: torch.Tensor) -> None:

@@ -24,7 +24,8 @@ TRANSFORM_FILE = "dataparser_transforms.json"  # nerfstudio's name for how the p
 def save_atomically(content: Any, path: Path) -> None:
     """``torch.save`` that leaves either the old file or the whole new one, never half of one."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
+    # beside the folder, not in it: nerfstudio takes any file among the checkpoints for one
+    part = path.parent.with_name(f".{path.name}.part")
     with open(part, "wb") as file:
         torch.save(content, file)
         file.flush()
@@ -46,7 +47,11 @@ def write_run(config: BeagsTrainerConfig, folder: Path, model_state: dict[str, T
         for name, value in model_state.items()
     }
     checkpoint = {"step": step, "pipeline": state, "optimizers": {}, "schedulers": {}, "scalers": {}}
-    save_atomically(checkpoint, folder / own.relative_model_dir / f"step-{step:09d}.ckpt")
+    path = folder / own.relative_model_dir / f"step-{step:09d}.ckpt"
+    save_atomically(checkpoint, path)
+    for old in path.parent.glob("*.ckpt"):  # of an earlier run into the same folder
+        if old != path:
+            old.unlink()
     config_path = folder / "config.yml"
     config_path.write_text(yaml.dump(own), "utf8")
     transform = config.get_base_dir() / TRANSFORM_FILE

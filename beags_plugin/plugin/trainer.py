@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from nerfstudio.engine.trainer import Trainer
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
     from beags_plugin.plugin.model import BeagsModel
 
-QUICK_PRESET = "beags-tiny"
+QUICKER = "Quicker: ns-train beags-tiny, or end the command with: beags-data --downscale-factor 2."
 LONG_RUN_SECONDS = 20 * 60  # a run that is expected to take longer says which preset is quicker
 ESTIMATE_STEPS = (20, 120)  # the estimate is the mean step between these: after warm-up, soon enough to matter
 
@@ -34,6 +35,7 @@ class BeagsTrainer(Trainer):
         self.schedule = PhaseSchedule(config.model_config.base_steps, config.model_config.refine_steps)
         self.last_step = config.max_num_iterations or self.schedule.total
         config.max_num_iterations = self.last_step
+        self.loaded_run: Path | None = None
         self._started = 0.0
         super().__init__(config, local_rank, world_size)
 
@@ -52,7 +54,17 @@ class BeagsTrainer(Trainer):
         """Train to the end of the schedule, also after a resume (nerfstudio would train that many steps more)."""
         self.config.max_num_iterations = max(self.last_step - self._start_step, 0)
         if self.config.max_num_iterations == 0:
-            _stop(UserError(f"this run is complete ({self._start_step} steps): nothing is left to train."))
+            _stop(
+                UserError(
+                    f"the checkpoint is of a complete run ({self._start_step} steps): nothing is left to train; to refine "
+                    "again, load <run>/base/nerfstudio_models with beags-refine."
+                )
+            )
+        CONSOLE.print(
+            f"{self.config.method_name}: {self.config.max_num_iterations} steps; how long they take is said after "
+            f"{ESTIMATE_STEPS[1]} of them. {QUICKER}",
+            highlight=False,
+        )
         self._started = time.perf_counter()
         try:
             super().train()
@@ -74,8 +86,8 @@ class BeagsTrainer(Trainer):
             f"About {_duration(left)} for {self.last_step - self._start_step} steps at the present speed "
             f"({1000 * seconds_per_step:.0f} ms a step; it slows down as Gaussians are added)."
         )
-        if left > LONG_RUN_SECONDS and self.config.method_name != QUICK_PRESET:
-            message += f" Quicker: ns-train {QUICK_PRESET}, or end the command with: beags-data --downscale-factor 2."
+        if left > LONG_RUN_SECONDS:
+            message += f" {QUICKER}"
         CONSOLE.print(message, highlight=False)
 
     def _load_checkpoint(self) -> None:
@@ -83,18 +95,16 @@ class BeagsTrainer(Trainer):
         if config.load_dir is not None and config.load_step is None:
             config.load_checkpoint = newest_checkpoint(config.load_dir)
             config.load_dir = None
-        if config.load_checkpoint is None and self.schedule.base_steps == 0:
+        if config.load_checkpoint is None and config.load_dir is None and self.schedule.base_steps == 0:
             raise UserError(
                 f"{config.method_name} starts from a trained base: add --load-dir <run>/nerfstudio_models of one "
                 "(or <run>/base/nerfstudio_models)."
             )
         super()._load_checkpoint()
-        if self.schedule.base_steps == 0 and not self._resumes_refinement():
+        models = config.load_dir or (config.load_checkpoint.parent if config.load_checkpoint else None)
+        self.loaded_run = models.absolute().parent if models else None
+        if self.schedule.base_steps == 0 and int(self._model.refined_steps) == 0:
             self._start_step = 0  # a base that was loaded: refinement counts its own steps
-
-    def _resumes_refinement(self) -> bool:
-        """Whether the checkpoint is one of this very method's (it has refined before), not a base."""
-        return bool(self._model.assigned) and (self.base_dir / "prepared" / "grid.pt").exists()
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
