@@ -17,8 +17,8 @@ _KINDS = ("extracted", "rendered")
 _STAGES = ("assigned", "refined")
 _METRICS = ("acc", "iou", "biou")
 _TRUTHS = {
-    "silhouette": "Extracted masks are compared with occlusion-free silhouettes; parts of them that hardly any training "
-    "photo shows (where the data says which) are left out.",
+    "silhouette": "Extracted masks are compared with occlusion-free silhouettes; parts of them that hardly any "
+    "training photo shows (where the data says which) are left out.",
     "visible": "Extracted masks are compared with the visible masks; pixels that other objects cover are left out.",
     "both": "Extracted masks are compared with occlusion-free silhouettes, or else with the visible masks.",
 }

@@ -134,8 +134,8 @@ class RefinementSwitch:
                     shutil.copytree(former / name, self.trainer.base_dir / name, dirs_exist_ok=True)
         if not (folder / "grid.pt").exists():
             raise UserError(
-                f"{former} was refining, but its folder {PREPARED} with masks and voxel grids is missing: restore it, or "
-                f"refine again from {BASE_SNAPSHOT}/nerfstudio_models."
+                f"{former} was refining, but its folder {PREPARED} with masks and voxel grids is missing: restore it, "
+                f"or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
             )
         state = torch.load(folder / "grid.pt", weights_only=True)
         labels = [

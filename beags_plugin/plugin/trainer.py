@@ -56,8 +56,8 @@ class BeagsTrainer(Trainer):
         if self.config.max_num_iterations == 0:
             _stop(
                 UserError(
-                    f"the checkpoint is of a complete run ({self._start_step} steps): nothing is left to train; to refine "
-                    "again, load <run>/base/nerfstudio_models with beags-refine."
+                    f"the checkpoint is of a complete run ({self._start_step} steps): nothing is left to train; "
+                    "to refine again, load <run>/base/nerfstudio_models with beags-refine."
                 )
             )
         CONSOLE.print(

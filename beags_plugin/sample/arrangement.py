@@ -108,7 +108,7 @@ def _textures(names: list[str], generator: np.random.Generator) -> dict[str, Tex
 def make_still(seed: int) -> Still:
     """The scene of a seed: sizes, places, turn, handedness, colours, textures and light all depend on it.
 
-    It is built about a box at the origin that the others touch (its faces are x = +-hx and y = +-hy), then moved to
+    It is built about a low box at the origin that carries others (its faces are x = +-hx and y = +-hy), then moved to
     the middle, mirrored or not, and turned.
     """
     generator = np.random.default_rng([seed, 1])
@@ -127,47 +127,43 @@ def make_still(seed: int) -> Still:
     def touch(first: str, second: str, point: list[float]) -> None:
         contacts.append((first, second, np.array(point)))
 
-    hx, hy, top = about(0.25), about(0.20), about(0.50, 0.05)
+    hx, hy, top = about(0.45, 0.04), about(0.40, 0.04), about(0.26)
     box = (*slab(0, -hx, hx), *slab(1, -hy, hy), *slab(2, -top / 2, top / 2))
     place("box", Solid(box, bound=float(np.linalg.norm([hx, hy, top / 2]))), [0.0, 0.0, top / 2])
     touch("box", "ground", [0.0, 0.0, 0.0])
 
-    # Contacts are points and lines where they can be: what a contact hides, no photo shows, and no method can know.
-    # The ring stands upright on the box.
-    radius, half, angle = about(0.17), about(0.045), generator.uniform(0.0, np.pi)
+    # Four things stand on the box, each in its quarter: what lies inside the box no photo shows, so nothing but their
+    # class keeps their Gaussians out of it.
+    def quarter(x: float, y: float) -> tuple[float, float]:
+        return x + generator.uniform(-0.02, 0.02), y + generator.uniform(-0.02, 0.02)
+
+    radius, height = about(0.14), about(0.36)
+    x, y = quarter(-0.24, 0.19)
+    cone = Solid((Cone(radius, height), *slab(2, 0.0, height)), bound=max(radius, height))
+    place("cone", cone, [x, y, top], _turn_z(generator.uniform(0.0, 2.0 * np.pi)))
+    touch("cone", "box", [x, y, top])
+
+    radius, height = about(0.125), about(0.42)
+    x, y = quarter(0.25, 0.20)
+    can = Solid((Tube(radius), *slab(2, -height / 2, height / 2)), bound=float(np.hypot(radius, height / 2)))
+    place("cylinder", can, [x, y, top + height / 2], _turn_z(generator.uniform(0.0, 2.0 * np.pi)))
+    touch("cylinder", "box", [x, y, top])
+
+    radius = about(0.14)
+    x, y = quarter(0.22, -0.19)
+    place("ball", Solid((Ball(radius),), bound=radius), [x, y, top + radius])
+    touch("ball", "box", [x, y, top])
+
+    radius, half, angle = about(0.16), about(0.045), generator.uniform(0.0, np.pi)
+    x, y = quarter(-0.21, -0.18)
     ring = Solid((Tube(radius), *slab(2, -half, half)), (Tube(0.76 * radius),), float(np.hypot(radius, half)))
     across = np.array([np.cos(angle), np.sin(angle), 0.0])
     axis = np.array([-np.sin(angle), np.cos(angle), 0.0])
-    x, y = generator.uniform(-0.04, 0.04), generator.uniform(-0.03, 0.03)
     place("ring", ring, [x, y, top + radius], np.stack([across, np.array([0.0, 0.0, -1.0]), axis], axis=1))
     touch("ring", "box", [x, y, top])
 
-    # The cone stands before the face x = -hx and touches it with its rim.
-    radius, height = about(0.16), about(0.40)
-    y = generator.uniform(-0.08, 0.08)
-    cone = Solid((Cone(radius, height), *slab(2, 0.0, height)), bound=max(radius, height))
-    place("cone", cone, [-hx - radius, y, 0.0], _turn_z(generator.uniform(0.0, 2.0 * np.pi)))
-    touch("cone", "box", [-hx, y, 0.0])
-    touch("cone", "ground", [-hx - radius, y, 0.0])
-
-    # The can stands against the upright edge (hx, hy).
-    radius, height = about(0.165), about(0.66)
-    way = generator.uniform(0.6, 0.95)
-    can_at = np.array([hx + radius * np.cos(way), hy + radius * np.sin(way), height / 2])
-    can = Solid((Tube(radius), *slab(2, -height / 2, height / 2)), bound=float(np.hypot(radius, height / 2)))
-    place("cylinder", can, list(can_at), _turn_z(generator.uniform(0.0, 2.0 * np.pi)))
-    touch("cylinder", "box", [hx, hy, top / 2])
-    touch("cylinder", "ground", [can_at[0], can_at[1], 0.0])
-
-    # The ball lies against the can, away from the box.
-    small, way = about(0.13), generator.uniform(-0.5, -0.1)
-    ball_at = np.array([*(can_at[:2] + (radius + small) * np.array([np.cos(way), np.sin(way)])), small])
-    place("ball", Solid((Ball(small),), bound=small), list(ball_at))
-    touch("ball", "cylinder", [*(can_at[:2] + radius * np.array([np.cos(way), np.sin(way)])), small])
-    touch("ball", "ground", [ball_at[0], ball_at[1], 0.0])
-
     # The bowl stands free before the face y = -hy; its foot is flat.
-    radius = about(0.31, 0.05)
+    radius = about(0.28, 0.05)
     inner = 0.9 * radius
     foot = inner + 0.02
     bowl_at = [generator.uniform(-0.06, 0.06), -hy - radius - about(0.2), foot]
@@ -176,7 +172,7 @@ def make_still(seed: int) -> Still:
     touch("bowl", "ground", [bowl_at[0], bowl_at[1], 0.0])
 
     # The plank leans with the middle of its upper edge against the upright edge (-hx, hy).
-    wide, thick, long, tilt = about(0.15), 0.018, about(0.21), generator.uniform(0.5, 0.65)
+    wide, thick, long, tilt = about(0.13), 0.018, about(0.15), generator.uniform(0.6, 0.75)
     way = generator.uniform(2.15, 2.55)
     out, along = np.array([np.cos(way), np.sin(way), 0.0]), np.array([np.sin(way), -np.cos(way), 0.0])
     c, s = np.cos(tilt), np.sin(tilt)
@@ -205,7 +201,7 @@ def _finish(
     # All solids are symmetric about their own y = 0, so mirroring a pose (M R M, M t) mirrors the object exactly.
     mirror = np.diag([1.0, generator.choice([-1.0, 1.0]), 1.0])
     turn = _turn_z(generator.uniform(0.0, 2.0 * np.pi))
-    shift = np.array([0.0, 0.14, 0.0])
+    shift = np.array([0.0, 0.24, 0.0])
     names = list(solids)
     textures = _textures(names, generator)
     things = tuple(

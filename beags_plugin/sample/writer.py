@@ -21,7 +21,7 @@ from beags_plugin.sample.points import seed_points, write_ply
 from beags_plugin.sample.seen import seen_part, visible_surface, well_seen
 from beags_plugin.sample.views import Picture, View, make_views, render_view
 
-VERSION = 5
+VERSION = 6
 """Raise it whenever the same config would give other files: older samples are then rebuilt."""
 POINT_NOISE = 0.004
 """World units, about one pixel's width at 640 x 480."""
@@ -83,8 +83,8 @@ def write_sample(
     Layout: transforms.json (OpenGL camera-to-world, world z up), images/<stem>.png, masks/<stem>.png (ids; degraded
     for train views, none for dropped ones, exact for test views), classes.json, seed_points.ply, and under
     ground_truth/ the exact masks/<stem>.png, silhouettes/<object>/<stem>.png (0 or 255), for test views
-    seen/<object>/<stem>.png (the part of the silhouette whose surface training photos show) and depth/<stem>.npy (float32,
-    z along the optical axis); masks and depth are those of the pixel centres. sample.json is the config.
+    seen/<object>/<stem>.png (the part of the silhouette whose surface training photos show) and depth/<stem>.npy
+    (float32, z along the optical axis); masks and depth are those of the pixel centres. sample.json is the config.
 
     All is written into a temporary folder beside it and renamed at the end: an interrupted run leaves no ``folder``.
     A folder that holds another sample is replaced.
