@@ -10,7 +10,6 @@ import torch
 
 from beags_plugin.evaluation.metrics import (
     MaskMetrics,
-    MetricTable,
     band_width,
     boundary_band,
     erode,
@@ -139,17 +138,3 @@ def test_psnr():
     b = a.clone()
     b[0, 0, 0] = 1.0
     assert psnr(a, b) == pytest.approx(10 * math.log10(60))
-
-
-def test_table_weighs_objects_not_masks():
-    table = MetricTable()
-    table.add("cup", "a", MaskMetrics(1.0, 0.5, 0.2))
-    table.add("cup", "b", MaskMetrics(0.5, 0.7, 0.4))
-    table.add("ball", "a", MaskMetrics(0.25, 0.1, 0.0))
-    found = table.as_dict()
-    assert found["objects"]["cup"] == pytest.approx({"acc": 0.75, "iou": 0.6, "biou": 0.3, "masks": 2})
-    assert found["objects"]["ball"]["masks"] == 1
-    assert found["mean"] == pytest.approx({"acc": 0.5, "iou": 0.35, "biou": 0.15})
-    assert MetricTable().as_dict() == {"objects": {}}
-    with pytest.raises(ValueError, match="no metrics"):
-        MetricTable().mean()

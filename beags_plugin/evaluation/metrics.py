@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -115,29 +115,3 @@ def mean_metrics(metrics: Iterable[MaskMetrics]) -> MaskMetrics:
     if not rows:
         raise ValueError("there are no metrics to average.")
     return MaskMetrics(*(math.fsum(column) / len(rows) for column in zip(*rows, strict=True)))
-
-
-@dataclass
-class MetricTable:
-    """Metrics of many masks, averaged over the masks of an object and then over the objects."""
-
-    rows: dict[str, dict[str, MaskMetrics]] = field(default_factory=dict)
-    """object name -> view name -> metrics, in the order added."""
-
-    def add(self, name: str, view: str, metrics: MaskMetrics) -> None:
-        """Record the metrics of object ``name`` in ``view``; an earlier record of the pair is replaced."""
-        self.rows.setdefault(name, {})[view] = metrics
-
-    def object_means(self) -> dict[str, MaskMetrics]:
-        """The mean over the masks of each object."""
-        return {name: mean_metrics(views.values()) for name, views in self.rows.items()}
-
-    def mean(self) -> MaskMetrics:
-        """The mean over the objects of their means; raises ``ValueError`` if the table is empty."""
-        return mean_metrics(self.object_means().values())
-
-    def as_dict(self) -> dict[str, Any]:
-        """{"mean": {"acc", "iou", "biou"}, "objects": {name: {"acc", "iou", "biou", "masks"}}}; no "mean" if empty."""
-        means = self.object_means()
-        objects = {name: {**mean.as_dict(), "masks": len(self.rows[name])} for name, mean in means.items()}
-        return {"mean": self.mean().as_dict(), "objects": objects} if objects else {"objects": {}}

@@ -16,6 +16,7 @@ from torch import Tensor
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.extraction.ply import write_ply
+from beags_plugin.extraction.select import remove_class, select_class
 from beags_plugin.plugin.runs import TRANSFORM_FILE, newest_checkpoint, write_run
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ def extract_objects(
 ) -> list[Extracted]:
     """Write a run and a .ply per object.
 
-    config_path: config.yml of a refined (or assigned) run. objects: names; none means every object but the background.
+    config_path: config.yml of a refined (or assigned) run. objects: names; none means every object that has Gaussians.
     remove: keep all but the object instead. output: folder for the runs; ``extracted/`` in the run by default.
     Raises ``UserError`` for an unknown name, before anything is written.
     """
@@ -91,33 +92,33 @@ def extract_objects(
     ids = {name: index for index, name in scene.classes.items()}
     if unknown := [name for name in objects if name not in ids]:
         raise UserError(f"there is no object {unknown[0]!r} in {config_path.parent}: choose of {', '.join(ids)}.")
-    names = list(objects) or [name for name, index in ids.items() if index != 0]
+    class_ids = scene.state["class_ids"]
+    present = {name for name, index in ids.items() if bool((class_ids == index).any())}
+    if absent := [name for name in objects if name not in present]:
+        raise UserError(f"no Gaussian belongs to {absent[0]!r}: its masks cover too little of the scene.")
+    names = list(objects) or [name for name, index in ids.items() if index != 0 and name in present]
     run = config_path.parent
     transform = read_transform(run)
+    select = remove_class if remove else select_class
     written = []
     for name in names:
-        class_ids = scene.state["class_ids"]
-        keep = class_ids != ids[name] if remove else class_ids == ids[name]
+        surfels, index = select(scene.surfels(), class_ids, ids[name])
         title = f"without_{file_name(name)}" if remove else file_name(name)
-        if not bool(keep.any()):
-            raise UserError(f"no Gaussian belongs to {name!r}: its masks cover too little of the scene.")
         folder = (output or run / "extracted") / title
-        written.append(_write_selection(scene, keep, folder, title, transform))
+        config = write_run(scene.config, folder, _rows(scene.state, index), scene.step)
+        ply = folder / f"{title}.ply"
+        write_ply(ply, surfels, class_ids[index], transform)
+        written.append(Extracted(title, config, ply, len(surfels)))
     return written
 
 
-def _write_selection(
-    scene: SavedScene, keep: Tensor, folder: Path, title: str, transform: tuple[Tensor, float] | None
-) -> Extracted:
+def _rows(state: dict[str, Any], index: Tensor) -> dict[str, Any]:
+    """A model's state with the surfels ``index`` [M] only."""
     per_surfel = {"class_ids", "class_margin"}
-    state = {
-        name: value[keep] if name in per_surfel or name.startswith("gauss_params.") else value
-        for name, value in scene.state.items()
+    return {
+        name: value[index] if name in per_surfel or name.startswith("gauss_params.") else value
+        for name, value in state.items()
     }
-    config = write_run(scene.config, folder, state, scene.step)
-    ply = folder / f"{title}.ply"
-    write_ply(ply, scene.surfels()[keep], scene.state["class_ids"][keep], transform)
-    return Extracted(title, config, ply, int(keep.sum()))
 
 
 def read_transform(run: Path) -> tuple[Tensor, float] | None:

@@ -105,6 +105,7 @@ class BeagsModel(SplatfactoModel):
     class_margin: Tensor  # [N] float32
     assigned: Tensor  # [] bool
     extent: Tensor  # [] float32, world units
+    refined_steps: Tensor  # [] int64, refinement steps that the scene has been through
 
     def populate_modules(self) -> None:
         """Build the surfels from the seed points that the data supplies."""
