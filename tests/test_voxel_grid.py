@@ -245,7 +245,7 @@ class _Stub:
 
     def rasterize(self, inputs, camera, settings, background, target=None):
         assert settings.geometry and not inputs.means.requires_grad
-        return SimpleNamespace(alpha=camera.alpha, depth=camera.depth)
+        return SimpleNamespace(alpha=camera.alpha, depth=camera.depth, median_depth=camera.median_depth)
 
     def class_map(self, inputs, camera, settings, num_classes):
         return camera.classes, camera.alpha
@@ -263,6 +263,7 @@ def _view(seed: int, width: int = 24, height: int = 18) -> _View:
     for name, value in {
         "alpha": torch.rand(height, width, generator=g),
         "depth": 2 + torch.rand(height, width, generator=g),
+        "median_depth": 4 + torch.rand(height, width, generator=g),
         "classes": torch.randint(0, CLASSES, (height, width), generator=g).int(),
     }.items():
         object.__setattr__(view, name, value)
@@ -276,13 +277,16 @@ def _surfels(count: int = 1) -> Surfels:
 SETTINGS = RasterSettings(near=0.1, far=100.0, geometry=False)
 
 
-def test_build_lifts_solid_pixels_of_all_views():
+@pytest.mark.parametrize("kind", ["median", "expected"])
+def test_build_lifts_solid_pixels_of_all_views(kind):
     views, calls = [_view(0), _view(1, 30, 20), _view(2)], []
     grid = build_visibility_grid(
-        _surfels(), torch.zeros(1).int(), views, _Stub(), SETTINGS, CLASSES, k=3, progress=lambda *s: calls.append(s)
-    )
+        _surfels(), torch.zeros(1).int(), views, _Stub(), SETTINGS, CLASSES, k=3, depth=kind,
+        progress=lambda *s: calls.append(s),
+    )  # fmt: skip
     solid = [view.alpha >= 0.5 for view in views]
-    points = torch.cat([lift(v.depth, v)[s] for v, s in zip(views, solid, strict=True)])
+    depths = [view.median_depth if kind == "median" else view.depth for view in views]
+    points = torch.cat([lift(d, v)[s] for d, v, s in zip(depths, views, solid, strict=True)])
     ids = torch.cat([v.classes[s] for v, s in zip(views, solid, strict=True)])
     assert grid.voxel_size == pytest.approx(voxel_size(points.numpy(), k=3))  # of all classes together
     expected = VisibilityGrid.from_points([(points, ids)], grid.voxel_size, grid.origin, CLASSES)
@@ -293,8 +297,8 @@ def test_build_lifts_solid_pixels_of_all_views():
 
 def test_build_skips_depths_that_cannot_be_lifted():
     view = _view(3)
-    view.depth[2, :] = math.nan
-    view.depth[3, :] = 0.0
+    view.median_depth[2, :] = math.nan
+    view.median_depth[3, :] = 0.0
     grid = build_visibility_grid(_surfels(), torch.zeros(1).int(), [view], _Stub(), SETTINGS, CLASSES, k=5)
     assert math.isfinite(grid.voxel_size)
 
@@ -304,6 +308,11 @@ def test_build_says_when_nothing_is_solid():
     view.alpha.fill_(0.3)
     with pytest.raises(UserError, match="nothing solid|anything solid"):
         build_visibility_grid(_surfels(), torch.zeros(1).int(), [view], _Stub(), SETTINGS, CLASSES)
+
+
+def test_build_names_an_unknown_depth():
+    with pytest.raises(UserError, match="'mean'.*median, expected"):
+        build_visibility_grid(_surfels(), torch.zeros(1).int(), [_view(0)], _Stub(), SETTINGS, CLASSES, depth="mean")
 
 
 def test_build_with_the_reference_rasterizer():

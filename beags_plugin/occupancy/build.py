@@ -15,7 +15,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.occupancy.voxel_size import reference_indices, voxel_size_of_reference
-from beags_plugin.rasterizers.drawing import geometry_inputs
+from beags_plugin.rasterizers.drawing import geometry_inputs, surface_depth
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 
 MIN_ALPHA_LIFTED = 0.5  # pixels with less alpha are not lifted
@@ -47,18 +47,20 @@ def build_visibility_grid(
     num_classes: int,
     k: int = 2000,
     seed: int = 0,
+    depth: str = "median",
     progress: Callable[[int, int], None] | None = None,
 ) -> VisibilityGrid:
     """Render depth and class of every view, lift the pixels with A >= 0.5, and voxelise them per class.
 
     surfels: N surfels. class_ids: [N] int32, phi. k: sets the voxel size (E8); seed: of the points that measure it.
+    depth: which depth is lifted: see ``surface_depth``.
     Keeps a pixel's number, depth and class (10 bytes) of all views, and lifts them view by view.
     Raises ``UserError`` if no pixel of any view reaches an alpha of 0.5.
     """
     settings = replace(settings, geometry=True, distortion=False)
     views = []
     for index, camera in enumerate(cameras):
-        views.append(_render(surfels, class_ids, camera, rasterizer, settings, num_classes))
+        views.append(_render(surfels, class_ids, camera, rasterizer, settings, num_classes, depth))
         if progress:
             progress(index + 1, len(cameras))
     reference, total = _reference_cloud(views, k, seed)
@@ -70,15 +72,16 @@ def build_visibility_grid(
     return VisibilityGrid.from_points(clouds, size, origin, num_classes)
 
 
-def _render(surfels, class_ids, camera, rasterizer, settings, num_classes: int) -> _View:
+def _render(surfels, class_ids, camera, rasterizer, settings, num_classes: int, depth: str) -> _View:
     inputs = geometry_inputs(surfels, class_ids)
     with torch.no_grad():
         drawn = rasterizer.rasterize(inputs, camera, settings, surfels.means.new_zeros(3))
         classes, _ = rasterizer.class_map(inputs, camera, settings, num_classes)
-    solid = ((drawn.alpha >= MIN_ALPHA_LIFTED) & torch.isfinite(drawn.depth) & (drawn.depth > 0)).reshape(-1)
+    surface = surface_depth(drawn, depth)
+    solid = ((drawn.alpha >= MIN_ALPHA_LIFTED) & torch.isfinite(surface) & (surface > 0)).reshape(-1)
     pixel = torch.nonzero(solid)[:, 0]
     small = torch.int16 if num_classes <= 1 << 15 else torch.int32
-    return _View(camera, pixel.int(), drawn.depth.reshape(-1)[pixel], classes.reshape(-1)[pixel].to(small))
+    return _View(camera, pixel.int(), surface.reshape(-1)[pixel], classes.reshape(-1)[pixel].to(small))
 
 
 def _reference_cloud(views: Sequence[_View], k: int, seed: int) -> tuple[np.ndarray, int]:

@@ -8,7 +8,11 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.rasterizers.interface import SurfelInputs
+from beags_plugin.errors import UserError
+from beags_plugin.rasterizers.interface import RasterOutputs, SurfelInputs
+
+SURFACE_DEPTHS = ("median", "expected")
+"""Which of E4's depths stands for the surface where pixels are lifted into space."""
 
 
 def surfel_inputs(
@@ -28,3 +32,15 @@ def geometry_inputs(surfels: Surfels, class_ids: Tensor | None = None) -> Surfel
     bare = surfels.detach()
     colors = torch.zeros_like(bare.means)
     return SurfelInputs(bare.means, bare.quats, bare.log_scales, bare.opacity_logits, colors, class_ids)
+
+
+def surface_depth(drawn: RasterOutputs, kind: str) -> Tensor:
+    """[H, W] depth of the surface that each pixel shows, world units; 0 where nothing (solid) is.
+
+    kind: "median", the hit at which half of the light is stopped: always on a surface; or "expected", the mean over
+    all hits (the D of E5): at an object's rim it lies in the air between the object and what is behind.
+    Raises ``UserError`` for another kind.
+    """
+    if kind not in SURFACE_DEPTHS:
+        raise UserError(f"there is no surface depth {kind!r}: choose one of {', '.join(SURFACE_DEPTHS)}.")
+    return drawn.median_depth if kind == "median" else drawn.depth

@@ -24,6 +24,7 @@ class AssignedScene:
     class_ids: [N] int32, phi.
     cameras: the training views.
     labels: per training view [H, W] int32, the masks M' that all refiners are given.
+    depth: which depth stands for the surface: see ``rasterizers.drawing.surface_depth``.
     """
 
     surfels: Surfels
@@ -34,6 +35,7 @@ class AssignedScene:
     rasterizer: Rasterizer
     settings: RasterSettings
     seed: int
+    depth: str = "median"
 
 
 class Refiner(ABC):

@@ -24,5 +24,6 @@ class BeaRefiner(Refiner):
             scene.num_classes,
             k=k,
             seed=scene.seed,
+            depth=scene.depth,
             progress=progress,
         )

@@ -16,7 +16,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.rasterizers.drawing import geometry_inputs
+from beags_plugin.rasterizers.drawing import geometry_inputs, surface_depth
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
 from beags_plugin.refiners.base import AssignedScene, Progress, Refiner
 
@@ -30,11 +30,13 @@ class PreparationConfig:
 
     reprojection: how masks are made consistent: a name of ``masks.REPROJECTIONS``, or "none" to keep them.
     tau: a vote counts if its point is visible: |z - D| <= tau z; infinity counts every vote (E5).
+    depth: which depth is lifted into space, "median" or "expected": see ``rasterizers.drawing.surface_depth``.
     k: neighbours that set the voxel size (E8).
     """
 
     reprojection: str = "pairwise"
     tau: float = 0.02
+    depth: str = "median"
     k: int = 2000
 
 
@@ -97,7 +99,7 @@ def prepare(
         timed("reprojection", start, "reprojection: off, masks used as they are")
     else:
         with stage("Rendering depth") as progress:
-            depths = _render_depths(surfels, cameras, rasterizer, settings, progress)
+            depths = _render_depths(surfels, cameras, rasterizer, settings, config.depth, progress)
         with stage("Reprojecting masks") as progress:
             reproject = REPROJECTIONS.get(config.reprojection)
             refined = reproject(depths, cameras, labels, num_classes, tau=config.tau, progress=progress)
@@ -111,7 +113,9 @@ def prepare(
     timed("assignment", start, _assignment_finding(assignment, class_names))
 
     start = time.perf_counter()
-    scene = AssignedScene(surfels, assignment.class_ids, cameras, consistent, num_classes, rasterizer, settings, seed)
+    scene = AssignedScene(
+        surfels, assignment.class_ids, cameras, consistent, num_classes, rasterizer, settings, seed, config.depth
+    )
     with stage("Building voxel grids") as progress:
         grid = refiner.build_grid(scene, config.k, progress)
     if grid is not None:
@@ -119,12 +123,13 @@ def prepare(
     return Preparation(consistent, confidence, assignment, grid, findings, seconds)
 
 
-def _render_depths(surfels, cameras, rasterizer, settings, progress) -> list[Tensor]:
+def _render_depths(surfels, cameras, rasterizer, settings, depth, progress) -> list[Tensor]:
     depths = []
     with torch.no_grad():
         for index, camera in enumerate(cameras):
             background = surfels.means.new_zeros(3)
-            depths.append(rasterizer.rasterize(geometry_inputs(surfels), camera, settings, background).depth)
+            drawn = rasterizer.rasterize(geometry_inputs(surfels), camera, settings, background)
+            depths.append(surface_depth(drawn, depth))
             if progress:
                 progress(index + 1, len(cameras))
     return depths
