@@ -43,4 +43,7 @@ def surface_depth(drawn: RasterOutputs, kind: str) -> Tensor:
     """
     if kind not in SURFACE_DEPTHS:
         raise UserError(f"there is no surface depth {kind!r}: choose one of {', '.join(SURFACE_DEPTHS)}.")
-    return drawn.median_depth if kind == "median" else drawn.depth
+    surface = drawn.median_depth if kind == "median" else drawn.depth
+    if surface is None:
+        raise ValueError("the settings must ask for geometry")
+    return surface
