@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beags_plugin.sample.solids import Ball, Cone, Solid, Tube, slab, turned
+from beags_plugin.sample.solids import Ball, Cone, Primitive, Solid, Tube, slab, turned
 from beags_plugin.sample.textures import (
     Noise,
     Texture,
@@ -21,8 +21,8 @@ from beags_plugin.sample.textures import (
 DOME_RADIUS = 5.0
 """World units; the ground is the disc z = 0 of this radius, closed by the half-dome above it."""
 
-HUE_RANGE = 0.25
-"""Share of the colour circle that the objects' hues cover."""
+HUE_RANGE = 0.12
+"""Share of the colour circle that the objects' hues cover; the ground's lies among them."""
 
 
 @dataclass(frozen=True)
@@ -80,18 +80,17 @@ def _turn_z(angle: float) -> np.ndarray:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _textures(names: list[str], generator: np.random.Generator) -> dict[str, Texture]:
-    noise = Noise(generator)
+def _textures(names: list[str], hue: float, noise: Noise, generator: np.random.Generator) -> dict[str, Texture]:
     # Related hues, dealt out at random: colour alone does not tell where one object ends and the next begins.
-    hues = generator.uniform() + HUE_RANGE * (generator.permutation(len(names)) / len(names) - 0.5)
+    hues = hue + HUE_RANGE * (generator.permutation(len(names)) / len(names) - 0.5)
     patterns = {
         "box": checks(6.5),
         "cone": bands(7.0, twist=1.0),
         "cylinder": sectors(6, slant=9.0),
         "ring": sectors(9),
-        "bowl": blotches(noise, 10.0),
-        "ball": marble(noise, 4.5),
-        "plank": bands(6.0),
+        "cup": blotches(noise, 10.0),
+        "dome": marble(noise, 4.5),
+        "tile": marble(noise, 3.0),
     }
     textures = {}
     for name, hue in zip(names, hues, strict=True):
@@ -108,8 +107,9 @@ def _textures(names: list[str], generator: np.random.Generator) -> dict[str, Tex
 def make_still(seed: int) -> Still:
     """The scene of a seed: sizes, places, turn, handedness, colours, textures and light all depend on it.
 
-    It is built about a low box at the origin that carries others (its faces are x = +-hx and y = +-hy), then moved to
-    the middle, mirrored or not, and turned.
+    All stand on flat faces, which no photo shows: nothing but their class keeps their Gaussians out of what is below.
+    It is built about a box at the origin (its faces are x = +-hx and y = +-hy), then moved to the middle, mirrored or
+    not, and turned.
     """
     generator = np.random.default_rng([seed, 1])
 
@@ -127,66 +127,47 @@ def make_still(seed: int) -> Still:
     def touch(first: str, second: str, point: list[float]) -> None:
         contacts.append((first, second, np.array(point)))
 
-    hx, hy, top = about(0.45, 0.04), about(0.40, 0.04), about(0.26)
+    def upright(name: str, outline: tuple[Primitive, ...], cut: tuple[Primitive, ...], reach: float, half: float,
+                position: tuple[float, float, float], on: str) -> None:  # fmt: skip
+        """A solid about its own z axis, 2 half high and within ``reach`` of it, with its foot at ``position``."""
+        x, y, z = position
+        solid = Solid((*outline, *slab(2, -half, half)), cut, bound=float(np.hypot(reach, half)))
+        place(name, solid, [x, y, z + half], _turn_z(generator.uniform(0.0, 2.0 * np.pi)))
+        touch(name, on, [x + 0.9 * reach, y, z])  # on the foot of a hollow solid too
+
+    hx, hy, top = about(0.24, 0.04), about(0.20, 0.04), about(0.30)
     box = (*slab(0, -hx, hx), *slab(1, -hy, hy), *slab(2, -top / 2, top / 2))
     place("box", Solid(box, bound=float(np.linalg.norm([hx, hy, top / 2]))), [0.0, 0.0, top / 2])
     touch("box", "ground", [0.0, 0.0, 0.0])
 
-    # Four things stand on the box, each in its quarter: what lies inside the box no photo shows, so nothing but their
-    # class keeps their Gaussians out of it.
-    def quarter(x: float, y: float) -> tuple[float, float]:
-        return x + generator.uniform(-0.02, 0.02), y + generator.uniform(-0.02, 0.02)
+    radius, half = about(0.13), about(0.16)
+    upright("cylinder", (Tube(radius),), (), radius, half, (0.03, 0.02, top), "box")
 
-    radius, height = about(0.14), about(0.36)
-    x, y = quarter(-0.24, 0.19)
+    radius, height = about(0.19), about(0.40)
+    cone_at = [0.62, 0.16, 0.0]
     cone = Solid((Cone(radius, height), *slab(2, 0.0, height)), bound=max(radius, height))
-    place("cone", cone, [x, y, top], _turn_z(generator.uniform(0.0, 2.0 * np.pi)))
-    touch("cone", "box", [x, y, top])
+    place("cone", cone, cone_at, _turn_z(generator.uniform(0.0, 2.0 * np.pi)))
+    touch("cone", "ground", cone_at)
 
-    radius, height = about(0.125), about(0.42)
-    x, y = quarter(0.25, 0.20)
-    can = Solid((Tube(radius), *slab(2, -height / 2, height / 2)), bound=float(np.hypot(radius, height / 2)))
-    place("cylinder", can, [x, y, top + height / 2], _turn_z(generator.uniform(0.0, 2.0 * np.pi)))
-    touch("cylinder", "box", [x, y, top])
+    radius, half = about(0.18), about(0.13)
+    hollow = (Tube(0.82 * radius), *slab(2, -0.8 * half, 2.0 * half))
+    upright("cup", (Tube(radius),), hollow, radius, half, (-0.62, -0.12, 0.0), "ground")
 
-    radius = about(0.14)
-    x, y = quarter(0.22, -0.19)
-    place("ball", Solid((Ball(radius),), bound=radius), [x, y, top + radius])
-    touch("ball", "box", [x, y, top])
+    radius = about(0.20)
+    dome_at = [-0.18, -0.62, 0.0]
+    place("dome", Solid((Ball(radius), *slab(2, 0.0, radius)), bound=radius), dome_at)
+    touch("dome", "ground", dome_at)
 
-    radius, half, angle = about(0.16), about(0.045), generator.uniform(0.0, np.pi)
-    x, y = quarter(-0.21, -0.18)
-    ring = Solid((Tube(radius), *slab(2, -half, half)), (Tube(0.76 * radius),), float(np.hypot(radius, half)))
-    across = np.array([np.cos(angle), np.sin(angle), 0.0])
-    axis = np.array([-np.sin(angle), np.cos(angle), 0.0])
-    place("ring", ring, [x, y, top + radius], np.stack([across, np.array([0.0, 0.0, -1.0]), axis], axis=1))
-    touch("ring", "box", [x, y, top])
+    radius, half = about(0.22), about(0.055)
+    upright("ring", (Tube(radius),), (Tube(0.6 * radius),), radius, half, (0.42, -0.48, 0.0), "ground")
 
-    # The bowl stands free before the face y = -hy; its foot is flat.
-    radius = about(0.28, 0.05)
-    inner = 0.9 * radius
-    foot = inner + 0.02
-    bowl_at = [generator.uniform(-0.06, 0.06), -hy - radius - about(0.2), foot]
-    bowl = Solid((Ball(radius), *slab(2, -foot, 0.1 * radius)), (Ball(inner),), radius)
-    place("bowl", bowl, bowl_at)
-    touch("bowl", "ground", [bowl_at[0], bowl_at[1], 0.0])
-
-    # The plank leans with the middle of its upper edge against the upright edge (-hx, hy).
-    wide, thick, long, tilt = about(0.13), 0.018, about(0.15), generator.uniform(0.6, 0.75)
-    way = generator.uniform(2.15, 2.55)
-    out, along = np.array([np.cos(way), np.sin(way), 0.0]), np.array([np.sin(way), -np.cos(way), 0.0])
-    c, s = np.cos(tilt), np.sin(tilt)
-    up = c * np.array([0.0, 0.0, 1.0]) - s * out
-    normal = s * np.array([0.0, 0.0, 1.0]) + c * out
-    leans = np.array([-hx, hy, 2.0 * long * c])
-    plank = Solid(
-        (*slab(0, -wide, wide), *slab(1, -thick, thick), *slab(2, -long, long)),
-        bound=float(np.hypot(wide, long) + thick),
-    )
-    centre = leans - long * up + thick * normal
-    place("plank", plank, list(centre), np.stack([along, normal, up], axis=1))
-    touch("plank", "box", list(leans))
-    touch("plank", "ground", list(centre - long * up - thick * normal))
+    # The tile lies with one edge along the box's face y = hy.
+    wide, thick, long = about(0.17), 0.018, about(0.22)
+    tile = (*slab(0, -wide, wide), *slab(1, -long, long), *slab(2, -thick, thick))
+    tile_at = [0.06, hy + long, thick]
+    place("tile", Solid(tile, bound=float(np.linalg.norm([wide, long, thick]))), tile_at)
+    touch("tile", "box", [tile_at[0], hy, thick])
+    touch("tile", "ground", [tile_at[0], tile_at[1], 0.0])
 
     return _finish(solids, poses, contacts, generator)
 
@@ -201,9 +182,11 @@ def _finish(
     # All solids are symmetric about their own y = 0, so mirroring a pose (M R M, M t) mirrors the object exactly.
     mirror = np.diag([1.0, generator.choice([-1.0, 1.0]), 1.0])
     turn = _turn_z(generator.uniform(0.0, 2.0 * np.pi))
-    shift = np.array([0.0, 0.24, 0.0])
+    shift = np.array([0.0, 0.1, 0.0])
     names = list(solids)
-    textures = _textures(names, generator)
+    noise = Noise(generator)
+    hue = generator.uniform()
+    textures = _textures(names, hue, noise, generator)
     things = tuple(
         Thing(
             name,
@@ -215,7 +198,7 @@ def _finish(
         for name in names
     )
     ids = {"ground": 0, **{name: i for i, name in enumerate(names, start=1)}}
-    hue, height, azimuth = generator.uniform(), generator.uniform(0.70, 0.85), generator.uniform(0.0, 2.0 * np.pi)
+    height, azimuth = generator.uniform(0.70, 0.85), generator.uniform(0.0, 2.0 * np.pi)
     return Still(
         things=things,
         contacts=tuple(Contact(ids[a], ids[b], turn @ mirror @ (p + shift)) for a, b, p in contacts),
@@ -223,8 +206,8 @@ def _finish(
         noise=Noise(generator),
         palette=np.stack(
             [
-                linear_from_hsv(hue, 0.09, 0.88),
-                linear_from_hsv(hue + 0.06, 0.16, 0.62),
+                linear_from_hsv(hue, 0.40, 0.88),
+                linear_from_hsv(hue + 0.06, 0.60, 0.62),
                 linear_from_hsv(hue + 0.5, 0.22, 0.80),
                 linear_from_hsv(hue + 0.58, 0.34, 0.52),
             ]

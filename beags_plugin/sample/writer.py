@@ -21,7 +21,7 @@ from beags_plugin.sample.points import seed_points, write_ply
 from beags_plugin.sample.seen import seen_part, visible_surface, well_seen
 from beags_plugin.sample.views import Picture, View, make_views, render_view
 
-VERSION = 7
+VERSION = 8
 """Raise it whenever the same config would give other files: older samples are then rebuilt."""
 POINT_NOISE = 0.03
 """World units, two to three pixels at 256 x 192: as a hand-held capture gives."""
