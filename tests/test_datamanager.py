@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import random
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 from data_folders import CX, CY, FX, FY, HEIGHT, WIDTH, noise, write_image, write_transforms
 from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
 
-from beags_plugin.plugin.datamanager import BeagsDataManager, BeagsDataManagerConfig, undistort_class_map
+from beags_plugin.plugin.datamanager import BeagsDataManager, BeagsDataManagerConfig, undistort_class_map, unique_names
 from beags_plugin.plugin.dataparser import BeagsDataParserConfig
 from beags_plugin.rasterizers.interface import IGNORE
 
@@ -214,3 +215,10 @@ def test_checkpoints_with_numpy_scalars_load(tmp_path):
     state = {"lr": np.float64(0.25), "base": np.float32(0.5)}
     torch.save(state, tmp_path / "state.ckpt")
     assert torch.load(tmp_path / "state.ckpt", weights_only=True) == state
+
+
+def test_views_of_equal_stems_have_names_of_their_own():
+    files = [Path("images/left/0001.png"), Path("images/right/0001.png"), Path("images/right/0002.png")]
+    assert unique_names(files) == ["left_0001", "right_0001", "0002"]
+    assert unique_names([Path("a/x.png"), Path("b/y.jpg")]) == ["x", "y"]
+    assert unique_names([Path("a/c/x.png"), Path("b/c/x.png")]) == ["a_c_x", "b_c_x"]

@@ -137,6 +137,15 @@ def test_gradients_are_finite_differences(output):
                 shifted.append((getattr(scene.draw(rasterizer, **{**values, name: moved}), output) * factors).sum())
             numeric = float(shifted[0] - shifted[1]) / (2 * step)
             assert float(gradient.view(-1)[pick]) == pytest.approx(numeric, rel=2e-4, abs=2e-4), (name, pick)
+        # All entries at once, along a random direction.
+        direction = torch.rand(value.shape, generator=g, dtype=torch.float64) - 0.5
+        ahead, behind = (
+            (getattr(scene.draw(rasterizer, **{**values, name: value + s * step * direction}), output) * factors).sum()
+            for s in (1, -1)
+        )
+        assert float((gradient * direction).sum()) == pytest.approx(
+            float(ahead - behind) / (2 * step), rel=1e-3, abs=1e-3
+        )
 
 
 def test_boundary_gradient_has_the_stated_closed_form():

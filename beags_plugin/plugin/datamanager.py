@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections import Counter
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
@@ -44,7 +45,7 @@ class View:
     """One undistorted view, on the data manager's device.
 
     image: [H, W, 3] float32 in 0..1. labels: [H, W] int32 class ids or IGNORE; None if the view has no mask.
-    name: the stem of the image file.
+    name: the stem of the image file; where several share it, with the folders that tell them apart, joined by "_".
     """
 
     camera: Camera
@@ -114,7 +115,11 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
             raise ValueError(f"unknown split {split!r}")
         cache = self.cached_train if split == "train" else self.cached_eval
         dataset = self.train_dataset if split == "train" else self.eval_dataset
-        return [self._view(dataset, data, index, original) for index, data in enumerate(cache)]
+        names = unique_names(dataset.image_filenames)
+        return [
+            self._view(dataset, data, index, name, original)
+            for index, (data, name) in enumerate(zip(cache, names, strict=True))
+        ]
 
     def replace_class_maps(self, class_maps: Sequence[Tensor]) -> None:
         """Train on ``class_maps``, one [H, W] integer tensor per training view, instead of the mask files.
@@ -133,7 +138,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
             data.setdefault("original_class_map", data["class_map"])
             data["class_map"] = labels.detach().to(torch.uint16).to(data["class_map"].device, copy=True)
 
-    def _view(self, dataset: BeagsDataset, data: dict, index: int, original: bool) -> View:
+    def _view(self, dataset: BeagsDataset, data: dict, index: int, name: str, original: bool) -> View:
         image = data["image"].to(self.device)
         image = image.float() / 255.0 if image.dtype == torch.uint8 else image
         replaced = "original_class_map" in data and not original
@@ -142,7 +147,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
             key = "original_class_map" if original and "original_class_map" in data else "class_map"
             labels = data[key].to(self.device).to(torch.int32)
         camera = camera_from_nerfstudio(dataset.cameras, index).to(self.device)
-        return View(camera, image[..., :3], labels, Path(dataset.image_filenames[index]).stem)
+        return View(camera, image[..., :3], labels, name)
 
     def _on_device(self, data: dict) -> dict:
         return {key: value.to(self.device) if key in OWN_KEYS else value for key, value in data.items()}
@@ -177,3 +182,14 @@ def undistort_class_map(class_map: np.ndarray, cameras: Cameras, index: int) -> 
         class_map, map_x, map_y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=(IGNORE,)
     )
     return np.ascontiguousarray(straight[y : y + h, x : x + w])
+
+
+def unique_names(files: Sequence[Path]) -> list[str]:
+    """For each file its stem, with as many of its folders before it as it takes to tell all apart, joined by "_"."""
+    parts = [Path(file).with_suffix("").parts for file in files]
+    depth = 1
+    while len({path[-depth:] for path in parts}) < len(set(parts)):
+        depth += 1
+    names = ["_".join(path[-depth:]) for path in parts]
+    stems = Counter(path[-1] for path in parts)
+    return [path[-1] if stems[path[-1]] == 1 else name for path, name in zip(parts, names, strict=True)]
