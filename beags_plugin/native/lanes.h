@@ -23,6 +23,7 @@ struct Lanes;
 template <>
 struct Lanes<float> {
   typedef float Real __attribute__((vector_size(32)));
+  typedef int32_t Whole;
   typedef int32_t Int __attribute__((vector_size(32)));  // also a mask: 0 or -1
   static constexpr int kCount = 8;
 };
@@ -30,6 +31,7 @@ struct Lanes<float> {
 template <>
 struct Lanes<double> {
   typedef double Real __attribute__((vector_size(32)));
+  typedef int64_t Whole;
   typedef int64_t Int __attribute__((vector_size(32)));
   static constexpr int kCount = 4;
 };

@@ -30,8 +30,8 @@ template <class T>
 struct OccupancyBatch {
   T field[kOccupancyFields][Lanes<T>::kCount];
   uint64_t state[Lanes<T>::kCount];  // hash of stream and Gaussian
-  int64_t low[3][Lanes<T>::kCount];  // corner of the voxels around the disc, and which of them are valid
-  uint64_t valid[Lanes<T>::kCount];
+  // Corner of the voxels around the disc, and which of them are valid: two words of 32 bits.
+  typename Lanes<T>::Whole low[3][Lanes<T>::kCount], valid[2][Lanes<T>::kCount];
   int64_t gaussian[Lanes<T>::kCount];
   int32_t class_id[Lanes<T>::kCount];
   int count;
@@ -94,11 +94,17 @@ BEAGS_OPS_INLINE void store(T* to, typename Lanes<T>::Real vector) {
   __builtin_memcpy(to, &vector, sizeof vector);
 }
 
-// The fields of the Gaussians first .. first + count - 1, and the voxels low .. high that their discs reach (whole
-// floats). Gaussians that count as nothing get kOpacity = NaN.
+// The voxels that a batch's discs reach: `size` of them along each axis from `low` on; `small`: at most 4, near enough
+// to be looked up.
 template <class T>
-BEAGS_OPS_INLINE void set_up(const OccupancyJob<T>& job, int64_t first, int count, OccupancyBatch<T>& batch,
-                             T low[3][Lanes<T>::kCount], T high[3][Lanes<T>::kCount]) {
+struct Boxes {
+  typename Lanes<T>::Int low[3], size[3], small;
+};
+
+// The fields of the Gaussians first .. first + count - 1 and their boxes. Those that count as nothing get an opacity
+// of NaN.
+template <class T>
+BEAGS_OPS_INLINE Boxes<T> set_up(const OccupancyJob<T>& job, int64_t first, int count, OccupancyBatch<T>& batch) {
   using R = typename Lanes<T>::Real;
   constexpr int kCount = Lanes<T>::kCount;
   T raw[10][kCount];
@@ -129,11 +135,14 @@ BEAGS_OPS_INLINE void set_up(const OccupancyJob<T>& job, int64_t first, int coun
   // NaN if a number is not finite or a scale is 0
   R broken = nan_unless_finite(logit) + nan_unless_finite(log_u) + nan_unless_finite(log_v) +
              nan_unless_finite(one / s_u) + nan_unless_finite(one / s_v);
+  const T per_voxel = T(1) / job.voxel_size;
+  Boxes<T> boxes;
+  boxes.small = ~(typename Lanes<T>::Int){};
   constexpr T kEpsilon = sizeof(T) == 4 ? T(1.1920929e-7) : T(2.220446049250313e-16);
   for (int axis = 0; axis < 3; ++axis) {
     const R mean = load(raw[axis]);
-    const R u = s_u * r0[axis] / job.voxel_size, v = s_v * r1[axis] / job.voxel_size;
-    const R center = (mean - job.origin[axis]) / job.voxel_size;
+    const R u = s_u * r0[axis] * per_voxel, v = s_v * r1[axis] * per_voxel;
+    const R center = (mean - job.origin[axis]) * per_voxel;
     store(batch.field[kR0 + axis], r0[axis]);
     store(batch.field[kR1 + axis], r1[axis]);
     store(batch.field[kAxisU + axis], u);
@@ -141,16 +150,14 @@ BEAGS_OPS_INLINE void set_up(const OccupancyJob<T>& job, int64_t first, int coun
     store(batch.field[kCenter + axis], center);
     broken += nan_unless_finite(mean) + nan_unless_finite(T(3) * s_u * r0[axis] + T(3) * s_v * r1[axis]);
     // The samples and this box round differently, by a few units in the last place.
-    const R half = T(3) * sqrt(u * u + v * v) * (1 + 16 * kEpsilon) +
-                   16 * kEpsilon * select(center < zero, -center, center);
-    store(low[axis], center - half);
-    store(high[axis], center + half);
-    for (int lane = 0; lane < kCount; ++lane) {
-      low[axis][lane] = floor(low[axis][lane]);
-      high[axis][lane] = floor(high[axis][lane]);
-    }
+    const R size = select(center < zero, -center, center);
+    const R half = T(3) * sqrt(u * u + v * v) * (1 + 16 * kEpsilon) + 16 * kEpsilon * size;
+    boxes.low[axis] = floor_to_int(center - half);
+    boxes.size[axis] = floor_to_int(center + half) - boxes.low[axis] + 1;
+    boxes.small &= (boxes.size[axis] <= 4) & (size + half < static_cast<T>(kVoxelHalf));
   }
   store(batch.field[kOpacity], one / (one + exponential(-logit)) + broken);
+  return boxes;
 }
 
 // Writes the gradients of a batch from its six sums; returns the sum of its losses.
@@ -205,22 +212,19 @@ BEAGS_OPS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& ba
   for (int lane = batch.count; lane < kCount; ++lane) {  // fill up with copies
     for (auto& field : batch.field) field[lane] = field[0];
     for (auto& low : batch.low) low[lane] = low[0];
+    for (auto& valid : batch.valid) valid[lane] = valid[0];
     batch.state[lane] = batch.state[0];
-    batch.valid[lane] = batch.valid[0];
     batch.class_id[lane] = batch.class_id[0];
   }
   R center[3], axis_u[3], axis_v[3];
-  I low[3] = {}, valid_low = {}, valid_high = {};
+  I low[3], words[2];
   for (int axis = 0; axis < 3; ++axis) {
     center[axis] = load(batch.field[kCenter + axis]);
     axis_u[axis] = load(batch.field[kAxisU + axis]);
     axis_v[axis] = load(batch.field[kAxisV + axis]);
-    for (int lane = 0; lane < kCount; ++lane) low[axis][lane] = static_cast<int32_t>(batch.low[axis][lane]);
   }
-  for (int lane = 0; lane < kCount; ++lane) {
-    valid_low[lane] = static_cast<int32_t>(batch.valid[lane]);
-    valid_high[lane] = static_cast<int32_t>(batch.valid[lane] >> 32);
-  }
+  __builtin_memcpy(low, batch.low, sizeof low);
+  __builtin_memcpy(words, batch.valid, sizeof words);
   Counter<T> counter(batch.state);
   R sums[6] = {};
   for (int64_t s = 0; s < job.samples; ++s) {
@@ -239,11 +243,20 @@ BEAGS_OPS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& ba
       const I place = (floor_to_int(at[0]) - low[0]) << 4 | (floor_to_int(at[1]) - low[1]) << 2 |
                       (floor_to_int(at[2]) - low[2]);
       const I half = -(place >> 5 & 1);
-      valid = -(((valid_low & ~half) | (valid_high & half)) >> (place & 31) & 1);
+      valid = -(((words[0] & ~half) | (words[1] & half)) >> (place & 31) & 1);
     } else {
+      const R limit = R{} + static_cast<T>(kVoxelHalf + 4);
+      I index[3];
+      for (int axis = 0; axis < 3; ++axis) {
+        const R low_held = select(at[axis] > -limit, at[axis], -limit);
+        index[axis] = floor_to_int(select(low_held < limit, low_held, limit)) + static_cast<int32_t>(kVoxelShift);
+      }
+      const I place = (index[0] & 3) << 4 | (index[1] & 3) << 2 | (index[2] & 3);
+      for (int axis = 0; axis < 3; ++axis) index[axis] >>= 2;
+      valid = I{};
       for (int lane = 0; lane < kCount; ++lane) {
-        const T voxel[3] = {floor(at[0][lane]), floor(at[1][lane]), floor(at[2][lane])};
-        valid[lane] = voxel_member(*job.valid, batch.class_id[lane], voxel) ? -1 : 0;
+        const uint64_t bits = brick_bits(*job.valid, batch.class_id[lane], index[0][lane], index[1][lane], index[2][lane]);
+        valid[lane] = -static_cast<int32_t>(bits >> place[lane] & 1);
       }
     }
     const R weight = (R)((I)exponential(T(-4.5) * area) & ~valid);
@@ -282,21 +295,23 @@ double occupancy_block(const OccupancyJob<T>& job, int64_t first, int64_t last, 
   near.count = wide.count = 0;
   double total = 0;
   for (int64_t start = first; start < last; start += kCount) {
-    T low[3][kCount], high[3][kCount];
     const int here = static_cast<int>(last - start < kCount ? last - start : kCount);
-    set_up(job, start, here, fresh, low, high);
+    const Boxes<T> boxes = set_up(job, start, here, fresh);
     for (int lane = 0; lane < here; ++lane) {
       const int64_t i = start + lane;
       const int32_t class_id = job.class_ids[i];
       const T opacity = fresh.field[kOpacity][lane];
       if (opacity != opacity || (!job.background && class_id == 0)) continue;
-      const T from[3] = {low[0][lane], low[1][lane], low[2][lane]};
-      const T to[3] = {high[0][lane], high[1][lane], high[2][lane]};
+      const bool known = class_id >= 0 && class_id < job.valid->num_classes;
+      const bool small = boxes.small[lane] || !known;
       int64_t corner[3] = {};
-      int n[3];
       uint64_t valid = 0;
-      const bool small = small_box(from, to, corner, n);
-      if (small) {
+      if (known && small) {
+        int n[3];
+        for (int axis = 0; axis < 3; ++axis) {
+          corner[axis] = boxes.low[axis][lane];
+          n[axis] = static_cast<int>(boxes.size[axis][lane]);
+        }
         valid = voxel_box(*job.valid, class_id, corner, n);
         const uint64_t box = box_bits(n[0], n[1], n[2]);
         if ((valid & box) == box) continue;  // wholly inside: the loss is exactly 0
@@ -305,8 +320,8 @@ double occupancy_block(const OccupancyJob<T>& job, int64_t first, int64_t last, 
       const int at = batch.count;
       append(fresh, lane, batch);
       batch.state[at] = mix(static_cast<uint64_t>(i) * kGolden + job.stream);
-      for (int axis = 0; axis < 3; ++axis) batch.low[axis][at] = corner[axis];
-      batch.valid[at] = valid;
+      for (int axis = 0; axis < 3; ++axis) batch.low[axis][at] = static_cast<typename Lanes<T>::Whole>(corner[axis]);
+      for (int word = 0; word < 2; ++word) batch.valid[word][at] = static_cast<int32_t>(valid >> 32 * word);
       batch.gaussian[at] = i;
       batch.class_id[at] = class_id;
       *active += 1;

@@ -9,6 +9,8 @@ namespace ops {
 using namespace BEAGS_ISA;
 namespace {
 
+// An array of bricks may take this many cells, or so many for each brick that is not empty; a hash table takes 4 to 8.
+constexpr double kMostDense = 1 << 16, kDensePerBrick = 16;
 constexpr int64_t kLeastForTeam = 4000;  // queries take tens of nanoseconds; a team takes microseconds to start
 
 // Sorts by key and unites the bits of equal keys.
@@ -58,26 +60,71 @@ void add_neighbours(const int64_t* voxel, std::vector<Brick>& bricks) {
 
 }  // namespace
 
-VoxelLookup::Bricks VoxelLookup::collect(std::vector<std::vector<Brick>> bricks) {
-  Bricks all;
+void VoxelLookup::Bricks::store(const std::vector<std::vector<Brick>>& bricks) {
+  num_classes = static_cast<int32_t>(bricks.size());
+  int64_t low[3], high[3], count = 0;
+  std::fill_n(low, 3, int64_t(1) << 20);
+  std::fill_n(high, 3, int64_t(0));
+  const auto coordinate = [](uint64_t key, int axis) { return static_cast<int64_t>(key >> (40 - 20 * axis) & 0xFFFFF); };
+  for (const std::vector<Brick>& of_class : bricks) {
+    count += static_cast<int64_t>(of_class.size());
+    for (const Brick& brick : of_class) {
+      for (int axis = 0; axis < 3; ++axis) {
+        low[axis] = std::min(low[axis], coordinate(brick.key, axis));
+        high[axis] = std::max(high[axis], coordinate(brick.key, axis));
+      }
+    }
+  }
+  double cells = num_classes;
+  for (int axis = 0; axis < 3; ++axis) {
+    base[axis] = static_cast<int32_t>(low[axis] - 2);
+    size[axis] = static_cast<int32_t>(std::max<int64_t>(high[axis] - low[axis], 0) + 5);
+    cells *= size[axis];
+  }
+  if (cells > kMostDense && cells > kDensePerBrick * static_cast<double>(count)) return hash(bricks);
+  dense.assign(static_cast<size_t>(cells), 0);
+  for (int c = 0; c < num_classes; ++c) {
+    for (const Brick& brick : bricks[c]) {
+      int64_t at = c;
+      for (int axis = 0; axis < 3; ++axis) at = at * size[axis] + coordinate(brick.key, axis) - base[axis];
+      dense[at] = brick.bits;
+    }
+  }
+}
+
+void VoxelLookup::Bricks::hash(const std::vector<std::vector<Brick>>& bricks) {
   uint64_t first = 0;
   for (const std::vector<Brick>& of_class : bricks) {
     int bits = 1;
     while ((uint64_t(1) << bits) < 2 * of_class.size()) ++bits;  // at most half full: short chains
-    all.ranges.push_back({first, (uint64_t(1) << bits) - 1, 64 - bits});
+    ranges.push_back({first, (uint64_t(1) << bits) - 1, 64 - bits});
     first += uint64_t(1) << bits;
   }
-  all.slots.assign(first, {kNoBrick, 0});
+  slots.assign(first, {kNoBrick, 0});
   for (size_t c = 0; c < bricks.size(); ++c) {
-    const BrickRange& range = all.ranges[c];
+    const BrickRange& range = ranges[c];
     for (const Brick& brick : bricks[c]) {
       uint64_t at = brick.key * kGolden >> range.shift;
-      while (all.slots[range.first + at].key != kNoBrick) at = (at + 1) & range.mask;
-      all.slots[range.first + at] = brick;
+      while (slots[range.first + at].key != kNoBrick) at = (at + 1) & range.mask;
+      slots[range.first + at] = brick;
     }
-    std::vector<Brick>().swap(bricks[c]);
   }
-  return all;
+}
+
+VoxelTable VoxelLookup::Bricks::table() const {
+  VoxelTable table{};
+  table.num_classes = num_classes;
+  table.dense = dense.empty() ? nullptr : dense.data();
+  std::copy_n(base, 3, table.base);
+  std::copy_n(size, 3, table.size);
+  table.bricks = slots.data();
+  table.classes = ranges.data();
+  return table;
+}
+
+int64_t VoxelLookup::Bricks::bytes() const {
+  return static_cast<int64_t>(dense.size() * sizeof(uint64_t) + slots.size() * sizeof(Brick) +
+                              ranges.size() * sizeof(BrickRange));
 }
 
 VoxelLookup::VoxelLookup(const int64_t* keys, const int32_t* classes, int64_t count, int num_classes,
@@ -104,8 +151,8 @@ VoxelLookup::VoxelLookup(const int64_t* keys, const int32_t* classes, int64_t co
     unite(occupied[c]);
     unite(valid[c]);
   }
-  occupied_ = collect(std::move(occupied));
-  valid_ = collect(std::move(valid));
+  occupied_.store(occupied);
+  valid_.store(valid);
 }
 
 // As VisibilityGrid's _scaled: each step is monotonic.

@@ -36,16 +36,19 @@ class VoxelLookup {
                    int threads) const;
 
  private:
+  // Storage of one VoxelTable.
   struct Bricks {
+    std::vector<uint64_t> dense;
+    int32_t base[3], size[3];
     std::vector<Brick> slots;
     std::vector<BrickRange> ranges;
-    VoxelTable table() const { return {slots.data(), ranges.data(), static_cast<int32_t>(ranges.size())}; }
-    int64_t bytes() const {
-      return static_cast<int64_t>(slots.size() * sizeof(Brick) + ranges.size() * sizeof(BrickRange));
-    }
+    int32_t num_classes;
+    // bricks: of each class, no two alike.
+    void store(const std::vector<std::vector<Brick>>& bricks);
+    void hash(const std::vector<std::vector<Brick>>& bricks);
+    VoxelTable table() const;
+    int64_t bytes() const;
   };
-  // One table out of bricks (in any order, several of a kind are united) for each class.
-  static Bricks collect(std::vector<std::vector<Brick>> bricks);
   template <class T>
   void scaled(const T* point, T* voxel) const;
 
