@@ -49,7 +49,7 @@ def reproject_pairwise(
     unlabelled than guessed). Cost O(V^2 pixels), memory O(pixels of one view x classes).
     Raises ``UserError`` for a mask of the wrong size or with ids out of range.
     """
-    _check(depths, cameras, labels, num_classes, tau)
+    check_views(depths, cameras, labels, num_classes, tau)
     results: list[ReprojectedMask] = []
     maps = _PixelMaps(cameras)
     while len(results) < len(cameras):
@@ -78,7 +78,8 @@ def _by_torch(depths, cameras, labels, num_classes: int, tau: float, i: int, map
     return _decide(votes, labels[i], camera)
 
 
-def _check(depths, cameras, labels, num_classes: int, tau: float) -> None:
+def check_views(depths, cameras, labels, num_classes: int, tau: float) -> None:
+    """Raise ``UserError`` for masks of the wrong size or with ids out of range, ``ValueError`` for other misfits."""
     if not len(depths) == len(cameras) == len(labels):
         raise ValueError(f"{len(depths)} depths, {len(cameras)} cameras and {len(labels)} masks do not belong together")
     if not tau >= 0:

@@ -30,7 +30,7 @@ void directions(const ColorJob<T>& job, int64_t first, int count, Directions<T>&
     d.z[i] = job.means[3 * (first + i) + 2] - job.center[2];
   }
   for (int i = 0; i < count; ++i) {
-    const T length = static_cast<T>(sqrt(d.x[i] * d.x[i] + d.y[i] * d.y[i] + d.z[i] * d.z[i]));
+    const T length = static_cast<T>(::sqrt(d.x[i] * d.x[i] + d.y[i] * d.y[i] + d.z[i] * d.z[i]));
     const T least = static_cast<T>(kLeastDistance);
     d.inverse[i] = T(1) / (length < least ? least : length);
     d.x[i] *= d.inverse[i];
