@@ -240,8 +240,8 @@ BEAGS_OPS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& ba
     for (int axis = 0; axis < 3; ++axis) at[axis] = fma(v, axis_v[axis], fma(u, axis_u[axis], center[axis]));
     I valid;
     if constexpr (kLocal) {
-      const I place = (floor_to_int(at[0]) - low[0]) << 4 | (floor_to_int(at[1]) - low[1]) << 2 |
-                      (floor_to_int(at[2]) - low[2]);
+      const I place =
+          (floor_to_int(at[0]) - low[0]) << 4 | (floor_to_int(at[1]) - low[1]) << 2 | (floor_to_int(at[2]) - low[2]);
       const I half = -(place >> 5 & 1);
       valid = -(((words[0] & ~half) | (words[1] & half)) >> (place & 31) & 1);
     } else {
@@ -255,7 +255,8 @@ BEAGS_OPS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& ba
       for (int axis = 0; axis < 3; ++axis) index[axis] >>= 2;
       valid = I{};
       for (int lane = 0; lane < kCount; ++lane) {
-        const uint64_t bits = brick_bits(*job.valid, batch.class_id[lane], index[0][lane], index[1][lane], index[2][lane]);
+        const uint64_t bits =
+            brick_bits(*job.valid, batch.class_id[lane], index[0][lane], index[1][lane], index[2][lane]);
         valid[lane] = -static_cast<int32_t>(bits >> place[lane] & 1);
       }
     }
