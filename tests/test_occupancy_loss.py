@@ -12,6 +12,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.occupancy import OccupancyLoss
 from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.occupancy.sampling import sample_stream
 from beags_plugin.ops import extension
 from beags_plugin.ops.occupancy_loss import occupancy_loss
 
@@ -169,14 +170,14 @@ def test_wrong_arguments_are_told_by_name():
         spoilt = list(arguments)
         spoilt[place] = spoilt[place][:-1] if place else spoilt[place][:, :2]
         with pytest.raises(ValueError, match=name):
-            occupancy_loss(*spoilt, ids_of(5), lookup, 0, 0, 3)
+            occupancy_loss(*spoilt, ids_of(5), lookup, 0, 3)
     with pytest.raises(ValueError, match="class_ids"):
-        occupancy_loss(*arguments, ids_of(5).long(), lookup, 0, 0, 3)
+        occupancy_loss(*arguments, ids_of(5).long(), lookup, 0, 3)
 
 
 def test_no_gradient_wanted_gives_the_same_value():
     surfels, grid = make_surfels(200), make_grid()
     arguments = [getattr(surfels, name) for name in FLOATS]
-    value = occupancy_loss(*arguments, ids_of(200), grid.lookup(), 4, 11, 20)
-    bare = occupancy_loss(*(a.detach() for a in arguments), ids_of(200), grid.lookup(), 4, 11, 20)
+    value = occupancy_loss(*arguments, ids_of(200), grid.lookup(), sample_stream(4, 11), 20)
+    bare = occupancy_loss(*(a.detach() for a in arguments), ids_of(200), grid.lookup(), sample_stream(4, 11), 20)
     assert torch.equal(value, bare) and value.requires_grad and not bare.requires_grad
