@@ -58,4 +58,4 @@ class _OccupancyLoss(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, *grad_outputs: Tensor):
-        return None, *torch._foreach_mul(list(ctx.saved_tensors), grad_outputs[0])
+        return None, *(gradient * grad_outputs[0] for gradient in ctx.saved_tensors)
