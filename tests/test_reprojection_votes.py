@@ -56,7 +56,7 @@ def test_both_are_their_torch_versions(method, tau, dtype, without_extension):
     changed = [(new.labels != old).double().mean() for new, old in zip(found, scene[2], strict=True) if old is not None]
     assert min(changed) > 0.001
     assert (found[3].labels != IGNORE).double().mean() > 0.1  # the view without a mask got one
-    assert len(torch.cat([mask.confidence.view(-1) for mask in found]).unique()) >= 6
+    assert len(torch.cat([mask.confidence.view(-1) for mask in found]).unique()) >= 4
 
 
 @compiled
