@@ -5,6 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from beags_plugin.ops import extension
+from beags_plugin.ops import sh_colors as compiled
+
 MAX_DEGREE = 3
 
 # Normalisation of the real basis, band by band: the integral of each squared function over the sphere is 1. Signs and
@@ -58,8 +61,11 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 def sh_colors(sh: Tensor, means: Tensor, camera_center: Tensor, degree: int) -> Tensor:
     """Colour of each surfel as seen from ``camera_center``: SH + 0.5, clamped at 0.
 
-    sh: [N, K, 3], K >= (degree + 1)^2. means: [N, 3] world. camera_center: [3] world. Returns [N, 3].
+    sh: [N, K, 3], K >= (degree + 1)^2. means: [N, 3] world. camera_center: [3] world. Returns [N, 3]. Computed by the
+    compiled op where it can be.
     """
+    if extension.can_take(sh, means, camera_center) and not camera_center.requires_grad:
+        return compiled.sh_colors(sh, means, camera_center, degree)
     if degree == 0:
         return (_C0 * sh[:, 0] + 0.5).clamp_min(0.0)
     directions = torch.nn.functional.normalize(means - camera_center, dim=-1)  # eps 1e-12: a surfel at the camera

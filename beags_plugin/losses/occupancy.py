@@ -11,7 +11,9 @@ from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.reduction import ordered_sum
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.occupancy.sampling import RADIUS, disc_points, sample_words
+from beags_plugin.occupancy.sampling import RADIUS, disc_points, sample_stream, sample_words
+from beags_plugin.ops import extension
+from beags_plugin.ops.occupancy_loss import occupancy_loss
 
 _CHUNK_POINTS = 1 << 16  # points looked up at a time: their temporaries stay in the cache; never changes the result
 
@@ -21,7 +23,8 @@ class OccupancyLoss(Loss):
     """L = 1 / (N Z) sum_i sum_r o_i G_i(x_r) Q_i(x_r), Q = 1 where D_occ(x_r, V_phi_i) = 0, else 0 (E9).
 
     It does not pass through the rasterizer, so Gaussians that no ray sees learn too. Surfels with a parameter that is
-    not finite count as 0. Memory does not depend on ``samples``.
+    not finite, or with a scale of 0, count as 0. Memory does not depend on ``samples``. The compiled op computes it
+    where it can; what follows here is its reference.
 
     samples: Z, points per Gaussian and step, uniform in its UV disc of radius 3.
     background: whether the background's Gaussians are held to its voxels too, as in the paper. Its far parts are
@@ -39,7 +42,12 @@ class OccupancyLoss(Loss):
         if grid is None or class_ids is None:
             raise ValueError("the occupancy loss needs class ids and a visibility grid")
         num_samples = int(self.samples)
-        active = _outside(surfels.means, surfels.quats, surfels.log_scales, surfels.opacity_logits, class_ids, grid)
+        parameters = (surfels.means, surfels.quats, surfels.log_scales, surfels.opacity_logits)
+        lookup = grid.lookup()
+        if lookup is not None and extension.can_take(*parameters):
+            stream = sample_stream(inputs.seed, inputs.step)
+            return occupancy_loss(*parameters, class_ids.int(), lookup, stream, num_samples, self.background)
+        active = _outside(*parameters, class_ids, grid)
         if not self.background:
             active = active[class_ids[active] != 0]
         rotation = rotation_from_quat(surfels.quats[active])
@@ -59,10 +67,11 @@ class OccupancyLoss(Loss):
 @torch.no_grad()
 def _outside(means, quats, log_scales, opacity_logits, class_ids: Tensor, grid: VisibilityGrid) -> Tensor:
     """Indices [M] int64 of the Gaussians whose disc is not wholly in valid voxels; the others' loss is exactly 0."""
-    half_axes = RADIUS * log_scales.exp()[:, None, :] * rotation_from_quat(quats)[..., :2]  # [N, 3, 2]
+    scales = log_scales.exp()
+    half_axes = RADIUS * scales[:, None, :] * rotation_from_quat(quats)[..., :2]  # [N, 3, 2]
     inside = grid.disc_inside(means, half_axes[..., 0], half_axes[..., 1], class_ids)
     finite = means.isfinite().all(1) & half_axes.isfinite().all(2).all(1) & opacity_logits.isfinite()
-    finite &= (log_scales > -torch.inf).all(1)
+    finite &= (1.0 / scales).isfinite().all(1)
     return torch.nonzero(finite & ~inside)[:, 0]
 
 

@@ -5,5 +5,8 @@ from beags_plugin.registry import Registry
 REPROJECTIONS = Registry(
     "reprojection",
     "beags.reprojections",
-    {"pairwise": "beags_plugin.masks.reprojection:reproject_pairwise"},
+    {
+        "pairwise": "beags_plugin.masks.reprojection:reproject_pairwise",
+        "voxel": "beags_plugin.masks.voxel_reprojection:reproject_voxel",
+    },
 )

@@ -11,6 +11,8 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.errors import UserError
+from beags_plugin.ops import extension
+from beags_plugin.ops.reprojection_votes import reprojection_votes
 from beags_plugin.rasterizers.interface import IGNORE
 
 _CHUNK_PIXELS = 1 << 16  # source pixels projected at a time: their temporaries stay in the cache
@@ -47,20 +49,40 @@ def reproject_pairwise(
     unlabelled than guessed). Cost O(V^2 pixels), memory O(pixels of one view x classes).
     Raises ``UserError`` for a mask of the wrong size or with ids out of range.
     """
-    _check(depths, cameras, labels, num_classes, tau)
-    voting = [(j, mask) for j, mask in enumerate(labels) if mask is not None]
-    results = []
-    for i, camera in enumerate(cameras):
-        votes = _Votes(camera.height * camera.width, num_classes, depths[i].device)
-        for j, mask in voting:
-            _cast(votes, depths[j], mask, depths[i], _pixel_map(cameras[j], camera, same=i == j), tau)
-        results.append(_decide(votes, labels[i], camera))
+    check_views(depths, cameras, labels, num_classes, tau)
+    results: list[ReprojectedMask] = []
+    if not cameras:
+        return results
+    maps = _PixelMaps(cameras)
+    while len(results) < len(cameras):
+        i = len(results)
+        size = max(camera.height * camera.width for camera in cameras) * num_classes
+        if extension.can_take(*depths) and size <= _DENSE_COUNTERS:
+            # as many views at a time as there are threads, each with its own counters
+            batch = range(i, min(i + max(1, min(extension.threads(), 2 * _DENSE_COUNTERS // size)), len(cameras)))
+            towards = torch.stack([torch.cat([A.flatten(1), b], dim=1) for A, b in map(maps.towards, batch)])
+            found = reprojection_votes(depths, labels, towards.to(depths[0]), i, num_classes, tau, IGNORE)
+            results += [ReprojectedMask(*pair) for pair in zip(*found, strict=True)]
+        else:
+            results.append(_by_torch(depths, cameras, labels, num_classes, tau, i, maps))
         if progress:
-            progress(i + 1, len(cameras))
+            for done in range(i + 1, len(results) + 1):
+                progress(done, len(cameras))
     return results
 
 
-def _check(depths, cameras, labels, num_classes: int, tau: float) -> None:
+def _by_torch(depths, cameras, labels, num_classes: int, tau: float, i: int, maps: _PixelMaps) -> ReprojectedMask:
+    """View i, as the compiled op does it; its reference."""
+    camera = cameras[i]
+    votes = _Votes(camera.height * camera.width, num_classes, depths[i].device)
+    for depth, mask, A, b in zip(depths, labels, *maps.towards(i), strict=True):
+        if mask is not None:
+            _cast(votes, depth, mask, depths[i], (A, b), tau)
+    return _decide(votes, labels[i], camera)
+
+
+def check_views(depths, cameras, labels, num_classes: int, tau: float) -> None:
+    """Raise ``UserError`` for masks of the wrong size or with ids out of range, ``ValueError`` for other misfits."""
     if not len(depths) == len(cameras) == len(labels):
         raise ValueError(f"{len(depths)} depths, {len(cameras)} cameras and {len(labels)} masks do not belong together")
     if not tau >= 0:
@@ -84,19 +106,31 @@ def _check(depths, cameras, labels, num_classes: int, tau: float) -> None:
             )
 
 
-def _pixel_map(source: Camera, target: Camera, same: bool) -> tuple[Tensor, Tensor]:
-    """A [3, 3] and b [3], float64: a source pixel (x, y) at depth d projects to d A (x, y, 1) + b = z (x', y', 1).
+class _PixelMaps:
+    """Between the pixels of all views: lifting and projecting in one step, so that no point has to be kept."""
 
-    This is lifting and projecting in one step, so that no point has to be kept.
-    """
-    if same:  # exactly the identity, whatever the rounding of the matrices
-        return torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    source, target = source.to("cpu", torch.float64), target.to("cpu", torch.float64)
-    turn = target.rotation @ source.rotation.T
-    return (
-        target.K @ turn @ torch.linalg.inv(source.K),
-        target.K @ (target.translation - turn @ source.translation),
-    )
+    def __init__(self, cameras: Sequence[Camera]) -> None:
+        views = [camera.to("cpu", torch.float64) for camera in cameras]
+        self.K = torch.stack([view.K for view in views])
+        self.rotation = torch.stack([view.rotation for view in views])
+        self.translation = torch.stack([view.translation for view in views])
+        # W^T K^-1: from pixels to directions in the world
+        self.lift = _product(self.rotation.transpose(1, 2), torch.linalg.inv(self.K))
+
+    def towards(self, i: int) -> tuple[Tensor, Tensor]:
+        """A [V, 3, 3] and b [V, 3], float64: a pixel (x, y) at depth d of view v projects to
+        d A (x, y, 1) + b = z (x', y', 1) in view i."""
+        A = _product(_product(self.K[i], self.rotation[i]), self.lift)
+        turn = _product(self.rotation[i], self.rotation.transpose(1, 2))
+        moved = self.translation[i] - _product(turn, self.translation[..., None])[..., 0]
+        b = _product(self.K[i], moved[..., None])[..., 0]
+        A[i], b[i] = torch.eye(3, dtype=torch.float64), 0.0  # exactly, whatever the rounding of the matrices
+        return A, b
+
+
+def _product(left: Tensor, right: Tensor) -> Tensor:
+    """[.., 3, 3] times [.., 3, C], always in the same order of operations, unlike a library's product."""
+    return sum(left[..., k, None] * right[..., k, None, :] for k in range(3))  # type: ignore[return-value]
 
 
 def _cast(votes: _Votes, depth: Tensor, mask: Tensor, target_depth: Tensor, pixel_map, tau: float) -> None:

@@ -3,6 +3,7 @@
 #include <nanobind/ndarray.h>
 
 #include "frame.h"
+#include "module_ops.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -128,4 +129,5 @@ NB_MODULE(_native, m) {
   m.def("instruction_set", &beags::instruction_set, "The kernels in use: avx2 or baseline.");
   beags::bind<float>(m, "FrameF32");
   beags::bind<double>(m, "FrameF64");
+  beags::bind_ops(m);
 }

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 
 import torch
 from torch import Tensor
 
 from beags_plugin.errors import UserError
+from beags_plugin.ops import extension
+from beags_plugin.ops.voxel_lookup import VoxelLookup
 
 DENSE_BYTES = 256 * 2**20  # up to this size, validity is kept as one byte per class and voxel
+_BOX = 4  # voxels along each side of the largest box that ``disc_inside`` looks at
 _BITS = 21  # of each of the three voxel indices in a key
 _HALF = 1 << (_BITS - 1)
 
@@ -22,7 +26,8 @@ class VisibilityGrid:
 
     voxel_size: world units. origin: [3] float64, corner of voxel (0, 0, 0), world. num_classes: ids lie below it.
     keys: [M] int64, sorted, unique: the occupied voxels, 21 bits per axis. classes: [M] int32, the class of each.
-    dense_bytes: see ``DENSE_BYTES``; 0 forces sorted keys. It changes the speed of ``valid``, never its result.
+    dense_bytes: see ``DENSE_BYTES``; 0 forces sorted keys. It changes the speed of ``valid``, never its result, and
+        only where the compiled ``lookup`` is absent.
     """
 
     def __init__(
@@ -35,7 +40,9 @@ class VisibilityGrid:
         self.origin = origin.to(torch.float64)
         self.num_classes = num_classes
         self.keys, self.classes = keys, classes
-        self._prepare_valid(dense_bytes)
+        self._dense_bytes = dense_bytes
+        self._lookup: VoxelLookup | None = None
+        self._prepared = False
 
     @classmethod
     def from_points(
@@ -59,11 +66,24 @@ class VisibilityGrid:
         of_key[inverse] = classes  # meaningful where one class was there
         return cls(voxel_size, origin, num_classes, keys[alone], of_key[alone], dense_bytes)
 
+    def lookup(self) -> VoxelLookup | None:
+        """The compiled lookup, made when it is first asked for; None without the extension or off the CPU."""
+        if extension.load() is None or self.keys.device.type != "cpu":
+            return None
+        if self._lookup is None:
+            self._lookup = VoxelLookup(self.keys, self.classes, self.num_classes, self.origin, self.voxel_size)
+        return self._lookup
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "_lookup": None}  # compiled objects cannot be copied; it is made again
+
     def count(self, points: Tensor, class_ids: Tensor) -> Tensor:
         """D_occ exactly: [P] int64 in 0..27; the plain definition, for checks and display.
 
         points: [P, 3] float, world. class_ids: [P] int.
         """
+        if (lookup := self._lookup_for(points)) is not None:
+            return lookup.count(points, class_ids)
         points, usable = self._usable(points)
         voxels = _voxels(points, self.origin, self.voxel_size)
         total = torch.zeros(len(points), dtype=torch.int64, device=points.device)
@@ -81,6 +101,9 @@ class VisibilityGrid:
 
         points: [P, 3] float, world; a point that is not finite is not valid. class_ids: [P] int.
         """
+        if (lookup := self._lookup_for(points)) is not None:
+            return lookup.valid(points, class_ids)
+        self._prepare_valid()
         voxels = _scaled(points, self.origin, self.voxel_size) - self._base.to(points)
         return self._member(voxels, class_ids)
 
@@ -88,9 +111,12 @@ class VisibilityGrid:
         """Discs that surely lie in valid voxels: [N] bool; True only if every point of the disc is valid.
 
         means: [N, 3] centres, world. axes_u, axes_v: [N, 3], the two half axes, from the centre to the rim, world.
-        class_ids: [N] int. The test looks at the disc's axis-aligned box; one over more than two voxels along an axis
+        class_ids: [N] int. The test looks at the disc's axis-aligned box; one over more than four voxels along an axis
         gives False.
         """
+        if (lookup := self._lookup_for(means)) is not None:
+            return lookup.disc_inside(means, axes_u, axes_v, class_ids)
+        self._prepare_valid()
         half = torch.sqrt(axes_u * axes_u + axes_v * axes_v)
         # The samples and this box round differently: a few units in the last place of the largest coordinate.
         rounding = 16 * torch.finfo(means.dtype).eps
@@ -98,13 +124,14 @@ class VisibilityGrid:
         base = self._base.to(means)
         low = _scaled(means - half, self.origin, self.voxel_size) - base
         high = _scaled(means + half, self.origin, self.voxel_size) - base
-        inside = ((high - low) <= 1).all(-1)  # False for NaN
-        low, high, class_ids = low[inside], high[inside], class_ids[inside]
-        every = torch.ones(len(low), dtype=torch.bool, device=means.device)
-        for corner in range(8):
-            pick = torch.tensor([corner >> axis & 1 for axis in range(3)], dtype=torch.bool, device=means.device)
-            every &= self._member(torch.where(pick, high, low), class_ids)
-        inside[inside.clone()] = every
+        span = high - low
+        inside = (span <= _BOX - 1).all(-1)  # False for NaN
+        for step in sorted(itertools.product(range(_BOX), repeat=3), key=max):
+            if max(step) != 1:  # few reach further than to the next voxel
+                asked = torch.nonzero(inside & (span.amax(-1) >= max(step)))[:, 0]
+            offset = span.new_tensor(step)
+            chosen = asked[(span[asked] >= offset).all(-1)]
+            inside[chosen] = self._member(low[chosen] + offset, class_ids[chosen]) & inside[chosen]
         return inside
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -123,12 +150,21 @@ class VisibilityGrid:
         size, num_classes = float(state["voxel_size"]), int(state["num_classes"])
         return cls(size, state["origin"], num_classes, state["keys"], state["classes"], dense_bytes)
 
+    def _lookup_for(self, points: Tensor) -> VoxelLookup | None:
+        return self.lookup() if extension.can_take(points) else None
+
     def _usable(self, points: Tensor) -> tuple[Tensor, Tensor]:
         usable = (_scaled(points, self.origin, self.voxel_size).abs() < _HALF).all(-1)
         return torch.where(usable[:, None], points, self.origin.to(points)), usable
 
-    def _prepare_valid(self, dense_bytes: int) -> None:
-        """The valid voxels, i.e. those next to an occupied one, cropped to a box with a rim of invalid voxels."""
+    def _prepare_valid(self) -> None:
+        """The valid voxels, i.e. those next to an occupied one, cropped to a box with a rim of invalid voxels.
+
+        What is needed without the compiled lookup; made when it is first asked for.
+        """
+        if self._prepared:
+            return
+        self._prepared = True
         voxels = _unpack(self.keys)
         device = voxels.device
         low = voxels.amin(0) if len(voxels) else torch.zeros(3, dtype=torch.int64, device=device)
@@ -148,7 +184,7 @@ class VisibilityGrid:
             linear = torch.unique(torch.cat([linear - stride, linear, linear + stride]))
         self._valid_keys = linear
         self._volume: Tensor | None = None
-        if self.num_classes * self._per_class <= dense_bytes:
+        if self.num_classes * self._per_class <= self._dense_bytes:
             self._volume = torch.zeros(self.num_classes * self._per_class, dtype=torch.bool, device=device)
             self._volume[linear] = True
             self._valid_keys = linear[:0]

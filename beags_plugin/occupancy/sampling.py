@@ -36,13 +36,17 @@ def _mix_tensor(words: Tensor) -> Tensor:
     return words ^ _logical_shift(words, 31)
 
 
+def sample_stream(seed: int, step: int) -> int:
+    """The 64 bits that seed and step give to all counters of one step."""
+    return _mix((_mix(seed & _WORD) + step * _GOLDEN) & _WORD)
+
+
 def sample_words(seed: int, step: int, gaussians: Tensor, samples: Tensor) -> Tensor:
     """64 random bits for every (sample, Gaussian): a hash of seed, step, Gaussian and sample.
 
     gaussians: [N] int64 indices. samples: [Z] int64 sample numbers. Returns [Z, N] int64.
     """
-    stream = _mix((_mix(seed & _WORD) + step * _GOLDEN) & _WORD)
-    per_gaussian = _mix_tensor(gaussians * _signed(_GOLDEN) + _signed(stream))
+    per_gaussian = _mix_tensor(gaussians * _signed(_GOLDEN) + _signed(sample_stream(seed, step)))
     return _mix_tensor(per_gaussian + (samples * _signed(_GOLDEN))[:, None])
 
 

@@ -1,0 +1,296 @@
+// The occupancy loss of one block of Gaussians (method, section 6; E9): values and closed-form gradients in one pass.
+// A lane is a Gaussian, so that sums over samples need no exchange between lanes, and a Gaussian's result does not
+// depend on its neighbours. Included by the files that are compiled for one instruction set.
+#pragma once
+
+#include "counter.h"
+#include "lanes.h"
+#include "op_kernels.h"
+#include "voxel_table.h"
+
+namespace beags {
+namespace ops {
+namespace BEAGS_ISA {
+
+// What a Gaussian needs to be sampled, and to turn the sums into gradients. Positions are in voxels.
+enum OccupancyField {
+  kCenter,                      // of the disc
+  kAxisU = kCenter + 3,         // s R0
+  kAxisV = kAxisU + 3,          // s R1
+  kR0 = kAxisV + 3,             // columns of the rotation
+  kR1 = kR0 + 3,                //
+  kUnit = kR1 + 3,              // unit quaternion
+  kInverseLength = kUnit + 4,   // 1 / |q|
+  kScale = kInverseLength + 1,  // world units
+  kOpacity = kScale + 2,
+  kOccupancyFields
+};
+
+// One batch of as many Gaussians as there are lanes, ready to be sampled.
+template <class T>
+struct OccupancyBatch {
+  T field[kOccupancyFields][Lanes<T>::kCount];
+  uint64_t state[Lanes<T>::kCount];  // hash of stream and Gaussian
+  // Corner of the voxels around the disc, and which of them are valid: two words of 32 bits.
+  typename Lanes<T>::Whole low[3][Lanes<T>::kCount], valid[2][Lanes<T>::kCount];
+  int64_t gaussian[Lanes<T>::kCount];
+  int32_t class_id[Lanes<T>::kCount];
+  int count;
+};
+
+template <class T>
+BEAGS_OPS_INLINE typename Lanes<T>::Real load(const T* from) {
+  typename Lanes<T>::Real vector;
+  __builtin_memcpy(&vector, from, sizeof vector);
+  return vector;
+}
+
+template <class T>
+BEAGS_OPS_INLINE void store(T* to, typename Lanes<T>::Real vector) {
+  __builtin_memcpy(to, &vector, sizeof vector);
+}
+
+// The voxels that a batch's discs reach: `size` of them along each axis from `low` on; `small`: at most 4, near enough
+// to be looked up.
+template <class T>
+struct Boxes {
+  typename Lanes<T>::Int low[3], size[3], small;
+};
+
+// The fields of the Gaussians first .. first + count - 1 and their boxes. Those that count as nothing get an opacity
+// of NaN.
+template <class T>
+BEAGS_OPS_INLINE Boxes<T> set_up(const OccupancyJob<T>& job, int64_t first, int count, OccupancyBatch<T>& batch) {
+  using R = typename Lanes<T>::Real;
+  constexpr int kCount = Lanes<T>::kCount;
+  T raw[10][kCount];
+  for (int lane = 0; lane < kCount; ++lane) {
+    const int64_t i = first + (lane < count ? lane : 0);
+    for (int axis = 0; axis < 3; ++axis) raw[axis][lane] = job.means[3 * i + axis];
+    for (int part = 0; part < 4; ++part) raw[3 + part][lane] = job.quats[4 * i + part];
+    for (int axis = 0; axis < 2; ++axis) raw[7 + axis][lane] = job.log_scales[2 * i + axis];
+    raw[9][lane] = job.opacity_logits[i];
+  }
+  const R zero = {}, one = zero + T(1);
+  R q[4];
+  for (int part = 0; part < 4; ++part) q[part] = load(raw[3 + part]);
+  const R inverse_length = one / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+  for (int part = 0; part < 4; ++part) {
+    q[part] *= inverse_length;
+    store(batch.field[kUnit + part], q[part]);
+  }
+  store(batch.field[kInverseLength], inverse_length);
+  const R w = q[0], x = q[1], y = q[2], z = q[3];
+  const R two = zero + T(2);
+  const R r0[3] = {one - two * (y * y + z * z), two * (x * y + w * z), two * (x * z - w * y)};
+  const R r1[3] = {two * (x * y - w * z), one - two * (x * x + z * z), two * (y * z + w * x)};
+  const R log_u = load(raw[7]), log_v = load(raw[8]), logit = load(raw[9]);
+  const R s_u = exponential(log_u), s_v = exponential(log_v);
+  store(batch.field[kScale], s_u);
+  store(batch.field[kScale + 1], s_v);
+  // NaN if a number is not finite or a scale is 0
+  R broken = nan_unless_finite(logit) + nan_unless_finite(log_u) + nan_unless_finite(log_v) +
+             nan_unless_finite(one / s_u) + nan_unless_finite(one / s_v);
+  const T per_voxel = T(1) / job.voxel_size;
+  Boxes<T> boxes;
+  boxes.small = ~(typename Lanes<T>::Int){};
+  constexpr T kEpsilon = sizeof(T) == 4 ? T(1.1920929e-7) : T(2.220446049250313e-16);
+  for (int axis = 0; axis < 3; ++axis) {
+    const R mean = load(raw[axis]);
+    const R u = s_u * r0[axis] * per_voxel, v = s_v * r1[axis] * per_voxel;
+    const R center = (mean - job.origin[axis]) * per_voxel;
+    store(batch.field[kR0 + axis], r0[axis]);
+    store(batch.field[kR1 + axis], r1[axis]);
+    store(batch.field[kAxisU + axis], u);
+    store(batch.field[kAxisV + axis], v);
+    store(batch.field[kCenter + axis], center);
+    broken += nan_unless_finite(mean) + nan_unless_finite(T(3) * s_u * r0[axis] + T(3) * s_v * r1[axis]);
+    // The samples and this box round differently, by a few units in the last place.
+    const R size = select(center < zero, -center, center);
+    const R half = T(3) * sqrt(u * u + v * v) * (1 + 16 * kEpsilon) + 16 * kEpsilon * size;
+    boxes.low[axis] = floor_to_int(center - half);
+    boxes.size[axis] = floor_to_int(center + half) - boxes.low[axis] + 1;
+    boxes.small &= (boxes.size[axis] <= 4) & (size + half < static_cast<T>(kVoxelHalf));
+  }
+  store(batch.field[kOpacity], one / (one + exponential(-logit)) + broken);
+  return boxes;
+}
+
+// Writes the gradients of a batch from its six sums; returns the sum of its losses.
+template <class T>
+BEAGS_OPS_INLINE double finish(const OccupancyJob<T>& job, const OccupancyBatch<T>& batch,
+                               const typename Lanes<T>::Real* sums) {
+  using R = typename Lanes<T>::Real;
+  constexpr int kCount = Lanes<T>::kCount;
+  const R g = sums[0], gu = sums[1], gv = sums[2], guu = sums[3], gvv = sums[4], guv = sums[5];
+  const R opacity = load(batch.field[kOpacity]);
+  T value[kCount];
+  store(value, opacity * g);
+  double total = 0;
+  for (int lane = 0; lane < batch.count; ++lane) total += value[lane];
+  if (!job.g_means) return total * job.factor;
+
+  const R s_u = load(batch.field[kScale]), s_v = load(batch.field[kScale + 1]);
+  const R o = opacity * static_cast<T>(job.factor);
+  T out[10][kCount];
+  const R along_u = o * gu / s_u, along_v = o * gv / s_v;
+  for (int axis = 0; axis < 3; ++axis) {  // dG/dp = G (u / s_u R0 + v / s_v R1)
+    store(out[axis], along_u * load(batch.field[kR0 + axis]) + along_v * load(batch.field[kR1 + axis]));
+  }
+  // With dG/dR0 = -G u (x - p) / s_u, dG/dR1 = -G v (x - p) / s_v and x - p = u s_u R0 + v s_v R1, the torque
+  // R0 x dG/dR0 + R1 x dG/dR1 is t n, t = G u v (s_u / s_v - s_v / s_u): only a turn within the plane changes G.
+  // A turn by w moves the unit quaternion q by (0, w) q / 2, hence dG/dq = 2 t (0, n) q = 2 t q (0, 0, 0, 1).
+  const R turn = T(2) * o * guv * (s_u / s_v - s_v / s_u) * load(batch.field[kInverseLength]);
+  store(out[3], -turn * load(batch.field[kUnit + 3]));
+  store(out[4], turn * load(batch.field[kUnit + 2]));
+  store(out[5], -turn * load(batch.field[kUnit + 1]));
+  store(out[6], turn * load(batch.field[kUnit]));
+  store(out[7], o * guu);  // dG/ds_u = G u^2 / s_u, so dG/d(log s_u) = G u^2
+  store(out[8], o * gvv);
+  store(out[9], o * (T(1) - opacity) * g);
+  for (int lane = 0; lane < batch.count; ++lane) {
+    const int64_t i = batch.gaussian[lane];
+    for (int axis = 0; axis < 3; ++axis) job.g_means[3 * i + axis] = out[axis][lane];
+    for (int part = 0; part < 4; ++part) job.g_quats[4 * i + part] = out[3 + part][lane];
+    for (int axis = 0; axis < 2; ++axis) job.g_log_scales[2 * i + axis] = out[7 + axis][lane];
+    job.g_opacity_logits[i] = out[9][lane];
+  }
+  return total * job.factor;
+}
+
+// Draws the samples of a batch and sums G Q times 1, u, v, u^2, v^2, u v. kLocal: every disc lies in the 4 x 4 x 4
+// voxels of `valid` (or far from all); otherwise each sample is looked up in the table.
+template <class T, bool kLocal>
+BEAGS_OPS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& batch) {
+  using R = typename Lanes<T>::Real;
+  using I = typename Lanes<T>::Int;
+  constexpr int kCount = Lanes<T>::kCount;
+  for (int lane = batch.count; lane < kCount; ++lane) {  // fill up with copies
+    for (auto& field : batch.field) field[lane] = field[0];
+    for (auto& low : batch.low) low[lane] = low[0];
+    for (auto& valid : batch.valid) valid[lane] = valid[0];
+    batch.state[lane] = batch.state[0];
+    batch.class_id[lane] = batch.class_id[0];
+  }
+  R center[3], axis_u[3], axis_v[3];
+  I low[3], words[2];
+  for (int axis = 0; axis < 3; ++axis) {
+    center[axis] = load(batch.field[kCenter + axis]);
+    axis_u[axis] = load(batch.field[kAxisU + axis]);
+    axis_v[axis] = load(batch.field[kAxisV + axis]);
+  }
+  __builtin_memcpy(low, batch.low, sizeof low);
+  __builtin_memcpy(words, batch.valid, sizeof words);
+  Counter<T> counter(batch.state);
+  R sums[6] = {};
+  for (int64_t s = 0; s < job.samples; ++s) {
+    I radial, angle;
+    counter.next(radial, angle);
+    const R area = to_real(radial) * T(1.0 / (1 << 24));  // (r / 3)^2: grows with the square of the radius
+    const R radius = T(3) * sqrt(area);
+    R u, v;
+    cos_sin(angle, u, v);
+    u *= radius;
+    v *= radius;
+    R at[3];
+    for (int axis = 0; axis < 3; ++axis) at[axis] = fma(v, axis_v[axis], fma(u, axis_u[axis], center[axis]));
+    I valid;
+    if constexpr (kLocal) {
+      const I place =
+          (floor_to_int(at[0]) - low[0]) << 4 | (floor_to_int(at[1]) - low[1]) << 2 | (floor_to_int(at[2]) - low[2]);
+      const I half = -(place >> 5 & 1);
+      valid = -(((words[0] & ~half) | (words[1] & half)) >> (place & 31) & 1);
+    } else {
+      const R limit = R{} + static_cast<T>(kVoxelHalf + 4);
+      I index[3];
+      for (int axis = 0; axis < 3; ++axis) {
+        const R low_held = select(at[axis] > -limit, at[axis], -limit);
+        index[axis] = floor_to_int(select(low_held < limit, low_held, limit)) + static_cast<int32_t>(kVoxelShift);
+      }
+      const I place = (index[0] & 3) << 4 | (index[1] & 3) << 2 | (index[2] & 3);
+      for (int axis = 0; axis < 3; ++axis) index[axis] >>= 2;
+      valid = I{};
+      for (int lane = 0; lane < kCount; ++lane) {
+        const uint64_t bits =
+            brick_bits(*job.valid, batch.class_id[lane], index[0][lane], index[1][lane], index[2][lane]);
+        valid[lane] = -static_cast<int32_t>(bits >> place[lane] & 1);
+      }
+    }
+    const R weight = (R)((I)exponential(T(-4.5) * area) & ~valid);
+    const R wu = weight * u, wv = weight * v;
+    sums[0] += weight;
+    sums[1] += wu;
+    sums[2] += wv;
+    sums[3] = fma(wu, u, sums[3]);
+    sums[4] = fma(wv, v, sums[4]);
+    sums[5] = fma(wu, v, sums[5]);
+  }
+  batch.count = batch.count < kCount ? batch.count : kCount;
+  const double total = finish(job, batch, sums);
+  batch.count = 0;
+  return total;
+}
+
+// Moves one lane to the end of another batch.
+template <class T>
+BEAGS_OPS_INLINE void append(const OccupancyBatch<T>& from, int lane, OccupancyBatch<T>& to) {
+  const int at = to.count++;
+  for (int field = 0; field < kOccupancyFields; ++field) to.field[field][at] = from.field[field][lane];
+}
+
+template <class T>
+double occupancy_block(const OccupancyJob<T>& job, int64_t first, int64_t last, int64_t* active) {
+  constexpr int kCount = Lanes<T>::kCount;
+  const int64_t count = last - first;
+  if (job.g_means) {
+    __builtin_memset(job.g_means + 3 * first, 0, 3 * count * sizeof(T));
+    __builtin_memset(job.g_quats + 4 * first, 0, 4 * count * sizeof(T));
+    __builtin_memset(job.g_log_scales + 2 * first, 0, 2 * count * sizeof(T));
+    __builtin_memset(job.g_opacity_logits + first, 0, count * sizeof(T));
+  }
+  OccupancyBatch<T> fresh, near, wide;  // near: within 4 x 4 x 4 voxels
+  near.count = wide.count = 0;
+  double total = 0;
+  for (int64_t start = first; start < last; start += kCount) {
+    const int here = static_cast<int>(last - start < kCount ? last - start : kCount);
+    const Boxes<T> boxes = set_up(job, start, here, fresh);
+    for (int lane = 0; lane < here; ++lane) {
+      const int64_t i = start + lane;
+      const int32_t class_id = job.class_ids[i];
+      const T opacity = fresh.field[kOpacity][lane];
+      if (opacity != opacity || (!job.background && class_id == 0)) continue;
+      const bool known = class_id >= 0 && class_id < job.valid->num_classes;
+      const bool small = boxes.small[lane] || !known;
+      int64_t corner[3] = {};
+      uint64_t valid = 0;
+      if (known && small) {
+        int n[3];
+        for (int axis = 0; axis < 3; ++axis) {
+          corner[axis] = boxes.low[axis][lane];
+          n[axis] = static_cast<int>(boxes.size[axis][lane]);
+        }
+        valid = voxel_box(*job.valid, class_id, corner, n);
+        const uint64_t box = box_bits(n[0], n[1], n[2]);
+        if ((valid & box) == box) continue;  // wholly inside: the loss is exactly 0
+      }
+      OccupancyBatch<T>& batch = small ? near : wide;
+      const int at = batch.count;
+      append(fresh, lane, batch);
+      batch.state[at] = mix(static_cast<uint64_t>(i) * kGolden + job.stream);
+      for (int axis = 0; axis < 3; ++axis) batch.low[axis][at] = static_cast<typename Lanes<T>::Whole>(corner[axis]);
+      for (int word = 0; word < 2; ++word) batch.valid[word][at] = static_cast<int32_t>(valid >> 32 * word);
+      batch.gaussian[at] = i;
+      batch.class_id[at] = class_id;
+      *active += 1;
+      if (near.count == kCount) total += sample<T, true>(job, near);
+      if (wide.count == kCount) total += sample<T, false>(job, wide);
+    }
+  }
+  if (near.count) total += sample<T, true>(job, near);
+  if (wide.count) total += sample<T, false>(job, wide);
+  return total;
+}
+
+}  // namespace BEAGS_ISA
+}  // namespace ops
+}  // namespace beags

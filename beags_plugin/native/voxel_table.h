@@ -1,0 +1,152 @@
+// Sets of voxels, one for each class, as bricks of 4 x 4 x 4 voxels with a bit for each: one read tells about 64
+// voxels. The bricks lie in an array over their bounding box where that is small, else in a hash table, whose memory is
+// linear in the occupied voxels. Plain data and inlined queries, which kernels of every instruction set share: hence
+// the namespace BEAGS_ISA.
+#pragma once
+
+#include <math.h>
+#include <stdint.h>
+
+namespace beags {
+namespace ops {
+
+constexpr int64_t kVoxelHalf = int64_t(1) << 20;   // occupied voxels lie in -kVoxelHalf .. kVoxelHalf - 1
+constexpr int64_t kVoxelShift = kVoxelHalf + 8;    // added to an index before it is cut into brick and place
+constexpr uint64_t kNoBrick = ~uint64_t(0);        // key of an empty slot; bricks use 60 bits
+constexpr uint64_t kGolden = 0x9E3779B97F4A7C15u;  // 2^64 / golden ratio
+
+struct Brick {
+  uint64_t key, bits;  // bit 16 x + 4 y + z
+};
+
+// The slots of one class: 2^(64 - shift) of them, from `first` on.
+struct BrickRange {
+  uint64_t first, mask;
+  int shift;
+};
+
+struct VoxelTable {
+  int32_t num_classes;
+  // The array [num_classes, size[0], size[1], size[2]] of bits, or null. Its first brick is `base`; along each axis its
+  // first two and last two bricks are empty, so that what lies outside can be moved there.
+  const uint64_t* dense;
+  int32_t base[3], size[3];
+  // The hash table, where there is no array.
+  const Brick* bricks;
+  const BrickRange* classes;
+};
+
+namespace BEAGS_ISA {
+
+// Brick coordinates in 0 .. 2^20 - 1.
+inline uint64_t brick_key(int64_t x, int64_t y, int64_t z) {
+  return static_cast<uint64_t>(x) << 40 | static_cast<uint64_t>(y) << 20 | static_cast<uint64_t>(z);
+}
+
+inline uint64_t hashed_bits(const VoxelTable& table, int32_t class_id, int64_t x, int64_t y, int64_t z) {
+  const BrickRange& range = table.classes[class_id];
+  const uint64_t key = brick_key(x, y, z);
+  for (uint64_t at = key * kGolden >> range.shift;; at = (at + 1) & range.mask) {
+    const Brick& brick = table.bricks[range.first + at];
+    if (brick.key == key) return brick.bits;
+    if (brick.key == kNoBrick) return 0;
+  }
+}
+
+// Place of a brick along one axis of the array; `last`: the largest that is allowed.
+inline int64_t dense_place(const VoxelTable& table, int axis, int64_t brick, int64_t last) {
+  const int64_t at = brick - table.base[axis];
+  return at < 0 ? 0 : at > last ? last : at;
+}
+
+inline uint64_t brick_bits(const VoxelTable& table, int32_t class_id, int64_t x, int64_t y, int64_t z) {
+  if (!table.dense) return hashed_bits(table, class_id, x, y, z);
+  const int64_t i = dense_place(table, 0, x, table.size[0] - 1), j = dense_place(table, 1, y, table.size[1] - 1),
+                k = dense_place(table, 2, z, table.size[2] - 1);
+  return table.dense[((class_id * static_cast<int64_t>(table.size[0]) + i) * table.size[1] + j) * table.size[2] + k];
+}
+
+// The same four bits in every one of 16 rows; the same 16 bits in every one of 4 slices.
+inline uint64_t in_rows(uint64_t bits) { return bits * 0x1111111111111111u; }
+inline uint64_t in_slices(uint64_t bits) { return bits * 0x0001000100010001u; }
+
+// Bits of the box of sizes 1..4 whose corner is voxel 0.
+inline uint64_t box_bits(int nx, int ny, int nz) {
+  const uint64_t row = (1u << nz) - 1, slice = row * 0x1111u & ((uint64_t(1) << 4 * ny) - 1);
+  return nx == 4 ? in_slices(slice) : in_slices(slice) & ((uint64_t(1) << 16 * nx) - 1);
+}
+
+// The voxels of the box of sizes n[] in 1..4 whose corner is voxel low[], |low| <= kVoxelHalf + 2: bit 16 x + 4 y + z
+// is the voxel low + (x, y, z). Other bits may be set.
+inline uint64_t voxel_box(const VoxelTable& table, int32_t class_id, const int64_t* low, const int* n) {
+  if (class_id < 0 || class_id >= table.num_classes) return 0;
+  int64_t brick[3];
+  int place[3];
+  for (int axis = 0; axis < 3; ++axis) {
+    const int64_t index = low[axis] + kVoxelShift;
+    brick[axis] = index >> 2;
+    place[axis] = static_cast<int>(index & 3);
+  }
+  uint64_t b[2][2][2];
+  if (table.dense) {
+    for (int axis = 0; axis < 3; ++axis) brick[axis] = dense_place(table, axis, brick[axis], table.size[axis] - 2);
+    const int64_t step_y = table.size[2], step_x = step_y * table.size[1];
+    const uint64_t* from = table.dense + (class_id * static_cast<int64_t>(table.size[0]) + brick[0]) * step_x +
+                           brick[1] * step_y + brick[2];
+    for (int i = 0; i < 2; ++i) {
+      for (int j = 0; j < 2; ++j) {
+        for (int k = 0; k < 2; ++k) b[i][j][k] = from[i * step_x + j * step_y + k];
+      }
+    }
+  } else {
+    for (int i = 0; i < 2; ++i) {
+      for (int j = 0; j < 2; ++j) {
+        for (int k = 0; k < 2; ++k) {
+          const bool needed = (!i || place[0] + n[0] > 4) && (!j || place[1] + n[1] > 4) && (!k || place[2] + n[2] > 4);
+          b[i][j][k] = needed ? hashed_bits(table, class_id, brick[0] + i, brick[1] + j, brick[2] + k) : 0;
+        }
+      }
+    }
+  }
+  // Move voxel `place` to voxel 0 along each axis: of a brick's rows of 4, the first 4 - place come from the nearer
+  // brick, the others from the farther one.
+  const uint64_t cells = in_rows(0xFu >> place[2]), rows = in_slices(0xFFFFu >> 4 * place[1]);
+  uint64_t slab[2];
+  for (int i = 0; i < 2; ++i) {
+    uint64_t column[2];
+    for (int j = 0; j < 2; ++j) {
+      column[j] = (b[i][j][0] >> place[2] & cells) | (b[i][j][1] << (4 - place[2]) & ~cells);
+    }
+    slab[i] = (column[0] >> 4 * place[1] & rows) | (column[1] << 4 * (4 - place[1]) & ~rows);
+  }
+  return slab[0] >> 16 * place[0] | slab[1] << 1 << (63 - 16 * place[0]);
+}
+
+// Membership of the voxel that is given as whole numbers in floating point, which need not be finite.
+template <class T>
+inline bool voxel_member(const VoxelTable& table, int32_t class_id, const T* voxel) {
+  const T limit = static_cast<T>(kVoxelHalf + 1);
+  if (!(fabs(voxel[0]) <= limit && fabs(voxel[1]) <= limit && fabs(voxel[2]) <= limit)) return false;
+  if (class_id < 0 || class_id >= table.num_classes) return false;
+  int64_t index[3];
+  for (int axis = 0; axis < 3; ++axis) index[axis] = static_cast<int64_t>(voxel[axis]) + kVoxelShift;
+  const uint64_t bits = brick_bits(table, class_id, index[0] >> 2, index[1] >> 2, index[2] >> 2);
+  return bits >> (16 * (index[0] & 3) + 4 * (index[1] & 3) + (index[2] & 3)) & 1;
+}
+
+// The voxels that a box reaches, from floats `low` to `high`. Returns whether they are at most 4 along each axis and
+// near enough to be looked up; else `from` and `n` are not set.
+template <class T>
+inline bool small_box(const T* low, const T* high, int64_t* from, int* n) {
+  const T limit = static_cast<T>(kVoxelHalf + 1);
+  for (int axis = 0; axis < 3; ++axis) {
+    if (!(high[axis] - low[axis] <= 3 && fabs(low[axis]) <= limit)) return false;  // false for NaN
+    from[axis] = static_cast<int64_t>(low[axis]);
+    n[axis] = static_cast<int>(high[axis] - low[axis]) + 1;
+  }
+  return true;
+}
+
+}  // namespace BEAGS_ISA
+}  // namespace ops
+}  // namespace beags

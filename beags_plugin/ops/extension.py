@@ -1,0 +1,45 @@
+"""The compiled module, if there is one, and what all fronts check."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib import import_module
+from types import ModuleType
+
+import torch  # before _native, which shares the OpenMP library that torch loads
+from torch import Tensor
+
+_SUFFIXES = {torch.float32: "f32", torch.float64: "f64"}
+
+
+@cache
+def load() -> ModuleType | None:
+    """``beags_plugin._native``, or None where it was not built or does not load (``beags doctor`` says why)."""
+    try:
+        return import_module("beags_plugin._native")
+    except ImportError:
+        return None
+
+
+def can_take(*tensors: Tensor) -> bool:
+    """Whether the compiled ops are there and take these float tensors: on the CPU, all float32 or all float64."""
+    dtype = tensors[0].dtype
+    fits = dtype in _SUFFIXES and all(value.device.type == "cpu" and value.dtype == dtype for value in tensors)
+    return fits and load() is not None
+
+
+def function(name: str, like: Tensor, owner: object | None = None):
+    """``name`` of the compiled module (or of ``owner``, one of its objects) for the dtype of ``like``."""
+    return getattr(load() if owner is None else owner, f"{name}_{_SUFFIXES[like.dtype]}")
+
+
+def threads() -> int:
+    """How many threads an op may use; none of their results depends on it."""
+    return torch.get_num_threads()
+
+
+def plain(name: str, value: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    """``value``, contiguous and without gradient; raises ``ValueError`` unless it has this shape and dtype."""
+    if tuple(value.shape) != shape or value.dtype != dtype:
+        raise ValueError(f"{name} must be {list(shape)} {dtype}, not {list(value.shape)} {value.dtype}")
+    return value.detach().contiguous()

@@ -1,0 +1,46 @@
+"""Labels of some views, voted by the lifted pixels of all (method, section 2; E5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from beags_plugin.ops import extension
+
+
+def reprojection_votes(
+    depths: Sequence[Tensor],
+    labels: Sequence[Tensor | None],
+    maps: Tensor,
+    first: int,
+    num_classes: int,
+    tau: float,
+    ignore: int,
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Labels and confidence of the views first .. first + T - 1; the winner of each pixel's votes, or what it was.
+
+    depths: V x [H, W], float32 or float64, on the CPU, all of one dtype. labels: V x [H, W] int32, None: no mask;
+        ids that are not 0 .. num_classes - 1 do not vote.
+    maps: [T, V, 12] of the same dtype, from view v to view first + t: A row-major, then b; a pixel (x, y) at depth d
+        projects to d A (x, y, 1) + b = z (x', y', 1).
+    tau: a vote counts where |z - D| <= tau z; infinity: everywhere. ignore: label of views without a mask.
+    Returns T x [H, W] int32 and T x [H, W] float32. Each thread takes H W num_classes counters of 4 bytes.
+    """
+    dtype = depths[0].dtype
+    depths = [extension.plain(f"depths[{v}]", d, (d.shape[0], d.shape[1]), dtype) for v, d in enumerate(depths)]
+    masks = [
+        None if mask is None else extension.plain(f"labels[{v}]", mask, tuple(depths[v].shape), torch.int32)
+        for v, mask in enumerate(labels)
+    ]
+    maps = extension.plain("maps", maps, (len(maps), len(depths), 12), dtype)
+    voted, confidence = [], []
+    for view in range(first, first + len(maps)):
+        mask = masks[view]
+        blank = torch.full(tuple(depths[view].shape), ignore, dtype=torch.int32)
+        voted.append(blank if mask is None else mask.clone())
+        confidence.append(torch.empty(tuple(depths[view].shape), dtype=torch.float32))
+    compute = extension.function("reprojection_votes", maps)
+    compute(depths, masks, first, maps, voted, confidence, num_classes, tau, extension.threads())
+    return voted, confidence

@@ -1,0 +1,54 @@
+"""Membership in the visibility voxel grids, one query a point (method, section 5)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from beags_plugin.ops import extension
+
+
+class VoxelLookup:
+    """The occupied voxels of all classes, and the valid ones (next to an occupied one), as hashed 4 x 4 x 4 bricks.
+
+    Memory is linear in the occupied voxels. Class ids that are no class of the grid have no voxels.
+
+    keys: [M] int64, sorted; classes: [M] int32, below ``num_classes``; origin: [3] float64, world; voxel_size: world
+        units; all as in ``occupancy.grid.VisibilityGrid``.
+    """
+
+    def __init__(self, keys: Tensor, classes: Tensor, num_classes: int, origin: Tensor, voxel_size: float) -> None:
+        keys = extension.plain("keys", keys, (len(keys),), torch.int64)
+        classes = extension.plain("classes", classes, (len(keys),), torch.int32)
+        origin = extension.plain("origin", origin, (3,), torch.float64)
+        module = extension.load()
+        assert module is not None, "the caller asks extension.load() first"
+        self.native: Any = module.VoxelLookup(keys, classes, num_classes, origin, voxel_size)
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the tables."""
+        return self.native.bytes
+
+    def count(self, points: Tensor, class_ids: Tensor) -> Tensor:
+        """D_occ: [P] int64 in 0..27. points: [P, 3] float32 or float64, world; class_ids: [P] int."""
+        return self._ask("count", torch.int64, class_ids, points=points)
+
+    def valid(self, points: Tensor, class_ids: Tensor) -> Tensor:
+        """Whether D_occ > 0: [P] bool. points: [P, 3] float32 or float64, world; class_ids: [P] int."""
+        return self._ask("valid", torch.bool, class_ids, points=points)
+
+    def disc_inside(self, means: Tensor, axes_u: Tensor, axes_v: Tensor, class_ids: Tensor) -> Tensor:
+        """Discs that surely lie in valid voxels: [N] bool; arguments as ``VisibilityGrid.disc_inside``."""
+        return self._ask("disc_inside", torch.bool, class_ids, means=means, axes_u=axes_u, axes_v=axes_v)
+
+    def _ask(self, name: str, dtype: torch.dtype, class_ids: Tensor, **vectors: Tensor) -> Tensor:
+        first = next(iter(vectors.values()))
+        count = len(first)
+        arrays = [extension.plain(key, value, (count, 3), first.dtype) for key, value in vectors.items()]
+        class_ids = extension.plain("class_ids", class_ids.int(), (count,), torch.int32)
+        out = torch.empty(count, dtype=dtype)
+        extension.function(name, first, self.native)(*arrays, class_ids, out, extension.threads())
+        return out
