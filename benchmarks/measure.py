@@ -18,6 +18,7 @@ EMPTY = "1/16x16"  # a step with next to no work: what is left is Python, bindin
 OVERHEAD_SIZE = SIZES[0]
 STEP_SIZE = SIZES[2]
 RASTERIZER_PARTS = ("rasterizer forward", "rasterizer backward")  # of a step: what the rest is compared with
+MEASURED_MEMORY = ("native", "torch", "gsplat", "step")
 # Cost of a pixel in one layer, forward and backward, relative to the native rasterizer's: for the time left only.
 _COST = {"native": 1.0, "torch": 80.0, "gsplat": 150.0}
 LARGEST_SLOW = 20_000_000  # pixels x layers; larger cases are for the native rasterizer alone
@@ -35,7 +36,7 @@ class Options:
     torch: bool = True
     gsplat: bool = True
     step: bool = True
-    memory: bool = True
+    memory: tuple[str, ...] = MEASURED_MEMORY
     torch_large: bool = False
     step_size: Size = STEP_SIZE
     overhead_size: Size = OVERHEAD_SIZE
@@ -185,7 +186,7 @@ def _interleave(
 def _peak(size: Size, entry, session: Session, options: Options, notes: list[str], advance: Advance) -> float | None:
     """Of the best instruction set and the first number of threads: the others take the same."""
     backend, isa, threads = entry
-    if not options.memory or isa not in (None, session.isa) or threads != options.threads[0]:
+    if backend not in options.memory or isa not in (None, session.isa) or threads != options.threads[0]:
         return None
     advance(work(size) * _COST[backend], f"{size.name} {backend} memory")
     return peak_in_new_process(notes, f"{backend} at {size.name}", size=size.name, threads=threads, backend=backend)
@@ -239,7 +240,7 @@ def measure_step(session: Session, options: Options, result: Result, advance: Ad
     }
     if math.isnan(step["sampled_share"]):
         step["sampled_share"] = None
-    if options.memory:
+    if "step" in options.memory:
         for kind, samples in kinds.items():
             advance(work(size) * 3, f"{size.name} step {kind} memory")
             what = {"size": size.name, "threads": threads, "samples": samples}

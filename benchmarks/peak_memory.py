@@ -7,6 +7,7 @@ import gc
 import resource
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -42,7 +43,5 @@ def _most_so_far() -> int:
 
 def _give_back_free_memory() -> None:
     """Without this the call could live on memory that the C library kept from earlier, and seem to take none."""
-    try:
+    with suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
-    except (OSError, AttributeError):
-        pass

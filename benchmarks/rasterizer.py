@@ -18,7 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from beags_plugin.errors import UserError  # noqa: E402
 from benchmarks.goals import as_json, check_goals  # noqa: E402
 from benchmarks.machine import command, commit, describe_machine  # noqa: E402
-from benchmarks.measure import Options, Result, Session, measure_sizes, measure_step, total_work  # noqa: E402
+from benchmarks.measure import MEASURED_MEMORY, Options, Result, Session, measure_sizes, measure_step, total_work  # noqa: E402
 from benchmarks.report import print_result  # noqa: E402
 from benchmarks.scenes import SIZES, parse_size  # noqa: E402
 
@@ -60,13 +60,13 @@ class Arguments:
             small = parse_size(QUICK_SIZE)
             return Options(
                 [small], list(self.threads), 2, 0.02, 2.0, self.torch, self.gsplat,
-                self.step, self.memory, step_size=small, overhead_size=small, many_samples=40,
+                self.step, ("native",), step_size=small, overhead_size=small, many_samples=40,
             )  # fmt: skip
         if self.rounds < 1 or not self.threads or min(self.threads) < 1 or not self.sizes:
             raise UserError("at least one size, one round and one thread are needed.")
         return Options(
             [parse_size(size) for size in self.sizes], list(self.threads), self.rounds, self.seconds, self.budget,
-            self.torch, self.gsplat, self.step, self.memory, self.torch_large,
+            self.torch, self.gsplat, self.step, MEASURED_MEMORY if self.memory else (), self.torch_large,
         )  # fmt: skip
 
 

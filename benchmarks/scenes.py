@@ -22,7 +22,7 @@ MARGIN = 0.03  # the cloud reaches over the image's border by this share of its 
 
 @dataclass(frozen=True)
 class Size:
-    """One case: n surfels on width x height pixels; half of them are narrower on the screen than ``diameter`` pixels."""
+    """One case: n surfels on width x height pixels, their screen boxes ``diameter`` pixels wide at the median."""
 
     n: int
     width: int
