@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import time
 from abc import ABC, abstractmethod
 
 import torch
@@ -11,7 +10,8 @@ from torch import Tensor
 
 from beags_plugin.rasterizers import RASTERIZERS, native
 from beags_plugin.rasterizers.interface import Rasterizer, SurfelInputs
-from benchmarks.scenes import OUTPUTS, Scene
+from benchmarks.clock import Seconds
+from benchmarks.scenes import OUTPUTS, Scene, surfel_inputs
 
 LEAVES = ("means", "quats", "log_scales", "opacity_logits", "colors", "background")
 
@@ -82,15 +82,15 @@ def make_leaves(scene: Scene) -> dict[str, Tensor]:
     return {name: values[name].detach().requires_grad_() for name in LEAVES}
 
 
-def run(backend: Backend, scene: Scene) -> tuple[float, float, dict[str, Tensor], dict[str, Tensor]]:
-    """One forward and backward: seconds of each, images and gradients by name."""
+def run(backend: Backend, scene: Scene) -> tuple[Seconds, Seconds, dict[str, Tensor], dict[str, Tensor]]:
+    """One forward and backward: how long each takes, images and gradients by name."""
     leaves = make_leaves(scene)
-    start = time.perf_counter()
+    start = Seconds.now()
     images = backend.draw(scene, leaves)
-    drawn = time.perf_counter()
+    drawn = Seconds.now()
     loss = _Loss.apply([scene.gradients[name] for name in images], *images.values())
     found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
-    done = time.perf_counter()
+    done = Seconds.now()
     gradients = {name: g for name, g in zip(leaves, found, strict=True) if g is not None}
     return drawn - start, done - drawn, images, gradients
 
@@ -145,9 +145,5 @@ def work_counts(scene: Scene) -> dict[str, int] | None:
     """lanes, contributing, tile_pairs, box_pairs of one view; None where the installed rasterizer does not count."""
     if not hasattr(native, "work_counts"):
         return None
-    surfels = scene.surfels
-    inputs = SurfelInputs(
-        surfels.means, surfels.quats, surfels.log_scales, surfels.opacity_logits, scene.colors, scene.class_ids
-    )
-    counts = native.work_counts(inputs, scene.camera, scene.settings)
+    counts = native.work_counts(surfel_inputs(scene), scene.camera, scene.settings)
     return {name: int(getattr(counts, name)) for name in ("lanes", "contributing", "tile_pairs", "box_pairs")}

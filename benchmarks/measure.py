@@ -45,17 +45,28 @@ class Options:
 
 @dataclass
 class Series:
-    """All timings of one thing, milliseconds."""
+    """All timings of one thing, milliseconds of wall and CPU time.
 
-    values: list[float] = field(default_factory=list)
+    With one thread what counts is CPU time, which other programs disturb little; with more it is wall time.
+    """
+
+    threads: int
+    values: list[tuple[float, float]] = field(default_factory=list)
 
     @property
     def best(self) -> float:
-        return min(self.values)
+        return min(self._counting())
 
     @property
     def median(self) -> float:
-        return statistics.median(self.values)
+        return statistics.median(self._counting())
+
+    @property
+    def wall(self) -> float:
+        return min(wall for wall, _ in self.values)
+
+    def _counting(self) -> list[float]:
+        return [cpu if self.threads == 1 else wall for wall, cpu in self.values]
 
 
 @dataclass
@@ -150,6 +161,7 @@ def measure_sizes(session: Session, options: Options, result: Result, advance: A
                     "backward_ms": backward.best,
                     "forward_median_ms": forward.median,
                     "backward_median_ms": backward.median,
+                    "wall_ms": forward.wall + backward.wall,
                     "calls": len(forward.values),
                     "ratio_to_torch": None
                     if reference is None
@@ -166,7 +178,7 @@ def _interleave(
     session: Session, size: Size, entries: list, options: Options, advance: Advance
 ) -> dict[Any, dict[str, Series]]:
     """Rounds in which every entry has its turn; a slow one drops out when its budget is spent."""
-    timed = {entry: {"forward": Series(), "backward": Series()} for entry in entries}
+    timed = {entry: {stage: Series(entry[2]) for stage in ("forward", "backward")} for entry in entries}
     spent = dict.fromkeys(entries, 0.0)
     for turn in range(options.rounds):
         for entry in entries:
@@ -179,7 +191,7 @@ def _interleave(
             )
             for stage, values in answer.items():
                 timed[entry][stage].values += values
-                spent[entry] += sum(values)
+                spent[entry] += sum(wall for wall, _ in values)
     return timed
 
 
@@ -206,7 +218,7 @@ def _add_stages(session: Session, size: Size, options: Options, scene: dict[str,
     """projection_binning_ms, same_bits: whether 1, 2 and 4 threads give the same bits."""
     threads = options.threads[0]
     frame = session.best.ask("stages", size=size.name, threads=threads, seconds=options.seconds)
-    scene["projection_binning_ms"] = None if frame is None else min(frame)
+    scene["projection_binning_ms"] = None if frame is None else Series(threads, frame).best
     digests = {session.best.ask("digest", size=size.name, threads=count) for count in (1, 2, 4)}
     scene["same_bits"] = len(digests) == 1
 
@@ -219,7 +231,7 @@ def measure_step(session: Session, options: Options, result: Result, advance: Ad
     size, threads = options.step_size, options.threads[0]
     kinds = {"base": None, "refinement": REFINEMENT_SAMPLES, "many samples": options.many_samples}
     rounds = max(options.rounds, 2)
-    whole = {kind: Series() for kind in kinds}
+    whole = {kind: Series(threads) for kind in kinds}
     parts: dict[str, dict[str, Series]] = {kind: {} for kind in kinds}
     for _ in range(rounds):
         for kind, samples in kinds.items():
@@ -227,7 +239,7 @@ def measure_step(session: Session, options: Options, result: Result, advance: Ad
             request = {"size": size.name, "threads": threads, "seconds": options.seconds, "samples": samples}
             whole[kind].values += session.best.ask("step", **request)["step"]
             for part, values in session.best.ask("step", parts=True, **request).items():
-                parts[kind].setdefault(part, Series()).values += values
+                parts[kind].setdefault(part, Series(threads)).values += values
     step = {
         "size": size.name,
         "threads": threads,
@@ -255,8 +267,9 @@ def _overhead(session: Session, options: Options, rounds: int) -> dict[str, Any]
     for _ in range(rounds):
         for name, size in (("empty", EMPTY), ("small", options.overhead_size.name)):
             request = {"size": size, "threads": threads, "seconds": options.seconds}
-            found.setdefault(f"{name}_step", Series()).values += session.best.ask("step", **request)["step"]
+            found.setdefault(f"{name}_step", Series(threads)).values += session.best.ask("step", **request)["step"]
             answer = session.best.ask("time", backend="native", **request)
-            both = [sum(pair) for pair in zip(answer["forward"], answer["backward"], strict=True)]
-            found.setdefault(f"{name}_rasterizer", Series()).values += both
+            for (wall, cpu), (more_wall, more_cpu) in zip(answer["forward"], answer["backward"], strict=True):
+                series = found.setdefault(f"{name}_rasterizer", Series(threads))
+                series.values.append((wall + more_wall, cpu + more_cpu))
     return {"size": options.overhead_size.name, **{f"{name}_ms": series.best for name, series in found.items()}}

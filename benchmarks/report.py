@@ -20,8 +20,9 @@ def print_result(result: Result, goals: list[Goal], about: dict[str, Any], conso
         soft_wrap=True,
     )
     console.print(
-        "Milliseconds: the least of all calls, in interleaved rounds; in brackets the median. float32, all outputs "
-        "(gsplat: colour, alpha and normal, all it has)."
+        "Milliseconds: the least of all calls, in interleaved rounds; in brackets the median. With 1 thread it is CPU "
+        "time, with more wall time. float32, all outputs (gsplat: colour, alpha and normal, all it has).",
+        soft_wrap=True,
     )
     _print_rows(result, console)
     _print_scenes(result, console)
@@ -35,7 +36,18 @@ def print_result(result: Result, goals: list[Goal], about: dict[str, Any], conso
 
 def _print_rows(result: Result, console: Console) -> None:
     table = Table(title="Rasterizers")
-    for name in ("size", "backend", "isa", "threads", "forward", "backward", "calls", "to torch", "peak MB"):
+    for name in (
+        "size",
+        "backend",
+        "isa",
+        "threads",
+        "forward",
+        "backward",
+        "wall, both",
+        "calls",
+        "to torch",
+        "peak MB",
+    ):
         table.add_column(name, justify="left" if name in ("size", "backend", "isa") else "right")
     previous = None
     for row in result.rows:
@@ -49,6 +61,7 @@ def _print_rows(result: Result, console: Console) -> None:
             str(row["threads"]),
             f"{_ms(row['forward_ms'])} ({_ms(row['forward_median_ms'])})",
             f"{_ms(row['backward_ms'])} ({_ms(row['backward_median_ms'])})",
+            _ms(row["wall_ms"]),
             str(row["calls"]),
             "" if row["ratio_to_torch"] is None else f"{row['ratio_to_torch']:.3g}x",
             "" if row["peak_mb"] is None else f"{row['peak_mb']:.0f}",

@@ -131,11 +131,13 @@ def classes_at(across: Tensor) -> Tensor:
     return (across.clamp(0, 0.999) * 2 * CLASSES).int() % CLASSES
 
 
+def surfel_inputs(scene: Scene) -> SurfelInputs:
+    """What is drawn, without gradients."""
+    s = scene.surfels
+    return SurfelInputs(s.means, s.quats, s.log_scales, s.opacity_logits, scene.colors, scene.class_ids)
+
+
 def median_width(scene: Scene) -> float:
     """Pixels: median width of the surfels' screen boxes, where alpha can reach 1/255."""
-    surfels = scene.surfels
-    inputs = SurfelInputs(
-        surfels.means, surfels.quats, surfels.log_scales, surfels.opacity_logits, scene.colors, scene.class_ids
-    )
-    box = project(inputs, scene.camera, scene.settings).box
+    box = project(surfel_inputs(scene), scene.camera, scene.settings).box
     return float((box[:, 2] - box[:, 0]).median())

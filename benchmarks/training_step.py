@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import torch
@@ -18,6 +17,7 @@ from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.drawing import surfel_inputs
 from beags_plugin.rasterizers.interface import RasterOutputs, SurfelInputs
+from benchmarks.clock import Seconds
 from benchmarks.scenes import CLASSES, Scene
 
 VOXELS_PER_SPACING = 1.5  # voxel size over the mean spacing of the surfels
@@ -59,9 +59,9 @@ class TrainingStep:
         ]
         self.step = 0
 
-    def run(self) -> float:
-        """One step; seconds."""
-        start = time.perf_counter()
+    def run(self) -> Seconds:
+        """One step; how long it takes."""
+        start = Seconds.now()
         for optimizer in self.optimizers:
             optimizer.zero_grad()
         surfels = self._surfels()
@@ -72,18 +72,17 @@ class TrainingStep:
         for optimizer in self.optimizers:
             optimizer.step()
         self.step += 1
-        return time.perf_counter() - start
+        return Seconds.now() - start
 
-    def run_parts(self) -> dict[str, float]:
-        """One step with its graph cut between the parts; seconds of each. A loss counts its forward and backward."""
-        seconds: dict[str, float] = {}
-        clock = time.perf_counter()
+    def run_parts(self) -> dict[str, Seconds]:
+        """One step with its graph cut between the parts; how long each takes, a loss there and back."""
+        seconds: dict[str, Seconds] = {}
+        clock = Seconds.now()
 
         def stop(part: str) -> None:
             nonlocal clock
-            now = time.perf_counter()
-            seconds[part] = seconds.get(part, 0.0) + now - clock
-            clock = time.perf_counter()
+            seconds[part] = Seconds.now() - clock
+            clock = Seconds.now()
 
         for optimizer in self.optimizers:
             optimizer.zero_grad()
@@ -93,18 +92,18 @@ class TrainingStep:
         stop("SH colours")
         names = ("means", "quats", "log_scales", "opacity_logits", "colors")
         cut = replace(inputs, **{name: getattr(inputs, name).detach().requires_grad_() for name in names})
-        clock = time.perf_counter()
+        clock = Seconds.now()
         render = self._rasterize(cut)
         stop("rasterizer forward")
         images = {name: getattr(render, name) for name in _OUTPUTS if getattr(render, name) is not None}
         leaves = {name: image.detach().requires_grad_() for name, image in images.items()}
         loss_inputs = self._loss_inputs(surfels, replace(render, **leaves))
         for name, loss in self.losses.items():
-            clock = time.perf_counter()
+            clock = Seconds.now()
             (loss.weight * loss.value(loss_inputs)).backward()
             stop(name)
         towards = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
-        clock = time.perf_counter()
+        clock = Seconds.now()
         torch.autograd.backward([images[name] for name in towards], list(towards.values()))
         stop("rasterizer backward")
         torch.autograd.backward([getattr(inputs, name) for name in names], [getattr(cut, name).grad for name in names])

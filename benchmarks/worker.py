@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
+Timings = list[tuple[float, float]]  # milliseconds of wall and CPU time, one pair a call
 MAX_CALLS = 40  # of one thing in one round
 SMALL = "64/32x32"  # a case that only loads code and starts threads
 
@@ -98,51 +99,49 @@ def _hello(names: list[str]) -> dict[str, Any]:
     }
 
 
-def _time(size: str, backend: str, threads: int, seconds: float) -> dict[str, list[float]]:
-    """Milliseconds of forward and backward, call by call, for about ``seconds`` and at least once."""
+def _time(size: str, backend: str, threads: int, seconds: float) -> dict[str, Timings]:
+    """Forward and backward, call by call, for about ``seconds`` and at least once."""
     from benchmarks import backends
 
     _set_threads(threads)
     made, scene = backends.make_backend(backend), _scene(size)
-    found: dict[str, list[float]] = {"forward": [], "backward": []}
+    found: dict[str, Timings] = {"forward": [], "backward": []}
     for _ in _calls(seconds):
         forward, backward, _, _ = backends.run(made, scene)
-        found["forward"].append(1e3 * forward)
-        found["backward"].append(1e3 * backward)
+        found["forward"].append(forward.ms())
+        found["backward"].append(backward.ms())
     return found
 
 
-def _stages(size: str, threads: int, seconds: float) -> list[float] | None:
-    """Milliseconds of the native forward's first stage alone (projection and binning), where it can be told apart."""
+def _stages(size: str, threads: int, seconds: float) -> Timings | None:
+    """The native forward's first stage alone (projection and binning), where it can be told apart."""
     from beags_plugin.rasterizers import native
-    from beags_plugin.rasterizers.interface import SurfelInputs
-    from benchmarks.backends import LEAVES
+    from benchmarks import backends
+    from benchmarks.clock import Seconds
 
     make_frame = getattr(native, "_frame", None)
     if make_frame is None:
         return None
     _set_threads(threads)
     scene = _scene(size)
-    floats = {name: value for name, value in {**vars(scene.surfels), "colors": scene.colors}.items() if name in LEAVES}
-    inputs = SurfelInputs(**floats, class_ids=scene.class_ids)
-    found = []
+    inputs, found = backends.surfel_inputs(scene), []
     for _ in _calls(seconds):
-        start = time.perf_counter()
+        start = Seconds.now()
         make_frame(inputs, scene.camera, scene.settings)
-        found.append(1e3 * (time.perf_counter() - start))
+        found.append((Seconds.now() - start).ms())
     return found
 
 
 def _step(
     size: str, threads: int, seconds: float, samples: int | None = None, parts: bool = False
-) -> dict[str, list[float]]:
-    """Milliseconds of whole training steps ("step"), or of a step's parts."""
+) -> dict[str, Timings]:
+    """Whole training steps ("step"), or a step's parts."""
     _set_threads(threads)
     step = _training_step(size, samples)
-    found: dict[str, list[float]] = {}
+    found: dict[str, Timings] = {}
     for _ in _calls(seconds):
         for name, value in (step.run_parts() if parts else {"step": step.run()}).items():
-            found.setdefault(name, []).append(1e3 * value)
+            found.setdefault(name, []).append(value.ms())
     return found
 
 
