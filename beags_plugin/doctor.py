@@ -145,7 +145,9 @@ sys.path[:] = json.loads(sys.argv[1])
 from beags_plugin.errors import UserError
 from beags_plugin.rasterizers import RASTERIZERS, make_rasterizer
 name = sys.argv[2]
+reason = None
 try:
+    reason = RASTERIZERS.get(name).unavailable()
     rasterizer = make_rasterizer(name)
     import torch
     from beags_plugin.core.cameras import Camera
@@ -157,9 +159,11 @@ try:
     render.color.sum().backward()
     assert render.alpha.max() > 0.1, "it draws nothing"
     native = sys.modules.get("beags_plugin._native") if name == "native" else None
-    print(json.dumps([True, f"can run here, with {native.instruction_set()} kernels" if native else "can run here"]))
+    kernels = f", with {native.instruction_set()} kernels" if native else ""
+    print(json.dumps([True, "can run here" + kernels, False]))
 except UserError as error:
-    print(json.dumps([False, RASTERIZERS.get(name).unavailable() or str(error)]))
+    # with a reason "auto" draws with another backend; an instruction set that was asked for in vain stops everything
+    print(json.dumps([False, reason or str(error), reason is not None]))
 """
 
 
@@ -175,8 +179,8 @@ def _try_in_process(name: str) -> Check:
     if done.returncode != 0 or not lines:
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
         return Check(name, False, f"it fails when it draws: {last}; --pipeline.model.rasterizer torch avoids it")
-    ok, sentence = json.loads(lines[-1])
-    if not ok and name == "native":
+    ok, sentence, replaced = json.loads(lines[-1])
+    if replaced and name == "native":
         sentence = f"{sentence.rstrip('.')}; until then the torch reference draws, some hundred times slower"
     return Check(name, ok, sentence)
 
