@@ -21,7 +21,7 @@ RASTERIZER_PARTS = ("rasterizer forward", "rasterizer backward")  # of a step: w
 MEASURED_MEMORY = ("native", "torch", "gsplat", "step")
 # Cost of a pixel in one layer, forward and backward, relative to the native rasterizer's: for the time left only.
 _COST = {"native": 1.0, "torch": 80.0, "gsplat": 150.0}
-LARGEST_SLOW = 20_000_000  # pixels x layers; larger cases are for the native rasterizer alone
+LARGEST_SLOW = 100_000  # surfels; larger cases are for the native rasterizer alone
 
 
 @dataclass
@@ -109,8 +109,8 @@ class Session:
     def entries(self, size: Size, options: Options, notes: list[str]) -> Iterator[tuple[str, str | None, int]]:
         """(backend, isa, threads) of everything that is timed at a size."""
         for name in self.backends:
-            if name != "native" and work(size) > LARGEST_SLOW and not (name == "torch" and options.torch_large):
-                notes.append(f"not measured: {name} at {size.name}, it takes minutes and gigabytes there")
+            if name != "native" and size.n > LARGEST_SLOW and not (name == "torch" and options.torch_large):
+                notes.append(f"not measured: {name} at {size.name}, where a call takes minutes and gigabytes")
                 continue
             for threads in options.threads:
                 yield name, self.isa if name == "native" else None, threads
@@ -131,7 +131,7 @@ def work(size: Size) -> float:
 def total_work(options: Options) -> float:
     """What ``advance`` is called with, summed up, roughly; for the time left."""
     kinds = 4 + _COST["torch"] * options.torch + _COST["gsplat"] * options.gsplat
-    cases = sum(work(size) * (kinds if work(size) <= LARGEST_SLOW else 4) for size in options.sizes)
+    cases = sum(work(size) * (kinds if size.n <= LARGEST_SLOW else 4) for size in options.sizes)
     return cases * len(options.threads) * 2 + work(options.step_size) * 100 * options.step
 
 

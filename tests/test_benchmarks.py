@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,7 @@ if str(ROOT) not in sys.path:
 from beags_plugin.errors import UserError
 from beags_plugin.rasterizers import native
 from benchmarks import backends, goals, scenes
-from benchmarks.measure import Result
+from benchmarks.measure import Options, Result, Session
 from benchmarks.training_step import TrainingStep
 
 KEYS = {
@@ -100,6 +101,19 @@ def test_a_wrong_size_is_a_sentence():
             scenes.parse_size(text)
     assert scenes.parse_size("3k/40x30") == scenes.Size(3000, 40, 30)
     assert [scenes.parse_size(size.name) for size in scenes.SIZES] == list(scenes.SIZES)
+
+
+def test_slow_backends_are_left_out_where_they_take_minutes():
+    session = object.__new__(Session)
+    session.backends, session.isa, session.others = ["native", "torch", "gsplat"], "avx2", {"scalar": None}
+    options = Options([], threads=[1], rounds=1, seconds=0.1, budget=1.0)
+    for size, expected in ((scenes.SIZES[2], {"native", "torch", "gsplat"}), (scenes.SIZES[3], {"native"})):
+        notes = []
+        entries = list(session.entries(size, options, notes))
+        assert {backend for backend, _, _ in entries} == expected
+        assert ("native", "scalar", 1) in entries and len(notes) == 3 - len(expected)
+    large = replace(options, torch_large=True)
+    assert ("torch", None, 1) in session.entries(scenes.SIZES[3], large, [])
 
 
 def test_scenes_are_seeded_and_as_wide_as_they_say():
