@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from beags_plugin.errors import UserError  # noqa: E402
 from benchmarks.goals import as_json, check_goals  # noqa: E402
-from benchmarks.machine import command, commit, describe_machine  # noqa: E402
+from benchmarks.machine import busy_note, command, commit, describe_machine  # noqa: E402
 from benchmarks.measure import MEASURED_MEMORY, Options, Result, Session, measure_sizes, measure_step, total_work  # noqa: E402
 from benchmarks.report import print_result  # noqa: E402
 from benchmarks.scenes import SIZES, parse_size  # noqa: E402
@@ -79,7 +79,9 @@ def main(arguments: list[str]) -> None:
     except UserError as error:
         console.print(f"benchmark: {error}")
         sys.exit(2)
-    result = Result()
+    result, machine = Result(), describe_machine()
+    if note := busy_note(int(machine["cores"])):
+        result.notes.append(note)
     columns = (TextColumn("{task.description:<36}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with ExitStack() as stack:
         progress = stack.enter_context(Progress(*columns, console=Console(stderr=True), transient=True))
@@ -94,7 +96,7 @@ def main(arguments: list[str]) -> None:
             measure_step(session, options, result, advance)
     goals = check_goals(result, session.isa)
     about = {
-        "machine": describe_machine(),
+        "machine": machine,
         "commit": commit(),
         "command": command(arguments),
         "torch": session.torch_version,

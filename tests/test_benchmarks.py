@@ -18,7 +18,7 @@ if str(ROOT) not in sys.path:
 
 from beags_plugin.errors import UserError
 from beags_plugin.rasterizers import native
-from benchmarks import backends, goals, scenes
+from benchmarks import backends, goals, machine, scenes
 from benchmarks.measure import Options, Result, Session
 from benchmarks.training_step import TrainingStep
 
@@ -66,6 +66,13 @@ def test_the_file_names_machine_commit_and_command(quick):
     assert result["machine"]["cpu"] and result["machine"]["cores"] >= 1 and result["commit"] and result["torch"]
     assert result["command"].startswith("benchmarks/rasterizer.py --quick")
     assert result["command"] in text.replace("\n", " ") and result["machine"]["cpu"] in text
+
+
+def test_a_busy_machine_is_told(monkeypatch):
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.2, 0.0, 0.0))
+    assert machine.busy_note(2) is None
+    monkeypatch.setattr(os, "getloadavg", lambda: (3.0, 0.0, 0.0))
+    assert "load 3.0 on 2 cores" in str(machine.busy_note(2))
 
 
 def test_every_goal_has_its_line(quick):
