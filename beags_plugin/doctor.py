@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import os
 import platform
 import shutil
+import signal
+import subprocess
 import sys
+import sysconfig
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -125,17 +130,87 @@ def _rasterizer(name: str) -> Check:
 
     title, required = f"rasterizer {name}", name == "torch"
     try:
+        if not required:
+            return replace(_try_in_process(name), name=title, required=False)
         reason = RASTERIZERS.get(name).unavailable()
     except Exception as error:
         return Check(title, False, _first_line(error), required)
     return Check(title, reason is None, reason or "can run here", required)
 
 
+# Draws one surfel, there and back: code for another processor is found only when it runs.
+_TRIAL = """
+import json, sys
+sys.path[:] = json.loads(sys.argv[1])
+from beags_plugin.errors import UserError
+from beags_plugin.rasterizers import RASTERIZERS, make_rasterizer
+name = sys.argv[2]
+reason = None
+try:
+    reason = RASTERIZERS.get(name).unavailable()
+    rasterizer = make_rasterizer(name)
+    import torch
+    from beags_plugin.core.cameras import Camera
+    from beags_plugin.rasterizers.interface import RasterSettings, SurfelInputs
+    K = torch.tensor([[9.0, 0.0, 4.0], [0.0, 9.0, 4.0], [0.0, 0.0, 1.0]])
+    inputs = SurfelInputs(torch.tensor([[0.0, 0.0, 1.0]], requires_grad=True), torch.ones(1, 4),
+                          torch.full((1, 2), -2.0), torch.zeros(1), torch.ones(1, 3))
+    render = rasterizer.rasterize(inputs, Camera(torch.eye(4), K, 8, 8), RasterSettings(0.1, 9.0), torch.zeros(3))
+    render.color.sum().backward()
+    assert render.alpha.max() > 0.1, "it draws nothing"
+    native = sys.modules.get("beags_plugin._native") if name == "native" else None
+    kernels = f", with {native.instruction_set()} kernels" if native else ""
+    print(json.dumps([True, "can run here" + kernels, False]))
+except UserError as error:
+    # with a reason "auto" draws with another backend; an instruction set that was asked for in vain stops everything
+    print(json.dumps([False, reason or str(error), reason is not None]))
+"""
+
+
+def _try_in_process(name: str) -> Check:
+    """Draw with the backend in a process of its own, which may die without taking the doctor along."""
+    done = subprocess.run(
+        [sys.executable, "-c", _TRIAL, json.dumps(sys.path), name], capture_output=True, text=True, timeout=120
+    )
+    if done.returncode < 0:
+        cause = f"it ends with {signal.Signals(-done.returncode).name}, so it is damaged or made for another processor"
+        return Check(name, False, f"{cause}: reinstall beags from source; --pipeline.model.rasterizer torch avoids it")
+    lines = done.stdout.strip().splitlines()
+    if done.returncode != 0 or not lines:
+        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        return Check(name, False, f"it fails when it draws: {last}; --pipeline.model.rasterizer torch avoids it")
+    ok, sentence, replaced = json.loads(lines[-1])
+    if replaced and name == "native":
+        sentence = f"{sentence.rstrip('.')}; until then the torch reference draws, some hundred times slower"
+    return Check(name, ok, sentence)
+
+
 def _compiler() -> Check:
-    for command in ("c++", "g++", "clang++"):
+    advice = "(Debian: apt install g++; macOS: xcode-select --install) and reinstall beags"
+    named = os.environ.get("CXX", "").split()[:1]  # CXX may hold options after the command
+    for command in named or ("c++", "g++", "clang++"):
         if path := shutil.which(command):
-            return Check("C++ compiler", True, path, False)
-    return Check("C++ compiler", False, "none: needed only to build beags (Debian: apt install g++)", False)
+            return _compiles(path, advice)
+    missing = f"CXX names {named[0]}, which is not there" if named else "none"
+    return Check("C++ compiler", False, f"{missing}: to build the fast rasterizer, install one {advice}", False)
+
+
+def _compiles(path: str, advice: str) -> Check:
+    """Whether the compiler does what the build asks of it: C++17, Python's headers, OpenMP."""
+
+    def accepts(source: str, *options: str) -> bool:
+        command = [path, "-std=c++17", "-fsyntax-only", *options, "-x", "c++", "-"]
+        return subprocess.run(command, input=source, capture_output=True, text=True, timeout=60).returncode == 0
+
+    if not accepts("#include <optional>\nstd::optional<int> value;\n"):
+        return Check("C++ compiler", False, f"{path} does not know C++17: install a newer one {advice}", False)
+    headers = sysconfig.get_paths()["include"]
+    if not accepts("#include <Python.h>\n", f"-I{headers}"):
+        sentence = f"{path}, but Python's headers are not in {headers}: install them (Debian: apt install python3-dev)"
+        return Check("C++ compiler", False, sentence, False)
+    if not accepts("#include <omp.h>\n", "-fopenmp"):
+        return Check("C++ compiler", True, f"{path}, without OpenMP: what it builds uses one thread", False)
+    return Check("C++ compiler", True, path, False)
 
 
 def _ffmpeg() -> Check:
@@ -147,10 +222,10 @@ def _ffmpeg() -> Check:
 def print_report(checks: list[Check], console: Console | None = None) -> None:
     """Print the checks as a table: "ok", "missing" (beags cannot run) or "absent" (something optional)."""
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
     from rich.text import Text
 
-    table = Table(show_header=False, box=None, padding=(0, 1))
+    table = Table("", "", Column(overflow="fold"), show_header=False, box=None, padding=(0, 1))
     for check in checks:
         word, style = ("ok", "green") if check.ok else ("missing", "red") if check.required else ("absent", "yellow")
         table.add_row(Text(word, style=style), Text(check.name), Text(check.sentence))

@@ -53,8 +53,70 @@ def test_a_check_that_breaks_in_any_way_is_reported():
 
 def test_no_programs_on_the_path(monkeypatch):
     monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CXX", raising=False)
     for check in (doctor._compiler(), doctor._ffmpeg()):
         assert not check.ok and not check.required and "install" in check.sentence
+
+
+def test_a_backend_that_kills_its_process_is_a_finding(monkeypatch):
+    monkeypatch.setattr(doctor, "_TRIAL", "import os, signal; os.kill(os.getpid(), signal.SIGILL)")
+    found = doctor._rasterizer("native")
+    assert not found.ok and not found.required and found.name == "rasterizer native"
+    assert "SIGILL" in found.sentence and "reinstall beags from source" in found.sentence
+    monkeypatch.setattr(doctor, "_TRIAL", "raise ValueError('odd')")
+    assert "it fails when it draws: ValueError: odd" in doctor._rasterizer("native").sentence
+
+
+def test_an_absent_extension_says_what_to_install_and_what_draws_instead(monkeypatch):
+    hidden = "import sys; sys.modules['beags_plugin._native'] = None\n"  # what makes an import fail
+    monkeypatch.setattr(doctor, "_TRIAL", hidden + doctor._TRIAL)
+    found = doctor._rasterizer("native")
+    assert not found.ok and not found.required and "\n" not in found.sentence
+    assert "install a C++ compiler and reinstall beags; until then the torch reference draws" in found.sentence
+    assert doctor._rasterizer("torch").ok
+
+
+def test_the_native_rasterizer_is_tried_with_its_kernels(checks):
+    found = checks["rasterizer native"]
+    if not found.ok:
+        pytest.skip(found.sentence)
+    from beags_plugin import _native
+
+    assert f"with {_native.instruction_set()} kernels" in found.sentence
+
+
+def _compiler_that(folder, script: str) -> str:
+    path = folder / "cxx"
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("script", "ok", "words"),
+    [
+        ("exit 1", False, "does not know C++17"),
+        ('! grep -q "Python.h"', False, "apt install python3-dev"),
+        ('! grep -q "omp.h"', True, "without OpenMP"),
+        ("cat > /dev/null", True, "cxx"),
+    ],
+)
+def test_the_compiler_is_tried(monkeypatch, tmp_path, script, ok, words):
+    monkeypatch.setenv("CXX", _compiler_that(tmp_path, script) + " -O2")
+    found = doctor._compiler()
+    assert found.ok == ok and not found.required and words in found.sentence
+
+
+def test_a_compiler_that_is_named_but_not_there(monkeypatch):
+    monkeypatch.setenv("CXX", "/nonexistent/c++ -O2")
+    found = doctor._compiler()
+    assert not found.ok and "CXX names /nonexistent/c++" in found.sentence and "install" in found.sentence
+
+
+def test_long_sentences_are_folded_not_cut():
+    out = io.StringIO()
+    doctor.print_report([doctor.Check("a", True, "x" * 200)], Console(file=out, width=60))
+    assert out.getvalue().count("x") == 200
 
 
 def test_the_report_tells_missing_from_absent():

@@ -1,0 +1,1 @@
+"""Measurements of the compiled code: see README.md in this folder."""

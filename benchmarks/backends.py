@@ -1,0 +1,149 @@
+"""What is measured, each as two steps over one scene: forward (to images), backward (to gradients of all inputs)."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor
+
+from beags_plugin.rasterizers import RASTERIZERS, native
+from beags_plugin.rasterizers.interface import Rasterizer, SurfelInputs
+from benchmarks.clock import Seconds
+from benchmarks.scenes import OUTPUTS, Scene, surfel_inputs
+
+LEAVES = ("means", "quats", "log_scales", "opacity_logits", "colors", "background")
+
+
+class Backend(ABC):
+    """Something that draws a scene, differentiably."""
+
+    @abstractmethod
+    def unavailable(self) -> str | None:
+        """None if it can run here, else one sentence: why not."""
+
+    @abstractmethod
+    def draw(self, scene: Scene, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The images by name, made from ``leaves`` (``LEAVES`` by name, with gradients)."""
+
+
+class OwnBackend(Backend):
+    """A registered rasterizer, with all its outputs."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def unavailable(self) -> str | None:
+        return RASTERIZERS.get(self.name).unavailable()
+
+    def rasterizer(self) -> Rasterizer:
+        """One that keeps within a quarter of the memory that is free."""
+        if self.name == "torch":
+            return RASTERIZERS.get("torch")(memory_limit=min(4e9, 0.25 * free_bytes()))
+        return RASTERIZERS.get(self.name)()
+
+    def draw(self, scene: Scene, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
+        floats = {name: leaves[name] for name in LEAVES if name != "background"}
+        render = self.rasterizer().rasterize(
+            SurfelInputs(**floats, class_ids=scene.class_ids),
+            scene.camera,
+            scene.settings,
+            leaves["background"],
+            scene.target,
+        )
+        return {name: getattr(render, name) for name in OUTPUTS}
+
+
+class GsplatBackend(Backend):
+    """gsplat's 2DGS functions in torch: colour, alpha and normal only, for they have no more."""
+
+    def unavailable(self) -> str | None:
+        try:
+            from benchmarks import gsplat_torch  # noqa: F401
+        except ImportError as error:
+            return f"gsplat's torch functions are not installed ({error})"
+        return None
+
+    def draw(self, scene: Scene, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
+        from benchmarks.gsplat_torch import draw
+
+        return draw(leaves, scene.camera, scene.settings.near, scene.settings.far)
+
+
+def make_backend(name: str) -> Backend:
+    """native, torch or gsplat."""
+    return GsplatBackend() if name == "gsplat" else OwnBackend(name)
+
+
+def make_leaves(scene: Scene) -> dict[str, Tensor]:
+    """Fresh leaves of the scene's float inputs, sharing its storage."""
+    values = {**vars(scene.surfels), "colors": scene.colors, "background": scene.background}
+    return {name: values[name].detach().requires_grad_() for name in LEAVES}
+
+
+def run(backend: Backend, scene: Scene) -> tuple[Seconds, Seconds, dict[str, Tensor], dict[str, Tensor]]:
+    """One forward and backward: how long each takes, images and gradients by name."""
+    leaves = make_leaves(scene)
+    start = Seconds.now()
+    images = backend.draw(scene, leaves)
+    drawn = Seconds.now()
+    loss = _Loss.apply([scene.gradients[name] for name in images], *images.values())
+    found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
+    done = Seconds.now()
+    gradients = {name: g for name, g in zip(leaves, found, strict=True) if g is not None}
+    return drawn - start, done - drawn, images, gradients
+
+
+class _Loss(torch.autograd.Function):
+    """A number with the gradients that it is given: handing them to autograd itself has costs that a loss has not."""
+
+    @staticmethod
+    def forward(ctx, gradients: list[Tensor], *images: Tensor) -> Tensor:
+        ctx.gradients = gradients
+        return images[0].new_zeros(())
+
+    @staticmethod
+    def backward(ctx, *_: Tensor):
+        return None, *ctx.gradients
+
+
+def digest(*tensors: Tensor) -> str:
+    """A hash of every bit of the tensors."""
+    total = hashlib.sha256()
+    for tensor in tensors:
+        total.update(tensor.detach().contiguous().numpy().tobytes())
+    return total.hexdigest()
+
+
+def free_bytes() -> float:
+    """Memory that can still be used; infinite where the system does not say."""
+    try:
+        with open("/proc/meminfo") as lines:
+            return next(1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        return float("inf")
+
+
+def instruction_set() -> str:
+    """The kernels that the compiled rasterizer uses in this process."""
+    if hasattr(native, "instruction_set"):
+        return native.instruction_set()
+    from beags_plugin import _native
+
+    return _native.instruction_set()
+
+
+def instruction_sets() -> list[str]:
+    """Those that can be forced through BEAGS_ISA here, best last as far as known."""
+    if hasattr(native, "instruction_sets"):
+        return list(native.instruction_sets())
+    return ["baseline", "avx2"]
+
+
+def work_counts(scene: Scene) -> dict[str, int] | None:
+    """lanes, contributing, tile_pairs, box_pairs of one view; None where the installed rasterizer does not count."""
+    if not hasattr(native, "work_counts"):
+        return None
+    counts = native.work_counts(surfel_inputs(scene), scene.camera, scene.settings)
+    return {name: int(getattr(counts, name)) for name in ("lanes", "contributing", "tile_pairs", "box_pairs")}

@@ -1,0 +1,159 @@
+"""One whole training step, in parts: SH colours, drawing, losses, the way back, Adam. Without nerfstudio."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.losses.base import Loss, LossInputs
+from beags_plugin.losses.boundary import BoundaryLoss
+from beags_plugin.losses.normal import NormalConsistencyLoss
+from beags_plugin.losses.occupancy import OccupancyLoss
+from beags_plugin.losses.photometric import PhotometricLoss
+from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.drawing import surfel_inputs
+from beags_plugin.rasterizers.interface import RasterOutputs, SurfelInputs
+from benchmarks.clock import Seconds
+from benchmarks.scenes import CLASSES, Scene
+
+VOXELS_PER_SPACING = 1.5  # voxel size over the mean spacing of the surfels
+_OUTPUTS = ("color", "alpha", "depth", "normal", "boundary")  # what the losses look at
+
+
+class TrainingStep:
+    """The step of the preset ``beags`` on one scene: L1 + SSIM and normal losses; in refinement two more.
+
+    samples: Z of the occupancy loss, in a refinement step with boundary and occupancy losses; None: a base step.
+    """
+
+    def __init__(self, scene: Scene, samples: int | None = None) -> None:
+        self.scene = scene
+        self.rasterizer = make_rasterizer("auto")
+        self.settings = replace(scene.settings, distortion=False)  # the preset's weight of the distortion is 0
+        self.refining = samples is not None
+        self.losses: dict[str, Loss] = {"photometric loss": PhotometricLoss(), "normal loss": NormalConsistencyLoss()}
+        self.losses["normal loss"] = replace(self.losses["normal loss"], start=0, weight=0.05)
+        if samples is not None:
+            self.losses["boundary loss"] = BoundaryLoss()
+            self.losses["occupancy loss"] = OccupancyLoss(samples=samples)
+        self.grid = visibility_grid(scene) if self.refining else None
+        surfels = scene.surfels
+        self.parameters = {
+            "means": surfels.means,
+            "features_dc": surfels.sh[:, 0],
+            "features_rest": surfels.sh[:, 1:],
+            "opacities": surfels.opacity_logits,
+            "scales": surfels.log_scales,
+            "quats": surfels.quats,
+        }
+        self.parameters = {
+            name: torch.nn.Parameter(value.clone().contiguous()) for name, value in self.parameters.items()
+        }
+        # A rate of 0: all the work of a step, and every step the same.
+        self.optimizers = [
+            torch.optim.Adam([value], lr=0.0, eps=1e-15, fused=True) for value in self.parameters.values()
+        ]
+        self.step = 0
+
+    def run(self) -> Seconds:
+        """One step; how long it takes."""
+        start = Seconds.now()
+        for optimizer in self.optimizers:
+            optimizer.zero_grad()
+        surfels = self._surfels()
+        class_ids = self.scene.class_ids if self.refining else None
+        render = self._rasterize(surfel_inputs(surfels, self.scene.camera, class_ids=class_ids))
+        inputs = self._loss_inputs(surfels, render)
+        torch.stack([loss.weight * loss.value(inputs) for loss in self.losses.values()]).sum().backward()
+        for optimizer in self.optimizers:
+            optimizer.step()
+        self.step += 1
+        return Seconds.now() - start
+
+    def run_parts(self) -> dict[str, Seconds]:
+        """One step with its graph cut between the parts; how long each takes, a loss there and back."""
+        seconds: dict[str, Seconds] = {}
+        clock = Seconds.now()
+
+        def stop(part: str) -> None:
+            nonlocal clock
+            seconds[part] = Seconds.now() - clock
+            clock = Seconds.now()
+
+        for optimizer in self.optimizers:
+            optimizer.zero_grad()
+        surfels = self._surfels()
+        class_ids = self.scene.class_ids if self.refining else None
+        inputs = surfel_inputs(surfels, self.scene.camera, class_ids=class_ids)
+        stop("SH colours")
+        names = ("means", "quats", "log_scales", "opacity_logits", "colors")
+        cut = replace(inputs, **{name: getattr(inputs, name).detach().requires_grad_() for name in names})
+        clock = Seconds.now()
+        render = self._rasterize(cut)
+        stop("rasterizer forward")
+        images = {name: getattr(render, name) for name in _OUTPUTS if getattr(render, name) is not None}
+        leaves = {name: image.detach().requires_grad_() for name, image in images.items()}
+        loss_inputs = self._loss_inputs(surfels, replace(render, **leaves))
+        for name, loss in self.losses.items():
+            clock = Seconds.now()
+            (loss.weight * loss.value(loss_inputs)).backward()
+            stop(name)
+        towards = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+        clock = Seconds.now()
+        torch.autograd.backward([images[name] for name in towards], list(towards.values()))
+        stop("rasterizer backward")
+        torch.autograd.backward([getattr(inputs, name) for name in names], [getattr(cut, name).grad for name in names])
+        stop("rest of the backward")
+        for optimizer in self.optimizers:
+            optimizer.step()
+        stop("Adam")
+        self.step += 1
+        return seconds
+
+    def sampled_share(self) -> float:
+        """The share of the surfels that do not lie wholly in valid voxels, so that the occupancy loss samples them."""
+        from beags_plugin.losses import occupancy
+
+        if self.grid is None or not hasattr(occupancy, "_outside"):
+            return float("nan")
+        s = self.scene.surfels
+        chosen = occupancy._outside(s.means, s.quats, s.log_scales, s.opacity_logits, self.scene.class_ids, self.grid)
+        return len(chosen) / len(s)
+
+    def _surfels(self) -> Surfels:
+        p = self.parameters
+        sh = torch.cat([p["features_dc"][:, None], p["features_rest"]], dim=1)
+        return Surfels(p["means"], p["quats"], p["scales"], p["opacities"], sh)
+
+    def _rasterize(self, inputs: SurfelInputs) -> RasterOutputs:
+        target = self.scene.target if self.refining else None
+        return self.rasterizer.rasterize(inputs, self.scene.camera, self.settings, self.scene.background, target)
+
+    def _loss_inputs(self, surfels: Surfels, render: RasterOutputs) -> LossInputs:
+        return LossInputs(
+            step=self.step,
+            seed=0,
+            surfels=surfels,
+            camera=self.scene.camera,
+            render=render,
+            image=self.scene.image,
+            labels=self.scene.target,
+            class_ids=self.scene.class_ids,
+            grid=self.grid,
+        )
+
+
+def visibility_grid(scene: Scene) -> VisibilityGrid:
+    """Voxels around the surfels' own centres: most surfels lie in valid ones, as in a scene that is well trained."""
+    means = scene.surfels.means
+    extent = means.amax(dim=0) - means.amin(dim=0) + 1e-3
+    spacing = float((extent.prod() / len(means)) ** (1 / 3))
+    return VisibilityGrid.from_points([(means, scene.class_ids)], VOXELS_PER_SPACING * spacing, _corner(means), CLASSES)
+
+
+def _corner(means: Tensor) -> Tensor:
+    return means.amin(dim=0).double()

@@ -1,0 +1,228 @@
+"""A process that measures what it is asked: one JSON request a line in, one JSON answer a line out.
+
+The instruction set is chosen once a process (environment variable BEAGS_ISA), so each one needs a process of its own;
+peak memory needs a fresh process for each case.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+Timings = list[tuple[float, float]]  # milliseconds of wall and CPU time, one pair a call
+MAX_CALLS = 40  # of one thing in one round
+SMALL = "64/32x32"  # a case that only loads code and starts threads
+
+
+class Worker:
+    """The asking side. ``isa``: forced instruction set, or None for the best one."""
+
+    def __init__(self, isa: str | None = None) -> None:
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+        environment.pop("BEAGS_ISA", None)
+        # Idle threads that spin would take the cores from the process whose turn it is.
+        environment.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+        if isa is not None:
+            environment["BEAGS_ISA"] = isa
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "benchmarks.worker"],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment, cwd=ROOT,
+        )  # fmt: skip
+
+    def ask(self, do: str, **arguments: Any) -> Any:
+        """The answer; raises ``RuntimeError`` with the worker's own message, or if it died."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        try:
+            print(json.dumps({"do": do, **arguments}), file=self._process.stdin, flush=True)
+            line = self._process.stdout.readline()
+        except BrokenPipeError:
+            line = ""
+        if not line:
+            raise RuntimeError(f"the measuring process ended with code {self._process.wait()}")
+        answer = json.loads(line)
+        if "error" in answer:
+            raise RuntimeError(answer["error"])
+        return answer["value"]
+
+    def close(self) -> None:
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._process.stdin.close()
+        self._process.stdout.close()
+        self._process.wait()
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def main() -> None:
+    """Answer until the input ends."""
+    # What a library prints must not get between the answers.
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    for line in sys.stdin:
+        request = json.loads(line)
+        try:
+            answer = {"value": _ANSWERS[request.pop("do")](**request)}
+        except Exception as error:
+            answer = {"error": f"{type(error).__name__}: {error}"}
+        print(json.dumps(answer), file=answers, flush=True)
+
+
+def _hello(names: list[str]) -> dict[str, Any]:
+    """What this process can measure: instruction set(s), and per backend None or why it cannot run."""
+    import torch
+
+    from benchmarks import backends
+
+    reasons = {name: backends.make_backend(name).unavailable() for name in names}
+    known = reasons.get("native", "") is None
+    for name, reason in reasons.items():
+        if reason is None:
+            backends.run(backends.make_backend(name), _scene(SMALL))  # what a process pays once
+    return {
+        "torch": torch.__version__,
+        "reasons": reasons,
+        "isa": backends.instruction_set() if known else None,
+        "isas": backends.instruction_sets() if known else [],
+    }
+
+
+def _time(size: str, backend: str, threads: int, seconds: float) -> dict[str, Timings]:
+    """Forward and backward, call by call, for about ``seconds`` and at least once."""
+    from benchmarks import backends
+
+    _set_threads(threads)
+    made, scene = backends.make_backend(backend), _scene(size)
+    found: dict[str, Timings] = {"forward": [], "backward": []}
+    for _ in _calls(seconds):
+        forward, backward, _, _ = backends.run(made, scene)
+        found["forward"].append(forward.ms())
+        found["backward"].append(backward.ms())
+    return found
+
+
+def _stages(size: str, threads: int, seconds: float) -> Timings | None:
+    """The native forward's first stage alone (projection and binning), where it can be told apart."""
+    from beags_plugin.rasterizers import native
+    from benchmarks import backends
+    from benchmarks.clock import Seconds
+
+    make_frame = getattr(native, "_frame", None)
+    if make_frame is None:
+        return None
+    _set_threads(threads)
+    scene = _scene(size)
+    inputs, found = backends.surfel_inputs(scene), []
+    for _ in _calls(seconds):
+        start = Seconds.now()
+        make_frame(inputs, scene.camera, scene.settings)
+        found.append((Seconds.now() - start).ms())
+    return found
+
+
+def _step(
+    size: str, threads: int, seconds: float, samples: int | None = None, parts: bool = False
+) -> dict[str, Timings]:
+    """Whole training steps ("step"), or a step's parts."""
+    _set_threads(threads)
+    step = _training_step(size, samples)
+    found: dict[str, Timings] = {}
+    for _ in _calls(seconds):
+        for name, value in (step.run_parts() if parts else {"step": step.run()}).items():
+            found.setdefault(name, []).append(value.ms())
+    return found
+
+
+def _digest(size: str, threads: int) -> str:
+    """A hash of all images and gradients of the native rasterizer."""
+    from benchmarks import backends
+
+    _set_threads(threads)
+    _, _, images, gradients = backends.run(backends.make_backend("native"), _scene(size))
+    return backends.digest(*images.values(), *gradients.values())
+
+
+def _describe(size: str) -> dict[str, Any]:
+    """The scene: median width of its surfels in pixels; the native rasterizer's work, or None."""
+    from benchmarks import backends, scenes
+
+    scene = _scene(size)
+    return {"median_width": scenes.median_width(scene), "work": backends.work_counts(scene)}
+
+
+def _sampled(size: str) -> float:
+    return _training_step(size, 20).sampled_share()
+
+
+def _peak(size: str, threads: int, backend: str | None = None, samples: int | None = None) -> float:
+    """MB that one forward and backward (or, without a backend, one training step) takes beyond scene and libraries."""
+    from benchmarks import backends
+    from benchmarks.peak_memory import peak_mb_of
+    from benchmarks.training_step import TrainingStep
+
+    _set_threads(threads)
+    if backend is None:
+        TrainingStep(_scene(SMALL), samples).run()
+        step = _training_step(size, samples)
+        step.run()  # Adam's moments are the scene's, not the step's
+        return peak_mb_of(step.run)
+    made, scene = backends.make_backend(backend), _scene(size)
+    backends.run(made, _scene(SMALL))
+    return peak_mb_of(lambda: backends.run(made, scene))
+
+
+def _calls(seconds: float):
+    """Counts calls until the time is over, at least one."""
+    end = time.perf_counter() + seconds
+    gc.collect()
+    for call in range(MAX_CALLS):
+        yield call
+        if time.perf_counter() >= end:
+            return
+
+
+def _set_threads(threads: int) -> None:
+    import torch
+
+    torch.set_num_threads(threads)
+
+
+@lru_cache(maxsize=8)
+def _scene(size: str):
+    from benchmarks.scenes import make_scene, parse_size
+
+    return make_scene(parse_size(size))
+
+
+@lru_cache(maxsize=8)
+def _training_step(size: str, samples: int | None):
+    from benchmarks.training_step import TrainingStep
+
+    return TrainingStep(_scene(size), samples)
+
+
+_ANSWERS: dict[str, Callable[..., Any]] = {
+    "hello": _hello,
+    "time": _time,
+    "stages": _stages,
+    "step": _step,
+    "digest": _digest,
+    "describe": _describe,
+    "sampled": _sampled,
+    "peak": _peak,
+}
+
+if __name__ == "__main__":
+    main()
