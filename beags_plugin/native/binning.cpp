@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cstring>
 
+#include "extent.h"
+
 namespace beags {
 namespace {
 
@@ -58,12 +60,6 @@ struct Reach {
   uint16_t mask;
 };
 
-// The bits of one row of groups for the pixels of `columns`, in the tile that starts at group column `first`.
-unsigned row_bits(Extent::Columns columns, int first) {
-  const int low = std::max(columns.first / kGroup - first, 0), high = std::min(columns.last / kGroup - first, 3);
-  return columns.first > columns.last || low > high ? 0u : ((2u << (high - low)) - 1u) << low;
-}
-
 // Adds the tiles that the surfel reaches; returns whether it is on the screen.
 template <class T>
 bool reach(const View& view, const Splat<T>& splat, int32_t index, std::vector<Reach>& out) {
@@ -71,25 +67,20 @@ bool reach(const View& view, const Splat<T>& splat, int32_t index, std::vector<R
   const int tiles_x = tiles_along(view.width);
   if (extent.first_row() > extent.last_row()) return extent.on_screen();
   for (int tile_y = extent.first_row() / kTile; tile_y <= extent.last_row() / kTile; ++tile_y) {
-    Extent::Columns columns[kGroup][2];
-    int first = view.width, last = -1;
+    const Bands bands = extent.bands(tile_y);
+    int first = tiles_x * kGroup, last = -1;
     for (int row = 0; row < kGroup; ++row) {
-      const int y = tile_y * kTile + row * kGroup;
-      for (int which = 0; which < 2; ++which) {
-        const bool outside = y + kGroup - 1 < extent.first_row() || y > extent.last_row();
-        const Extent::Columns here = outside ? Extent::Columns{0, -1} : extent.columns(y, which);
-        columns[row][which] = here;
-        if (here.first > here.last) continue;
-        first = std::min(first, here.first);
-        last = std::max(last, here.last);
-      }
+      if (bands.first[row] > bands.last[row]) continue;
+      first = std::min(first, bands.first[row]);
+      last = std::max(last, bands.last[row]);
     }
-    if (first > last) continue;
-    for (int tile_x = first / kTile; tile_x <= last / kTile; ++tile_x) {
+    for (int tile_x = first / kGroup; tile_x * kGroup <= last; ++tile_x) {
       unsigned mask = 0;
       for (int row = 0; row < kGroup; ++row) {
-        const int group = tile_x * kGroup;
-        mask |= (row_bits(columns[row][0], group) | row_bits(columns[row][1], group)) << (kGroup * row);
+        const int from = std::max(bands.first[row] - tile_x * kGroup, 0);
+        const int to = std::min(bands.last[row] - tile_x * kGroup, kGroup - 1);
+        const unsigned bits = from > to ? 0 : (2u << to) - (1u << from);
+        mask |= bits << (kGroup * row);
       }
       if (mask) out.push_back({tile_y * tiles_x + tile_x, index, static_cast<uint16_t>(mask)});
     }
@@ -123,7 +114,7 @@ Bins bin(const View& view, const Splat<T>* splats, std::vector<int32_t> drawn, b
     for (const Reach& at : chunk) ++bins.tile_start[at.tile + 1];
   }
   for (size_t tile = 1; tile < bins.tile_start.size(); ++tile) bins.tile_start[tile] += bins.tile_start[tile - 1];
-  bins.pairs.resize(bins.tile_start.back());
+  bins.pairs.resize(bins.tile_start.back() + kPrefetched);
   std::vector<int64_t> next(bins.tile_start.begin(), bins.tile_start.end() - 1);
   int32_t record = 0;
   for (const auto& chunk : reached) {

@@ -12,7 +12,7 @@ struct Bins {
   std::vector<int32_t> order;         // the drawn surfels by rising depth, equal ones by index
   std::vector<int64_t> record_start;  // [order + 1]: the records of order[rank], in the order of their tiles
   std::vector<int64_t> tile_start;    // [tiles + 1] into pairs
-  std::vector<Pair> pairs;            // by tile, then by rank
+  std::vector<Pair> pairs;            // by tile, then by rank; and kPrefetched unused ones
 };
 
 // drawn: indices of the surfels that were not culled, rising. visible: [N], set to true for those on the screen.
