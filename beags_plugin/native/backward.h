@@ -13,8 +13,8 @@ struct alignas(64) PixelGradients {
   T end[kLanes<T>];
   T g_color[3][kLanes<T>], g_alpha[kLanes<T>];
   T g_normal[3][kLanes<T>], g_depth[kLanes<T>], g_median_depth[kLanes<T>],
-      median_pair[kLanes<T>];  // g_depth: of sum w d
-  T g_distortion[kLanes<T>], alpha[kLanes<T>], first[kLanes<T>], moment1[kLanes<T>], moment2[kLanes<T>];
+      median_pair[kLanes<T>];                                     // g_depth: of sum w d
+  T first[kLanes<T>], g_alpha_m[kLanes<T>], g_moment[kLanes<T>];  // distortion: its gradient times A and sum w m
   T g_boundary[kLanes<T>], target[kLanes<T>];
 };
 
@@ -26,13 +26,8 @@ BEAGS_INLINE void load_saved(const Job<T>& job, int tile, PixelGradients<T>* pix
     const int64_t at = saved_at<T>(tile, pack);
     store(p.transmittance, load(from.end_transmittance + at));
     store(p.end, load(from.end + at));
-    store(p.alpha, all(T(1)) - load(p.transmittance));
     if ((kWanted & kGeometry) && from.median_pair) store(p.median_pair, load(from.median_pair + at));
-    if ((kWanted & kDistortion) && from.first) {
-      store(p.first, load(from.first + at));
-      store(p.moment1, load(from.moment1 + at));
-      store(p.moment2, load(from.moment2 + at));
-    }
+    if ((kWanted & kDistortion) && from.first) store(p.first, load(from.first + at));
   }
 }
 
@@ -51,16 +46,21 @@ BEAGS_INLINE void load_gradients(const Job<T>& job, int tile, PixelGradients<T>*
       }
     }
     if (g.alpha) p.g_alpha[lane] = g.alpha[at];
+    const T alpha = T(1) - p.transmittance[lane];
+    const int64_t saved = saved_at<T>(tile, pack) + lane;
     if (kWanted & kGeometry) {
-      const T alpha = p.alpha[lane];
       if (g.depth && alpha > T(0)) {
         p.g_depth[lane] = g.depth[at] / alpha;
-        p.g_alpha[lane] -= p.g_depth[lane] * job.saved.depth_sum[saved_at<T>(tile, pack) + lane] / alpha;
+        p.g_alpha[lane] -= p.g_depth[lane] * job.saved.depth_sum[saved] / alpha;
       }
       if (g.median_depth) p.g_median_depth[lane] = g.median_depth[at];
       for (int c = 0; c < 3 && g.normal; ++c) p.g_normal[c][lane] = g.normal[3 * at + c];
     }
-    if ((kWanted & kDistortion) && g.distortion) p.g_distortion[lane] = g.distortion[at];
+    if ((kWanted & kDistortion) && g.distortion) {
+      p.g_alpha_m[lane] = g.distortion[at] * alpha;
+      p.g_moment[lane] = g.distortion[at] * job.saved.moment1[saved];
+      p.g_alpha[lane] += g.distortion[at] * job.saved.moment2[saved];
+    }
     if ((kWanted & kBoundary) && g.boundary) {
       p.target[lane] = static_cast<T>(job.target[at]);
       p.g_boundary[lane] = job.target[at] == kIgnore ? T(0) : g.boundary[at];
@@ -90,11 +90,12 @@ BEAGS_INLINE Real<T> weight_gradient(const Job<T>& job, int k, const Splat<T>& s
     g_hit = fma(w, load(p.g_depth), keep(median, load(p.g_median_depth)));
   }
   if (kWanted & kDistortion) {
-    // sum over pairs w_i w_j (m_i - m_j)^2, by w_i and by m_i; dm/dd = k / d^2.
-    const Real<T> inverse = hits.get(hits.inverse_depth, i), g = load(p.g_distortion), moment1 = load(p.moment1);
-    const Real<T> m = all(job.mapping) * (load(p.first) - inverse), slope = fma(m, load(p.alpha), all(T(0)) - moment1);
-    g_w = fma(g, fma(m, slope - moment1, load(p.moment2)), g_w);
-    g_hit = fma(w * g * slope, all(T(2) * job.mapping) * (inverse * inverse), g_hit);
+    // sum over pairs w_i w_j (m_i - m_j)^2: by w_i it is m (m A - 2 sum w m) + sum w m^2, of which g_alpha has the last
+    // term, and by m_i 2 w_i (m A - sum w m); dm/dd = k / d^2.
+    const Real<T> nearness = hits.get(hits.nearness, i), m = load(p.first) - nearness, g_moment = load(p.g_moment);
+    const Real<T> slope = m * load(p.g_alpha_m) - g_moment;
+    g_w = fma(m, slope - g_moment, g_w);
+    g_hit = fma(w * slope, all(T(2) / job.mapping) * (nearness * nearness), g_hit);
   }
   if (kWanted & kBoundary) g_w = g_w + drop(load(p.target) == all(static_cast<T>(s.class_id)), load(p.g_boundary));
   return g_w;
@@ -209,8 +210,8 @@ template <Parts kWanted, class T>
 void backward(const Job<T>& job, int tile) {
   PixelGradients<T> pixels[kTilePacks<T>] = {};
   load_gradients<kWanted>(job, tile, pixels);
-  constexpr unsigned kNeeds = kNeedShape | (kWanted & (kGeometry | kDistortion) ? kNeedDepth : 0) |
-                              (kWanted & kDistortion ? kNeedInverseDepth : 0);
+  constexpr unsigned kNeeds =
+      kNeedShape | (kWanted & (kGeometry | kDistortion) ? kNeedDepth : 0) | (kWanted & kDistortion ? kNeedNearness : 0);
   walk_back<record_size(kWanted), kNeeds>(
       job, tile, pixels,
       [&](auto plain, int k, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> dx, Real<T> dy,

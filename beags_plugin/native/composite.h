@@ -40,7 +40,8 @@ BEAGS_INLINE int64_t saved_at(int tile, int pack) {
 // The pixels' centres (the pixel plus 0.5), by pack.
 template <class T>
 struct Centres {
-  T x[kTilePixels], y[kTilePixels];
+  alignas(64) T x[kTilePixels];
+  T y[kTilePixels];
 
   Centres(const Job<T>& job, int tile) {
     const int x0 = tile % job.tiles_x * kTile, y0 = tile / job.tiles_x * kTile;
@@ -63,16 +64,16 @@ struct Centres {
 };
 
 // What later steps need of a hit beside alpha.
-constexpr unsigned kNeedDepth = 1, kNeedInverseDepth = 2, kNeedShape = 4;
+constexpr unsigned kNeedDepth = 1, kNeedNearness = 2, kNeedShape = 4;
 
 // One surfel at the packs of a tile where it contributes. In lanes where it does not, all is 0.
 template <class T>
 struct Hits {
   int count;
   int pack[kTilePacks<T>];
-  T alpha[kTilePixels];
-  T depth[kTilePixels], inverse_depth[kTilePixels];  // of the hit
-  T inverse[kTilePixels];                            // 1 / q2, and 0 where the low-pass wins over rho3d
+  alignas(64) T alpha[kTilePixels];
+  T depth[kTilePixels], nearness[kTilePixels];  // d and k / d of the hit
+  T inverse[kTilePixels];                       // 1 / q2, and 0 where the low-pass wins over rho3d
   T rho[kTilePixels];
 
   BEAGS_INLINE Real<T> get(const T* field, int i) const { return load(field + i * kLanes<T>); }
@@ -88,14 +89,14 @@ BEAGS_INLINE void evaluate(const Job<T>& job, const Splat<T>& s, int pack, Real<
   const Real<T> q2 = fma(all(s.w_y), dy, fma(all(s.w_x), dx, all(s.w_0)));
   Real<T> inverse = all(T(1)) / q2;
   const Real<T> u = q0 * inverse, v = q1 * inverse;
-  Real<T> rho = fma(u, u, v * v), depth = all(s.det) * inverse, inverse_depth = all(s.inverse_det) * q2;
+  Real<T> rho = fma(u, u, v * v), depth = all(s.det) * inverse, nearness = all(s.nearness_det) * q2;
   if (!kPlain) {
     const Real<T> half = fma(dy, dy, dx * dx), rho2d = half + half;
     const Mask<T> plane = rho <= rho2d;  // false for NaN: an edge-on surfel at its centre
     rho = min(rho, rho2d);
     inverse = keep(plane, inverse);
     depth = select(plane, depth, all(s.z));
-    inverse_depth = select(plane, inverse_depth, all(s.inverse_z));
+    nearness = select(plane, nearness, all(s.nearness_z));
   }
   const Real<T> exponent = fma(all(T(-0.5 / kLn2)), rho, all(s.log2_opacity));
   Mask<T> on = wanted & (all(T(kLog2MinAlpha)) <= exponent);
@@ -105,7 +106,7 @@ BEAGS_INLINE void evaluate(const Job<T>& job, const Splat<T>& s, int pack, Real<
   const int at = hits.count * kLanes<T>;
   store(hits.alpha + at, keep(on, alpha));
   if (kNeeds & kNeedDepth) store(hits.depth + at, keep(on, depth));
-  if (kNeeds & kNeedInverseDepth) store(hits.inverse_depth + at, keep(on, inverse_depth));
+  if (kNeeds & kNeedNearness) store(hits.nearness + at, keep(on, nearness));
   if (kNeeds & kNeedShape) {
     store(hits.inverse + at, keep(on, inverse));
     store(hits.rho + at, keep(on, rho));
@@ -131,7 +132,7 @@ BEAGS_INLINE void prefetch(const Job<T>& job, const Pair& pair) {
 template <class T>
 struct Walk {
   Centres<T> centre;
-  T transmittance[kTilePixels];
+  alignas(64) T transmittance[kTilePixels];
   T end[kTilePixels];  // pairs before the one at which the pixel stopped
   Mask<T> live[kTilePacks<T>];
   unsigned active = 0;    // groups with a live pixel

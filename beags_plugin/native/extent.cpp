@@ -81,34 +81,37 @@ Bands Extent::bands(int tile_row) const {
     }
     return out;
   }
-  const auto clamp = [](float value, float low, float high) {
-    value = value < low ? low : value;
-    return value > high ? high : value;
+  // Four rows of groups at a time.
+  typedef float Four __attribute__((vector_size(16)));
+  const auto min = [](Four a, Four b) { return a < b ? a : b; };
+  const auto max = [](Four a, Four b) { return a > b ? a : b; };
+  const auto root = [](Four a) {  // 0 for negative numbers
+    for (int i = 0; i < kGroup; ++i) a[i] = std::sqrt(a[i] > 0 ? a[i] : 0);
+    return a;
   };
-  const float limit = static_cast<float>(width_), inverse_height = 1 / half_height_;
-  // Straight code on four rows at a time, for the compiler to vectorise.
+  const Four zero = {}, limit = zero + static_cast<float>(width_);
+  const Four y0 = Four{0, 1, 2, 3} * float(kGroup) + (static_cast<float>(tile_row * kTile) + 0.5f - cy_);
+  const Four y1 = y0 + float(kGroup - 1);
+  const Four low = y0 - (y_ + margin_), high = y1 - (y_ - margin_);  // the rows' centres, from the ellipse's
+  // Where the ellipse reaches furthest to either side: at its extreme point, or as near to it as the rows come.
+  const auto nearest = [&](float y) {
+    return min(max(min(max(zero + y, low), high), zero - half_height_), zero + half_height_);
+  };
+  const auto half_width = [&](Four y) {
+    const Four t = y / half_height_;
+    return width_at_centre_ * root(1 + 4e-7f - t * t);  // rounded up: the root is steep at 0
+  };
+  const Four y_left = nearest(-y_right_), y_right = nearest(y_right_);
+  const auto meets = (low <= half_height_) & (high >= -half_height_);
+  const Four left = meets ? x_ + slope_ * y_left - half_width(y_left) : limit;
+  const Four right = meets ? x_ + slope_ * y_right + half_width(y_right) : -limit;
+  const Four y = min(max(zero, y0), y1), square = disc_ * disc_ - y * y;
+  const Four half = square > 0 ? root(square) : -limit;
+  // Centres of pixels lie at 0.5; truncation rounds down, as these are not negative.
+  const Four first = min(max(min(left, -half) + (cx_ + 0.5f - margin_), zero), limit);
+  const Four last = min(max(max(right, half) + (cx_ + 0.5f + margin_), zero), limit);
   for (int i = 0; i < kGroup; ++i) {
-    const float y0 = static_cast<float>(tile_row * kTile + i * kGroup) + 0.5f - cy_, y1 = y0 + (kGroup - 1);
-    const float low = y0 - y_ - margin_, high = y1 - y_ + margin_;  // the rows' centres, from the ellipse's
-    // Where the ellipse reaches furthest to either side: at its extreme point, or as near to it as the rows come.
-    const float y_right = clamp(clamp(y_right_, low, high), -half_height_, half_height_);
-    const float y_left = clamp(clamp(-y_right_, low, high), -half_height_, half_height_);
-    const float t_right = y_right * inverse_height, t_left = y_left * inverse_height;
-    constexpr float kOne = 1 + 4e-7f;  // rounded up: the root is steep at 0
-    const float square_right = kOne - t_right * t_right, square_left = kOne - t_left * t_left;
-    float right = x_ + slope_ * y_right + width_at_centre_ * std::sqrt(square_right > 0 ? square_right : 0);
-    float left = x_ + slope_ * y_left - width_at_centre_ * std::sqrt(square_left > 0 ? square_left : 0);
-    const bool meets = low <= half_height_ && high >= -half_height_;
-    right = meets ? right : -limit;
-    left = meets ? left : limit;
-    const float y = clamp(0.0f, y0, y1), square = disc_ * disc_ - y * y;
-    const float half = square > 0 ? std::sqrt(square) : -limit;
-    left = left < -half ? left : -half;
-    right = right > half ? right : half;
-    // Centres of pixels lie at 0.5; truncation rounds down, as these are not negative.
-    const float first = clamp(cx_ + left + 0.5f - margin_, 0.0f, limit);
-    const float last = clamp(cx_ + right + 0.5f + margin_, 0.0f, limit);
-    const int first_pixel = static_cast<int>(first), end_pixel = static_cast<int>(last);
+    const int first_pixel = static_cast<int>(first[i]), end_pixel = static_cast<int>(last[i]);
     out.first[i] = first_pixel / kGroup;
     out.last[i] = end_pixel > first_pixel ? (end_pixel - 1) / kGroup : -1;
   }

@@ -21,24 +21,23 @@ BEAGS_INLINE void accumulate(T* sum, Real<T> w, T value) {
 }
 
 template <Parts kWanted, class T>
-BEAGS_INLINE void add_hit(const Job<T>& job, int k, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> w,
-                          Real<T> before, Pixels<T>& p) {
-  const Mask<T> on = all(T(0)) < w;
+BEAGS_INLINE void add_hit(int k, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> w, Real<T> before,
+                          Pixels<T>& p) {
   for (int c = 0; c < 3; ++c) accumulate(p.color[c], w, s.color[c]);
   if (kWanted & kGeometry) {
     for (int c = 0; c < 3; ++c) accumulate(p.normal[c], w, s.normal[c]);
     const Real<T> depth = hits.get(hits.depth, i);
     store(p.depth, fma(w, depth, load(p.depth)));
     // The last hit in front of which T > 0.5: where T ends below that, it is the one at which T passes 0.5.
-    const Mask<T> passes = on & (all(T(0.5)) < before);
+    const Mask<T> passes = all(T(0)) < keep(all(T(0.5)) < before, w);
     store(p.median_depth, select(passes, depth, load(p.median_depth)));
     store(p.median_pair, select(passes, all(static_cast<T>(k)), load(p.median_pair)));
   }
   if (kWanted & kDistortion) {
-    const Real<T> inverse = keep(on, hits.get(hits.inverse_depth, i));
-    const Real<T> seen = load(p.first), first = select(seen == all(T(0)), inverse, seen);
+    const Real<T> nearness = keep(all(T(0)) < w, hits.get(hits.nearness, i));
+    const Real<T> seen = load(p.first), first = select(seen == all(T(0)), nearness, seen);
     store(p.first, first);
-    const Real<T> m = all(job.mapping) * (first - inverse);  // m_i - m_first: the differences are all that counts
+    const Real<T> m = first - nearness;  // m_i - m_first: the differences are all that counts
     const Real<T> wm = w * m;
     store(p.moment1, load(p.moment1) + wm);
     store(p.moment2, fma(wm, m, load(p.moment2)));
@@ -77,11 +76,11 @@ void forward(const Job<T>& job, int tile) {
     for_each_pixel(job, tile,
                    [&](int64_t at, int pack, int lane) { pixels[pack].target[lane] = static_cast<T>(job.target[at]); });
   }
-  constexpr unsigned kNeeds = (kWanted & kGeometry ? kNeedDepth : 0) | (kWanted & kDistortion ? kNeedInverseDepth : 0);
+  constexpr unsigned kNeeds = (kWanted & kGeometry ? kNeedDepth : 0) | (kWanted & kDistortion ? kNeedNearness : 0);
   composite<kNeeds>(
       job, tile, walk,
       [&](int k, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> w, Real<T> before)
-          __attribute__((always_inline)) { add_hit<kWanted>(job, k, s, hits, i, w, before, pixels[hits.pack[i]]); });
+          __attribute__((always_inline)) { add_hit<kWanted>(k, s, hits, i, w, before, pixels[hits.pack[i]]); });
   if (kWanted & kGeometry) {
     for (int pack = 0; pack < kTilePacks<T>; ++pack) {
       Pixels<T>& p = pixels[pack];

@@ -10,23 +10,32 @@ namespace beags {
 namespace {
 
 template <class T>
+bool all_finite(const T* numbers, int count) {
+  T zero = 0;
+  for (int i = 0; i < count; ++i) zero += 0 * numbers[i];
+  return zero == 0;
+}
+
+// The transcendental functions are taken in T.
+template <class T>
 SurfelParameters parameters(const Inputs<T>& inputs, int64_t i) {
   SurfelParameters s;
   std::copy_n(inputs.means + 3 * i, 3, s.mean);
   std::copy_n(inputs.quats + 4 * i, 4, s.quat);
-  std::copy_n(inputs.log_scales + 2 * i, 2, s.log_scale);
-  s.opacity_logit = inputs.opacity_logits[i];
-  std::copy_n(inputs.colors + 3 * i, 3, s.color);
+  for (int axis = 0; axis < 2; ++axis) s.scale[axis] = std::exp(inputs.log_scales[2 * i + axis]);
+  const T logit = inputs.opacity_logits[i], faded = std::exp(-std::abs(logit));
+  s.log2_opacity = std::min(logit, T(0)) / kLn2 - std::log2(1 + faded);
+  s.transparency = (logit > 0 ? faded : T(1)) / (1 + faded);
   return s;
 }
 
-// Rounds to T; false if that overflows.
+// Rounds all but colour and class to T; false if that overflows.
 template <class T>
-bool narrow(const Splat<double>& from, int32_t class_id, Splat<T>& to) {
-  bool finite = true;
+bool narrow(const Splat<double>& from, Splat<T>& to) {
+  T zero = 0;
   const auto round = [&](double number) {
     const T rounded = static_cast<T>(number);
-    finite = finite && std::isfinite(rounded);
+    zero += 0 * rounded;  // NaN if one is not finite
     return rounded;
   };
   to.cx = round(from.cx);
@@ -40,20 +49,32 @@ bool narrow(const Splat<double>& from, int32_t class_id, Splat<T>& to) {
   to.w_0 = round(from.w_0);
   to.det = round(from.det);
   to.z = round(from.z);
-  to.inverse_z = round(from.inverse_z);
+  to.nearness_z = round(from.nearness_z);
   to.log2_opacity = round(from.log2_opacity);
   to.tilt_u = round(from.tilt_u);
   to.tilt_v = round(from.tilt_v);
-  // Edge-on, det = 0: no hit reads its inverse, which must only not be NaN.
+  // Edge-on, det = 0: no hit reads this, which must only not be NaN.
   constexpr double kLargest = std::numeric_limits<T>::max();
-  to.inverse_det = static_cast<T>(std::clamp(from.inverse_det, -kLargest, kLargest));
-  for (int c = 0; c < 3; ++c) {
-    to.color[c] = static_cast<T>(from.color[c]);
-    to.normal[c] = static_cast<T>(from.normal[c]);
-  }
-  to.class_id = class_id;
+  to.nearness_det = static_cast<T>(std::clamp(from.nearness_det, -kLargest, kLargest));
+  for (int i = 0; i < 3; ++i) to.normal[i] = static_cast<T>(from.normal[i]);
   to.plain = from.plain;
-  return finite;
+  return zero == 0;
+}
+
+// Projects surfel i.
+template <class T>
+Fate place_surfel(const View& view, const Inputs<T>& inputs, int64_t i, Splat<T>& splat) {
+  if (!all_finite(inputs.means + 3 * i, 3) || !all_finite(inputs.quats + 4 * i, 4) ||
+      !all_finite(inputs.log_scales + 2 * i, 2) || !all_finite(inputs.opacity_logits + i, 1) ||
+      !all_finite(inputs.colors + 3 * i, 3)) {
+    return Fate::kNonFinite;
+  }
+  Splat<double> exact;
+  const Fate fate = project(view, parameters(inputs, i), exact);
+  if (fate != Fate::kDrawn) return fate;
+  std::copy_n(inputs.colors + 3 * i, 3, splat.color);
+  splat.class_id = inputs.class_ids ? inputs.class_ids[i] : 0;
+  return narrow(exact, splat) ? Fate::kDrawn : Fate::kNonFinite;
 }
 
 }  // namespace
@@ -65,23 +86,27 @@ Frame<T>::Frame(const View& view, const Inputs<T>& inputs, bool* visible, int th
       tiles_y_(tiles_along(view.height)),
       num_surfels_(inputs.count),
       splats_(new Splat<T>[inputs.count]) {
-  std::vector<Fate> fates(inputs.count);
-  const int team = inputs.count < kTeamSurfels ? 1 : threads;
-#pragma omp parallel for num_threads(team) schedule(static)
-  for (int64_t i = 0; i < inputs.count; ++i) {
-    Splat<double> splat;
-    fates[i] = project(view_, parameters(inputs, i), splat);
-    const int32_t class_id = inputs.class_ids ? inputs.class_ids[i] : 0;
-    if (fates[i] == Fate::kDrawn && !narrow(splat, class_id, splats_[i])) fates[i] = Fate::kNonFinite;
+  const int64_t n = inputs.count, chunks = (n + kChunk - 1) / kChunk;
+  std::vector<std::vector<Reach>> reached(chunks);
+  std::vector<int64_t> record_start(n + 1, 0), nonfinite(chunks, 0);
+  std::vector<T> depths(n);
+  const int team = n < kTeamSurfels ? 1 : threads;
+  // Determinism: chunks are of a fixed size and share nothing.
+#pragma omp parallel for num_threads(team) schedule(dynamic, 1)
+  for (int64_t chunk = 0; chunk < chunks; ++chunk) {
+    reached[chunk].reserve(4 * kChunk);
+    for (int64_t i = chunk * kChunk; i < std::min(n, (chunk + 1) * kChunk); ++i) {
+      const size_t before = reached[chunk].size();
+      const Fate fate = place_surfel(view_, inputs, i, splats_[i]);
+      nonfinite[chunk] += fate == Fate::kNonFinite;
+      visible[i] = fate == Fate::kDrawn && find_tiles(view_, splats_[i], reached[chunk]);
+      record_start[i + 1] = static_cast<int64_t>(reached[chunk].size() - before);
+      if (fate == Fate::kDrawn) depths[i] = splats_[i].z;
+    }
   }
-  std::vector<int32_t> drawn;
-  drawn.reserve(inputs.count);
-  for (int64_t i = 0; i < inputs.count; ++i) {
-    num_nonfinite_ += fates[i] == Fate::kNonFinite;
-    if (fates[i] == Fate::kDrawn) drawn.push_back(static_cast<int32_t>(i));
-    visible[i] = false;
-  }
-  bins_ = bin(view_, splats_.get(), std::move(drawn), visible, team);
+  for (int64_t i = 0; i < n; ++i) record_start[i + 1] += record_start[i];
+  for (const int64_t count : nonfinite) num_nonfinite_ += count;
+  bins_ = bin(view_, reached, std::move(record_start), depths.data());
 }
 
 template <class T>
@@ -92,7 +117,7 @@ Job<T> Frame<T>::job() const {
   job.tiles_x = tiles_x_;
   job.tiles_y = tiles_y_;
   job.near_plane = static_cast<T>(view_.near_plane);
-  job.mapping = static_cast<T>(view_.near_plane / (1 - view_.near_plane / view_.far_plane));
+  job.mapping = static_cast<T>(view_.mapping());
   std::copy_n(background_, 3, job.background);
   job.splats = splats_.get();
   job.tile_start = bins_.tile_start.data();
@@ -123,7 +148,7 @@ void Frame<T>::forward(const Images<T>& images, const T* background, const int32
   job.images = images;
   const Parts parts =
       (images.depth ? kGeometry : 0) | (images.distortion ? kDistortion : 0) | (images.boundary ? kBoundary : 0);
-  const auto kernel = kernels<T>().forward[parts];
+  const auto kernel = kernels<T>().variants[parts].forward;
   // Determinism: tiles share nothing, so any thread may take any of them.
   for_each_tile(threads, [&](int tile) { kernel(job, tile); });
 }
@@ -137,8 +162,9 @@ void Frame<T>::backward(const Inputs<T>& inputs, const int32_t* target, const Im
   const Parts parts = (from.depth || from.median_depth || from.normal ? kGeometry : 0) |
                       (from.distortion ? kDistortion : 0) | (from.boundary ? kBoundary : 0);
   const bool only_colors = !to.means && !to.quats && !to.log_scales && !to.opacity_logits;
-  const auto kernel = only_colors ? kernels<T>().backward_colors : kernels<T>().backward[parts];
-  const int size = only_colors ? kColorRecord : record_size(variant<T>(parts));
+  const Variant<T>& variant = kernels<T>().variants[parts];
+  const auto kernel = only_colors ? kernels<T>().backward_colors : variant.backward;
+  const int size = only_colors ? kColorRecord : variant.record_size;
   const std::unique_ptr<T[]> records(new T[static_cast<size_t>(num_pairs()) * size]);  // the kernels fill all of it
   const std::unique_ptr<T[]> backgrounds(new T[static_cast<size_t>(tiles()) * 3]);
   job.records = records.get();
@@ -161,24 +187,22 @@ void Frame<T>::reduce(const Inputs<T>& inputs, const T* records, int size, const
   const auto write = [](T* values, int64_t surfel, const double* numbers, int count) {
     for (int i = 0; values && i < count; ++i) values[count * surfel + i] = static_cast<T>(numbers[i]);
   };
-  const int64_t ranks = static_cast<int64_t>(bins_.order.size());
-  const int team = ranks < kTeamSurfels ? 1 : threads;
+  const int team = num_surfels_ < kTeamSurfels ? 1 : threads;
   // Determinism: each surfel's records are summed by one thread, in the order of their tiles.
-#pragma omp parallel for num_threads(team) schedule(static)
-  for (int64_t rank = 0; rank < ranks; ++rank) {
-    if (bins_.record_start[rank] == bins_.record_start[rank + 1]) continue;
+#pragma omp parallel for num_threads(team) schedule(dynamic, kChunk)
+  for (int64_t i = 0; i < num_surfels_; ++i) {
+    if (bins_.record_start[i] == bins_.record_start[i + 1]) continue;
     double sums[kRecord] = {};
-    for (int64_t record = bins_.record_start[rank]; record < bins_.record_start[rank + 1]; ++record) {
-      for (int i = 0; i < size; ++i) sums[i] += records[record * size + i];
+    for (int64_t record = bins_.record_start[i]; record < bins_.record_start[i + 1]; ++record) {
+      for (int number = 0; number < size; ++number) sums[number] += records[record * size + number];
     }
-    const int64_t surfel = bins_.order[rank];
-    write(to.colors, surfel, sums + kColor, 3);
+    write(to.colors, i, sums + kColor, 3);
     if (size == kColorRecord) continue;
-    const SurfelGradients g = project_backward(view_, parameters(inputs, surfel), sums);
-    write(to.means, surfel, g.mean, 3);
-    write(to.quats, surfel, g.quat, 4);
-    write(to.log_scales, surfel, g.log_scale, 2);
-    write(to.opacity_logits, surfel, &g.opacity_logit, 1);
+    const SurfelGradients g = project_backward(view_, parameters(inputs, i), sums);
+    write(to.means, i, g.mean, 3);
+    write(to.quats, i, g.quat, 4);
+    write(to.log_scales, i, g.log_scale, 2);
+    write(to.opacity_logits, i, &g.opacity_logit, 1);
   }
 }
 

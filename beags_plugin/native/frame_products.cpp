@@ -41,12 +41,23 @@ void Frame<T>::class_contributions(const int32_t* labels, int num_classes, T* ou
   const auto kernel = kernels<T>().class_contributions;
   for_each_tile(threads, [&](int tile) { kernel(job, product, tile); });
 
-  // Determinism: one thread adds up, tile after tile.
-  for (int tile = 0; tile < tiles(); ++tile) {
-    const T* row = sums.data() + slot_start[tile];
+  // Where the sums of each record start, and its tile.
+  std::vector<int64_t> row_of(num_pairs());
+  std::vector<int32_t> tile_of(num_pairs());
+  for_each_tile(threads, [&](int tile) {
     for (int64_t k = bins_.tile_start[tile]; k < bins_.tile_start[tile + 1]; ++k) {
-      T* to = out + static_cast<int64_t>(bins_.pairs[k].splat) * num_classes;
-      for (const int32_t label : tile_labels[tile]) to[label] += *row++;
+      const int32_t record = bins_.pairs[k].record;
+      row_of[record] = slot_start[tile] + (k - bins_.tile_start[tile]) * num_slots[tile];
+      tile_of[record] = tile;
+    }
+  });
+  const int team = num_surfels_ < kTeamSurfels ? 1 : threads;
+  // Determinism: each surfel's records are summed by one thread, in the order of their tiles.
+#pragma omp parallel for num_threads(team) schedule(dynamic, kChunk)
+  for (int64_t i = 0; i < num_surfels_; ++i) {
+    for (int64_t record = bins_.record_start[i]; record < bins_.record_start[i + 1]; ++record) {
+      const T* row = sums.data() + row_of[record];
+      for (const int32_t label : tile_labels[tile_of[record]]) out[i * num_classes + label] += *row++;
     }
   }
 }

@@ -18,28 +18,22 @@ void multiply_transposed(const double* m, const double* v, double* out) {  // ou
 
 template <class... Numbers>
 bool finite(Numbers... numbers) {
-  return (std::isfinite(numbers) && ...);
-}
-
-bool finite(const SurfelParameters& s) {
-  return finite(s.mean[0], s.mean[1], s.mean[2], s.quat[0], s.quat[1], s.quat[2], s.quat[3], s.log_scale[0],
-                s.log_scale[1], s.opacity_logit, s.color[0], s.color[1], s.color[2]);
+  return ((0 * numbers) + ...) == 0;  // one comparison for all
 }
 
 // The surfel in camera space (E1), its centre's depth divided out: a, b, p over p_z.
 struct Placement {
-  double length, unit[4];                  // of the quaternion
+  double inverse_length, unit[4];          // of the quaternion
   double axis_u[3], axis_v[3], axis_n[3];  // columns of R
-  double scale_u, scale_v;
-  double z, a[3], b[3], p[3];
+  double z, inverse_z, a[3], b[3], p[3];
   double cx, cy;             // projected centre
   double mu[2], mv[2];       // first two columns of the recentred rows Mx, My; their third is 0
   double normal[3], facing;  // facing: +1 or -1, turns the normal towards the camera
 };
 
 void place(const View& view, const SurfelParameters& s, Placement& at) {
-  at.length = std::sqrt(s.quat[0] * s.quat[0] + dot(s.quat + 1, s.quat + 1));
-  for (int i = 0; i < 4; ++i) at.unit[i] = s.quat[i] / at.length;
+  at.inverse_length = 1 / std::sqrt(s.quat[0] * s.quat[0] + dot(s.quat + 1, s.quat + 1));
+  for (int i = 0; i < 4; ++i) at.unit[i] = s.quat[i] * at.inverse_length;
   const double w = at.unit[0], x = at.unit[1], y = at.unit[2], z = at.unit[3];
   const double columns[3][3] = {{1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)},
                                 {2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)},
@@ -47,8 +41,6 @@ void place(const View& view, const SurfelParameters& s, Placement& at) {
   std::copy_n(columns[0], 3, at.axis_u);
   std::copy_n(columns[1], 3, at.axis_v);
   std::copy_n(columns[2], 3, at.axis_n);
-  at.scale_u = std::exp(s.log_scale[0]);
-  at.scale_v = std::exp(s.log_scale[1]);
 
   double center[3], a[3], b[3];
   multiply(view.rotation, s.mean, center);
@@ -58,11 +50,13 @@ void place(const View& view, const SurfelParameters& s, Placement& at) {
   multiply(view.rotation, at.axis_n, at.normal);
   at.facing = dot(at.normal, center) > 0 ? -1.0 : 1.0;
   at.z = center[2];
+  at.inverse_z = 1 / at.z;
+  const double scale_u = s.scale[0] * at.inverse_z, scale_v = s.scale[1] * at.inverse_z;
   for (int i = 0; i < 3; ++i) {
     at.normal[i] *= at.facing;
-    at.p[i] = center[i] / at.z;
-    at.a[i] = a[i] * at.scale_u / at.z;
-    at.b[i] = b[i] * at.scale_v / at.z;
+    at.p[i] = center[i] * at.inverse_z;
+    at.a[i] = a[i] * scale_u;
+    at.b[i] = b[i] * scale_v;
   }
   at.cx = dot(view.kx, at.p);
   at.cy = dot(view.ky, at.p);
@@ -72,17 +66,14 @@ void place(const View& view, const SurfelParameters& s, Placement& at) {
   at.mv[1] = dot(view.ky, at.b) - at.cy * at.b[2];
 }
 
-double log_sigmoid(double logit) { return std::min(logit, 0.0) - std::log1p(std::exp(-std::abs(logit))); }
-
 }  // namespace
 
 Fate project(const View& view, const SurfelParameters& s, Splat<double>& splat) {
-  if (!finite(s)) return Fate::kNonFinite;
   Placement at;
   place(view, s, at);
-  if (!finite(at.unit[0], at.scale_u, at.scale_v, at.z)) return Fate::kNonFinite;  // quaternion 0, or an overflow
-  splat.log2_opacity = log_sigmoid(s.opacity_logit) / kLn2;
-  if (at.z <= view.near_plane || splat.log2_opacity < kLog2MinAlpha) return Fate::kCulled;
+  if (!finite(at.unit[0], s.scale[0], s.scale[1], at.z)) return Fate::kNonFinite;  // quaternion 0, or an overflow
+  if (at.z <= view.near_plane || s.log2_opacity < kLog2MinAlpha) return Fate::kCulled;
+  splat.log2_opacity = s.log2_opacity;
   splat.cx = at.cx;
   splat.cy = at.cy;
   splat.u_x = at.mv[1];  // E2: q = k x l, expanded in (dx, dy)
@@ -93,12 +84,11 @@ Fate project(const View& view, const SurfelParameters& s, Splat<double>& splat) 
   splat.w_y = at.a[2] * at.mu[1] - at.b[2] * at.mu[0];
   splat.w_0 = at.mu[0] * at.mv[1] - at.mu[1] * at.mv[0];
   splat.det = at.z * splat.w_0;
-  splat.inverse_det = 1 / splat.det;
   splat.z = at.z;
-  splat.inverse_z = 1 / at.z;
+  splat.nearness_det = view.mapping() / splat.det;
+  splat.nearness_z = view.mapping() * at.inverse_z;
   splat.tilt_u = at.a[2];
   splat.tilt_v = at.b[2];
-  std::copy_n(s.color, 3, splat.color);
   std::copy_n(at.normal, 3, splat.normal);
   if (!finite(splat.cx, splat.cy, splat.u_x, splat.u_y, splat.v_x, splat.v_y, splat.w_x, splat.w_y, splat.w_0,
               splat.det)) {
@@ -110,18 +100,19 @@ Fate project(const View& view, const SurfelParameters& s, Splat<double>& splat) 
 
 bool is_plain(const View& view, const Splat<double>& s) {
   constexpr double kMargin = 1e-4;  // float32's rounding
-  const double disc = std::sqrt(kLn2 * (s.log2_opacity - kLog2MinAlpha));
-  // |q2| at most `disc` pixels off the centre, and a bound of |(q0, q1)| there: rho3d <= rho2d all over the disc.
-  // Beyond it, the low-pass is too faint to be drawn.
-  const double least = std::abs(s.w_0) - disc * std::hypot(s.w_x, s.w_y);
+  constexpr double kLog2MaxAlpha = -0.0144995696951151;
+  const double squared_disc = kLn2 * (s.log2_opacity - kLog2MinAlpha);  // of the low-pass's radius
+  // |q2| at most that far off the centre, and a bound of |(q0, q1)| there: rho3d <= rho2d all over the disc. Beyond it,
+  // the low-pass is too faint to be drawn.
+  const double least = std::abs(s.w_0) - std::sqrt(squared_disc * (s.w_x * s.w_x + s.w_y * s.w_y));
   const double squares = s.u_x * s.u_x + s.u_y * s.u_y + s.v_x * s.v_x + s.v_y * s.v_y;
   const double area = s.u_x * s.v_y - s.u_y * s.v_x;
   const double stretch = (squares + std::sqrt(std::max(0.0, squares * squares - 4 * area * area))) / 2;
   if (!(least > 0) || !(stretch * (1 + kMargin) < 2 * least * least)) return false;
-  // The nearest point of the surfel's disc, at most `reach` standard deviations off its centre.
-  const double reach = std::sqrt(2.0) * disc;
-  if (!(s.z * (1 - reach * std::hypot(s.tilt_u, s.tilt_v)) > view.near_plane * (1 + kMargin))) return false;
-  return s.log2_opacity < std::log2(kMaxAlpha) - kMargin && std::isfinite(s.inverse_det);
+  // The nearest point of the surfel's own disc, which is sqrt(2) times as many standard deviations wide.
+  const double nearest = 1 - std::sqrt(2 * squared_disc * (s.tilt_u * s.tilt_u + s.tilt_v * s.tilt_v));
+  if (!(s.z * nearest > view.near_plane * (1 + kMargin))) return false;
+  return s.log2_opacity < kLog2MaxAlpha - kMargin && finite(s.nearness_det);
 }
 
 SurfelGradients project_backward(const View& view, const SurfelParameters& s, const double* record) {
@@ -158,11 +149,11 @@ SurfelGradients project_backward(const View& view, const SurfelParameters& s, co
   }
   g_a[2] += -at.cx * g_mu[0] - at.cy * g_mv[0] - mv[1] * q2[1] + mu[1] * q2[2];
   g_b[2] += -at.cx * g_mu[1] - at.cy * g_mv[1] + mv[0] * q2[1] - mu[0] * q2[2];
-  g_z -= (dot(g_a, at.a) + dot(g_b, at.b) + dot(g_p, at.p)) / at.z;
+  g_z -= (dot(g_a, at.a) + dot(g_b, at.b) + dot(g_p, at.p)) * at.inverse_z;
   for (int i = 0; i < 3; ++i) {
-    g_a[i] /= at.z;
-    g_b[i] /= at.z;
-    g_p[i] /= at.z;
+    g_a[i] *= at.inverse_z;
+    g_b[i] *= at.inverse_z;
+    g_p[i] *= at.inverse_z;
   }
   g_p[2] += g_z;
 
@@ -173,11 +164,11 @@ SurfelGradients project_backward(const View& view, const SurfelParameters& s, co
   multiply_transposed(view.rotation, g_a, u);
   multiply_transposed(view.rotation, g_b, v);
   multiply_transposed(view.rotation, g_normal, n);
-  out.log_scale[0] = at.scale_u * dot(u, at.axis_u);
-  out.log_scale[1] = at.scale_v * dot(v, at.axis_v);
+  out.log_scale[0] = s.scale[0] * dot(u, at.axis_u);
+  out.log_scale[1] = s.scale[1] * dot(v, at.axis_v);
   for (int i = 0; i < 3; ++i) {
-    u[i] *= at.scale_u;
-    v[i] *= at.scale_v;
+    u[i] *= s.scale[0];
+    v[i] *= s.scale[1];
   }
   const double w = at.unit[0], x = at.unit[1], y = at.unit[2], z = at.unit[3];
   const double g_unit[4] = {2 * (z * (u[1] - v[0]) + y * (n[0] - u[2]) + x * (v[2] - n[1])),
@@ -185,8 +176,8 @@ SurfelGradients project_backward(const View& view, const SurfelParameters& s, co
                             2 * (x * (u[1] + v[0]) + z * (v[2] + n[1]) + w * (n[0] - u[2]) - 2 * y * (u[0] + n[2])),
                             2 * (x * (u[2] + n[0]) + y * (v[2] + n[1]) + w * (u[1] - v[0]) - 2 * z * (u[0] + v[1]))};
   const double along = at.unit[0] * g_unit[0] + dot(at.unit + 1, g_unit + 1);
-  for (int i = 0; i < 4; ++i) out.quat[i] = (g_unit[i] - at.unit[i] * along) / at.length;
-  out.opacity_logit = g[kLogOpacity] / (1.0 + std::exp(s.opacity_logit));  // d log sigmoid = 1 - sigmoid
+  for (int i = 0; i < 4; ++i) out.quat[i] = (g_unit[i] - at.unit[i] * along) * at.inverse_length;
+  out.opacity_logit = g[kLogOpacity] * s.transparency;  // d log sigmoid = 1 - sigmoid
   return out;
 }
 

@@ -12,10 +12,14 @@ struct View {
   double kx[3], ky[3];  // first two rows of K; the third is (0, 0, 1)
   int width, height;    // pixels
   double near_plane, far_plane;
+
+  // k in the distortion's m(d) = far / (far - near) - k / d: far near / (far - near).
+  double mapping() const { return near_plane / (1 - near_plane / far_plane); }
 };
 
 struct SurfelParameters {
-  double mean[3], quat[4], log_scale[2], opacity_logit, color[3];
+  double mean[3], quat[4], scale[2];
+  double log2_opacity, transparency;  // transparency: 1 - opacity
 };
 
 struct SurfelGradients {
@@ -24,7 +28,7 @@ struct SurfelGradients {
 
 enum class Fate { kDrawn, kCulled, kNonFinite };
 
-// Fills `splat` (but for the class) if the surfel is drawn.
+// Fills `splat` (but for colour and class) if the surfel is drawn.
 Fate project(const View& view, const SurfelParameters& surfel, Splat<double>& splat);
 
 // Whether rho3d <= rho2d wherever it is drawn, it lies wholly beyond the near plane and its alpha stays below the

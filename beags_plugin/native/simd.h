@@ -149,11 +149,11 @@ BEAGS_INLINE Real<float> exp2(Real<float> x) {
   const Real<T> magic = all(12582912.0f);  // 1.5 * 2^23: the lowest bits of the sum hold x, rounded
   const Real<T> shifted = x + magic;
   const Real<T> f = x - (shifted - magic);
-  const Real<T> f2 = f * f;
-  const Real<T> low = fma(all(6.9314696706e-1f), f, all(1.0000000717e+0f));
-  const Real<T> middle = fma(all(5.5507132775e-2f), f, all(2.4022119724e-1f));
-  const Real<T> high = fma(all(1.3276470686e-3f), f, all(9.6755413240e-3f));
-  const Real<T> p = fma(fma(high, f2, middle), f2, low);
+  Real<T> p = fma(all(1.3276470686e-3f), f, all(9.6755413240e-3f));
+  p = fma(p, f, all(5.5507132775e-2f));
+  p = fma(p, f, all(2.4022119724e-1f));
+  p = fma(p, f, all(6.9314696706e-1f));
+  p = fma(p, f, all(1.0000000717e+0f));
   Real<T> out;
   BEAGS_EACH(Register<T>::scale(p.part[i], shifted.part[i]));
 }

@@ -9,23 +9,26 @@
 namespace beags {
 namespace BEAGS_ISA {
 
-#ifdef BEAGS_QUICK
+// Which variant draws `parts`. In float64 and without SIMD, which are there to check and to compare, always the whole.
 template <class T>
-constexpr unsigned quick(unsigned) {
-  return 7;
-}
+constexpr Parts variant([[maybe_unused]] Parts parts) {
+#if defined(BEAGS_SCALAR) || defined(BEAGS_QUICK)
+  return kAllParts;
 #else
-template <class T>
-constexpr unsigned quick(unsigned p) {
-  return variant<T>(p);
-}
+  return sizeof(T) == sizeof(double) ? kAllParts : parts;
 #endif
+}
+
+template <Parts kWanted, class T>
+constexpr Variant<T> make_variant() {
+  constexpr Parts kDrawn = variant<T>(kWanted);
+  return {forward<kDrawn, T>, backward<kDrawn, T>, record_size(kDrawn)};
+}
+
 template <class T>
-constexpr Kernels<T> kernels() {
-  return {{forward<quick<T>(0)>, forward<quick<T>(1)>, forward<quick<T>(2)>, forward<quick<T>(3)>, forward<quick<T>(4)>,
-           forward<quick<T>(5)>, forward<quick<T>(6)>, forward<quick<T>(7)>},
-          {backward<quick<T>(0)>, backward<quick<T>(1)>, backward<quick<T>(2)>, backward<quick<T>(3)>,
-           backward<quick<T>(4)>, backward<quick<T>(5)>, backward<quick<T>(6)>, backward<quick<T>(7)>},
+constexpr Kernels<T> make_kernels() {
+  return {{make_variant<0, T>(), make_variant<1, T>(), make_variant<2, T>(), make_variant<3, T>(), make_variant<4, T>(),
+           make_variant<5, T>(), make_variant<6, T>(), make_variant<7, T>()},
           backward_colors<T>,
           class_contributions<T>,
           class_map<T>,
@@ -33,11 +36,11 @@ constexpr Kernels<T> kernels() {
           count<T>};
 }
 
-extern const Kernels<float> kKernelsF32 = kernels<float>();
-#ifndef BEAGS_QUICK
-extern const Kernels<double> kKernelsF64 = kernels<double>();
+extern constexpr Kernels<float> kKernelsF32 = make_kernels<float>();
+#if defined(BEAGS_QUICK)
+extern constexpr Kernels<double> kKernelsF64 = {};
 #else
-extern const Kernels<double> kKernelsF64 = {};
+extern constexpr Kernels<double> kKernelsF64 = make_kernels<double>();
 #endif
 
 }  // namespace BEAGS_ISA

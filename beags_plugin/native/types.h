@@ -26,8 +26,8 @@ struct alignas(32) Splat {
   T cx, cy;  // c, pixels
   T u_x, u_y, v_x, v_y;
   T w_x, w_y, w_0;
-  T det, inverse_det;
-  T z, inverse_z;  // depth of the centre, world units
+  T det, z;                    // z: depth of the centre, world units
+  T nearness_det, nearness_z;  // k / det and k / z, with k of Job
   T log2_opacity;
   int32_t class_id;
   int32_t plain;  // see is_plain in projection.h
@@ -74,11 +74,6 @@ static_assert(kShapeEnd <= kShapeRecord && kRecordEnd <= kRecord, "records hold 
 using Parts = unsigned;
 constexpr Parts kGeometry = 1, kDistortion = 2, kBoundary = 4;
 constexpr Parts kAllParts = kGeometry | kDistortion | kBoundary;
-// The variant that runs where `parts` are wanted: in float64, which is for checking, always the whole.
-template <class T>
-constexpr Parts variant(Parts parts) {
-  return sizeof(T) == sizeof(double) ? kAllParts : parts;
-}
 constexpr int record_size(Parts parts) { return parts & (kGeometry | kDistortion) ? kRecord : kShapeRecord; }
 
 // The images, [height, width, channels], or the gradients towards them; null: not wanted.
@@ -94,7 +89,7 @@ struct Saved {
   T* end_transmittance;
   T* end;                        // pairs of the tile before the one at which the pixel stopped
   T *depth_sum, *median_pair;    // sum of w d; the pair at which T passes 0.5, or -1
-  T *first, *moment1, *moment2;  // distortion: 1 / d of the first hit, sums of w m and w m^2 from there
+  T *first, *moment1, *moment2;  // distortion: k / d of the first hit, sums of w m and w m^2 from there
   static constexpr int kCount = 7;
 };
 
@@ -103,7 +98,7 @@ template <class T>
 struct Job {
   int width, height, tiles_x, tiles_y;
   T near_plane;
-  T mapping;  // k in m(d) = far / (far - near) - k / d, k = far near / (far - near): differences of m need k alone
+  T mapping;  // k in m(d) = far / (far - near) - k / d; only differences of m count
   T background[3];
   const int32_t* target;  // [height, width] class ids, or null: no boundary
 
@@ -137,10 +132,15 @@ struct Work {
 
 // The kernels of one instruction set, for one tile each.
 template <class T>
+struct Variant {
+  void (*forward)(const Job<T>&, int tile);
+  void (*backward)(const Job<T>&, int tile);
+  int record_size;
+};
+template <class T>
 struct Kernels {
-  void (*forward[kAllParts + 1])(const Job<T>&, int tile);   // by Parts
-  void (*backward[kAllParts + 1])(const Job<T>&, int tile);  // by Parts
-  void (*backward_colors)(const Job<T>&, int tile);          // towards colours and background alone
+  Variant<T> variants[kAllParts + 1];                // by Parts
+  void (*backward_colors)(const Job<T>&, int tile);  // towards colours and background alone
   void (*class_contributions)(const Job<T>&, const Product<T>&, int tile);
   void (*class_map)(const Job<T>&, const Product<T>&, int tile);
   void (*heaviest)(const Job<T>&, const Product<T>&, int tile);
