@@ -6,167 +6,233 @@
 namespace beags {
 namespace BEAGS_ISA {
 
-// What the backward knows of a vector of pixels before it starts; g_ are gradients of the loss.
+// What the backward knows of a pack of pixels; g_ are gradients of the loss.
 template <class T>
-struct Gradients {
-  Real<T> g_color[3], g_normal[3], g_alpha, g_depth, g_median_depth, g_distortion, g_boundary;  // g_depth: of sum w d
-  Real<T> transmittance, behind;  // behind: sum over the surfels behind of w dL/dw, and the background's part
-  Real<T> alpha, inverse, moment1, moment2;
-  Mask<T> last, median_pair, target;
+struct alignas(64) PixelGradients {
+  T transmittance[kLanes<T>], behind[kLanes<T>];  // behind: the part of dL/dT of what lies behind, times T
+  T end[kLanes<T>];
+  T g_color[3][kLanes<T>], g_alpha[kLanes<T>];
+  T g_normal[3][kLanes<T>], g_depth[kLanes<T>], g_median_depth[kLanes<T>],
+      median_pair[kLanes<T>];                                     // g_depth: of sum w d
+  T first[kLanes<T>], g_alpha_m[kLanes<T>], g_moment[kLanes<T>];  // distortion: its gradient times A and sum w m
+  T g_boundary[kLanes<T>], target[kLanes<T>];
 };
 
-template <class T>
-BEAGS_INLINE void load_gradients(const Job<T>& job, int tile, Gradients<T>* pixels) {
-  T background[3] = {};
+template <Parts kWanted, class T>
+BEAGS_INLINE void load_saved(const Job<T>& job, int tile, PixelGradients<T>* pixels) {
+  const Saved<T>& from = job.saved;
   for (int pack = 0; pack < kTilePacks<T>; ++pack) {
-    Gradients<T>& p = pixels[pack];
-    p = Gradients<T>{};
-    const int64_t saved = static_cast<int64_t>(tile) * kTilePixels + pack * Simd<T>::kLanes;
-    p.transmittance = load(job.end_transmittance + saved);
-    p.alpha = T(1) - p.transmittance;
-    p.last = load_integers<T>(job.last + saved);
-    if (job.geometry) p.median_pair = load_integers<T>(job.median_pair + saved);
-    if (job.distortion) {
-      p.inverse = load(job.first_inverse_depth + saved);
-      p.moment1 = load(job.moment1 + saved);
-      p.moment2 = load(job.moment2 + saved);
-    }
+    PixelGradients<T>& p = pixels[pack];
+    const int64_t at = saved_at<T>(tile, pack);
+    store(p.transmittance, load(from.end_transmittance + at));
+    store(p.end, load(from.end + at));
+    if ((kWanted & kGeometry) && from.median_pair) store(p.median_pair, load(from.median_pair + at));
+    if ((kWanted & kDistortion) && from.first) store(p.first, load(from.first + at));
   }
+}
+
+template <Parts kWanted, class T>
+BEAGS_INLINE void load_gradients(const Job<T>& job, int tile, PixelGradients<T>* pixels) {
+  load_saved<kWanted>(job, tile, pixels);
+  const Images<const T>& g = job.gradients;
+  T background[3] = {};
   for_each_pixel(job, tile, [&](int64_t at, int pack, int lane) {
-    Gradients<T>& p = pixels[pack];
-    const T alpha = p.alpha[lane];
-    if (job.g_color) {
+    PixelGradients<T>& p = pixels[pack];
+    if (g.color) {
       for (int c = 0; c < 3; ++c) {
-        p.g_color[c][lane] = job.g_color[3 * at + c];
+        p.g_color[c][lane] = g.color[3 * at + c];
         background[c] += p.g_color[c][lane] * p.transmittance[lane];
         p.behind[lane] += p.g_color[c][lane] * p.transmittance[lane] * job.background[c];
       }
     }
-    if (job.g_alpha) p.g_alpha[lane] = job.g_alpha[at];
-    if (job.g_depth && alpha > T(0)) {
-      const T saved = job.depth_sum[static_cast<int64_t>(tile) * kTilePixels + pack * Simd<T>::kLanes + lane];
-      p.g_depth[lane] = job.g_depth[at] / alpha;
-      p.g_alpha[lane] -= p.g_depth[lane] * saved / alpha;
+    if (g.alpha) p.g_alpha[lane] = g.alpha[at];
+    const T alpha = T(1) - p.transmittance[lane];
+    const int64_t saved = saved_at<T>(tile, pack) + lane;
+    if (kWanted & kGeometry) {
+      if (g.depth && alpha > T(0)) {
+        p.g_depth[lane] = g.depth[at] / alpha;
+        p.g_alpha[lane] -= p.g_depth[lane] * job.saved.depth_sum[saved] / alpha;
+      }
+      if (g.median_depth) p.g_median_depth[lane] = g.median_depth[at];
+      for (int c = 0; c < 3 && g.normal; ++c) p.g_normal[c][lane] = g.normal[3 * at + c];
     }
-    if (job.g_median_depth) p.g_median_depth[lane] = job.g_median_depth[at];
-    if (job.g_normal) {
-      for (int c = 0; c < 3; ++c) p.g_normal[c][lane] = job.g_normal[3 * at + c];
+    if ((kWanted & kDistortion) && g.distortion) {
+      p.g_alpha_m[lane] = g.distortion[at] * alpha;
+      p.g_moment[lane] = g.distortion[at] * job.saved.moment1[saved];
+      p.g_alpha[lane] += g.distortion[at] * job.saved.moment2[saved];
     }
-    if (job.g_distortion) p.g_distortion[lane] = job.g_distortion[at];
-    if (job.g_boundary) {
-      p.target[lane] = job.target[at];
-      p.g_boundary[lane] = job.target[at] == kIgnore ? T(0) : job.g_boundary[at];
+    if ((kWanted & kBoundary) && g.boundary) {
+      p.target[lane] = static_cast<T>(job.target[at]);
+      p.g_boundary[lane] = job.target[at] == kIgnore ? T(0) : g.boundary[at];
     }
   });
   for (int c = 0; c < 3; ++c) job.g_background[3 * tile + c] = background[c];
 }
 
-// Adds one surfel's part at one vector of pixels, back to front.
-template <class T>
-BEAGS_INLINE void add_gradients(const Job<T>& job, int k, const Splat<T>& s, const Hit<T>& hit, Gradients<T>& p,
-                                Real<T>* sums) {
-  const Real<T> zero = {};
-  const Mask<T> on = hit.on;
-  const Real<T> inverse_left = T(1) / (T(1) - hit.alpha);
-  const Real<T> before = p.transmittance * inverse_left;
-  const Real<T> w = on ? hit.alpha * before : zero;
-  const bool depths = job.g_depth || job.g_median_depth || job.g_distortion;
-  const Real<T> depth = on ? hit.depth : zero + T(1);
-
-  Real<T> g_w = p.g_alpha;
-  if (job.g_color) {
+// dL/dw of a hit, but for what lies behind it; sets `g_hit`, the gradient towards its depth.
+template <Parts kWanted, class T>
+BEAGS_INLINE Real<T> weight_gradient(const Job<T>& job, int k, const Splat<T>& s, const Hits<T>& hits, int i,
+                                     const PixelGradients<T>& p, Real<T> w, Vector<T>* sums, Real<T>& g_hit) {
+  Real<T> g_w = load(p.g_alpha);
+  for (int c = 0; c < 3; ++c) {
+    const Real<T> g = load(p.g_color[c]);
+    g_w = fma(g, all(s.color[c]), g_w);
+    add(sums[kColor + c], w, g);
+  }
+  if (kWanted & kGeometry) {
     for (int c = 0; c < 3; ++c) {
-      g_w = fma(p.g_color[c], zero + s.color[c], g_w);
-      sums[kColor + c] = fma(w, p.g_color[c], sums[kColor + c]);
+      const Real<T> g = load(p.g_normal[c]);
+      g_w = fma(g, all(s.normal[c]), g_w);
+      add(sums[kNormal + c], w, g);
     }
+    g_w = fma(load(p.g_depth), hits.get(hits.depth, i), g_w);
+    const Mask<T> median = load(p.median_pair) == all(static_cast<T>(k));
+    g_hit = fma(w, load(p.g_depth), keep(median, load(p.g_median_depth)));
   }
-  if (job.g_normal) {
-    for (int c = 0; c < 3; ++c) {
-      g_w = fma(p.g_normal[c], zero + s.normal[c], g_w);
-      sums[kNormal + c] = fma(w, p.g_normal[c], sums[kNormal + c]);
-    }
+  if (kWanted & kDistortion) {
+    // sum over pairs w_i w_j (m_i - m_j)^2: by w_i it is m (m A - 2 sum w m) + sum w m^2, of which g_alpha has the last
+    // term, and by m_i 2 w_i (m A - sum w m); dm/dd = k / d^2.
+    const Real<T> nearness = hits.get(hits.nearness, i), m = load(p.first) - nearness, g_moment = load(p.g_moment);
+    const Real<T> slope = m * load(p.g_alpha_m) - g_moment;
+    g_w = fma(m, slope - g_moment, g_w);
+    g_hit = fma(w * slope, all(T(2) / job.mapping) * (nearness * nearness), g_hit);
   }
-  if (job.g_boundary) g_w += p.target != s.class_id ? p.g_boundary : zero;
-  Real<T> g_hit = zero;  // towards the hit's depth
-  if (depths) {
-    g_w = fma(p.g_depth, depth, g_w);
-    g_hit = w * p.g_depth;
-    if (job.g_median_depth) g_hit += p.median_pair == k ? p.g_median_depth : zero;
-    if (job.g_distortion) {
-      // sum over pairs w_i w_j (m_i - m_j)^2, by w_i and by m_i; dm/dd = k / d^2.
-      const Real<T> inverse = T(1) / depth, m = job.mapping * (p.inverse - inverse);
-      g_w += p.g_distortion * (m * (m * p.alpha - T(2) * p.moment1) + p.moment2);
-      const Real<T> slope = T(2) * job.mapping * inverse * inverse * (m * p.alpha - p.moment1);
-      g_hit = fma(w * p.g_distortion, slope, g_hit);
-    }
-    g_hit = on ? g_hit : zero;
-  }
-  const Real<T> g_alpha = before * g_w - p.behind * inverse_left;
-  p.behind = fma(w, g_w, p.behind);
-  p.transmittance = on ? before : p.transmittance;
+  if (kWanted & kBoundary) g_w = g_w + drop(load(p.target) == all(static_cast<T>(s.class_id)), load(p.g_boundary));
+  return g_w;
+}
 
-  const Real<T> g_log = (on & ~hit.clamped) ? g_alpha * hit.alpha : zero;  // towards log alpha; E3: no slope at 0.99
-  sums[kLogOpacity] += g_log;
+// Adds one surfel's part at one pack of pixels, back to front.
+template <Parts kWanted, bool kPlain, class T>
+BEAGS_INLINE void add_gradients(const Job<T>& job, int k, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> dx,
+                                Real<T> dy, PixelGradients<T>& p, Vector<T>* sums) {
+  constexpr bool kDepths = kWanted & (kGeometry | kDistortion);
+  const Real<T> alpha = hits.get(hits.alpha, i), inverse_left = all(T(1)) / (all(T(1)) - alpha);
+  const Real<T> before = load(p.transmittance) * inverse_left, w = alpha * before;
+  Real<T> g_hit = all(T(0));
+  const Real<T> g_w = weight_gradient<kWanted>(job, k, s, hits, i, p, w, sums, g_hit);
+  store(p.transmittance, before);
+  // Towards log alpha: alpha dL/dalpha = w g_w - (what lies behind) alpha / (1 - alpha).
+  const Real<T> behind = load(p.behind);
+  Real<T> g_log = w * g_w - behind * (alpha * inverse_left);
+  store(p.behind, fma(w, g_w, behind));
+  if (!kPlain) g_log = keep(alpha < all(T(kMaxAlpha)), g_log);  // E3: no slope at 0.99
+  add(sums[kLogOpacity], g_log);
   // rho3d: d rho / dq = 2 (u, v, -rho) / q2 and dL/d rho = -g_log / 2; depth = det / q2.
-  const Mask<T> plane = on & hit.plane;
-  const Real<T> inverse = plane ? hit.inverse : zero;
-  const Real<T> scaled = g_log * inverse * inverse;
-  const Real<T> g_q0 = -scaled * hit.q0, g_q1 = -scaled * hit.q1;
-  const Real<T> g_q2 = (g_log * hit.rho - g_hit * depth) * inverse;
-  sums[kQ0] += g_q0;
-  sums[kQ0x] = fma(g_q0, hit.dx, sums[kQ0x]);
-  sums[kQ0y] = fma(g_q0, hit.dy, sums[kQ0y]);
-  sums[kQ1] += g_q1;
-  sums[kQ1x] = fma(g_q1, hit.dx, sums[kQ1x]);
-  sums[kQ1y] = fma(g_q1, hit.dy, sums[kQ1y]);
-  sums[kQ2] += g_q2;
-  sums[kQ2x] = fma(g_q2, hit.dx, sums[kQ2x]);
-  sums[kQ2y] = fma(g_q2, hit.dy, sums[kQ2y]);
+  const Real<T> inverse = hits.get(hits.inverse, i);
+  const Real<T> s_0 = g_log * (inverse * inverse), s_x = s_0 * dx, s_y = s_0 * dy;
+  add(sums[kSx], s_x);
+  add(sums[kSy], s_y);
+  add(sums[kSxx], s_x, dx);
+  add(sums[kSxy], s_x, dy);
+  add(sums[kSyy], s_y, dy);
+  Real<T> along = g_log * hits.get(hits.rho, i);
+  if (kDepths) along = along - g_hit * hits.get(hits.depth, i);
+  const Real<T> h = along * inverse;
+  add(sums[kH], h);
+  add(sums[kHx], h, dx);
+  add(sums[kHy], h, dy);
+  if (kDepths) add(sums[kDet], g_hit, inverse);
+  if (kPlain) return;
   // Low-pass: d rho2d / dc = -4 (dx, dy); depth = p_z.
-  const Real<T> g_disc = plane ? zero : T(2) * g_log;
-  sums[kCx] = fma(g_disc, hit.dx, sums[kCx]);
-  sums[kCy] = fma(g_disc, hit.dy, sums[kCy]);
-  if (depths) {
-    sums[kDet] = fma(g_hit, inverse, sums[kDet]);
-    sums[kZ] += plane ? zero : g_hit;
+  const Mask<T> disc = inverse == all(T(0));
+  const Real<T> g_disc = keep(disc, g_log + g_log);
+  add(sums[kCx], g_disc, dx);
+  add(sums[kCy], g_disc, dy);
+  if (kDepths) add(sums[kZ], keep(disc, g_hit));
+}
+
+// Which groups of pixels are not yet past their end, going back to front.
+template <class T>
+struct Waking {
+  int end[kGroupPixels] = {};  // of the pixel of a group that stopped last
+  int next = 0;                // the largest one among the groups that sleep
+  unsigned active = 0;
+
+  explicit Waking(const PixelGradients<T>* pixels) {
+    for (int i = 0; i < kTilePixels; ++i) {
+      const int here = static_cast<int>(pixels[i / kLanes<T>].end[i % kLanes<T>]);
+      if (here > end[i / kGroupPixels]) end[i / kGroupPixels] = here;
+      if (here > next) next = here;
+    }
+  }
+  void wake(int k) {
+    next = 0;
+    for (int group = 0; group < kGroupPixels; ++group) {
+      if (k < end[group]) {
+        active |= 1u << group;
+      } else if (end[group] > next) {
+        next = end[group];
+      }
+    }
+  }
+};
+
+// Calls visit(plain, k, splat, hits, i, dx, dy, pixels of the pack, sums) for what the forward composited, back to
+// front, and writes each pair's record: kSize sums over the tile's pixels.
+template <int kSize, unsigned kNeeds, class T, class Visit>
+BEAGS_INLINE void walk_back(const Job<T>& job, int tile, PixelGradients<T>* pixels, Visit visit) {
+  const Centres<T> centre(job, tile);
+  Waking<T> waking(pixels);
+  const Pair* pairs = job.pairs + job.tile_start[tile];
+  Hits<T> hits;
+  for (int k = static_cast<int>(job.tile_start[tile + 1] - job.tile_start[tile]) - 1; k >= 0; --k) {
+    if (k >= kPrefetched) {
+      prefetch(job, pairs[k - kPrefetched]);
+      const char* record =
+          reinterpret_cast<const char*>(job.records + static_cast<int64_t>(pairs[k - kPrefetched].record) * kSize);
+      __builtin_prefetch(record, 1);
+      __builtin_prefetch(record + kSize * sizeof(T) - 1, 1);
+    }
+    if (k < waking.next) waking.wake(k);
+    const Splat<T>& splat = job.splats[pairs[k].splat];
+    collect<kNeeds>(job, splat, pairs[k].mask & waking.active, centre, hits,
+                    [&](int pack)
+                        __attribute__((always_inline)) { return all(static_cast<T>(k)) < load(pixels[pack].end); });
+    Vector<T> sums[kSize] = {};
+    const auto each = [&](auto plain) __attribute__((always_inline)) {
+      for (int i = 0; i < hits.count; ++i) {
+        const int pack = hits.pack[i];
+        const Real<T> dx = centre.pack_x(pack) - all(splat.cx), dy = centre.pack_y(pack) - all(splat.cy);
+        visit(plain, k, splat, hits, i, dx, dy, pixels[pack], sums);
+      }
+    };
+    if (splat.plain) {
+      each(Constant<true>{});
+    } else {
+      each(Constant<false>{});
+    }
+    T* record = job.records + static_cast<int64_t>(pairs[k].record) * kSize;
+    for (int i = 0; i < kSize; i += 4) Register<T>::sum4(sums + i, record + i);
   }
 }
 
-template <class T>
+template <Parts kWanted, class T>
 void backward(const Job<T>& job, int tile) {
-  static_assert(kRecordSize % 4 == 0, "sum_lanes takes four at a time");
-  const Centres<T> centre(job, tile);
-  Gradients<T> pixels[kTilePacks<T>];
-  load_gradients(job, tile, pixels);
-  int end = 0, group_end[kGroupPixels] = {};  // one past the last pair that reaches the tile, and each group
-  for (int pack = 0; pack < kTilePacks<T>; ++pack) {
-    for (int lane = 0; lane < Simd<T>::kLanes; ++lane) {
-      const int last = static_cast<int>(pixels[pack].last[lane]);
-      if (last > group_end[pack / kPacks<T>]) group_end[pack / kPacks<T>] = last;
-      if (last > end) end = last;
-    }
-  }
-  const int64_t start = job.tile_start[tile];
-  const int pairs = static_cast<int>(job.tile_start[tile + 1] - start);
-  for (int k = pairs - 1; k >= 0; --k) {
-    const Pair pair = job.pairs[start + k];
-    Real<T> sums[kRecordSize] = {};
-    if (k < end) {
-      const Splat<T>& splat = job.splats[pair.splat];
-      for (unsigned groups = pair.mask; groups; groups &= groups - 1) {
-        const int group = __builtin_ctz(groups);
-        if (k >= group_end[group]) continue;
-        for (int pack = group * kPacks<T>; pack < (group + 1) * kPacks<T>; ++pack) {
-          Hit<T> hit;
-          const Mask<T> wanted = pixels[pack].last > k;
-          if (!evaluate(job, splat, centre.x[pack], centre.y[pack], wanted, hit)) continue;
-          add_gradients(job, k, splat, hit, pixels[pack], sums);
-        }
-      }
-    }
-    T* record = job.records + static_cast<int64_t>(pair.record) * kRecordSize;
-    for (int i = 0; i < kRecordSize; i += 4) sum_lanes(sums + i, record + i);
-  }
+  PixelGradients<T> pixels[kTilePacks<T>] = {};
+  load_gradients<kWanted>(job, tile, pixels);
+  constexpr unsigned kNeeds =
+      kNeedShape | (kWanted & (kGeometry | kDistortion) ? kNeedDepth : 0) | (kWanted & kDistortion ? kNeedNearness : 0);
+  walk_back<record_size(kWanted), kNeeds>(
+      job, tile, pixels,
+      [&](auto plain, int k, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> dx, Real<T> dy,
+          PixelGradients<T>& p, Vector<T>* sums) __attribute__((always_inline)) {
+        add_gradients<kWanted, decltype(plain)::value>(job, k, s, hits, i, dx, dy, p, sums);
+      });
+}
+
+// Towards the colours and the background alone: dC/dc is w, and nothing behind a hit matters.
+template <class T>
+void backward_colors(const Job<T>& job, int tile) {
+  PixelGradients<T> pixels[kTilePacks<T>] = {};
+  load_gradients<0>(job, tile, pixels);
+  walk_back<kColorRecord, 0>(job, tile, pixels,
+                             [&](auto, int, const Splat<T>&, const Hits<T>& hits, int i, Real<T>, Real<T>,
+                                 PixelGradients<T>& p, Vector<T>* sums) __attribute__((always_inline)) {
+                               const Real<T> alpha = hits.get(hits.alpha, i),
+                                             before = load(p.transmittance) / (all(T(1)) - alpha);
+                               store(p.transmittance, before);
+                               for (int c = 0; c < 3; ++c) add(sums[kColor + c], alpha * before, load(p.g_color[c]));
+                             });
 }
 
 }  // namespace BEAGS_ISA

@@ -3,10 +3,10 @@
 #include <algorithm>
 #include <cstring>
 
+#include "extent.h"
+
 namespace beags {
 namespace {
-
-constexpr int64_t kChunk = 512;  // surfels that one thread bins at a time
 
 template <class T>
 struct BitsOf;
@@ -21,7 +21,7 @@ struct BitsOf<double> {
 
 // Stable radix sort by depth. Depths are positive, so their bits rise as they do.
 template <class T>
-void sort_by_depth(const Splat<T>* splats, std::vector<int32_t>& indices) {
+void sort_by_depth(const T* depths, std::vector<int32_t>& indices) {
   using Bits = typename BitsOf<T>::type;
   struct Item {
     Bits key;
@@ -33,7 +33,7 @@ void sort_by_depth(const Splat<T>* splats, std::vector<int32_t>& indices) {
   std::vector<Item> items(n), other(n);
   std::vector<uint32_t> counts(static_cast<size_t>(kPasses) << kDigit);
   for (size_t i = 0; i < n; ++i) {
-    std::memcpy(&items[i].key, &splats[indices[i]].z, sizeof(Bits));
+    std::memcpy(&items[i].key, depths + indices[i], sizeof(Bits));
     items[i].index = indices[i];
     for (int pass = 0; pass < kPasses; ++pass) {
       ++counts[(pass << kDigit) + ((items[i].key >> (pass * kDigit)) & ((1u << kDigit) - 1))];
@@ -53,86 +53,67 @@ void sort_by_depth(const Splat<T>* splats, std::vector<int32_t>& indices) {
   for (size_t i = 0; i < n; ++i) indices[i] = items[i].index;
 }
 
-struct Reach {
-  int32_t tile, splat;
-  uint16_t mask;
-};
+}  // namespace
 
-// The bits of one row of groups for the pixels of `columns`, in the tile that starts at group column `first`.
-unsigned row_bits(Extent::Columns columns, int first) {
-  const int low = std::max(columns.first / kGroup - first, 0), high = std::min(columns.last / kGroup - first, 3);
-  return columns.first > columns.last || low > high ? 0u : ((2u << (high - low)) - 1u) << low;
-}
-
-// Adds the tiles that the surfel reaches; returns whether it is on the screen.
 template <class T>
-bool reach(const View& view, const Splat<T>& splat, int32_t index, std::vector<Reach>& out) {
+bool find_tiles(const View& view, const Splat<T>& splat, std::vector<Reach>& out) {
   const Extent extent(view, splat);
   const int tiles_x = tiles_along(view.width);
   if (extent.first_row() > extent.last_row()) return extent.on_screen();
   for (int tile_y = extent.first_row() / kTile; tile_y <= extent.last_row() / kTile; ++tile_y) {
-    Extent::Columns columns[kGroup][2];
-    int first = view.width, last = -1;
+    const Bands bands = extent.bands(tile_y);
+    int first = tiles_x * kGroup, last = -1;
     for (int row = 0; row < kGroup; ++row) {
-      const int y = tile_y * kTile + row * kGroup;
-      for (int which = 0; which < 2; ++which) {
-        const bool outside = y + kGroup - 1 < extent.first_row() || y > extent.last_row();
-        const Extent::Columns here = outside ? Extent::Columns{0, -1} : extent.columns(y, which);
-        columns[row][which] = here;
-        if (here.first > here.last) continue;
-        first = std::min(first, here.first);
-        last = std::max(last, here.last);
-      }
+      if (bands.first[row] > bands.last[row]) continue;
+      first = std::min(first, bands.first[row]);
+      last = std::max(last, bands.last[row]);
     }
-    if (first > last) continue;
-    for (int tile_x = first / kTile; tile_x <= last / kTile; ++tile_x) {
+    for (int tile_x = first / kGroup; tile_x * kGroup <= last; ++tile_x) {
       unsigned mask = 0;
       for (int row = 0; row < kGroup; ++row) {
-        const int group = tile_x * kGroup;
-        mask |= (row_bits(columns[row][0], group) | row_bits(columns[row][1], group)) << (kGroup * row);
+        const int from = std::max(bands.first[row] - tile_x * kGroup, 0);
+        const int to = std::min(bands.last[row] - tile_x * kGroup, kGroup - 1);
+        const unsigned bits = from > to ? 0 : (2u << to) - (1u << from);
+        mask |= bits << (kGroup * row);
       }
-      if (mask) out.push_back({tile_y * tiles_x + tile_x, index, static_cast<uint16_t>(mask)});
+      if (mask) out.push_back({tile_y * tiles_x + tile_x, static_cast<uint16_t>(mask)});
     }
   }
   return extent.on_screen();
 }
 
-}  // namespace
+template bool find_tiles(const View&, const Splat<float>&, std::vector<Reach>&);
+template bool find_tiles(const View&, const Splat<double>&, std::vector<Reach>&);
 
 template <class T>
-Bins bin(const View& view, const Splat<T>* splats, std::vector<int32_t> drawn, bool* visible, int threads) {
+Bins bin(const View& view, const std::vector<std::vector<Reach>>& reached, std::vector<int64_t> record_start,
+         const T* depths) {
   Bins bins;
-  sort_by_depth(splats, drawn);
-  bins.order = std::move(drawn);
-  const int64_t n = static_cast<int64_t>(bins.order.size()), chunks = (n + kChunk - 1) / kChunk;
-  std::vector<std::vector<Reach>> reached(chunks);
-  bins.record_start.assign(n + 1, 0);
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
-  for (int64_t chunk = 0; chunk < chunks; ++chunk) {
-    for (int64_t rank = chunk * kChunk; rank < std::min(n, (chunk + 1) * kChunk); ++rank) {
-      const size_t before = reached[chunk].size();
-      const int32_t index = bins.order[rank];
-      visible[index] = reach(view, splats[index], index, reached[chunk]);
-      bins.record_start[rank + 1] = static_cast<int64_t>(reached[chunk].size() - before);
-    }
+  bins.record_start = std::move(record_start);
+  const int32_t n = static_cast<int32_t>(bins.record_start.size()) - 1;
+  for (int32_t i = 0; i < n; ++i) {
+    if (bins.record_start[i] < bins.record_start[i + 1]) bins.order.push_back(i);
   }
-  for (int64_t rank = 0; rank < n; ++rank) bins.record_start[rank + 1] += bins.record_start[rank];
+  sort_by_depth(depths, bins.order);
 
   bins.tile_start.assign(static_cast<size_t>(tiles_along(view.width)) * tiles_along(view.height) + 1, 0);
   for (const auto& chunk : reached) {
     for (const Reach& at : chunk) ++bins.tile_start[at.tile + 1];
   }
   for (size_t tile = 1; tile < bins.tile_start.size(); ++tile) bins.tile_start[tile] += bins.tile_start[tile - 1];
-  bins.pairs.resize(bins.tile_start.back());
+  bins.pairs.resize(bins.tile_start.back() + kPrefetched);
   std::vector<int64_t> next(bins.tile_start.begin(), bins.tile_start.end() - 1);
-  int32_t record = 0;
-  for (const auto& chunk : reached) {
-    for (const Reach& at : chunk) bins.pairs[next[at.tile]++] = {at.splat, record++, at.mask};
+  for (const int32_t surfel : bins.order) {
+    const int64_t chunk = surfel / kChunk, first = bins.record_start[surfel], end = bins.record_start[surfel + 1];
+    const Reach* tiles = reached[chunk].data() + (first - bins.record_start[chunk * kChunk]);
+    for (int64_t record = first; record < end; ++record, ++tiles) {
+      bins.pairs[next[tiles->tile]++] = {surfel, static_cast<int32_t>(record), tiles->mask};
+    }
   }
   return bins;
 }
 
-template Bins bin(const View&, const Splat<float>*, std::vector<int32_t>, bool*, int);
-template Bins bin(const View&, const Splat<double>*, std::vector<int32_t>, bool*, int);
+template Bins bin(const View&, const std::vector<std::vector<Reach>>&, std::vector<int64_t>, const float*);
+template Bins bin(const View&, const std::vector<std::vector<Reach>>&, std::vector<int64_t>, const double*);
 
 }  // namespace beags

@@ -9,148 +9,210 @@ namespace beags {
 namespace BEAGS_ISA {
 
 template <class T>
-constexpr int kPacks = kGroupPixels / Simd<T>::kLanes;  // vectors in a group of 4 x 4 pixels
+constexpr int kPacks = kGroupPixels / kLanes<T>;  // packs of pixels, one lane each, in a group of 4 x 4
 template <class T>
 constexpr int kTilePacks = kGroupPixels * kPacks<T>;
 
-template <class T>
-BEAGS_INLINE Real<T> load(const T* from) {
-  Real<T> value;
-  __builtin_memcpy(&value, from, sizeof value);
-  return value;
-}
-template <class T>
-BEAGS_INLINE void store(T* to, Real<T> value) {
-  __builtin_memcpy(to, &value, sizeof value);
-}
-// int32 in memory, lanes as wide as T in registers.
-template <class T>
-BEAGS_INLINE Mask<T> load_integers(const int32_t* from) {
-  Mask<T> value;
-  for (int lane = 0; lane < Simd<T>::kLanes; ++lane) value[lane] = from[lane];
-  return value;
-}
-template <class T>
-BEAGS_INLINE void store_integers(int32_t* to, Mask<T> value) {
-  for (int lane = 0; lane < Simd<T>::kLanes; ++lane) to[lane] = static_cast<int32_t>(value[lane]);
-}
-
-// Where a lane of a tile lies in the image.
-struct Place {
-  int x, y;
-};
-template <class T>
-BEAGS_INLINE Place place(const Job<T>& job, int tile, int pack, int lane) {
-  const int group = pack / kPacks<T>, pixel = (pack % kPacks<T>)*Simd<T>::kLanes + lane;
-  return {tile % job.tiles_x * kTile + group % kGroup * kGroup + pixel % kGroup,
-          tile / job.tiles_x * kTile + group / kGroup * kGroup + pixel / kGroup};
-}
-
-// Calls visit(lane's index into the image, pack, lane) for the lanes inside the image, in a fixed order.
+// Calls visit(index into the image, pack, lane) for the pixels of a tile that lie inside the image, in a fixed order.
 template <class T, class Visit>
 BEAGS_INLINE void for_each_pixel(const Job<T>& job, int tile, Visit visit) {
-  for (int pack = 0; pack < kTilePacks<T>; ++pack) {
-    for (int lane = 0; lane < Simd<T>::kLanes; ++lane) {
-      const Place at = place(job, tile, pack, lane);
-      if (at.x < job.width && at.y < job.height) visit(static_cast<int64_t>(at.y) * job.width + at.x, pack, lane);
+  const int x0 = tile % job.tiles_x * kTile, y0 = tile / job.tiles_x * kTile;
+  for (int group = 0; group < kGroupPixels; ++group) {
+    const int x = x0 + group % kGroup * kGroup, y = y0 + group / kGroup * kGroup;
+    const int columns = job.width - x < kGroup ? job.width - x : kGroup;
+    const int rows = job.height - y < kGroup ? job.height - y : kGroup;
+    for (int row = 0; row < rows; ++row) {
+      const int64_t at = static_cast<int64_t>(y + row) * job.width + x;
+      for (int column = 0; column < columns; ++column) {
+        const int pixel = kGroupPixels * group + kGroup * row + column;
+        visit(at + column, pixel / kLanes<T>, pixel % kLanes<T>);
+      }
     }
   }
 }
 
-// Pixel centres (the pixel plus 0.5).
+// Where a pack's values lie among the 256 of a tile.
+template <class T>
+BEAGS_INLINE int64_t saved_at(int tile, int pack) {
+  return static_cast<int64_t>(tile) * kTilePixels + pack * kLanes<T>;
+}
+
+// The pixels' centres (the pixel plus 0.5), by pack.
 template <class T>
 struct Centres {
-  Real<T> x[kTilePacks<T>], y[kTilePacks<T>];
+  alignas(64) T x[kTilePixels];
+  T y[kTilePixels];
 
   Centres(const Job<T>& job, int tile) {
-    for (int pack = 0; pack < kTilePacks<T>; ++pack) {
-      for (int lane = 0; lane < Simd<T>::kLanes; ++lane) {
-        const Place at = place(job, tile, pack, lane);
-        x[pack][lane] = at.x + T(0.5);
-        y[pack][lane] = at.y + T(0.5);
-      }
+    const int x0 = tile % job.tiles_x * kTile, y0 = tile / job.tiles_x * kTile;
+    for (int i = 0; i < kTilePixels; ++i) {
+      const int group = i / kGroupPixels, pixel = i % kGroupPixels;
+      x[i] = static_cast<T>(x0 + group % kGroup * kGroup + pixel % kGroup) + T(0.5);
+      y[i] = static_cast<T>(y0 + group / kGroup * kGroup + pixel / kGroup) + T(0.5);
     }
   }
+
+  // Registers of whole rows of a group are equal in x: what is computed from x alone is then computed once.
+  BEAGS_INLINE Real<T> pack_x(int pack) const {
+    Real<T> out = load(x + pack * kLanes<T>);
+    if constexpr (kRegister<T> % kGroup == 0) {
+      BEAGS_UNROLL for (int i = 1; i < kParts<T>; ++i) out.part[i] = out.part[0];
+    }
+    return out;
+  }
+  BEAGS_INLINE Real<T> pack_y(int pack) const { return load(y + pack * kLanes<T>); }
 };
 
-// One surfel at the pixels of one vector.
+// What later steps need of a hit beside alpha.
+constexpr unsigned kNeedDepth = 1, kNeedNearness = 2, kNeedShape = 4;
+
+// One surfel at the packs of a tile where it contributes. In lanes where it does not, all is 0.
 template <class T>
-struct Hit {
-  Real<T> dx, dy, q0, q1, inverse;  // inverse = 1 / q2: only where `plane`
-  Real<T> rho, depth, alpha;
-  Mask<T> on;       // it contributes
-  Mask<T> plane;    // rho3d wins; else the low-pass does
-  Mask<T> clamped;  // alpha was above its maximum
+struct Hits {
+  int count;
+  int pack[kTilePacks<T>];
+  alignas(64) T alpha[kTilePixels];
+  T depth[kTilePixels], nearness[kTilePixels];  // d and k / d of the hit
+  T inverse[kTilePixels];                       // 1 / q2, and 0 where the low-pass wins over rho3d
+  T rho[kTilePixels];
+
+  BEAGS_INLINE Real<T> get(const T* field, int i) const { return load(field + i * kLanes<T>); }
 };
 
-// False if it contributes to no lane of `wanted`. The forward and the backward must agree in every bit.
-template <class T>
-BEAGS_INLINE bool evaluate(const Job<T>& job, const Splat<T>& s, Real<T> x, Real<T> y, Mask<T> wanted, Hit<T>& hit) {
-  const Real<T> zero = {};
-  hit.dx = x - s.cx;
-  hit.dy = y - s.cy;
-  hit.q0 = fma(zero + s.u_x, hit.dx, s.u_y * hit.dy);  // E2
-  hit.q1 = fma(zero + s.v_x, hit.dx, s.v_y * hit.dy);
-  const Real<T> q2 = fma(zero + s.w_x, hit.dx, fma(zero + s.w_y, hit.dy, zero + s.w_0));
-  hit.inverse = T(1) / q2;
-  const Real<T> u = hit.q0 * hit.inverse, v = hit.q1 * hit.inverse;
-  const Real<T> rho3d = fma(u, u, v * v);
-  const Real<T> rho2d = T(2) * fma(hit.dx, hit.dx, hit.dy * hit.dy);
-  hit.plane = rho3d <= rho2d;  // false for NaN: an edge-on surfel at its centre
-  hit.rho = hit.plane ? rho3d : rho2d;
-  hit.depth = hit.plane ? s.det * hit.inverse : zero + s.z;
-  const Real<T> exponent = fma(zero - T(0.5), hit.rho, zero + s.log_opacity);
-  hit.on = wanted & (exponent >= T(kLogMinAlpha)) & (hit.depth >= job.near_plane);
-  if (!any(hit.on)) return false;
-  const Real<T> alpha = exponential(exponent);  // E3
-  hit.clamped = alpha > T(kMaxAlpha);
-  hit.alpha = hit.clamped ? zero + T(kMaxAlpha) : alpha;
-  return true;
+// Adds the pack to `hits` if the surfel contributes to one of its lanes that are `wanted`. A plain splat needs neither
+// the low-pass nor the near plane nor alpha's maximum. The forward and the backward must agree in every bit.
+template <bool kPlain, unsigned kNeeds, class T>
+BEAGS_INLINE void evaluate(const Job<T>& job, const Splat<T>& s, int pack, Real<T> dx, Real<T> dy, Mask<T> wanted,
+                           Hits<T>& hits) {
+  const Real<T> q0 = fma(all(s.u_y), dy, all(s.u_x) * dx);  // E2
+  const Real<T> q1 = fma(all(s.v_y), dy, all(s.v_x) * dx);
+  const Real<T> q2 = fma(all(s.w_y), dy, fma(all(s.w_x), dx, all(s.w_0)));
+  Real<T> inverse = all(T(1)) / q2;
+  const Real<T> u = q0 * inverse, v = q1 * inverse;
+  Real<T> rho = fma(u, u, v * v), depth = all(s.det) * inverse, nearness = all(s.nearness_det) * q2;
+  if (!kPlain) {
+    const Real<T> half = fma(dy, dy, dx * dx), rho2d = half + half;
+    const Mask<T> plane = rho <= rho2d;  // false for NaN: an edge-on surfel at its centre
+    rho = min(rho, rho2d);
+    inverse = keep(plane, inverse);
+    depth = select(plane, depth, all(s.z));
+    nearness = select(plane, nearness, all(s.nearness_z));
+  }
+  const Real<T> exponent = fma(all(T(-0.5 / kLn2)), rho, all(s.log2_opacity));
+  Mask<T> on = wanted & (all(T(kLog2MinAlpha)) <= exponent);
+  if (!kPlain) on = on & (all(job.near_plane) <= depth);
+  Real<T> alpha = exp2(exponent);  // E3
+  if (!kPlain) alpha = min(alpha, all(T(kMaxAlpha)));
+  const int at = hits.count * kLanes<T>;
+  store(hits.alpha + at, keep(on, alpha));
+  if (kNeeds & kNeedDepth) store(hits.depth + at, keep(on, depth));
+  if (kNeeds & kNeedNearness) store(hits.nearness + at, keep(on, nearness));
+  if (kNeeds & kNeedShape) {
+    store(hits.inverse + at, keep(on, inverse));
+    store(hits.rho + at, keep(on, rho));
+  }
+  hits.pack[hits.count] = pack;
+  hits.count += any(on);
 }
 
-// Composites a tile front to back: calls visit(k, splat, pack, hit, on, w, before, after) for each surfel and vector of
-// pixels that it reaches; k counts pairs within the tile, on are the lanes it adds to, w = 0 elsewhere; before and
-// after are T. Leaves T in `transmittance`.
-template <class T, class Visit>
-BEAGS_INLINE void composite(const Job<T>& job, int tile, Real<T>* transmittance, Visit visit) {
-  const Centres<T> centre(job, tile);
+template <bool kValue>
+struct Constant {
+  static constexpr bool value = kValue;
+};
+
+BEAGS_INLINE int first_bit(unsigned bits) { return __builtin_ctz(bits); }
+
+template <class T>
+BEAGS_INLINE void prefetch(const Job<T>& job, const Pair& pair) {
+  const char* splat = reinterpret_cast<const char*>(job.splats + pair.splat);
+  for (unsigned line = 0; line < sizeof(Splat<T>); line += 64) __builtin_prefetch(splat + line);
+}
+
+// A tile on its way front to back.
+template <class T>
+struct Walk {
+  Centres<T> centre;
+  alignas(64) T transmittance[kTilePixels];
+  T end[kTilePixels];  // pairs before the one at which the pixel stopped
   Mask<T> live[kTilePacks<T>];
-  for (int pack = 0; pack < kTilePacks<T>; ++pack) {
-    live[pack] = Mask<T>{};
-    transmittance[pack] = Real<T>{} + T(1);
+  unsigned active = 0;    // groups with a live pixel
+  int64_t evaluated = 0;  // packs so far
+
+  Walk(const Job<T>& job, int tile) : centre(job, tile) {
+    const int pairs = static_cast<int>(job.tile_start[tile + 1] - job.tile_start[tile]);
+    T inside[kTilePixels] = {};
+    for_each_pixel(job, tile, [&](int64_t, int pack, int lane) {
+      inside[pack * kLanes<T> + lane] = T(1);
+      active |= 1u << (pack / kPacks<T>);
+    });
+    for (int i = 0; i < kTilePixels; ++i) {
+      transmittance[i] = T(1);
+      end[i] = inside[i] * static_cast<T>(pairs);
+    }
+    for (int pack = 0; pack < kTilePacks<T>; ++pack) live[pack] = all(T(0.5)) < load(inside + pack * kLanes<T>);
   }
-  unsigned active = 0;  // groups with a live pixel
-  for_each_pixel(job, tile, [&](int64_t, int pack, int lane) {
-    live[pack][lane] = -1;
-    active |= 1u << (pack / kPacks<T>);
-  });
-  const int64_t start = job.tile_start[tile];
-  const int pairs = static_cast<int>(job.tile_start[tile + 1] - start);
-  for (int k = 0; k < pairs && active; ++k) {
-    const Pair pair = job.pairs[start + k];
-    const Splat<T>& splat = job.splats[pair.splat];
-    for (unsigned groups = pair.mask & active; groups; groups &= groups - 1) {
-      const int group = __builtin_ctz(groups);
-      bool stopped = false;
-      for (int pack = group * kPacks<T>; pack < (group + 1) * kPacks<T>; ++pack) {
-        Hit<T> hit;
-        if (!evaluate(job, splat, centre.x[pack], centre.y[pack], live[pack], hit)) continue;
-        const Real<T> before = transmittance[pack], after = before * (T(1) - hit.alpha);
-        const Mask<T> stop = hit.on & (after < T(kMinTransmittance));
-        if (any(stop)) {
-          live[pack] &= ~stop;
-          stopped = true;
-        }
-        const Mask<T> on = hit.on & ~stop;
-        const Real<T> w = on ? hit.alpha * before : Real<T>{};
-        visit(k, splat, pack, hit, on, w, before, after);
-        transmittance[pack] = on ? after : before;
+
+  void stop(int pack, Mask<T> stopped, int k) {
+    T* at = end + pack * kLanes<T>;
+    store(at, select(stopped, all(static_cast<T>(k)), load(at)));
+    live[pack] = without(live[pack], stopped);
+    const int group = pack / kPacks<T>;
+    for (int i = 0; i < kPacks<T>; ++i) {
+      if (any(live[group * kPacks<T> + i])) return;
+    }
+    active &= ~(1u << group);
+  }
+};
+
+// Evaluates a surfel at the groups of pixels in `groups`; wanted(pack) are the lanes that count. That this comes before
+// anything is done with the hits keeps the chains of dependent operations short.
+template <unsigned kNeeds, class T, class Wanted>
+BEAGS_INLINE void collect(const Job<T>& job, const Splat<T>& splat, unsigned groups, const Centres<T>& centre,
+                          Hits<T>& hits, Wanted wanted) {
+  const auto each = [&](auto plain) __attribute__((always_inline)) {
+    for (; groups; groups &= groups - 1) {
+      const int first = first_bit(groups) * kPacks<T>;
+      for (int pack = first; pack < first + kPacks<T>; ++pack) {
+        const Real<T> dx = centre.pack_x(pack) - all(splat.cx), dy = centre.pack_y(pack) - all(splat.cy);
+        evaluate<decltype(plain)::value, kNeeds>(job, splat, pack, dx, dy, wanted(pack), hits);
       }
-      if (stopped) {
-        Mask<T> left = live[group * kPacks<T>];
-        for (int i = 1; i < kPacks<T>; ++i) left |= live[group * kPacks<T> + i];
-        if (!any(left)) active &= ~(1u << group);
+    }
+  };
+  hits.count = 0;
+  if (splat.plain) {
+    each(Constant<true>{});
+  } else {
+    each(Constant<false>{});
+  }
+}
+
+// Composites a tile front to back: calls visit(k, splat, hits, i, w, before) for each surfel and each i of its hits; k
+// counts pairs within the tile, w is 0 in lanes where nothing is added, `before` is T.
+template <unsigned kNeeds, class T, class Visit>
+BEAGS_INLINE void composite(const Job<T>& job, int tile, Walk<T>& walk, Visit visit) {
+  const Pair* pairs = job.pairs + job.tile_start[tile];
+  const int count = static_cast<int>(job.tile_start[tile + 1] - job.tile_start[tile]);
+  Hits<T> hits;
+  for (int k = 0; k < count && walk.active; ++k) {
+    prefetch(job, pairs[k + kPrefetched]);
+    const Splat<T>& splat = job.splats[pairs[k].splat];
+    const unsigned groups = pairs[k].mask & walk.active;
+    walk.evaluated += __builtin_popcount(groups) * kPacks<T>;
+    collect<kNeeds>(job, splat, groups, walk.centre, hits,
+                    [&](int pack) __attribute__((always_inline)) { return walk.live[pack]; });
+    for (int i = 0; i < hits.count; ++i) {
+      const int pack = hits.pack[i];
+      T* transmittance = walk.transmittance + pack * kLanes<T>;
+      const Real<T> before = load(transmittance);
+      Real<T> w = hits.get(hits.alpha, i) * before, after = before - w;
+      const Mask<T> stopped = after < all(T(kMinTransmittance));
+      if (any(stopped)) {
+        walk.stop(pack, stopped, k);
+        w = drop(stopped, w);
+        after = before - w;
       }
+      store(transmittance, after);
+      visit(k, splat, hits, i, w, before);
     }
   }
 }

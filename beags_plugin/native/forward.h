@@ -6,82 +6,109 @@
 namespace beags {
 namespace BEAGS_ISA {
 
+// Sums of one pack of pixels.
 template <class T>
-void forward(const Job<T>& job, int tile) {
-  struct Pixels {
-    Real<T> color[3], normal[3], depth, median_depth, inverse, moment1, moment2, boundary;
-    Mask<T> last, median_pair, target;
-  };
-  Pixels pixels[kTilePacks<T>];
-  Real<T> transmittance[kTilePacks<T>];
-  for (Pixels& p : pixels) {
-    p = Pixels{};
-    p.median_pair = ~p.median_pair;  // -1
-    p.target += kIgnore;
-  }
-  if (job.target) {
-    for_each_pixel(job, tile, [&](int64_t at, int pack, int lane) { pixels[pack].target[lane] = job.target[at]; });
-  }
+struct alignas(64) Pixels {
+  T color[3][kLanes<T>], normal[3][kLanes<T>], depth[kLanes<T>];
+  T median_depth[kLanes<T>], median_pair[kLanes<T>];
+  T first[kLanes<T>], moment1[kLanes<T>], moment2[kLanes<T>];
+  T boundary[kLanes<T>], target[kLanes<T>];
+};
 
-  composite(
-      job, tile, transmittance,
-      [&](int k, const Splat<T>& s, int pack, const Hit<T>& hit, Mask<T> on, Real<T> w, Real<T> before, Real<T> after) {
-        Pixels& p = pixels[pack];
-        const Mask<T> zero = {};
-        p.last = on ? zero + (k + 1) : p.last;
-        for (int c = 0; c < 3; ++c) p.color[c] = fma(w, Real<T>{} + s.color[c], p.color[c]);
-        if (job.geometry) {
-          for (int c = 0; c < 3; ++c) p.normal[c] = fma(w, Real<T>{} + s.normal[c], p.normal[c]);
-          const Real<T> depth = on ? hit.depth : Real<T>{};  // where it is off, it may be infinite
-          p.depth = fma(w, depth, p.depth);
-          const Mask<T> passes = on & (before > T(0.5)) & (after <= T(0.5));
-          p.median_depth = passes ? depth : p.median_depth;
-          p.median_pair = passes ? zero + k : p.median_pair;
-        }
-        if (job.distortion) {
-          const Real<T> inverse = T(1) / (on ? hit.depth : Real<T>{} + T(1));
-          p.inverse = on & (p.inverse == T(0)) ? inverse : p.inverse;
-          const Real<T> m = job.mapping * (p.inverse - inverse);  // m_i - m_first: the differences are all that counts
-          p.moment1 = fma(w, m, p.moment1);
-          p.moment2 = fma(w, m * m, p.moment2);
-        }
-        if (job.target) {
-          const Mask<T> wrong = (p.target != s.class_id) & (p.target != kIgnore);  // E7
-          p.boundary += wrong ? w : Real<T>{};
-        }
-      });
+template <class T>
+BEAGS_INLINE void accumulate(T* sum, Real<T> w, T value) {
+  store(sum, fma(w, all(value), load(sum)));
+}
 
+template <Parts kWanted, class T>
+BEAGS_INLINE void add_hit(int k, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> w, Real<T> before,
+                          Pixels<T>& p) {
+  for (int c = 0; c < 3; ++c) accumulate(p.color[c], w, s.color[c]);
+  if (kWanted & kGeometry) {
+    for (int c = 0; c < 3; ++c) accumulate(p.normal[c], w, s.normal[c]);
+    const Real<T> depth = hits.get(hits.depth, i);
+    store(p.depth, fma(w, depth, load(p.depth)));
+    // The last hit in front of which T > 0.5: where T ends below that, it is the one at which T passes 0.5.
+    const Mask<T> passes = all(T(0)) < keep(all(T(0.5)) < before, w);
+    store(p.median_depth, select(passes, depth, load(p.median_depth)));
+    store(p.median_pair, select(passes, all(static_cast<T>(k)), load(p.median_pair)));
+  }
+  if (kWanted & kDistortion) {
+    const Real<T> nearness = keep(all(T(0)) < w, hits.get(hits.nearness, i));
+    const Real<T> seen = load(p.first), first = select(seen == all(T(0)), nearness, seen);
+    store(p.first, first);
+    const Real<T> m = first - nearness;  // m_i - m_first: the differences are all that counts
+    const Real<T> wm = w * m;
+    store(p.moment1, load(p.moment1) + wm);
+    store(p.moment2, fma(wm, m, load(p.moment2)));
+  }
+  if (kWanted & kBoundary) {
+    const Mask<T> right = load(p.target) == all(static_cast<T>(s.class_id));  // E7
+    store(p.boundary, load(p.boundary) + drop(right, w));
+  }
+}
+
+template <Parts kWanted, class T>
+BEAGS_INLINE void save(const Job<T>& job, int tile, const Walk<T>& walk, const Pixels<T>* pixels) {
+  const Saved<T>& to = job.saved;
   for (int pack = 0; pack < kTilePacks<T>; ++pack) {
-    const Pixels& p = pixels[pack];
-    const int64_t saved = static_cast<int64_t>(tile) * kTilePixels + pack * Simd<T>::kLanes;
-    store(job.end_transmittance + saved, transmittance[pack]);
-    store_integers<T>(job.last + saved, p.last);
-    if (job.geometry) {
-      store(job.depth_sum + saved, p.depth);
-      store_integers<T>(job.median_pair + saved, p.median_pair);
+    const Pixels<T>& p = pixels[pack];
+    const int64_t at = saved_at<T>(tile, pack);
+    store(to.end_transmittance + at, load(walk.transmittance + pack * kLanes<T>));
+    store(to.end + at, load(walk.end + pack * kLanes<T>));
+    if ((kWanted & kGeometry) && to.depth_sum) {
+      store(to.depth_sum + at, load(p.depth));
+      store(to.median_pair + at, load(p.median_pair));
     }
-    if (job.distortion) {
-      store(job.first_inverse_depth + saved, p.inverse);
-      store(job.moment1 + saved, p.moment1);
-      store(job.moment2 + saved, p.moment2);
+    if ((kWanted & kDistortion) && to.first) {
+      store(to.first + at, load(p.first));
+      store(to.moment1 + at, load(p.moment1));
+      store(to.moment2 + at, load(p.moment2));
     }
   }
-  for_each_pixel(job, tile, [&](int64_t at, int pack, int lane) {
-    const Pixels& p = pixels[pack];
-    const T end = transmittance[pack][lane], alpha = T(1) - end;  // E4: A = sum w = 1 - T
-    for (int c = 0; c < 3; ++c) job.color[3 * at + c] = p.color[c][lane] + end * job.background[c];
-    job.alpha[at] = alpha;
-    if (job.geometry) {
-      job.depth[at] = alpha > T(0) ? p.depth[lane] / alpha : T(0);
-      job.median_depth[at] = p.median_depth[lane];
-      for (int c = 0; c < 3; ++c) job.normal[3 * at + c] = p.normal[c][lane];
+}
+
+template <Parts kWanted, class T>
+void forward(const Job<T>& job, int tile) {
+  Walk<T> walk(job, tile);
+  Pixels<T> pixels[kTilePacks<T>] = {};
+  if ((kWanted & kBoundary) && job.target) {
+    for_each_pixel(job, tile,
+                   [&](int64_t at, int pack, int lane) { pixels[pack].target[lane] = static_cast<T>(job.target[at]); });
+  }
+  constexpr unsigned kNeeds = (kWanted & kGeometry ? kNeedDepth : 0) | (kWanted & kDistortion ? kNeedNearness : 0);
+  composite<kNeeds>(
+      job, tile, walk,
+      [&](int k, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> w, Real<T> before)
+          __attribute__((always_inline)) { add_hit<kWanted>(k, s, hits, i, w, before, pixels[hits.pack[i]]); });
+  if (kWanted & kGeometry) {
+    for (int pack = 0; pack < kTilePacks<T>; ++pack) {
+      Pixels<T>& p = pixels[pack];
+      const Mask<T> never = all(T(0.5)) < load(walk.transmittance + pack * kLanes<T>);
+      store(p.median_depth, drop(never, load(p.median_depth)));
+      store(p.median_pair, select(never, all(T(-1)), load(p.median_pair)));
     }
-    if (job.distortion) {
+  }
+  if (job.saved.end) save<kWanted>(job, tile, walk, pixels);
+  const Images<T>& to = job.images;
+  for_each_pixel(job, tile, [&](int64_t at, int pack, int lane) {
+    const Pixels<T>& p = pixels[pack];
+    const T end = walk.transmittance[pack * kLanes<T> + lane], alpha = T(1) - end;  // E4: A = sum w = 1 - T
+    for (int c = 0; c < 3; ++c) to.color[3 * at + c] = p.color[c][lane] + end * job.background[c];
+    to.alpha[at] = alpha;
+    if ((kWanted & kGeometry) && to.depth) {
+      to.depth[at] = alpha > T(0) ? p.depth[lane] / alpha : T(0);
+      to.median_depth[at] = p.median_depth[lane];
+      for (int c = 0; c < 3; ++c) to.normal[3 * at + c] = p.normal[c][lane];
+    }
+    if ((kWanted & kDistortion) && to.distortion) {
       // The sum over pairs, closed: A sum(w m^2) - (sum w m)^2; rounding must not make it negative.
       const T value = alpha * p.moment2[lane] - p.moment1[lane] * p.moment1[lane];
-      job.distortion_out[at] = value > T(0) ? value : T(0);
+      to.distortion[at] = value > T(0) ? value : T(0);
     }
-    if (job.boundary) job.boundary[at] = p.boundary[lane];
+    if ((kWanted & kBoundary) && to.boundary) {
+      to.boundary[at] = p.target[lane] == static_cast<T>(kIgnore) ? T(0) : p.boundary[lane];
+    }
   });
 }
 

@@ -2,72 +2,82 @@
 
 #include <algorithm>
 #include <cmath>
-#include <cstdlib>
-#include <cstring>
-#include <type_traits>
+#include <limits>
+
+#include "isa.h"
 
 namespace beags {
 namespace {
 
-bool use_avx2() {
-#if defined(__x86_64__)
-  static const bool use = [] {
-    const char* forced = std::getenv("BEAGS_ISA");
-    if (forced && std::strcmp(forced, "baseline") == 0) return false;
-    return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
-  }();
-  return use;
-#else
-  return false;
-#endif
-}
-
 template <class T>
-const Kernels<T>& kernels() {
-#if defined(__x86_64__)
-  if (use_avx2()) {
-    if constexpr (std::is_same_v<T, float>) return avx2::kKernelsF32;
-    if constexpr (std::is_same_v<T, double>) return avx2::kKernelsF64;
-  }
-#endif
-  if constexpr (std::is_same_v<T, float>) return baseline::kKernelsF32;
-  if constexpr (std::is_same_v<T, double>) return baseline::kKernelsF64;
+bool all_finite(const T* numbers, int count) {
+  T zero = 0;
+  for (int i = 0; i < count; ++i) zero += 0 * numbers[i];
+  return zero == 0;
 }
 
+// The transcendental functions are taken in T.
 template <class T>
 SurfelParameters parameters(const Inputs<T>& inputs, int64_t i) {
   SurfelParameters s;
   std::copy_n(inputs.means + 3 * i, 3, s.mean);
   std::copy_n(inputs.quats + 4 * i, 4, s.quat);
-  std::copy_n(inputs.log_scales + 2 * i, 2, s.log_scale);
-  s.opacity_logit = inputs.opacity_logits[i];
-  std::copy_n(inputs.colors + 3 * i, 3, s.color);
+  for (int axis = 0; axis < 2; ++axis) s.scale[axis] = std::exp(inputs.log_scales[2 * i + axis]);
+  const T logit = inputs.opacity_logits[i], faded = std::exp(-std::abs(logit));
+  s.log2_opacity = std::min(logit, T(0)) / kLn2 - std::log2(1 + faded);
+  s.transparency = (logit > 0 ? faded : T(1)) / (1 + faded);
   return s;
 }
 
-// Rounds to T; false if that overflows.
+// Rounds all but colour and class to T; false if that overflows.
 template <class T>
-bool narrow(const Splat<double>& from, int32_t class_id, Splat<T>& to) {
-  const double numbers[] = {from.cx,  from.cy,  from.u_x, from.u_y, from.v_x,         from.v_y,    from.w_x,
-                            from.w_y, from.w_0, from.det, from.z,   from.log_opacity, from.tilt_u, from.tilt_v};
-  T* fields[] = {&to.cx,  &to.cy,  &to.u_x, &to.u_y, &to.v_x,         &to.v_y,    &to.w_x,
-                 &to.w_y, &to.w_0, &to.det, &to.z,   &to.log_opacity, &to.tilt_u, &to.tilt_v};
-  bool finite = true;
-  for (size_t i = 0; i < sizeof numbers / sizeof *numbers; ++i) {
-    *fields[i] = static_cast<T>(numbers[i]);
-    finite = finite && std::isfinite(*fields[i]);
+bool narrow(const Splat<double>& from, Splat<T>& to) {
+  T zero = 0;
+  const auto round = [&](double number) {
+    const T rounded = static_cast<T>(number);
+    zero += 0 * rounded;  // NaN if one is not finite
+    return rounded;
+  };
+  to.cx = round(from.cx);
+  to.cy = round(from.cy);
+  to.u_x = round(from.u_x);
+  to.u_y = round(from.u_y);
+  to.v_x = round(from.v_x);
+  to.v_y = round(from.v_y);
+  to.w_x = round(from.w_x);
+  to.w_y = round(from.w_y);
+  to.w_0 = round(from.w_0);
+  to.det = round(from.det);
+  to.z = round(from.z);
+  to.nearness_z = round(from.nearness_z);
+  to.log2_opacity = round(from.log2_opacity);
+  to.tilt_u = round(from.tilt_u);
+  to.tilt_v = round(from.tilt_v);
+  // Edge-on, det = 0: no hit reads this, which must only not be NaN.
+  constexpr double kLargest = std::numeric_limits<T>::max();
+  to.nearness_det = static_cast<T>(std::clamp(from.nearness_det, -kLargest, kLargest));
+  for (int i = 0; i < 3; ++i) to.normal[i] = static_cast<T>(from.normal[i]);
+  to.plain = from.plain;
+  return zero == 0;
+}
+
+// Projects surfel i.
+template <class T>
+Fate place_surfel(const View& view, const Inputs<T>& inputs, int64_t i, Splat<T>& splat) {
+  if (!all_finite(inputs.means + 3 * i, 3) || !all_finite(inputs.quats + 4 * i, 4) ||
+      !all_finite(inputs.log_scales + 2 * i, 2) || !all_finite(inputs.opacity_logits + i, 1) ||
+      !all_finite(inputs.colors + 3 * i, 3)) {
+    return Fate::kNonFinite;
   }
-  for (int c = 0; c < 3; ++c) {
-    to.color[c] = static_cast<T>(from.color[c]);
-    to.normal[c] = static_cast<T>(from.normal[c]);
-  }
-  to.class_id = class_id;
-  return finite;
+  Splat<double> exact;
+  const Fate fate = project(view, parameters(inputs, i), exact);
+  if (fate != Fate::kDrawn) return fate;
+  std::copy_n(inputs.colors + 3 * i, 3, splat.color);
+  splat.class_id = inputs.class_ids ? inputs.class_ids[i] : 0;
+  return narrow(exact, splat) ? Fate::kDrawn : Fate::kNonFinite;
 }
 
 }  // namespace
-
-const char* instruction_set() { return use_avx2() ? "avx2" : "baseline"; }
 
 template <class T>
 Frame<T>::Frame(const View& view, const Inputs<T>& inputs, bool* visible, int threads)
@@ -76,24 +86,27 @@ Frame<T>::Frame(const View& view, const Inputs<T>& inputs, bool* visible, int th
       tiles_y_(tiles_along(view.height)),
       num_surfels_(inputs.count),
       splats_(new Splat<T>[inputs.count]) {
-  std::vector<Fate> fates(inputs.count);
-  // A team costs more than it brings below a few thousand surfels (tens of nanoseconds each).
-  const int team = inputs.count < 2000 ? 1 : threads;
-#pragma omp parallel for num_threads(team) schedule(static)
-  for (int64_t i = 0; i < inputs.count; ++i) {
-    Splat<double> splat;
-    fates[i] = project(view_, parameters(inputs, i), splat);
-    const int32_t class_id = inputs.class_ids ? inputs.class_ids[i] : 0;
-    if (fates[i] == Fate::kDrawn && !narrow(splat, class_id, splats_[i])) fates[i] = Fate::kNonFinite;
+  const int64_t n = inputs.count, chunks = (n + kChunk - 1) / kChunk;
+  std::vector<std::vector<Reach>> reached(chunks);
+  std::vector<int64_t> record_start(n + 1, 0), nonfinite(chunks, 0);
+  std::vector<T> depths(n);
+  const int team = n < kTeamSurfels ? 1 : threads;
+  // Determinism: chunks are of a fixed size and share nothing.
+#pragma omp parallel for num_threads(team) schedule(dynamic, 1)
+  for (int64_t chunk = 0; chunk < chunks; ++chunk) {
+    reached[chunk].reserve(4 * kChunk);
+    for (int64_t i = chunk * kChunk; i < std::min(n, (chunk + 1) * kChunk); ++i) {
+      const size_t before = reached[chunk].size();
+      const Fate fate = place_surfel(view_, inputs, i, splats_[i]);
+      nonfinite[chunk] += fate == Fate::kNonFinite;
+      visible[i] = fate == Fate::kDrawn && find_tiles(view_, splats_[i], reached[chunk]);
+      record_start[i + 1] = static_cast<int64_t>(reached[chunk].size() - before);
+      if (fate == Fate::kDrawn) depths[i] = splats_[i].z;
+    }
   }
-  std::vector<int32_t> drawn;
-  drawn.reserve(inputs.count);
-  for (int64_t i = 0; i < inputs.count; ++i) {
-    num_nonfinite_ += fates[i] == Fate::kNonFinite;
-    if (fates[i] == Fate::kDrawn) drawn.push_back(static_cast<int32_t>(i));
-    visible[i] = false;
-  }
-  bins_ = bin(view_, splats_.get(), std::move(drawn), visible, team);
+  for (int64_t i = 0; i < n; ++i) record_start[i + 1] += record_start[i];
+  for (const int64_t count : nonfinite) num_nonfinite_ += count;
+  bins_ = bin(view_, reached, std::move(record_start), depths.data());
 }
 
 template <class T>
@@ -104,98 +117,62 @@ Job<T> Frame<T>::job() const {
   job.tiles_x = tiles_x_;
   job.tiles_y = tiles_y_;
   job.near_plane = static_cast<T>(view_.near_plane);
-  job.mapping = static_cast<T>(view_.near_plane / (1 - view_.near_plane / view_.far_plane));
+  job.mapping = static_cast<T>(view_.mapping());
+  std::copy_n(background_, 3, job.background);
   job.splats = splats_.get();
   job.tile_start = bins_.tile_start.data();
   job.pairs = bins_.pairs.data();
+  job.saved = saved_;
   return job;
 }
 
 template <class T>
-void Frame<T>::forward(const Images<T>& images, const T* background, const int32_t* target, int threads) {
-  geometry_ = images.depth != nullptr;
-  distortion_ = images.distortion != nullptr;
+void Frame<T>::forward(const Images<T>& images, const T* background, const int32_t* target, bool keep, int threads) {
   std::copy_n(background, 3, background_);
-  const size_t pixels = static_cast<size_t>(tiles()) * kTilePixels;
-  end_transmittance_.resize(pixels);
-  last_.resize(pixels);
-  depth_sum_.resize(geometry_ ? pixels : 0);
-  median_pair_.resize(geometry_ ? pixels : 0);
-  first_inverse_depth_.resize(distortion_ ? pixels : 0);
-  moment1_.resize(distortion_ ? pixels : 0);
-  moment2_.resize(distortion_ ? pixels : 0);
-
+  saved_ = {};
+  if (keep) {
+    const size_t pixels = static_cast<size_t>(tiles()) * kTilePixels;
+    size_t used = 0;
+    kept_.reset(new T[pixels * Saved<T>::kCount]);  // the kernels fill all of it that they read
+    const auto take = [&](bool wanted) { return wanted ? kept_.get() + pixels * used++ : nullptr; };
+    saved_.end_transmittance = take(true);
+    saved_.end = take(true);
+    saved_.depth_sum = take(images.depth);
+    saved_.median_pair = take(images.depth);
+    saved_.first = take(images.distortion);
+    saved_.moment1 = take(images.distortion);
+    saved_.moment2 = take(images.distortion);
+  }
   Job<T> job = this->job();
-  job.geometry = geometry_;
-  job.distortion = distortion_;
-  std::copy_n(background, 3, job.background);
   job.target = target;
-  job.color = images.color;
-  job.alpha = images.alpha;
-  job.depth = images.depth;
-  job.median_depth = images.median_depth;
-  job.normal = images.normal;
-  job.distortion_out = images.distortion;
-  job.boundary = images.boundary;
-  job.end_transmittance = end_transmittance_.data();
-  job.last = last_.data();
-  job.depth_sum = depth_sum_.data();
-  job.median_pair = median_pair_.data();
-  job.first_inverse_depth = first_inverse_depth_.data();
-  job.moment1 = moment1_.data();
-  job.moment2 = moment2_.data();
+  job.images = images;
+  const Parts parts =
+      (images.depth ? kGeometry : 0) | (images.distortion ? kDistortion : 0) | (images.boundary ? kBoundary : 0);
+  const auto kernel = kernels<T>().variants[parts].forward;
   // Determinism: tiles share nothing, so any thread may take any of them.
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
-  for (int tile = 0; tile < tiles(); ++tile) kernels<T>().forward(job, tile);
+  for_each_tile(threads, [&](int tile) { kernel(job, tile); });
 }
 
 template <class T>
-void Frame<T>::backward(const Inputs<T>& inputs, const int32_t* target, const ImageGradients<T>& from,
-                        const InputGradients<T>& to, int threads) {
+void Frame<T>::backward(const Inputs<T>& inputs, const int32_t* target, const Images<const T>& from,
+                        const InputGradients<T>& to, int threads) const {
   Job<T> job = this->job();
-  job.geometry = geometry_;
-  job.distortion = distortion_;
-  std::copy_n(background_, 3, job.background);
   job.target = target;
-  job.end_transmittance = end_transmittance_.data();
-  job.last = last_.data();
-  job.depth_sum = depth_sum_.data();
-  job.median_pair = median_pair_.data();
-  job.first_inverse_depth = first_inverse_depth_.data();
-  job.moment1 = moment1_.data();
-  job.moment2 = moment2_.data();
-  job.g_color = from.color;
-  job.g_alpha = from.alpha;
-  job.g_depth = from.depth;
-  job.g_median_depth = from.median_depth;
-  job.g_normal = from.normal;
-  job.g_distortion = from.distortion;
-  job.g_boundary = from.boundary;
-  const std::unique_ptr<T[]> records(new T[bins_.pairs.size() * kRecordSize]);  // the kernels fill all of it
+  job.gradients = from;
+  const Parts parts = (from.depth || from.median_depth || from.normal ? kGeometry : 0) |
+                      (from.distortion ? kDistortion : 0) | (from.boundary ? kBoundary : 0);
+  const bool only_colors = !to.means && !to.quats && !to.log_scales && !to.opacity_logits;
+  const Variant<T>& variant = kernels<T>().variants[parts];
+  const auto kernel = only_colors ? kernels<T>().backward_colors : variant.backward;
+  const int size = only_colors ? kColorRecord : variant.record_size;
+  const std::unique_ptr<T[]> records(new T[static_cast<size_t>(num_pairs()) * size]);  // the kernels fill all of it
   const std::unique_ptr<T[]> backgrounds(new T[static_cast<size_t>(tiles()) * 3]);
   job.records = records.get();
   job.g_background = backgrounds.get();
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
-  for (int tile = 0; tile < tiles(); ++tile) kernels<T>().backward(job, tile);
+  for_each_tile(threads, [&](int tile) { kernel(job, tile); });
 
-  // Determinism: each surfel's records are summed by one thread, in the order of their tiles.
-  const int64_t ranks = static_cast<int64_t>(bins_.order.size());
-  const int team = ranks < 2000 ? 1 : threads;
-#pragma omp parallel for num_threads(team) schedule(static)
-  for (int64_t rank = 0; rank < ranks; ++rank) {
-    double sums[kRecordSize] = {};
-    for (int64_t record = bins_.record_start[rank]; record < bins_.record_start[rank + 1]; ++record) {
-      for (int i = 0; i < kRecordSize; ++i) sums[i] += records[record * kRecordSize + i];
-    }
-    const int64_t surfel = bins_.order[rank];
-    if (bins_.record_start[rank] == bins_.record_start[rank + 1]) continue;
-    const SurfelGradients g = project_backward(view_, parameters(inputs, surfel), sums);
-    for (int i = 0; i < 3; ++i) to.means[3 * surfel + i] = static_cast<T>(g.mean[i]);
-    for (int i = 0; i < 4; ++i) to.quats[4 * surfel + i] = static_cast<T>(g.quat[i]);
-    for (int i = 0; i < 2; ++i) to.log_scales[2 * surfel + i] = static_cast<T>(g.log_scale[i]);
-    to.opacity_logits[surfel] = static_cast<T>(g.opacity_logit);
-    for (int i = 0; i < 3; ++i) to.colors[3 * surfel + i] = static_cast<T>(sums[kColor + i]);
-  }
+  reduce(inputs, records.get(), size, to, threads);
+  if (!to.background) return;
   double background[3] = {};
   for (int tile = 0; tile < tiles(); ++tile) {
     for (int c = 0; c < 3; ++c) background[c] += backgrounds[3 * tile + c];
@@ -203,91 +180,30 @@ void Frame<T>::backward(const Inputs<T>& inputs, const int32_t* target, const Im
   for (int c = 0; c < 3; ++c) to.background[c] = static_cast<T>(background[c]);
 }
 
+// Adds up each surfel's records and carries them on to its parameters.
 template <class T>
-void Frame<T>::class_contributions(const int32_t* labels, int num_classes, T* out, int threads) const {
-  // Number each tile's labels 0, 1, ..: a tile rarely has more than a few.
-  std::vector<int32_t> slots(static_cast<size_t>(view_.width) * view_.height, -1), num_slots(tiles(), 0);
-  std::vector<std::vector<int32_t>> tile_labels(tiles());
-  std::vector<int64_t> slot_start(tiles() + 1, 0);
-  std::vector<int32_t> slot_of(num_classes, -1);
-  for (int tile = 0; tile < tiles(); ++tile) {
-    const int x0 = tile % tiles_x_ * kTile, y0 = tile / tiles_x_ * kTile;
-    for (int y = y0; y < std::min(y0 + kTile, view_.height); ++y) {
-      for (int x = x0; x < std::min(x0 + kTile, view_.width); ++x) {
-        const int64_t at = static_cast<int64_t>(y) * view_.width + x;
-        const int32_t label = labels[at];
-        if (label < 0 || label >= num_classes) continue;
-        if (slot_of[label] < 0) {
-          slot_of[label] = num_slots[tile]++;
-          tile_labels[tile].push_back(label);
-        }
-        slots[at] = slot_of[label];
-      }
+void Frame<T>::reduce(const Inputs<T>& inputs, const T* records, int size, const InputGradients<T>& to,
+                      int threads) const {
+  const auto write = [](T* values, int64_t surfel, const double* numbers, int count) {
+    for (int i = 0; values && i < count; ++i) values[count * surfel + i] = static_cast<T>(numbers[i]);
+  };
+  const int team = num_surfels_ < kTeamSurfels ? 1 : threads;
+  // Determinism: each surfel's records are summed by one thread, in the order of their tiles.
+#pragma omp parallel for num_threads(team) schedule(dynamic, kChunk)
+  for (int64_t i = 0; i < num_surfels_; ++i) {
+    if (bins_.record_start[i] == bins_.record_start[i + 1]) continue;
+    double sums[kRecord] = {};
+    for (int64_t record = bins_.record_start[i]; record < bins_.record_start[i + 1]; ++record) {
+      for (int number = 0; number < size; ++number) sums[number] += records[record * size + number];
     }
-    for (const int32_t label : tile_labels[tile]) slot_of[label] = -1;
-    slot_start[tile + 1] = slot_start[tile] + (bins_.tile_start[tile + 1] - bins_.tile_start[tile]) * num_slots[tile];
+    write(to.colors, i, sums + kColor, 3);
+    if (size == kColorRecord) continue;
+    const SurfelGradients g = project_backward(view_, parameters(inputs, i), sums);
+    write(to.means, i, g.mean, 3);
+    write(to.quats, i, g.quat, 4);
+    write(to.log_scales, i, g.log_scale, 2);
+    write(to.opacity_logits, i, &g.opacity_logit, 1);
   }
-  std::vector<T> sums(slot_start[tiles()], T(0));
-  Product<T> product{};
-  product.slots = slots.data();
-  product.num_slots = num_slots.data();
-  product.slot_start = slot_start.data();
-  product.sums = sums.data();
-  const Job<T> job = this->job();
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
-  for (int tile = 0; tile < tiles(); ++tile) kernels<T>().class_contributions(job, product, tile);
-
-  // Determinism: one thread adds up, tile after tile.
-  for (int tile = 0; tile < tiles(); ++tile) {
-    const T* row = sums.data() + slot_start[tile];
-    for (int64_t k = bins_.tile_start[tile]; k < bins_.tile_start[tile + 1]; ++k) {
-      T* to = out + static_cast<int64_t>(bins_.pairs[k].splat) * num_classes;
-      for (const int32_t label : tile_labels[tile]) to[label] += *row++;
-    }
-  }
-}
-
-template <class T>
-void Frame<T>::class_map(int num_classes, int32_t* classes, T* share, int threads) const {
-  const Job<T> job = this->job();
-#pragma omp parallel num_threads(threads)
-  {
-    std::vector<int32_t> place_of(num_classes, -1), present;
-    std::vector<T> sums;
-#pragma omp for schedule(dynamic, 1)
-    for (int tile = 0; tile < tiles(); ++tile) {
-      present.clear();
-      for (int64_t k = bins_.tile_start[tile]; k < bins_.tile_start[tile + 1]; ++k) {
-        const int32_t id = splats_[bins_.pairs[k].splat].class_id;
-        if (place_of[id] < 0) {
-          place_of[id] = 0;
-          present.push_back(id);
-        }
-      }
-      std::sort(present.begin(), present.end());
-      const int32_t count = static_cast<int32_t>(present.size());
-      for (int32_t i = 0; i < count; ++i) place_of[present[i]] = i;
-      sums.assign(static_cast<size_t>(count) * kTilePixels, T(0));
-      Product<T> product{};
-      product.labels = present.data();
-      product.slots = place_of.data();
-      product.num_slots = &count;
-      product.sums = sums.data();
-      product.classes = classes;
-      product.share = share;
-      kernels<T>().class_map(job, product, tile);
-      for (const int32_t id : present) place_of[id] = -1;
-    }
-  }
-}
-
-template <class T>
-void Frame<T>::heaviest(int32_t* indices, int threads) const {
-  const Job<T> job = this->job();
-  Product<T> product{};
-  product.classes = indices;
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
-  for (int tile = 0; tile < tiles(); ++tile) kernels<T>().heaviest(job, product, tile);
 }
 
 template class Frame<float>;

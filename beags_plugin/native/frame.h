@@ -10,6 +10,10 @@
 
 namespace beags {
 
+// A team of threads costs more than it brings below about 0.3 ms of work.
+constexpr int64_t kTeamSurfels = 2000;  // projecting one takes a tenth of a microsecond
+constexpr int64_t kTeamPairs = 500;     // drawing one takes most of a microsecond
+
 // N surfels, contiguous, as rasterizers/interface.py's SurfelInputs; class_ids may be null.
 template <class T>
 struct Inputs {
@@ -18,25 +22,18 @@ struct Inputs {
   const int32_t* class_ids;
 };
 
-// Null: not wanted.
-template <class T>
-struct Images {
-  T *color, *alpha, *depth, *median_depth, *normal, *distortion, *boundary;
-};
-
-template <class T>
-struct ImageGradients {
-  const T *color, *alpha, *depth, *median_depth, *normal, *distortion, *boundary;
-};
-
-// Zero on entry: surfels that were not drawn are left alone.
+// Null: not wanted. The others are zero on entry: surfels that were not drawn are left alone.
 template <class T>
 struct InputGradients {
   T *means, *quats, *log_scales, *opacity_logits, *colors, *background;
 };
 
-// "avx2" or "baseline": the kernels in use. The environment variable BEAGS_ISA=baseline forces the plain ones.
-const char* instruction_set();
+// How much there is to do; see Work.
+struct WorkCounts {
+  int64_t lanes, contributing;
+  int64_t tile_pairs;  // (tile, surfel) pairs that are kept
+  int64_t box_pairs;   // those that the usual bounds, boxes of 3.33 standard deviations, would give
+};
 
 template <class T>
 class Frame {
@@ -45,36 +42,43 @@ class Frame {
   Frame(const View& view, const Inputs<T>& inputs, bool* visible, int threads);
 
   int64_t num_nonfinite() const { return num_nonfinite_; }
-  int64_t num_pairs() const { return static_cast<int64_t>(bins_.pairs.size()); }
+  int64_t num_pairs() const { return bins_.tile_start.back(); }
   int64_t num_surfels() const { return num_surfels_; }
   const View& view() const { return view_; }
 
-  // Keeps what `backward` needs. background: [3]; target: [height, width] or null.
-  void forward(const Images<T>& images, const T* background, const int32_t* target, int threads);
+  // background: [3]; target: [height, width] or null. keep: for a `backward` to come.
+  void forward(const Images<T>& images, const T* background, const int32_t* target, bool keep, int threads);
   // Once after `forward`, with the same inputs and target.
-  void backward(const Inputs<T>& inputs, const int32_t* target, const ImageGradients<T>& from,
-                const InputGradients<T>& to, int threads);
+  void backward(const Inputs<T>& inputs, const int32_t* target, const Images<const T>& from,
+                const InputGradients<T>& to, int threads) const;
 
   // labels: [height, width]; out: [N, num_classes], zero on entry; labels outside 0 .. num_classes - 1 do not count.
   void class_contributions(const int32_t* labels, int num_classes, T* out, int threads) const;
   // classes, share: [height, width]. Class ids lie in 0 .. num_classes - 1.
   void class_map(int num_classes, int32_t* classes, T* share, int threads) const;
   void heaviest(int32_t* indices, int threads) const;
+  WorkCounts work_counts(int threads) const;
 
  private:
   Job<T> job() const;
   int tiles() const { return tiles_x_ * tiles_y_; }
+  // Calls work(tile) for every tile, on threads that share them out as they come.
+  template <class Work>
+  void for_each_tile(int threads, Work work) const {
+    const int team = num_pairs() < kTeamPairs ? 1 : threads;
+#pragma omp parallel for num_threads(team) schedule(dynamic, 1)
+    for (int tile = 0; tile < tiles(); ++tile) work(tile);
+  }
+  void reduce(const Inputs<T>& inputs, const T* records, int size, const InputGradients<T>& to, int threads) const;
 
   View view_;
   int tiles_x_, tiles_y_;
   int64_t num_surfels_, num_nonfinite_ = 0;
   std::unique_ptr<Splat<T>[]> splats_;
   Bins bins_;
-  // Saved for the backward, [tiles, 256].
-  bool geometry_ = false, distortion_ = false;
   T background_[3] = {};
-  std::vector<T> end_transmittance_, depth_sum_, first_inverse_depth_, moment1_, moment2_;
-  std::vector<int32_t> last_, median_pair_;
+  std::unique_ptr<T[]> kept_;  // what `saved_` points to
+  Saved<T> saved_ = {};
 };
 
 }  // namespace beags

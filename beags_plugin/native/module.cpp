@@ -1,8 +1,11 @@
 // The Python module: plain arrays in and out. Arguments are checked once, in rasterizers/native.py and interface.py.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
 
 #include "frame.h"
+#include "isa.h"
 #include "module_ops.h"
 
 namespace nb = nanobind;
@@ -65,19 +68,19 @@ void bind(nb::module_& m, const char* name) {
       .def(
           "forward",
           [](Frame<T>& self, In background, Labels target, Out color, Out alpha, Out depth, Out median_depth,
-             Out normal, Out distortion, Out boundary, int threads) {
+             Out normal, Out distortion, Out boundary, bool keep, int threads) {
             nb::gil_scoped_release release;
             self.forward({data(color), data(alpha), data(depth), data(median_depth), data(normal), data(distortion),
                           data(boundary)},
-                         background.data(), data(target), threads);
+                         background.data(), data(target), keep, threads);
           },
           "background"_a, "target"_a.none(), "color"_a, "alpha"_a, "depth"_a.none(), "median_depth"_a.none(),
-          "normal"_a.none(), "distortion"_a.none(), "boundary"_a.none(), "threads"_a)
+          "normal"_a.none(), "distortion"_a.none(), "boundary"_a.none(), "keep"_a, "threads"_a)
       .def(
           "backward",
-          [](Frame<T>& self, In means, In quats, In log_scales, In opacity_logits, In colors, Labels target, In color,
-             In alpha, In depth, In median_depth, In normal, In distortion, In boundary, Out g_means, Out g_quats,
-             Out g_log_scales, Out g_opacity_logits, Out g_colors, Out g_background, int threads) {
+          [](const Frame<T>& self, In means, In quats, In log_scales, In opacity_logits, In colors, Labels target,
+             In color, In alpha, In depth, In median_depth, In normal, In distortion, In boundary, Out g_means,
+             Out g_quats, Out g_log_scales, Out g_opacity_logits, Out g_colors, Out g_background, int threads) {
             const Inputs<T> inputs{static_cast<int64_t>(means.shape(0)),
                                    means.data(),
                                    quats.data(),
@@ -89,14 +92,14 @@ void bind(nb::module_& m, const char* name) {
             self.backward(inputs, data(target),
                           {data(color), data(alpha), data(depth), data(median_depth), data(normal), data(distortion),
                            data(boundary)},
-                          {g_means.data(), g_quats.data(), g_log_scales.data(), g_opacity_logits.data(),
-                           g_colors.data(), g_background.data()},
+                          {data(g_means), data(g_quats), data(g_log_scales), data(g_opacity_logits), data(g_colors),
+                           data(g_background)},
                           threads);
           },
           "means"_a, "quats"_a, "log_scales"_a, "opacity_logits"_a, "colors"_a, "target"_a.none(), "color"_a.none(),
           "alpha"_a.none(), "depth"_a.none(), "median_depth"_a.none(), "normal"_a.none(), "distortion"_a.none(),
-          "boundary"_a.none(), "g_means"_a, "g_quats"_a, "g_log_scales"_a, "g_opacity_logits"_a, "g_colors"_a,
-          "g_background"_a, "threads"_a)
+          "boundary"_a.none(), "g_means"_a.none(), "g_quats"_a.none(), "g_log_scales"_a.none(),
+          "g_opacity_logits"_a.none(), "g_colors"_a.none(), "g_background"_a.none(), "threads"_a)
       .def(
           "class_contributions",
           [](const Frame<T>& self, Labels labels, int num_classes, Out out, int threads) {
@@ -117,7 +120,14 @@ void bind(nb::module_& m, const char* name) {
             nb::gil_scoped_release release;
             self.heaviest(indices.data(), threads);
           },
-          "indices"_a, "threads"_a);
+          "indices"_a, "threads"_a)
+      .def(
+          "work_counts",
+          [](const Frame<T>& self, int threads) {
+            const WorkCounts counts = self.work_counts(threads);
+            return nb::make_tuple(counts.lanes, counts.contributing, counts.tile_pairs, counts.box_pairs);
+          },
+          "threads"_a);
 }
 
 }  // namespace
@@ -126,7 +136,8 @@ void bind(nb::module_& m, const char* name) {
 NB_MODULE(_native, m) {
   nb::set_leak_warnings(false);  // an image that is alive at exit keeps its frame, through autograd
   m.doc() = "The compiled CPU rasterizer; use it through beags_plugin.rasterizers.native.";
-  m.def("instruction_set", &beags::instruction_set, "The kernels in use: avx2 or baseline.");
+  m.def("instruction_set", &beags::instruction_set, "The kernels in use; RuntimeError if those asked for cannot run.");
+  m.def("instruction_sets", &beags::instruction_sets, "Those that can run here, best first.");
   beags::bind<float>(m, "FrameF32");
   beags::bind<double>(m, "FrameF64");
   beags::bind_ops(m);

@@ -1,21 +1,17 @@
 #include "op_kernels.h"
 
-#include <cstdlib>
-#include <cstring>
 #include <type_traits>
+
+#include "isa.h"
 
 namespace beags {
 namespace ops {
 namespace {
 
-// As for the rasterizer: BEAGS_ISA=baseline forces the plain kernels.
+// The ops have two builds: what runs AVX-512 runs AVX2.
 bool use_avx2() {
-#if defined(__x86_64__)
-  static const bool use = [] {
-    const char* forced = std::getenv("BEAGS_ISA");
-    if (forced && std::strcmp(forced, "baseline") == 0) return false;
-    return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
-  }();
+#if defined(BEAGS_HAS_AVX2)
+  static const bool use = instruction_set() == "avx2" || instruction_set() == "avx512";
   return use;
 #else
   return false;
@@ -26,7 +22,7 @@ bool use_avx2() {
 
 template <class T>
 const OpKernels<T>& op_kernels() {
-#if defined(__x86_64__)
+#if defined(BEAGS_HAS_AVX2)
   if (use_avx2()) {
     if constexpr (std::is_same_v<T, float>) return avx2::kOpKernelsF32;
     if constexpr (std::is_same_v<T, double>) return avx2::kOpKernelsF64;

@@ -18,28 +18,22 @@ void multiply_transposed(const double* m, const double* v, double* out) {  // ou
 
 template <class... Numbers>
 bool finite(Numbers... numbers) {
-  return (std::isfinite(numbers) && ...);
-}
-
-bool finite(const SurfelParameters& s) {
-  return finite(s.mean[0], s.mean[1], s.mean[2], s.quat[0], s.quat[1], s.quat[2], s.quat[3], s.log_scale[0],
-                s.log_scale[1], s.opacity_logit, s.color[0], s.color[1], s.color[2]);
+  return ((0 * numbers) + ...) == 0;  // one comparison for all
 }
 
 // The surfel in camera space (E1), its centre's depth divided out: a, b, p over p_z.
 struct Placement {
-  double length, unit[4];                  // of the quaternion
+  double inverse_length, unit[4];          // of the quaternion
   double axis_u[3], axis_v[3], axis_n[3];  // columns of R
-  double scale_u, scale_v;
-  double z, a[3], b[3], p[3];
+  double z, inverse_z, a[3], b[3], p[3];
   double cx, cy;             // projected centre
   double mu[2], mv[2];       // first two columns of the recentred rows Mx, My; their third is 0
   double normal[3], facing;  // facing: +1 or -1, turns the normal towards the camera
 };
 
 void place(const View& view, const SurfelParameters& s, Placement& at) {
-  at.length = std::sqrt(s.quat[0] * s.quat[0] + dot(s.quat + 1, s.quat + 1));
-  for (int i = 0; i < 4; ++i) at.unit[i] = s.quat[i] / at.length;
+  at.inverse_length = 1 / std::sqrt(s.quat[0] * s.quat[0] + dot(s.quat + 1, s.quat + 1));
+  for (int i = 0; i < 4; ++i) at.unit[i] = s.quat[i] * at.inverse_length;
   const double w = at.unit[0], x = at.unit[1], y = at.unit[2], z = at.unit[3];
   const double columns[3][3] = {{1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)},
                                 {2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)},
@@ -47,8 +41,6 @@ void place(const View& view, const SurfelParameters& s, Placement& at) {
   std::copy_n(columns[0], 3, at.axis_u);
   std::copy_n(columns[1], 3, at.axis_v);
   std::copy_n(columns[2], 3, at.axis_n);
-  at.scale_u = std::exp(s.log_scale[0]);
-  at.scale_v = std::exp(s.log_scale[1]);
 
   double center[3], a[3], b[3];
   multiply(view.rotation, s.mean, center);
@@ -58,11 +50,13 @@ void place(const View& view, const SurfelParameters& s, Placement& at) {
   multiply(view.rotation, at.axis_n, at.normal);
   at.facing = dot(at.normal, center) > 0 ? -1.0 : 1.0;
   at.z = center[2];
+  at.inverse_z = 1 / at.z;
+  const double scale_u = s.scale[0] * at.inverse_z, scale_v = s.scale[1] * at.inverse_z;
   for (int i = 0; i < 3; ++i) {
     at.normal[i] *= at.facing;
-    at.p[i] = center[i] / at.z;
-    at.a[i] = a[i] * at.scale_u / at.z;
-    at.b[i] = b[i] * at.scale_v / at.z;
+    at.p[i] = center[i] * at.inverse_z;
+    at.a[i] = a[i] * scale_u;
+    at.b[i] = b[i] * scale_v;
   }
   at.cx = dot(view.kx, at.p);
   at.cy = dot(view.ky, at.p);
@@ -72,17 +66,14 @@ void place(const View& view, const SurfelParameters& s, Placement& at) {
   at.mv[1] = dot(view.ky, at.b) - at.cy * at.b[2];
 }
 
-double log_sigmoid(double logit) { return std::min(logit, 0.0) - std::log1p(std::exp(-std::abs(logit))); }
-
 }  // namespace
 
 Fate project(const View& view, const SurfelParameters& s, Splat<double>& splat) {
-  if (!finite(s)) return Fate::kNonFinite;
   Placement at;
   place(view, s, at);
-  if (!finite(at.unit[0], at.scale_u, at.scale_v, at.z)) return Fate::kNonFinite;  // quaternion 0, or an overflow
-  splat.log_opacity = log_sigmoid(s.opacity_logit);
-  if (at.z <= view.near_plane || splat.log_opacity < kLogMinAlpha) return Fate::kCulled;
+  if (!finite(at.unit[0], s.scale[0], s.scale[1], at.z)) return Fate::kNonFinite;  // quaternion 0, or an overflow
+  if (at.z <= view.near_plane || s.log2_opacity < kLog2MinAlpha) return Fate::kCulled;
+  splat.log2_opacity = s.log2_opacity;
   splat.cx = at.cx;
   splat.cy = at.cy;
   splat.u_x = at.mv[1];  // E2: q = k x l, expanded in (dx, dy)
@@ -94,18 +85,37 @@ Fate project(const View& view, const SurfelParameters& s, Splat<double>& splat) 
   splat.w_0 = at.mu[0] * at.mv[1] - at.mu[1] * at.mv[0];
   splat.det = at.z * splat.w_0;
   splat.z = at.z;
+  splat.nearness_det = view.mapping() / splat.det;
+  splat.nearness_z = view.mapping() * at.inverse_z;
   splat.tilt_u = at.a[2];
   splat.tilt_v = at.b[2];
-  std::copy_n(s.color, 3, splat.color);
   std::copy_n(at.normal, 3, splat.normal);
   if (!finite(splat.cx, splat.cy, splat.u_x, splat.u_y, splat.v_x, splat.v_y, splat.w_x, splat.w_y, splat.w_0,
               splat.det)) {
     return Fate::kNonFinite;
   }
+  splat.plain = is_plain(view, splat);
   return Fate::kDrawn;
 }
 
-SurfelGradients project_backward(const View& view, const SurfelParameters& s, const double* g) {
+bool is_plain(const View& view, const Splat<double>& s) {
+  constexpr double kMargin = 1e-4;  // float32's rounding
+  constexpr double kLog2MaxAlpha = -0.0144995696951151;
+  const double squared_disc = kLn2 * (s.log2_opacity - kLog2MinAlpha);  // of the low-pass's radius
+  // |q2| at most that far off the centre, and a bound of |(q0, q1)| there: rho3d <= rho2d all over the disc. Beyond it,
+  // the low-pass is too faint to be drawn.
+  const double least = std::abs(s.w_0) - std::sqrt(squared_disc * (s.w_x * s.w_x + s.w_y * s.w_y));
+  const double squares = s.u_x * s.u_x + s.u_y * s.u_y + s.v_x * s.v_x + s.v_y * s.v_y;
+  const double area = s.u_x * s.v_y - s.u_y * s.v_x;
+  const double stretch = (squares + std::sqrt(std::max(0.0, squares * squares - 4 * area * area))) / 2;
+  if (!(least > 0) || !(stretch * (1 + kMargin) < 2 * least * least)) return false;
+  // The nearest point of the surfel's own disc, which is sqrt(2) times as many standard deviations wide.
+  const double nearest = 1 - std::sqrt(2 * squared_disc * (s.tilt_u * s.tilt_u + s.tilt_v * s.tilt_v));
+  if (!(s.z * nearest > view.near_plane * (1 + kMargin))) return false;
+  return s.log2_opacity < kLog2MaxAlpha - kMargin && finite(s.nearness_det);
+}
+
+SurfelGradients project_backward(const View& view, const SurfelParameters& s, const double* record) {
   Placement at;
   place(view, s, at);
   const double *mu = at.mu, *mv = at.mv;
@@ -113,13 +123,21 @@ SurfelGradients project_backward(const View& view, const SurfelParameters& s, co
   const double w_y = at.a[2] * mu[1] - at.b[2] * mu[0];
   const double w_0 = mu[0] * mv[1] - mu[1] * mv[0];
 
+  // Gradients towards q0, q1 and q2 (sums over pixels, times 1, dx, dy): -s (q0, q1) and h, with q0 = mv1 dx - mu1 dy
+  // and q1 = -mv0 dx + mu0 dy.
+  const double* g = record;
+  const double q0[3] = {mu[1] * g[kSy] - mv[1] * g[kSx], mu[1] * g[kSxy] - mv[1] * g[kSxx],
+                        mu[1] * g[kSyy] - mv[1] * g[kSxy]};
+  const double q1[3] = {mv[0] * g[kSx] - mu[0] * g[kSy], mv[0] * g[kSxx] - mu[0] * g[kSxy],
+                        mv[0] * g[kSxy] - mu[0] * g[kSyy]};
+  const double* q2 = g + kH;
   // dx = x - cx: the centre moves every pixel's q, besides the low-pass disc.
-  const double g_cx = g[kCx] - (mv[1] * g[kQ0] - mv[0] * g[kQ1] + w_x * g[kQ2]);
-  const double g_cy = g[kCy] - (-mu[1] * g[kQ0] + mu[0] * g[kQ1] + w_y * g[kQ2]);
-  const double g_w0 = g[kQ2] + at.z * g[kDet];
+  const double g_cx = g[kCx] - (mv[1] * q0[0] - mv[0] * q1[0] + w_x * q2[0]);
+  const double g_cy = g[kCy] - (-mu[1] * q0[0] + mu[0] * q1[0] + w_y * q2[0]);
+  const double g_w0 = q2[0] + at.z * g[kDet];
   double g_z = g[kZ] + w_0 * g[kDet];
-  const double g_mu[2] = {g[kQ1y] - at.b[2] * g[kQ2y] + mv[1] * g_w0, -g[kQ0y] + at.a[2] * g[kQ2y] - mv[0] * g_w0};
-  const double g_mv[2] = {-g[kQ1x] + at.b[2] * g[kQ2x] - mu[1] * g_w0, g[kQ0x] - at.a[2] * g[kQ2x] + mu[0] * g_w0};
+  const double g_mu[2] = {q1[2] - at.b[2] * q2[2] + mv[1] * g_w0, -q0[2] + at.a[2] * q2[2] - mv[0] * g_w0};
+  const double g_mv[2] = {-q1[1] + at.b[2] * q2[1] - mu[1] * g_w0, q0[1] - at.a[2] * q2[1] + mu[0] * g_w0};
   const double g_cx_all = g_cx - at.a[2] * g_mu[0] - at.b[2] * g_mu[1];
   const double g_cy_all = g_cy - at.a[2] * g_mv[0] - at.b[2] * g_mv[1];
 
@@ -129,13 +147,13 @@ SurfelGradients project_backward(const View& view, const SurfelParameters& s, co
     g_b[i] = view.kx[i] * g_mu[1] + view.ky[i] * g_mv[1];
     g_p[i] = view.kx[i] * g_cx_all + view.ky[i] * g_cy_all;
   }
-  g_a[2] += -at.cx * g_mu[0] - at.cy * g_mv[0] - mv[1] * g[kQ2x] + mu[1] * g[kQ2y];
-  g_b[2] += -at.cx * g_mu[1] - at.cy * g_mv[1] + mv[0] * g[kQ2x] - mu[0] * g[kQ2y];
-  g_z -= (dot(g_a, at.a) + dot(g_b, at.b) + dot(g_p, at.p)) / at.z;
+  g_a[2] += -at.cx * g_mu[0] - at.cy * g_mv[0] - mv[1] * q2[1] + mu[1] * q2[2];
+  g_b[2] += -at.cx * g_mu[1] - at.cy * g_mv[1] + mv[0] * q2[1] - mu[0] * q2[2];
+  g_z -= (dot(g_a, at.a) + dot(g_b, at.b) + dot(g_p, at.p)) * at.inverse_z;
   for (int i = 0; i < 3; ++i) {
-    g_a[i] /= at.z;
-    g_b[i] /= at.z;
-    g_p[i] /= at.z;
+    g_a[i] *= at.inverse_z;
+    g_b[i] *= at.inverse_z;
+    g_p[i] *= at.inverse_z;
   }
   g_p[2] += g_z;
 
@@ -146,11 +164,11 @@ SurfelGradients project_backward(const View& view, const SurfelParameters& s, co
   multiply_transposed(view.rotation, g_a, u);
   multiply_transposed(view.rotation, g_b, v);
   multiply_transposed(view.rotation, g_normal, n);
-  out.log_scale[0] = at.scale_u * dot(u, at.axis_u);
-  out.log_scale[1] = at.scale_v * dot(v, at.axis_v);
+  out.log_scale[0] = s.scale[0] * dot(u, at.axis_u);
+  out.log_scale[1] = s.scale[1] * dot(v, at.axis_v);
   for (int i = 0; i < 3; ++i) {
-    u[i] *= at.scale_u;
-    v[i] *= at.scale_v;
+    u[i] *= s.scale[0];
+    v[i] *= s.scale[1];
   }
   const double w = at.unit[0], x = at.unit[1], y = at.unit[2], z = at.unit[3];
   const double g_unit[4] = {2 * (z * (u[1] - v[0]) + y * (n[0] - u[2]) + x * (v[2] - n[1])),
@@ -158,82 +176,9 @@ SurfelGradients project_backward(const View& view, const SurfelParameters& s, co
                             2 * (x * (u[1] + v[0]) + z * (v[2] + n[1]) + w * (n[0] - u[2]) - 2 * y * (u[0] + n[2])),
                             2 * (x * (u[2] + n[0]) + y * (v[2] + n[1]) + w * (u[1] - v[0]) - 2 * z * (u[0] + v[1]))};
   const double along = at.unit[0] * g_unit[0] + dot(at.unit + 1, g_unit + 1);
-  for (int i = 0; i < 4; ++i) out.quat[i] = (g_unit[i] - at.unit[i] * along) / at.length;
-  out.opacity_logit = g[kLogOpacity] / (1.0 + std::exp(s.opacity_logit));  // d log sigmoid = 1 - sigmoid
+  for (int i = 0; i < 4; ++i) out.quat[i] = (g_unit[i] - at.unit[i] * along) * at.inverse_length;
+  out.opacity_logit = g[kLogOpacity] * s.transparency;  // d log sigmoid = 1 - sigmoid
   return out;
-}
-
-template <class T>
-Extent::Extent(const View& view, const Splat<T>& s) : width_(view.width), height_(view.height), cx_(s.cx), cy_(s.cy) {
-  const double r2 = std::max(0.0, 2 * (static_cast<double>(s.log_opacity) - kLogMinAlpha));  // rho <= r2
-  disc_ = std::sqrt(r2 / 2);
-  const double mu[2] = {s.v_y, -s.u_y}, mv[2] = {-s.v_x, s.u_x}, tilt[2] = {s.tilt_u, s.tilt_v};
-  // Dual conic M diag(r2, r2, -1) M^T: its entries give the box.
-  const double xx = r2 * (mu[0] * mu[0] + mu[1] * mu[1]), xy = r2 * (mu[0] * mv[0] + mu[1] * mv[1]);
-  const double yy = r2 * (mv[0] * mv[0] + mv[1] * mv[1]);
-  const double xw = r2 * (mu[0] * tilt[0] + mu[1] * tilt[1]), yw = r2 * (mv[0] * tilt[0] + mv[1] * tilt[1]);
-  const double ww = r2 * (tilt[0] * tilt[0] + tilt[1] * tilt[1]) - 1;
-  // ww >= 0: the disc crosses the camera plane. Within 1e-3 of that, float32's rounding would spoil the box.
-  everywhere_ = !(ww < -1e-3);
-  first_row_ = 0;
-  last_row_ = height_ - 1;
-  if (!(ww < 0)) return;
-  const double half_x = std::sqrt(std::max(0.0, xw * xw - xx * ww)) / -ww;
-  const double half_y = std::sqrt(std::max(0.0, yw * yw - yy * ww)) / -ww;
-  left_ = xw / ww - half_x;
-  right_ = xw / ww + half_x;
-  top_ = yw / ww - half_y;
-  bottom_ = yw / ww + half_y;
-  on_screen_ = cx_ + std::min(left_, -disc_) < width_ && cx_ + std::max(right_, disc_) > 0 &&
-               cy_ + std::min(top_, -disc_) < height_ && cy_ + std::max(bottom_, disc_) > 0;
-  if (everywhere_) return;
-
-  a_ = static_cast<double>(s.u_x) * s.u_x + static_cast<double>(s.v_x) * s.v_x - r2 * s.w_x * s.w_x;
-  b_ = static_cast<double>(s.u_x) * s.u_y + static_cast<double>(s.v_x) * s.v_y - r2 * s.w_x * s.w_y;
-  c_ = static_cast<double>(s.u_y) * s.u_y + static_cast<double>(s.v_y) * s.v_y - r2 * s.w_y * s.w_y;
-  d_ = -r2 * s.w_x * s.w_0;
-  e_ = -r2 * s.w_y * s.w_0;
-  f_ = -r2 * s.w_0 * s.w_0;
-  // The tangent x = right touches at the pole C* (1, 0, -right); likewise on the left.
-  y_left_ = half_x > 0 ? (xy - left_ * yw) / (half_x * ww) : yw / ww;
-  y_right_ = half_x > 0 ? (xy - right_ * yw) / (-half_x * ww) : yw / ww;
-  const double first = std::ceil(cy_ + std::min(top_, -disc_) - 0.5 - 0.01);  // 0.01 px: rounding
-  const double last = std::floor(cy_ + std::max(bottom_, disc_) - 0.5 + 0.01);
-  first_row_ = static_cast<int>(std::clamp(first, 0.0, static_cast<double>(height_)));
-  last_row_ = static_cast<int>(std::clamp(last, -1.0, height_ - 1.0));
-}
-
-template Extent::Extent(const View&, const Splat<float>&);
-template Extent::Extent(const View&, const Splat<double>&);
-
-// Where the conic ends on the line y: to the left (side = -1) or to the right (side = +1).
-double Extent::edge(double y, double side) const {
-  const double half = b_ * y + d_;
-  const double root = std::sqrt(std::max(0.0, half * half - a_ * (c_ * y * y + 2 * e_ * y + f_)));
-  const double x = (-half + side * root) / a_;
-  const double outer = side < 0 ? left_ : right_;
-  return std::isfinite(x) ? std::clamp(x, left_, right_) : outer;  // a = 0: a line along x
-}
-
-Extent::Columns Extent::clip(double left, double right) const {
-  const double first = std::ceil(cx_ + left - 0.5 - 0.01), last = std::floor(cx_ + right - 0.5 + 0.01);
-  return {static_cast<int>(std::clamp(first, 0.0, static_cast<double>(width_))),
-          static_cast<int>(std::clamp(last, -1.0, width_ - 1.0))};
-}
-
-Extent::Columns Extent::columns(int row, int which) const {
-  if (everywhere_) return which == 0 ? Columns{0, width_ - 1} : Columns{0, -1};
-  const double y0 = row + 0.5 - cy_, y1 = y0 + (kGroup - 1);
-  if (which == 1) {
-    const double y = std::clamp(0.0, y0, y1);
-    if (std::abs(y) > disc_ + 0.01) return {0, -1};
-    const double half = std::sqrt(std::max(0.0, disc_ * disc_ - y * y));
-    return clip(-half, half);
-  }
-  if (y1 < top_ - 0.01 || y0 > bottom_ + 0.01) return {0, -1};
-  const double left = y0 <= y_left_ && y_left_ <= y1 ? left_ : edge(y_left_ < y0 ? y0 : y1, -1);
-  const double right = y0 <= y_right_ && y_right_ <= y1 ? right_ : edge(y_right_ < y0 ? y0 : y1, +1);
-  return clip(left, right);
 }
 
 }  // namespace beags

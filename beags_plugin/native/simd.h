@@ -1,104 +1,178 @@
-// Vectors of 32 bytes: 8 float32 or 4 float64 lanes. GCC and clang lower them to what the instruction set has.
-// Included by the files of tile kernels only, each of which is compiled for one instruction set: so everything lies in
-// the namespace BEAGS_ISA, lest the linker merge the copies.
+// Vectors of the instruction set that the including file is compiled for. A Real holds kParts<T> registers that run in
+// step: that hides latencies and shares what is the same for all of them. Included by the files of tile kernels only,
+// and everything lies in the namespace BEAGS_ISA, lest the linker merge the copies.
 #pragma once
 
 #include <math.h>
 #include <stdint.h>
-#if defined(__AVX__)
+#if defined(__x86_64__)
 #include <immintrin.h>
+#elif defined(__ARM_NEON)
+#include <arm_neon.h>
 #endif
 
 #define BEAGS_INLINE inline __attribute__((always_inline))
+#define BEAGS_UNROLL _Pragma("GCC unroll 4")
+
+#if defined(BEAGS_SCALAR)
+#include "simd_scalar.h"
+#elif defined(__AVX512F__)
+#include "simd_avx512.h"
+#elif defined(__AVX2__)
+#include "simd_avx2.h"
+#else
+#include "simd_generic.h"
+#endif
 
 namespace beags {
 namespace BEAGS_ISA {
 
 template <class T>
-struct Simd;
+using Vector = typename Register<T>::Vector;
+template <class T>
+constexpr int kParts = Register<T>::kParts;
+template <class T>
+constexpr int kRegister = Register<T>::kLanes;
+template <class T>
+constexpr int kLanes = kRegister<T> * kParts<T>;
 
-template <>
-struct Simd<float> {
-  typedef float Real __attribute__((vector_size(32)));
-  typedef int32_t Mask __attribute__((vector_size(32)));
-  typedef int32_t Integer;
-  static constexpr int kLanes = 8;
-};
-
-template <>
-struct Simd<double> {
-  typedef double Real __attribute__((vector_size(32)));
-  typedef int64_t Mask __attribute__((vector_size(32)));
-  typedef int64_t Integer;
-  static constexpr int kLanes = 4;
+template <class T>
+struct Real {
+  Vector<T> part[kParts<T>];
 };
 
 template <class T>
-using Real = typename Simd<T>::Real;
+struct Mask {
+  typename Register<T>::Mask part[kParts<T>];
+};
+
+#define BEAGS_EACH(expression)                                               \
+  BEAGS_UNROLL for (int i = 0; i < kParts<T>; ++i) out.part[i] = expression; \
+  return out
+
 template <class T>
-using Mask = typename Simd<T>::Mask;
+BEAGS_INLINE Real<T> all(T value) {
+  Real<T> out;
+  BEAGS_EACH(Register<T>::broadcast(value));
+}
+template <class T>
+BEAGS_INLINE Real<T> load(const T* from) {
+  Real<T> out;
+  BEAGS_EACH(Register<T>::load(from + i * kRegister<T>));
+}
+template <class T>
+BEAGS_INLINE void store(T* to, Real<T> value) {
+  BEAGS_UNROLL for (int i = 0; i < kParts<T>; ++i)
+      __builtin_memcpy(to + i * kRegister<T>, &value.part[i], sizeof value.part[i]);
+}
+template <class T>
+BEAGS_INLINE Mask<T> none() {
+  return Mask<T>{};
+}
+
+#define BEAGS_OPERATOR(op)                                 \
+  template <class T>                                       \
+  BEAGS_INLINE Real<T> operator op(Real<T> a, Real<T> b) { \
+    Real<T> out;                                           \
+    BEAGS_EACH(a.part[i] op b.part[i]);                    \
+  }
+BEAGS_OPERATOR(+)
+BEAGS_OPERATOR(-)
+BEAGS_OPERATOR(*)
+BEAGS_OPERATOR(/)
+#undef BEAGS_OPERATOR
 
 // a b + c, in one rounding where the instruction set has it.
-BEAGS_INLINE Real<float> fma(Real<float> a, Real<float> b, Real<float> c) {
-#if defined(__FMA__)
-  return _mm256_fmadd_ps(a, b, c);
-#else
-  return a * b + c;
-#endif
+template <class T>
+BEAGS_INLINE Real<T> fma(Real<T> a, Real<T> b, Real<T> c) {
+  Real<T> out;
+  BEAGS_EACH(Register<T>::fma(a.part[i], b.part[i], c.part[i]));
 }
-BEAGS_INLINE Real<double> fma(Real<double> a, Real<double> b, Real<double> c) {
-#if defined(__FMA__)
-  return _mm256_fmadd_pd(a, b, c);
-#else
-  return a * b + c;
-#endif
+// b if either is NaN.
+template <class T>
+BEAGS_INLINE Real<T> min(Real<T> a, Real<T> b) {
+  Real<T> out;
+  BEAGS_EACH(Register<T>::min(a.part[i], b.part[i]));
+}
+template <class T>
+BEAGS_INLINE Mask<T> operator<=(Real<T> a, Real<T> b) {
+  Mask<T> out;
+  BEAGS_EACH(Register<T>::less_equal(a.part[i], b.part[i]));
+}
+template <class T>
+BEAGS_INLINE Mask<T> operator<(Real<T> a, Real<T> b) {
+  Mask<T> out;
+  BEAGS_EACH(Register<T>::less(a.part[i], b.part[i]));
+}
+template <class T>
+BEAGS_INLINE Mask<T> operator==(Real<T> a, Real<T> b) {
+  Mask<T> out;
+  BEAGS_EACH(Register<T>::equal(a.part[i], b.part[i]));
+}
+template <class T>
+BEAGS_INLINE Mask<T> operator&(Mask<T> a, Mask<T> b) {
+  Mask<T> out;
+  BEAGS_EACH(Register<T>::both(a.part[i], b.part[i]));
+}
+template <class T>
+BEAGS_INLINE Mask<T> without(Mask<T> a, Mask<T> b) {  // a and not b
+  Mask<T> out;
+  BEAGS_EACH(Register<T>::without(a.part[i], b.part[i]));
+}
+template <class T>
+BEAGS_INLINE bool any(Mask<T> mask) {
+  typename Register<T>::Mask joined = mask.part[0];
+  BEAGS_UNROLL for (int i = 1; i < kParts<T>; ++i) joined = Register<T>::either(joined, mask.part[i]);
+  return Register<T>::any(joined);
+}
+template <class T>
+BEAGS_INLINE Real<T> select(Mask<T> mask, Real<T> yes, Real<T> no) {
+  Real<T> out;
+  BEAGS_EACH(Register<T>::select(mask.part[i], yes.part[i], no.part[i]));
+}
+// `value` in the lanes of the mask, 0 elsewhere (where it may be infinite or NaN).
+template <class T>
+BEAGS_INLINE Real<T> keep(Mask<T> mask, Real<T> value) {
+  Real<T> out;
+  BEAGS_EACH(Register<T>::keep(mask.part[i], value.part[i]));
+}
+template <class T>
+BEAGS_INLINE Real<T> drop(Mask<T> mask, Real<T> value) {  // the other lanes
+  Real<T> out;
+  BEAGS_EACH(Register<T>::drop(mask.part[i], value.part[i]));
 }
 
-template <class M>
-BEAGS_INLINE bool any(M mask) {
-#if defined(__AVX__)
-  return !_mm256_testz_si256((__m256i)mask, (__m256i)mask);
-#else
-  int64_t word[4];
-  __builtin_memcpy(word, &mask, sizeof word);
-  return (word[0] | word[1] | word[2] | word[3]) != 0;
-#endif
+// 2^x for -126 < x <= 0 (lanes outside hold garbage); float32 to 2e-7: x = i + f with |f| <= 1/2, and a minimax
+// polynomial for 2^f, in Estrin's order.
+BEAGS_INLINE Real<float> exp2(Real<float> x) {
+  using T = float;
+  const Real<T> magic = all(12582912.0f);  // 1.5 * 2^23: the lowest bits of the sum hold x, rounded
+  const Real<T> shifted = x + magic;
+  const Real<T> f = x - (shifted - magic);
+  Real<T> p = fma(all(1.3276470686e-3f), f, all(9.6755413240e-3f));
+  p = fma(p, f, all(5.5507132775e-2f));
+  p = fma(p, f, all(2.4022119724e-1f));
+  p = fma(p, f, all(6.9314696706e-1f));
+  p = fma(p, f, all(1.0000000717e+0f));
+  Real<T> out;
+  BEAGS_EACH(Register<T>::scale(p.part[i], shifted.part[i]));
 }
+BEAGS_INLINE Real<double> exp2(Real<double> x) {
+  double lanes[kLanes<double>];
+  store(lanes, x);
+  for (double& lane : lanes) lane = ::exp2(lane);
+  return load(lanes);
+}
+#undef BEAGS_EACH
 
-// e^x for -87 < x <= 0, to 2e-7 (lanes outside hold garbage): e^x = 2^i 2^f with |f| <= 1/2, and a minimax polynomial
-// for 2^f.
-BEAGS_INLINE Real<float> exponential(Real<float> x) {
-  const Real<float> y = x * 1.44269504088896341f;
-  const Real<float> shifted = y + 12582912.0f;  // 1.5 * 2^23: the lowest bits now hold y, rounded
-  const Real<float> f = y - (shifted - 12582912.0f);
-  const Mask<float> i = (Mask<float>)shifted << 23;
-  const Real<float> zero = {};
-  Real<float> p = zero + 1.3276470686e-3f;
-  p = fma(p, f, zero + 9.6755413240e-3f);
-  p = fma(p, f, zero + 5.5507132775e-2f);
-  p = fma(p, f, zero + 2.4022119724e-1f);
-  p = fma(p, f, zero + 6.9314696706e-1f);
-  p = fma(p, f, zero + 1.0000000717e+0f);
-  return (Real<float>)((Mask<float>)p + i);
+// A sum over pixels that is added up in one register.
+template <class T>
+BEAGS_INLINE void add(Vector<T>& sum, Real<T> value) {
+  BEAGS_UNROLL for (int i = 0; i < kParts<T>; ++i) sum = sum + value.part[i];
 }
-BEAGS_INLINE Real<double> exponential(Real<double> x) {
-  for (int lane = 0; lane < Simd<double>::kLanes; ++lane) x[lane] = exp(x[lane]);
-  return x;
-}
-
-// out[i] = sum of the lanes of vectors[i], i = 0..3; always in the same order.
-BEAGS_INLINE void sum_lanes(const Real<float>* vectors, float* out) {
-  typedef float Half __attribute__((vector_size(16)));
-#define BEAGS_ADD_PAIRS(a, b) \
-  (__builtin_shufflevector(a, b, 0, 2, 8, 10, 4, 6, 12, 14) + __builtin_shufflevector(a, b, 1, 3, 9, 11, 5, 7, 13, 15))
-  const Real<float> low = BEAGS_ADD_PAIRS(vectors[0], vectors[1]), high = BEAGS_ADD_PAIRS(vectors[2], vectors[3]);
-  const Real<float> all = BEAGS_ADD_PAIRS(low, high);
-#undef BEAGS_ADD_PAIRS
-  const Half sum = __builtin_shufflevector(all, all, 0, 1, 2, 3) + __builtin_shufflevector(all, all, 4, 5, 6, 7);
-  __builtin_memcpy(out, &sum, sizeof sum);
-}
-BEAGS_INLINE void sum_lanes(const Real<double>* vectors, double* out) {
-  for (int i = 0; i < 4; ++i) out[i] = (vectors[i][0] + vectors[i][1]) + (vectors[i][2] + vectors[i][3]);
+template <class T>
+BEAGS_INLINE void add(Vector<T>& sum, Real<T> a, Real<T> b) {  // of a b
+  BEAGS_UNROLL for (int i = 0; i < kParts<T>; ++i) sum = Register<T>::fma(a.part[i], b.part[i], sum);
 }
 
 }  // namespace BEAGS_ISA

@@ -1,14 +1,6 @@
 // The tile kernels for processors with AVX2 and FMA; empty where the compiler was not told to use them.
 #define BEAGS_ISA avx2
+#define BEAGS_PARTS 2
 #if defined(__AVX2__) && defined(__FMA__)
 #include "tiles.h"
-
-namespace beags {
-namespace BEAGS_ISA {
-
-extern const Kernels<float> kKernelsF32 = kernels<float>();
-extern const Kernels<double> kKernelsF64 = kernels<double>();
-
-}  // namespace BEAGS_ISA
-}  // namespace beags
 #endif

@@ -27,14 +27,25 @@ class Images(NamedTuple):
 
 
 class InputGradients(NamedTuple):
-    """Gradients towards the float fields of ``SurfelInputs`` and the background, of the same shapes and dtypes."""
+    """Gradients towards the float fields of ``SurfelInputs`` and the background, shaped as these; None: not needed."""
 
-    means: Tensor
-    quats: Tensor
-    log_scales: Tensor
-    opacity_logits: Tensor
-    colors: Tensor
-    background: Tensor
+    means: Tensor | None
+    quats: Tensor | None
+    log_scales: Tensor | None
+    opacity_logits: Tensor | None
+    colors: Tensor | None
+    background: Tensor | None
+
+
+class Needed(NamedTuple):
+    """Which fields of ``InputGradients`` are needed."""
+
+    means: bool
+    quats: bool
+    log_scales: bool
+    opacity_logits: bool
+    colors: bool
+    background: bool
 
 
 @dataclass(frozen=True)
@@ -44,6 +55,7 @@ class Drawing:
     inputs, camera, settings: as in ``Rasterizer.rasterize``.
     background: [3] of the inputs' dtype.
     target: [H, W] int32 class ids or IGNORE, or None: no boundary.
+    differentiable: whether a backward may follow; if not, the forward need not keep anything for it.
     """
 
     inputs: SurfelInputs
@@ -51,6 +63,7 @@ class Drawing:
     settings: RasterSettings
     background: Tensor
     target: Tensor | None
+    differentiable: bool
 
 
 class Forward(NamedTuple):
@@ -81,7 +94,7 @@ class KernelRasterizer(Rasterizer):
         """Draw. depth, median_depth and normal are None without ``settings.geometry``, and so on."""
 
     @abstractmethod
-    def backward_kernel(self, drawing: Drawing, state: Any, gradients: Images) -> InputGradients:
+    def backward_kernel(self, drawing: Drawing, state: Any, gradients: Images, needed: Needed) -> InputGradients:
         """The way back. None among ``gradients`` means zero; the others are contiguous."""
 
     def rasterize(
@@ -101,22 +114,24 @@ class KernelRasterizer(Rasterizer):
             target = check_image("target", target, camera)
             if inputs.class_ids is None:
                 raise ValueError("class_ids must be given together with target")
-        fixed = (self, camera, settings, inputs.class_ids, target)
         floats = (inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits, inputs.colors)
-        *images, visible, num_nonfinite = _Rasterize.apply(fixed, *floats, background.contiguous())  # type: ignore
+        differentiable = torch.is_grad_enabled() and any(value.requires_grad for value in (*floats, background))
+        bare = SurfelInputs(*(value.detach() for value in floats), class_ids=inputs.class_ids)
+        drawing = Drawing(bare, camera, settings, background.detach().contiguous(), target, differentiable)
+        if not differentiable:
+            images, visible, num_nonfinite, _ = self.forward_kernel(drawing)
+        else:
+            *images, visible, num_nonfinite = _Rasterize.apply(self, drawing, *floats, background)  # type: ignore
         return RasterOutputs(*images, visible=visible, num_nonfinite=num_nonfinite)
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, fixed, means, quats, log_scales, opacity_logits, colors, background):
-        rasterizer, camera, settings, class_ids, target = fixed
-        floats = (value.detach() for value in (means, quats, log_scales, opacity_logits, colors))
-        drawing = Drawing(SurfelInputs(*floats, class_ids=class_ids), camera, settings, background.detach(), target)
+    def forward(ctx, rasterizer, drawing, *floats):
         images, visible, num_nonfinite, state = rasterizer.forward_kernel(drawing)
         # The inputs are saved through autograd, which notices it if they are changed in place before the backward.
-        ctx.save_for_backward(means, quats, log_scales, opacity_logits, colors, background)
-        ctx.fixed, ctx.state = (rasterizer, replace(drawing, inputs=None, background=None)), state
+        ctx.save_for_backward(*floats)
+        ctx.rasterizer, ctx.drawing, ctx.state = rasterizer, replace(drawing, inputs=None, background=None), state
         ctx.mark_non_differentiable(visible)
         ctx.set_materialize_grads(False)  # None tells the kernel what it need not compute
         return *images, visible, num_nonfinite
@@ -124,11 +139,10 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, *gradients):
-        rasterizer, drawing = ctx.fixed
         *floats, background = (value.detach() for value in ctx.saved_tensors)
-        drawing = replace(drawing, inputs=SurfelInputs(*floats), background=background)
+        drawing = replace(ctx.drawing, inputs=SurfelInputs(*floats), background=background)
         images = Images(*(None if g is None else g.contiguous() for g in gradients[:-2]))
         if all(g is None for g in images):
-            return (None,) * 7
-        found = rasterizer.backward_kernel(drawing, ctx.state, images)
-        return None, *(g if needed else None for g, needed in zip(found, ctx.needs_input_grad[1:], strict=True))
+            return (None,) * 8
+        found = ctx.rasterizer.backward_kernel(drawing, ctx.state, images, Needed(*ctx.needs_input_grad[2:]))
+        return None, None, *found

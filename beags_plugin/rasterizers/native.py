@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from types import ModuleType
@@ -18,6 +19,7 @@ from beags_plugin.rasterizers.autograd import (
     Images,
     InputGradients,
     KernelRasterizer,
+    Needed,
     check_image,
 )
 from beags_plugin.rasterizers.interface import RasterSettings, SurfelInputs
@@ -25,11 +27,46 @@ from beags_plugin.rasterizers.interface import RasterSettings, SurfelInputs
 _FLOATS = ("means", "quats", "log_scales", "opacity_logits", "colors")
 
 
+@dataclass(frozen=True)
+class WorkCounts:
+    """How much one forward has to do: noise-free companions of its time.
+
+    lanes: pixel lanes that the kernels evaluate. contributing: (pixel, surfel) pairs among them that contribute.
+    tile_pairs: (tile, surfel) pairs that are kept. box_pairs: those that the usual bounds would give, boxes of 3.33
+        standard deviations.
+    """
+
+    lanes: int
+    contributing: int
+    tile_pairs: int
+    box_pairs: int
+
+
+def instruction_set() -> str:
+    """The instruction set in use; BEAGS_ISA in the environment forces one. Raises ``UserError`` if it cannot run."""
+    return _module().instruction_set()
+
+
+def instruction_sets() -> list[str]:
+    """Those that this build holds and this processor runs, best first; "scalar", to measure against, comes last."""
+    return _module().instruction_sets()
+
+
+@torch.no_grad()
+def work_counts(inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> WorkCounts:
+    """What drawing these surfels takes; see ``Rasterizer.rasterize`` for the arguments."""
+    frame, _ = _frame(_detached(inputs.checked()), camera, settings)
+    return WorkCounts(*frame.work_counts(_threads()))
+
+
 @cache
 def _load() -> tuple[ModuleType | None, str | None]:
-    """The compiled module, or one sentence on why it is not there."""
+    """The compiled module, or one sentence on why it is not there.
+
+    Raises ``UserError`` if the instruction set that the environment asks for cannot run: nothing may hide that.
+    """
     try:
-        return import_module("beags_plugin._native"), None
+        module = import_module("beags_plugin._native")
     except ModuleNotFoundError:
         return (
             None,
@@ -37,6 +74,18 @@ def _load() -> tuple[ModuleType | None, str | None]:
         )
     except ImportError as error:
         return None, f"beags_plugin._native does not load ({error}); reinstall beags."
+    try:
+        module.instruction_set()
+    except RuntimeError as error:
+        raise UserError(str(error)) from None
+    return module, None
+
+
+def _module() -> ModuleType:
+    module, reason = _load()
+    if module is None:
+        raise UserError(f"the rasterizer 'native' cannot run here: {reason}")
+    return module
 
 
 def _threads() -> int:
@@ -69,13 +118,14 @@ class NativeRasterizer(KernelRasterizer):
             distortion=image(settings.distortion),
             boundary=image(drawing.target is not None),
         )
-        frame.forward(drawing.background, drawing.target, *images, _threads())
+        frame.forward(drawing.background, drawing.target, *images, drawing.differentiable, _threads())
         return Forward(images, visible, frame.num_nonfinite, frame)
 
-    def backward_kernel(self, drawing: Drawing, state: Any, gradients: Images) -> InputGradients:
+    def backward_kernel(self, drawing: Drawing, state: Any, gradients: Images, needed: Needed) -> InputGradients:
         """See ``KernelRasterizer.backward_kernel``."""
         floats = [getattr(drawing.inputs, name) for name in _FLOATS]
-        found = InputGradients(*(torch.zeros_like(value) for value in (*floats, drawing.background)))
+        likes = zip((*floats, drawing.background), needed, strict=True)
+        found = InputGradients(*(torch.zeros_like(value) if wanted else None for value, wanted in likes))
         state.backward(*floats, drawing.target, *gradients, *found, _threads())
         return found
 
@@ -123,9 +173,7 @@ def _detached(inputs: SurfelInputs) -> SurfelInputs:
 
 def _frame(inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> tuple[Any, Tensor]:
     """The compiled module's frame (surfels projected and sorted into tiles), and visible [N] bool."""
-    module, reason = _load()
-    if module is None:
-        raise UserError(f"the rasterizer 'native' cannot run here: {reason}")
+    module = _module()
     if inputs.means.device.type != "cpu":
         raise ValueError(f"the native rasterizer takes CPU tensors, not {inputs.means.device}")
     make = module.FrameF32 if inputs.means.dtype == torch.float32 else module.FrameF64
