@@ -127,7 +127,7 @@ def _work(result: Result) -> Iterator[Goal]:
 
 def _memory(table: _Table) -> Iterator[Goal]:
     row = table.row(LARGE)
-    peak = row and row["peak_mb"]
+    peak: float | None = None if row is None else row["peak_mb"]
     measured = "no figure" if peak is None else f"{peak:.0f} MB"
     yield Goal(f"extra memory at {LARGE.name}", "at most 100 MB", measured, None if peak is None else peak <= 100)
 
@@ -155,7 +155,7 @@ def _step(step: dict[str, Any]) -> Iterator[Goal]:
         f"memory of a refinement step, Z = {samples} against Z = 20, {size}",
         f"no more ({MEMORY_SLACK_MB:g} MB are noise)",
         measured,
-        many <= few + MEMORY_SLACK_MB if known else None,
+        None if few is None or many is None else many <= few + MEMORY_SLACK_MB,
     )
     overhead = step.get("overhead", {})
     for what in ("rasterizer", "step"):
