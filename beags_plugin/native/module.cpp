@@ -3,6 +3,7 @@
 #include <nanobind/ndarray.h>
 
 #include "frame.h"
+#include "module_images.h"
 #include "module_ops.h"
 
 namespace nb = nanobind;
@@ -130,4 +131,5 @@ NB_MODULE(_native, m) {
   beags::bind<float>(m, "FrameF32");
   beags::bind<double>(m, "FrameF64");
   beags::bind_ops(m);
+  beags::bind_images(m);
 }

@@ -1,0 +1,162 @@
+// L1 and SSIM, and their gradient in closed form, one row at a time (method, section 1). Included once for each
+// instruction set. A row is blurred down the columns first, for which the products are made anew, into a few
+// buffers that stay in the cache, then along the row, where the window steps over the interleaved channels.
+#pragma once
+
+#include "image_kernels.h"
+#include "lanes.h"
+
+namespace beags {
+namespace ops {
+namespace BEAGS_ISA {
+
+template <class T>
+using RealOf = typename Lanes<T>::Real;
+
+// `count` numbers, or as many as a vector holds; zeros behind them.
+template <class T>
+BEAGS_OPS_INLINE RealOf<T> load_part(const T* from, int64_t count) {
+  RealOf<T> value = {};
+  if (count >= Lanes<T>::kCount) {
+    __builtin_memcpy(&value, from, sizeof value);
+  } else {
+    for (int64_t i = 0; i < count; ++i) value[i] = from[i];
+  }
+  return value;
+}
+template <class T>
+BEAGS_OPS_INLINE void store_part(T* to, RealOf<T> value, int64_t count) {
+  if (count >= Lanes<T>::kCount) {
+    __builtin_memcpy(to, &value, sizeof value);
+  } else {
+    for (int64_t i = 0; i < count; ++i) to[i] = value[i];
+  }
+}
+
+constexpr int kPad = kReach * kChannels;  // numbers beyond a row's ends that the window reaches, held at 0
+
+// Numbers in one buffer of a row.
+template <class T>
+BEAGS_OPS_INLINE int64_t buffer_length(int width) {
+  return static_cast<int64_t>(width) * kChannels + 2 * kPad + 2 * Lanes<T>::kCount;
+}
+template <class T>
+int64_t photometric_scratch(int width) {
+  return 4 * buffer_length<T>(width);
+}
+
+template <class T>
+BEAGS_OPS_INLINE void clear_pads(T* scratch, int width, int buffers) {
+  const int64_t length = buffer_length<T>(width), end = kPad + static_cast<int64_t>(width) * kChannels;
+  for (int b = 0; b < buffers; ++b) {
+    for (int i = 0; i < kPad; ++i) scratch[b * length + i] = T(0);
+    for (int64_t i = end; i < length; ++i) scratch[b * length + i] = T(0);
+  }
+}
+
+// The window along a row; `from` points at the buffer's number of the first lane.
+template <class T>
+BEAGS_OPS_INLINE RealOf<T> blur_row(const PhotometricJob<T>& job, const T* from) {
+  RealOf<T> sum = {};
+  for (int k = 0; k < kWindow; ++k) {
+    RealOf<T> value;
+    __builtin_memcpy(&value, from + (k - kReach) * kChannels, sizeof value);
+    sum = fma(RealOf<T>{} + job.window[k], value, sum);
+  }
+  return sum;
+}
+
+template <class T>
+void photometric(const PhotometricJob<T>& job, int row, T* scratch) {
+  using R = RealOf<T>;
+  constexpr int kLanes = Lanes<T>::kCount;
+  const int64_t line = static_cast<int64_t>(job.width) * kChannels, length = buffer_length<T>(job.width);
+  const int first = row < kReach ? -row : -kReach;
+  const int last = row + kReach < job.height ? kReach : job.height - 1 - row;
+  clear_pads(scratch, job.width, 4);
+  for (int64_t i = 0; i < line; i += kLanes) {
+    R x = {}, y = {}, squares = {}, product = {};
+    for (int k = first; k <= last; ++k) {
+      const int64_t at = (row + k) * line + i;
+      const R w = R{} + job.window[k + kReach];
+      const R a = load_part(job.image + at, line - i), b = load_part(job.reference + at, line - i);
+      const R wa = w * a, wb = w * b;
+      x += wa;
+      y += wb;
+      squares = fma(wa, a, fma(wb, b, squares));
+      product = fma(wa, b, product);
+    }
+    T* to = scratch + kPad + i;
+    store_part(to, x, line - i);
+    store_part(to + length, y, line - i);
+    store_part(to + 2 * length, squares, line - i);
+    store_part(to + 3 * length, product, line - i);
+  }
+  R absolute = {}, similar = {};  // Determinism: summed lane by lane along the row, whoever draws it
+  for (int64_t i = 0; i < line; i += kLanes) {
+    const T* from = scratch + kPad + i;
+    const R m_x = blur_row(job, from), m_y = blur_row(job, from + length);
+    const R squares = blur_row(job, from + 2 * length), product = blur_row(job, from + 3 * length);
+    const R m_xx_yy = fma(m_x, m_x, m_y * m_y), m_xy = m_x * m_y;
+    const R a1 = T(2) * m_xy + job.c1, a2 = T(2) * (product - m_xy) + job.c2;
+    const R b1 = m_xx_yy + job.c1, b2 = squares - m_xx_yy + job.c2;
+    const R inverse = T(1) / (b1 * b2), index = a1 * a2 * inverse;
+    const int64_t at = row * line + i, count = line - i;
+    const R difference = load_part(job.image + at, count) - load_part(job.reference + at, count);
+    absolute += select(difference < R{}, -difference, difference);
+    if (count >= kLanes) {
+      similar += index;
+    } else {
+      for (int64_t lane = 0; lane < count; ++lane) similar[lane] += index[lane];
+    }
+    if (job.slopes) {
+      const int64_t map = static_cast<int64_t>(job.height) * line;
+      store_part(job.slopes + at, T(2) * (m_y * (a2 - a1) + m_x * index * (b1 - b2)) * inverse, count);
+      store_part(job.slopes + map + at, -index / b2, count);
+      store_part(job.slopes + 2 * map + at, T(2) * a1 * inverse, count);
+    }
+  }
+  double sums[2] = {};
+  for (int lane = 0; lane < kLanes; ++lane) {
+    sums[0] += absolute[lane];
+    sums[1] += similar[lane];
+  }
+  job.sums[2 * row] = sums[0];
+  job.sums[2 * row + 1] = sums[1];
+}
+
+// A symmetric window with zeros outside is its own adjoint, so the way back is the same blur.
+template <class T>
+void photometric_gradient(const PhotometricJob<T>& job, int row, T* scratch) {
+  using R = RealOf<T>;
+  constexpr int kLanes = Lanes<T>::kCount;
+  const int64_t line = static_cast<int64_t>(job.width) * kChannels, length = buffer_length<T>(job.width);
+  const int64_t map = static_cast<int64_t>(job.height) * line;
+  const int first = row < kReach ? -row : -kReach;
+  const int last = row + kReach < job.height ? kReach : job.height - 1 - row;
+  clear_pads(scratch, job.width, 3);
+  for (int64_t i = 0; i < line; i += kLanes) {
+    R sums[3] = {};
+    for (int k = first; k <= last; ++k) {
+      const int64_t at = (row + k) * line + i;
+      const R w = R{} + job.window[k + kReach];
+      for (int m = 0; m < 3; ++m) sums[m] = fma(w, load_part(job.slopes + m * map + at, line - i), sums[m]);
+    }
+    for (int m = 0; m < 3; ++m) store_part(scratch + m * length + kPad + i, sums[m], line - i);
+  }
+  for (int64_t i = 0; i < line; i += kLanes) {
+    const T* from = scratch + kPad + i;
+    const R mean = blur_row(job, from), squares = blur_row(job, from + length);
+    const R product = blur_row(job, from + 2 * length);
+    const int64_t at = row * line + i, count = line - i;
+    const R x = load_part(job.image + at, count), y = load_part(job.reference + at, count);
+    const R one = R{} + T(1);
+    const R sign = select(x > y, one, select(x < y, -one, R{}));
+    const R similar = mean + T(2) * x * squares + y * product;
+    store_part(job.gradient + at, job.l1_scale * sign + job.ssim_scale * similar, count);
+  }
+}
+
+}  // namespace BEAGS_ISA
+}  // namespace ops
+}  // namespace beags
