@@ -13,24 +13,39 @@ namespace BEAGS_ISA {
 template <class T>
 using RealOf = typename Lanes<T>::Real;
 
-// `count` numbers, or as many as a vector holds; zeros behind them.
-template <class T>
-BEAGS_OPS_INLINE RealOf<T> load_part(const T* from, int64_t count) {
-  RealOf<T> value = {};
-  if (count >= Lanes<T>::kCount) {
+// The lanes of a vector that lie in the row: all of them, or `count`; zeros in the others.
+struct Whole {
+  template <class T>
+  BEAGS_OPS_INLINE static RealOf<T> load(const T* from) {
+    RealOf<T> value;
     __builtin_memcpy(&value, from, sizeof value);
-  } else {
-    for (int64_t i = 0; i < count; ++i) value[i] = from[i];
+    return value;
   }
-  return value;
-}
-template <class T>
-BEAGS_OPS_INLINE void store_part(T* to, RealOf<T> value, int64_t count) {
-  if (count >= Lanes<T>::kCount) {
+  template <class T>
+  BEAGS_OPS_INLINE static void store(T* to, RealOf<T> value) {
     __builtin_memcpy(to, &value, sizeof value);
-  } else {
+  }
+};
+struct Part {
+  int64_t count;
+  template <class T>
+  BEAGS_OPS_INLINE RealOf<T> load(const T* from) const {
+    RealOf<T> value = {};
+    for (int64_t i = 0; i < count; ++i) value[i] = from[i];
+    return value;
+  }
+  template <class T>
+  BEAGS_OPS_INLINE void store(T* to, RealOf<T> value) const {
     for (int64_t i = 0; i < count; ++i) to[i] = value[i];
   }
+};
+
+// Calls visit(first number, lanes) for every vector of a row of `line` numbers.
+template <class T, class Visit>
+BEAGS_OPS_INLINE void for_each_vector(int64_t line, Visit visit) {
+  int64_t i = 0;
+  for (; i + Lanes<T>::kCount <= line; i += Lanes<T>::kCount) visit(i, Whole{});
+  if (i < line) visit(i, Part{line - i});
 }
 
 constexpr int kPad = kReach * kChannels;  // numbers beyond a row's ends that the window reaches, held at 0
@@ -69,17 +84,16 @@ BEAGS_OPS_INLINE RealOf<T> blur_row(const PhotometricJob<T>& job, const T* from)
 template <class T>
 void photometric(const PhotometricJob<T>& job, int row, T* scratch) {
   using R = RealOf<T>;
-  constexpr int kLanes = Lanes<T>::kCount;
   const int64_t line = static_cast<int64_t>(job.width) * kChannels, length = buffer_length<T>(job.width);
   const int first = row < kReach ? -row : -kReach;
   const int last = row + kReach < job.height ? kReach : job.height - 1 - row;
   clear_pads(scratch, job.width, 4);
-  for (int64_t i = 0; i < line; i += kLanes) {
+  for_each_vector<T>(line, [&](int64_t i, auto lanes) {
     R x = {}, y = {}, squares = {}, product = {};
     for (int k = first; k <= last; ++k) {
       const int64_t at = (row + k) * line + i;
       const R w = R{} + job.window[k + kReach];
-      const R a = load_part(job.image + at, line - i), b = load_part(job.reference + at, line - i);
+      const R a = lanes.load(job.image + at), b = lanes.load(job.reference + at);
       const R wa = w * a, wb = w * b;
       x += wa;
       y += wb;
@@ -87,13 +101,14 @@ void photometric(const PhotometricJob<T>& job, int row, T* scratch) {
       product = fma(wa, b, product);
     }
     T* to = scratch + kPad + i;
-    store_part(to, x, line - i);
-    store_part(to + length, y, line - i);
-    store_part(to + 2 * length, squares, line - i);
-    store_part(to + 3 * length, product, line - i);
-  }
+    lanes.store(to, x);
+    lanes.store(to + length, y);
+    lanes.store(to + 2 * length, squares);
+    lanes.store(to + 3 * length, product);
+  });
+  const int64_t map = static_cast<int64_t>(job.height) * line;
   R absolute = {}, similar = {};  // Determinism: summed lane by lane along the row, whoever draws it
-  for (int64_t i = 0; i < line; i += kLanes) {
+  for_each_vector<T>(line, [&](int64_t i, auto lanes) {
     const T* from = scratch + kPad + i;
     const R m_x = blur_row(job, from), m_y = blur_row(job, from + length);
     const R squares = blur_row(job, from + 2 * length), product = blur_row(job, from + 3 * length);
@@ -101,23 +116,20 @@ void photometric(const PhotometricJob<T>& job, int row, T* scratch) {
     const R a1 = T(2) * m_xy + job.c1, a2 = T(2) * (product - m_xy) + job.c2;
     const R b1 = m_xx_yy + job.c1, b2 = squares - m_xx_yy + job.c2;
     const R inverse = T(1) / (b1 * b2), index = a1 * a2 * inverse;
-    const int64_t at = row * line + i, count = line - i;
-    const R difference = load_part(job.image + at, count) - load_part(job.reference + at, count);
+    const int64_t at = row * line + i;
+    const R difference = lanes.load(job.image + at) - lanes.load(job.reference + at);
     absolute += select(difference < R{}, -difference, difference);
-    if (count >= kLanes) {
-      similar += index;
-    } else {
-      for (int64_t lane = 0; lane < count; ++lane) similar[lane] += index[lane];
-    }
+    T counted[Lanes<T>::kCount] = {};
+    lanes.store(counted, index);
+    similar += Whole::load(counted);
     if (job.slopes) {
-      const int64_t map = static_cast<int64_t>(job.height) * line;
-      store_part(job.slopes + at, T(2) * (m_y * (a2 - a1) + m_x * index * (b1 - b2)) * inverse, count);
-      store_part(job.slopes + map + at, -index / b2, count);
-      store_part(job.slopes + 2 * map + at, T(2) * a1 * inverse, count);
+      lanes.store(job.slopes + at, T(2) * (m_y * (a2 - a1) + m_x * index * (b1 - b2)) * inverse);
+      lanes.store(job.slopes + map + at, -index * (b1 * inverse));
+      lanes.store(job.slopes + 2 * map + at, T(2) * a1 * inverse);
     }
-  }
+  });
   double sums[2] = {};
-  for (int lane = 0; lane < kLanes; ++lane) {
+  for (int lane = 0; lane < Lanes<T>::kCount; ++lane) {
     sums[0] += absolute[lane];
     sums[1] += similar[lane];
   }
@@ -129,32 +141,31 @@ void photometric(const PhotometricJob<T>& job, int row, T* scratch) {
 template <class T>
 void photometric_gradient(const PhotometricJob<T>& job, int row, T* scratch) {
   using R = RealOf<T>;
-  constexpr int kLanes = Lanes<T>::kCount;
   const int64_t line = static_cast<int64_t>(job.width) * kChannels, length = buffer_length<T>(job.width);
   const int64_t map = static_cast<int64_t>(job.height) * line;
   const int first = row < kReach ? -row : -kReach;
   const int last = row + kReach < job.height ? kReach : job.height - 1 - row;
   clear_pads(scratch, job.width, 3);
-  for (int64_t i = 0; i < line; i += kLanes) {
+  for_each_vector<T>(line, [&](int64_t i, auto lanes) {
     R sums[3] = {};
     for (int k = first; k <= last; ++k) {
-      const int64_t at = (row + k) * line + i;
+      const T* from = job.slopes + (row + k) * line + i;
       const R w = R{} + job.window[k + kReach];
-      for (int m = 0; m < 3; ++m) sums[m] = fma(w, load_part(job.slopes + m * map + at, line - i), sums[m]);
+      for (int m = 0; m < 3; ++m) sums[m] = fma(w, lanes.load(from + m * map), sums[m]);
     }
-    for (int m = 0; m < 3; ++m) store_part(scratch + m * length + kPad + i, sums[m], line - i);
-  }
-  for (int64_t i = 0; i < line; i += kLanes) {
+    for (int m = 0; m < 3; ++m) lanes.store(scratch + m * length + kPad + i, sums[m]);
+  });
+  for_each_vector<T>(line, [&](int64_t i, auto lanes) {
     const T* from = scratch + kPad + i;
     const R mean = blur_row(job, from), squares = blur_row(job, from + length);
     const R product = blur_row(job, from + 2 * length);
-    const int64_t at = row * line + i, count = line - i;
-    const R x = load_part(job.image + at, count), y = load_part(job.reference + at, count);
+    const int64_t at = row * line + i;
+    const R x = lanes.load(job.image + at), y = lanes.load(job.reference + at);
     const R one = R{} + T(1);
     const R sign = select(x > y, one, select(x < y, -one, R{}));
     const R similar = mean + T(2) * x * squares + y * product;
-    store_part(job.gradient + at, job.l1_scale * sign + job.ssim_scale * similar, count);
-  }
+    lanes.store(job.gradient + at, job.l1_scale * sign + job.ssim_scale * similar);
+  });
 }
 
 }  // namespace BEAGS_ISA
