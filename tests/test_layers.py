@@ -16,6 +16,8 @@ CORE = [  # all that stands under the plugin layer
     "losses.photometric",
     "losses.normal",
     "masks.reprojection",
+    "masks.voxel_reprojection",
+    "ops.occupancy_loss",
     "assignment.assignment",
     "occupancy.build",
     "refiners.bea",

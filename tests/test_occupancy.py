@@ -18,6 +18,8 @@ from beags_plugin.losses.occupancy import OccupancyLoss
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.occupancy.sampling import disc_points, sample_words
 
+both = pytest.mark.usefixtures("ops")  # run with the torch versions and with the compiled ops
+
 COUNT = 30
 FLOATS = ("means", "quats", "log_scales", "opacity_logits")
 
@@ -78,6 +80,7 @@ def _gradients(value: torch.Tensor, surfels: Surfels) -> list[torch.Tensor]:
     return list(torch.autograd.grad(value, [getattr(surfels, name) for name in FLOATS]))
 
 
+@both
 @pytest.mark.parametrize("samples", [1, 20])
 @pytest.mark.parametrize("dense_bytes", [1 << 28, 0])
 def test_value_and_gradients_equal_autograd(samples, dense_bytes):
@@ -91,6 +94,7 @@ def test_value_and_gradients_equal_autograd(samples, dense_bytes):
         assert torch.allclose(a, b, rtol=1e-9, atol=1e-12), name
 
 
+@both
 def test_gradients_equal_finite_differences():
     """Of the loss with its points held in the world: moving a surfel must not move them."""
     surfels, grid = _surfels(count=6), _grid()
@@ -110,6 +114,7 @@ def test_gradients_equal_finite_differences():
             )
 
 
+@both
 def test_skipped_gaussians_change_nothing():
     """All inside: no loss, no gradient. Some inside: the others' points stay the same."""
     surfels, grid = _surfels(), _grid()
@@ -125,6 +130,7 @@ def test_skipped_gaussians_change_nothing():
     assert not invalid[:, skipped].any()  # by counting, none of 500 points of a skipped disc is outside
 
 
+@both
 def test_everything_inside_gives_zero_with_gradients():
     surfels = Surfels(**{name: getattr(_surfels(), name) for name in (*FLOATS, "sh")})
     with torch.no_grad():
@@ -137,6 +143,7 @@ def test_everything_inside_gives_zero_with_gradients():
     assert float(OccupancyLoss().value(_inputs(nothing, ids=torch.zeros(0).int()))) == 0.0
 
 
+@both
 def test_a_class_without_voxels_is_penalised_everywhere():
     surfels = _surfels()
     ids = torch.zeros(COUNT, dtype=torch.int32)  # no point of class 0 was lifted
@@ -157,6 +164,7 @@ def test_results_do_not_depend_on_chunks(monkeypatch):
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
+@both
 def test_results_do_not_depend_on_threads():
     count = 70_001  # enough for torch to split
     surfels, results, threads = _surfels(torch.float32, count), [], torch.get_num_threads()
@@ -171,6 +179,7 @@ def test_results_do_not_depend_on_threads():
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
+@both
 def test_float32_agrees_with_float64():
     values = [
         float(OccupancyLoss(samples=50).value(_inputs(_surfels(dtype)))) for dtype in (torch.float32, torch.float64)
@@ -178,6 +187,7 @@ def test_float32_agrees_with_float64():
     assert values[0] == pytest.approx(values[1], rel=1e-3)  # a point on a voxel's face may change sides
 
 
+@both
 def test_many_samples_take_no_more_memory():
     """The largest tensor that one evaluation makes is the same for Z = 20 and Z = 1000."""
     from torch.utils._python_dispatch import TorchDispatchMode
@@ -201,6 +211,7 @@ def test_many_samples_take_no_more_memory():
     assert sizes[1] <= sizes[0] and values[1] == pytest.approx(values[0], rel=0.02)
 
 
+@both
 @pytest.mark.parametrize("factor", [1e-4, 1e6])
 def test_scale_of_the_scene_does_not_matter(factor):
     value = OccupancyLoss(samples=50).value(_inputs(_surfels(torch.float32, 200)))
@@ -208,6 +219,7 @@ def test_scale_of_the_scene_does_not_matter(factor):
     assert float(scaled) == pytest.approx(float(value), rel=1e-3)
 
 
+@both
 def test_broken_surfels_count_as_nothing():
     for name, value in [("means", math.nan), ("means", math.inf), ("quats", 0.0), ("log_scales", math.inf),
                         ("log_scales", -math.inf), ("opacity_logits", math.nan)]:  # fmt: skip
@@ -315,6 +327,7 @@ def test_importing_the_packages_stays_light():
     assert result.returncode == 0, result.stderr
 
 
+@both
 def test_the_background_can_be_left_out():
     surfels, ids = _surfels(), _ids()
     objects = surfels[ids != 0]
@@ -324,6 +337,7 @@ def test_the_background_can_be_left_out():
     assert all(not gradient[ids == 0].any() for gradient in _gradients(value, surfels))
 
 
+@both
 def test_a_gaussian_that_no_ray_sees_learns_position_scale_rotation_and_opacity():
     """Behind an opaque wall the image gives no gradient at all; the occupancy loss reaches every kind of parameter."""
     from beags_plugin.core.cameras import Camera

@@ -15,6 +15,8 @@ from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.masks.reprojection import reproject_pairwise
 from beags_plugin.rasterizers.interface import IGNORE
 
+both = pytest.mark.usefixtures("ops")  # run with the torch versions and with the compiled ops
+
 SIZES = [(9, 7), (11, 8), (6, 10), (9, 7)]  # width, height
 
 
@@ -79,6 +81,7 @@ def _by_loops(depths, cameras, labels, num_classes, tau):
     return results
 
 
+@both
 @pytest.mark.parametrize("tau", [0.02, 0.05, math.inf])
 @pytest.mark.parametrize("dense", [True, False])
 def test_equals_loops(monkeypatch, tau, dense):
@@ -103,6 +106,7 @@ def test_chunks_do_not_matter(monkeypatch):
         assert torch.equal(a.labels, b.labels) and torch.equal(a.confidence, b.confidence)
 
 
+@both
 def test_one_view_votes_for_itself():
     depths, cameras, labels = _scene()
     (result,) = reproject_pairwise(depths[:1], cameras[:1], labels[:1], 3)
@@ -119,6 +123,7 @@ def _copies(masks, depth=2.0):
     return [(int(r.labels), float(r.confidence)) for r in reproject_pairwise(depths, [camera] * len(masks), labels, 4)]
 
 
+@both
 def test_majority_tie_and_silence():
     assert _copies([1, 1, 3]) == [(1, pytest.approx(2 / 3))] * 3
     assert _copies([1, 3, IGNORE, None]) == [(1, 0.5), (3, 0.5), (IGNORE, 0.5), (IGNORE, 0.5)]  # a tie changes nothing
@@ -127,6 +132,7 @@ def test_majority_tie_and_silence():
     assert _copies([0, None]) == [(0, 1.0)] * 2  # the background is a class like others
 
 
+@both
 def test_hidden_points_do_not_vote():
     """Camera 1 stands behind the wall that camera 0 sees, and sees something nearer itself."""
     camera = _cameras([(1, 1)])[0]
@@ -136,6 +142,7 @@ def test_hidden_points_do_not_vote():
     assert int(reproject_pairwise(depths, [camera] * 2, labels, 2, tau=math.inf)[1].labels) == 1
 
 
+@both
 @pytest.mark.parametrize("factor", [1e-4, 1e6])
 def test_scale_of_the_scene_does_not_matter(factor):
     depths, cameras, labels = _scene(seed=2)
@@ -149,6 +156,7 @@ def test_scale_of_the_scene_does_not_matter(factor):
     assert all(torch.equal(a.labels, b.labels) for a, b in zip(before, after, strict=True))
 
 
+@both
 def test_depths_that_are_not_finite_do_not_vote():
     depths, cameras, labels = _scene()
     for value in (math.nan, math.inf, -1.0):

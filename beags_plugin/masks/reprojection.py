@@ -51,6 +51,8 @@ def reproject_pairwise(
     """
     check_views(depths, cameras, labels, num_classes, tau)
     results: list[ReprojectedMask] = []
+    if not cameras:
+        return results
     maps = _PixelMaps(cameras)
     while len(results) < len(cameras):
         i = len(results)
@@ -64,7 +66,8 @@ def reproject_pairwise(
         else:
             results.append(_by_torch(depths, cameras, labels, num_classes, tau, i, maps))
         if progress:
-            progress(len(results), len(cameras))
+            for done in range(i + 1, len(results) + 1):
+                progress(done, len(cameras))
     return results
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -34,6 +34,8 @@ def reproject_voxel(
     Cost O(V pixels), memory linear in the voxels.
     """
     check_views(depths, cameras, labels, num_classes, tau)
+    if not cameras:
+        return []
     size = _voxel_size(depths, cameras)
     origin = _origin(cameras)
     votes = VoxelVotes(origin, size) if extension.can_take(*depths) else _TorchVotes(origin, size)
@@ -48,7 +50,9 @@ def reproject_voxel(
     results = []
     for i, (depth, camera, mask) in enumerate(zip(depths, cameras, labels, strict=True)):
         shape = (camera.height, camera.width)
-        voted = torch.full(shape, IGNORE, dtype=torch.int32, device=depth.device) if mask is None else mask.int().clone()
+        voted = (
+            torch.full(shape, IGNORE, dtype=torch.int32, device=depth.device) if mask is None else mask.int().clone()
+        )
         confidence = torch.zeros(shape, dtype=torch.float32, device=depth.device)
         drawn = _drawn(depth)
         voted[drawn], confidence[drawn] = votes.read(lift(depth, camera)[drawn], voted[drawn])
@@ -68,14 +72,13 @@ def _voxel_size(depths: Sequence[Tensor], cameras: Sequence[Camera]) -> float:
     for depth, camera in zip(depths, cameras, strict=True):
         focal = (float(camera.K[0, 0]) * float(camera.K[1, 1])) ** 0.5
         footprints.append((depth[_drawn(depth)] / focal).double().cpu())
-    every = torch.cat(footprints) if footprints else torch.zeros(0)
+    every = torch.cat(footprints)
     return VOXEL_PIXELS * float(every.median()) if len(every) else 1.0
 
 
 def _origin(cameras: Sequence[Camera]) -> Tensor:
     """[3] float64: amid the cameras, as the keys reach equally far to all sides."""
-    centers = [camera.to("cpu", torch.float64).center for camera in cameras]
-    return torch.stack(centers).mean(0) if centers else torch.zeros(3, dtype=torch.float64)
+    return torch.stack([camera.to("cpu", torch.float64).center for camera in cameras]).mean(0)
 
 
 class _TorchVotes:

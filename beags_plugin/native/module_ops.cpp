@@ -37,47 +37,42 @@ template <class T>
 void bind_lookup(nb::class_<VoxelLookup>& lookup, const char* suffix) {
   using In = Array<const T>;
   const std::string end(suffix);
-  lookup.def(
-      ("count_" + end).c_str(),
-      [](const VoxelLookup& self, In points, Ids class_ids, Array<int64_t> out, int threads) {
-        nb::gil_scoped_release release;
-        self.count_occupied(rows(class_ids), points.data(), class_ids.data(), out.data(), threads);
-      },
-      "points"_a, "class_ids"_a, "out"_a, "threads"_a);
-  lookup.def(
-      ("valid_" + end).c_str(),
-      [](const VoxelLookup& self, In points, Ids class_ids, Array<bool> out, int threads) {
-        nb::gil_scoped_release release;
-        self.is_valid(rows(class_ids), points.data(), class_ids.data(), out.data(), threads);
-      },
-      "points"_a, "class_ids"_a, "out"_a, "threads"_a);
-  lookup.def(
-      ("disc_inside_" + end).c_str(),
-      [](const VoxelLookup& self, In means, In axes_u, In axes_v, Ids class_ids, Array<bool> out, int threads) {
-        nb::gil_scoped_release release;
-        self.disc_inside(rows(class_ids), means.data(), axes_u.data(), axes_v.data(), class_ids.data(), out.data(),
-                         threads);
-      },
-      "means"_a, "axes_u"_a, "axes_v"_a, "class_ids"_a, "out"_a, "threads"_a);
+  lookup.def(("count_" + end).c_str(),
+             [](const VoxelLookup& self, In points, Ids class_ids, Array<int64_t> out, int threads) {
+               nb::gil_scoped_release release;
+               self.count_occupied(rows(class_ids), points.data(), class_ids.data(), out.data(), threads);
+             },
+             "points"_a, "class_ids"_a, "out"_a, "threads"_a);
+  lookup.def(("valid_" + end).c_str(),
+             [](const VoxelLookup& self, In points, Ids class_ids, Array<bool> out, int threads) {
+               nb::gil_scoped_release release;
+               self.is_valid(rows(class_ids), points.data(), class_ids.data(), out.data(), threads);
+             },
+             "points"_a, "class_ids"_a, "out"_a, "threads"_a);
+  lookup.def(("disc_inside_" + end).c_str(),
+             [](const VoxelLookup& self, In means, In axes_u, In axes_v, Ids class_ids, Array<bool> out, int threads) {
+               nb::gil_scoped_release release;
+               self.disc_inside(rows(class_ids), means.data(), axes_u.data(), axes_v.data(), class_ids.data(),
+                                out.data(), threads);
+             },
+             "means"_a, "axes_u"_a, "axes_v"_a, "class_ids"_a, "out"_a, "threads"_a);
 }
 
 template <class T>
 void bind_votes(nb::class_<VoxelVotes>& votes, const char* suffix) {
   const std::string end(suffix);
-  votes.def(
-      ("add_" + end).c_str(),
-      [](VoxelVotes& self, Array<const T> points, Ids labels) {
-        nb::gil_scoped_release release;
-        self.add(rows(labels), points.data(), labels.data());
-      },
-      "points"_a, "labels"_a);
-  votes.def(
-      ("read_" + end).c_str(),
-      [](const VoxelVotes& self, Array<const T> points, Array<int32_t> labels, Array<float> confidence) {
-        nb::gil_scoped_release release;
-        self.read(static_cast<int64_t>(labels.shape(0)), points.data(), labels.data(), confidence.data());
-      },
-      "points"_a, "labels"_a, "confidence"_a);
+  votes.def(("add_" + end).c_str(),
+            [](VoxelVotes& self, Array<const T> points, Ids labels) {
+              nb::gil_scoped_release release;
+              self.add(rows(labels), points.data(), labels.data());
+            },
+            "points"_a, "labels"_a);
+  votes.def(("read_" + end).c_str(),
+            [](const VoxelVotes& self, Array<const T> points, Array<int32_t> labels, Array<float> confidence) {
+              nb::gil_scoped_release release;
+              self.read(static_cast<int64_t>(labels.shape(0)), points.data(), labels.data(), confidence.data());
+            },
+            "points"_a, "labels"_a, "confidence"_a);
 }
 
 template <class T>
@@ -85,94 +80,90 @@ void bind_functions(nb::module_& m, const char* suffix) {
   using In = Array<const T>;
   using Out = Array<T>;
   const std::string end(suffix);
-  m.def(
-      ("occupancy_loss_" + end).c_str(),
-      [](In means, In quats, In log_scales, In opacity_logits, Ids class_ids, const VoxelLookup& lookup,
-         uint64_t stream, int64_t samples, bool background, Out g_means, Out g_quats, Out g_log_scales,
-         Out g_opacity_logits, int threads) {
-        const VoxelTable valid = lookup.valid();
-        const int64_t count = rows(class_ids);
-        OccupancyJob<T> job{};
-        job.means = means.data();
-        job.quats = quats.data();
-        job.log_scales = log_scales.data();
-        job.opacity_logits = opacity_logits.data();
-        job.class_ids = class_ids.data();
-        job.valid = &valid;
-        for (int axis = 0; axis < 3; ++axis) job.origin[axis] = static_cast<T>(lookup.origin()[axis]);
-        job.voxel_size = static_cast<T>(lookup.voxel_size());
-        job.stream = stream;
-        job.samples = samples;
-        job.background = background;
-        job.factor = 1.0 / (count && samples ? static_cast<double>(count) * static_cast<double>(samples) : 1.0);
-        job.g_means = numbers(g_means);
-        job.g_quats = numbers(g_quats);
-        job.g_log_scales = numbers(g_log_scales);
-        job.g_opacity_logits = numbers(g_opacity_logits);
-        OccupancyResult result;
-        {
+  m.def(("occupancy_loss_" + end).c_str(),
+        [](In means, In quats, In log_scales, In opacity_logits, Ids class_ids, const VoxelLookup& lookup,
+           uint64_t stream, int64_t samples, bool background, Out g_means, Out g_quats, Out g_log_scales,
+           Out g_opacity_logits, int threads) {
+          const VoxelTable valid = lookup.valid();
+          const int64_t count = rows(class_ids);
+          OccupancyJob<T> job{};
+          job.means = means.data();
+          job.quats = quats.data();
+          job.log_scales = log_scales.data();
+          job.opacity_logits = opacity_logits.data();
+          job.class_ids = class_ids.data();
+          job.valid = &valid;
+          for (int axis = 0; axis < 3; ++axis) job.origin[axis] = static_cast<T>(lookup.origin()[axis]);
+          job.voxel_size = static_cast<T>(lookup.voxel_size());
+          job.stream = stream;
+          job.samples = samples;
+          job.background = background;
+          job.factor = 1.0 / (count && samples ? static_cast<double>(count) * static_cast<double>(samples) : 1.0);
+          job.g_means = numbers(g_means);
+          job.g_quats = numbers(g_quats);
+          job.g_log_scales = numbers(g_log_scales);
+          job.g_opacity_logits = numbers(g_opacity_logits);
+          OccupancyResult result;
+          {
+            nb::gil_scoped_release release;
+            result = occupancy_loss(job, count, threads);
+          }
+          return nb::make_tuple(result.value, result.active);
+        },
+        "means"_a, "quats"_a, "log_scales"_a, "opacity_logits"_a, "class_ids"_a, "lookup"_a, "stream"_a, "samples"_a,
+        "background"_a, "g_means"_a.none(), "g_quats"_a.none(), "g_log_scales"_a.none(), "g_opacity_logits"_a.none(),
+        "threads"_a);
+  m.def(("sh_colors_" + end).c_str(),
+        [](In sh, In means, const std::vector<double>& center, int degree, Out colors, Array<uint8_t> clamped,
+           int threads) {
+          ColorJob<T> job{};
+          job.degree = degree;
+          job.num_bases = static_cast<int>(sh.shape(1));
+          for (int axis = 0; axis < 3; ++axis) job.center[axis] = static_cast<T>(center[axis]);
+          job.sh = sh.data();
+          job.means = means.data();
+          job.colors = colors.data();
+          job.clamped = clamped.data();
           nb::gil_scoped_release release;
-          result = occupancy_loss(job, count, threads);
-        }
-        return nb::make_tuple(result.value, result.active);
-      },
-      "means"_a, "quats"_a, "log_scales"_a, "opacity_logits"_a, "class_ids"_a, "lookup"_a, "stream"_a, "samples"_a,
-      "background"_a, "g_means"_a.none(), "g_quats"_a.none(), "g_log_scales"_a.none(), "g_opacity_logits"_a.none(),
-      "threads"_a);
-  m.def(
-      ("sh_colors_" + end).c_str(),
-      [](In sh, In means, const std::vector<double>& center, int degree, Out colors, Array<uint8_t> clamped,
-         int threads) {
-        ColorJob<T> job{};
-        job.degree = degree;
-        job.num_bases = static_cast<int>(sh.shape(1));
-        for (int axis = 0; axis < 3; ++axis) job.center[axis] = static_cast<T>(center[axis]);
-        job.sh = sh.data();
-        job.means = means.data();
-        job.colors = colors.data();
-        job.clamped = clamped.data();
-        nb::gil_scoped_release release;
-        sh_colors(job, static_cast<int64_t>(sh.shape(0)), threads);
-      },
-      "sh"_a, "means"_a, "center"_a, "degree"_a, "colors"_a, "clamped"_a, "threads"_a);
-  m.def(
-      ("sh_colors_backward_" + end).c_str(),
-      [](In sh, In means, const std::vector<double>& center, int degree, Array<uint8_t> clamped, In g_colors, Out g_sh,
-         Out g_means, int threads) {
-        ColorJob<T> job{};
-        job.degree = degree;
-        job.num_bases = static_cast<int>(sh.shape(1));
-        for (int axis = 0; axis < 3; ++axis) job.center[axis] = static_cast<T>(center[axis]);
-        job.sh = sh.data();
-        job.means = means.data();
-        job.clamped = clamped.data();
-        job.g_colors = g_colors.data();
-        job.g_sh = numbers(g_sh);
-        job.g_means = numbers(g_means);
-        nb::gil_scoped_release release;
-        sh_colors_backward(job, static_cast<int64_t>(sh.shape(0)), threads);
-      },
-      "sh"_a, "means"_a, "center"_a, "degree"_a, "clamped"_a, "g_colors"_a, "g_sh"_a.none(), "g_means"_a.none(),
-      "threads"_a);
-  m.def(
-      ("reprojection_votes_" + end).c_str(),
-      [](const std::vector<In>& depths, const std::vector<std::optional<Ids>>& labels, int first, const In& maps,
-         const std::vector<Array<int32_t>>& voted, const std::vector<Array<float>>& confidence, int num_classes,
-         double tau, int threads) {
-        std::vector<VotingView<T>> views;
-        for (size_t v = 0; v < depths.size(); ++v) {
-          views.push_back({static_cast<int>(depths[v].shape(0)), static_cast<int>(depths[v].shape(1)),
-                           depths[v].data(), labels[v] ? labels[v]->data() : nullptr});
-        }
-        std::vector<VotedView<T>> targets;
-        for (size_t t = 0; t < voted.size(); ++t) {
-          targets.push_back({first + static_cast<int>(t), maps.data() + 12 * views.size() * t, voted[t].data(),
-                             confidence[t].data()});
-        }
-        nb::gil_scoped_release release;
-        reprojection_votes(views, targets, num_classes, tau, threads);
-      },
-      "depths"_a, "labels"_a, "first"_a, "maps"_a, "voted"_a, "confidence"_a, "num_classes"_a, "tau"_a, "threads"_a);
+          sh_colors(job, static_cast<int64_t>(sh.shape(0)), threads);
+        },
+        "sh"_a, "means"_a, "center"_a, "degree"_a, "colors"_a, "clamped"_a, "threads"_a);
+  m.def(("sh_colors_backward_" + end).c_str(),
+        [](In sh, In means, const std::vector<double>& center, int degree, Array<uint8_t> clamped, In g_colors,
+           Out g_sh, Out g_means, int threads) {
+          ColorJob<T> job{};
+          job.degree = degree;
+          job.num_bases = static_cast<int>(sh.shape(1));
+          for (int axis = 0; axis < 3; ++axis) job.center[axis] = static_cast<T>(center[axis]);
+          job.sh = sh.data();
+          job.means = means.data();
+          job.clamped = clamped.data();
+          job.g_colors = g_colors.data();
+          job.g_sh = numbers(g_sh);
+          job.g_means = numbers(g_means);
+          nb::gil_scoped_release release;
+          sh_colors_backward(job, static_cast<int64_t>(sh.shape(0)), threads);
+        },
+        "sh"_a, "means"_a, "center"_a, "degree"_a, "clamped"_a, "g_colors"_a, "g_sh"_a.none(), "g_means"_a.none(),
+        "threads"_a);
+  m.def(("reprojection_votes_" + end).c_str(),
+        [](const std::vector<In>& depths, const std::vector<std::optional<Ids>>& labels, int first, const In& maps,
+           const std::vector<Array<int32_t>>& voted, const std::vector<Array<float>>& confidence, int num_classes,
+           double tau, int threads) {
+          std::vector<VotingView<T>> views;
+          for (size_t v = 0; v < depths.size(); ++v) {
+            views.push_back({static_cast<int>(depths[v].shape(0)), static_cast<int>(depths[v].shape(1)),
+                             depths[v].data(), labels[v] ? labels[v]->data() : nullptr});
+          }
+          std::vector<VotedView<T>> targets;
+          for (size_t t = 0; t < voted.size(); ++t) {
+            targets.push_back({first + static_cast<int>(t), maps.data() + 12 * views.size() * t, voted[t].data(),
+                               confidence[t].data()});
+          }
+          nb::gil_scoped_release release;
+          reprojection_votes(views, targets, num_classes, tau, threads);
+        },
+        "depths"_a, "labels"_a, "first"_a, "maps"_a, "voted"_a, "confidence"_a, "num_classes"_a, "tau"_a, "threads"_a);
 }
 
 }  // namespace

@@ -3,6 +3,7 @@
 // depend on its neighbours. Included by the files that are compiled for one instruction set.
 #pragma once
 
+#include "counter.h"
 #include "lanes.h"
 #include "op_kernels.h"
 #include "voxel_table.h"
@@ -35,51 +36,6 @@ struct OccupancyBatch {
   int64_t gaussian[Lanes<T>::kCount];
   int32_t class_id[Lanes<T>::kCount];
   int count;
-};
-
-// The SplitMix64 finaliser, as occupancy/sampling.py.
-template <class W>
-BEAGS_OPS_INLINE W mix(W word) {
-  word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9u;
-  word = (word ^ word >> 27) * 0x94D049BB133111EBu;
-  return word ^ word >> 31;
-}
-
-// One random number for each lane and sample: 24 bits for the radius, 24 for the angle.
-template <class T>
-struct Counter;
-
-template <>
-struct Counter<float> {
-  Words even, odd;  // lanes 0, 2, .. and 1, 3, ..
-  explicit Counter(const uint64_t* state) {
-    for (int i = 0; i < 4; ++i) {
-      even[i] = state[2 * i];
-      odd[i] = state[2 * i + 1];
-    }
-  }
-  BEAGS_OPS_INLINE void next(IntF& radial, IntF& angle) {
-    typedef uint32_t Halves __attribute__((vector_size(32)));
-    const Words a = mix(even), b = mix(odd);
-    radial = (IntF)((Halves)(a >> 32 | (b >> 32 << 32)) >> 8);
-    angle = (IntF)((Halves)((a << 32 >> 32) | b << 32) >> 8);
-    even += kGolden;
-    odd += kGolden;
-  }
-};
-
-template <>
-struct Counter<double> {
-  Words words;
-  explicit Counter(const uint64_t* state) {
-    for (int i = 0; i < 4; ++i) words[i] = state[i];
-  }
-  BEAGS_OPS_INLINE void next(IntD& radial, IntD& angle) {
-    const Words word = mix(words);
-    radial = (IntD)(word >> 40);
-    angle = (IntD)(word << 32 >> 40);
-    words += kGolden;
-  }
 };
 
 template <class T>
@@ -240,8 +196,8 @@ BEAGS_OPS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& ba
     for (int axis = 0; axis < 3; ++axis) at[axis] = fma(v, axis_v[axis], fma(u, axis_u[axis], center[axis]));
     I valid;
     if constexpr (kLocal) {
-      const I place = (floor_to_int(at[0]) - low[0]) << 4 | (floor_to_int(at[1]) - low[1]) << 2 |
-                      (floor_to_int(at[2]) - low[2]);
+      const I place =
+          (floor_to_int(at[0]) - low[0]) << 4 | (floor_to_int(at[1]) - low[1]) << 2 | (floor_to_int(at[2]) - low[2]);
       const I half = -(place >> 5 & 1);
       valid = -(((words[0] & ~half) | (words[1] & half)) >> (place & 31) & 1);
     } else {
@@ -255,7 +211,8 @@ BEAGS_OPS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& ba
       for (int axis = 0; axis < 3; ++axis) index[axis] >>= 2;
       valid = I{};
       for (int lane = 0; lane < kCount; ++lane) {
-        const uint64_t bits = brick_bits(*job.valid, batch.class_id[lane], index[0][lane], index[1][lane], index[2][lane]);
+        const uint64_t bits =
+            brick_bits(*job.valid, batch.class_id[lane], index[0][lane], index[1][lane], index[2][lane]);
         valid[lane] = -static_cast<int32_t>(bits >> place[lane] & 1);
       }
     }

@@ -19,7 +19,7 @@ struct OccupancyJob {
   uint64_t stream;  // hash of seed and step
   int64_t samples;
   bool background;
-  double factor;                                         // 1 / (N Z)
+  double factor;                                           // 1 / (N Z)
   T *g_means, *g_quats, *g_log_scales, *g_opacity_logits;  // null: no gradients
 };
 

@@ -69,8 +69,9 @@ void reprojection_votes(const std::vector<VotingView<T>>& views, const std::vect
   }
 }
 
-#define BEAGS_INSTANTIATE(T) \
-  template void reprojection_votes(const std::vector<VotingView<T>>&, const std::vector<VotedView<T>>&, int, double, int);
+#define BEAGS_INSTANTIATE(T)                                                                                         \
+  template void reprojection_votes(const std::vector<VotingView<T>>&, const std::vector<VotedView<T>>&, int, double, \
+                                   int);
 BEAGS_INSTANTIATE(float)
 BEAGS_INSTANTIATE(double)
 #undef BEAGS_INSTANTIATE

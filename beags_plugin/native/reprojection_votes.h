@@ -17,10 +17,10 @@ struct VotingView {
 
 template <class T>
 struct VotedView {
-  int view;              // index of the view whose pixels are voted on
-  const T* maps;         // [views, 12]: A row-major, then b, from every view to this one (see CastJob)
-  int32_t* labels;       // [height, width]; on entry the original labels, kept where there is no clear winner
-  float* confidence;     // [height, width]
+  int view;           // index of the view whose pixels are voted on
+  const T* maps;      // [views, 12]: A row-major, then b, from every view to this one (see CastJob)
+  int32_t* labels;    // [height, width]; on entry the original labels, kept where there is no clear winner
+  float* confidence;  // [height, width]
 };
 
 // Targets are shared among the threads, so each thread keeps one view's counters.

@@ -28,7 +28,7 @@ void sh_colors_backward(const ColorJob<T>& job, int64_t count, int threads) {
   run(op_kernels<T>().colors_backward, job, count, threads);
 }
 
-#define BEAGS_INSTANTIATE(T)                                \
+#define BEAGS_INSTANTIATE(T)                                 \
   template void sh_colors(const ColorJob<T>&, int64_t, int); \
   template void sh_colors_backward(const ColorJob<T>&, int64_t, int);
 BEAGS_INSTANTIATE(float)

@@ -65,7 +65,9 @@ void VoxelLookup::Bricks::store(const std::vector<std::vector<Brick>>& bricks) {
   int64_t low[3], high[3], count = 0;
   std::fill_n(low, 3, int64_t(1) << 20);
   std::fill_n(high, 3, int64_t(0));
-  const auto coordinate = [](uint64_t key, int axis) { return static_cast<int64_t>(key >> (40 - 20 * axis) & 0xFFFFF); };
+  const auto coordinate = [](uint64_t key, int axis) {
+    return static_cast<int64_t>(key >> (40 - 20 * axis) & 0xFFFFF);
+  };
   for (const std::vector<Brick>& of_class : bricks) {
     count += static_cast<int64_t>(of_class.size());
     for (const Brick& brick : of_class) {
@@ -195,8 +197,8 @@ void VoxelLookup::is_valid(int64_t count, const T* points, const int32_t* class_
 }
 
 template <class T>
-void VoxelLookup::disc_inside(int64_t count, const T* means, const T* axes_u, const T* axes_v,
-                              const int32_t* class_ids, bool* out, int threads) const {
+void VoxelLookup::disc_inside(int64_t count, const T* means, const T* axes_u, const T* axes_v, const int32_t* class_ids,
+                              bool* out, int threads) const {
   const VoxelTable table = valid();
   const T rounding = 16 * std::numeric_limits<T>::epsilon();  // as VisibilityGrid's disc_inside
   const int team = count < kLeastForTeam ? 1 : threads;
@@ -222,9 +224,9 @@ void VoxelLookup::disc_inside(int64_t count, const T* means, const T* axes_u, co
   }
 }
 
-#define BEAGS_INSTANTIATE(T)                                                                                      \
-  template void VoxelLookup::count_occupied(int64_t, const T*, const int32_t*, int64_t*, int) const;              \
-  template void VoxelLookup::is_valid(int64_t, const T*, const int32_t*, bool*, int) const;                       \
+#define BEAGS_INSTANTIATE(T)                                                                         \
+  template void VoxelLookup::count_occupied(int64_t, const T*, const int32_t*, int64_t*, int) const; \
+  template void VoxelLookup::is_valid(int64_t, const T*, const int32_t*, bool*, int) const;          \
   template void VoxelLookup::disc_inside(int64_t, const T*, const T*, const T*, const int32_t*, bool*, int) const;
 BEAGS_INSTANTIATE(float)
 BEAGS_INSTANTIATE(double)

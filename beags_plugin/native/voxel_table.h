@@ -91,8 +91,8 @@ inline uint64_t voxel_box(const VoxelTable& table, int32_t class_id, const int64
   if (table.dense) {
     for (int axis = 0; axis < 3; ++axis) brick[axis] = dense_place(table, axis, brick[axis], table.size[axis] - 2);
     const int64_t step_y = table.size[2], step_x = step_y * table.size[1];
-    const uint64_t* from =
-        table.dense + (class_id * static_cast<int64_t>(table.size[0]) + brick[0]) * step_x + brick[1] * step_y + brick[2];
+    const uint64_t* from = table.dense + (class_id * static_cast<int64_t>(table.size[0]) + brick[0]) * step_x +
+                           brick[1] * step_y + brick[2];
     for (int i = 0; i < 2; ++i) {
       for (int j = 0; j < 2; ++j) {
         for (int k = 0; k < 2; ++k) b[i][j][k] = from[i * step_x + j * step_y + k];

@@ -141,8 +141,8 @@ int64_t VoxelVotes::num_voxels() const {
   return total;
 }
 
-#define BEAGS_INSTANTIATE(T)                                                 \
-  template void VoxelVotes::add(int64_t, const T*, const int32_t*);          \
+#define BEAGS_INSTANTIATE(T)                                        \
+  template void VoxelVotes::add(int64_t, const T*, const int32_t*); \
   template void VoxelVotes::read(int64_t, const T*, int32_t*, float*) const;
 BEAGS_INSTANTIATE(float)
 BEAGS_INSTANTIATE(double)

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from beags_plugin.occupancy.sampling import sample_stream
 from beags_plugin.ops import extension
 from beags_plugin.ops.voxel_lookup import VoxelLookup
 
@@ -18,8 +17,7 @@ def occupancy_loss(
     opacity_logits: Tensor,
     class_ids: Tensor,
     lookup: VoxelLookup,
-    seed: int,
-    step: int,
+    stream: int,
     samples: int,
     background: bool = True,
 ) -> Tensor:
@@ -29,7 +27,8 @@ def occupancy_loss(
         float64, on the CPU. Surfels with a parameter that is not finite, or with a scale of 0, count as 0.
     class_ids: [N] int32, phi.
     lookup: of the visibility grid.
-    seed, step: decide the random points, as in ``occupancy.sampling``. samples: Z, points per Gaussian.
+    stream: 64 bits that decide the random points: ``occupancy.sampling.sample_stream`` of seed and step.
+    samples: Z, points per Gaussian.
     background: whether the Gaussians of class 0 take part.
     """
     n, dtype = len(means), means.dtype
@@ -40,7 +39,7 @@ def occupancy_loss(
     class_ids = extension.plain("class_ids", class_ids, (n,), torch.int32)
     if samples < 0:
         raise ValueError(f"samples must be 0 or more, not {samples}")
-    fixed = (class_ids, lookup.native, sample_stream(seed, step), samples, background)
+    fixed = (class_ids, lookup.native, stream, samples, background)
     return _OccupancyLoss.apply(fixed, *parameters)  # type: ignore[return-value]
 
 
@@ -59,4 +58,4 @@ class _OccupancyLoss(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, *grad_outputs: Tensor):
-        return None, *torch._foreach_mul(list(ctx.saved_tensors), grad_outputs[0])
+        return None, *(gradient * grad_outputs[0] for gradient in ctx.saved_tensors)

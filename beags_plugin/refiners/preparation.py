@@ -28,8 +28,9 @@ Stage = Callable[[str], AbstractContextManager[Progress | None]]
 class PreparationConfig:
     """Options of the stages between base training and refinement.
 
-    reprojection: how masks are made consistent: a name of ``masks.REPROJECTIONS``, or "none" to keep them.
-    tau: a vote counts if its point is visible: |z - D| <= tau z; infinity counts every vote (E5).
+    reprojection: how masks are made consistent: "pairwise", "voxel" or another name of ``masks.REPROJECTIONS``; "none"
+        keeps them.
+    tau: pairwise: a vote counts if its point is visible: |z - D| <= tau z; infinity counts every vote (E5).
     k: neighbours that set the voxel size (E8).
     """
 
