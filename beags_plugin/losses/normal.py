@@ -35,7 +35,7 @@ class NormalConsistencyLoss(Loss):
         if render.depth is None or render.normal is None:
             raise ValueError("the normal loss needs a render with geometry")
         if extension.can_take(render.depth, render.normal, render.alpha):
-            return normal_consistency(render.depth, render.normal, render.alpha, inputs.camera)
+            return normal_consistency(render.depth, render.normal, render.alpha, inputs.camera.K)
         slope, known = depth_normals(render.depth, inputs.camera)
         error = 1.0 - (render.normal[1:-1, 1:-1] * slope).sum(-1)
         error = torch.where(known, render.alpha.detach()[1:-1, 1:-1] * error, 0.0)

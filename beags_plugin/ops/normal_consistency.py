@@ -6,20 +6,20 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from beags_plugin.core.cameras import Camera
 from beags_plugin.ops import extension
 
 
-def normal_consistency(depth: Tensor, normal: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
+def normal_consistency(depth: Tensor, normal: Tensor, alpha: Tensor, K: Tensor) -> Tensor:
     """Mean over the inner pixels of A (1 - n . n_depth): a scalar, differentiable, once, in ``depth`` and ``normal``.
 
     depth: [H, W], 0 where unknown. normal: [H, W, 3], camera space. alpha: [H, W], held constant. All float32 or all
-    float64, on the CPU. See ``losses.normal`` for what counts. Bit for bit the same for any number of threads.
+    float64, on the CPU. K: [3, 3], pixels. See ``losses.normal`` for what counts. Bit for bit the same for any number of threads.
     """
-    shape, dtype = (camera.height, camera.width), depth.dtype
-    extension.plain("depth", depth, shape, dtype)
+    shape, dtype = tuple(depth.shape), depth.dtype
+    if len(shape) != 2:
+        raise ValueError(f"depth must be [H, W], not {list(shape)}")
     extension.plain("normal", normal, (*shape, 3), dtype)
-    fixed = (extension.plain("alpha", alpha, shape, dtype), camera.K.detach().cpu().double().tolist())
+    fixed = (extension.plain("alpha", alpha, shape, dtype), K.detach().cpu().double().tolist())
     return _NormalConsistency.apply(depth, normal, fixed)  # type: ignore[return-value]
 
 
