@@ -13,7 +13,8 @@ def normal_consistency(depth: Tensor, normal: Tensor, alpha: Tensor, K: Tensor) 
     """Mean over the inner pixels of A (1 - n . n_depth): a scalar, differentiable, once, in ``depth`` and ``normal``.
 
     depth: [H, W], 0 where unknown. normal: [H, W, 3], camera space. alpha: [H, W], held constant. All float32 or all
-    float64, on the CPU. K: [3, 3], pixels. See ``losses.normal`` for what counts. Bit for bit the same for any number of threads.
+    float64, on the CPU. K: [3, 3], pixels. See ``losses.normal`` for what counts. Bit for bit the same for any number
+    of threads.
     """
     shape, dtype = tuple(depth.shape), depth.dtype
     if len(shape) != 2:
