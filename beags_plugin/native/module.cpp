@@ -6,6 +6,7 @@
 
 #include "frame.h"
 #include "isa.h"
+#include "module_images.h"
 #include "module_ops.h"
 
 namespace nb = nanobind;
@@ -141,4 +142,5 @@ NB_MODULE(_native, m) {
   beags::bind<float>(m, "FrameF32");
   beags::bind<double>(m, "FrameF64");
   beags::bind_ops(m);
+  beags::bind_images(m);
 }

@@ -1,0 +1,105 @@
+#include "image_losses.h"
+
+#include <cmath>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "isa.h"
+
+namespace beags {
+namespace ops {
+namespace {
+
+template <class T>
+struct Tables;
+template <>
+struct Tables<float> {
+  static const ImageKernels<float>& plain() { return baseline::kImageKernelsF32; }
+#if defined(BEAGS_HAS_AVX2)
+  static const ImageKernels<float>& fast() { return avx2::kImageKernelsF32; }
+#endif
+};
+template <>
+struct Tables<double> {
+  static const ImageKernels<double>& plain() { return baseline::kImageKernelsF64; }
+#if defined(BEAGS_HAS_AVX2)
+  static const ImageKernels<double>& fast() { return avx2::kImageKernelsF64; }
+#endif
+};
+
+// The rasterizer's choice; where that is AVX-512, AVX2 runs too.
+template <class T>
+const ImageKernels<T>& image_kernels() {
+#if defined(BEAGS_HAS_AVX2)
+  static const bool fast = instruction_set().compare(0, 3, "avx") == 0;
+  if (fast) return Tables<T>::fast();
+#endif
+  return Tables<T>::plain();
+}
+
+constexpr int64_t kTeamPixels = 16384;  // a team costs tens of microseconds, a pixel some ten nanoseconds
+
+int team(int width, int height, int threads) {
+  return static_cast<int64_t>(width) * height < kTeamPixels ? 1 : threads;
+}
+
+}  // namespace
+
+template <class T>
+PhotometricSums photometric(PhotometricJob<T> job, int threads) {
+  const ImageKernels<T>& kernels = image_kernels<T>();
+  double window[kWindow], total = 0;
+  for (int k = 0; k < kWindow; ++k) total += window[k] = std::exp(-0.5 * (k - kReach) * (k - kReach) / (1.5 * 1.5));
+  for (int k = 0; k < kWindow; ++k) job.window[k] = static_cast<T>(window[k] / total);
+  const int64_t numbers = static_cast<int64_t>(job.width) * job.height * kChannels;
+  const std::unique_ptr<T[]> slopes(job.gradient ? new T[3 * numbers] : nullptr);
+  std::vector<double> sums(2 * static_cast<size_t>(job.height));
+  job.slopes = slopes.get();
+  job.sums = sums.data();
+#pragma omp parallel num_threads(team(job.width, job.height, threads))
+  {
+    const std::unique_ptr<T[]> scratch(new T[kernels.photometric_scratch(job.width)]);
+#pragma omp for schedule(static)
+    for (int row = 0; row < job.height; ++row) kernels.photometric(job, row, scratch.get());
+    if (job.gradient) {
+#pragma omp for schedule(static)
+      for (int row = 0; row < job.height; ++row) kernels.photometric_gradient(job, row, scratch.get());
+    }
+  }
+  PhotometricSums result{};
+  for (int row = 0; row < job.height; ++row) {
+    result.absolute += sums[2 * row];
+    result.similar += sums[2 * row + 1];
+  }
+  return result;
+}
+
+template <class T>
+double normal_consistency(NormalJob<T> job, int threads) {
+  const ImageKernels<T>& kernels = image_kernels<T>();
+  const std::unique_ptr<T[]> shares(job.g_depth ? new T[4 * static_cast<size_t>(job.width) * job.height] : nullptr);
+  std::vector<double> sums(job.height);
+  job.shares = shares.get();
+  job.sums = sums.data();
+#pragma omp parallel num_threads(team(job.width, job.height, threads))
+  {
+#pragma omp for schedule(static)
+    for (int row = 0; row < job.height; ++row) kernels.normal(job, row);
+    if (job.g_depth) {
+#pragma omp for schedule(static)
+      for (int row = 0; row < job.height; ++row) kernels.normal_gradient(job, row);
+    }
+  }
+  double total = 0;
+  for (const double sum : sums) total += sum;
+  return total;
+}
+
+template PhotometricSums photometric(PhotometricJob<float>, int);
+template PhotometricSums photometric(PhotometricJob<double>, int);
+template double normal_consistency(NormalJob<float>, int);
+template double normal_consistency(NormalJob<double>, int);
+
+}  // namespace ops
+}  // namespace beags

@@ -1,0 +1,155 @@
+"""The compiled image losses: the values and gradients of the same losses in torch, the same bits on any threads."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.losses.base import LossInputs
+from beags_plugin.losses.normal import NormalConsistencyLoss
+from beags_plugin.losses.photometric import PhotometricLoss, ssim
+from beags_plugin.ops import extension
+
+if extension.load() is None:
+    pytest.skip("the compiled module is not there", allow_module_level=True)
+
+SIZES = [(1, 1), (2, 3), (5, 4), (11, 11), (9, 37), (40, 33), (130, 150)]
+
+
+def _loss_inputs(camera=None, image=None, **render) -> LossInputs:
+    outputs = {"color": None, "depth": None, "normal": None, "distortion": None, "boundary": None}
+    drawn = SimpleNamespace(**{**outputs, **render})
+    return LossInputs(step=0, seed=0, surfels=None, camera=camera, render=drawn, image=image)
+
+
+def _random(*shape, seed: int = 0, dtype=torch.float64) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
+
+
+@pytest.fixture
+def in_torch(monkeypatch):
+    """Calls a function with the compiled ops out of sight."""
+
+    def call(function):
+        with monkeypatch.context() as patch:
+            patch.setattr(extension, "can_take", lambda *tensors: False)
+            return function()
+
+    return call
+
+
+def _value_and_gradients(loss, inputs_of, *leaves):
+    leaves = [leaf.clone().requires_grad_() for leaf in leaves]
+    value = loss.value(inputs_of(*leaves))
+    return [value, *torch.autograd.grad(3.0 * value, leaves)]
+
+
+def _check(found, expected, dtype):
+    for a, b in zip(found, expected, strict=True):
+        assert a.dtype == dtype and a.shape == b.shape
+        tolerance = 1e-11 if dtype == torch.float64 else 2e-4
+        assert (a.double() - b.double()).abs().max() <= tolerance * b.double().abs().max().clamp_min(1e-3)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("size", SIZES)
+def test_photometric_is_torchs(size, dtype, in_torch):
+    photo, drawn = _random(*size, 3, dtype=dtype), _random(*size, 3, seed=1, dtype=dtype)
+    drawn[0, 0] = photo[0, 0]  # |x - y| has slope 0 there
+
+    def measure():
+        return _value_and_gradients(PhotometricLoss(), lambda x: _loss_inputs(image=photo, color=x), drawn)
+
+    _check(measure(), in_torch(measure), dtype)
+    assert torch.allclose(ssim(drawn, photo), in_torch(lambda: ssim(drawn, photo)), atol=1e-5)
+
+
+def _view(size, dtype):
+    height, width = size
+    K = torch.tensor([[22.0, 0.3, 0.4 * width], [0.0, 25.0, 0.6 * height], [0.0, 0.0, 1.0]])
+    depth = 3.0 + 0.3 * _random(*size, dtype=dtype)
+    if min(size) > 4:
+        depth[2, 3] = 0.0
+        depth[-2, 1] = 0.0
+    normal = _random(*size, 3, seed=2, dtype=dtype) - torch.tensor([0.5, 0.5, 1.5], dtype=dtype)
+    return Camera(torch.eye(4), K, width, height), depth, normal, _random(*size, seed=3, dtype=dtype)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("size", SIZES)
+def test_normal_consistency_is_torchs(size, dtype, in_torch):
+    camera, depth, normal, alpha = _view(size, dtype)
+
+    def measure():
+        return _value_and_gradients(
+            NormalConsistencyLoss(), lambda d, n: _loss_inputs(camera, depth=d, normal=n, alpha=alpha), depth, normal
+        )
+
+    _check(measure(), in_torch(measure), dtype)
+
+
+def test_normal_consistency_of_a_scaled_scene_is_the_same():
+    camera, depth, normal, alpha = _view((30, 40), torch.float32)
+    loss = NormalConsistencyLoss()
+    values = [
+        loss.value(_loss_inputs(camera, depth=depth * factor, normal=normal, alpha=alpha)).item()
+        for factor in (1.0, 2.0**-13, 2.0**20)
+    ]
+    assert values[0] == values[1] == values[2]
+
+
+def test_gradients_by_finite_differences():
+    camera, depth, normal, alpha = _view((6, 7), torch.float64)
+    depth = depth.clamp_min(2.9)  # no holes: at one the loss jumps
+    loss = NormalConsistencyLoss()
+    assert torch.autograd.gradcheck(
+        lambda d, n: loss.value(_loss_inputs(camera, depth=d, normal=n, alpha=alpha)),
+        (depth.requires_grad_(), normal.requires_grad_()),
+    )
+    photo, drawn = _random(6, 7, 3), _random(6, 7, 3, seed=1).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: PhotometricLoss().value(_loss_inputs(image=photo, color=x)), drawn)
+
+
+def test_any_number_of_threads_gives_the_same_bits():
+    camera, depth, normal, alpha = _view((180, 200), torch.float32)
+    photo, drawn = _random(180, 200, 3).float(), _random(180, 200, 3, seed=1).float()
+    before, runs = torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 4):
+            torch.set_num_threads(count)
+            runs.append(
+                _value_and_gradients(PhotometricLoss(), lambda x: _loss_inputs(image=photo, color=x), drawn)
+                + _value_and_gradients(
+                    NormalConsistencyLoss(),
+                    lambda d, n: _loss_inputs(camera, depth=d, normal=n, alpha=alpha),
+                    depth,
+                    normal,
+                )
+            )
+    finally:
+        torch.set_num_threads(before)
+    for other in runs[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(runs[0], other, strict=True))
+
+
+def test_plain_kernels_agree_with_the_fast_ones():
+    program = (
+        "import torch; from beags_plugin.losses.photometric import ssim\n"
+        "g = torch.Generator().manual_seed(0); a, b = torch.rand(2, 50, 61, 3, generator=g)\n"
+        "a.requires_grad_(); v = ssim(a, b); v.backward(); print(v.item(), a.grad.abs().sum().item())"
+    )
+    found = []
+    for isa in ("baseline", None):
+        environment = {name: value for name, value in os.environ.items() if name != "BEAGS_ISA"}
+        done = subprocess.run(
+            [sys.executable, "-c", program], env={**environment, **({"BEAGS_ISA": isa} if isa else {})},
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        found.append([float(number) for number in done.stdout.split()])
+    assert found[0] == pytest.approx(found[1], rel=1e-5)
