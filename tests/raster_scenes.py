@@ -104,3 +104,44 @@ def empty() -> Scene:
 
 SCENES = {"small": make_scene, "opaque": opaque_layers, "awkward": awkward, "empty": empty}
 OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion", "boundary")
+
+
+def gradients_by_output(rasterizer, scene: Scene) -> dict[str, dict[str, Tensor]]:
+    """For each output, the gradients of a fixed random combination of it towards every float input and background."""
+    leaves = {name: getattr(scene.inputs, name).clone().requires_grad_() for name in FLOATS}
+    leaves["background"] = scene.background.clone().requires_grad_()
+    losses = _losses(scene.draw(rasterizer, **leaves))
+    return {name: _gradients(loss, leaves) for name, loss in losses.items()}
+
+
+def gradients(rasterizer, scene: Scene, only: tuple[str, ...] | None = None) -> dict[str, Tensor]:
+    """The gradients of all these combinations together (or of those of some outputs), in one backward."""
+    leaves = {name: getattr(scene.inputs, name).clone().requires_grad_() for name in FLOATS}
+    leaves["background"] = scene.background.clone().requires_grad_()
+    losses = _losses(scene.draw(rasterizer, **leaves))
+    return _gradients(sum(loss for name, loss in losses.items() if only is None or name in only), leaves)
+
+
+def _losses(render) -> dict[str, Tensor]:
+    g = torch.Generator().manual_seed(1)
+    losses = {}
+    for name in OUTPUTS:
+        image = getattr(render, name)
+        weight = torch.randn(image.shape, generator=g, dtype=torch.float64).to(image)
+        losses[name] = (image * weight).sum()
+    return losses
+
+
+def _gradients(loss: Tensor, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
+    if not loss.requires_grad:
+        return {name: torch.zeros_like(leaf) for name, leaf in leaves.items()}
+    found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True, retain_graph=True)
+    pairs = zip(leaves.items(), found, strict=True)
+    return {name: torch.zeros_like(leaf) if value is None else value for (name, leaf), value in pairs}
+
+
+def error(found: Tensor, expected: Tensor) -> float:
+    """Largest difference, in units of the largest expected number (or of 1, if that is more)."""
+    if expected.numel() == 0:
+        return 0.0
+    return ((found.double() - expected.double()).abs().max() / expected.double().abs().max().clamp_min(1.0)).item()

@@ -178,10 +178,9 @@ BEAGS_INLINE void walk_back(const Job<T>& job, int tile, PixelGradients<T>* pixe
   for (int k = static_cast<int>(job.tile_start[tile + 1] - job.tile_start[tile]) - 1; k >= 0; --k) {
     if (k >= kPrefetched) {
       prefetch(job, pairs[k - kPrefetched]);
-      const char* record =
-          reinterpret_cast<const char*>(job.records + static_cast<int64_t>(pairs[k - kPrefetched].record) * kSize);
+      const T* record = job.records + static_cast<int64_t>(pairs[k - kPrefetched].record) * kSize;
       __builtin_prefetch(record, 1);
-      __builtin_prefetch(record + kSize * sizeof(T) - 1, 1);
+      __builtin_prefetch(record + kSize - 1, 1);
     }
     if (k < waking.next) waking.wake(k);
     const Splat<T>& splat = job.splats[pairs[k].splat];
@@ -212,12 +211,11 @@ void backward(const Job<T>& job, int tile) {
   load_gradients<kWanted>(job, tile, pixels);
   constexpr unsigned kNeeds =
       kNeedShape | (kWanted & (kGeometry | kDistortion) ? kNeedDepth : 0) | (kWanted & kDistortion ? kNeedNearness : 0);
-  walk_back<record_size(kWanted), kNeeds>(
-      job, tile, pixels,
-      [&](auto plain, int k, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> dx, Real<T> dy,
-          PixelGradients<T>& p, Vector<T>* sums) __attribute__((always_inline)) {
-        add_gradients<kWanted, decltype(plain)::value>(job, k, s, hits, i, dx, dy, p, sums);
-      });
+  const auto add = [&job](auto plain, int k, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> dx, Real<T> dy,
+                          PixelGradients<T>& p, Vector<T>* sums) __attribute__((always_inline)) {
+    add_gradients<kWanted, decltype(plain)::value>(job, k, s, hits, i, dx, dy, p, sums);
+  };
+  walk_back<record_size(kWanted), kNeeds>(job, tile, pixels, add);
 }
 
 // Towards the colours and the background alone: dC/dc is w, and nothing behind a hit matters.
@@ -225,14 +223,14 @@ template <class T>
 void backward_colors(const Job<T>& job, int tile) {
   PixelGradients<T> pixels[kTilePacks<T>] = {};
   load_gradients<0>(job, tile, pixels);
-  walk_back<kColorRecord, 0>(job, tile, pixels,
-                             [&](auto, int, const Splat<T>&, const Hits<T>& hits, int i, Real<T>, Real<T>,
-                                 PixelGradients<T>& p, Vector<T>* sums) __attribute__((always_inline)) {
-                               const Real<T> alpha = hits.get(hits.alpha, i),
-                                             before = load(p.transmittance) / (all(T(1)) - alpha);
-                               store(p.transmittance, before);
-                               for (int c = 0; c < 3; ++c) add(sums[kColor + c], alpha * before, load(p.g_color[c]));
-                             });
+  const auto add_colors = [](auto, int, const Splat<T>&, const Hits<T>& hits, int i, Real<T>, Real<T>,
+                             PixelGradients<T>& p, Vector<T>* sums) __attribute__((always_inline)) {
+    const Real<T> alpha = hits.get(hits.alpha, i), inverse_left = all(T(1)) / (all(T(1)) - alpha);
+    const Real<T> before = load(p.transmittance) * inverse_left, w = alpha * before;
+    store(p.transmittance, before);
+    for (int c = 0; c < 3; ++c) add(sums[kColor + c], w, load(p.g_color[c]));
+  };
+  walk_back<kColorRecord, 0>(job, tile, pixels, add_colors);
 }
 
 }  // namespace BEAGS_ISA
