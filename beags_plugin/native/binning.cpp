@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cstring>
+#include <stdexcept>
 
 #include "extent.h"
 
@@ -100,13 +101,24 @@ Bins bin(const View& view, const std::vector<std::vector<Reach>>& reached, std::
   for (const auto& chunk : reached) {
     for (const Reach& at : chunk) ++bins.tile_start[at.tile + 1];
   }
-  for (size_t tile = 1; tile < bins.tile_start.size(); ++tile) bins.tile_start[tile] += bins.tile_start[tile - 1];
+  for (size_t tile = 1; tile < bins.tile_start.size(); ++tile) {
+    if (bins.tile_start[tile] > kMostTilePairs) throw std::runtime_error("over 16 million surfels reach one tile");
+    bins.tile_start[tile] += bins.tile_start[tile - 1];
+  }
+  if (bins.tile_start.back() > INT32_MAX) throw std::runtime_error("over 2 billion pairs of a tile and a surfel");
   bins.pairs.resize(bins.tile_start.back() + kPrefetched);
+  const auto tiles_of = [&](int32_t surfel) {
+    const int64_t chunk = surfel / kChunk;
+    return reached[chunk].data() + (bins.record_start[surfel] - bins.record_start[chunk * kChunk]);
+  };
   std::vector<int64_t> next(bins.tile_start.begin(), bins.tile_start.end() - 1);
-  for (const int32_t surfel : bins.order) {
-    const int64_t chunk = surfel / kChunk, first = bins.record_start[surfel], end = bins.record_start[surfel + 1];
-    const Reach* tiles = reached[chunk].data() + (first - bins.record_start[chunk * kChunk]);
-    for (int64_t record = first; record < end; ++record, ++tiles) {
+  const size_t ranks = bins.order.size();
+  for (size_t rank = 0; rank < ranks; ++rank) {
+    const int32_t surfel = bins.order[rank];
+    if (rank + 16 < ranks) __builtin_prefetch(bins.record_start.data() + bins.order[rank + 16]);
+    if (rank + 8 < ranks) __builtin_prefetch(tiles_of(bins.order[rank + 8]));
+    const Reach* tiles = tiles_of(surfel);
+    for (int64_t record = bins.record_start[surfel]; record < bins.record_start[surfel + 1]; ++record, ++tiles) {
       bins.pairs[next[tiles->tile]++] = {surfel, static_cast<int32_t>(record), tiles->mask};
     }
   }

@@ -9,7 +9,7 @@ struct Register;
 
 template <>
 struct Register<float> {
-  static constexpr int kLanes = 8, kParts = BEAGS_PARTS;
+  static constexpr int kLanes = 8, kParts = 2;
   using Vector = __m256;
   using Mask = __m256;  // all bits of a lane, or none
 

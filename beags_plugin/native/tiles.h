@@ -12,7 +12,7 @@ namespace BEAGS_ISA {
 // Which variant draws `parts`. In float64 and without SIMD, which are there to check and to compare, always the whole.
 template <class T>
 constexpr Parts variant([[maybe_unused]] Parts parts) {
-#if defined(BEAGS_SCALAR) || defined(BEAGS_QUICK)
+#if defined(BEAGS_SCALAR)
   return kAllParts;
 #else
   return sizeof(T) == sizeof(double) ? kAllParts : parts;
@@ -37,11 +37,7 @@ constexpr Kernels<T> make_kernels() {
 }
 
 extern constexpr Kernels<float> kKernelsF32 = make_kernels<float>();
-#if defined(BEAGS_QUICK)
-extern constexpr Kernels<double> kKernelsF64 = {};
-#else
 extern constexpr Kernels<double> kKernelsF64 = make_kernels<double>();
-#endif
 
 }  // namespace BEAGS_ISA
 }  // namespace beags

@@ -15,7 +15,8 @@ constexpr double kMaxAlpha = 0.99;
 constexpr double kMinTransmittance = 1e-4;
 constexpr double kLn2 = 0.6931471805599453;
 constexpr int kIgnore = 65535;
-constexpr int kPrefetched = 4;  // pairs ahead whose splats are fetched; so many unused pairs end the list
+constexpr int64_t kMostTilePairs = 1 << 24;  // the kernels count a tile's pairs in T, exact up to here in float32
+constexpr int kPrefetched = 4;               // pairs ahead whose splats are fetched; so many unused pairs end the list
 
 // One surfel as one view sees it (E1, E2). M is divided by the centre's depth and recentred on the projected centre c,
 // so that with (dx, dy) = pixel - c the cross product is affine, q = dx A + dy B + C, and free of the scene's unit:
