@@ -124,6 +124,17 @@ def test_any_number_of_threads_gives_the_same_bits(dtype, threads):
 
 
 @needs_native
+def test_nothing_is_left_over_from_the_drawing_before():
+    """Drawings take over each other's memory."""
+    large, small = (make_scene(count=n, width=w, height=51, seed=4, size=-2.0) for n, w in ((2500, 91), (2400, 83)))
+    first = gradients(NativeRasterizer(), large)
+    for scene in (small, large.to(torch.float32), small):
+        gradients(NativeRasterizer(), scene)
+    again = gradients(NativeRasterizer(), large)
+    assert all(torch.equal(first[name], again[name]) for name in first)
+
+
+@needs_native
 @pytest.mark.parametrize("name", ALL_SCENES)
 def test_products_are_the_references(name):
     scene = ALL_SCENES[name]()

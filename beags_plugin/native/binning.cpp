@@ -106,7 +106,8 @@ Bins bin(const View& view, const std::vector<std::vector<Reach>>& reached, std::
     bins.tile_start[tile] += bins.tile_start[tile - 1];
   }
   if (bins.tile_start.back() > INT32_MAX) throw std::runtime_error("over 2 billion pairs of a tile and a surfel");
-  bins.pairs.resize(bins.tile_start.back() + kPrefetched);
+  bins.pairs = Scratch<Pair>(bins.tile_start.back() + kPrefetched);
+  std::fill_n(bins.pairs.get() + bins.tile_start.back(), kPrefetched, Pair{});
   const auto tiles_of = [&](int32_t surfel) {
     const int64_t chunk = surfel / kChunk;
     return reached[chunk].data() + (bins.record_start[surfel] - bins.record_start[chunk * kChunk]);

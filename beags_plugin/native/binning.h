@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "projection.h"
+#include "scratch.h"
 #include "types.h"
 
 namespace beags {
@@ -12,7 +13,7 @@ struct Bins {
   std::vector<int32_t> order;         // the surfels that reach a tile, by rising depth, equal ones by index
   std::vector<int64_t> record_start;  // [N + 1]: the records of a surfel, in the order of their tiles
   std::vector<int64_t> tile_start;    // [tiles + 1] into pairs
-  std::vector<Pair> pairs;            // by tile, then by depth; and kPrefetched unused ones
+  Scratch<Pair> pairs;                // by tile, then by depth; and kPrefetched unused ones
 };
 
 // A tile that a surfel reaches.

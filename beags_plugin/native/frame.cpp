@@ -85,7 +85,7 @@ Frame<T>::Frame(const View& view, const Inputs<T>& inputs, bool* visible, int th
       tiles_x_(tiles_along(view.width)),
       tiles_y_(tiles_along(view.height)),
       num_surfels_(inputs.count),
-      splats_(new Splat<T>[inputs.count]) {
+      splats_(inputs.count) {
   const int64_t n = inputs.count, chunks = (n + kChunk - 1) / kChunk;
   std::vector<std::vector<Reach>> reached(chunks);
   std::vector<int64_t> record_start(n + 1, 0), nonfinite(chunks, 0);
@@ -121,7 +121,7 @@ Job<T> Frame<T>::job() const {
   std::copy_n(background_, 3, job.background);
   job.splats = splats_.get();
   job.tile_start = bins_.tile_start.data();
-  job.pairs = bins_.pairs.data();
+  job.pairs = bins_.pairs.get();
   job.saved = saved_;
   return job;
 }
@@ -133,7 +133,7 @@ void Frame<T>::forward(const Images<T>& images, const T* background, const int32
   if (keep) {
     const size_t pixels = static_cast<size_t>(tiles()) * kTilePixels;
     size_t used = 0;
-    kept_.reset(new T[pixels * Saved<T>::kCount]);  // the kernels fill all of it that they read
+    kept_ = Scratch<T>(pixels * Saved<T>::kCount);  // the kernels fill all of it that they read
     const auto take = [&](bool wanted) { return wanted ? kept_.get() + pixels * used++ : nullptr; };
     saved_.end_transmittance = take(true);
     saved_.end = take(true);
@@ -165,8 +165,8 @@ void Frame<T>::backward(const Inputs<T>& inputs, const int32_t* target, const Im
   const Variant<T>& variant = kernels<T>().variants[parts];
   const auto kernel = only_colors ? kernels<T>().backward_colors : variant.backward;
   const int size = only_colors ? kColorRecord : variant.record_size;
-  const std::unique_ptr<T[]> records(new T[static_cast<size_t>(num_pairs()) * size]);  // the kernels fill all of it
-  const std::unique_ptr<T[]> backgrounds(new T[static_cast<size_t>(tiles()) * 3]);
+  const Scratch<T> records(static_cast<size_t>(num_pairs()) * size);  // the kernels fill all of it
+  const Scratch<T> backgrounds(static_cast<size_t>(tiles()) * 3);
   job.records = records.get();
   job.g_background = backgrounds.get();
   for_each_tile(threads, [&](int tile) { kernel(job, tile); });

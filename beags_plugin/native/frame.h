@@ -1,11 +1,11 @@
 // One view of one set of surfels: projected and binned once, then drawn, differentiated or asked for its products.
 #pragma once
 
-#include <memory>
 #include <vector>
 
 #include "binning.h"
 #include "projection.h"
+#include "scratch.h"
 #include "types.h"
 
 namespace beags {
@@ -74,10 +74,10 @@ class Frame {
   View view_;
   int tiles_x_, tiles_y_;
   int64_t num_surfels_, num_nonfinite_ = 0;
-  std::unique_ptr<Splat<T>[]> splats_;
+  Scratch<Splat<T>> splats_;
   Bins bins_;
   T background_[3] = {};
-  std::unique_ptr<T[]> kept_;  // what `saved_` points to
+  Scratch<T> kept_;  // what `saved_` points to
   Saved<T> saved_ = {};
 };
 

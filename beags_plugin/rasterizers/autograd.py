@@ -121,8 +121,9 @@ class KernelRasterizer(Rasterizer):
         if not differentiable:
             images, visible, num_nonfinite, _ = self.forward_kernel(drawing)
         else:
-            *images, visible, num_nonfinite = _Rasterize.apply(self, drawing, *floats, background)  # type: ignore
-        return RasterOutputs(*images, visible=visible, num_nonfinite=num_nonfinite)
+            found: Any = _Rasterize.apply(self, drawing, *floats, background)
+            *images, visible, num_nonfinite = found
+        return RasterOutputs(*images, visible=visible, num_nonfinite=num_nonfinite)  # type: ignore
 
 
 class _Rasterize(torch.autograd.Function):
