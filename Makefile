@@ -17,7 +17,7 @@ setup:
 	@bash scripts/setup_env.sh "$(BEAGS_VENV)"
 
 test: setup
-	"$(BIN)/python" -m pytest -q
+	BEAGS_REQUIRE_NATIVE=1 "$(BIN)/python" -m pytest -q
 
 demo: setup
 	"$(BIN)/beags" demo $(if $(DATA),--data "$(DATA)")

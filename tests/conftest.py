@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 import torch
 
 from beags_plugin.ops import extension
 from beags_plugin.rasterizers import RASTERIZERS
+
+
+def pytest_sessionstart(session):
+    """`make test` builds the extension first: there its tests must run, not be skipped."""
+    if os.environ.get("BEAGS_REQUIRE_NATIVE") and extension.load() is None:
+        pytest.exit(f"BEAGS_REQUIRE_NATIVE is set, but {extension.found()[1]}", returncode=1)
 
 
 @pytest.fixture(params=["torch", "native"])

@@ -19,7 +19,8 @@ from raster_scenes import (
 )
 
 from beags_plugin.errors import UserError
-from beags_plugin.rasterizers import make_rasterizer, native
+from beags_plugin.ops import extension
+from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import IGNORE, SurfelInputs
 from beags_plugin.rasterizers.native import NativeRasterizer
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
@@ -209,8 +210,8 @@ def test_a_missing_module_is_told_in_a_sentence(monkeypatch):
     def missing(name):
         raise ModuleNotFoundError(f"No module named {name!r}")
 
-    native._load.cache_clear()
-    monkeypatch.setattr(native, "import_module", missing)
+    extension.found.cache_clear()
+    monkeypatch.setattr(extension, "import_module", missing)
     try:
         reason = NativeRasterizer.unavailable()
         assert reason is not None
@@ -222,4 +223,4 @@ def test_a_missing_module_is_told_in_a_sentence(monkeypatch):
         with pytest.raises(UserError, match="was not built"):
             scene.draw(NativeRasterizer())
     finally:
-        native._load.cache_clear()
+        extension.found.cache_clear()

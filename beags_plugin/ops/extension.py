@@ -9,16 +9,36 @@ from types import ModuleType
 import torch  # before _native, which shares the OpenMP library that torch loads
 from torch import Tensor
 
+from beags_plugin.errors import UserError
+
 _SUFFIXES = {torch.float32: "f32", torch.float64: "f64"}
 
 
 @cache
+def found() -> tuple[ModuleType | None, str | None]:
+    """``beags_plugin._native``, or one sentence on why it is not there.
+
+    Raises ``UserError`` if the instruction set that the environment asks for cannot run: nothing may hide that.
+    """
+    try:
+        module = import_module("beags_plugin._native")
+    except ModuleNotFoundError:
+        return (
+            None,
+            "the compiled module beags_plugin._native was not built; install a C++ compiler and reinstall beags.",
+        )
+    except ImportError as error:
+        return None, f"beags_plugin._native does not load ({error}); reinstall beags."
+    try:
+        module.instruction_set()
+    except RuntimeError as error:
+        raise UserError(str(error)) from None
+    return module, None
+
+
 def load() -> ModuleType | None:
     """``beags_plugin._native``, or None where it was not built or does not load (``beags doctor`` says why)."""
-    try:
-        return import_module("beags_plugin._native")
-    except ImportError:
-        return None
+    return found()[0]
 
 
 def can_take(*tensors: Tensor) -> bool:

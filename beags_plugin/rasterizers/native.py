@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
-from importlib import import_module
 from types import ModuleType
 from typing import Any
 
-import torch  # before _native, which shares the OpenMP library that torch loads
+import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.errors import UserError
+from beags_plugin.ops import extension
 from beags_plugin.rasterizers.autograd import (
     Drawing,
     Forward,
@@ -56,40 +55,14 @@ def instruction_sets() -> list[str]:
 def work_counts(inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> WorkCounts:
     """What drawing these surfels takes; see ``Rasterizer.rasterize`` for the arguments."""
     frame, _ = _frame(_detached(inputs.checked()), camera, settings)
-    return WorkCounts(*frame.work_counts(_threads()))
-
-
-@cache
-def _load() -> tuple[ModuleType | None, str | None]:
-    """The compiled module, or one sentence on why it is not there.
-
-    Raises ``UserError`` if the instruction set that the environment asks for cannot run: nothing may hide that.
-    """
-    try:
-        module = import_module("beags_plugin._native")
-    except ModuleNotFoundError:
-        return (
-            None,
-            "the compiled module beags_plugin._native was not built; install a C++ compiler and reinstall beags.",
-        )
-    except ImportError as error:
-        return None, f"beags_plugin._native does not load ({error}); reinstall beags."
-    try:
-        module.instruction_set()
-    except RuntimeError as error:
-        raise UserError(str(error)) from None
-    return module, None
+    return WorkCounts(*frame.work_counts(extension.threads()))
 
 
 def _module() -> ModuleType:
-    module, reason = _load()
+    module, reason = extension.found()
     if module is None:
         raise UserError(f"the rasterizer 'native' cannot run here: {reason}")
     return module
-
-
-def _threads() -> int:
-    return torch.get_num_threads()
 
 
 class NativeRasterizer(KernelRasterizer):
@@ -98,7 +71,7 @@ class NativeRasterizer(KernelRasterizer):
     @classmethod
     def unavailable(cls) -> str | None:
         """See ``Rasterizer.unavailable``."""
-        return _load()[1]
+        return extension.found()[1]
 
     def forward_kernel(self, drawing: Drawing) -> Forward:
         """See ``KernelRasterizer.forward_kernel``."""
@@ -118,7 +91,7 @@ class NativeRasterizer(KernelRasterizer):
             distortion=image(settings.distortion),
             boundary=image(drawing.target is not None),
         )
-        frame.forward(drawing.background, drawing.target, *images, drawing.differentiable, _threads())
+        frame.forward(drawing.background, drawing.target, *images, drawing.differentiable, extension.threads())
         return Forward(images, visible, frame.num_nonfinite, frame)
 
     def backward_kernel(self, drawing: Drawing, state: Any, gradients: Images, needed: Needed) -> InputGradients:
@@ -126,7 +99,7 @@ class NativeRasterizer(KernelRasterizer):
         floats = [getattr(drawing.inputs, name) for name in _FLOATS]
         likes = zip((*floats, drawing.background), needed, strict=True)
         found = InputGradients(*(torch.zeros_like(value) if wanted else None for value, wanted in likes))
-        state.backward(*floats, drawing.target, *gradients, *found, _threads())
+        state.backward(*floats, drawing.target, *gradients, *found, extension.threads())
         return found
 
     @torch.no_grad()
@@ -138,7 +111,7 @@ class NativeRasterizer(KernelRasterizer):
         labels = check_image("labels", labels, camera)
         frame, _ = _frame(inputs, camera, settings)
         out = inputs.means.new_zeros(inputs.means.shape[0], num_classes)
-        frame.class_contributions(labels, num_classes, out, _threads())
+        frame.class_contributions(labels, num_classes, out, extension.threads())
         return out
 
     @torch.no_grad()
@@ -155,7 +128,7 @@ class NativeRasterizer(KernelRasterizer):
         frame, _ = _frame(inputs, camera, settings)
         classes = torch.empty(camera.height, camera.width, dtype=torch.int32)
         share = inputs.means.new_empty(camera.height, camera.width)
-        frame.class_map(num_classes, classes, share, _threads())
+        frame.class_map(num_classes, classes, share, extension.threads())
         return classes, share
 
     @torch.no_grad()
@@ -163,7 +136,7 @@ class NativeRasterizer(KernelRasterizer):
         """See ``Rasterizer.heaviest``."""
         frame, _ = _frame(_detached(inputs.checked()), camera, settings)
         indices = torch.empty(camera.height, camera.width, dtype=torch.int32)
-        frame.heaviest(indices, _threads())
+        frame.heaviest(indices, extension.threads())
         return indices
 
 
@@ -181,5 +154,5 @@ def _frame(inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> tu
     visible = torch.empty(inputs.means.shape[0], dtype=torch.bool)
     floats = [getattr(inputs, name) for name in _FLOATS]
     size = (camera.width, camera.height)
-    frame = make(*floats, inputs.class_ids, *matrices, *size, settings.near, settings.far, visible, _threads())
+    frame = make(*floats, inputs.class_ids, *matrices, *size, settings.near, settings.far, visible, extension.threads())
     return frame, visible
