@@ -9,6 +9,7 @@ from typing import Annotated
 
 import tyro
 from rich.console import Console
+from rich.markup import escape
 
 from beags_plugin.errors import UserError
 
@@ -57,7 +58,7 @@ class Sample:
         from beags_plugin.demo import make_sample
 
         make_sample(self.output, self.seed, self.width, self.height, self.degradation)
-        CONSOLE.print(f"sample: {self.output}")
+        CONSOLE.print(f"sample: {self.output}", markup=False)
 
 
 @dataclass
@@ -78,7 +79,8 @@ class Extract:
 
         for done in extract_objects(self.load_config, self.object, self.remove, self.output):
             CONSOLE.print(
-                f"{done.name}: {done.gaussians} Gaussians\n  {done.ply}\n  ns-viewer --load-config {done.config}"
+                f"{done.name}: {done.gaussians} Gaussians\n  {done.ply}\n  ns-viewer --load-config {done.config}",
+                markup=False,
             )
 
 
@@ -106,7 +108,7 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         command.run()
     except UserError as error:
-        CONSOLE.print(f"[bold red]beags:[/bold red] {error}")
+        CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}")
         sys.exit(2)
 
 

@@ -17,8 +17,9 @@ from rich.console import Console
 from beags_plugin.errors import UserError
 from beags_plugin.progress import progress_bar
 
-CONSOLE = Console(soft_wrap=True, highlight=False)
+CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 QUICK_PIXELS = 50_000  # a folder of the user's is scaled down to at most so many pixels a view, to end in minutes
+STAMP = "trained.json"  # beside the run: what it was made from
 SHEET_VIEWS = 3  # held-out views in the picture
 
 
@@ -35,8 +36,7 @@ def run_demo(
     data: Path | None, output: Path | None, preset: str, downscale: float | None, seed: int, fresh: bool
 ) -> None:
     """Do the whole job in ``output`` and print the table; see ``cli.Demo`` for the arguments."""
-    from beags_plugin.plugin.presets import preset_names
-
+    check_preset(preset)
     seconds: dict[str, float] = {}
     if data is None:
         output = output or Path("outputs/demo")
@@ -49,14 +49,14 @@ def run_demo(
     else:
         output = output or Path("outputs") / data.resolve().name
         downscale = downscale or quick_downscale(data)
-    if preset not in preset_names():
-        raise UserError(f"there is no preset {preset!r}: choose one of {', '.join(preset_names())}.")
     run = output / "run"
     request = {"preset": preset, "downscale": downscale, "inputs": _digest(data, preset)}
     if fresh or not _trained(output, request):
-        shutil.rmtree(run, ignore_errors=True)
+        _clear(output)
+        output.mkdir(parents=True, exist_ok=True)
+        (output / STAMP).write_text("{}")  # the run that follows is the demo's, also if it is broken off
         train(data, run, preset, downscale)
-        (output / "trained.json").write_text(json.dumps(request))
+        (output / STAMP).write_text(json.dumps(request))
     else:
         CONSOLE.print(f"Trained before: {run} (add --fresh to train again).")
     measure(run, output, seconds)
@@ -64,25 +64,46 @@ def run_demo(
 
 def quick_downscale(data: Path) -> float:
     """Whole factor that brings the images of ``data`` to ``QUICK_PIXELS`` or less."""
-    from PIL import Image
+    from beags_plugin.plugin.layout import image_size
 
-    images = sorted(path for path in data.glob("images*/*") if path.suffix.lower() in {".jpg", ".jpeg", ".png"})
+    images = sorted(path for path in data.glob("images*/**/*") if path.suffix.lower() in {".jpg", ".jpeg", ".png"})
+    if not images:
+        images = _first_frame(data)
     if not images:
         return 1.0  # the data parser names what is missing
-    width, height = Image.open(images[0]).size
+    width, height = image_size(images[0])
     factor = 1
     while width * height / factor**2 > QUICK_PIXELS:
         factor += 1
     return float(factor)
 
 
+def _first_frame(data: Path) -> list[Path]:
+    """The first image that transforms.json names; none where there is no such file, or it is damaged."""
+    try:
+        return [data / json.loads((data / "transforms.json").read_text(encoding="utf-8"))["frames"][0]["file_path"]]
+    except (OSError, ValueError, LookupError, TypeError):
+        return []
+
+
+def check_preset(preset: str) -> None:
+    """Raise ``UserError`` unless the preset trains a base and refines it, which is what the demo compares."""
+    from beags_plugin.plugin.presets import load_preset
+
+    model = load_preset(preset).config.model_config
+    if not (model.base_steps and model.refine_steps):
+        raise UserError(f"the demo compares a base with its refinement, and {preset} trains only one: take beags-tiny.")
+
+
 def _digest(data: Path, preset: str) -> str:
-    """Changes with the preset, the version of the code and any file of the data (by name, size and time)."""
-    from beags_plugin import __version__
+    """Changes with the preset, the package's code and any file of the data (by name, size and time)."""
     from beags_plugin.plugin.presets import preset_folder
 
-    digest = hashlib.sha256(f"{__version__} {data.resolve()}".encode())
+    digest = hashlib.sha256(str(data.resolve()).encode())
     digest.update((preset_folder() / f"{preset}.toml").read_bytes())
+    package = Path(__file__).parent
+    for path in sorted([*package.rglob("*.py"), *package.glob("_native*"), *package.glob("native/*")]):
+        digest.update(path.read_bytes())
     for path in sorted(path for path in data.rglob("*") if path.is_file()):
         stat = path.stat()
         digest.update(f"{path.relative_to(data)} {stat.st_size} {stat.st_mtime_ns}".encode())
@@ -90,8 +111,19 @@ def _digest(data: Path, preset: str) -> str:
 
 
 def _trained(output: Path, request: dict[str, Any]) -> bool:
-    stamp = output / "trained.json"
-    return stamp.exists() and json.loads(stamp.read_text()) == request and (output / "run" / "training.json").exists()
+    try:
+        former = json.loads((output / STAMP).read_text())
+    except (OSError, ValueError):
+        return False
+    return former == request and (output / "run" / "training.json").exists()
+
+
+def _clear(output: Path) -> None:
+    """Remove the demo's own former run; raises ``UserError`` if ``run`` is something else's."""
+    run = output / "run"
+    if run.exists() and not (output / STAMP).exists():
+        raise UserError(f"{run} is not the demo's: choose another --output, or move it away.")
+    shutil.rmtree(run, ignore_errors=True)
 
 
 def train(data: Path, run: Path, preset: str, downscale: float) -> None:

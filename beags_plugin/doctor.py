@@ -174,11 +174,11 @@ def _try_in_process(name: str) -> Check:
     )
     if done.returncode < 0:
         cause = f"it ends with {signal.Signals(-done.returncode).name}, so it is damaged or made for another processor"
-        return Check(name, False, f"{cause}: reinstall beags from source; --pipeline.model.rasterizer torch avoids it")
+        return Check(name, False, f"{cause}: reinstall beags from source; BEAGS_NATIVE=0 in the environment avoids it")
     lines = done.stdout.strip().splitlines()
     if done.returncode != 0 or not lines:
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        return Check(name, False, f"it fails when it draws: {last}; --pipeline.model.rasterizer torch avoids it")
+        return Check(name, False, f"it fails when it draws: {last}; BEAGS_NATIVE=0 in the environment avoids it")
     ok, sentence, replaced = json.loads(lines[-1])
     if replaced and name == "native":
         sentence = f"{sentence.rstrip('.')}; until then the torch reference draws, some hundred times slower"

@@ -222,3 +222,5 @@ def test_views_of_equal_stems_have_names_of_their_own():
     assert unique_names(files) == ["left_0001", "right_0001", "0002"]
     assert unique_names([Path("a/x.png"), Path("b/y.jpg")]) == ["x", "y"]
     assert unique_names([Path("a/c/x.png"), Path("b/c/x.png")]) == ["a_c_x", "b_c_x"]
+    assert unique_names([Path("a/x.png"), Path("b/x.png"), Path("a_x.png")]) == ["a_x_2", "b_x", "a_x"]
+    assert unique_names([Path("x.png"), Path("x.jpg")]) == ["x", "x_2"]

@@ -224,3 +224,15 @@ def test_a_missing_module_is_told_in_a_sentence(monkeypatch):
             scene.draw(NativeRasterizer())
     finally:
         extension.found.cache_clear()
+
+
+def test_the_compiled_module_can_be_turned_off(monkeypatch):
+    monkeypatch.setenv("BEAGS_NATIVE", "0")
+    extension.found.cache_clear()
+    try:
+        assert "turns the compiled module off" in str(NativeRasterizer.unavailable())
+        assert extension.load() is None
+        assert isinstance(make_rasterizer("auto"), TorchRasterizer)
+    finally:
+        monkeypatch.undo()
+        extension.found.cache_clear()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from functools import cache
 from importlib import import_module
 from types import ModuleType
@@ -20,6 +21,8 @@ def found() -> tuple[ModuleType | None, str | None]:
 
     Raises ``UserError`` if the instruction set that the environment asks for cannot run: nothing may hide that.
     """
+    if os.environ.get("BEAGS_NATIVE") == "0":
+        return None, "BEAGS_NATIVE=0 in the environment turns the compiled module off; unset it."
     try:
         module = import_module("beags_plugin._native")
     except ModuleNotFoundError:

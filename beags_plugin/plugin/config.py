@@ -59,6 +59,7 @@ class BeagsTrainerConfig(TrainerConfig):
     def save_config(self) -> None:
         """Save config.yml with absolute paths, so that every command finds the run from any folder."""
         self.output_dir = Path(self.output_dir).absolute()
+        self.run_dir = self.run_dir.absolute() if self.run_dir is not None else None
         for holder in (self, self.data_config, self.data_config.dataparser):
             if (data := getattr(holder, "data", None)) is not None:
                 holder.data = Path(data).absolute()

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
+from itertools import chain, count
 from pathlib import Path
 from typing import Literal
 
@@ -185,11 +186,19 @@ def undistort_class_map(class_map: np.ndarray, cameras: Cameras, index: int) -> 
 
 
 def unique_names(files: Sequence[Path]) -> list[str]:
-    """For each file its stem, with as many of its folders before it as it takes to tell all apart, joined by "_"."""
+    """For each file its stem; stems that several share get their folders before them, and a number if need be."""
     parts = [Path(file).with_suffix("").parts for file in files]
     depth = 1
     while len({path[-depth:] for path in parts}) < len(set(parts)):
         depth += 1
-    names = ["_".join(path[-depth:]) for path in parts]
     stems = Counter(path[-1] for path in parts)
-    return [path[-1] if stems[path[-1]] == 1 else name for path, name in zip(parts, names, strict=True)]
+    taken = {stem for stem, uses in stems.items() if uses == 1}
+    names = []
+    for path in parts:
+        name = path[-1]
+        if stems[name] > 1:
+            whole = "_".join(path[-depth:])
+            name = next(n for n in chain([whole], (f"{whole}_{i}" for i in count(2))) if n not in taken)
+            taken.add(name)
+        names.append(name)
+    return names

@@ -309,8 +309,10 @@ def _delegate(parser: DataParser, split: str, file: Path) -> DataparserOutputs:
 def _select_ground_truth(ground_truth: dict | None, chosen: Sequence[int]) -> dict | None:
     if ground_truth is None:
         return None
-    silhouettes = {name: [files[i] for i in chosen] for name, files in ground_truth["silhouettes"].items()}
-    return {"masks": [ground_truth["masks"][i] for i in chosen], "silhouettes": silhouettes}
+    selected: dict = {"masks": [ground_truth["masks"][i] for i in chosen]}
+    for kind in ("silhouettes", "seen"):
+        selected[kind] = {name: [files[i] for i in chosen] for name, files in ground_truth[kind].items()}
+    return selected
 
 
 beags_data = DataParserSpecification(

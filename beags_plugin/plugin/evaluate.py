@@ -29,25 +29,24 @@ def held_out_views(config: BeagsTrainerConfig, classes: dict[int, str]) -> list[
     Without it, the data's own masks of those views serve as visible masks.
     """
     manager = config.data_config.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
-    parser = manager.dataparser.config
-    folder = Path(parser.data) / parser.ground_truth_path
+    truth = manager.eval_dataset.metadata["ground_truth"] or {"masks": None, "silhouettes": {}, "seen": {}}
     views = []
-    for view in manager.views("test"):
-        exact = folder / "masks" / f"{view.name}.png"
+    for index, view in enumerate(manager.views("test")):
         visible = view.labels
-        if exact.exists():
+        if truth["masks"] and (exact := truth["masks"][index]) is not None:
             visible = torch.from_numpy(read_class_map(exact).astype(np.int32))
-        silhouettes = _per_object(folder / "silhouettes", classes, view.name)
-        seen = _per_object(folder / "seen", classes, view.name)
+        silhouettes, seen = (_per_object(truth[kind], classes, index) for kind in ("silhouettes", "seen"))
         views.append(EvalView(view.camera, view.image, visible, silhouettes, view.name, seen))
     return views
 
 
-def _per_object(folder: Path, classes: dict[int, str], view: str) -> dict[int, torch.Tensor] | None:
-    """Object id to the [h, w] bool mask ``<folder>/<object>/<view>.png``; None if there is none."""
+def _per_object(
+    files: dict[str, list[Path | None]], classes: dict[int, str], view: int
+) -> dict[int, torch.Tensor] | None:
+    """Object id to its [h, w] bool mask in a view; None if there is none."""
     masks = {
         index: torch.from_numpy(read_class_map(path) > 0)
         for index, name in classes.items()
-        if (path := folder / name / f"{view}.png").exists()
+        if (path := files[name][view] if name in files else None) is not None
     }
     return masks or None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,10 +101,12 @@ def extract_objects(
     run = config_path.parent
     transform = read_transform(run)
     select = remove_class if remove else select_class
+    folders = folder_names(scene.classes)
     written = []
     for name in names:
         surfels, index = select(scene.surfels(), class_ids, ids[name])
-        title = f"without_{file_name(name)}" if remove else file_name(name)
+        title = folders[ids[name]]
+        title = f"without_{title}" if remove else title
         folder = (output or run / "extracted") / title
         config = write_run(scene.config, folder, _rows(scene.state, index), scene.step)
         ply = folder / f"{title}.ply"
@@ -128,6 +131,13 @@ def read_transform(run: Path) -> tuple[Tensor, float] | None:
         return None
     content = json.loads(path.read_text("utf8"))
     return torch.tensor(content["transform"], dtype=torch.float64), float(content["scale"])
+
+
+def folder_names(classes: dict[int, str]) -> dict[int, str]:
+    """Class id to the name of its folder; where two would get the same one, the id follows."""
+    plain = {index: file_name(name) for index, name in classes.items()}
+    shared = Counter(name.lower() for name in plain.values())  # some file systems ignore case
+    return {index: name if shared[name.lower()] == 1 else f"{name}_{index}" for index, name in plain.items()}
 
 
 def file_name(name: str) -> str:

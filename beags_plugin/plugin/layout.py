@@ -169,12 +169,14 @@ def find_ground_truth(folder: Path, images: Sequence[Path], images_root: Path) -
     """Exact masks kept for evaluation only, or None where ``folder`` is absent.
 
     ``masks``: per view the path of the visible-id image or None. ``silhouettes``: object name to per view the path of
-    its occlusion-free silhouette or None.
+    its occlusion-free silhouette or None. ``seen``: likewise, the part of it that training photos show.
     """
     if not folder.is_dir():
         return None
-    objects = sorted(path for path in (folder / "silhouettes").glob("*") if path.is_dir())
-    return {
-        "masks": files_of_views(folder / "masks", images, images_root),
-        "silhouettes": {path.name: files_of_views(path, images, images_root) for path in objects},
-    }
+
+    def per_object(kind: str) -> dict[str, list[Path | None]]:
+        objects = sorted(path for path in (folder / kind).glob("*") if path.is_dir())
+        return {path.name: files_of_views(path, images, images_root) for path in objects}
+
+    masks = files_of_views(folder / "masks", images, images_root)
+    return {"masks": masks, "silhouettes": per_object("silhouettes"), "seen": per_object("seen")}

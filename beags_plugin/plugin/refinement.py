@@ -91,7 +91,7 @@ class RefinementSwitch:
             stage=progress_bar,
         )
         for finding in prepared.findings:
-            CONSOLE.print(f"  {finding}", highlight=False)
+            CONSOLE.print(f"  {finding}", highlight=False, markup=False)
         model.class_ids.copy_(prepared.assignment.class_ids)
         model.class_margin.copy_(prepared.assignment.margin)
         model.assigned.fill_(True)
@@ -100,7 +100,9 @@ class RefinementSwitch:
         self._save(prepared, [view.name for view in views])
         self._start(prepared.grid, prepared.labels)
         model.prepared_seconds = prepared.seconds
-        CONSOLE.print(f"  base kept in {self.trainer.base_dir / BASE_SNAPSHOT}", highlight=False, soft_wrap=True)
+        CONSOLE.print(
+            f"  base kept in {self.trainer.base_dir / BASE_SNAPSHOT}", highlight=False, markup=False, soft_wrap=True
+        )
 
     def _start(self, grid: VisibilityGrid | None, labels: list[torch.Tensor]) -> None:
         self.datamanager.replace_class_maps(labels)
@@ -143,7 +145,7 @@ class RefinementSwitch:
             for view in self.datamanager.views("train")
         ]
         self._start(VisibilityGrid.from_state_dict(state) if state else None, labels)
-        CONSOLE.print(f"  refinement taken up from {folder}", highlight=False, soft_wrap=True)
+        CONSOLE.print(f"  refinement taken up from {folder}", highlight=False, markup=False, soft_wrap=True)
 
 
 def peak_memory_mb() -> float:

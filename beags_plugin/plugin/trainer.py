@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 
 from beags_plugin.errors import UserError
 from beags_plugin.plugin.refinement import peak_memory_mb
@@ -144,5 +145,5 @@ def _duration(seconds: float) -> str:
 
 
 def _stop(error: UserError) -> None:
-    CONSOLE.print(f"[bold red]beags:[/bold red] {error}", highlight=False, soft_wrap=True)
+    CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}", highlight=False, soft_wrap=True)
     sys.exit(2)

@@ -1,0 +1,93 @@
+"""What ``beags demo`` decides before and around the training."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from data_folders import write_image
+
+from beags_plugin.demo import STAMP, _clear, _trained, check_preset, quick_downscale
+from beags_plugin.errors import UserError
+from beags_plugin.plugin.config import base_config
+from beags_plugin.plugin.extract import folder_names
+
+
+def test_large_images_are_scaled_down_by_a_whole_factor(tmp_path):
+    assert quick_downscale(tmp_path) == 1.0
+    write_image(tmp_path / "images/left/a.png", np.zeros((300, 400), np.uint8))
+    assert quick_downscale(tmp_path) == 2.0  # 200 x 150 are 30,000 pixels
+
+
+def test_images_elsewhere_are_found_through_the_poses(tmp_path):
+    write_image(tmp_path / "photos/a.png", np.zeros((300, 400), np.uint8))
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [{"file_path": "photos/a.png"}]}))
+    assert quick_downscale(tmp_path) == 2.0
+
+
+def test_an_image_that_cannot_be_read_is_told_in_a_sentence(tmp_path):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images/a.png").write_text("no picture")
+    with pytest.raises(UserError, match="cannot be read as an image"):
+        quick_downscale(tmp_path)
+
+
+def test_only_presets_of_both_phases_make_a_demo():
+    check_preset("beags-tiny")
+    with pytest.raises(UserError, match="'beags-huge'"):
+        check_preset("beags-huge")
+    for preset in ("beags-base", "beags-refine"):
+        with pytest.raises(UserError, match="compares a base with its refinement"):
+            check_preset(preset)
+
+
+def test_a_run_that_is_not_the_demos_is_kept(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/notes.txt").write_text("mine")
+    with pytest.raises(UserError, match="is not the demo's"):
+        _clear(tmp_path)
+    assert (tmp_path / "run/notes.txt").exists()
+    (tmp_path / STAMP).write_text("{}")
+    _clear(tmp_path)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_damaged_stamp_means_not_trained(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/training.json").write_text("{}")
+    assert not _trained(tmp_path, {"preset": "beags-tiny"})
+    (tmp_path / STAMP).write_text("{")
+    assert not _trained(tmp_path, {"preset": "beags-tiny"})
+    (tmp_path / STAMP).write_text(json.dumps({"preset": "beags-tiny"}))
+    assert _trained(tmp_path, {"preset": "beags-tiny"})
+
+
+def test_brackets_in_a_path_are_no_markup(tmp_path):
+    command = [sys.executable, "-m", "beags_plugin.cli", "demo", "--data", str(tmp_path / "x[/y]")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "x[/y] is no folder" in done.stdout.replace("\n", "") and "Traceback" not in done.stderr
+
+
+def test_objects_never_share_a_folder():
+    assert folder_names({1: "cup 1", 2: "cup_1", 3: "Box", 4: "ring"}) == {
+        1: "cup_1_1",
+        2: "cup_1_2",
+        3: "Box",
+        4: "ring",
+    }
+    assert folder_names({1: "cup", 2: "Cup"}) == {1: "cup_1", 2: "Cup_2"}
+
+
+def test_a_saved_run_names_its_folder_absolutely(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    config = base_config()
+    config.run_dir = config.output_dir / "mine"
+    assert not config.run_dir.is_absolute()
+    config.get_base_dir().mkdir(parents=True)
+    config.save_config()
+    assert config.run_dir == tmp_path / "outputs" / "mine"
+    assert (config.run_dir / "config.yml").exists()
