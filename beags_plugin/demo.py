@@ -10,12 +10,15 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from rich.console import Console
 
 from beags_plugin.errors import UserError
 from beags_plugin.progress import progress_bar
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.model import BeagsModelConfig
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 QUICK_PIXELS = 50_000  # a folder of the user's is scaled down to at most so many pixels a view, to end in minutes
@@ -90,7 +93,7 @@ def check_preset(preset: str) -> None:
     """Raise ``UserError`` unless the preset trains a base and refines it, which is what the demo compares."""
     from beags_plugin.plugin.presets import load_preset
 
-    model = load_preset(preset).config.model_config
+    model = cast("BeagsModelConfig", load_preset(preset).config.pipeline.model)
     if not (model.base_steps and model.refine_steps):
         raise UserError(f"the demo compares a base with its refinement, and {preset} trains only one: take beags-tiny.")
 

@@ -15,7 +15,9 @@ def ordered_sum(values: Tensor) -> Tensor:
     """
     values = values.reshape(-1)
     while values.numel() > _ROW:
-        values = torch.nn.functional.pad(values, (0, -values.numel() % _ROW)).view(-1, _ROW).sum(1)
+        if missing := -values.numel() % _ROW:
+            values = torch.nn.functional.pad(values, (0, missing))
+        values = values.view(-1, _ROW).sum(1)
     return values.sum()  # too few elements to be split
 
 
