@@ -91,8 +91,10 @@ def _first_frame(data: Path) -> list[Path]:
 
 def check_preset(preset: str) -> None:
     """Raise ``UserError`` unless the preset trains a base and refines it, which is what the demo compares."""
-    from beags_plugin.plugin.presets import load_preset
+    from beags_plugin.plugin.presets import load_preset, preset_names
 
+    if preset not in preset_names():
+        raise UserError(f"there is no preset {preset!r}: choose one of {', '.join(preset_names())}.")
     model = cast("BeagsModelConfig", load_preset(preset).config.pipeline.model)
     if not (model.base_steps and model.refine_steps):
         raise UserError(f"the demo compares a base with its refinement, and {preset} trains only one: take beags-tiny.")
