@@ -290,7 +290,7 @@ SETTINGS = RasterSettings(near=0.1, far=100.0, geometry=False)
 def test_build_lifts_solid_pixels_of_all_views(kind):
     views, calls = [_view(0), _view(1, 30, 20), _view(2)], []
     grid = build_visibility_grid(
-        _surfels(), torch.zeros(1).int(), views, _Stub(), SETTINGS, CLASSES, k=3, depth=kind,
+        _surfels(CLASSES), torch.arange(CLASSES).int(), views, _Stub(), SETTINGS, CLASSES, k=3, depth=kind,
         progress=lambda *s: calls.append(s),
     )  # fmt: skip
     solid = [view.alpha >= 0.5 for view in views]
@@ -308,7 +308,8 @@ def test_build_skips_depths_that_cannot_be_lifted():
     view = _view(3)
     view.median_depth[2, :] = math.nan
     view.median_depth[3, :] = 0.0
-    grid = build_visibility_grid(_surfels(), torch.zeros(1).int(), [view], _Stub(), SETTINGS, CLASSES, k=5)
+    ids = torch.arange(CLASSES).int()
+    grid = build_visibility_grid(_surfels(CLASSES), ids, [view], _Stub(), SETTINGS, CLASSES, k=5)
     assert math.isfinite(grid.voxel_size)
 
 
@@ -316,12 +317,14 @@ def test_build_says_when_nothing_is_solid():
     view = _view(4)
     view.alpha.fill_(0.3)
     with pytest.raises(UserError, match="nothing solid|anything solid"):
-        build_visibility_grid(_surfels(), torch.zeros(1).int(), [view], _Stub(), SETTINGS, CLASSES)
+        build_visibility_grid(_surfels(CLASSES), torch.arange(CLASSES).int(), [view], _Stub(), SETTINGS, CLASSES)
 
 
 def test_build_names_an_unknown_depth():
     with pytest.raises(UserError, match="'mean'.*median, expected"):
-        build_visibility_grid(_surfels(), torch.zeros(1).int(), [_view(0)], _Stub(), SETTINGS, CLASSES, depth="mean")
+        build_visibility_grid(
+            _surfels(CLASSES), torch.arange(CLASSES).int(), [_view(0)], _Stub(), SETTINGS, CLASSES, depth="mean"
+        )
 
 
 def test_build_with_the_reference_rasterizer():

@@ -49,7 +49,7 @@ def assign_classes(
     total = torch.zeros(len(surfels), num_classes, dtype=torch.float64, device=surfels.means.device)
     for index, (camera, mask) in enumerate(zip(cameras, labels, strict=True)):
         if mask is not None:
-            _check(mask, index, num_classes)
+            check_class_ids(mask, index, num_classes)
             with torch.no_grad():
                 total += rasterizer.class_contributions(inputs, camera, settings, mask, num_classes).double()
         if progress:
@@ -61,7 +61,8 @@ def assign_classes(
     return Assignment(class_ids.masked_fill(never_seen, 0), margin.float(), never_seen)
 
 
-def _check(mask: Tensor, index: int, num_classes: int) -> None:
+def check_class_ids(mask: Tensor, index: int, num_classes: int) -> None:
+    """Raise ``UserError`` unless the mask [H, W] int of view ``index`` holds ids below ``num_classes`` or IGNORE."""
     known = mask[mask != IGNORE]
     if known.numel() and (int(known.min()) < 0 or int(known.max()) >= num_classes):
         raise UserError(

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.rotations import rotation_from_quat
+from beags_plugin.errors import UserError
 from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.reduction import ordered_sum
 from beags_plugin.occupancy.grid import VisibilityGrid
@@ -36,6 +37,10 @@ class OccupancyLoss(Loss):
 
     samples: int = 20
     background: bool = True
+
+    def __post_init__(self) -> None:
+        if not (self.samples >= 1 and float(self.samples).is_integer()):
+            raise UserError(f"the occupancy loss has samples = {self.samples}: it must be a whole number, 1 or more.")
 
     def value(self, inputs: LossInputs) -> Tensor:
         surfels, grid, class_ids = inputs.surfels, inputs.grid, inputs.class_ids

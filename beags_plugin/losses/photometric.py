@@ -8,6 +8,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from beags_plugin.errors import UserError
 from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.reduction import ordered_mean
 from beags_plugin.ops import extension
@@ -25,6 +26,10 @@ class PhotometricLoss(Loss):
     """(1 - ssim_weight) L1 + ssim_weight (1 - SSIM) between the drawn image and the photograph."""
 
     ssim_weight: float = 0.2
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.ssim_weight <= 1.0:
+            raise UserError(f"the photometric loss has ssim_weight = {self.ssim_weight}: it must lie in 0..1.")
 
     def value(self, inputs: LossInputs) -> Tensor:
         drawn, photo = inputs.render.color, inputs.image.to(inputs.render.color)

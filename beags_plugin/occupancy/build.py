@@ -15,7 +15,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.occupancy.voxel_size import reference_indices, voxel_size_of_reference
-from beags_plugin.rasterizers.drawing import geometry_inputs, surface_depth
+from beags_plugin.rasterizers.drawing import draw_class_map, geometry_inputs, surface_depth
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 
 MIN_ALPHA_LIFTED = 0.5  # pixels with less alpha are not lifted
@@ -52,7 +52,8 @@ def build_visibility_grid(
 ) -> VisibilityGrid:
     """Render depth and class of every view, lift the pixels with A >= 0.5, and voxelise them per class.
 
-    surfels: N surfels. class_ids: [N] int32, phi. k: sets the voxel size (E8); seed: of the points that measure it.
+    surfels: N surfels. class_ids: [N] int32, phi, below ``num_classes``.
+    k: sets the voxel size (E8); seed: of the points that measure it.
     depth: which depth is lifted: see ``surface_depth``.
     Keeps a pixel's number, depth and class (10 bytes) of all views, and lifts them view by view.
     Raises ``UserError`` if no pixel of any view reaches an alpha of 0.5.
@@ -73,10 +74,9 @@ def build_visibility_grid(
 
 
 def _render(surfels, class_ids, camera, rasterizer, settings, num_classes: int, depth: str) -> _View:
-    inputs = geometry_inputs(surfels, class_ids)
     with torch.no_grad():
-        drawn = rasterizer.rasterize(inputs, camera, settings, surfels.means.new_zeros(3))
-        classes, _ = rasterizer.class_map(inputs, camera, settings, num_classes)
+        drawn = rasterizer.rasterize(geometry_inputs(surfels), camera, settings, surfels.means.new_zeros(3))
+    classes, _ = draw_class_map(rasterizer, surfels, class_ids, camera, settings)
     surface = surface_depth(drawn, depth)
     solid = ((drawn.alpha >= MIN_ALPHA_LIFTED) & torch.isfinite(surface) & (surface > 0)).reshape(-1)
     pixel = torch.nonzero(solid)[:, 0]

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
+from beags_plugin.core.class_ranks import ClassRanks
 from beags_plugin.errors import UserError
 from beags_plugin.ops import extension
 from beags_plugin.ops.voxel_lookup import VoxelLookup
@@ -24,7 +25,8 @@ class VisibilityGrid:
     D_occ(x, V_phi) is the number of occupied voxels of V_phi among the 27 around x. A class whose grid is empty (it
     is seen nowhere, or collides everywhere) has D_occ = 0 everywhere: all of it is penalised.
 
-    voxel_size: world units. origin: [3] float64, corner of voxel (0, 0, 0), world. num_classes: ids lie below it.
+    voxel_size: world units. origin: [3] float64, corner of voxel (0, 0, 0), world. num_classes: ids lie below it,
+        perhaps far apart: memory and speed depend on how many classes have voxels, not on their ids.
     keys: [M] int64, sorted, unique: the occupied voxels, 21 bits per axis. classes: [M] int32, the class of each.
     dense_bytes: see ``DENSE_BYTES``; 0 forces sorted keys. It changes the speed of ``valid``, never its result, and
         only where the compiled ``lookup`` is absent.
@@ -71,7 +73,7 @@ class VisibilityGrid:
         if extension.load() is None or self.keys.device.type != "cpu":
             return None
         if self._lookup is None:
-            self._lookup = VoxelLookup(self.keys, self.classes, self.num_classes, self.origin, self.voxel_size)
+            self._lookup = VoxelLookup(self.keys, self.classes, self.origin, self.voxel_size)
         return self._lookup
 
     def __getstate__(self) -> dict[str, object]:
@@ -173,35 +175,38 @@ class VisibilityGrid:
         dims = high - low + 5
         self._last = (dims - 1).tolist()
         x, y, z = dims.tolist()
-        if x * y * z * self.num_classes >= 1 << 63:
+        self._ranks = ClassRanks(self.classes)
+        if x * y * z * len(self._ranks) >= 1 << 63:
             raise UserError(f"the views span {x} x {y} x {z} voxels, which is too many: raise k to get larger voxels.")
         self._strides = (y * z, z, 1)
         self._per_class = x * y * z
-        linear = self.classes.long() * self._per_class
+        linear = self._ranks.ranks(self.classes).long() * self._per_class
         for axis, stride in enumerate(self._strides):
             linear = linear + (voxels[:, axis] - self._base[axis]) * stride
         for stride in self._strides:  # the 27 neighbours, axis by axis; the rim keeps them inside the box
             linear = torch.unique(torch.cat([linear - stride, linear, linear + stride]))
         self._valid_keys = linear
         self._volume: Tensor | None = None
-        if self.num_classes * self._per_class <= self._dense_bytes:
-            self._volume = torch.zeros(self.num_classes * self._per_class, dtype=torch.bool, device=device)
+        if len(self._ranks) * self._per_class <= self._dense_bytes:
+            self._volume = torch.zeros(len(self._ranks) * self._per_class, dtype=torch.bool, device=device)
             self._volume[linear] = True
             self._valid_keys = linear[:0]
 
     def _member(self, voxels: Tensor, class_ids: Tensor) -> Tensor:
         """Validity of voxels given as whole floats [P, 3] relative to the box; those outside are moved to its rim."""
-        linear = class_ids.long() * self._per_class
+        ranks = self._ranks.ranks(class_ids)
+        known = ranks < len(self._ranks)  # a class without voxels has none that is valid
+        linear = ranks.masked_fill(~known, 0).long() * self._per_class
         for axis, stride in enumerate(self._strides):
             # nan_to_num: NaN goes to the rim too
             index = voxels[:, axis].nan_to_num(nan=0.0).clamp(0, self._last[axis])
             linear = linear + index.long() * stride
         if self._volume is not None:
-            return self._volume[linear]
+            return self._volume[linear] & known
         if len(self._valid_keys) == 0:
             return torch.zeros_like(linear, dtype=torch.bool)
         position = torch.searchsorted(self._valid_keys, linear).clamp_(max=len(self._valid_keys) - 1)
-        return self._valid_keys[position] == linear
+        return (self._valid_keys[position] == linear) & known
 
 
 def _scaled(points: Tensor, origin: Tensor, size: float) -> Tensor:

@@ -39,7 +39,7 @@ def occupancy_loss(
     class_ids = extension.plain("class_ids", class_ids, (n,), torch.int32)
     if samples < 0:
         raise ValueError(f"samples must be 0 or more, not {samples}")
-    fixed = (class_ids, lookup.native, stream, samples, background)
+    fixed = (lookup.ranks(class_ids), lookup.native, stream, samples, background)
     return _OccupancyLoss.apply(fixed, *parameters)  # type: ignore[return-value]
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from beags_plugin.core.class_ranks import ClassRanks
 from beags_plugin.ops import extension
 
 
@@ -15,17 +16,23 @@ class VoxelLookup:
 
     Memory is linear in the occupied voxels. Class ids that are no class of the grid have no voxels.
 
-    keys: [M] int64, sorted; classes: [M] int32, below ``num_classes``; origin: [3] float64, world; voxel_size: world
-        units; all as in ``occupancy.grid.VisibilityGrid``.
+    keys: [M] int64, sorted; classes: [M] int32; origin: [3] float64, world; voxel_size: world units; all as in
+        ``occupancy.grid.VisibilityGrid``.
     """
 
-    def __init__(self, keys: Tensor, classes: Tensor, num_classes: int, origin: Tensor, voxel_size: float) -> None:
+    def __init__(self, keys: Tensor, classes: Tensor, origin: Tensor, voxel_size: float) -> None:
         keys = extension.plain("keys", keys, (len(keys),), torch.int64)
         classes = extension.plain("classes", classes, (len(keys),), torch.int32)
         origin = extension.plain("origin", origin, (3,), torch.float64)
         module = extension.load()
         assert module is not None, "the caller asks extension.load() first"
-        self.native: Any = module.VoxelLookup(keys, classes, num_classes, origin, voxel_size)
+        self._ranks = ClassRanks(classes)
+        ranks, count = self._ranks.ranks(classes), len(self._ranks)
+        self.native: Any = module.VoxelLookup(keys, ranks, count, origin, voxel_size)
+
+    def ranks(self, class_ids: Tensor) -> Tensor:
+        """The classes as ``native`` numbers them: [N] int32, background 0. class_ids: [N] int32."""
+        return self._ranks.ranks(class_ids)
 
     @property
     def bytes(self) -> int:
@@ -50,5 +57,5 @@ class VoxelLookup:
         arrays = [extension.plain(key, value, (count, 3), first.dtype) for key, value in vectors.items()]
         class_ids = extension.plain("class_ids", class_ids.int(), (count,), torch.int32)
         out = torch.empty(count, dtype=dtype)
-        extension.function(name, first, self.native)(*arrays, class_ids, out, extension.threads())
+        extension.function(name, first, self.native)(*arrays, self.ranks(class_ids), out, extension.threads())
         return out

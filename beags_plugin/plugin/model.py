@@ -28,7 +28,7 @@ from beags_plugin.plugin.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.schedule import PhaseSchedule
 from beags_plugin.plugin.training import training_callbacks
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.drawing import geometry_inputs, surfel_inputs
+from beags_plugin.rasterizers.drawing import draw_class_map, surfel_inputs
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
 from beags_plugin.refiners.preparation import PreparationConfig
 
@@ -299,8 +299,7 @@ class BeagsModel(SplatfactoModel):
             "background": background.expand(camera.height, camera.width, 3),
         }
         if bool(self.assigned):
-            inputs = geometry_inputs(surfels, class_ids)
-            classes, confidence = self.rasterizer.class_map(inputs, camera, settings, max(self.classes) + 1)
+            classes, confidence = draw_class_map(self.rasterizer, surfels, class_ids, camera, settings)
             colors = torch.from_numpy(colorize(classes.cpu().numpy().astype(np.uint16)))
             outputs["class_map"] = colors.to(self.device).float() / 255.0
             outputs["class_confidence"] = confidence[..., None].float()

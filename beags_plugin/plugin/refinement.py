@@ -54,6 +54,11 @@ class RefinementSwitch:
                 "beags-base, which needs none."
             )
 
+    def check_options(self) -> None:
+        """Raise ``UserError`` at the start of a run whose options would stop it when it comes to refine."""
+        if self.wanted:
+            self.model.config.prepare.check()
+
     def before_step(self, step: int) -> None:
         """Take up refinement that a checkpoint was in, or start it where no base step precedes it."""
         model = self.model

@@ -29,6 +29,7 @@ def training_callbacks(model: BeagsModel, attributes: TrainingCallbackAttributes
     model.extent = camera_extent(datamanager.train_dataset.cameras.camera_to_worlds).to(model.device)
     densifier = Densifier(model, optimizers)
     switch = RefinementSwitch(model, trainer, datamanager)
+    switch.check_options()
     switch.check_masks()
 
     def before(step: int) -> None:

@@ -5,18 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
-from beags_plugin.assignment.assignment import Assignment, assign_classes
+from beags_plugin.assignment.assignment import Assignment, assign_classes, check_class_ids
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.class_ranks import ClassRanks
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.rasterizers.drawing import geometry_inputs, surface_depth
+from beags_plugin.rasterizers.drawing import check_surface_depth, geometry_inputs, surface_depth
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
 from beags_plugin.refiners.base import AssignedScene, Progress, Refiner
 
@@ -39,6 +40,19 @@ class PreparationConfig:
     tau: float = 0.02
     depth: str = "median"
     k: int = 2000
+
+    def check(self) -> None:
+        """Raise ``UserError`` for a value that no stage can work with: hours before the stages would say so."""
+        choices = ["none", *REPROJECTIONS.names()]
+        if self.reprojection not in choices:
+            raise UserError(f"there is no reprojection {self.reprojection!r}: choose one of {', '.join(choices)}.")
+        if self.reprojection != "none":
+            REPROJECTIONS.get(self.reprojection)  # one of another package may not load
+        check_surface_depth(self.depth)
+        if not self.tau >= 0:
+            raise UserError(f"tau is {self.tau}: it must be 0 or more (inf counts every vote).")
+        if not self.k >= 1:
+            raise UserError(f"k is {self.k}: the voxel size needs at least 1 neighbour.")
 
 
 @dataclass(frozen=True)
@@ -77,7 +91,7 @@ def prepare(
 
     surfels: the trained base, N surfels.
     cameras: V training views; labels: per view [H, W] int32 class ids or IGNORE, None where there is no mask.
-    class_names: id to name, background (0) included.
+    class_names: id to name, background (0) included; ids may lie far apart: the stages work on their ranks.
     Raises ``UserError`` if no view has a mask or no mask names an object.
     """
     if not any(mask is not None and bool(((mask > 0) & (mask != IGNORE)).any()) for mask in labels):
@@ -86,7 +100,8 @@ def prepare(
             "which needs none."
         )
     surfels = surfels.detach()
-    num_classes = max(class_names) + 1
+    known = _known_classes(labels, class_names)
+    ranked = [None if mask is None else _translated(mask, known, known.ranks) for mask in labels]
     findings, seconds = [], {}
 
     def timed(name: str, start: float, finding: str) -> None:
@@ -96,6 +111,7 @@ def prepare(
     start = time.perf_counter()
     confidence = None
     if config.reprojection == "none":
+        ranked = [_or_ignore(mask, camera) for mask, camera in zip(ranked, cameras, strict=True)]
         consistent = [_or_ignore(mask, camera) for mask, camera in zip(labels, cameras, strict=True)]
         timed("reprojection", start, "reprojection: off, masks used as they are")
     else:
@@ -103,17 +119,20 @@ def prepare(
             depths = _render_depths(surfels, cameras, rasterizer, settings, config.depth, progress)
         with stage("Reprojecting masks") as progress:
             reproject = REPROJECTIONS.get(config.reprojection)
-            refined = reproject(depths, cameras, labels, num_classes, tau=config.tau, progress=progress)
-        consistent = [mask.labels for mask in refined]
+            refined = reproject(depths, cameras, ranked, len(known), tau=config.tau, progress=progress)
+        ranked = [mask.labels for mask in refined]
+        consistent = [_translated(mask, known, known.class_ids) for mask in ranked]
         confidence = [mask.confidence for mask in refined]
         timed("reprojection", start, _reprojection_finding(labels, consistent))
 
     start = time.perf_counter()
     with stage("Assigning classes") as progress:
-        assignment = assign_classes(surfels, cameras, consistent, rasterizer, settings, num_classes, progress=progress)
+        assignment = assign_classes(surfels, cameras, ranked, rasterizer, settings, len(known), progress=progress)
+    assignment = replace(assignment, class_ids=known.class_ids(assignment.class_ids))
     timed("assignment", start, _assignment_finding(assignment, class_names))
 
     start = time.perf_counter()
+    num_classes = max(class_names) + 1
     scene = AssignedScene(
         surfels, assignment.class_ids, cameras, consistent, num_classes, rasterizer, settings, seed, config.depth
     )
@@ -122,6 +141,28 @@ def prepare(
     if grid is not None:
         timed("voxel grids", start, f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {config.k})")
     return Preparation(consistent, confidence, assignment, grid, findings, seconds)
+
+
+def _known_classes(labels: Sequence[Tensor | None], class_names: dict[int, str]) -> ClassRanks:
+    """The named classes and those between them that masks hold; ``UserError`` for ids above the last named one."""
+    named = ClassRanks(torch.tensor(sorted(class_names)))
+    if named.trivial:
+        return named  # the stages check the masks
+    last = max(class_names)
+    present = torch.zeros(last + 1, dtype=torch.bool)
+    for index, mask in enumerate(labels):
+        if mask is not None:
+            check_class_ids(mask, index, last + 1)
+            present[mask[mask != IGNORE].long().to(present.device)] = True
+    return ClassRanks(torch.cat([named.ids, present.nonzero()[:, 0]]))
+
+
+def _translated(mask: Tensor, known: ClassRanks, table: Callable[[Tensor], Tensor]) -> Tensor:
+    """A mask [H, W] int32 with ``table`` of its values; IGNORE stays."""
+    if known.trivial:
+        return mask  # ranks are ids
+    unlabelled = mask == IGNORE
+    return table(mask.masked_fill(unlabelled, 0)).masked_fill_(unlabelled, IGNORE)
 
 
 def _render_depths(surfels, cameras, rasterizer, settings, depth, progress) -> list[Tensor]:

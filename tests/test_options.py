@@ -1,0 +1,78 @@
+"""Options that no stage could work with are refused before the first step, in one sentence."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import pytest
+
+from beags_plugin.errors import UserError
+from beags_plugin.losses.occupancy import OccupancyLoss
+from beags_plugin.losses.photometric import PhotometricLoss
+from beags_plugin.masks import REPROJECTIONS
+from beags_plugin.refiners.preparation import PreparationConfig
+
+WRONG = [
+    ({"reprojection": "pairs"}, "there is no reprojection 'pairs': choose one of none, pairwise, voxel."),
+    ({"depth": "mean"}, "there is no surface depth 'mean': choose one of median, expected."),
+    ({"tau": -0.1}, "tau is -0.1: it must be 0 or more (inf counts every vote)."),
+    ({"tau": math.nan}, "tau is nan: it must be 0 or more (inf counts every vote)."),
+    ({"k": 0}, "k is 0: the voxel size needs at least 1 neighbour."),
+]
+
+
+@pytest.mark.parametrize(("options", "sentence"), WRONG)
+def test_wrong_options_of_the_preparation(options, sentence):
+    with pytest.raises(UserError) as error:
+        PreparationConfig(**options).check()
+    assert str(error.value) == sentence
+
+
+@pytest.mark.parametrize("reprojection", ["none", "pairwise", "voxel"])
+@pytest.mark.parametrize("tau", [0.0, math.inf])
+def test_options_at_their_limits_are_taken(reprojection, tau):
+    PreparationConfig(reprojection=reprojection, tau=tau, depth="expected", k=1).check()
+
+
+def test_a_reprojection_of_another_package_that_does_not_load(monkeypatch):
+    monkeypatch.setitem(REPROJECTIONS._specs, "theirs", "no_such_package:reproject")
+    with pytest.raises(UserError, match="'theirs' .*cannot be loaded"):
+        PreparationConfig(reprojection="theirs").check()
+
+
+@pytest.mark.parametrize("samples", [0, -3, 2.5, math.nan])
+def test_samples_of_the_occupancy_loss(samples):
+    with pytest.raises(UserError, match=f"samples = {samples}: it must be a whole number, 1 or more"):
+        OccupancyLoss(samples=samples)
+
+
+@pytest.mark.parametrize("weight", [-0.1, 1.5, math.nan])
+def test_the_weight_of_ssim(weight):
+    with pytest.raises(UserError, match=f"ssim_weight = {weight}: it must lie in 0..1"):
+        PhotometricLoss(ssim_weight=weight)
+
+
+@pytest.mark.parametrize("refine_steps", [0, 10])
+def test_a_run_is_refused_at_its_start_only_if_it_refines(refine_steps):
+    pytest.importorskip("nerfstudio")
+    from beags_plugin.plugin.config import base_config
+    from beags_plugin.plugin.refinement import RefinementSwitch
+
+    config = base_config().model_config
+    config.refine_steps, config.prepare = refine_steps, PreparationConfig(k=0)
+    switch = RefinementSwitch(SimpleNamespace(config=config), None, None)
+    if refine_steps:
+        with pytest.raises(UserError, match="k is 0"):
+            switch.check_options()
+    else:
+        switch.check_options()
+
+
+def test_a_loss_with_a_wrong_option_is_refused_where_it_is_built():
+    pytest.importorskip("nerfstudio")
+    from beags_plugin.plugin.model import LossSpec
+    from beags_plugin.plugin.schedule import PhaseSchedule
+
+    with pytest.raises(UserError, match="samples = 0"):
+        LossSpec(phase="refine", options={"samples": 0}).build("occupancy", PhaseSchedule(10, 10))
