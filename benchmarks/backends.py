@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
+from dataclasses import asdict
 
 import torch
 from torch import Tensor
@@ -125,25 +126,8 @@ def free_bytes() -> float:
         return float("inf")
 
 
-def instruction_set() -> str:
-    """The kernels that the compiled rasterizer uses in this process."""
-    if hasattr(native, "instruction_set"):
-        return native.instruction_set()
-    from beags_plugin import _native
-
-    return _native.instruction_set()
-
-
-def instruction_sets() -> list[str]:
-    """Those that can be forced through BEAGS_ISA here, best last as far as known."""
-    if hasattr(native, "instruction_sets"):
-        return list(native.instruction_sets())
-    return ["baseline", "avx2"]
-
-
 def work_counts(scene: Scene) -> dict[str, int] | None:
-    """lanes, contributing, tile_pairs, box_pairs of one view; None where the installed rasterizer does not count."""
-    if not hasattr(native, "work_counts"):
+    """lanes, contributing, tile_pairs, box_pairs of one view; None without the compiled rasterizer."""
+    if native.NativeRasterizer.unavailable() is not None:
         return None
-    counts = native.work_counts(surfel_inputs(scene), scene.camera, scene.settings)
-    return {name: int(getattr(counts, name)) for name in ("lanes", "contributing", "tile_pairs", "box_pairs")}
+    return asdict(native.work_counts(surfel_inputs(scene), scene.camera, scene.settings))

@@ -218,7 +218,7 @@ def _add_stages(session: Session, size: Size, options: Options, scene: dict[str,
     """projection_binning_ms, same_bits: whether 1, 2 and 4 threads give the same bits."""
     threads = options.threads[0]
     frame = session.best.ask("stages", size=size.name, threads=threads, seconds=options.seconds)
-    scene["projection_binning_ms"] = None if frame is None else Series(threads, frame).best
+    scene["projection_binning_ms"] = Series(threads, frame).best
     digests = {session.best.ask("digest", size=size.name, threads=count) for count in (1, 2, 4)}
     scene["same_bits"] = len(digests) == 1
 

@@ -84,6 +84,7 @@ def _hello(names: list[str]) -> dict[str, Any]:
     """What this process can measure: instruction set(s), and per backend None or why it cannot run."""
     import torch
 
+    from beags_plugin.rasterizers import native
     from benchmarks import backends
 
     reasons = {name: backends.make_backend(name).unavailable() for name in names}
@@ -94,8 +95,8 @@ def _hello(names: list[str]) -> dict[str, Any]:
     return {
         "torch": torch.__version__,
         "reasons": reasons,
-        "isa": backends.instruction_set() if known else None,
-        "isas": backends.instruction_sets() if known else [],
+        "isa": native.instruction_set() if known else None,
+        "isas": native.instruction_sets() if known else [],
     }
 
 
@@ -113,21 +114,18 @@ def _time(size: str, backend: str, threads: int, seconds: float) -> dict[str, Ti
     return found
 
 
-def _stages(size: str, threads: int, seconds: float) -> Timings | None:
-    """The native forward's first stage alone (projection and binning), where it can be told apart."""
+def _stages(size: str, threads: int, seconds: float) -> Timings:
+    """The native forward's first stage alone: projection and binning."""
     from beags_plugin.rasterizers import native
     from benchmarks import backends
     from benchmarks.clock import Seconds
 
-    make_frame = getattr(native, "_frame", None)
-    if make_frame is None:
-        return None
     _set_threads(threads)
     scene = _scene(size)
     inputs, found = backends.surfel_inputs(scene), []
     for _ in _calls(seconds):
         start = Seconds.now()
-        make_frame(inputs, scene.camera, scene.settings)
+        native._frame(inputs, scene.camera, scene.settings)
         found.append((Seconds.now() - start).ms())
     return found
 

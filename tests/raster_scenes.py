@@ -114,10 +114,12 @@ def gradients_by_output(rasterizer, scene: Scene) -> dict[str, dict[str, Tensor]
     return {name: _gradients(loss, leaves) for name, loss in losses.items()}
 
 
-def gradients(rasterizer, scene: Scene, only: tuple[str, ...] | None = None) -> dict[str, Tensor]:
-    """The gradients of all these combinations together (or of those of some outputs), in one backward."""
-    leaves = {name: getattr(scene.inputs, name).clone().requires_grad_() for name in FLOATS}
-    leaves["background"] = scene.background.clone().requires_grad_()
+def gradients(
+    rasterizer, scene: Scene, only: tuple[str, ...] | None = None, wanted: tuple[str, ...] = (*FLOATS, "background")
+) -> dict[str, Tensor]:
+    """The gradients of all these combinations together (or of those of some outputs) towards ``wanted``, at once."""
+    values = {name: getattr(scene.inputs, name) for name in FLOATS} | {"background": scene.background}
+    leaves = {name: values[name].clone().requires_grad_() for name in wanted}
     losses = _losses(scene.draw(rasterizer, **leaves))
     return _gradients(sum(loss for name, loss in losses.items() if only is None or name in only), leaves)
 

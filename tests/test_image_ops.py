@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import pytest
@@ -47,7 +44,7 @@ def in_torch(monkeypatch):
 def _value_and_gradients(loss, inputs_of, *leaves):
     leaves = [leaf.clone().requires_grad_() for leaf in leaves]
     value = loss.value(inputs_of(*leaves))
-    return [value, *torch.autograd.grad(3.0 * value, leaves)]
+    return [value.detach(), *torch.autograd.grad(3.0 * value, leaves)]
 
 
 def _check(found, expected, dtype):
@@ -57,16 +54,23 @@ def _check(found, expected, dtype):
         assert (a.double() - b.double()).abs().max() <= tolerance * b.double().abs().max().clamp_min(1e-3)
 
 
+def _pictures(size, dtype):
+    photo, drawn = _random(*size, 3, dtype=dtype), _random(*size, 3, seed=1, dtype=dtype)
+    drawn[0, 0] = photo[0, 0]  # |x - y| has slope 0 there
+    return photo, drawn
+
+
+def photometric_results(size, dtype):
+    """The loss (L1 and SSIM) and its gradient."""
+    photo, drawn = _pictures(size, dtype)
+    return _value_and_gradients(PhotometricLoss(), lambda x: _loss_inputs(image=photo, color=x), drawn)
+
+
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("size", SIZES)
 def test_photometric_is_torchs(size, dtype, in_torch):
-    photo, drawn = _random(*size, 3, dtype=dtype), _random(*size, 3, seed=1, dtype=dtype)
-    drawn[0, 0] = photo[0, 0]  # |x - y| has slope 0 there
-
-    def measure():
-        return _value_and_gradients(PhotometricLoss(), lambda x: _loss_inputs(image=photo, color=x), drawn)
-
-    _check(measure(), in_torch(measure), dtype)
+    _check(photometric_results(size, dtype), in_torch(lambda: photometric_results(size, dtype)), dtype)
+    photo, drawn = _pictures(size, dtype)
     assert torch.allclose(ssim(drawn, photo), in_torch(lambda: ssim(drawn, photo)), atol=1e-5)
 
 
@@ -81,17 +85,18 @@ def _view(size, dtype):
     return Camera(torch.eye(4), K, width, height), depth, normal, _random(*size, seed=3, dtype=dtype)
 
 
+def normal_results(size, dtype):
+    """The loss and its gradients by depth and normal."""
+    camera, depth, normal, alpha = _view(size, dtype)
+    return _value_and_gradients(
+        NormalConsistencyLoss(), lambda d, n: _loss_inputs(camera, depth=d, normal=n, alpha=alpha), depth, normal
+    )
+
+
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("size", SIZES)
 def test_normal_consistency_is_torchs(size, dtype, in_torch):
-    camera, depth, normal, alpha = _view(size, dtype)
-
-    def measure():
-        return _value_and_gradients(
-            NormalConsistencyLoss(), lambda d, n: _loss_inputs(camera, depth=d, normal=n, alpha=alpha), depth, normal
-        )
-
-    _check(measure(), in_torch(measure), dtype)
+    _check(normal_results(size, dtype), in_torch(lambda: normal_results(size, dtype)), dtype)
 
 
 def test_normal_consistency_of_a_scaled_scene_is_the_same():
@@ -117,39 +122,13 @@ def test_gradients_by_finite_differences():
 
 
 def test_any_number_of_threads_gives_the_same_bits():
-    camera, depth, normal, alpha = _view((180, 200), torch.float32)
-    photo, drawn = _random(180, 200, 3).float(), _random(180, 200, 3, seed=1).float()
+    size, dtype = (180, 200), torch.float32
     before, runs = torch.get_num_threads(), []
     try:
         for count in (1, 2, 4):
             torch.set_num_threads(count)
-            runs.append(
-                _value_and_gradients(PhotometricLoss(), lambda x: _loss_inputs(image=photo, color=x), drawn)
-                + _value_and_gradients(
-                    NormalConsistencyLoss(),
-                    lambda d, n: _loss_inputs(camera, depth=d, normal=n, alpha=alpha),
-                    depth,
-                    normal,
-                )
-            )
+            runs.append(photometric_results(size, dtype) + normal_results(size, dtype))
     finally:
         torch.set_num_threads(before)
     for other in runs[1:]:
         assert all(torch.equal(a, b) for a, b in zip(runs[0], other, strict=True))
-
-
-def test_plain_kernels_agree_with_the_fast_ones():
-    program = (
-        "import torch; from beags_plugin.losses.photometric import ssim\n"
-        "g = torch.Generator().manual_seed(0); a, b = torch.rand(2, 50, 61, 3, generator=g)\n"
-        "a.requires_grad_(); v = ssim(a, b); v.backward(); print(v.item(), a.grad.abs().sum().item())"
-    )
-    found = []
-    for isa in ("baseline", None):
-        environment = {name: value for name, value in os.environ.items() if name != "BEAGS_ISA"}
-        done = subprocess.run(
-            [sys.executable, "-c", program], env={**environment, **({"BEAGS_ISA": isa} if isa else {})},
-            capture_output=True, text=True, check=True,
-        )  # fmt: skip
-        found.append([float(number) for number in done.stdout.split()])
-    assert found[0] == pytest.approx(found[1], rel=1e-5)

@@ -57,19 +57,56 @@ def test_what_is_asked_for_does_not_depend_on_what_else_is(geometry, distortion,
     assert all(torch.equal(a, b) for a, b in zip(*runs, strict=True))
 
 
+class Watched(NativeRasterizer):
+    """Remembers what its kernels were asked for, and what the backward returned."""
+
+    def __init__(self):
+        super().__init__()
+        self.differentiable, self.backwards = [], []
+
+    def forward_kernel(self, drawing):
+        self.differentiable.append(drawing.differentiable)
+        return super().forward_kernel(drawing)
+
+    def backward_kernel(self, drawing, state, gradients, needed):
+        found = super().backward_kernel(drawing, state, gradients, needed)
+        self.backwards.append((needed, found))
+        return found
+
+
+WANTED = [
+    ("colors",),
+    ("background",),
+    ("opacity_logits",),
+    ("quats",),
+    ("colors", "opacity_logits"),
+    ("means", "quats", "log_scales"),
+]
+
+
 @needs_native
-@pytest.mark.parametrize("wanted", [("colors",), ("background",), ("colors", "opacity_logits"), ("means", "quats")])
-def test_gradients_do_not_depend_on_which_are_needed(wanted):
+@pytest.mark.parametrize("only", [("color",), OUTPUTS])
+@pytest.mark.parametrize("wanted", WANTED)
+def test_needed_gradients_alone_are_made_and_have_the_same_bits(wanted, only):
     scene = make_scene().to(torch.float32)
-    everything = gradients(NativeRasterizer(), scene, only=("color",))
-    leaves = {
-        name: (scene.background if name == "background" else getattr(scene.inputs, name)).clone().requires_grad_()
-        for name in wanted
-    }
-    render = scene.draw(NativeRasterizer(), **leaves)
-    weight = torch.randn(render.color.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    found = torch.autograd.grad((render.color * weight.to(render.color)).sum(), list(leaves.values()))
-    assert all(torch.equal(g, everything[name]) for name, g in zip(wanted, found, strict=True))
+    everything = gradients(NativeRasterizer(), scene, only)
+    rasterizer = Watched()
+    found = gradients(rasterizer, scene, only, wanted)
+    assert all(found[name].any() and torch.equal(found[name], everything[name]) for name in wanted)
+    [(needed, made)] = rasterizer.backwards
+    assert {name for name, value in needed._asdict().items() if value} == set(wanted)
+    assert {name for name, value in made._asdict().items() if value is not None} == set(wanted)
+
+
+@needs_native
+def test_without_gradients_nothing_is_kept_for_a_backward():
+    scene, rasterizer = make_scene(), Watched()
+    assert not scene.draw(rasterizer).color.requires_grad
+    means = scene.inputs.means.clone().requires_grad_()
+    with torch.no_grad():
+        assert not scene.draw(rasterizer, means=means).color.requires_grad
+    assert scene.draw(rasterizer, means=means).color.requires_grad
+    assert rasterizer.differentiable == [False, False, True]
 
 
 @needs_native
@@ -104,13 +141,3 @@ def test_usual_boxes_are_those_of_a_surfel_that_faces_the_camera():
     camera = Camera(torch.eye(4, dtype=torch.float64), K, 300, 200)
     # 3.33 e^-1 200 / 4 = 61.25 and 3.33 e^-2 200 / 4 = 22.5: columns 38.7 .. 161.3, rows 37.5 .. 82.5
     assert native.work_counts(inputs, camera, one.settings).box_pairs == (11 - 2) * (6 - 2)
-
-
-@needs_native
-def test_only_needed_gradients_are_made():
-    scene = make_scene()
-    opacity_logits = scene.inputs.opacity_logits.clone().requires_grad_()
-    scene.draw(NativeRasterizer(), opacity_logits=opacity_logits).color.sum().backward()
-    assert opacity_logits.grad is not None
-    assert scene.inputs.means.grad is None
-    assert not scene.draw(NativeRasterizer()).color.requires_grad

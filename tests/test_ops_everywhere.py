@@ -23,6 +23,7 @@ torch.save(results(), sys.argv[2])
 
 def results() -> dict[str, list[torch.Tensor]]:
     """Something of every op that has a kernel for each instruction set."""
+    from test_image_ops import normal_results, photometric_results
     from test_occupancy_loss import evaluate, make_grid, make_surfels
     from test_reprojection_votes import larger_scene
     from test_sh_colors import evaluate as evaluate_colors
@@ -36,6 +37,8 @@ def results() -> dict[str, list[torch.Tensor]]:
         found[f"colors {dtype}"] = evaluate_colors(*scene(200, 16, dtype), 3)
         masks = reproject_pairwise(*larger_scene(dtype))
         found[f"votes {dtype}"] = [value for mask in masks for value in (mask.labels, mask.confidence)]
+        found[f"photometric {dtype}"] = photometric_results((50, 61), dtype)
+        found[f"normal consistency {dtype}"] = normal_results((50, 61), dtype)
     return found
 
 

@@ -24,10 +24,6 @@ class MaskMetrics:
     iou: float
     biou: float
 
-    def as_dict(self) -> dict[str, float]:
-        """{"acc", "iou", "biou"}."""
-        return {"acc": self.acc, "iou": self.iou, "biou": self.biou}
-
 
 def _array(image: Any) -> np.ndarray:
     """A numpy view of an array, or of a tensor on any device."""

@@ -2,8 +2,8 @@
 // for one instruction set.
 #pragma once
 
+#include "golden.h"
 #include "lanes.h"
-#include "voxel_table.h"
 
 namespace beags {
 namespace ops {

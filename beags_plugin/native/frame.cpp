@@ -187,6 +187,7 @@ void Frame<T>::reduce(const Inputs<T>& inputs, const T* records, int size, const
   const auto write = [](T* values, int64_t surfel, const double* numbers, int count) {
     for (int i = 0; values && i < count; ++i) values[count * surfel + i] = static_cast<T>(numbers[i]);
   };
+  const bool shape = to.means || to.quats || to.log_scales;
   const int team = num_surfels_ < kTeamSurfels ? 1 : threads;
   // Determinism: each surfel's records are summed by one thread, in the order of their tiles.
 #pragma omp parallel for num_threads(team) schedule(dynamic, kChunk)
@@ -198,11 +199,14 @@ void Frame<T>::reduce(const Inputs<T>& inputs, const T* records, int size, const
     }
     write(to.colors, i, sums + kColor, 3);
     if (size == kColorRecord) continue;
-    const SurfelGradients g = project_backward(view_, parameters(inputs, i), sums);
+    const SurfelParameters surfel = parameters(inputs, i);
+    const double g_opacity_logit = sums[kLogOpacity] * surfel.transparency;  // d log sigmoid = 1 - sigmoid
+    write(to.opacity_logits, i, &g_opacity_logit, 1);
+    if (!shape) continue;
+    const ShapeGradients g = project_backward(view_, surfel, sums);
     write(to.means, i, g.mean, 3);
     write(to.quats, i, g.quat, 4);
     write(to.log_scales, i, g.log_scale, 2);
-    write(to.opacity_logits, i, &g.opacity_logit, 1);
   }
 }
 

@@ -2,7 +2,7 @@
 
 #include <cmath>
 #include <memory>
-#include <string>
+#include <type_traits>
 #include <vector>
 
 #include "isa.h"
@@ -12,30 +12,15 @@ namespace ops {
 namespace {
 
 template <class T>
-struct Tables;
-template <>
-struct Tables<float> {
-  static const ImageKernels<float>& plain() { return baseline::kImageKernelsF32; }
-#if defined(BEAGS_HAS_AVX2)
-  static const ImageKernels<float>& fast() { return avx2::kImageKernelsF32; }
-#endif
-};
-template <>
-struct Tables<double> {
-  static const ImageKernels<double>& plain() { return baseline::kImageKernelsF64; }
-#if defined(BEAGS_HAS_AVX2)
-  static const ImageKernels<double>& fast() { return avx2::kImageKernelsF64; }
-#endif
-};
-
-// The rasterizer's choice; where that is AVX-512, AVX2 runs too.
-template <class T>
 const ImageKernels<T>& image_kernels() {
 #if defined(BEAGS_HAS_AVX2)
-  static const bool fast = instruction_set().compare(0, 3, "avx") == 0;
-  if (fast) return Tables<T>::fast();
+  if (uses_avx2()) {
+    if constexpr (std::is_same_v<T, float>) return avx2::kImageKernelsF32;
+    if constexpr (std::is_same_v<T, double>) return avx2::kImageKernelsF64;
+  }
 #endif
-  return Tables<T>::plain();
+  if constexpr (std::is_same_v<T, float>) return baseline::kImageKernelsF32;
+  if constexpr (std::is_same_v<T, double>) return baseline::kImageKernelsF64;
 }
 
 constexpr int64_t kTeamPixels = 16384;  // a team costs tens of microseconds, a pixel some ten nanoseconds

@@ -90,6 +90,11 @@ const std::string& instruction_set() {
   return name;
 }
 
+bool uses_avx2() {
+  static const bool uses = instruction_set() == "avx2" || instruction_set() == "avx512";
+  return uses;
+}
+
 template <>
 const Kernels<float>& kernels() {
   return *chosen().f32;

@@ -15,7 +15,10 @@ std::vector<std::string> instruction_sets();
 // sentence for the user, if that one cannot run here.
 const std::string& instruction_set();
 
-// Its kernels.
+// Whether that one is AVX2 or comes with it. The ops and image losses have two builds: for AVX2, for any processor.
+bool uses_avx2();
+
+// The tile kernels of the one in use.
 template <class T>
 const Kernels<T>& kernels();
 

@@ -1,9 +1,9 @@
 // The Python module: plain arrays in and out. Arguments are checked once, in rasterizers/native.py and interface.py.
 #include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include "arrays.h"
 #include "frame.h"
 #include "isa.h"
 #include "module_images.h"
@@ -14,16 +14,6 @@ using namespace nb::literals;
 
 namespace beags {
 namespace {
-
-template <class T>
-using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
-using Labels = Array<const int32_t>;
-
-// The array's numbers, or null for None.
-template <class T>
-T* data(const Array<T>& array) {
-  return array.is_valid() ? array.data() : nullptr;
-}
 
 View make_view(const Array<const double>& viewmat, const Array<const double>& k, int width, int height,
                double near_plane, double far_plane) {
@@ -48,7 +38,7 @@ void bind(nb::module_& m, const char* name) {
   nb::class_<Frame<T>>(m, name)
       .def(
           "__init__",
-          [](Frame<T>* self, In means, In quats, In log_scales, In opacity_logits, In colors, Labels class_ids,
+          [](Frame<T>* self, In means, In quats, In log_scales, In opacity_logits, In colors, Ids class_ids,
              Array<const double> viewmat, Array<const double> k, int width, int height, double near_plane,
              double far_plane, Array<bool> visible, int threads) {
             const View view = make_view(viewmat, k, width, height, near_plane, far_plane);
@@ -65,11 +55,10 @@ void bind(nb::module_& m, const char* name) {
           "means"_a, "quats"_a, "log_scales"_a, "opacity_logits"_a, "colors"_a, "class_ids"_a.none(), "viewmat"_a,
           "K"_a, "width"_a, "height"_a, "near"_a, "far"_a, "visible"_a, "threads"_a)
       .def_prop_ro("num_nonfinite", &Frame<T>::num_nonfinite)
-      .def_prop_ro("num_pairs", &Frame<T>::num_pairs)
       .def(
           "forward",
-          [](Frame<T>& self, In background, Labels target, Out color, Out alpha, Out depth, Out median_depth,
-             Out normal, Out distortion, Out boundary, bool keep, int threads) {
+          [](Frame<T>& self, In background, Ids target, Out color, Out alpha, Out depth, Out median_depth, Out normal,
+             Out distortion, Out boundary, bool keep, int threads) {
             nb::gil_scoped_release release;
             self.forward({data(color), data(alpha), data(depth), data(median_depth), data(normal), data(distortion),
                           data(boundary)},
@@ -79,7 +68,7 @@ void bind(nb::module_& m, const char* name) {
           "normal"_a.none(), "distortion"_a.none(), "boundary"_a.none(), "keep"_a, "threads"_a)
       .def(
           "backward",
-          [](const Frame<T>& self, In means, In quats, In log_scales, In opacity_logits, In colors, Labels target,
+          [](const Frame<T>& self, In means, In quats, In log_scales, In opacity_logits, In colors, Ids target,
              In color, In alpha, In depth, In median_depth, In normal, In distortion, In boundary, Out g_means,
              Out g_quats, Out g_log_scales, Out g_opacity_logits, Out g_colors, Out g_background, int threads) {
             const Inputs<T> inputs{static_cast<int64_t>(means.shape(0)),
@@ -103,7 +92,7 @@ void bind(nb::module_& m, const char* name) {
           "g_opacity_logits"_a.none(), "g_colors"_a.none(), "g_background"_a.none(), "threads"_a)
       .def(
           "class_contributions",
-          [](const Frame<T>& self, Labels labels, int num_classes, Out out, int threads) {
+          [](const Frame<T>& self, Ids labels, int num_classes, Out out, int threads) {
             nb::gil_scoped_release release;
             self.class_contributions(labels.data(), num_classes, out.data(), threads);
           },
@@ -136,7 +125,7 @@ void bind(nb::module_& m, const char* name) {
 
 NB_MODULE(_native, m) {
   nb::set_leak_warnings(false);  // an image that is alive at exit keeps its frame, through autograd
-  m.doc() = "The compiled CPU rasterizer; use it through beags_plugin.rasterizers.native.";
+  m.doc() = "The CPU rasterizer and the ops; use them through beags_plugin.rasterizers.native and beags_plugin.ops.";
   m.def("instruction_set", &beags::instruction_set, "The kernels in use; RuntimeError if those asked for cannot run.");
   m.def("instruction_sets", &beags::instruction_sets, "Those that can run here, best first.");
   beags::bind<float>(m, "FrameF32");

@@ -1,10 +1,9 @@
 // The image losses as Python sees them: plain arrays in and out. Arguments are checked once, in beags_plugin/ops.
 #include "module_images.h"
 
-#include <nanobind/ndarray.h>
-
 #include <string>
 
+#include "arrays.h"
 #include "image_losses.h"
 
 namespace nb = nanobind;
@@ -14,9 +13,6 @@ namespace beags {
 namespace {
 
 using namespace ops;
-
-template <class T>
-using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
 
 template <class T>
 void bind(nb::module_& m, const std::string& suffix) {
@@ -34,7 +30,7 @@ void bind(nb::module_& m, const std::string& suffix) {
         job.c2 = static_cast<T>(c2);
         job.l1_scale = static_cast<T>(l1_scale);
         job.ssim_scale = static_cast<T>(ssim_scale);
-        job.gradient = gradient.is_valid() ? gradient.data() : nullptr;
+        job.gradient = data(gradient);
         PhotometricSums sums;
         {
           nb::gil_scoped_release release;
@@ -58,8 +54,8 @@ void bind(nb::module_& m, const std::string& suffix) {
           job.normal = normal.data();
           job.alpha = alpha.data();
           job.scale = static_cast<T>(scale);
-          job.g_depth = g_depth.is_valid() ? g_depth.data() : nullptr;
-          job.g_normal = g_normal.is_valid() ? g_normal.data() : nullptr;
+          job.g_depth = data(g_depth);
+          job.g_normal = data(g_normal);
           nb::gil_scoped_release release;
           return normal_consistency(job, threads);
         },

@@ -1,12 +1,12 @@
 // The ops as Python sees them: plain arrays in and out. Arguments are checked once, in beags_plugin/ops.
 #include "module_ops.h"
 
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/vector.h>
 
 #include <memory>
 
+#include "arrays.h"
 #include "occupancy_loss.h"
 #include "reprojection_votes.h"
 #include "sh_colors.h"
@@ -20,16 +20,6 @@ namespace beags {
 namespace {
 
 using namespace ops;
-
-template <class T>
-using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
-using Ids = Array<const int32_t>;
-
-// The array's numbers, or null for None.
-template <class T>
-T* numbers(const Array<T>& array) {
-  return array.is_valid() ? array.data() : nullptr;
-}
 
 int64_t rows(const Ids& ids) { return static_cast<int64_t>(ids.shape(0)); }
 
@@ -99,10 +89,10 @@ void bind_functions(nb::module_& m, const char* suffix) {
           job.samples = samples;
           job.background = background;
           job.factor = 1.0 / (count && samples ? static_cast<double>(count) * static_cast<double>(samples) : 1.0);
-          job.g_means = numbers(g_means);
-          job.g_quats = numbers(g_quats);
-          job.g_log_scales = numbers(g_log_scales);
-          job.g_opacity_logits = numbers(g_opacity_logits);
+          job.g_means = data(g_means);
+          job.g_quats = data(g_quats);
+          job.g_log_scales = data(g_log_scales);
+          job.g_opacity_logits = data(g_opacity_logits);
           OccupancyResult result;
           {
             nb::gil_scoped_release release;
@@ -139,8 +129,8 @@ void bind_functions(nb::module_& m, const char* suffix) {
           job.means = means.data();
           job.clamped = clamped.data();
           job.g_colors = g_colors.data();
-          job.g_sh = numbers(g_sh);
-          job.g_means = numbers(g_means);
+          job.g_sh = data(g_sh);
+          job.g_means = data(g_means);
           nb::gil_scoped_release release;
           sh_colors_backward(job, static_cast<int64_t>(sh.shape(0)), threads);
         },
@@ -189,7 +179,6 @@ void bind_ops(nb::module_& m) {
       },
       "origin"_a, "voxel_size"_a, "threads"_a);
   votes.def("decide", &VoxelVotes::decide, nb::call_guard<nb::gil_scoped_release>());
-  votes.def_prop_ro("num_voxels", &VoxelVotes::num_voxels);
   bind_votes<float>(votes, "f32");
   bind_votes<double>(votes, "f64");
   bind_functions<float>(m, "f32");

@@ -6,24 +6,11 @@
 
 namespace beags {
 namespace ops {
-namespace {
-
-// The ops have two builds: what runs AVX-512 runs AVX2.
-bool use_avx2() {
-#if defined(BEAGS_HAS_AVX2)
-  static const bool use = instruction_set() == "avx2" || instruction_set() == "avx512";
-  return use;
-#else
-  return false;
-#endif
-}
-
-}  // namespace
 
 template <class T>
 const OpKernels<T>& op_kernels() {
 #if defined(BEAGS_HAS_AVX2)
-  if (use_avx2()) {
+  if (uses_avx2()) {
     if constexpr (std::is_same_v<T, float>) return avx2::kOpKernelsF32;
     if constexpr (std::is_same_v<T, double>) return avx2::kOpKernelsF64;
   }

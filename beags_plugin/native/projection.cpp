@@ -115,7 +115,7 @@ bool is_plain(const View& view, const Splat<double>& s) {
   return s.log2_opacity < kLog2MaxAlpha - kMargin && finite(s.nearness_det);
 }
 
-SurfelGradients project_backward(const View& view, const SurfelParameters& s, const double* record) {
+ShapeGradients project_backward(const View& view, const SurfelParameters& s, const double* record) {
   Placement at;
   place(view, s, at);
   const double *mu = at.mu, *mv = at.mv;
@@ -157,7 +157,7 @@ SurfelGradients project_backward(const View& view, const SurfelParameters& s, co
   }
   g_p[2] += g_z;
 
-  SurfelGradients out;
+  ShapeGradients out;
   multiply_transposed(view.rotation, g_p, out.mean);
   const double g_normal[3] = {at.facing * g[kNormal], at.facing * g[kNormal + 1], at.facing * g[kNormal + 2]};
   double u[3], v[3], n[3];  // towards the columns of R
@@ -177,7 +177,6 @@ SurfelGradients project_backward(const View& view, const SurfelParameters& s, co
                             2 * (x * (u[2] + n[0]) + y * (v[2] + n[1]) + w * (u[1] - v[0]) - 2 * z * (u[0] + v[1]))};
   const double along = at.unit[0] * g_unit[0] + dot(at.unit + 1, g_unit + 1);
   for (int i = 0; i < 4; ++i) out.quat[i] = (g_unit[i] - at.unit[i] * along) * at.inverse_length;
-  out.opacity_logit = g[kLogOpacity] * s.transparency;  // d log sigmoid = 1 - sigmoid
   return out;
 }
 

@@ -22,8 +22,8 @@ struct SurfelParameters {
   double log2_opacity, transparency;  // transparency: 1 - opacity
 };
 
-struct SurfelGradients {
-  double mean[3], quat[4], log_scale[2], opacity_logit;
+struct ShapeGradients {
+  double mean[3], quat[4], log_scale[2];
 };
 
 enum class Fate { kDrawn, kCulled, kNonFinite };
@@ -35,7 +35,7 @@ Fate project(const View& view, const SurfelParameters& surfel, Splat<double>& sp
 // maximum: most surfels, which the kernels then draw without these distinctions.
 bool is_plain(const View& view, const Splat<double>& splat);
 
-// The gradient towards the parameters, from that towards the splat's fields (`record`: kRecord sums).
-SurfelGradients project_backward(const View& view, const SurfelParameters& surfel, const double* record);
+// The gradient towards mean, quat and log_scale, from that towards the splat's fields (`record`: kRecord sums).
+ShapeGradients project_backward(const View& view, const SurfelParameters& surfel, const double* record);
 
 }  // namespace beags

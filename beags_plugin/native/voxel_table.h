@@ -7,13 +7,14 @@
 #include <math.h>
 #include <stdint.h>
 
+#include "golden.h"
+
 namespace beags {
 namespace ops {
 
-constexpr int64_t kVoxelHalf = int64_t(1) << 20;   // occupied voxels lie in -kVoxelHalf .. kVoxelHalf - 1
-constexpr int64_t kVoxelShift = kVoxelHalf + 8;    // added to an index before it is cut into brick and place
-constexpr uint64_t kNoBrick = ~uint64_t(0);        // key of an empty slot; bricks use 60 bits
-constexpr uint64_t kGolden = 0x9E3779B97F4A7C15u;  // 2^64 / golden ratio
+constexpr int64_t kVoxelHalf = int64_t(1) << 20;  // occupied voxels lie in -kVoxelHalf .. kVoxelHalf - 1
+constexpr int64_t kVoxelShift = kVoxelHalf + 8;   // added to an index before it is cut into brick and place
+constexpr uint64_t kNoBrick = ~uint64_t(0);       // key of an empty slot; bricks use 60 bits
 
 struct Brick {
   uint64_t key, bits;  // bit 16 x + 4 y + z

@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cmath>
 
+#include "golden.h"
+
 namespace beags {
 namespace ops {
 namespace {
@@ -10,10 +12,9 @@ namespace {
 constexpr uint64_t kNowhere = ~uint64_t(0);  // points that are not finite or too far away
 constexpr int64_t kHalf = int64_t(1) << 20;  // 21 bits along each axis
 constexpr int kShares = 64;
-constexpr uint64_t kOdd = 0x9E3779B97F4A7C15u;  // 2^64 / golden ratio
 
 uint64_t hash(uint64_t key) {
-  key = (key ^ key >> 32) * kOdd;
+  key = (key ^ key >> 32) * kGolden;
   return key ^ key >> 29;
 }
 int share_of(uint64_t hash) { return static_cast<int>(hash >> 58); }
@@ -57,7 +58,7 @@ void VoxelVotes::add(int64_t count, const T* points, const int32_t* labels) {
 void VoxelVotes::Share::vote(uint64_t key, int32_t label) {
   if (2 * (used + 1) > static_cast<int64_t>(counts.size())) grow();
   const uint64_t mask = counts.size() - 1;
-  for (uint64_t at = hash(key + kOdd * static_cast<uint64_t>(label)) & mask;; at = (at + 1) & mask) {
+  for (uint64_t at = hash(key + kGolden * static_cast<uint64_t>(label)) & mask;; at = (at + 1) & mask) {
     Count& slot = counts[at];
     if (slot.votes == 0) {
       slot = {key, label, 1};
@@ -76,7 +77,7 @@ void VoxelVotes::Share::grow() {
   const uint64_t mask = larger.size() - 1;
   for (const Count& count : counts) {
     if (count.votes == 0) continue;
-    uint64_t at = hash(count.key + kOdd * static_cast<uint64_t>(count.label)) & mask;
+    uint64_t at = hash(count.key + kGolden * static_cast<uint64_t>(count.label)) & mask;
     while (larger[at].votes) at = (at + 1) & mask;
     larger[at] = count;
   }
@@ -88,14 +89,12 @@ void VoxelVotes::Share::decide() {
   size_t size = 16;
   while (size < 2 * static_cast<size_t>(used)) size *= 2;
   winners.assign(size, Winner{0, 0, 0, 0, 0});
-  voxels = 0;
   const uint64_t mask = size - 1;
   for (const Count& count : counts) {
     if (count.votes == 0) continue;
     uint64_t at = hash(count.key) & mask;
     while (winners[at].total && winners[at].key != count.key) at = (at + 1) & mask;
     Winner& winner = winners[at];
-    voxels += winner.total == 0;
     winner.key = count.key;
     winner.total += count.votes;
     if (count.votes > winner.most) {
@@ -133,12 +132,6 @@ void VoxelVotes::read(int64_t count, const T* points, int32_t* labels, float* co
     confidence[i] = winner ? static_cast<float>(winner->most) / static_cast<float>(winner->total) : 0.0f;
     if (winner && winner->leaders == 1) labels[i] = winner->label;
   }
-}
-
-int64_t VoxelVotes::num_voxels() const {
-  int64_t total = 0;
-  for (const Share& share : shares_) total += share.voxels;
-  return total;
 }
 
 #define BEAGS_INSTANTIATE(T)                                        \

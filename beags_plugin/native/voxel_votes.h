@@ -22,8 +22,6 @@ class VoxelVotes {
   template <class T>
   void read(int64_t count, const T* points, int32_t* labels, float* confidence) const;
 
-  int64_t num_voxels() const;
-
  private:
   struct Count {
     uint64_t key;
@@ -39,7 +37,7 @@ class VoxelVotes {
   struct Share {
     std::vector<Count> counts;
     std::vector<Winner> winners;
-    int64_t used = 0, voxels = 0;
+    int64_t used = 0;
     void vote(uint64_t key, int32_t label);
     void grow();
     void decide();

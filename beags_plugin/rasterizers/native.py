@@ -95,7 +95,12 @@ class NativeRasterizer(KernelRasterizer):
         return Forward(images, visible, frame.num_nonfinite, frame)
 
     def backward_kernel(self, drawing: Drawing, state: Any, gradients: Images, needed: Needed) -> InputGradients:
-        """See ``KernelRasterizer.backward_kernel``."""
+        """See ``KernelRasterizer.backward_kernel``.
+
+        Only what is needed is allocated and returned. The tiles do less where nothing but ``colors`` and ``background``
+        is needed; for any other field they add up the sums of all fields, and what then saves work is to need none of
+        ``means``, ``quats`` and ``log_scales``, as the way back through the projection is skipped.
+        """
         floats = [getattr(drawing.inputs, name) for name in _FLOATS]
         likes = zip((*floats, drawing.background), needed, strict=True)
         found = InputGradients(*(torch.zeros_like(value) if wanted else None for value, wanted in likes))
