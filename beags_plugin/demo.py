@@ -145,7 +145,7 @@ def train(data: Path, run: Path, preset: str, downscale: float) -> None:
 
 def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
     """Compare assignment alone with refinement, extract every object, write summary.json and the picture."""
-    from beags_plugin.evaluation.contact_sheet import draw_rows, write_contact_sheet
+    from beags_plugin.evaluation.contact_sheet import draw_rows, novel_camera, write_contact_sheet
     from beags_plugin.evaluation.run_metrics import evaluate_scene
     from beags_plugin.evaluation.table import RunReport, print_table, summary_json
     from beags_plugin.plugin.evaluate import held_out_views, raster_settings
@@ -168,7 +168,8 @@ def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
     with _Timer(seconds, "picture"):
         shown = views[:: max(1, len(views) // SHEET_VIEWS)][:SHEET_VIEWS]
         objects = [index for index in classes if index != 0]
-        rows = draw_rows(shown, base.surfels(), refined.surfels(), class_ids, objects, rasterizer, settings)
+        scenes = (base.surfels(), refined.surfels())
+        rows = draw_rows(shown, *scenes, class_ids, objects, rasterizer, settings, novel=novel_camera(views))
         write_contact_sheet(picture, rows, classes)
     training = json.loads((run / "training.json").read_text())
     stages = {"sample": seconds.pop("sample", 0.0), **training["seconds"], **seconds}

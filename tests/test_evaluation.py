@@ -19,6 +19,7 @@ from beags_plugin.evaluation.contact_sheet import (
     contact_sheet,
     draw_rows,
     interpolate_cameras,
+    novel_camera,
     write_contact_sheet,
 )
 from beags_plugin.evaluation.metrics import MaskMetrics
@@ -223,6 +224,14 @@ def test_half_way_between_two_cameras():
     assert torch.allclose(middle.rotation, expected, atol=1e-6)
     for fraction, end in ((0.0, camera()), (1.0, turned)):
         assert torch.allclose(interpolate_cameras(camera(), turned, fraction).viewmat, end.viewmat, atol=1e-6)
+
+
+def test_the_novel_view_lies_towards_the_nearest_one():
+    views = [EvalView(camera(shift), None) for shift in (0.0, 5.0, -1.0)]
+    novel = novel_camera(views)
+    assert novel is not None
+    assert torch.allclose(novel.center, 0.5 * (views[0].camera.center + views[2].camera.center), atol=1e-6)
+    assert novel_camera(views[:1]) is None
 
 
 def test_the_sheet_shows_objects_before_and_after(tmp_path):

@@ -54,16 +54,18 @@ def draw_rows(
     rasterizer: Rasterizer,
     settings: RasterSettings,
     *,
+    novel: Camera | None = None,
     background: Tensor | None = None,
 ) -> list[SheetRow]:
-    """Draw the views and one novel view, half-way between the first two.
+    """Draw the views and one novel view.
 
     before, after: the N surfels with assignment alone and after refinement. class_ids: [N] int32, phi, of both.
-    objects: ids to show alone. background: [3], black if None. No gradients.
+    objects: ids to show alone. novel: its camera; ``novel_camera`` of the views if None. background: [3], black if None.
+    No gradients.
     """
-    if len(views) >= 2:
-        camera = interpolate_cameras(views[0].camera, views[1].camera, 0.5)
-        views = [*views, EvalView(camera, None, name="novel view")]
+    novel = novel or novel_camera(views)
+    if novel is not None:
+        views = [*views, EvalView(novel, None, name="novel view")]
     settings = replace(settings, geometry=False, distortion=False)
     if background is None:
         background = after.means.new_zeros(3)
@@ -85,6 +87,15 @@ def draw_rows(
             )
             rows.append(row)
     return rows
+
+
+def novel_camera(views: Sequence[EvalView]) -> Camera | None:
+    """Half-way between the first view and the one nearest to it, so that it still looks at the scene; None for one."""
+    if len(views) < 2:
+        return None
+    first, *others = (view.camera for view in views)
+    nearest = min(others, key=lambda camera: float((camera.center - first.center).norm()))
+    return interpolate_cameras(first, nearest, 0.5)
 
 
 def _alone(
