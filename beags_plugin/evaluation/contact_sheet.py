@@ -60,7 +60,8 @@ def draw_rows(
     """Draw the views and one novel view.
 
     before, after: the N surfels with assignment alone and after refinement. class_ids: [N] int32, phi, of both.
-    objects: ids to show alone. novel: its camera; ``novel_camera`` of the views if None. background: [3], black if None.
+    objects: ids to show alone. novel: its camera; ``novel_camera`` of the views if None. background: [3], black if
+    None.
     No gradients.
     """
     novel = novel or novel_camera(views)
