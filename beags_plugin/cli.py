@@ -1,4 +1,4 @@
-"""The command line: ``beags demo | sample | extract | doctor``."""
+"""The command line: ``beags demo | sample | extract | bench | doctor``."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Sample:
     height: int = 192
     """Pixels."""
     degradation: str = "mild"
-    """How masks are damaged: none, mild or strong."""
+    """How masks are damaged: none, mild or strong, or any degree from 0 on (1 is mild, 2 strong)."""
 
     def run(self) -> None:
         from beags_plugin.demo import make_sample
@@ -85,6 +85,41 @@ class Extract:
 
 
 @dataclass
+class Bench:
+    """Run an experiment: many short trainings that share bases, then tables, JSON, CSV and a picture.
+
+    What is done is not done again: an interrupted experiment goes on where it was.
+    """
+
+    experiment: tyro.conf.Positional[str]
+    """Its name (ablation, sensitivity, depth, masks: the files of experiments/), or the path of a .toml file."""
+    data: tuple[Path, ...] = ()
+    """Folders with images, poses and masks to train on, instead of the experiment's samples."""
+    scenes: int | None = None
+    """How many of the experiment's sample scenes; all if left out, none where --data is given."""
+    preset: str | None = None
+    """What to train with: a preset of method_configs/; the experiment's own if left out."""
+    downscale: float | None = None
+    """Divide the image size of --data by this; chosen for a quick run if left out."""
+    quick: bool = False
+    """Try the experiment out in a minute or two: tiny scenes, few steps, figures that mean nothing."""
+    output: Path = Path("outputs/bench")
+    """Folder of scenes, trials and results."""
+    json: Path | None = None
+    """File for all figures; <output>/<experiment>.json if left out."""
+    csv: Path | None = None
+    """File for all figures as a table; <output>/<experiment>.csv if left out."""
+    picture: Path | None = None
+    """File for the picture; <output>/<experiment>.png if left out."""
+
+    def run(self) -> None:
+        from beags_plugin.bench.run import Options, run_experiment
+
+        options = {name: value for name, value in vars(self).items() if name != "experiment"}
+        run_experiment(self.experiment, Options(**options))
+
+
+@dataclass
 class Doctor:
     """Say what this installation can do, and what is missing."""
 
@@ -98,6 +133,7 @@ Command = (
     Annotated[Demo, tyro.conf.subcommand(name="demo")]
     | Annotated[Sample, tyro.conf.subcommand(name="sample")]
     | Annotated[Extract, tyro.conf.subcommand(name="extract")]
+    | Annotated[Bench, tyro.conf.subcommand(name="bench")]
     | Annotated[Doctor, tyro.conf.subcommand(name="doctor")]
 )
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 import subprocess
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from rich.console import Console
 
+from beags_plugin.digests import code_digest, folder_digest, value_digest
 from beags_plugin.errors import UserError
 from beags_plugin.progress import progress_bar
 
@@ -104,15 +104,7 @@ def _digest(data: Path, preset: str) -> str:
     """Changes with the preset, the package's code and any file of the data (by name, size and time)."""
     from beags_plugin.plugin.presets import preset_folder
 
-    digest = hashlib.sha256(str(data.resolve()).encode())
-    digest.update((preset_folder() / f"{preset}.toml").read_bytes())
-    package = Path(__file__).parent
-    for path in sorted([*package.rglob("*.py"), *package.glob("_native*"), *package.glob("native/*")]):
-        digest.update(path.read_bytes())
-    for path in sorted(path for path in data.rglob("*") if path.is_file()):
-        stat = path.stat()
-        digest.update(f"{path.relative_to(data)} {stat.st_size} {stat.st_mtime_ns}".encode())
-    return digest.hexdigest()
+    return value_digest([folder_digest(data), code_digest(), (preset_folder() / f"{preset}.toml").read_text("utf8")])
 
 
 def _trained(output: Path, request: dict[str, Any]) -> bool:

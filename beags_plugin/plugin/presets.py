@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +10,12 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from beags_plugin.errors import UserError
 from beags_plugin.plugin.config import BeagsTrainerConfig, base_config
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # pyright: ignore[reportMissingImports]  (installed on Python 3.10 only)
-
-_PACKAGE = Path(__file__).resolve().parents[1]
+from beags_plugin.shipped import read_toml, shipped_folder
 
 
 def preset_folder() -> Path:
-    """Where the preset files lie: inside the installed package, or beside it in a source checkout."""
-    installed = _PACKAGE / "method_configs"
-    return installed if installed.is_dir() else _PACKAGE.parent / "method_configs"
+    """Where the preset files lie."""
+    return shipped_folder("method_configs")
 
 
 def preset_names() -> list[str]:
@@ -38,10 +30,7 @@ def load_preset(name: str, folder: Path | None = None) -> MethodSpecification:
     that cannot be read and for a key that the base config does not have.
     """
     path = (folder or preset_folder()) / f"{name}.toml"
-    try:
-        content = tomllib.loads(path.read_text("utf8"))
-    except (OSError, tomllib.TOMLDecodeError) as error:
-        raise UserError(f"the preset {path} cannot be read: {error}.") from error
+    content = read_toml(path, "preset")
     if unknown := set(content) - {"description", "overrides"}:
         raise UserError(f"the preset {path} has unknown entries {sorted(unknown)}: only description and overrides.")
     config = base_config()

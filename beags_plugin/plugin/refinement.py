@@ -7,6 +7,7 @@ import os
 import resource
 import shutil
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -155,6 +156,9 @@ class RefinementSwitch:
 
 def peak_memory_mb() -> float:
     """Largest resident memory of this process so far, MB of 10^6 bytes."""
+    with suppress(OSError, StopIteration):  # Linux only; getrusage's would count what the parent process once held
+        status = Path("/proc/self/status").read_text().splitlines()
+        return int(next(line for line in status if line.startswith("VmHWM:")).split()[1]) * 1024 / 1e6
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
 
 

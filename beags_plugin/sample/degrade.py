@@ -30,7 +30,7 @@ class Degradation:
     swapped: float = 0.0
 
 
-PRESETS = {
+PRESETS = {  # in the order of their degree: 0, 1, 2
     "none": Degradation(),
     "mild": Degradation(rim=0.004, dropped=0.05, swapped=0.04),
     "strong": Degradation(rim=0.009, dropped=0.2, swapped=0.12),
@@ -46,12 +46,35 @@ class Swap:
     pixels: int
 
 
+def degradation_of_degree(degree: float) -> Degradation:
+    """Masks wrong to any degree: 0 is "none", 1 "mild", 2 "strong", straight lines between and beyond them.
+
+    Raises ``UserError`` for a degree below 0, or so high that a share would exceed 1.
+    """
+    if not 0.0 <= degree < math.inf:
+        raise UserError(f"the degree of mask degradation is {degree}: give a number from 0 on (1 is mild, 2 strong).")
+    steps = list(PRESETS.values())
+    first = min(int(degree), len(steps) - 2)
+    low, high, share = steps[first], steps[first + 1], degree - first
+    values = (
+        (1.0 - share) * getattr(low, name) + share * getattr(high, name) for name in ("rim", "dropped", "swapped")
+    )
+    return resolve_degradation(Degradation(*values))
+
+
 def resolve_degradation(degradation: str | Degradation) -> Degradation:
-    """A preset by name, or a checked custom one; raises ``UserError`` for what is neither."""
+    """A preset or a degree (a number) by name, or a checked custom one; raises ``UserError`` for what is neither."""
     if isinstance(degradation, str):
-        if degradation not in PRESETS:
-            raise UserError(f"there is no mask degradation {degradation!r}: choose one of {', '.join(PRESETS)}.")
-        return PRESETS[degradation]
+        if degradation in PRESETS:
+            return PRESETS[degradation]
+        try:
+            degree = float(degradation)
+        except ValueError:
+            raise UserError(
+                f"there is no mask degradation {degradation!r}: choose one of {', '.join(PRESETS)}, or a degree from "
+                "0 on (1 is mild, 2 strong)."
+            ) from None
+        return degradation_of_degree(degree)
     for name in ("rim", "dropped", "swapped"):
         value = getattr(degradation, name)
         if not 0.0 <= value <= 1.0:

@@ -34,7 +34,7 @@ class SampleConfig:
 
     seed: of arrangement, sizes, colours, textures, light, camera jitter, mask degradation.
     width, height: pixels. num_train, num_test: views.
-    degradation: of the train masks: "none", "mild", "strong", or a ``Degradation``.
+    degradation: of the train masks: "none", "mild", "strong", a degree as text ("1.5"), or a ``Degradation``.
     num_points: seed points. antialias: rays per pixel and direction for the images.
     """
 

@@ -1,0 +1,246 @@
+"""An experiment as its TOML file describes it: scenes, a preset, and variants of its config."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from beags_plugin.errors import UserError
+from beags_plugin.shipped import read_toml, shipped_folder
+
+PHASES = ("base", "refine", "both")
+DAMAGE = "damage"  # the axis that is no config key: the degree of mask damage
+_ENTRIES = {"description", "preset", "seeds", "sample", "reference", "confidence", "variant", "sweep", "paper", *PHASES}
+_VARIANT = {"name", DAMAGE, *PHASES}
+_SWEEP = {"name", "key", "values", "phase", "lines", "relative_to_pixels"}
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to train: what it changes of the preset, for the base and for the refinement.
+
+    base, refine: dotted config keys and their values. damage: degree of mask damage, None: masks as they are.
+    sweep, line, x: of a variant that is a point of a sweep: its name, its curve, its place on the axis.
+    """
+
+    name: str
+    base: Mapping[str, Any] = field(default_factory=dict)
+    refine: Mapping[str, Any] = field(default_factory=dict)
+    damage: float | None = None
+    sweep: str = ""
+    line: str = ""
+    x: float | None = None
+
+
+@dataclass(frozen=True)
+class Paper:
+    """Figures of the paper, for comparison: variant name to (IoU, BIoU) in percent per data set."""
+
+    source: str
+    columns: tuple[str, ...]
+    rows: Mapping[str, tuple[tuple[float, float], ...]]
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What ``experiments/<name>.toml`` says.
+
+    sample_seeds, sample: the generated scenes, and other options of ``SampleConfig`` for them.
+    seeds: of the training. reference: the variant whose errors the others' are compared with.
+    confidence: whether a picture of the masks' confidence belongs to it.
+    relative_to_pixels: sweeps whose axis is also told per million pixels of the training views.
+    """
+
+    name: str
+    description: str
+    preset: str
+    sample_seeds: tuple[int, ...]
+    sample: Mapping[str, Any]
+    seeds: tuple[int, ...]
+    variants: tuple[Variant, ...]
+    reference: str | None = None
+    confidence: bool = False
+    relative_to_pixels: frozenset[str] = frozenset()
+    paper: Paper | None = None
+
+    @property
+    def sweeps(self) -> tuple[str, ...]:
+        """Names of the sweeps, in order."""
+        return tuple(dict.fromkeys(variant.sweep for variant in self.variants if variant.sweep))
+
+
+def experiment_names() -> list[str]:
+    """Names of the experiments that ship with the package."""
+    return sorted(path.stem for path in shipped_folder("experiments").glob("*.toml"))
+
+
+def load_experiment(name: str) -> Experiment:
+    """The experiment of that name, or of the TOML file at that path; raises ``UserError`` for what is neither or wrong.
+
+    Every config key is tried on the preset, so that a typo shows before anything is trained.
+    """
+    path = Path(name) if name.endswith(".toml") else shipped_folder("experiments") / f"{name}.toml"
+    if not name.endswith(".toml") and name not in experiment_names():
+        raise UserError(
+            f"there is no experiment {name!r}: choose one of {', '.join(experiment_names())}, or name a .toml file."
+        )
+    experiment = _Reader(path).experiment()
+    check_keys(experiment, path)
+    return experiment
+
+
+def check_keys(experiment: Experiment, source: Path) -> None:
+    """Raise ``UserError`` unless the preset exists and takes every override of every variant."""
+    from beags_plugin.plugin.presets import load_preset, override, preset_names
+
+    if experiment.preset not in preset_names():
+        raise UserError(
+            f"{source}: there is no preset {experiment.preset!r}: choose one of {', '.join(preset_names())}."
+        )
+    for variant in experiment.variants:
+        config = load_preset(experiment.preset).config
+        for key, value in [*variant.base.items(), *variant.refine.items()]:
+            override(config, key, value, source)
+
+
+class _Reader:
+    """Reads one file; every mistake is a ``UserError`` that names the file and the entry."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.content = read_toml(path, "experiment")
+
+    def experiment(self) -> Experiment:
+        content = self.content
+        self.known(content, _ENTRIES, "")
+        common = {phase: self.table(content, phase, "") for phase in PHASES}
+        variants = [self.variant(entry, common) for entry in self.tables(content, "variant")]
+        sweeps = self.tables(content, "sweep")
+        for sweep in sweeps:
+            variants += self.points(sweep, common)
+        if not variants:
+            raise self.wrong("has neither [[variant]] nor [[sweep]]: describe at least one.")
+        names = [variant.name for variant in variants]
+        if repeated := {name for name in names if names.count(name) > 1}:
+            raise self.wrong(f"has two variants called {min(repeated)!r}: rename one of them.")
+        reference = self.value(content, "reference", str, None)
+        if reference is not None and reference not in names:
+            raise self.wrong(f"refers to {reference!r}, which is no variant: name one of {', '.join(names)}.")
+        sample = dict(self.table(content, "sample", ""))
+        return Experiment(
+            name=self.path.stem,
+            description=self.value(content, "description", str),
+            preset=self.value(content, "preset", str),
+            sample_seeds=self.whole_numbers(sample.pop("seeds", [0]), "sample.seeds"),
+            sample=self.checked_sample(sample),
+            seeds=self.whole_numbers(content.get("seeds", [42]), "seeds"),
+            variants=tuple(variants),
+            reference=reference,
+            confidence=self.value(content, "confidence", bool, False),
+            relative_to_pixels=frozenset(s["name"] for s in sweeps if s.get("relative_to_pixels")),
+            paper=self.paper(),
+        )
+
+    def variant(self, entry: dict[str, Any], common: dict[str, dict[str, Any]]) -> Variant:
+        name = self.value(entry, "name", str)
+        self.known(entry, _VARIANT, f"variant {name!r}: ")
+        own = {phase: self.table(entry, phase, f"variant {name!r}: ") for phase in PHASES}
+        damage = entry.get(DAMAGE)
+        return Variant(name, *_by_phase(common, own), damage=None if damage is None else self.degree(damage))
+
+    def points(self, sweep: dict[str, Any], common: dict[str, dict[str, Any]]) -> list[Variant]:
+        """The variants of a sweep: every value on every line."""
+        name = self.value(sweep, "name", str)
+        where = f"sweep {name!r}: "
+        self.known(sweep, _SWEEP, where)
+        key = self.value(sweep, "key", str, where=where)
+        phase = self.value(sweep, "phase", str, "refine", where)
+        if phase not in PHASES:
+            raise self.wrong(f"{where}phase is {phase!r}: choose one of {', '.join(PHASES)}.")
+        values = sweep.get("values")
+        if not isinstance(values, list) or not values or any(isinstance(v, (str, list, dict)) for v in values):
+            raise self.wrong(f"{where}values must be a list of numbers.")
+        lines = self.table(sweep, "lines", where) or {"": {}}
+        variants = []
+        for line, overrides in lines.items():
+            for value in values:
+                own: dict[str, dict[str, Any]] = {**{p: {} for p in PHASES}, "refine": dict(overrides)}
+                if key != DAMAGE:
+                    own[phase] = {**own[phase], key: value}
+                title = f"{name} = {value:g}" + (f", {line}" if line else "")
+                damage = self.degree(value) if key == DAMAGE else None
+                variants.append(Variant(title, *_by_phase(common, own), damage, name, line, float(value)))
+        return variants
+
+    def paper(self) -> Paper | None:
+        if "paper" not in self.content:
+            return None
+        table = self.table(self.content, "paper", "")
+        self.known(table, {"source", "columns", "rows"}, "paper: ")
+        columns = tuple(table.get("columns", ()))
+        rows = {}
+        for name, pairs in self.table(table, "rows", "paper: ").items():
+            if not (isinstance(pairs, list) and len(pairs) == len(columns) and all(_is_pair(p) for p in pairs)):
+                raise self.wrong(f"paper: the row {name!r} must have a pair [IoU, BIoU] for each of the columns.")
+            rows[name] = tuple((float(iou), float(biou)) for iou, biou in pairs)
+        return Paper(self.value(table, "source", str, where="paper: "), columns, rows)
+
+    def checked_sample(self, options: dict[str, Any]) -> dict[str, Any]:
+        from beags_plugin.sample.writer import SampleConfig
+
+        try:
+            SampleConfig(**options).check()
+        except (TypeError, UserError) as error:
+            raise self.wrong(f"sample: {error}") from None
+        return options
+
+    def degree(self, value: Any) -> float:
+        from beags_plugin.sample.degrade import degradation_of_degree
+
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise self.wrong(f"damage is {value!r}: give a number (1 is mild, 2 strong).")
+        degradation_of_degree(float(value))
+        return float(value)
+
+    def whole_numbers(self, values: Any, what: str) -> tuple[int, ...]:
+        if not isinstance(values, list) or not all(type(value) is int and value >= 0 for value in values):
+            raise self.wrong(f"{what} must be a list of whole numbers, 0 or more.")
+        return tuple(values)
+
+    def value(self, table: dict[str, Any], key: str, kind: type, default: Any = ..., where: str = "") -> Any:
+        value = table.get(key, default)
+        if value is ...:
+            raise self.wrong(f"{where}has no {key}: add it.")
+        if value is not default and type(value) is not kind:
+            raise self.wrong(f"{where}{key} must be {kind.__name__}, not {value!r}.")
+        return value
+
+    def table(self, holder: dict[str, Any], key: str, where: str) -> dict[str, Any]:
+        value = holder.get(key, {})
+        if not isinstance(value, dict):
+            raise self.wrong(f"{where}{key} must be a table, not {value!r}.")
+        return value
+
+    def tables(self, holder: dict[str, Any], key: str) -> list[dict[str, Any]]:
+        value = holder.get(key, [])
+        if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
+            raise self.wrong(f"{key} must be written [[{key}]].")
+        return value
+
+    def known(self, table: dict[str, Any], entries: set[str], where: str) -> None:
+        if unknown := sorted(set(table) - entries):
+            raise self.wrong(f"{where}has an unknown entry {unknown[0]!r}: only {', '.join(sorted(entries))}.")
+
+    def wrong(self, what: str) -> UserError:
+        return UserError(f"the experiment {self.path}: {what}")
+
+
+def _by_phase(common: dict[str, dict[str, Any]], own: dict[str, dict[str, Any]]) -> tuple[dict, dict]:
+    """What base and refinement override: what is common to all variants first, then the variant's own."""
+    return tuple({**common["both"], **common[p], **own["both"], **own[p]} for p in ("base", "refine"))  # type: ignore[return-value]
+
+
+def _is_pair(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(isinstance(number, (int, float)) for number in value)

@@ -1,0 +1,115 @@
+"""An experiment's rows as a picture: bars of variants, curves of sweeps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from beags_plugin.bench.experiment import Experiment
+from beags_plugin.bench.results import Row, means
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_BARS = (("extracted_iou_after", "extracted IoU, %"), ("extracted_biou_after", "extracted BIoU, %"))
+_CURVES = (
+    ("extracted_iou_after", "extracted IoU, %", 100.0),
+    ("extracted_biou_after", "extracted BIoU, %", 100.0),
+    ("psnr_after", "PSNR, dB", 1.0),
+    ("seconds refinement", "refinement, s", 1.0),
+    ("peak_memory_mb", "peak memory, MB", 1.0),
+)
+_PAPER_MARKS = "ovs^Dp*X"
+_LOGARITHMIC = 20.0  # an axis that spans more than this factor is logarithmic
+
+
+def draw(path: Path, experiment: Experiment, rows: Sequence[Row]) -> None:
+    """Write the picture as PNG (or what the suffix says): a row of bars for the variants, one of curves per sweep."""
+    import matplotlib
+
+    matplotlib.use("Agg")  # there may be no screen
+    from matplotlib import pyplot
+
+    variants = [row for row in rows if not row.variant.sweep]
+    height = 1 if variants else 0
+    count = height + len(experiment.sweeps)
+    figure, axes = pyplot.subplots(
+        count, len(_CURVES), figsize=(4.0 * len(_CURVES), 3.6 * count), squeeze=False, layout="constrained"
+    )
+    if variants:
+        for column, (metric, title) in enumerate(_BARS):
+            _bars(axes[0, column], experiment, variants, metric, title, column, labels=column == 0)
+        _bars(axes[0, 2], experiment, variants, "psnr_after", "PSNR, dB", None, labels=False)
+        for column, (metric, title) in enumerate((_CURVES[3][:2], _CURVES[4][:2]), start=3):
+            _bars(axes[0, column], experiment, variants, metric, title, None, labels=False)
+    for line, sweep in enumerate(experiment.sweeps, start=height):
+        for column, curve in enumerate(_CURVES):
+            _curves(axes[line, column], [row for row in rows if row.variant.sweep == sweep], sweep, *curve)
+    figure.suptitle(f"{experiment.name}: {experiment.description}", wrap=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+
+
+def _bars(
+    axes: Axes, experiment: Experiment, rows: Sequence[Row], metric: str, title: str, paper: int | None, labels: bool
+) -> None:
+    """Bars of the means, a dot per scene, and the paper's figures as hollow marks; paper: index in its pairs."""
+    factor = 100.0 if title.endswith("%") else 1.0
+    names = list(dict.fromkeys(row.variant.name for row in rows))
+    place = {name: len(names) - 1 - index for index, name in enumerate(names)}
+    low: list[float] = []
+    for row in means(rows):
+        if (value := row.figures[metric]) is not None:
+            axes.barh(place[row.variant.name], factor * value, color="#9ecae1", zorder=1)
+            low.append(factor * value)
+    for row in rows:
+        if (value := row.figures[metric]) is not None:
+            axes.plot(factor * value, place[row.variant.name], ".", color="#08306b", zorder=3)
+            low.append(factor * value)
+    if paper is not None and experiment.paper is not None:
+        for mark, (index, column) in zip(_PAPER_MARKS, enumerate(experiment.paper.columns), strict=False):
+            shown = [(pairs[index][paper], place[n]) for n, pairs in experiment.paper.rows.items() if n in place]
+            if shown:
+                x, y = zip(*shown, strict=True)
+                axes.plot(x, y, mark, color="#d94801", fillstyle="none", label=f"the paper's {column}", zorder=2)
+                low += x
+        if labels:
+            axes.figure.legend(loc="outside lower left", ncols=4, fontsize="small")
+    if low and min(low) > 0:
+        axes.set_xlim(left=0 if factor == 1.0 and "PSNR" not in title else 0.95 * min(low))
+    axes.set_yticks(list(place.values()), list(place) if labels else [""] * len(place))
+    axes.set_title(title)
+
+
+def _curves(axes: Axes, rows: Sequence[Row], sweep: str, metric: str, title: str, factor: float) -> None:
+    """Thick lines: means; thin: scenes; a colour per line of the sweep."""
+    lines = list(dict.fromkeys(row.variant.line for row in rows))
+    for line, color in zip(lines, _colors(len(lines)), strict=True):
+        of_line = [row for row in rows if row.variant.line == line]
+        for scene, seed in dict.fromkeys((row.scene, row.seed) for row in of_line):
+            points = _points([row for row in of_line if (row.scene, row.seed) == (scene, seed)], metric, factor)
+            axes.plot(*points, lw=0.6, alpha=0.6, color=color)
+        axes.plot(*_points(means(of_line), metric, factor), "o-", lw=2, ms=4, color=color, label=line or None)
+    values = [row.variant.x for row in rows if row.variant.x is not None]
+    if min(values) > 0 and max(values) / min(values) > _LOGARITHMIC:
+        axes.set_xscale("log")
+    if title.startswith("peak"):
+        axes.set_ylim(bottom=0)
+    if lines != [""]:
+        axes.legend(fontsize="small")
+    axes.set_xlabel(sweep)
+    axes.set_title(title)
+
+
+def _points(rows: Sequence[Row], metric: str, factor: float) -> tuple[list[float], list[float]]:
+    pairs = [(row.variant.x, row.figures[metric]) for row in rows]
+    known = sorted((x, factor * y) for x, y in pairs if x is not None and y is not None)
+    return [x for x, _ in known], [y for _, y in known]
+
+
+def _colors(count: int) -> list[Any]:
+    from matplotlib import colormaps
+
+    return [colormaps["tab10"](index % 10) for index in range(count)]

@@ -1,0 +1,167 @@
+"""From the outcomes of an experiment's trials to rows, means over scenes, JSON and CSV."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from beags_plugin.bench.experiment import Experiment, Variant
+
+STAGES = ("base training", "reprojection", "assignment", "voxel grids", "refinement")
+MOMENTS = ("before", "after")  # refinement
+KINDS = ("extracted", "rendered")
+MASK_METRICS = ("acc", "iou", "biou")
+MEAN = "mean"  # in the column "object": over all masks of the scene
+_PLACE = ("scene", "seed", "variant", "sweep", "line", "x", "object", "failed")
+_COSTS = (*(f"seconds {stage}" for stage in STAGES), "cpu_seconds", "peak_memory_mb", "steps", "gaussians")
+_QUALITY = tuple(f"{metric}_{moment}" for metric in ("psnr", "ssim") for moment in MOMENTS) + tuple(
+    f"{kind}_{metric}_{moment}" for kind in KINDS for metric in MASK_METRICS for moment in MOMENTS
+)
+_SCALE = ("voxel_size", "training_pixels")
+FIGURES = (*_QUALITY, *_COSTS, *_SCALE)
+COLUMNS = (*_PLACE, *FIGURES)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A variant on a scene, or its mean over scenes.
+
+    figures: name (of ``FIGURES``) to value, None where it does not exist; mask metrics in 0..1. objects: the same of
+    each object. failed: why there are no figures, in a sentence. count: scenes and seeds that a mean is over;
+    failures: those that it lacks.
+    """
+
+    variant: Variant
+    scene: str
+    seed: int | None
+    figures: Mapping[str, float | None]
+    objects: Mapping[str, Mapping[str, float | None]]
+    failed: str | None = None
+    count: int = 1
+    failures: int = 0
+
+
+def make_row(
+    variant: Variant, scene: str, seed: int, base: Mapping[str, Any] | None, result: Mapping[str, Any] | None,
+    failed: str | None,
+) -> Row:  # fmt: skip
+    """The row of one trial. base, result: what the worker wrote for the base and for the refinement, if it did."""
+    if base is None or result is None:
+        return Row(variant, scene, seed, dict.fromkeys(FIGURES), {}, failed or "it has no result")
+    figures: dict[str, float | None] = dict.fromkeys(FIGURES)
+    figures |= _quality(result["before"], result["after"])
+    seconds = {**result["seconds"], "base training": base["seconds"]["base training"]}
+    figures |= {f"seconds {stage}": seconds.get(stage) for stage in STAGES}
+    figures |= {name: result[name] for name in (*_COSTS[len(STAGES) :], *_SCALE)}
+    after = result["after"]["objects"]
+    objects = {name: _quality(found, after[name]) for name, found in result["before"]["objects"].items()}
+    return Row(variant, scene, seed, figures, objects)
+
+
+def _quality(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, float | None]:
+    figures: dict[str, float | None] = {}
+    for moment, found in zip(MOMENTS, (before, after), strict=True):
+        for metric in ("psnr", "ssim"):
+            figures[f"{metric}_{moment}"] = found.get(metric)
+        for kind in KINDS:
+            for metric in MASK_METRICS:
+                figures[f"{kind}_{metric}_{moment}"] = None if found[kind] is None else found[kind][metric]
+    return figures
+
+
+def means(rows: Sequence[Row]) -> list[Row]:
+    """Per variant, in order, the mean of every figure over its scenes and seeds; trials that failed are left out.
+
+    A figure that some scene lacks is averaged over those that have it. A variant whose trials all failed keeps the
+    first reason.
+    """
+    of_variant: dict[str, list[Row]] = {}
+    for row in rows:
+        of_variant.setdefault(row.variant.name, []).append(row)
+    averaged = []
+    for group in of_variant.values():
+        good = [row for row in group if row.failed is None]
+        figures = {name: _mean(row.figures[name] for row in good) for name in FIGURES}
+        failures = len(group) - len(good)
+        reason = None if good else group[0].failed
+        averaged.append(Row(group[0].variant, MEAN, None, figures, {}, reason, len(good), failures))
+    return averaged
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return math.fsum(known) / len(known) if known else None
+
+
+def error_left(row: Row, reference: Row | None, metric: str = "extracted_biou_after") -> float | None:
+    """(1 - metric) of a row over (1 - metric) of the reference: what is left of its error; None if unknown."""
+    if reference is None or (value := row.figures[metric]) is None or (start := reference.figures[metric]) is None:
+        return None
+    return (1.0 - value) / (1.0 - start) if start < 1.0 else None
+
+
+def find_reference(rows: Sequence[Row], experiment: Experiment, scene: str) -> Row | None:
+    """The row of the experiment's reference variant on that scene."""
+    return next((row for row in rows if row.variant.name == experiment.reference and row.scene == scene), None)
+
+
+def flat(row: Row) -> list[dict[str, Any]]:
+    """The row as ``COLUMNS``, and a line for each object (quality only)."""
+    variant = row.variant
+    place = {
+        "scene": row.scene,
+        "seed": row.seed,
+        "variant": variant.name,
+        "sweep": variant.sweep or None,
+        "line": variant.line or None,
+        "x": variant.x,
+        "object": MEAN,
+        "failed": row.failed,
+    }
+    empty = dict.fromkeys(COLUMNS)
+    lines = [{**empty, **place, **row.figures}]
+    return lines + [{**empty, **place, "object": name, **figures} for name, figures in row.objects.items()]
+
+
+def report_json(experiment: Experiment, rows: Sequence[Row], provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """{"experiment", "description", "preset", "reference", provenance ..., "rows": [...], "means": [...], "paper"}.
+
+    Every row has ``COLUMNS``; rows of ``means`` have "count", "failures" and "error_left" besides.
+    """
+    averaged = means(rows)
+    reference = find_reference(averaged, experiment, MEAN)
+    paper = experiment.paper
+    return {
+        "experiment": experiment.name,
+        "description": experiment.description,
+        "preset": experiment.preset,
+        "reference": experiment.reference,
+        **provenance,
+        "rows": [line for row in rows for line in flat(row)],
+        "means": [
+            {**flat(row)[0], "count": row.count, "failures": row.failures, "error_left": error_left(row, reference)}
+            for row in averaged
+        ],
+        "paper": paper and {"source": paper.source, "columns": list(paper.columns), "rows": dict(paper.rows)},
+    }
+
+
+def write_json(path: Path, report: Mapping[str, Any]) -> None:
+    """Write the report; its folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """Write every row, objects included, then the means (scene "mean"); its folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        for row in [*rows, *means(rows)]:
+            writer.writerows(flat(row))

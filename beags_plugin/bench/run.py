@@ -1,0 +1,144 @@
+"""``beags bench``: from an experiment's name to its tables, files and pictures."""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from beags_plugin.bench.experiment import Experiment, Variant, check_keys, load_experiment
+from beags_plugin.bench.results import Row, make_row, report_json, write_csv, write_json
+from beags_plugin.bench.runner import Outcome, run_trials
+from beags_plugin.bench.scenes import Scene, damaged_masks, given_scenes, sample_scene
+from beags_plugin.bench.trials import MODEL, Run, plan, steps_of
+from beags_plugin.digests import code_digest
+from beags_plugin.errors import UserError
+from beags_plugin.progress import progress_bar
+
+CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
+QUICK_SAMPLE = {"width": 96, "height": 72, "num_train": 16, "num_test": 3}
+QUICK_BASE = {"base_steps": 220, "densify.start": 50, "densify.stop": 180}
+QUICK_REFINE = {"refine_steps": 10}
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command line asks for; see ``cli.Bench``."""
+
+    data: tuple[Path, ...] = ()
+    scenes: int | None = None
+    preset: str | None = None
+    downscale: float | None = None
+    quick: bool = False
+    output: Path = Path("outputs/bench")
+    json: Path | None = None
+    csv: Path | None = None
+    picture: Path | None = None
+
+
+def run_experiment(name: str, options: Options) -> list[Row]:
+    """Run what is not done yet of an experiment, print its tables and write its files; returns the rows.
+
+    Raises ``UserError`` for a mistake in the experiment or the options; a trial that fails is a row that says so.
+    """
+    from beags_plugin.bench.pictures import draw
+    from beags_plugin.bench.provenance import commit, describe_machine
+    from beags_plugin.bench.tables import tables
+
+    experiment = adapted(load_experiment(name), options)
+    scenes = scenes_of(experiment, options)
+    masks = {
+        (scene.name, degree): damaged_masks(scene, degree, options.output / "scenes")
+        for scene in scenes
+        for degree in sorted({variant.damage for variant in experiment.variants if variant.damage is not None})
+    }
+    runs = plan(experiment, scenes, masks, code_digest())
+    with progress_bar("Training, in steps") as progress:
+        outcomes = run_trials([run.trial for run in runs], options.output / "trials", steps_of, progress)
+    rows = rows_of(runs, outcomes)
+    for table in tables(experiment, rows):
+        CONSOLE.print(table)
+    files = {kind: getattr(options, kind) or options.output / f"{experiment.name}.{end}" for kind, end in _FILES}
+    provenance: dict[str, Any] = {
+        "command": shlex.join(["beags", *sys.argv[1:]]),
+        "commit": commit(),
+        "machine": describe_machine(),
+        "quick": options.quick,
+    }
+    write_json(files["json"], report_json(experiment, rows, provenance))
+    write_csv(files["csv"], rows)
+    draw(files["picture"], experiment, rows)
+    for kind, path in files.items():
+        CONSOLE.print(f"{kind}: {path}")
+    return rows
+
+
+_FILES = (("json", "json"), ("csv", "csv"), ("picture", "png"))
+
+
+def adapted(experiment: Experiment, options: Options) -> Experiment:
+    """The experiment with another preset or, for --quick, so small that its figures mean nothing."""
+    if options.preset is not None:
+        experiment = dataclasses.replace(experiment, preset=options.preset)
+        check_keys(experiment, Path(f"{experiment.name}.toml"))
+    if not options.quick:
+        return experiment
+    base = {MODEL + key: value for key, value in QUICK_BASE.items()}
+    refine = {MODEL + key: value for key, value in QUICK_REFINE.items()}
+    variants = [
+        dataclasses.replace(
+            variant,
+            base={**variant.base, **base},
+            refine={**refine, **variant.refine},
+        )
+        for variant in _thinned(experiment.variants)
+    ]
+    return dataclasses.replace(
+        experiment,
+        variants=tuple(variants),
+        sample={**experiment.sample, **QUICK_SAMPLE},
+        sample_seeds=experiment.sample_seeds[:1],
+    )
+
+
+def _thinned(variants: Sequence[Variant]) -> list[Variant]:
+    """All plain variants, and of each line of a sweep the first and the last."""
+    lines: dict[tuple[str, str], list[Variant]] = {}
+    for variant in variants:
+        key = (variant.sweep, variant.line) if variant.sweep else (variant.name, "")
+        lines.setdefault(key, []).append(variant)
+    return [variant for line in lines.values() for variant in [*line[:1], *line[1:][-1:]]]
+
+
+def scenes_of(experiment: Experiment, options: Options) -> list[Scene]:
+    """The experiment's samples (none by default where the user gives data) and the user's folders.
+
+    Raises ``UserError`` if there are none at all, or fewer samples than asked for.
+    """
+    given = given_scenes(options.data, options.downscale)
+    count = options.scenes if options.scenes is not None else (0 if given else len(experiment.sample_seeds))
+    if not 0 <= count <= len(experiment.sample_seeds):
+        raise UserError(
+            f"--scenes is {count}, but {experiment.name} names {len(experiment.sample_seeds)} sample scenes."
+        )
+    folder = options.output / "scenes"
+    samples = [sample_scene(folder, seed, experiment.sample) for seed in experiment.sample_seeds[:count]]
+    if not samples and not given:
+        raise UserError("there is no scene to train on: name a folder with --data, or give --scenes 1 or more.")
+    return samples + given
+
+
+def rows_of(runs: Sequence[Run], outcomes: dict[str, Outcome]) -> list[Row]:
+    """A row for every run, in order."""
+    rows = []
+    for run in runs:
+        assert run.trial.base is not None
+        base, refined = outcomes[run.trial.base.digest], outcomes[run.trial.digest]
+        rows.append(make_row(run.variant, run.scene.name, run.seed, base.result, refined.result, refined.failed))
+    return rows

@@ -1,0 +1,108 @@
+"""Runs trials one after the other, each in a process of its own, and keeps what is done."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from beags_plugin.bench.trials import Trial
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a trial: the content of result.json, or why it failed, in a sentence."""
+
+    folder: Path
+    result: dict[str, Any] | None
+    failed: str | None = None
+
+
+def run_trials(
+    trials: Sequence[Trial], folder: Path, weight: Callable[[Trial], int], progress: Progress | None = None
+) -> dict[str, Outcome]:
+    """Run every trial, and its base before it, unless it is done already; outcome by digest.
+
+    folder: where each trial has a folder of its own. weight: of a trial in the progress, e.g. its number of steps.
+    A trial that fails leaves its reason and the others go on; what was interrupted is run again by the next call.
+    """
+    queue = {trial.digest: trial for wanted in trials for trial in (wanted.base, wanted) if trial is not None}
+    total = sum(weight(trial) for trial in queue.values())
+    outcomes: dict[str, Outcome] = {}
+    done = 0
+    for digest, trial in queue.items():
+        base = outcomes[trial.base.digest] if trial.base is not None else None
+        outcomes[digest] = _run(trial, folder / trial.folder_name, base)
+        done += weight(trial)
+        if progress is not None:
+            progress(done, total)
+    return outcomes
+
+
+def _run(trial: Trial, folder: Path, base: Outcome | None) -> Outcome:
+    if base is not None and base.failed is not None:
+        return Outcome(folder, None, f"its base failed: {base.failed}")
+    with _locked(folder) as lock:
+        if (result := _read(folder / "result.json")) is not None:
+            return Outcome(folder, result)
+        if folder.exists():
+            shutil.rmtree(folder)  # what an interrupted or failed trial left
+        folder.mkdir(parents=True)
+        request = {
+            "preset": trial.preset,
+            "data": str(trial.scene.data.absolute()),
+            "downscale": trial.scene.downscale,
+            "masks": None if trial.masks is None else str(trial.masks.absolute()),
+            "base": None if base is None else str((base.folder / "run").absolute()),
+            "seed": trial.seed,
+            "overrides": dict(trial.overrides),
+            "digest": trial.digest,
+        }
+        (folder / "trial.json").write_text(json.dumps(request, indent=1))
+        code = _work(folder, lock)
+        if (result := _read(folder / "result.json")) is not None:
+            return Outcome(folder, result)
+        failed = _read(folder / "failed.json")
+        reason = failed["failed"] if failed else f"it ended with exit code {code}; {folder / 'log.txt'} says more."
+        return Outcome(folder, None, reason)
+
+
+def _work(folder: Path, lock: IO) -> int:
+    command = [sys.executable, "-m", "beags_plugin.bench.worker", str(folder)]
+    with open(folder / "log.txt", "w") as log:
+        # the lock goes along: should this process be killed, a new one waits for the trial instead of starting it again
+        return subprocess.run(
+            command, stdout=log, stderr=subprocess.STDOUT, pass_fds=(lock.fileno(),), env=_environment()
+        ).returncode
+
+
+def _environment() -> dict[str, str]:
+    """Of the worker: it imports the package that this process runs, wherever the user stands."""
+    package = str(Path(__file__).resolve().parents[2])
+    paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {"OMP_WAIT_POLICY": "PASSIVE", **os.environ, "PYTHONPATH": os.pathsep.join(paths), "COLUMNS": "160"}
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[IO]:
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with open(folder.parent / f".{folder.name}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield lock
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError):
+        return None

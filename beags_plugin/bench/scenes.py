@@ -1,0 +1,117 @@
+"""The scenes of an experiment on disk: generated samples, folders of the user's, and copies of masks with damage."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beags_plugin.digests import folder_digest, value_digest
+from beags_plugin.errors import UserError
+from beags_plugin.masks.classes import read_class_map, write_class_map
+from beags_plugin.progress import progress_bar
+from beags_plugin.rasterizers.interface import IGNORE
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Something to train on. data: its folder. digest: changes with its content. seed: of damage done to its masks."""
+
+    name: str
+    data: Path
+    downscale: float
+    digest: str
+    seed: int = 0
+
+
+def sample_scene(folder: Path, seed: int, options: Mapping[str, Any]) -> Scene:
+    """The generated scene of that seed, written into ``folder`` unless it lies there already."""
+    from beags_plugin.sample.writer import SampleConfig, is_sample, write_sample
+
+    config = SampleConfig(**{**options, "seed": seed})
+    digest = value_digest(config.as_dict())
+    target = folder / f"sample-{seed}-{digest[:8]}"
+    if not is_sample(target, config):
+        with progress_bar(f"Tracing sample {seed}") as progress:
+            write_sample(target, config, progress)
+    return Scene(f"sample {seed}", target, 1.0, digest, seed)
+
+
+def given_scenes(folders: Sequence[Path], downscale: float | None) -> list[Scene]:
+    """The user's scenes, scaled down for a quick run unless ``downscale`` says otherwise.
+
+    Raises ``UserError`` for a folder that does not exist, and for two of one name.
+    """
+    from beags_plugin.demo import quick_downscale
+
+    scenes = []
+    for folder in folders:
+        if not folder.is_dir():
+            raise UserError(f"{folder} is no folder: name one with images, poses and masks.")
+        name = folder.resolve().name
+        if any(scene.name == name for scene in scenes):
+            raise UserError(f"two of the given folders are called {name}: rename one of them.")
+        scenes.append(Scene(name, folder.resolve(), downscale or quick_downscale(folder), folder_digest(folder)))
+    return scenes
+
+
+def damaged_masks(scene: Scene, degree: float, folder: Path) -> Path:
+    """A folder with the scene's masks, those of the training views damaged to ``degree`` (1 is mild, 2 strong).
+
+    Damage is done to exact masks where the scene has them (``ground_truth/masks``), else to the masks that it has, and
+    is decided by the scene's seed and the view's name. At degree 1 a sample gets the masks that it has by default.
+    The masks of held-out views stay as they are. An existing folder of the same damage is used again.
+    """
+    from beags_plugin.plugin.dataparser import BeagsDataParserConfig
+    from beags_plugin.sample.degrade import degradation_of_degree, degrade_mask, dropped_views
+
+    degradation = degradation_of_degree(degree)
+    target = folder / f"masks-{value_digest([scene.digest, scene.seed, degree, _own_code()])[:12]}"
+    if (target / "complete").exists():
+        return target
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir(parents=True)
+    parser = BeagsDataParserConfig(data=scene.data).setup()
+    splits = {split: parser.get_dataparser_outputs(split) for split in ("test", "train")}
+    stems = [Path(file).stem for file in splits["train"].image_filenames]
+    dropped = dropped_views(stems, scene.seed, degradation.dropped)
+    for split, outputs in splits.items():  # a view in both is for training
+        classes = np.array(sorted(outputs.metadata["classes"]))
+        for image, mask in zip(outputs.image_filenames, _best_masks(outputs.metadata, split), strict=True):
+            if mask is None or (split == "train" and image.stem in dropped):
+                continue
+            labels = read_class_map(mask, outputs.metadata["ignore_ids"])
+            if split == "train":
+                ranks = np.where(labels == IGNORE, len(classes), np.searchsorted(classes, labels))
+                ranks = degrade_mask(ranks, len(classes), degradation, scene.seed, image.stem)
+                labels = np.append(classes, IGNORE)[ranks]
+            path = target / _below(image, scene.data / "images").with_suffix(".png")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_class_map(path, labels.astype(np.uint16))
+    (target / "complete").touch()
+    return target
+
+
+def _best_masks(metadata: dict[str, Any], split: str) -> list[Path | None]:
+    """Per view its exact mask, in training views only; else the one it has."""
+    given: list[Path | None] = metadata["class_map_filenames"]
+    truth = metadata["ground_truth"]
+    exact = truth["masks"] if truth and split == "train" else [None] * len(given)
+    return [best or mask for best, mask in zip(exact, given, strict=True)]
+
+
+def _below(image: Path, root: Path) -> Path:
+    """Where the data parser looks for the mask of ``image``."""
+    return image.relative_to(root) if image.is_relative_to(root) else Path(image.name)
+
+
+def _own_code() -> str:
+    from beags_plugin.sample import degrade
+
+    sources: list[Callable[[], bytes]] = [Path(str(module)).read_bytes for module in (degrade.__file__, __file__)]
+    return hashlib.sha256(b"".join(read() for read in sources)).hexdigest()

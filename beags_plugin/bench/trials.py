@@ -1,0 +1,105 @@
+"""Trials: one training each, told apart by a digest of all that decides its result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from beags_plugin.bench.experiment import Experiment, Variant
+from beags_plugin.bench.scenes import Scene
+from beags_plugin.digests import value_digest
+
+MODEL = "pipeline.model."
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One training: of a base, or (with ``base``) of the refinement that starts from that base.
+
+    overrides: dotted config keys and their values. masks: folder that replaces the scene's masks.
+    code: digest of the code that it is run with.
+    """
+
+    scene: Scene
+    preset: str
+    overrides: Mapping[str, Any] = field(hash=False)
+    seed: int
+    code: str
+    masks: Path | None = None
+    base: Trial | None = None
+
+    @cached_property
+    def digest(self) -> str:
+        """Equal for trials whose results are equal; the data's place and the names of variants do not matter."""
+        return value_digest(
+            {
+                "scene": self.scene.digest,
+                "downscale": self.scene.downscale,
+                "preset": self.preset_content,
+                "overrides": {key: repr(value) for key, value in self.overrides.items()},  # repr: JSON has no infinity
+                "seed": self.seed,
+                "code": self.code,
+                "masks": self.masks and self.masks.name,  # a digest in itself
+                "base": self.base and self.base.digest,
+            }
+        )
+
+    @cached_property
+    def preset_content(self) -> str:
+        """The text of the preset's file."""
+        from beags_plugin.plugin.presets import preset_folder
+
+        return (preset_folder() / f"{self.preset}.toml").read_text("utf8")
+
+    @property
+    def folder_name(self) -> str:
+        """Of its folder among the trials."""
+        scene = "".join(c if c.isalnum() or c in "._-" else "-" for c in self.scene.name)
+        return f"{scene}-{'base' if self.base is None else 'refined'}-{self.digest[:12]}"
+
+
+@dataclass(frozen=True)
+class Run:
+    """A trial in its part in an experiment: that variant on that scene with that seed."""
+
+    variant: Variant
+    scene: Scene
+    seed: int
+    trial: Trial
+
+
+def plan(
+    experiment: Experiment, scenes: Sequence[Scene], masks: Mapping[tuple[str, float], Path], code: str
+) -> list[Run]:
+    """Every variant on every scene with every seed, scene after scene; variants share bases where they can.
+
+    masks: folder of damaged masks by scene name and degree. code: digest of the code.
+    """
+    runs = []
+    for scene in scenes:
+        for seed in experiment.seeds:
+            for variant in experiment.variants:
+                # no damage to the masks makes another base: it is trained from photos alone
+                base = Trial(
+                    scene, experiment.preset, {**variant.base, MODEL + "refine_steps": 0}, seed, code, masks=None
+                )
+                damaged = None if variant.damage is None else masks[scene.name, variant.damage]
+                refine = {**variant.refine, MODEL + "base_steps": 0}
+                runs.append(
+                    Run(variant, scene, seed, Trial(scene, experiment.preset, refine, seed, code, damaged, base))
+                )
+    return runs
+
+
+def steps_of(trial: Trial) -> int:
+    """How many steps it trains; raises ``UserError`` for overrides that the config does not take."""
+    from beags_plugin.plugin.presets import load_preset, override
+
+    config = load_preset(trial.preset).config
+    for key, value in trial.overrides.items():
+        override(config, key, value, Path(trial.scene.name))
+    model = config.pipeline.model
+    return model.base_steps + model.refine_steps  # type: ignore[attr-defined]

@@ -1,0 +1,35 @@
+"""Digests that tell whether something made earlier would come out the same again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+_PACKAGE = Path(__file__).parent
+_TELLING = ("cli.py", "demo.py", "doctor.py", "bench")  # print and draw what the rest has computed
+
+
+def code_digest() -> str:
+    """Changes with every file of the package that can change a result, the compiled extension included."""
+    digest = hashlib.sha256()
+    for path in sorted([*_PACKAGE.rglob("*.py"), *_PACKAGE.glob("_native*"), *_PACKAGE.glob("native/*")]):
+        if path.relative_to(_PACKAGE).parts[0] not in _TELLING:
+            digest.update(path.read_bytes())
+    digest.update((_PACKAGE / "bench" / "measure.py").read_bytes())
+    return digest.hexdigest()
+
+
+def folder_digest(folder: Path) -> str:
+    """Changes with any file of ``folder``, by path, size and time."""
+    digest = hashlib.sha256(str(folder.resolve()).encode())
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        stat = path.stat()
+        digest.update(f"{path.relative_to(folder)} {stat.st_size} {stat.st_mtime_ns}".encode())
+    return digest.hexdigest()
+
+
+def value_digest(value: Any) -> str:
+    """Of plain values (JSON), whatever the order of a dict's keys."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
