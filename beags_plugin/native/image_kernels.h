@@ -44,14 +44,5 @@ struct ImageKernels {
   void (*normal_gradient)(const NormalJob<T>& job, int row);
 };
 
-namespace baseline {
-extern const ImageKernels<float> kImageKernelsF32;
-extern const ImageKernels<double> kImageKernelsF64;
-}  // namespace baseline
-namespace avx2 {
-extern const ImageKernels<float> kImageKernelsF32;
-extern const ImageKernels<double> kImageKernelsF64;
-}  // namespace avx2
-
 }  // namespace ops
 }  // namespace beags

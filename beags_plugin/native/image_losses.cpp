@@ -2,26 +2,13 @@
 
 #include <cmath>
 #include <memory>
-#include <type_traits>
 #include <vector>
 
-#include "isa.h"
+#include "two_builds.h"
 
 namespace beags {
 namespace ops {
 namespace {
-
-template <class T>
-const ImageKernels<T>& image_kernels() {
-#if defined(BEAGS_HAS_AVX2)
-  if (uses_avx2()) {
-    if constexpr (std::is_same_v<T, float>) return avx2::kImageKernelsF32;
-    if constexpr (std::is_same_v<T, double>) return avx2::kImageKernelsF64;
-  }
-#endif
-  if constexpr (std::is_same_v<T, float>) return baseline::kImageKernelsF32;
-  if constexpr (std::is_same_v<T, double>) return baseline::kImageKernelsF64;
-}
 
 constexpr int64_t kTeamPixels = 16384;  // a team costs tens of microseconds, a pixel some ten nanoseconds
 
@@ -33,7 +20,7 @@ int team(int width, int height, int threads) {
 
 template <class T>
 PhotometricSums photometric(PhotometricJob<T> job, int threads) {
-  const ImageKernels<T>& kernels = image_kernels<T>();
+  const ImageKernels<T>& kernels = best_table<ImageKernels<T>>();
   double window[kWindow], total = 0;
   for (int k = 0; k < kWindow; ++k) total += window[k] = std::exp(-0.5 * (k - kReach) * (k - kReach) / (1.5 * 1.5));
   for (int k = 0; k < kWindow; ++k) job.window[k] = static_cast<T>(window[k] / total);
@@ -62,7 +49,7 @@ PhotometricSums photometric(PhotometricJob<T> job, int threads) {
 
 template <class T>
 double normal_consistency(NormalJob<T> job, int threads) {
-  const ImageKernels<T>& kernels = image_kernels<T>();
+  const ImageKernels<T>& kernels = best_table<ImageKernels<T>>();
   const std::unique_ptr<T[]> shares(job.g_depth ? new T[4 * static_cast<size_t>(job.width) * job.height] : nullptr);
   std::vector<double> sums(job.height);
   job.shares = shares.get();

@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <vector>
 
+#include "two_builds.h"
+
 namespace beags {
 namespace ops {
 
@@ -16,7 +18,7 @@ OccupancyResult occupancy_loss(const OccupancyJob<T>& job, int64_t count, int th
   for (int64_t block = 0; block < blocks; ++block) {
     const int64_t first = block * kOccupancyBlock, last = std::min(first + kOccupancyBlock, count);
     OccupancyResult result{0, 0};
-    result.value = op_kernels<T>().occupancy(job, first, last, &result.active);
+    result.value = best_table<OpKernels<T>>().occupancy(job, first, last, &result.active);
     results[block] = result;
   }
   // Determinism: blocks are the same for any number of threads, and are summed in order.

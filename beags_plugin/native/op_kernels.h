@@ -1,5 +1,6 @@
 // The ops' kernels: each works on one share of the data, on one thread, on raw pointers. They are compiled once for
-// each instruction set (ops_baseline.cpp, ops_avx2.cpp); the files that split the work among threads ask `op_kernels`.
+// each instruction set (ops_baseline.cpp, ops_avx2.cpp); the files that split the work among threads ask
+// `best_table`.
 #pragma once
 
 #include <stdint.h>
@@ -61,18 +62,6 @@ struct OpKernels {
   // Row y of the source: depth and labels [source_width].
   void (*cast_row)(const CastJob<T>& job, int y, const T* depth, const int32_t* labels);
 };
-
-template <class T>
-const OpKernels<T>& op_kernels();
-
-namespace baseline {
-extern const OpKernels<float> kOpKernelsF32;
-extern const OpKernels<double> kOpKernelsF64;
-}  // namespace baseline
-namespace avx2 {
-extern const OpKernels<float> kOpKernelsF32;
-extern const OpKernels<double> kOpKernelsF64;
-}  // namespace avx2
 
 }  // namespace ops
 }  // namespace beags

@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "op_kernels.h"
+#include "two_builds.h"
 
 namespace beags {
 namespace ops {
@@ -59,7 +60,7 @@ void reprojection_votes(const std::vector<VotingView<T>>& views, const std::vect
         job.source_width = view.width;
         for (int y = 0; y < view.height; ++y) {
           const int64_t row = static_cast<int64_t>(y) * view.width;
-          op_kernels<T>().cast_row(job, y, view.depth + row, view.labels + row);
+          best_table<OpKernels<T>>().cast_row(job, y, view.depth + row, view.labels + row);
         }
       }
       for (int64_t pixel = 0; pixel < pixels; ++pixel) {

@@ -2,6 +2,8 @@
 
 #include <algorithm>
 
+#include "two_builds.h"
+
 namespace beags {
 namespace ops {
 namespace {
@@ -20,12 +22,12 @@ void run(void (*kernel)(const ColorJob<T>&, int64_t, int64_t), const ColorJob<T>
 
 template <class T>
 void sh_colors(const ColorJob<T>& job, int64_t count, int threads) {
-  run(op_kernels<T>().colors, job, count, threads);
+  run(best_table<OpKernels<T>>().colors, job, count, threads);
 }
 
 template <class T>
 void sh_colors_backward(const ColorJob<T>& job, int64_t count, int threads) {
-  run(op_kernels<T>().colors_backward, job, count, threads);
+  run(best_table<OpKernels<T>>().colors_backward, job, count, threads);
 }
 
 #define BEAGS_INSTANTIATE(T)                                 \

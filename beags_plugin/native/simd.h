@@ -94,31 +94,20 @@ BEAGS_INLINE Real<T> min(Real<T> a, Real<T> b) {
   Real<T> out;
   BEAGS_EACH(Register<T>::min(a.part[i], b.part[i]));
 }
-template <class T>
-BEAGS_INLINE Mask<T> operator<=(Real<T> a, Real<T> b) {
-  Mask<T> out;
-  BEAGS_EACH(Register<T>::less_equal(a.part[i], b.part[i]));
-}
-template <class T>
-BEAGS_INLINE Mask<T> operator<(Real<T> a, Real<T> b) {
-  Mask<T> out;
-  BEAGS_EACH(Register<T>::less(a.part[i], b.part[i]));
-}
-template <class T>
-BEAGS_INLINE Mask<T> operator==(Real<T> a, Real<T> b) {
-  Mask<T> out;
-  BEAGS_EACH(Register<T>::equal(a.part[i], b.part[i]));
-}
-template <class T>
-BEAGS_INLINE Mask<T> operator&(Mask<T> a, Mask<T> b) {
-  Mask<T> out;
-  BEAGS_EACH(Register<T>::both(a.part[i], b.part[i]));
-}
-template <class T>
-BEAGS_INLINE Mask<T> without(Mask<T> a, Mask<T> b) {  // a and not b
-  Mask<T> out;
-  BEAGS_EACH(Register<T>::without(a.part[i], b.part[i]));
-}
+
+#define BEAGS_MASK(name, Operand, operation)                  \
+  template <class T>                                          \
+  BEAGS_INLINE Mask<T> name(Operand<T> a, Operand<T> b) {     \
+    Mask<T> out;                                              \
+    BEAGS_EACH(Register<T>::operation(a.part[i], b.part[i])); \
+  }
+BEAGS_MASK(operator<=, Real, less_equal)
+BEAGS_MASK(operator<, Real, less)
+BEAGS_MASK(operator==, Real, equal)
+BEAGS_MASK(operator&, Mask, both)
+BEAGS_MASK(without, Mask, without)  // a and not b
+#undef BEAGS_MASK
+
 template <class T>
 BEAGS_INLINE bool any(Mask<T> mask) {
   typename Register<T>::Mask joined = mask.part[0];
