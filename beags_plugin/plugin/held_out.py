@@ -23,8 +23,8 @@ CURVE = "held_out.json"
 class HeldOutCurve:
     """Quality against steps, kept in ``<run>/held_out.json``.
 
-    A record holds ``step`` (steps done), ``gaussians``, ``psnr`` (dB) and ``ssim`` of the held-out views (means over the
-    views), ``train_psnr`` of as many training views spread over all, and ``seconds`` of training so far, without what
+    A record holds ``step`` (steps done), ``gaussians``, ``psnr`` (dB) and ``ssim`` of the held-out views (means over
+    them), ``train_psnr`` of as many training views spread over all, and ``seconds`` of training so far, without what
     the measurements took. Only colours are drawn, so that a measurement costs a fraction of a step per view.
     """
 

@@ -17,7 +17,6 @@ from beags_plugin.errors import UserError
 from beags_plugin.plugin.held_out import HeldOutCurve
 from beags_plugin.plugin.refinement import peak_memory_mb
 from beags_plugin.plugin.runs import newest_checkpoint, save_atomically
-from beags_plugin.plugin.schedule import PhaseSchedule
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
@@ -35,7 +34,7 @@ class BeagsTrainer(Trainer):
     config: BeagsTrainerConfig
 
     def __init__(self, config: BeagsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
-        self.schedule = PhaseSchedule(config.model_config.base_steps, config.model_config.refine_steps)
+        self.schedule = config.model_config.schedule()
         self.last_step = config.max_num_iterations or self.schedule.total
         config.max_num_iterations = self.last_step
         self.loaded_run: Path | None = None
