@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 pytest.importorskip("nerfstudio")
 
+from beags_plugin.core.densification import DensifyConfig
 from beags_plugin.plugin.schedule import PhaseSchedule, log_linear
 from beags_plugin.plugin.training import camera_extent, move_adam_state
 
@@ -46,3 +49,129 @@ def test_adam_moments_follow_their_surfels():
     optimizer.step()
     assert torch.isfinite(parameter).all() and bool((parameter != 0).all())
     assert len(optimizer.state) == 1
+
+
+# -- the official schedule, and shorter runs of it -------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def model():
+    """A model of the documented base config on a few random seed points."""
+    from nerfstudio.data.scene_box import SceneBox
+
+    from beags_plugin.plugin.config import base_config
+
+    g = torch.Generator().manual_seed(1)
+    points = (torch.randn(30, 3, generator=g), torch.randint(0, 256, (30, 3), generator=g))
+    box = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    return base_config().model_config.setup(scene_box=box, num_train_data=1, seed_points=points)
+
+
+def steps_where(happens):
+    return [done for done in range(1, 30_001) if happens(done)]
+
+
+def test_the_official_steps_of_growth_and_resets():
+    config = DensifyConfig()
+    assert config.scaled(1.0) == config
+    assert steps_where(config.grows_at) == list(range(600, 15_000, 100))
+    assert steps_where(config.resets_at) == [3_000, 6_000, 9_000, 12_000]
+    assert not steps_where(replace(config, reset_every=0).resets_at)
+
+
+def test_a_shorter_run_has_the_same_proportions_but_no_shorter_intervals_than_it_can_bear():
+    half = DensifyConfig().scaled(0.5)
+    assert (half.every, half.start, half.stop, half.reset_every, half.prune_scale_after) == (50, 250, 7500, 1500, 1500)
+    tenth = DensifyConfig(min_every=40, min_reset_every=900).scaled(0.1)
+    assert (tenth.every, tenth.start, tenth.stop, tenth.reset_every, tenth.prune_scale_after) == (
+        40,
+        50,
+        1500,
+        900,
+        300,
+    )
+    never = DensifyConfig(reset_every=0, every=30, min_every=40).scaled(0.1)
+    assert (never.reset_every, never.every) == (0, 30)  # what is stated shorter than the bound stays as stated
+
+
+def test_stated_steps_are_scaled_with_the_length_of_the_base():
+    assert PhaseSchedule(30_000, 3_000, 30_000).scaled(7_000) == 7_000
+    assert PhaseSchedule(3_000, 300, 30_000).scaled(7_000) == 700
+    assert PhaseSchedule(3_000, 300).scaled(7_000) == 7_000  # stated for this run
+    assert PhaseSchedule(0, 3_000, 30_000).scaled(7_000) == 7_000  # no base to scale by
+    assert PhaseSchedule(30, 0, 30_000).scaled(100) == 1 and PhaseSchedule(30, 0, 30_000).scaled(0) == 0
+
+
+def test_losses_start_at_their_share_of_the_base():
+    from beags_plugin.plugin.model import LossSpec
+
+    short = PhaseSchedule(3_000, 300, 30_000)
+    assert LossSpec(start=7_000).build("normal", short).start == 700
+    assert LossSpec(start=50, phase="refine").build("boundary", short).start == 3_050
+
+
+def test_the_degree_of_the_colours_grows_by_one_every_thousand_steps(model):
+    def degree(step, base_steps=30_000):
+        model.step, model.schedule = step, PhaseSchedule(base_steps, 0, 30_000)
+        return model.active_sh_degree()
+
+    model.train()
+    assert [degree(step) for step in (0, 999, 1000, 1999, 2000, 3000, 29_999)] == [0, 0, 1, 1, 2, 3, 3]
+    assert [degree(step, 3_000) for step in (99, 100, 299, 300)] == [0, 1, 2, 3]
+
+
+def test_the_official_losses_and_their_starts(model):
+    model.schedule = PhaseSchedule(30_000, 0, 30_000)
+    losses = {name: (loss.weight, loss.start) for name, loss in model.losses.items()}
+    assert losses == {
+        "photometric": (1.0, 0),
+        "normal": (0.05, 7_000),
+        "boundary": (0.5, 30_000),
+        "occupancy": (10.0, 30_000),
+    }
+    assert model.losses["photometric"].ssim_weight == 0.2
+
+
+def test_official_learning_rates(model):
+    from beags_plugin.plugin.config import base_config
+    from beags_plugin.plugin.training import set_learning_rates
+
+    configs = base_config().optimizers
+    optimizers = {name: torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))]) for name in configs}
+    model.extent, model.schedule = torch.tensor(2.5), PhaseSchedule(30_000, 0, 30_000)
+
+    def rates(step):
+        set_learning_rates(model, optimizers, configs, step)
+        return {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.items()}
+
+    constant = {"features_dc": 2.5e-3, "features_rest": 1.25e-4, "opacities": 0.05, "scales": 0.005, "quats": 0.001}
+    assert rates(0) == pytest.approx({"means": 2.5 * 1.6e-4, **constant})
+    assert rates(15_000) == pytest.approx({"means": 2.5 * 1.6e-5, **constant})
+    assert rates(29_999) == pytest.approx({"means": 2.5 * 1.6e-6, **constant}, rel=1e-3)
+    assert all(configs[name]["optimizer"].eps == 1e-15 for name in configs)
+
+
+def test_growth_looks_at_the_pull_of_geometry_not_of_direction_dependent_colour(model):
+    """As officially: the gradient of the rasterizer's input, apart from that through the viewing direction."""
+    from nerfstudio.cameras.cameras import Cameras
+
+    pose = torch.eye(4)[None, :3]
+    pose[0, 2, 3] = 4.0
+    camera = Cameras(
+        pose, torch.tensor([40.0]), torch.tensor([40.0]), torch.tensor([16.0]), torch.tensor([12.0]), 32, 24
+    )
+    model.train()
+    model.step, model.schedule, model.extent = 5_000, PhaseSchedule(30_000, 0, 30_000), torch.tensor(1.0)
+    torch.nn.init.normal_(model.gauss_params["features_rest"], generator=torch.Generator().manual_seed(4))
+
+    def pulls():
+        model.zero_grad()
+        model.get_outputs(camera)["rgb"].square().sum().backward()
+        return model.drawn.means.grad.clone(), model.gauss_params["means"].grad.clone()
+
+    geometry, everything = pulls()
+    assert float((geometry - everything).abs().max()) > 0.1 * float(everything.abs().max())
+    torch.nn.init.zeros_(model.gauss_params["features_rest"])  # no direction: both are the same
+    geometry, everything = pulls()
+    assert float(everything.abs().max()) > 0
+    assert torch.equal(geometry, everything)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -23,7 +23,9 @@ COINCIDENT = 1e-7  # smallest initial scale relative to the cloud's size: coinci
 class DensifyConfig:
     """When and how the scene grows; lengths are relative to the scene's extent.
 
-    every, start, stop: densify at multiples of ``every`` within (start, stop].
+    every, start, stop: densify at multiples of ``every`` between ``start`` and ``stop``, both excluded (as officially).
+    min_every: ``scaled`` makes ``every`` no shorter: an interval must show the surfels to many views.
+    min_reset_every: likewise of ``reset_every``: opacities need time to recover.
     grad_threshold: mean screen gradient from which a surfel is cloned or split.
     clone_scale: a larger surfel is split, a smaller one cloned.
     prune_opacity: fainter surfels go. prune_scale: larger ones go, after step ``prune_scale_after``.
@@ -42,6 +44,31 @@ class DensifyConfig:
     reset_every: int = 3_000
     reset_opacity: float = 0.01
     max_surfels: int = 0
+    min_every: int = 50
+    min_reset_every: int = 1_000
+
+    def scaled(self, factor: float) -> DensifyConfig:
+        """The same for a run ``factor`` times as long: its steps are scaled, within the smallest intervals."""
+
+        def steps(stated: int, least: int = 0) -> int:
+            return max(round(stated * factor), min(least, stated)) if stated > 0 else stated
+
+        return replace(
+            self,
+            every=max(steps(self.every, self.min_every), 1),
+            start=steps(self.start),
+            stop=steps(self.stop),
+            prune_scale_after=steps(self.prune_scale_after),
+            reset_every=steps(self.reset_every, self.min_reset_every),
+        )
+
+    def grows_at(self, done: int) -> bool:
+        """Whether the scene is densified after ``done`` steps."""
+        return self.start < done < self.stop and done % self.every == 0
+
+    def resets_at(self, done: int) -> bool:
+        """Whether opacities are reset after ``done`` steps."""
+        return self.reset_every > 0 and done < self.stop and done % self.reset_every == 0
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,8 @@ class BeagsTrainerConfig(TrainerConfig):
     """Folder of this run; None puts it where nerfstudio does (output_dir/experiment/method/timestamp)."""
     max_num_iterations: int = 0
     """Stop after so many steps of the schedule; 0 runs base_steps + refine_steps."""
+    steps_per_held_out: int = 0
+    """Measure all held-out views every so many steps, into held_out.json of the run; 0: never."""
 
     @property
     def model_config(self) -> BeagsModelConfig:

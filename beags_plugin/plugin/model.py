@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -46,13 +46,14 @@ class LossSpec:
     phase: Literal["base", "refine", "both"] = "both"
     """Where the term may act."""
     start: int = 0
-    """First step of the term, counted from the first step of the run (or of the refinement, for phase "refine")."""
+    """First step of the term: of the run, stated for a base of schedule_steps; or, for phase "refine", of the
+    refinement, as it is."""
     options: dict[str, bool | int | float] = field(default_factory=dict)
     """Options of the loss itself, e.g. ssim_weight or samples."""
 
     def build(self, name: str, schedule: PhaseSchedule) -> Loss:
         """The loss, with its steps made absolute."""
-        first = schedule.base_steps + self.start if self.phase == "refine" else self.start
+        first = schedule.base_steps + self.start if self.phase == "refine" else schedule.scaled(self.start)
         if self.phase != "refine" and schedule.base_steps == 0:
             first = 0  # the base was trained elsewhere: its terms have long started
         last = schedule.base_steps if self.phase == "base" else None
@@ -76,6 +77,9 @@ class BeagsModelConfig(ModelConfig):
     """Steps of base training; 0 for a refinement that starts from a loaded base."""
     refine_steps: int = 3_000
     """Steps of refinement; 0 trains a base only."""
+    schedule_steps: int = 30_000
+    """Length of base training for which all other steps and intervals of the base are stated; with another base_steps
+    they are scaled in proportion. 0: they are taken as they are."""
     refiner: str = "bea"
     """What happens after class assignment: bea (this method), none (assignment alone), or a registered one."""
     losses: dict[str, LossSpec] = field(default_factory=dict)
@@ -90,6 +94,19 @@ class BeagsModelConfig(ModelConfig):
     """Near plane in units of the scene's extent."""
     far: float = 100.0
     """Far plane in units of the scene's extent."""
+
+    def schedule(self) -> PhaseSchedule:
+        """Steps of both phases."""
+        return PhaseSchedule(self.base_steps, self.refine_steps, self.schedule_steps)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What the last training step drew. means: [N, 3], the rasterizer's input, which keeps its own gradient."""
+
+    camera: Camera
+    render: RasterOutputs
+    means: Tensor
 
 
 class BeagsModel(SplatfactoModel):
@@ -133,7 +150,7 @@ class BeagsModel(SplatfactoModel):
         self.register_buffer("refined_steps", torch.tensor(0))
         metadata = self.kwargs.get("metadata") or {}
         self.classes: dict[int, str] = dict(metadata.get("classes") or {0: "background"})
-        self.schedule = PhaseSchedule(self.config.base_steps, self.config.refine_steps)
+        self.schedule = self.config.schedule()
         self.losses = {
             name: spec.build(name, self.schedule)
             for name, spec in self.config.losses.items()
@@ -148,7 +165,7 @@ class BeagsModel(SplatfactoModel):
         self.refining_since = 0.0
         self.crop_box: OrientedBox | None = None
         self.background_color = torch.zeros(3)
-        self.drawn: tuple[Camera, RasterOutputs] | None = None
+        self.drawn: Drawn | None = None
         self.object_choice = ViewerDropdown("Object", EVERYTHING, [EVERYTHING, *self._object_names()])
 
     def _object_names(self) -> list[str]:
@@ -230,7 +247,8 @@ class BeagsModel(SplatfactoModel):
         """Degrees grow one by one while the base trains; a scene that is only looked at shows them all."""
         if not self.training or self.schedule.refining(self.step):
             return self.config.sh_degree
-        return min(self.step // max(self.config.sh_degree_interval, 1), self.config.sh_degree)
+        interval = max(self.schedule.scaled(self.config.sh_degree_interval), 1)
+        return min(self.step // interval, self.config.sh_degree)
 
     def active_losses(self) -> dict[str, Loss]:
         """The terms that count at the current step."""
@@ -250,16 +268,21 @@ class BeagsModel(SplatfactoModel):
         needs = frozenset().union(*(loss.needs for loss in self.active_losses().values()))
         target = (cameras.metadata or {}).get("class_map") if "boundary" in needs else None
         background = self._training_background()
+        inputs = surfel_inputs(
+            self.surfels(), camera, self.active_sh_degree(), self.class_ids if target is not None else None
+        )
+        # a node of its own: what pulls the surfels across the screen, without the pull of direction-dependent colour
+        inputs = replace(inputs, means=inputs.means.view_as(inputs.means))
+        if inputs.means.requires_grad:
+            inputs.means.retain_grad()
         render = self.rasterizer.rasterize(
-            surfel_inputs(
-                self.surfels(), camera, self.active_sh_degree(), self.class_ids if target is not None else None
-            ),
+            inputs,
             camera,
             self.settings(geometry="geometry" in needs, distortion="distortion" in needs),
             background,
             None if target is None else target.to(self.device, torch.int32),
         )
-        self.drawn = (camera, render)
+        self.drawn = Drawn(camera, render, inputs.means)
         outputs = {"rgb": render.color, "accumulation": render.alpha[..., None], "background": background}
         if render.depth is not None:
             outputs["depth"] = render.depth[..., None]
@@ -327,14 +350,13 @@ class BeagsModel(SplatfactoModel):
         image = self._truth(batch, outputs["background"])
         if not self.training or self.drawn is None:
             return {"photometric": (outputs["rgb"] - image).abs().mean()}
-        camera, render = self.drawn
         class_map = batch.get("class_map")
         inputs = LossInputs(
             step=self.step,
             seed=self.seed,
             surfels=self.surfels(),
-            camera=camera,
-            render=render,
+            camera=self.drawn.camera,
+            render=self.drawn.render,
             image=image,
             labels=None if class_map is None else class_map.to(self.device, torch.int32),
             class_ids=self.class_ids,

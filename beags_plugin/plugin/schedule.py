@@ -10,10 +10,23 @@ REFINE_SCHEDULE_FROM = 0.9  # refinement repeats the learning rates of the last 
 
 @dataclass(frozen=True)
 class PhaseSchedule:
-    """Steps of the two phases: base is [0, base_steps), refinement [base_steps, base_steps + refine_steps)."""
+    """Steps of the two phases: base is [0, base_steps), refinement [base_steps, base_steps + refine_steps).
+
+    stated_for: length of the base for which the schedule's other steps are stated; 0 if they are stated for this one.
+    """
 
     base_steps: int
     refine_steps: int
+    stated_for: int = 0
+
+    @property
+    def scale(self) -> float:
+        """Factor from stated steps to those of this run; 1 where there is no base to train."""
+        return self.base_steps / self.stated_for if self.base_steps > 0 and self.stated_for > 0 else 1.0
+
+    def scaled(self, steps: int) -> int:
+        """A stated step (or interval: at least 1) in this run; 0 stays 0, which often means never."""
+        return max(round(steps * self.scale), 1) if steps > 0 else steps
 
     @property
     def total(self) -> int:

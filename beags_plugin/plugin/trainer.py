@@ -13,12 +13,13 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
 from beags_plugin.errors import UserError
+from beags_plugin.plugin.held_out import HeldOutCurve
 from beags_plugin.plugin.refinement import peak_memory_mb
 from beags_plugin.plugin.runs import newest_checkpoint, save_atomically
-from beags_plugin.plugin.schedule import PhaseSchedule
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
+    from beags_plugin.plugin.datamanager import BeagsDataManager
     from beags_plugin.plugin.model import BeagsModel
 
 QUICKER = "Quicker: ns-train beags-tiny, or end the command with: beags-data --downscale-factor 2."
@@ -32,10 +33,11 @@ class BeagsTrainer(Trainer):
     config: BeagsTrainerConfig
 
     def __init__(self, config: BeagsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
-        self.schedule = PhaseSchedule(config.model_config.base_steps, config.model_config.refine_steps)
+        self.schedule = config.model_config.schedule()
         self.last_step = config.max_num_iterations or self.schedule.total
         config.max_num_iterations = self.last_step
         self.loaded_run: Path | None = None
+        self.curve: HeldOutCurve | None = None
         self._started = 0.0
         super().__init__(config, local_rank, world_size)
 
@@ -66,6 +68,11 @@ class BeagsTrainer(Trainer):
             highlight=False,
         )
         self._started = time.perf_counter()
+        if self.config.steps_per_held_out > 0:
+            datamanager = cast("BeagsDataManager", self.pipeline.datamanager)
+            self.curve = HeldOutCurve(
+                self.base_dir, self.config.steps_per_held_out, self.last_step, self._model, datamanager
+            )
         try:
             super().train()
         except UserError as error:
@@ -79,6 +86,12 @@ class BeagsTrainer(Trainer):
         if done == ESTIMATE_STEPS[1]:
             self._say_duration((time.perf_counter() - self._estimate_from) / (ESTIMATE_STEPS[1] - ESTIMATE_STEPS[0]))
         return super().train_iteration(step)
+
+    def eval_iteration(self, step: int) -> None:
+        """nerfstudio's evaluation of single views, and the curve of all held-out ones."""
+        super().eval_iteration(step)
+        if self.curve is not None:
+            self.curve.after_step(step)
 
     def _say_duration(self, seconds_per_step: float) -> None:
         left = (self.last_step - self._start_step) * seconds_per_step

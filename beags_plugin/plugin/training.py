@@ -70,24 +70,22 @@ class Densifier:
 
     def __init__(self, model: BeagsModel, optimizers: dict) -> None:
         self.model = model
-        self.config = model.config.densify
+        self.config = model.config.densify.scaled(model.schedule.scale)
         self.optimizers = optimizers
         self.statistics = GradientStatistics(model.num_points)
 
     def after_step(self, step: int) -> None:
         """Gather; densify and reset opacities when their step has come."""
-        model, config = self.model, self.config
-        if step >= min(config.stop, model.schedule.base_steps) or model.drawn is None:
-            return
-        camera, render = model.drawn
-        means = model.gauss_params["means"]
-        if means.grad is not None:
-            gradient = screen_gradient(means.grad.detach(), means.detach(), camera)
-            self.statistics.add(gradient, render.visible)
+        model, config, drawn = self.model, self.config, self.model.drawn
         done = step + 1
-        if done > config.start and done % config.every == 0:
+        if done >= min(config.stop, model.schedule.base_steps) or drawn is None:
+            return
+        if drawn.means.grad is not None:
+            gradient = screen_gradient(drawn.means.grad, drawn.means.detach(), drawn.camera)
+            self.statistics.add(gradient, drawn.render.visible)
+        if config.grows_at(done):
             self._densify(done)
-        if config.reset_every > 0 and done % config.reset_every == 0 and done < config.stop:
+        if config.resets_at(done):
             self._reset_opacity()
 
     def _densify(self, step: int) -> None:

@@ -1,0 +1,75 @@
+"""How well a run draws the views that it does not train on, measured now and then while it trains."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from beags_plugin.losses.photometric import ssim
+from beags_plugin.rasterizers.drawing import surfel_inputs
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.datamanager import BeagsDataManager, View
+    from beags_plugin.plugin.model import BeagsModel
+
+CURVE = "held_out.json"
+"""File of a run: one record per measurement, see ``HeldOutCurve``."""
+
+
+class HeldOutCurve:
+    """Quality against steps, kept in ``<run>/held_out.json``.
+
+    A record holds ``step`` (steps done), ``gaussians``, ``psnr`` (dB) and ``ssim`` of the held-out views (means over
+    them), ``train_psnr`` of as many training views spread over all, and ``seconds`` of training so far, without what
+    the measurements took. Only colours are drawn, so that a measurement costs a fraction of a step per view.
+    """
+
+    def __init__(self, folder: Path, every: int, last: int, model: BeagsModel, datamanager: BeagsDataManager) -> None:
+        self.file = folder / CURVE
+        self.every = every
+        self.ends = {model.schedule.base_steps, last}
+        self.model = model
+        self.held_out = datamanager.views("eval")
+        train = datamanager.views("train")
+        count = min(len(self.held_out), len(train))
+        self.train = [train[index * len(train) // count] for index in range(count)]
+        self.records: list[dict[str, float]] = []
+        self._started, self._measuring = time.perf_counter(), 0.0
+
+    def after_step(self, step: int) -> None:
+        """Measure if the time has come: at every multiple of ``every`` steps, and where a phase ends."""
+        done = step + 1
+        if done % self.every == 0 or done in self.ends:
+            began = time.perf_counter()
+            self.records.append(self._measure(done, began - self._started - self._measuring))
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+            self.file.write_text(json.dumps(self.records, indent=1))
+            self._measuring += time.perf_counter() - began
+
+    def _measure(self, done: int, seconds: float) -> dict[str, float]:
+        psnr, similarity = zip(*(self._quality(view) for view in self.held_out), strict=True)
+        train_psnr = [self._quality(view)[0] for view in self.train]
+        return {
+            "step": done,
+            "gaussians": self.model.num_points,
+            "psnr": sum(psnr) / len(psnr),
+            "ssim": sum(similarity) / len(similarity),
+            "train_psnr": sum(train_psnr) / len(train_psnr),
+            "seconds": seconds,
+        }
+
+    @torch.no_grad()
+    def _quality(self, view: View) -> tuple[float, float]:
+        model = self.model
+        drawn = model.rasterizer.rasterize(
+            surfel_inputs(model.surfels(), view.camera, model.active_sh_degree()),
+            view.camera,
+            model.settings(geometry=False),
+            model.background_color.to(model.device),
+        ).color.clamp(0.0, 1.0)
+        error = (drawn - view.image).square().mean().clamp_min(1e-10)
+        return float(-10.0 * torch.log10(error)), float(ssim(drawn, view.image))

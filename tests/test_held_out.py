@@ -1,0 +1,80 @@
+"""The curve of held-out quality that a run keeps."""
+
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+pytest.importorskip("nerfstudio")
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.losses.photometric import ssim
+from beags_plugin.plugin.held_out import HeldOutCurve
+from beags_plugin.plugin.schedule import PhaseSchedule
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.drawing import surfel_inputs
+from beags_plugin.rasterizers.interface import RasterSettings
+
+CAMERA = Camera(torch.eye(4), torch.tensor([[30.0, 0, 12], [0, 30.0, 10], [0, 0, 1]]), 24, 20)
+
+
+class Model:
+    """What the curve asks of a model."""
+
+    def __init__(self, rasterizer):
+        g = torch.Generator().manual_seed(2)
+        self.scene = Surfels(
+            means=torch.randn(9, 3, generator=g) * 0.5 + torch.tensor([0.0, 0.0, 4.0]),
+            quats=torch.randn(9, 4, generator=g),
+            log_scales=torch.full((9, 2), -1.0),
+            opacity_logits=torch.ones(9),
+            sh=torch.randn(9, 4, 3, generator=g),
+        )
+        self.rasterizer, self.num_points, self.device = rasterizer, 9, torch.device("cpu")
+        self.schedule = PhaseSchedule(base_steps=25, refine_steps=5)
+        self.background_color = torch.zeros(3)
+
+    def surfels(self):
+        return self.scene
+
+    def active_sh_degree(self):
+        return 1
+
+    def settings(self, geometry):
+        assert not geometry  # colours alone are cheap
+        return RasterSettings(0.01, 100.0, geometry)
+
+
+class Data:
+    """Three training views and two held-out ones, plain grey."""
+
+    def views(self, split):
+        greys = {"train": (0.1, 0.2, 0.3), "eval": (0.4, 0.6)}[split]
+        return [SimpleNamespace(camera=CAMERA, image=torch.full((20, 24, 3), grey)) for grey in greys]
+
+
+def test_it_measures_all_held_out_views_at_the_given_steps_and_where_phases_end(tmp_path):
+    model = Model(make_rasterizer("torch"))
+    curve = HeldOutCurve(tmp_path, 10, 28, model, Data())
+    for step in range(28):
+        curve.after_step(step)
+    records = json.loads((tmp_path / "held_out.json").read_text())
+    assert [record["step"] for record in records] == [10, 20, 25, 28]
+    drawn = model.rasterizer.rasterize(
+        surfel_inputs(model.scene, CAMERA, 1), CAMERA, model.settings(False), torch.zeros(3)
+    ).color.clamp(0, 1)
+
+    def psnr(grey):
+        return float(-10 * torch.log10((drawn - grey).square().mean()))
+
+    last = records[-1]
+    assert last["psnr"] == pytest.approx((psnr(0.4) + psnr(0.6)) / 2, rel=1e-5)
+    assert last["train_psnr"] == pytest.approx((psnr(0.1) + psnr(0.2)) / 2, rel=1e-5)  # as many views as are held out
+    greys = [torch.full((20, 24, 3), grey) for grey in (0.4, 0.6)]
+    assert last["ssim"] == pytest.approx(sum(float(ssim(drawn, grey)) for grey in greys) / 2, rel=1e-5)
+    assert last["gaussians"] == 9
+    assert 0 <= records[0]["seconds"] <= last["seconds"]
