@@ -138,36 +138,31 @@ def train(data: Path, run: Path, preset: str, downscale: float) -> None:
 def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
     """Compare assignment alone with refinement, extract every object, write summary.json and the picture."""
     from beags_plugin.evaluation.contact_sheet import draw_rows, novel_camera, write_contact_sheet
-    from beags_plugin.evaluation.run_metrics import evaluate_scene
-    from beags_plugin.evaluation.table import RunReport, print_table, summary_json
-    from beags_plugin.plugin.evaluate import held_out_views, raster_settings
-    from beags_plugin.plugin.extract import extract_objects, load_scene
-    from beags_plugin.rasterizers import make_rasterizer
+    from beags_plugin.evaluation.table import print_run, summary_json
+    from beags_plugin.plugin.evaluate import EvaluatedRun
+    from beags_plugin.plugin.extract import extract_objects
 
-    base, refined = load_scene(run / "base" / "config.yml"), load_scene(run / "config.yml")
-    class_ids, classes = refined.state["class_ids"], refined.classes
-    settings = raster_settings(refined)
-    rasterizer = make_rasterizer(refined.config.model_config.rasterizer)
-    views = held_out_views(refined.config, classes)
     with _Timer(seconds, "evaluation"), progress_bar("Evaluating") as progress:
-        before, after = (
-            evaluate_scene(scene.surfels(), class_ids, rasterizer, settings, views, classes, progress=progress)
-            for scene in (base, refined)
-        )
+        evaluated = EvaluatedRun(run / "config.yml")
+        metrics = evaluated.metrics(progress=progress)
     with _Timer(seconds, "extraction"):
         extracted = extract_objects(run / "config.yml")
     picture = output / "contact_sheet.png"
     with _Timer(seconds, "picture"):
+        views, classes = evaluated.views, evaluated.classes
         shown = views[:: max(1, len(views) // SHEET_VIEWS)][:SHEET_VIEWS]
         objects = [index for index in classes if index != 0]
+        base, refined = evaluated.stages["before"], evaluated.stages["after"]
+        assert refined.class_ids is not None
         scenes = (base.surfels(), refined.surfels())
-        rows = draw_rows(shown, *scenes, class_ids, objects, rasterizer, settings, novel=novel_camera(views))
+        drawing = (evaluated.rasterizer, evaluated.settings)
+        rows = draw_rows(shown, *scenes, refined.class_ids, objects, *drawing, novel=novel_camera(views))
         write_contact_sheet(picture, rows, classes)
     training = json.loads((run / "training.json").read_text())
     stages = {"sample": seconds.pop("sample", 0.0), **training["seconds"], **seconds}
-    report = RunReport(classes, before, after, stages, training["peak_memory_mb"])
-    (output / "summary.json").write_text(json.dumps(summary_json(report), indent=2))
-    print_table(report, CONSOLE)
+    memory = training["peak_memory_mb"]
+    (output / "summary.json").write_text(json.dumps(summary_json(metrics, stages, memory), indent=2))
+    print_run(metrics, stages, memory, CONSOLE)
     CONSOLE.print(f"objects: {', '.join(str(item.ply) for item in extracted)}")
     CONSOLE.print(f"figures: {output / 'summary.json'}")
     CONSOLE.print(f"picture: {picture}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,8 +24,10 @@ from beags_plugin.evaluation.contact_sheet import (
     write_contact_sheet,
 )
 from beags_plugin.evaluation.metrics import MaskMetrics
+from beags_plugin.evaluation.protocol import Protocol
+from beags_plugin.evaluation.report import RunMetrics
 from beags_plugin.evaluation.run_metrics import EvalView, ObjectMetrics, SceneMetrics, evaluate_scene
-from beags_plugin.evaluation.table import RunReport, print_table, summary_json
+from beags_plugin.evaluation.table import print_run, summary_json
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterOutputs, RasterSettings
 
 SIZE = 24
@@ -172,16 +175,19 @@ def test_the_image_is_compared_after_clamping():
     assert metrics.psnr == pytest.approx(20.0, abs=1e-4)  # an error of 0.1 everywhere
 
 
-def report(refined: bool = True) -> RunReport:
+SECONDS = {"base": 12.345}
+
+
+def report(classes: dict[int, str] | None = None) -> RunMetrics:
     def stage(value: float, psnr: float) -> SceneMetrics:
         one = ObjectMetrics(MaskMetrics(value, value - 0.1, value - 0.2), MaskMetrics(value, value, value))
         return SceneMetrics(one, {1: one, 2: ObjectMetrics(None, None)}, psnr, "silhouette")
 
-    return RunReport(CLASSES, stage(0.8, 30.0), stage(0.9, math.inf) if refined else None, {"base": 12.345}, 812.0)
+    return RunMetrics("lab", "config.yml", Protocol(), classes or CLASSES, stage(0.8, 30.0), stage(0.9, math.inf))
 
 
 def test_the_summary_has_the_documented_keys():
-    summary = json.loads(json.dumps(summary_json(report()), allow_nan=False))
+    summary = json.loads(json.dumps(summary_json(report(), SECONDS, 812.0), allow_nan=False))
     assert set(summary) == {"mean", "objects", "psnr", "seconds", "peak_memory_mb"}
     assert set(summary["objects"]) == {"cup", "box"}
     for row in (summary["mean"], summary["objects"]["cup"]):
@@ -194,20 +200,24 @@ def test_the_summary_has_the_documented_keys():
 
 
 def test_equal_names_stay_apart():
-    both = RunReport({1: "cup", 2: "cup"}, report().assigned)
-    assert set(summary_json(both)["objects"]) == {"cup (1)", "cup (2)"}
-    assert summary_json(both)["mean"]["extracted"]["refined"]["iou"] is None
+    assert set(report({1: "cup", 2: "cup"}).to_json()["objects"]) == {"cup (1)", "cup (2)"}
+
+
+def test_a_run_without_a_former_state_has_no_before():
+    content = replace(report(), before=None).to_json()
+    assert content["mean"]["extracted"]["before"] == {"acc": None, "iou": None, "biou": None}
+    assert content["mean"]["extracted"]["after"]["acc"] == 0.9 and content["psnr"]["before"] is None
 
 
 def test_the_table_shows_both_stages():
     from rich.console import Console
 
     out = io.StringIO()
-    print_table(report(), Console(file=out, width=80))
+    print_run(report(), SECONDS, 812.0, Console(file=out, width=80))
     cells = [line.split() for line in out.getvalue().splitlines()]
-    assert ["cup", "assigned", "80.0", "70.0", "60.0", "80.0", "80.0", "80.0"] in cells
-    assert ["refined", "90.0", "80.0", "70.0", "90.0", "90.0", "90.0"] in cells
-    assert ["box", "assigned", *6 * ["–"]] in cells
+    assert ["cup", "before", "80.0", "70.0", "60.0", "80.0", "80.0", "80.0"] in cells
+    assert ["after", "90.0", "80.0", "70.0", "90.0", "90.0", "90.0"] in cells
+    assert ["box", "before", *6 * ["–"]] in cells
     for part in ("PSNR, dB: 30.00 → –", "base 12.3", "812 MB", "silhouettes"):
         assert part in out.getvalue()
 

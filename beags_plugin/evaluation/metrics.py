@@ -9,20 +9,22 @@ from typing import Any
 
 import numpy as np
 
-BAND_FRACTION = 0.02
-"""Width of the boundary band as a fraction of the image diagonal (method, section 8)."""
+from beags_plugin.evaluation.protocol import Protocol
+
+METRICS = ("acc", "iou", "biou")
 
 
 @dataclass(frozen=True)
 class MaskMetrics:
-    """Agreement of one predicted mask with its truth; each in 0..1, higher is better.
+    """Agreement of one predicted mask with its truth, or a mean of it; each in 0..1, higher is better.
 
-    acc: pixel accuracy. iou: intersection over union. biou: IoU of the inner boundary bands.
+    acc: pixel accuracy. iou: intersection over union. biou: IoU of the inner boundary bands. None: the union is empty
+    and the protocol leaves such a ratio out.
     """
 
-    acc: float
-    iou: float
-    biou: float
+    acc: float | None
+    iou: float | None
+    biou: float | None
 
 
 def _array(image: Any) -> np.ndarray:
@@ -30,9 +32,9 @@ def _array(image: Any) -> np.ndarray:
     return image.detach().cpu().numpy() if hasattr(image, "detach") else np.asarray(image)
 
 
-def band_width(height: int, width: int) -> int:
-    """d = max(1, round(0.02 x image diagonal)), in pixels (method, section 8)."""
-    return max(1, round(BAND_FRACTION * math.hypot(height, width)))
+def band_width(height: int, width: int, share: float = Protocol.band_share) -> int:
+    """d = max(1, round(share x image diagonal)), in pixels (method, section 8)."""
+    return max(1, round(share * math.hypot(height, width)))
 
 
 def erode(mask: np.ndarray, times: int) -> np.ndarray:
@@ -61,20 +63,17 @@ def resize_nearest(mask: np.ndarray, height: int, width: int) -> np.ndarray:
     return mask[rows[:, None], columns[None, :]]
 
 
-def _iou(a: np.ndarray, b: np.ndarray, counted: np.ndarray) -> float:
-    union = np.count_nonzero((a | b) & counted)
-    return np.count_nonzero(a & b & counted) / union if union else 1.0  # both empty: 1
+def compared_masks(
+    prediction: Any, truth: Any, ignore: Any = None, protocol: Protocol | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The two masks at one size, as they are compared, and the pixels that count.
 
-
-def mask_metrics(prediction: Any, truth: Any, ignore: Any = None) -> MaskMetrics:
-    """Acc, IoU and BIoU of a mask; where a ratio has nothing to count, it is 1.
-
-    prediction: [H', W'] bool array or tensor, resized (nearest) to the truth if the sizes differ.
-    truth: [H, W] bool. ignore: [H, W] bool or None; True pixels are left out of every count, and the prediction
-    is taken to be right there, so that a hole in an ignored region makes no boundary around it.
-    Raises ``ValueError`` for masks that are not two-dimensional or an ``ignore`` of another size than the truth.
-    Source: method, section 8.
+    prediction: [H', W'] bool array or tensor. truth: [H, W] bool. ignore: [H, W] bool or None. Returns three bool
+    arrays of the size of the truth (of the prediction, if the protocol resizes the truth): prediction, truth, counted.
+    Where a pixel does not count, the prediction is taken to be right, so that a hole in an ignored region makes no
+    boundary around it. Raises ``ValueError`` as ``mask_metrics`` does.
     """
+    protocol = protocol or Protocol()
     predicted, true = _array(prediction).astype(bool), _array(truth).astype(bool)
     if predicted.ndim != 2 or true.ndim != 2 or 0 in predicted.shape or 0 in true.shape:
         raise ValueError(f"masks must be non-empty and [H, W]: got {predicted.shape} and {true.shape}.")
@@ -82,14 +81,35 @@ def mask_metrics(prediction: Any, truth: Any, ignore: Any = None) -> MaskMetrics
     if counted.shape != true.shape:
         raise ValueError(f"the ignore mask is {counted.shape} but the truth is {true.shape}.")
     if predicted.shape != true.shape:
-        predicted = resize_nearest(predicted, *true.shape)
-    predicted = np.where(counted, predicted, true)
+        if protocol.resize == "prediction":
+            predicted = resize_nearest(predicted, *true.shape)
+        else:
+            true, counted = (resize_nearest(mask, *predicted.shape) for mask in (true, counted))
+    return np.where(counted, predicted, true), true, counted
+
+
+def mask_metrics(prediction: Any, truth: Any, ignore: Any = None, protocol: Protocol | None = None) -> MaskMetrics:
+    """Acc, IoU and BIoU of a mask.
+
+    prediction: [H', W'] bool array or tensor. truth: [H, W] bool. ignore: [H, W] bool or None; True pixels are left
+    out of every count. protocol: who is resized if the sizes differ, the width of the band, what empty unions count.
+    Where no pixel counts at all, Acc is 1.
+    Raises ``ValueError`` for masks that are not two-dimensional or an ``ignore`` of another size than the truth.
+    Source: method, section 8.
+    """
+    protocol = protocol or Protocol()
+    predicted, true, counted = compared_masks(prediction, truth, ignore, protocol)
+
+    def iou(a: np.ndarray, b: np.ndarray) -> float | None:
+        union = np.count_nonzero((a | b) & counted)
+        return np.count_nonzero(a & b & counted) / union if union else protocol.empty_value
+
     total = np.count_nonzero(counted)
-    d = band_width(*true.shape)
+    d = band_width(*true.shape, protocol.band_share)
     return MaskMetrics(
         acc=np.count_nonzero((predicted == true) & counted) / total if total else 1.0,
-        iou=_iou(predicted, true, counted),
-        biou=_iou(boundary_band(predicted, d), boundary_band(true, d), counted),
+        iou=iou(predicted, true),
+        biou=iou(boundary_band(predicted, d), boundary_band(true, d)),
     )
 
 
@@ -105,9 +125,15 @@ def psnr(a: Any, b: Any) -> float:
     return math.inf if error == 0.0 else -10.0 * math.log10(error)
 
 
-def mean_metrics(metrics: Iterable[MaskMetrics]) -> MaskMetrics:
-    """The mean of each metric; raises ``ValueError`` if there are none."""
-    rows = [(m.acc, m.iou, m.biou) for m in metrics]
+def mean(values: Iterable[float | None]) -> float | None:
+    """The mean of those that are not None; None if there are none."""
+    present = [value for value in values if value is not None]
+    return math.fsum(present) / len(present) if present else None
+
+
+def mean_metrics(metrics: Iterable[MaskMetrics | None]) -> MaskMetrics | None:
+    """The mean of each metric over those who have it; None for no metrics at all."""
+    rows = [row for row in metrics if row is not None]
     if not rows:
-        raise ValueError("there are no metrics to average.")
-    return MaskMetrics(*(math.fsum(column) / len(rows) for column in zip(*rows, strict=True)))
+        return None
+    return MaskMetrics(mean(row.acc for row in rows), mean(row.iou for row in rows), mean(row.biou for row in rows))

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.evaluation.metrics import MaskMetrics, mask_metrics, mean_metrics, psnr
+from beags_plugin.evaluation.metrics import MaskMetrics, mask_metrics, mean, mean_metrics, psnr
+from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.extraction.select import select_class
+from beags_plugin.losses.photometric import ssim
 from beags_plugin.rasterizers.drawing import geometry_inputs, surfel_inputs
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
 
-MASK_THRESHOLD = 0.5
-"""A pixel belongs to a mask where the alpha (extracted) or the value (rendered) is greater."""
+Kind = Literal["extracted", "rendered"]
+KINDS: tuple[Kind, ...] = ("extracted", "rendered")
 
 
 @dataclass(frozen=True)
@@ -50,84 +52,185 @@ class ObjectMetrics:
 
 
 @dataclass(frozen=True)
+class MaskRecord:
+    """One scored mask.
+
+    kind: extracted (the object drawn alone) or rendered (the object's share of the whole scene). class_id: of the
+    object. view: index of the view. truth: what it was compared with, "silhouette" or "visible".
+    """
+
+    kind: Kind
+    class_id: int
+    view: int
+    truth: str
+    metrics: MaskMetrics
+
+
+@dataclass(frozen=True)
+class ViewRecord:
+    """The image of one view: its name, PSNR in dB (infinite for equal images) and SSIM; None without a photograph."""
+
+    name: str
+    psnr: float | None
+    ssim: float | None
+
+
+@dataclass(frozen=True)
 class SceneMetrics:
     """A scene's figures over all its views.
 
-    mean: over all the masks of the scene. objects: object id to the mean over its masks.
-    psnr: dB, mean over the views with a photograph; None if there is none; infinite for equal images.
+    mean: over the scene, as the protocol says. objects: object id to the mean over its masks.
+    psnr: dB, mean over the views with a photograph; None if there is none; infinite for equal images. ssim: likewise.
     extracted_truth: what extracted masks were compared with: "silhouette" (occlusion-free), "visible" (the visible
         masks, without the pixels that other objects cover: what is behind them is unknown), "both", or None.
+    masks, views: the single figures that these means are made of.
     """
 
     mean: ObjectMetrics
     objects: dict[int, ObjectMetrics]
     psnr: float | None
     extracted_truth: str | None
+    ssim: float | None = None
+    masks: tuple[MaskRecord, ...] = ()
+    views: tuple[ViewRecord, ...] = ()
 
 
 def evaluate_scene(
     surfels: Surfels,
-    class_ids: Tensor,
+    class_ids: Tensor | None,
     rasterizer: Rasterizer,
     settings: RasterSettings,
     views: Sequence[EvalView],
     classes: Mapping[int, str],
     *,
+    protocol: Protocol | None = None,
+    complete: bool = True,
     background: Tensor | None = None,
     sh_degree: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> SceneMetrics:
-    """Extracted and rendered Acc, IoU and BIoU of each object, and PSNR.
+    """Extracted and rendered Acc, IoU and BIoU of each object, PSNR and SSIM.
 
-    surfels: N surfels. class_ids: [N] int32, phi. classes: id to name; 0, the background, is not scored.
-    background: [3] behind the images for PSNR; black if None. sh_degree: of the colours; all if None.
-    Every mask counts, empty ones too (both empty: 1). No gradients. Source: method, section 8.
+    surfels: N surfels. class_ids: [N] int32, phi; None if there are none, so that only images are scored.
+    classes: id to name; 0, the background, is not scored. complete: False where surfels were taken out of the scene,
+    so that only objects drawn alone can be scored. background: [3] behind the images; black if None.
+    sh_degree: of the colours; all if None. Empty masks count too. No gradients. Source: method, section 8.
     """
+    protocol = protocol or Protocol()
     surfels = surfels.detach()
-    objects = sorted(class_id for class_id in classes if class_id != 0)
-    drawing = replace(settings, geometry=False, distortion=False)
-    parts = {class_id: select_class(surfels, class_ids, class_id)[0] for class_id in objects}
+    objects = [] if class_ids is None else sorted(class_id for class_id in classes if class_id != 0)
+    settings = replace(settings, geometry=False, distortion=False)
     if background is None:
         background = surfels.means.new_zeros(3)
-    extracted: dict[int, list[MaskMetrics]] = {class_id: [] for class_id in objects}
-    rendered: dict[int, list[MaskMetrics]] = {class_id: [] for class_id in objects}
-    truths: set[str] = set()
-    ratios: list[float] = []
+    masks: list[MaskRecord] = []
+    images: list[ViewRecord] = []
     with torch.no_grad():
-        for done, view in enumerate(views):
-            for class_id in objects:
-                if (truth := extracted_truth(view, class_id)) is not None:
-                    kind, mask, ignore = truth
-                    truths.add(kind)
-                    prediction = extracted_mask(parts[class_id], view.camera, rasterizer, drawing)
-                    extracted[class_id].append(mask_metrics(prediction, mask, ignore))
-            if view.visible is not None:
-                predictions = rendered_masks(surfels, class_ids, objects, view.camera, rasterizer, drawing)
-                for class_id, prediction in predictions.items():
-                    metrics = mask_metrics(prediction, view.visible == class_id, view.visible == IGNORE)
-                    rendered[class_id].append(metrics)
-            if view.image is not None:
-                inputs = surfel_inputs(surfels, view.camera, sh_degree)
-                color = rasterizer.rasterize(inputs, view.camera, drawing, background).color
-                ratios.append(psnr(color.clamp(0, 1), view.image))
+        for index, view in enumerate(views):
+            draw = MaskDrawing(surfels, class_ids, view, rasterizer, settings, protocol)
+            for kind in KINDS if complete else KINDS[:1]:
+                for class_id, mask in draw.masks(kind, objects).items():
+                    metrics = mask_metrics(mask.prediction, mask.truth, mask.ignore, protocol)
+                    masks.append(MaskRecord(kind, class_id, index, mask.source, metrics))
+            image = view.image if complete else None
+            images.append(
+                _score_image(replace(view, image=image), surfels, rasterizer, settings, background, sh_degree)
+            )
             if progress is not None:
-                progress(done + 1, len(views))
+                progress(index + 1, len(views))
+    truths = {record.truth for record in masks if record.kind == "extracted"}
     return SceneMetrics(
-        mean=ObjectMetrics(
-            _mean([m for rows in extracted.values() for m in rows]),
-            _mean([m for rows in rendered.values() for m in rows]),
-        ),
-        objects={c: ObjectMetrics(_mean(extracted[c]), _mean(rendered[c])) for c in objects},
-        psnr=math.fsum(ratios) / len(ratios) if ratios else None,
+        mean=ObjectMetrics(*(average(masks, kind, protocol) for kind in KINDS)),
+        objects={c: ObjectMetrics(*(_object_mean(masks, kind, c) for kind in KINDS)) for c in objects},
+        psnr=mean(image.psnr for image in images),
         extracted_truth="both" if len(truths) == 2 else next(iter(truths), None),
+        ssim=mean(image.ssim for image in images),
+        masks=tuple(masks),
+        views=tuple(images),
     )
 
 
-def _mean(metrics: list[MaskMetrics]) -> MaskMetrics | None:
-    return mean_metrics(metrics) if metrics else None
+def _score_image(
+    view: EvalView,
+    surfels: Surfels,
+    rasterizer: Rasterizer,
+    settings: RasterSettings,
+    background: Tensor,
+    sh_degree: int | None,
+) -> ViewRecord:
+    if view.image is None:
+        return ViewRecord(view.name, None, None)
+    inputs = surfel_inputs(surfels, view.camera, sh_degree)
+    color = rasterizer.rasterize(inputs, view.camera, settings, background).color.clamp(0, 1)
+    return ViewRecord(view.name, psnr(color, view.image), float(ssim(color, view.image.to(color))))
 
 
-def extracted_truth(view: EvalView, class_id: int) -> tuple[str, Tensor, Tensor | None] | None:
+def average(masks: Iterable[MaskRecord], kind: Kind, protocol: Protocol, scene: Hashable = 0) -> MaskMetrics | None:
+    """The scene's mean of one kind of masks, as ``protocol.scene_average`` says; None without any."""
+    return pooled_average({scene: masks}, kind, protocol)
+
+
+def pooled_average(
+    scenes: Mapping[Hashable, Iterable[MaskRecord]], kind: Kind, protocol: Protocol
+) -> MaskMetrics | None:
+    """The mean of one kind of masks of several scenes, as if they were one scene; None without any."""
+    groups: dict[Hashable, list[MaskMetrics]] = {}
+    for scene, masks in scenes.items():
+        for record in masks:
+            if record.kind == kind:
+                key = {"masks": 0, "objects": (scene, record.class_id), "views": (scene, record.view)}
+                groups.setdefault(key[protocol.scene_average], []).append(record.metrics)
+    return mean_metrics(mean_metrics(group) for group in groups.values())
+
+
+def _object_mean(masks: Iterable[MaskRecord], kind: Kind, class_id: int) -> MaskMetrics | None:
+    return mean_metrics(r.metrics for r in masks if r.kind == kind and r.class_id == class_id)
+
+
+@dataclass(frozen=True)
+class DrawnMask:
+    """A predicted mask [H, W] bool and what it is compared with.
+
+    truth: [h, w] bool. ignore: [h, w] bool, pixels that do not count, or None. source: "silhouette" or "visible".
+    """
+
+    prediction: Tensor
+    truth: Tensor
+    ignore: Tensor | None
+    source: str
+
+
+@dataclass(frozen=True)
+class MaskDrawing:
+    """The masks of a labelled scene in one view; arguments as of ``evaluate_scene``."""
+
+    surfels: Surfels
+    class_ids: Tensor | None
+    view: EvalView
+    rasterizer: Rasterizer
+    settings: RasterSettings
+    protocol: Protocol
+
+    def masks(self, kind: Kind, objects: Sequence[int]) -> dict[int, DrawnMask]:
+        """Object id to its mask, for those of ``objects`` that the view has a truth of."""
+        if self.class_ids is None or not objects:
+            return {}
+        view, drawing = self.view, (self.view.camera, self.rasterizer, self.settings, self.protocol.threshold)
+        found = {}
+        if kind == "extracted":
+            for class_id in objects:
+                if (truth := extracted_truth(view, class_id, self.protocol)) is not None:
+                    part = select_class(self.surfels, self.class_ids, class_id)[0]
+                    found[class_id] = DrawnMask(extracted_mask(part, *drawing), truth[1], truth[2], truth[0])
+        elif view.visible is not None:
+            for class_id, prediction in rendered_masks(self.surfels, self.class_ids, objects, *drawing).items():
+                unlabelled = view.visible == IGNORE
+                found[class_id] = DrawnMask(prediction, view.visible == class_id, unlabelled, "visible")
+        return found
+
+
+def extracted_truth(
+    view: EvalView, class_id: int, protocol: Protocol | None = None
+) -> tuple[str, Tensor, Tensor | None] | None:
     """What an extracted object is compared with in a view.
 
     Returns (kind, mask [h, w] bool, pixels to leave out [h, w] bool or None), or None if the view has no mask of it.
@@ -135,19 +238,22 @@ def extracted_truth(view: EvalView, class_id: int) -> tuple[str, Tensor, Tensor 
     """
     if view.silhouettes is not None and class_id in view.silhouettes:
         silhouette = view.silhouettes[class_id]
-        known = None if view.seen is None else view.seen.get(class_id)
+        scored_whole = (protocol or Protocol()).silhouettes == "whole"
+        known = None if scored_whole or view.seen is None else view.seen.get(class_id)
         return "silhouette", silhouette, None if known is None else silhouette & ~known
     if view.visible is None:
         return None
     return "visible", view.visible == class_id, (view.visible != class_id) & (view.visible != 0)
 
 
-def extracted_mask(part: Surfels, camera: Camera, rasterizer: Rasterizer, settings: RasterSettings) -> Tensor:
-    """[H, W] bool: A > 0.5 where only the object's surfels are drawn."""
+def extracted_mask(
+    part: Surfels, camera: Camera, rasterizer: Rasterizer, settings: RasterSettings, threshold: float
+) -> Tensor:
+    """[H, W] bool: A > threshold where only the object's surfels are drawn."""
     if len(part) == 0:
         return torch.zeros(camera.height, camera.width, dtype=torch.bool)
     black = part.means.new_zeros(3)
-    return rasterizer.rasterize(geometry_inputs(part), camera, settings, black).alpha > MASK_THRESHOLD
+    return rasterizer.rasterize(geometry_inputs(part), camera, settings, black).alpha > threshold
 
 
 def rendered_masks(
@@ -157,8 +263,9 @@ def rendered_masks(
     camera: Camera,
     rasterizer: Rasterizer,
     settings: RasterSettings,
+    threshold: float,
 ) -> dict[int, Tensor]:
-    """Object id to [H, W] bool: value > 0.5 of the whole scene with the object 1 and the rest 0, on black.
+    """Object id to [H, W] bool: value > threshold of the whole scene with the object 1 and the rest 0, on black.
 
     Three objects share one drawing, one in each colour channel.
     """
@@ -171,5 +278,5 @@ def rendered_masks(
         for channel, class_id in enumerate(triple):
             colors[:, channel] = (class_ids == class_id).to(colors.dtype)
         value = rasterizer.rasterize(replace(inputs, colors=colors), camera, settings, black).color
-        masks |= {class_id: value[..., channel] > MASK_THRESHOLD for channel, class_id in enumerate(triple)}
+        masks |= {class_id: value[..., channel] > threshold for channel, class_id in enumerate(triple)}
     return masks

@@ -50,6 +50,16 @@ class SavedScene:
         sh = torch.cat([dc[:, None], rest], dim=1)
         return Surfels(state["means"], state["quats"], state["scales"], state["opacities"][:, 0], sh)
 
+    @property
+    def assigned(self) -> bool:
+        """Whether the Gaussians have classes."""
+        return bool(self.state["assigned"])
+
+    @property
+    def class_ids(self) -> Tensor | None:
+        """[N] int32, phi; None before the Gaussians have classes."""
+        return self.state["class_ids"] if self.assigned else None
+
 
 def load_run_config(config_path: Path) -> BeagsTrainerConfig:
     """The config of a run of ours; raises ``UserError`` if the file is none."""
@@ -66,18 +76,24 @@ def load_run_config(config_path: Path) -> BeagsTrainerConfig:
     return config
 
 
-def load_scene(config_path: Path) -> SavedScene:
-    """Read a run's newest checkpoint; raises ``UserError`` if the run is incomplete or no class was assigned."""
+def read_scene(config_path: Path) -> SavedScene:
+    """Read a run's newest checkpoint; raises ``UserError`` if the run is incomplete."""
     config = load_run_config(config_path)
     checkpoint = torch.load(newest_checkpoint(config.get_checkpoint_dir()), map_location="cpu", weights_only=True)
     prefix = "_model."
     state = {name[len(prefix) :]: value for name, value in checkpoint["pipeline"].items() if name.startswith(prefix)}
-    if not bool(state["assigned"]):
+    return SavedScene(config, state, checkpoint["step"], state["_extra_state"]["classes"])
+
+
+def load_scene(config_path: Path) -> SavedScene:
+    """Read a run's newest checkpoint; raises ``UserError`` if the run is incomplete or no class was assigned."""
+    scene = read_scene(config_path)
+    if not scene.assigned:
         raise UserError(
             f"{config_path.parent} is a base without classes: refine it first "
-            f"(ns-train beags-refine --load-dir {config.get_checkpoint_dir()})."
+            f"(ns-train beags-refine --load-dir {scene.config.get_checkpoint_dir()})."
         )
-    return SavedScene(config, state, checkpoint["step"], state["_extra_state"]["classes"])
+    return scene
 
 
 def extract_objects(

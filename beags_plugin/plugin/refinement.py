@@ -18,7 +18,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from beags_plugin.errors import UserError
 from beags_plugin.masks.classes import read_class_map, write_class_map
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.plugin.runs import write_run
+from beags_plugin.plugin.runs import BASE_SNAPSHOT, write_run
 from beags_plugin.progress import progress_bar
 from beags_plugin.refiners import REFINERS
 from beags_plugin.refiners.preparation import Preparation, prepare
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from beags_plugin.plugin.datamanager import BeagsDataManager
     from beags_plugin.plugin.model import BeagsModel
 
-BASE_SNAPSHOT = "base"  # folder of the run that keeps the scene as it was when refinement started
 PREPARED = "prepared"  # folder of the run that keeps masks, grids and what was found
 
 

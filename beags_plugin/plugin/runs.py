@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
 
 
+BASE_SNAPSHOT = "base"  # folder of the run that keeps the scene as it was when refinement started
 TRANSFORM_FILE = "dataparser_transforms.json"  # nerfstudio's name for how the poses were normalised
 
 

@@ -1,0 +1,50 @@
+"""How masks are scored: the choices that papers make differently, each with its default (method, section 8)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal, get_args, get_type_hints
+
+from beags_plugin.errors import UserError
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """The choices behind a figure; the defaults are the paper's where it states them."""
+
+    threshold: float = 0.5
+    """A pixel belongs to a mask where the alpha (extracted) or the drawn value (rendered) is greater."""
+    resize: Literal["prediction", "truth"] = "prediction"
+    """Which of the two masks is brought to the other's size, by nearest pixel."""
+    empty: Literal["one", "zero", "skip"] = "one"
+    """What an IoU or BIoU counts whose union is empty: 1, 0, or nothing (it is left out of the means)."""
+    scene_average: Literal["masks", "objects", "views"] = "masks"
+    """Mean of a scene: over all its masks; or over the means of the objects; or over the means of the views."""
+    data_set_average: Literal["scenes", "pooled"] = "scenes"
+    """Mean of several scenes: over the means of the scenes; or as if all views were of one scene."""
+    band_share: float = 0.02
+    """Width of the boundary band, as a share of the image diagonal; at least one pixel."""
+    silhouettes: Literal["seen", "whole"] = "seen"
+    """Of occlusion-free silhouettes, score what training photos show (where the data says it), or everything."""
+
+    def check(self) -> None:
+        """Raise ``UserError`` for a value that cannot be used."""
+        if not 0.0 <= self.threshold < 1.0:
+            raise UserError(f"threshold is {self.threshold}: give a number from 0 to below 1.")
+        if not (math.isfinite(self.band_share) and self.band_share > 0.0):
+            raise UserError(f"band_share is {self.band_share}: give a positive share of the diagonal, such as 0.02.")
+        types = get_type_hints(Protocol)
+        for field in fields(self):
+            choices, value = get_args(types[field.name]), getattr(self, field.name)
+            if choices and value not in choices:
+                raise UserError(f"{field.name} is {value!r}: choose one of {', '.join(choices)}.")
+
+    def to_json(self) -> dict[str, Any]:
+        """Every choice by name."""
+        return asdict(self)
+
+    @property
+    def empty_value(self) -> float | None:
+        """What an IoU of an empty union counts; None if it is left out."""
+        return {"one": 1.0, "zero": 0.0, "skip": None}[self.empty]

@@ -1,0 +1,195 @@
+"""What an evaluation found, for one run and for several: plain values for JSON, and rows for CSV."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from beags_plugin.evaluation.metrics import METRICS, MaskMetrics, mean, mean_metrics
+from beags_plugin.evaluation.protocol import Protocol
+from beags_plugin.evaluation.run_metrics import KINDS, Kind, ObjectMetrics, SceneMetrics, pooled_average
+
+Stage = Literal["before", "after"]
+STAGES: tuple[Stage, ...] = ("before", "after")
+CSV_COLUMNS = (
+    "scene", "object", "stage", *(f"{kind}_{metric}" for kind in KINDS for metric in METRICS), "psnr", "ssim",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RunMetrics:
+    """The figures of one run.
+
+    scene: its name in tables. config: path of the run. protocol: the choices behind the figures. classes: id to name,
+    with or without the background. before: after assignment alone, None where the run has kept no such state.
+    after: of the run as it is. notes: what a reader of the figures should know, a sentence each.
+    """
+
+    scene: str
+    config: str
+    protocol: Protocol
+    classes: Mapping[int, str]
+    before: SceneMetrics | None
+    after: SceneMetrics
+    notes: tuple[str, ...] = ()
+
+    def stages(self) -> dict[Stage, SceneMetrics]:
+        """The states that there are, in order."""
+        both = {"before": self.before, "after": self.after}
+        return {stage: found for stage in STAGES if (found := both[stage]) is not None}
+
+    def names(self) -> dict[int, str]:
+        """Object id to a name that no other object has: a name used twice gets its id appended."""
+        names = {class_id: self.classes.get(class_id, f"object {class_id}") for class_id in self.after.objects}
+        taken = list(names.values())
+        return {c: f"{name} ({c})" if taken.count(name) > 1 else name for c, name in names.items()}
+
+    def to_json(self) -> dict[str, Any]:
+        """The run as plain values, ready for ``json.dump``; a figure that does not exist or is infinite is None.
+
+        {"scene", "config", "protocol": {choice: value}, "extracted_truth", "notes": [sentence],
+        "mean": {"extracted": {"before": {"acc", "iou", "biou"}, "after": {...}}, "rendered": {...}},
+        "psnr": {"before", "after"}, "ssim": {"before", "after"}, "objects": {name: as mean},
+        "masks": [{"kind", "object", "view", "truth", "before": {"acc", "iou", "biou"}, "after": {...}}],
+        "views": [{"view", "psnr": {"before", "after"}, "ssim": {...}}]}.
+        """
+        names, stages = self.names(), self.stages()
+        view_names = [view.name for view in self.after.views]
+
+        def numbers(pick: Callable[[SceneMetrics], float | None]) -> dict[str, Any]:
+            return {stage: finite(pick(stages[stage])) if stage in stages else None for stage in STAGES}
+
+        def metrics(pick: Callable[[SceneMetrics], MaskMetrics | None]) -> dict[str, Any]:
+            return {stage: plain_metrics(pick(stages[stage]) if stage in stages else None) for stage in STAGES}
+
+        def both_kinds(pick: Callable[[SceneMetrics], ObjectMetrics]) -> dict[str, Any]:
+            return {kind: metrics(lambda scene, kind=kind: getattr(pick(scene), kind)) for kind in KINDS}
+
+        return {
+            "scene": self.scene,
+            "config": self.config,
+            "protocol": self.protocol.to_json(),
+            "extracted_truth": self.after.extracted_truth,
+            "notes": list(self.notes),
+            "mean": both_kinds(lambda scene: scene.mean),
+            "psnr": numbers(lambda scene: scene.psnr),
+            "ssim": numbers(lambda scene: scene.ssim),
+            "objects": {name: both_kinds(lambda scene, c=c: scene.objects[c]) for c, name in names.items()},
+            "masks": [
+                {
+                    "kind": mask.kind,
+                    "object": names[mask.class_id],
+                    "view": view_names[mask.view],
+                    "truth": mask.truth,
+                    **metrics(lambda scene, i=i: scene.masks[i].metrics),
+                }
+                for i, mask in enumerate(self.after.masks)
+            ],
+            "views": [
+                {
+                    "view": name,
+                    "psnr": numbers(lambda scene, i=i: scene.views[i].psnr),
+                    "ssim": numbers(lambda scene, i=i: scene.views[i].ssim),
+                }
+                for i, name in enumerate(view_names)
+            ],
+        }
+
+
+@dataclass(frozen=True)
+class DataSetMetrics:
+    """Runs of one protocol and their mean.
+
+    name: of the data set, in tables. means: stage to the mean of both kinds; psnr, ssim: stage to their means. A stage
+    is compared over the scenes that have it, so "before" is left out unless all scenes with "after" have it.
+    """
+
+    name: str
+    runs: tuple[RunMetrics, ...]
+    means: Mapping[Stage, ObjectMetrics] = field(default_factory=dict)
+    psnr: Mapping[Stage, float | None] = field(default_factory=dict)
+    ssim: Mapping[Stage, float | None] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """{"data_set", "protocol", "mean", "psnr", "ssim" (all three as of a run), "scenes": [run, ...]}."""
+        empty = ObjectMetrics(None, None)
+        return {
+            "data_set": self.name,
+            "protocol": self.runs[0].protocol.to_json(),
+            "mean": {
+                kind: {stage: plain_metrics(getattr(self.means.get(stage, empty), kind)) for stage in STAGES}
+                for kind in KINDS
+            },
+            "psnr": {stage: finite(self.psnr.get(stage)) for stage in STAGES},
+            "ssim": {stage: finite(self.ssim.get(stage)) for stage in STAGES},
+            "scenes": [run.to_json() for run in self.runs],
+        }
+
+    def csv_rows(self) -> list[list[Any]]:
+        """A row per scene, object and stage, then the means; the columns are ``CSV_COLUMNS``, fractions in 0..1."""
+        rows = []
+        for run in self.runs:
+            for stage, scene in run.stages().items():
+                for class_id, name in run.names().items():
+                    rows.append([run.scene, name, stage, *_cells(scene.objects[class_id]), None, None])
+                rows.append([run.scene, "", stage, *_cells(scene.mean), finite(scene.psnr), finite(scene.ssim)])
+        for stage, found in self.means.items():
+            rows.append([self.name, "", stage, *_cells(found), finite(self.psnr[stage]), finite(self.ssim[stage])])
+        return rows
+
+
+def data_set(name: str, runs: Sequence[RunMetrics]) -> DataSetMetrics:
+    """The runs and their mean, as ``protocol.data_set_average`` says; raises ``ValueError`` without runs."""
+    if not runs or len({run.protocol for run in runs}) != 1:
+        raise ValueError("a data set needs runs, all scored by one protocol")
+    protocol = runs[0].protocol
+    kinds: dict[Stage, dict[Kind, MaskMetrics | None]] = {stage: {} for stage in STAGES}
+    for kind in KINDS:
+        for stage, scenes in _comparable(runs, lambda scene, kind=kind: getattr(scene.mean, kind)).items():
+            if protocol.data_set_average == "pooled":
+                groups: dict[Hashable, Any] = {index: scene.masks for index, scene in enumerate(scenes)}
+                kinds[stage][kind] = pooled_average(groups, kind, protocol)
+            else:
+                kinds[stage][kind] = mean_metrics(getattr(scene.mean, kind) for scene in scenes)
+
+    def of_images(metric: Literal["psnr", "ssim"]) -> dict[Stage, float | None]:
+        found: dict[Stage, float | None] = dict.fromkeys(STAGES)
+        for stage, scenes in _comparable(runs, lambda scene: getattr(scene, metric)).items():
+            pooled = protocol.data_set_average == "pooled"
+            units = [view for scene in scenes for view in scene.views] if pooled else scenes
+            found[stage] = mean(getattr(unit, metric) for unit in units)
+        return found
+
+    psnr, ssim = of_images("psnr"), of_images("ssim")
+    means: dict[Stage, ObjectMetrics] = {}
+    for stage in STAGES:
+        figures = ObjectMetrics(kinds[stage].get("extracted"), kinds[stage].get("rendered"))
+        if figures != ObjectMetrics(None, None) or psnr[stage] is not None:
+            means[stage] = figures
+    return DataSetMetrics(name, tuple(runs), means, psnr, ssim)
+
+
+def _comparable(runs: Sequence[RunMetrics], has: Callable[[SceneMetrics], Any]) -> dict[Stage, list[SceneMetrics]]:
+    """Stage to the scenes with a figure; without "before" if some have only "after": a mean of fewer would mislead."""
+    found = [run for run in runs if has(run.after) is not None]
+    scenes: dict[Stage, list[SceneMetrics]] = {"after": [run.after for run in found]}
+    before = [run.before for run in found if run.before is not None and has(run.before) is not None]
+    if len(before) == len(found):
+        scenes = {"before": before, **scenes}
+    return scenes
+
+
+def plain_metrics(metrics: MaskMetrics | None) -> dict[str, float | None]:
+    """{"acc", "iou", "biou"}, each a float or None."""
+    return {name: None if metrics is None else finite(getattr(metrics, name)) for name in METRICS}
+
+
+def _cells(metrics: ObjectMetrics) -> list[float | None]:
+    return [value for kind in KINDS for value in plain_metrics(getattr(metrics, kind)).values()]
+
+
+def finite(value: float | None) -> float | None:
+    """JSON has no infinity: the PSNR of equal images becomes None."""
+    return float(value) if value is not None and math.isfinite(value) else None
