@@ -156,7 +156,8 @@ def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
         assert refined.class_ids is not None
         scenes = (base.surfels(), refined.surfels())
         drawing = (evaluated.rasterizer, evaluated.settings)
-        rows = draw_rows(shown, *scenes, refined.class_ids, objects, *drawing, novel=novel_camera(views))
+        scenery = {"novel": novel_camera(views), "background": views.background}
+        rows = draw_rows(shown, *scenes, refined.class_ids, objects, *drawing, **scenery)
         write_contact_sheet(picture, rows, classes)
     training = json.loads((run / "training.json").read_text())
     stages = {"sample": seconds.pop("sample", 0.0), **training["seconds"], **seconds}

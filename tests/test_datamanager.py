@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import random
+from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,9 @@ import torch
 from data_folders import CX, CY, FX, FY, HEIGHT, WIDTH, noise, write_image, write_transforms
 from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
 
-from beags_plugin.plugin.datamanager import BeagsDataManager, BeagsDataManagerConfig, undistort_class_map, unique_names
+from beags_plugin.plugin.datamanager import BeagsDataManager, BeagsDataManagerConfig, unique_names
 from beags_plugin.plugin.dataparser import BeagsDataParserConfig
+from beags_plugin.plugin.undistortion import undistort_class_map
 from beags_plugin.rasterizers.interface import IGNORE
 
 LARGE_W, LARGE_H = 160, 120
@@ -99,8 +101,12 @@ def test_every_label_comes_from_the_pixel_that_the_image_came_from(tmp_path, mod
     cameras = manager(tmp_path).train_dataset.cameras
     camera, K = cameras[0].reshape(()), cameras[0].get_intrinsics_matrices().numpy()
     ramps = np.stack([columns, rows, columns], axis=2)
-    _, ramps, _ = _undistort_image(camera, camera.distortion_params.numpy(), {}, ramps, K)
-    labels = undistort_class_map((rows * LARGE_W + columns).astype(np.uint16), cameras, 0)
+    straight = deepcopy(cameras)
+    new_K, ramps, _ = _undistort_image(camera, camera.distortion_params.numpy(), {}, ramps, K)
+    for name, value in zip(("fx", "fy", "cx", "cy"), (*np.diag(new_K)[:2], *new_K[:2, 2]), strict=True):
+        getattr(straight, name)[0] = float(value)
+    straight.height[0], straight.width[0] = ramps.shape[:2]
+    labels = undistort_class_map((rows * LARGE_W + columns).astype(np.uint16), cameras, straight, 0)
     assert labels.shape == ramps.shape[:2]
     known = labels != IGNORE
     inside = known & (ramps[..., 0] > 1) & (ramps[..., 1] > 1)  # at the rim the ramp blends with black

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from beags_plugin.evaluation.run_metrics import EvalView, ObjectMetrics, SceneMetrics, evaluate_scene
-from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+from beags_plugin.errors import UserError
+from beags_plugin.evaluation.report import finite
+from beags_plugin.evaluation.run_metrics import ObjectMetrics, SceneMetrics
 
 
 def measure_run(config_path: Path) -> dict[str, Any]:
@@ -18,45 +16,25 @@ def measure_run(config_path: Path) -> dict[str, Any]:
 
     figures: {"psnr": dB, "ssim": 0..1, "extracted": {"acc", "iou", "biou"}, "rendered": {...},
     "objects": {name: {"extracted": {...}, "rendered": {...}}}}; mask figures in 0..1, None where unknown.
-    before: the base with the classes of this very run, which is what assignment alone gives.
+    before: what assignment alone gives, as the run has kept it. Raises ``UserError`` for a run that has not.
     """
-    from beags_plugin.losses.photometric import ssim
-    from beags_plugin.plugin.evaluate import held_out_views, raster_settings
-    from beags_plugin.plugin.extract import load_scene
-    from beags_plugin.rasterizers import make_rasterizer
-    from beags_plugin.rasterizers.drawing import surfel_inputs
+    from beags_plugin.plugin.evaluate import EvaluatedRun
 
-    refined = load_scene(config_path)
-    base = load_scene(config_path.parent / "base" / "config.yml")
-    views = held_out_views(refined.config, refined.classes)
-    settings = raster_settings(refined)
-    rasterizer = make_rasterizer(refined.config.model_config.rasterizer)
-
-    def similarity(surfels, views: Sequence[EvalView], rasterizer: Rasterizer, settings: RasterSettings) -> float:
-        black, values = torch.zeros(3), []
-        with torch.no_grad():
-            for view in views:
-                if view.image is not None:
-                    inputs = surfel_inputs(surfels, view.camera)
-                    color = rasterizer.rasterize(inputs, view.camera, settings, black).color
-                    values.append(float(ssim(color.clamp(0, 1), view.image)))
-        return math.fsum(values) / len(values)
-
-    def figures(surfels) -> dict[str, Any]:
-        metrics = evaluate_scene(surfels, refined.state["class_ids"], rasterizer, settings, views, refined.classes)
-        return {**_plain(metrics, refined.classes), "ssim": similarity(surfels, views, rasterizer, settings)}
-
+    run = EvaluatedRun(config_path)
+    found = run.metrics()
+    if found.before is None:
+        raise UserError(f"{config_path.parent} has kept no base with classes: name a run that refined.")
     return {
-        "before": figures(base.surfels()),
-        "after": figures(refined.surfels()),
-        "gaussians": len(refined.state["class_ids"]),
+        "before": _plain(found.before, found.classes),
+        "after": _plain(found.after, found.classes),
+        "gaussians": len(run.stages["after"].surfels()),
     }
 
 
-def _plain(metrics: SceneMetrics, classes: dict[int, str]) -> dict[str, Any]:
-    psnr = metrics.psnr
+def _plain(metrics: SceneMetrics, classes: Mapping[int, str]) -> dict[str, Any]:
     return {
-        "psnr": psnr if psnr is not None and math.isfinite(psnr) else None,
+        "psnr": finite(metrics.psnr),
+        "ssim": finite(metrics.ssim),
         **_masks(metrics.mean),
         "objects": {classes[class_id]: _masks(found) for class_id, found in metrics.objects.items()},
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -12,16 +12,15 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
+from beags_plugin.evaluation.cells import Square, below, cell, crop, square_around, wrapped, write_picture
 from beags_plugin.evaluation.metrics import resize_nearest
 from beags_plugin.evaluation.run_metrics import EvalView, extracted_truth
 from beags_plugin.extraction.select import select_class
+from beags_plugin.masks.classes import colorize
 from beags_plugin.rasterizers.drawing import surfel_inputs
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
 
-_CAPTION = 18  # pixels of text above each cell
-_GAP = 4  # pixels between cells
-_MARGIN = 0.15  # of the crop, around the object: rims spread outside it
+_WIDTH = 1920  # pixels; a view of many objects goes on below
 _FAINT = 0.1  # alpha from which a stray splat widens the crop
 _CHECKER = (200, 236)  # two greys behind cut-out objects
 _CHECKER_SIDE = 8
@@ -149,49 +148,36 @@ def _rotation_log(rotation: Tensor) -> Tensor:
 def contact_sheet(rows: Sequence[SheetRow], classes: Mapping[int, str], cell_height: int = 220) -> np.ndarray:
     """Put the rows into one picture; objects are cropped alike before and after, and enlarged.
 
-    classes: object id to name. cell_height: pixels of each cell.
+    classes: object id to name. cell_height: pixels of each cell. A row that would be wider than a screen is wrapped.
     Returns [H, W, 3] uint8. Raises ``ValueError`` without rows.
     """
-    from beags_plugin.masks.classes import colorize
-
     if not rows:
         raise ValueError("a contact sheet needs at least one row")
-    objects = sorted(rows[0].before)
-    lines = []
-    for row in rows:
-        height, width = row.render.shape[:2]
-        size = (max(1, round(cell_height * width / height)), cell_height)
-        blank = np.full((height, width, 3), 255, dtype=np.uint8)
-        photo = blank if row.photo is None else row.photo
-        overlay = blank if row.labels is None else _overlay(photo, row.labels, colorize(row.labels))
-        cells = [
-            _cell(photo, size, f"{row.name}: photo" if row.photo is not None else row.name),
-            _cell(overlay, size, "mask" if row.labels is not None else "no mask"),
-            _cell(row.render, size, "render"),
-        ]
-        for class_id in objects:
-            name = classes.get(class_id, f"object {class_id}")
-            window = _window(row, class_id)
-            for stage, image in (("before", row.before[class_id]), ("after", row.after[class_id])):
-                cells.append(
-                    _cell(_cut_out(image, window, cell_height), (cell_height, cell_height), f"{name}, {stage}")
-                )
-        lines.append(np.concatenate([part for cell in cells for part in (cell, _space(cell))], axis=1))
-    widest = max(line.shape[1] for line in lines)
-    padded = [np.pad(line, ((0, _GAP), (0, widest - line.shape[1]), (0, 0)), constant_values=255) for line in lines]
-    return np.concatenate(padded, axis=0)
+    return below([line for row in rows for line in wrapped(_groups(row, classes, cell_height), _WIDTH)])
+
+
+def _groups(row: SheetRow, classes: Mapping[int, str], cell_height: int) -> Iterator[list[np.ndarray]]:
+    """The cells of a row: photo, mask and render; then each object's two."""
+    height, width = row.render.shape[:2]
+    size = (max(1, round(cell_height * width / height)), cell_height)
+    blank = np.full((height, width, 3), 255, dtype=np.uint8)
+    photo = blank if row.photo is None else row.photo
+    overlay = blank if row.labels is None else _overlay(photo, row.labels, colorize(row.labels))
+    yield [
+        cell(photo, size, f"{row.name}: photo" if row.photo is not None else row.name),
+        cell(overlay, size, "mask" if row.labels is not None else "no mask"),
+        cell(row.render, size, "render"),
+    ]
+    square = (cell_height, cell_height)
+    for class_id in sorted(row.before):
+        name, window = classes.get(class_id, f"object {class_id}"), _window(row, class_id)
+        stages = (("before", row.before[class_id]), ("after", row.after[class_id]))
+        yield [cell(_cut_out(image, window, cell_height), square, f"{name}, {stage}") for stage, image in stages]
 
 
 def write_contact_sheet(path: str | Path, rows: Sequence[SheetRow], classes: Mapping[int, str]) -> None:
     """Write ``contact_sheet`` as a PNG; raises ``UserError`` if it cannot be written."""
-    from PIL import Image
-
-    picture = contact_sheet(rows, classes)
-    try:
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(picture).save(path)
-    except (OSError, ValueError) as error:
-        raise UserError(f"the picture {path} cannot be written: {error}.") from error
+    write_picture(path, contact_sheet(rows, classes))
 
 
 def _overlay(photo: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.ndarray:
@@ -203,49 +189,21 @@ def _overlay(photo: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.nd
     return np.where(shown[..., None], mixed, photo).astype(np.uint8)
 
 
-def _window(row: SheetRow, class_id: int) -> tuple[int, int, int]:
-    """(top, left, side) of the square that holds the object before, after and in truth; it may leave the image."""
-    height, width = row.render.shape[:2]
-    shown = np.zeros((height, width), dtype=bool)
+def _window(row: SheetRow, class_id: int) -> Square:
+    """The square that holds the object before, after and in truth."""
+    shown = np.zeros(row.render.shape[:2], dtype=bool)
     for image in (row.before[class_id], row.after[class_id]):
         shown |= image[..., 3] > 255 * _FAINT
     if class_id in row.focus:
         shown |= row.focus[class_id]
-    if not shown.any():
-        return 0, 0, max(height, width)
-    ys, xs = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
-    side = int(max(ys[-1] - ys[0], xs[-1] - xs[0]) + 1)
-    side = max(8, round(side * (1 + 2 * _MARGIN)))
-    return int((ys[0] + ys[-1] + 1 - side) // 2), int((xs[0] + xs[-1] + 1 - side) // 2), side
+    return square_around(shown)
 
 
-def _cut_out(image: np.ndarray, window: tuple[int, int, int], size: int) -> np.ndarray:
+def _cut_out(image: np.ndarray, window: Square, size: int) -> np.ndarray:
     """[size, size, 3] uint8: the window of an [H, W, 4] image, enlarged, over a checkerboard."""
-    top, left, side = window
-    crop = np.zeros((side, side, 4), dtype=np.uint8)
-    y0, x0 = max(top, 0), max(left, 0)
-    y1, x1 = min(top + side, image.shape[0]), min(left + side, image.shape[1])
-    if y1 > y0 and x1 > x0:
-        crop[y0 - top : y1 - top, x0 - left : x1 - left] = image[y0:y1, x0:x1]
-    large = np.stack([resize_nearest(crop[..., i], size, size) for i in range(4)], axis=-1).astype(np.float64)
+    part = crop(image, window)
+    large = np.stack([resize_nearest(part[..., i], size, size) for i in range(4)], axis=-1).astype(np.float64)
     y, x = np.mgrid[:size, :size] // _CHECKER_SIDE
     board = np.where((x + y) % 2, *_CHECKER)[..., None]
     alpha = large[..., 3:] / 255
     return (large[..., :3] * alpha + board * (1 - alpha)).round().astype(np.uint8)
-
-
-def _cell(image: np.ndarray, size: tuple[int, int], caption: str) -> np.ndarray:
-    """[height + caption, width, 3] uint8: the image resized to (width, height) under its caption."""
-    from PIL import Image, ImageDraw
-
-    width, height = size
-    enlarged = image.shape[1] < width  # enlarged pixels stay sharp, so that rims can be judged
-    resample = Image.Resampling.NEAREST if enlarged else Image.Resampling.BOX
-    cell = Image.new("RGB", (width, height + _CAPTION), "white")
-    cell.paste(Image.fromarray(image).resize(size, resample), (0, _CAPTION))
-    ImageDraw.Draw(cell).text((2, 3), caption.encode("latin-1", "replace").decode("latin-1"), fill="black")
-    return np.asarray(cell)
-
-
-def _space(cell: np.ndarray) -> np.ndarray:
-    return np.full((cell.shape[0], _GAP, 3), 255, dtype=np.uint8)

@@ -105,7 +105,7 @@ def mask_metrics(prediction: Any, truth: Any, ignore: Any = None, protocol: Prot
         return np.count_nonzero(a & b & counted) / union if union else protocol.empty_value
 
     total = np.count_nonzero(counted)
-    d = band_width(*true.shape, protocol.band_share)
+    d = band_width(true.shape[0], true.shape[1], protocol.band_share)
     return MaskMetrics(
         acc=np.count_nonzero((predicted == true) & counted) / total if total else 1.0,
         iou=iou(predicted, true),

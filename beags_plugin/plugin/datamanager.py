@@ -11,10 +11,9 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from torch import Tensor
@@ -24,9 +23,10 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.dataparser import BeagsDataParserConfig, absolute
 from beags_plugin.plugin.dataset import BeagsDataset
+from beags_plugin.plugin.undistortion import undistort_alpha, undistort_class_map
 from beags_plugin.rasterizers.interface import IGNORE
 
-OWN_KEYS = ("class_map", "original_class_map")
+OWN_KEYS = ("class_map", "original_class_map", "alpha")
 
 
 @dataclass
@@ -45,7 +45,8 @@ class BeagsDataManagerConfig(FullImageDatamanagerConfig):
 class View:
     """One undistorted view, on the data manager's device.
 
-    image: [H, W, 3] float32 in 0..1. labels: [H, W] int32 class ids or IGNORE; None if the view has no mask.
+    image: [H, W, 3] float32 in 0..1, on black where it has alpha. labels: [H, W] int32 class ids or IGNORE; None if
+    the view has no mask. alpha: [H, W] float32 in 0..1, the image's alpha; None if it is opaque.
     name: the stem of the image file; where several share it, with the folders that tell them apart, joined by "_".
     """
 
@@ -53,14 +54,20 @@ class View:
     image: Tensor
     labels: Tensor | None
     name: str
+    alpha: Tensor | None = None
+
+    def image_on(self, background: Tensor) -> Tensor:
+        """The image [H, W, 3] with ``background`` [3] behind what is transparent."""
+        return self.image if self.alpha is None else self.image + (1.0 - self.alpha)[..., None] * background
 
 
 class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
     """nerfstudio's data manager of full images, for CPUs too, with class maps in every batch.
 
-    Batches hold ``image`` [H, W, 3], ``class_map`` [H, W] uint16 and, once the class maps were replaced,
-    ``original_class_map``, all on the device; a training camera's metadata holds its ``class_map`` too. Training
-    views come in a random order without repetition within a round, given by ``train_cameras_sampling_seed`` alone.
+    Batches hold ``image`` [H, W, 3], ``class_map`` [H, W] uint16, ``alpha`` [H, W] uint8 where the image has it, and,
+    once the class maps were replaced, ``original_class_map``, all on the device; a training camera's metadata holds its
+    ``class_map`` too. Training views come in a random order without repetition within a round, given by
+    ``train_cameras_sampling_seed`` alone.
     """
 
     config: BeagsDataManagerConfig
@@ -69,23 +76,33 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
 
     def __init__(self, config: BeagsDataManagerConfig, *args, **kwargs) -> None:
         super().__init__(config, *args, **kwargs)
+        self._distorted: dict[str, Cameras] = {}
         # nerfstudio draws evaluation views from Python's global generator, which others use too.
         self._eval_order = random.Random(config.train_cameras_sampling_seed)
 
     def _load_images(self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]) -> list[dict]:
         dataset = self.train_dataset if split == "train" else self.eval_dataset
-        distorted = deepcopy(dataset.cameras)  # nerfstudio overwrites intrinsics and sizes while it undistorts
+        # nerfstudio overwrites intrinsics and sizes while it undistorts
+        distorted = self._distorted[split] = deepcopy(dataset.cameras)
         # "cpu" pins memory, which needs CUDA; "gpu" means self.device, whatever that is.
         on_cpu = torch.device(self.device).type == "cpu"
         cache = super()._load_images(split, cache_images_device="gpu" if on_cpu else cache_images_device)
         for index, data in enumerate(cache):
-            class_map = undistort_class_map(data["class_map"].numpy(), distorted, index)
+            lens = (distorted, dataset.cameras, index)
+            class_map = undistort_class_map(data["class_map"].numpy(), *lens)
             if class_map.shape != tuple(data["image"].shape[:2]):
                 raise RuntimeError(f"class map {class_map.shape} and image {data['image'].shape} differ in size")
             data["class_map"] = torch.from_numpy(class_map)
+            if (alpha := dataset.get_alpha(index)) is not None:
+                data["alpha"] = torch.from_numpy(undistort_alpha(alpha, *lens))
             if on_cpu or cache_images_device == "gpu":
-                data["class_map"] = data["class_map"].to(self.device)
+                data.update(self._on_device(data))
         return cache
+
+    def undistort_eval_map(self, class_map: np.ndarray, index: int) -> np.ndarray:
+        """A class map [h, w] of an evaluation view, of any size, as it would be had the camera no lens distortion."""
+        assert self.cached_eval is not None  # the cameras are straightened when the images load
+        return undistort_class_map(class_map, self._distorted["eval"], self.eval_dataset.cameras, index)
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         camera, data = super().next_train(step)
@@ -148,41 +165,11 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
             key = "original_class_map" if original and "original_class_map" in data else "class_map"
             labels = data[key].to(self.device).to(torch.int32)
         camera = camera_from_nerfstudio(dataset.cameras, index).to(self.device)
-        return View(camera, image[..., :3], labels, name)
+        alpha = data["alpha"].to(self.device).float() / 255.0 if "alpha" in data else None
+        return View(camera, image[..., :3], labels, name, alpha)
 
     def _on_device(self, data: dict) -> dict:
         return {key: value.to(self.device) if key in OWN_KEYS else value for key, value in data.items()}
-
-
-def undistort_class_map(class_map: np.ndarray, cameras: Cameras, index: int) -> np.ndarray:
-    """Remove the lens distortion from a class map [H, W] as nerfstudio does from the image; pixels outside: IGNORE.
-
-    cameras: as they were before the images were undistorted. The nearest id is taken: ids never blend.
-    """
-    if cameras.distortion_params is None or not cameras.distortion_params[index].any():
-        return class_map
-    parameters = cameras.distortion_params[index].double().numpy()
-    height, width = class_map.shape
-    K = cameras.get_intrinsics_matrices()[index].double().numpy()
-    K[:2, 2] -= 0.5  # OpenCV's pixel centres are at whole numbers
-    if int(cameras.camera_type[index]) == CameraType.FISHEYE.value:
-        coefficients = parameters[:4]
-        new_K = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
-            K, coefficients, (width, height), np.eye(3), balance=0
-        )
-        map_x, map_y = cv2.fisheye.initUndistortRectifyMap(
-            K, coefficients, np.eye(3), new_K, (width, height), cv2.CV_32FC1
-        )
-        x, y, w, h = 0, 0, width, height
-    else:
-        k1, k2, k3, _, p1, p2 = parameters  # nerfstudio's order; OpenCV wants k1, k2, p1, p2, k3
-        coefficients = np.array([k1, k2, p1, p2, k3])
-        new_K, (x, y, w, h) = cv2.getOptimalNewCameraMatrix(K, coefficients, (width, height), 0)
-        map_x, map_y = cv2.initUndistortRectifyMap(K, coefficients, np.eye(3), new_K, (width, height), cv2.CV_32FC1)
-    straight = cv2.remap(
-        class_map, map_x, map_y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=(IGNORE,)
-    )
-    return np.ascontiguousarray(straight[y : y + h, x : x + w])
 
 
 def unique_names(files: Sequence[Path]) -> list[str]:

@@ -17,13 +17,13 @@ from beags_plugin.rasterizers.interface import IGNORE
 class BeagsDataset(InputDataset):
     """Views of one split: ``image`` [H, W, 3] and ``class_map`` [H, W] uint16, all IGNORE where a view has no mask.
 
-    Images with alpha are put on black. Images are averaged over the area of each new pixel, class maps take the id at
-    its centre; both cover the camera's image from edge to edge.
+    Images with alpha are put on black; ``get_alpha`` gives the alpha. Images are averaged over the area of each new
+    pixel, class maps take the id at its centre; both cover the camera's image from edge to edge.
 
     scale_factor: of the data manager's ``camera_res_scale_factor``, on top of the parser's downscale factor.
     """
 
-    exclude_batch_keys_from_device = ["image", "mask", "class_map"]
+    exclude_batch_keys_from_device = ["image", "mask", "class_map", "alpha"]
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
         super().__init__(dataparser_outputs)  # not the factor: nerfstudio rounds the size down but scales K exactly
@@ -48,6 +48,14 @@ class BeagsDataset(InputDataset):
             pixels = np.array(image.convert("RGB"))
         return resize_area(pixels, *self._sizes[image_idx])
 
+    def get_alpha(self, image_idx: int) -> np.ndarray | None:
+        """The image's alpha [H, W] uint8, before undistortion; None if it is opaque everywhere."""
+        with Image.open(self._dataparser_outputs.image_filenames[image_idx]) as image:
+            if not image.has_transparency_data:
+                return None
+            alpha = np.array(image.convert("RGBA").getchannel("A"))
+        return None if (alpha == 255).all() else resize_area(alpha, *self._sizes[image_idx])
+
     def get_metadata(self, data: dict) -> dict:
         """The class map that belongs to ``data["image_idx"]``."""
         from beags_plugin.masks.classes import read_class_map
@@ -63,7 +71,7 @@ class BeagsDataset(InputDataset):
 
 
 def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Average an image [H, W, C] over the area of each of the ``width`` x ``height`` new pixels."""
+    """Average an image [H, W, C] or [H, W] over the area of each of the ``width`` x ``height`` new pixels."""
     if image.shape[:2] == (height, width):
         return image
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)

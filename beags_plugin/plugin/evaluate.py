@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-import torch
-from torch import Tensor
-
 from beags_plugin.errors import UserError
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.report import RunMetrics, Stage
-from beags_plugin.evaluation.run_metrics import EvalView, SceneMetrics, evaluate_scene
-from beags_plugin.masks.classes import read_class_map
+from beags_plugin.evaluation.run_metrics import SceneMetrics, evaluate_scene
+from beags_plugin.plugin.evaluation_views import HeldOutViews
 from beags_plugin.plugin.extract import SavedScene, read_scene
-from beags_plugin.plugin.runs import BASE_SNAPSHOT
+from beags_plugin.plugin.runs import BASE_SNAPSHOT, EXTRACTION_FILE
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 
@@ -40,32 +36,32 @@ def evaluate_run(
 
 
 class EvaluatedRun:
-    """A run on disk with its held-out views; everything is read when it is first asked for.
+    """A run on disk with its held-out views, which are read when they are first asked for.
 
-    name: of the scene in tables. stages: "before" and "after", or "after" alone, to the saved scenes.
+    name: of the scene in tables. stages: "before" and "after", or "after" alone, to the saved scenes. complete: False
+    for a run of ``beags extract``, which holds a part of a scene. classes: id to name of what can be scored.
     """
 
     def __init__(self, config_path: Path, name: str = "") -> None:
         self.config_path = Path(config_path)
         after = read_scene(self.config_path)
-        snapshot = self.config_path.parent / BASE_SNAPSHOT / "config.yml"
-        before = read_scene(snapshot) if snapshot.exists() and after.assigned else None
         self.stages: dict[Stage, SavedScene] = {"after": after}
-        if before is not None and before.assigned:
+        snapshot = self.config_path.parent / BASE_SNAPSHOT / "config.yml"
+        if after.assigned and snapshot.exists() and (before := read_scene(snapshot)).assigned:
             self.stages = {"before": before, "after": after}
+        self.complete = not (self.config_path.parent / EXTRACTION_FILE).exists()
+        self.classes = after.classes if self.complete else present_classes(after)
         self.name = name or scene_name(after.config)
-        self.classes = after.classes
         self.settings = raster_settings(after)
         self.rasterizer: Rasterizer = make_rasterizer(after.config.model_config.rasterizer)
 
     @cached_property
-    def views(self) -> list[EvalView]:
+    def views(self) -> HeldOutViews:
         """The held-out views; raises ``UserError`` if the run's data cannot be read."""
-        config = self.stages["after"].config
         try:
-            return held_out_views(config, self.classes)
+            return HeldOutViews(self.stages["after"].config, self.classes)
         except UserError as error:
-            raise UserError(f"{self.config_path} names data that cannot be read: {error}") from error
+            raise UserError(f"the data of {self.config_path} cannot be read: {error}") from error
 
     def metrics(self, protocol: Protocol | None = None, progress: Progress | None = None) -> RunMetrics:
         """The figures of all stages; arguments as of ``evaluate_run``."""
@@ -83,6 +79,8 @@ class EvaluatedRun:
                 self.views,
                 self.classes,
                 protocol=protocol,
+                complete=self.complete,
+                background=self.views.background,
                 progress=None if progress is None else lambda done, _, former=former: progress(former + done, total),
             )
         return RunMetrics(
@@ -92,18 +90,29 @@ class EvaluatedRun:
             classes=self.classes,
             before=found.get("before"),
             after=found["after"],
-            notes=self._notes(found["after"]),
+            notes=tuple(self._notes(found["after"])),
         )
 
-    def _notes(self, after: SceneMetrics) -> tuple[str, ...]:
-        notes = []
+    def _notes(self, after: SceneMetrics) -> Iterator[str]:
         if not self.stages["after"].assigned:
-            notes.append("This run has no classes (a base alone), so only images are scored.")
+            yield "This run has no classes (it is a base alone), so only images are scored."
+        elif not after.masks and self.complete:
+            yield "No held-out view has a mask, so only images are scored."
         elif not after.masks:
-            notes.append("No held-out view has a mask, so only images are scored.")
+            yield "No held-out view has a mask of what this extracted run holds, so nothing is scored."
+        elif not self.complete:
+            yield "This run holds a part of a scene, so only objects drawn alone are scored."
         elif "before" not in self.stages:
-            notes.append("This run has kept no state before refinement, so there is nothing to compare with.")
-        return tuple(notes)
+            yield "This run has kept no state before refinement, so there is nothing to compare with."
+        if trained_on := self.views.trained_on():
+            yield f"{trained_on} of these {len(self.views)} views were trained on, so the figures flatter the run."
+
+
+def present_classes(scene: SavedScene) -> dict[int, str]:
+    """Id to name of the classes that have Gaussians."""
+    assert scene.class_ids is not None  # what was extracted has classes
+    present = set(scene.class_ids.unique().tolist())
+    return {class_id: name for class_id, name in scene.classes.items() if class_id in present}
 
 
 def scene_name(config: BeagsTrainerConfig) -> str:
@@ -116,30 +125,3 @@ def raster_settings(scene: SavedScene) -> RasterSettings:
     """Depth range of a saved scene."""
     extent, model = float(scene.state["extent"]), scene.config.model_config
     return RasterSettings(model.near * extent, model.far * extent)
-
-
-def held_out_views(config: BeagsTrainerConfig, classes: dict[int, str]) -> list[EvalView]:
-    """The test views of the run's data, with exact masks and silhouettes where the data has ``ground_truth/``.
-
-    Without it, the data's own masks of those views serve as visible masks.
-    """
-    manager = config.data_config.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
-    truth = manager.eval_dataset.metadata["ground_truth"] or {"masks": None, "silhouettes": {}, "seen": {}}
-    views = []
-    for index, view in enumerate(manager.views("test")):
-        visible = view.labels
-        if truth["masks"] and (exact := truth["masks"][index]) is not None:
-            visible = torch.from_numpy(read_class_map(exact).astype(np.int32))
-        silhouettes, seen = (_per_object(truth[kind], classes, index) for kind in ("silhouettes", "seen"))
-        views.append(EvalView(view.camera, view.image, visible, silhouettes, view.name, seen))
-    return views
-
-
-def _per_object(files: dict[str, list[Path | None]], classes: dict[int, str], view: int) -> dict[int, Tensor] | None:
-    """Object id to its [h, w] bool mask in a view; None if there is none."""
-    masks = {
-        index: torch.from_numpy(read_class_map(path) > 0)
-        for index, name in classes.items()
-        if (path := files[name][view] if name in files else None) is not None
-    }
-    return masks or None

@@ -18,7 +18,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.extraction.ply import write_ply
 from beags_plugin.extraction.select import remove_class, select_class
-from beags_plugin.plugin.runs import TRANSFORM_FILE, newest_checkpoint, write_run
+from beags_plugin.plugin.runs import EXTRACTION_FILE, TRANSFORM_FILE, newest_checkpoint, write_run
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
@@ -125,6 +125,8 @@ def extract_objects(
         title = f"without_{title}" if remove else title
         folder = (output or run / "extracted") / title
         config = write_run(scene.config, folder, _rows(scene.state, index), scene.step)
+        origin = {"object": name, "removed": remove, "run": str(config_path.absolute())}
+        (folder / EXTRACTION_FILE).write_text(json.dumps(origin, indent=2), "utf8")
         ply = folder / f"{title}.ply"
         write_ply(ply, surfels, class_ids[index], transform)
         written.append(Extracted(title, config, ply, len(surfels)))

@@ -65,11 +65,13 @@ class HeldOutCurve:
     @torch.no_grad()
     def _quality(self, view: View) -> tuple[float, float]:
         model = self.model
+        background = model.background_color.to(model.device)
+        image = view.image_on(background)
         drawn = model.rasterizer.rasterize(
             surfel_inputs(model.surfels(), view.camera, model.active_sh_degree()),
             view.camera,
             model.settings(geometry=False),
-            model.background_color.to(model.device),
+            background,
         ).color.clamp(0.0, 1.0)
-        error = (drawn - view.image).square().mean().clamp_min(1e-10)
-        return float(-10.0 * torch.log10(error)), float(ssim(drawn, view.image))
+        error = (drawn - image).square().mean().clamp_min(1e-10)
+        return float(-10.0 * torch.log10(error)), float(ssim(drawn, image))

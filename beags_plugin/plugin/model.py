@@ -72,7 +72,8 @@ class BeagsModelConfig(ModelConfig):
     sh_degree_interval: int = 1000
     """A degree is added every so many steps."""
     background_color: Literal["black", "white", "random"] = "black"
-    """Background behind the scene in training; "random" draws one per step."""
+    """Background behind the scene, and behind images with alpha; "random" draws one per training step, and is black
+    elsewhere."""
     base_steps: int = 30_000
     """Steps of base training; 0 for a refinement that starts from a loaded base."""
     refine_steps: int = 3_000
@@ -107,6 +108,11 @@ class Drawn:
     camera: Camera
     render: RasterOutputs
     means: Tensor
+
+
+def fixed_background(config: BeagsModelConfig) -> Tensor:
+    """[3], the colour behind a scene that is looked at or scored: the one that it was trained on, black for random."""
+    return torch.full((3,), 1.0 if config.background_color == "white" else 0.0)
 
 
 class BeagsModel(SplatfactoModel):
@@ -164,7 +170,7 @@ class BeagsModel(SplatfactoModel):
         self.prepared_seconds: dict[str, float] = {}
         self.refining_since = 0.0
         self.crop_box: OrientedBox | None = None
-        self.background_color = torch.zeros(3)
+        self.background_color = fixed_background(self.config)
         self.drawn: Drawn | None = None
         self.object_choice = ViewerDropdown("Object", EVERYTHING, [EVERYTHING, *self._object_names()])
 
@@ -292,8 +298,7 @@ class BeagsModel(SplatfactoModel):
         if self.config.background_color == "random":
             generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.step)
             return torch.rand(3, generator=generator).to(self.device)
-        value = 1.0 if self.config.background_color == "white" else 0.0
-        return torch.full((3,), value, device=self.device)
+        return fixed_background(self.config).to(self.device)
 
     def shown(self) -> Tensor:
         """[N] bool, the surfels that the viewer's choices leave visible."""
@@ -331,7 +336,11 @@ class BeagsModel(SplatfactoModel):
     # -- losses and metrics --------------------------------------------------------------------------------------------
 
     def _truth(self, batch: dict[str, Any], background: Tensor) -> Tensor:
-        return self.composite_with_background(self.get_gt_img(batch["image"]), background)
+        """The photograph [H, W, 3]; where it is transparent, the background shows, as it does behind the Gaussians."""
+        image = self.get_gt_img(batch["image"])
+        if "alpha" not in batch:
+            return image
+        return image + (1.0 - self.get_gt_img(batch["alpha"])[..., None]) * background  # it comes on black
 
     def get_gt_img(self, image: Tensor) -> Tensor:
         """[H, W, C] float in 0..1 on the model's device; never downscaled."""

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 
 BASE_SNAPSHOT = "base"  # folder of the run that keeps the scene as it was when refinement started
+EXTRACTION_FILE = "extraction.json"  # in a run that holds a part of another: of which, and what was taken
 TRANSFORM_FILE = "dataparser_transforms.json"  # nerfstudio's name for how the poses were normalised
 
 

@@ -1,0 +1,85 @@
+"""The held-out views of a run's data, with all that is known of them, as the nerfstudio-free evaluation wants them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, cast, overload
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.evaluation.metrics import resize_nearest
+from beags_plugin.evaluation.run_metrics import EvalView
+from beags_plugin.masks.classes import read_class_map
+from beags_plugin.plugin.model import fixed_background
+from beags_plugin.rasterizers.interface import IGNORE
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.config import BeagsTrainerConfig
+    from beags_plugin.plugin.datamanager import BeagsDataManager
+
+
+class HeldOutViews(Sequence[EvalView]):
+    """The test views of the data; masks and silhouettes are read when a view is asked for, at the size of their files.
+
+    Visible masks come from ``ground_truth/masks``, or else from the data's own masks; silhouettes from
+    ``ground_truth/silhouettes``, and what training photos show of them from ``ground_truth/seen``. All are undistorted
+    like the photographs. Photographs with alpha stand on the background that the run was trained on.
+    """
+
+    def __init__(self, config: BeagsTrainerConfig, classes: Mapping[int, str]) -> None:
+        manager = config.data_config.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
+        self.manager = cast("BeagsDataManager", manager)
+        self.classes = classes
+        self.background = fixed_background(config.model_config)
+        self._views = self.manager.views("test")
+        self._metadata = self.manager.eval_dataset.metadata
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    @overload
+    def __getitem__(self, index: int) -> EvalView: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[EvalView]: ...
+    def __getitem__(self, index: int | slice) -> EvalView | list[EvalView]:
+        chosen = range(len(self))[index]
+        return self._view(chosen) if isinstance(chosen, int) else [self._view(i) for i in chosen]
+
+    def trained_on(self) -> int:
+        """How many of these views are training views too."""
+        trained = set(self.manager.train_dataset.image_filenames)
+        return sum(path in trained for path in self.manager.eval_dataset.image_filenames)
+
+    def _view(self, index: int) -> EvalView:
+        view = self._views[index]
+        truth = self._metadata["ground_truth"] or {"masks": None, "silhouettes": {}, "seen": {}}
+        exact = truth["masks"][index] if truth["masks"] else None
+        file = exact or self._metadata["class_map_filenames"][index]
+        visible = None if file is None else self._read_ids(file, index)
+        silhouettes = self._per_object(truth["silhouettes"], index)
+        seen = self._per_object(truth["seen"], index)
+        seen = {c: _of_size(mask, silhouettes[c]) for c, mask in seen.items() if c in silhouettes}
+        return EvalView(
+            view.camera, view.image_on(self.background), visible, silhouettes or None, view.name, seen or None
+        )
+
+    def _per_object(self, files: Mapping[str, Sequence[Path | None]], view: int) -> dict[int, Tensor]:
+        """Object id to its [h, w] bool mask in a view, for those that have one."""
+        masks = {}
+        for class_id, name in self.classes.items():
+            file = files[name][view] if name in files else None
+            if file is not None:
+                ids = self.manager.undistort_eval_map(read_class_map(file), view)
+                masks[class_id] = torch.from_numpy((ids != 0) & (ids != IGNORE))
+        return masks
+
+    def _read_ids(self, file: Path, view: int) -> Tensor:
+        ids = read_class_map(file, self._metadata["ignore_ids"])
+        return torch.from_numpy(self.manager.undistort_eval_map(ids, view).astype(np.int32))
+
+
+def _of_size(mask: Tensor, other: Tensor) -> Tensor:
+    return mask if mask.shape == other.shape else torch.from_numpy(resize_nearest(mask.numpy(), *other.shape))

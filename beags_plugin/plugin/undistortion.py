@@ -1,0 +1,63 @@
+"""Removing lens distortion from images of any size, as nerfstudio removes it from the photographs."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from nerfstudio.cameras.cameras import Cameras, CameraType
+
+from beags_plugin.rasterizers.interface import IGNORE
+
+
+def undistort_class_map(class_map: np.ndarray, distorted: Cameras, straight: Cameras, index: int) -> np.ndarray:
+    """Remove the lens distortion from a class map; the nearest id is taken: ids never blend.
+
+    class_map: [h, w], the whole distorted image at any size. distorted, straight: the cameras before and after
+    nerfstudio undistorted (and cropped) the photographs; ``index``: which of them.
+    Returns [h', w'], the whole straight image at the same pixels per camera pixel; outside the lens IGNORE.
+    """
+    maps = _lens_maps(distorted, straight, index, class_map.shape)
+    if maps is None:
+        return class_map
+    options = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": (IGNORE,)}
+    return cv2.remap(class_map, *maps, cv2.INTER_NEAREST, **options)
+
+
+def undistort_alpha(alpha: np.ndarray, distorted: Cameras, straight: Cameras, index: int) -> np.ndarray:
+    """Remove the lens distortion from an alpha channel [h, w] uint8, interpolated; outside the lens 0."""
+    maps = _lens_maps(distorted, straight, index, alpha.shape)
+    return alpha if maps is None else cv2.remap(alpha, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+
+
+def _lens_maps(
+    distorted: Cameras, straight: Cameras, index: int, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Where each pixel of the straight image lies in the distorted one of ``shape`` [h, w], x and y [h', w'] float32.
+
+    None without distortion.
+    """
+    if distorted.distortion_params is None or not distorted.distortion_params[index].any():
+        return None
+    parameters = distorted.distortion_params[index].double().numpy()
+    height, width = shape
+    sizes = [[int(getattr(c, side)[index]) for side in ("width", "height")] for c in (distorted, straight)]
+    (full_width, full_height), (cropped_width, cropped_height) = sizes
+    new_size = (
+        max(1, round(cropped_width * width / full_width)),
+        max(1, round(cropped_height * height / full_height)),
+    )
+    K = _scaled_intrinsics(distorted, index, width / full_width, height / full_height)
+    new_K = _scaled_intrinsics(straight, index, new_size[0] / cropped_width, new_size[1] / cropped_height)
+    if int(distorted.camera_type[index]) == CameraType.FISHEYE.value:
+        return cv2.fisheye.initUndistortRectifyMap(K, parameters[:4], np.eye(3), new_K, new_size, cv2.CV_32FC1)
+    k1, k2, k3, _, p1, p2 = parameters  # nerfstudio's order; OpenCV wants k1, k2, p1, p2, k3
+    coefficients = np.array([k1, k2, p1, p2, k3])
+    return cv2.initUndistortRectifyMap(K, coefficients, np.eye(3), new_K, new_size, cv2.CV_32FC1)
+
+
+def _scaled_intrinsics(cameras: Cameras, index: int, x_factor: float, y_factor: float) -> np.ndarray:
+    """[3, 3] float64, K of the image scaled by these factors, for OpenCV, whose pixel centres are whole numbers."""
+    K = cameras.get_intrinsics_matrices()[index].double().numpy()
+    K = np.diag([x_factor, y_factor, 1.0]) @ K
+    K[:2, 2] -= 0.5
+    return K
