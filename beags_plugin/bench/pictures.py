@@ -46,7 +46,7 @@ def draw(path: Path, experiment: Experiment, rows: Sequence[Row]) -> None:
     for line, sweep in enumerate(experiment.sweeps, start=height):
         for column, curve in enumerate(_CURVES):
             _curves(axes[line, column], [row for row in rows if row.variant.sweep == sweep], sweep, *curve)
-    figure.suptitle(f"{experiment.name}: {experiment.description}", wrap=True)
+    figure.suptitle(experiment.description)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)

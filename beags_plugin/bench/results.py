@@ -18,12 +18,12 @@ KINDS = ("extracted", "rendered")
 MASK_METRICS = ("acc", "iou", "biou")
 MEAN = "mean"  # in the column "object": over all masks of the scene
 _PLACE = ("scene", "seed", "variant", "sweep", "line", "x", "object", "failed")
-_COSTS = (*(f"seconds {stage}" for stage in STAGES), "cpu_seconds", "peak_memory_mb", "steps", "gaussians")
+_COSTS = ("cpu_seconds", "peak_memory_mb", "own_memory_mb", "steps", "gaussians")
 _QUALITY = tuple(f"{metric}_{moment}" for metric in ("psnr", "ssim") for moment in MOMENTS) + tuple(
     f"{kind}_{metric}_{moment}" for kind in KINDS for metric in MASK_METRICS for moment in MOMENTS
 )
 _SCALE = ("voxel_size", "training_pixels")
-FIGURES = (*_QUALITY, *_COSTS, *_SCALE)
+FIGURES = (*_QUALITY, *(f"seconds {stage}" for stage in STAGES), *_COSTS, *_SCALE)
 COLUMNS = (*_PLACE, *FIGURES)
 
 
@@ -57,7 +57,7 @@ def make_row(
     figures |= _quality(result["before"], result["after"])
     seconds = {**result["seconds"], "base training": base["seconds"]["base training"]}
     figures |= {f"seconds {stage}": seconds.get(stage) for stage in STAGES}
-    figures |= {name: result[name] for name in (*_COSTS[len(STAGES) :], *_SCALE)}
+    figures |= {name: result[name] for name in (*_COSTS, *_SCALE)}
     after = result["after"]["objects"]
     objects = {name: _quality(found, after[name]) for name, found in result["before"]["objects"].items()}
     return Row(variant, scene, seed, figures, objects)

@@ -22,6 +22,7 @@ from beags_plugin.errors import UserError
 from beags_plugin.progress import progress_bar
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
+TABLE_WIDTH = 150  # cells that are cut short say nothing: rather let a narrow terminal break the lines
 QUICK_SAMPLE = {"width": 96, "height": 72, "num_train": 16, "num_test": 3}
 QUICK_BASE = {"base_steps": 220, "densify.start": 50, "densify.stop": 180}
 QUICK_REFINE = {"refine_steps": 10}
@@ -62,8 +63,9 @@ def run_experiment(name: str, options: Options) -> list[Row]:
     with progress_bar("Training, in steps") as progress:
         outcomes = run_trials([run.trial for run in runs], options.output / "trials", steps_of, progress)
     rows = rows_of(runs, outcomes)
+    wide = Console(width=max(CONSOLE.width, TABLE_WIDTH), highlight=False, markup=False)
     for table in tables(experiment, rows):
-        CONSOLE.print(table)
+        wide.print(table)
     files = {kind: getattr(options, kind) or options.output / f"{experiment.name}.{end}" for kind, end in _FILES}
     provenance: dict[str, Any] = {
         "command": shlex.join(["beags", *sys.argv[1:]]),

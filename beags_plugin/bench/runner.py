@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from beags_plugin.bench.trials import Trial
 
@@ -40,19 +40,20 @@ def run_trials(
     total = sum(weight(trial) for trial in queue.values())
     outcomes: dict[str, Outcome] = {}
     done = 0
-    for digest, trial in queue.items():
-        base = outcomes[trial.base.digest] if trial.base is not None else None
-        outcomes[digest] = _run(trial, folder / trial.folder_name, base)
-        done += weight(trial)
-        if progress is not None:
-            progress(done, total)
+    with Worker() as worker:
+        for digest, trial in queue.items():
+            base = outcomes[trial.base.digest] if trial.base is not None else None
+            outcomes[digest] = _run(trial, folder / trial.folder_name, base, worker)
+            done += weight(trial)
+            if progress is not None:
+                progress(done, total)
     return outcomes
 
 
-def _run(trial: Trial, folder: Path, base: Outcome | None) -> Outcome:
+def _run(trial: Trial, folder: Path, base: Outcome | None, worker: Worker) -> Outcome:
     if base is not None and base.failed is not None:
         return Outcome(folder, None, f"its base failed: {base.failed}")
-    with _locked(folder) as lock:
+    with _locked(folder):
         if (result := _read(folder / "result.json")) is not None:
             return Outcome(folder, result)
         if folder.exists():
@@ -69,7 +70,7 @@ def _run(trial: Trial, folder: Path, base: Outcome | None) -> Outcome:
             "digest": trial.digest,
         }
         (folder / "trial.json").write_text(json.dumps(request, indent=1))
-        code = _work(folder, lock)
+        code = worker.run(folder)
         if (result := _read(folder / "result.json")) is not None:
             return Outcome(folder, result)
         failed = _read(folder / "failed.json")
@@ -77,13 +78,36 @@ def _run(trial: Trial, folder: Path, base: Outcome | None) -> Outcome:
         return Outcome(folder, None, reason)
 
 
-def _work(folder: Path, lock: IO) -> int:
-    command = [sys.executable, "-m", "beags_plugin.bench.worker", str(folder)]
-    with open(folder / "log.txt", "w") as log:
-        # the lock goes along: should this process be killed, a new one waits for the trial instead of starting it again
-        return subprocess.run(
-            command, stdout=log, stderr=subprocess.STDOUT, pass_fds=(lock.fileno(),), env=_environment()
-        ).returncode
+class Worker:
+    """The program that runs trials, ``worker.serve``; started with the first trial, ended by leaving the context."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[str] | None = None
+
+    def run(self, folder: Path) -> int:
+        """Run the trial in ``folder``; returns the exit code of its process, negative for a signal."""
+        if self._process is None:
+            command = [sys.executable, "-m", "beags_plugin.bench.worker"]
+            self._process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+                env=_environment(),
+            )  # fmt: skip
+        assert self._process.stdin is not None and self._process.stdout is not None
+        try:
+            print(folder.absolute(), file=self._process.stdin, flush=True)
+            return int(self._process.stdout.readline())
+        except (OSError, ValueError):  # the program itself is gone
+            process, self._process = self._process, None
+            process.stdin = None
+            return process.wait()
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process is not None:
+            self._process.terminate()
+            self._process.wait()
 
 
 def _environment() -> dict[str, str]:
@@ -94,11 +118,12 @@ def _environment() -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[IO]:
+def _locked(folder: Path) -> Iterator[None]:
+    """Two programs that want the same trial: the second waits, and finds it done."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with open(folder.parent / f".{folder.name}.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        yield lock
+        yield
 
 
 def _read(path: Path) -> dict[str, Any] | None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import io
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -77,7 +79,8 @@ def damaged_masks(scene: Scene, degree: float, folder: Path) -> Path:
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)
     parser = BeagsDataParserConfig(data=scene.data).setup()
-    splits = {split: parser.get_dataparser_outputs(split) for split in ("test", "train")}
+    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
+        splits = {split: parser.get_dataparser_outputs(split) for split in ("test", "train")}
     stems = [Path(file).stem for file in splits["train"].image_filenames]
     dropped = dropped_views(stems, scene.seed, degradation.dropped)
     for split, outputs in splits.items():  # a view in both is for training

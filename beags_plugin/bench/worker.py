@@ -1,15 +1,20 @@
-"""One trial in a process of its own: ``python -m beags_plugin.bench.worker FOLDER``, with FOLDER/trial.json.
+"""Trials, each in a process of its own: ``python -m beags_plugin.bench.worker`` reads their folders, a line each.
 
-Trains into FOLDER/run, measures, and writes FOLDER/result.json; or FOLDER/failed.json with the reason in a sentence.
+A trial's folder holds trial.json. The worker trains into FOLDER/run, measures, and writes FOLDER/result.json; or
+FOLDER/failed.json with the reason in a sentence. What it prints goes to FOLDER/log.txt. For each folder the program
+prints the exit code of the process that it forked: imports, which take longer than a short trial, are done once.
 """
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import resource
+import signal
 import sys
 import traceback
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +22,50 @@ from beags_plugin.errors import UserError
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
+
+
+PR_SET_PDEATHSIG = 1  # of Linux's prctl
+
+
+def serve() -> None:
+    """Read folders from standard input until it ends."""
+    _import_everything()
+    for line in sys.stdin:
+        child = os.fork()
+        if child == 0:
+            os._exit(_in_child(Path(line.rstrip("\n"))))
+        _, status = os.waitpid(child, 0)
+        print(os.waitstatus_to_exitcode(status), flush=True)
+
+
+def _import_everything() -> None:
+    """Import what a trial needs, but compute nothing: threads would not survive the fork."""
+    from nerfstudio.scripts import train  # noqa: F401
+
+    from beags_plugin.bench import measure  # noqa: F401
+    from beags_plugin.ops import extension
+    from beags_plugin.plugin import evaluate, extract, presets  # noqa: F401
+
+    extension.load()
+
+
+def _in_child(folder: Path) -> int:
+    """The exit code of the trial in ``folder``."""
+    with suppress(OSError, AttributeError):  # Linux: end with the program that waits for the trial
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+    code = 1
+    try:
+        with open(folder / "log.txt", "wb") as log, open(os.devnull) as nothing:
+            os.dup2(nothing.fileno(), 0)
+            os.dup2(log.fileno(), 1)
+            os.dup2(log.fileno(), 2)
+        code = main(folder)
+    except BaseException:  # an interrupt too must not go on in the loop of the parent
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+    return code
 
 
 def main(folder: Path) -> int:
@@ -36,18 +85,20 @@ def main(folder: Path) -> int:
 def run(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
     """Train and measure.
 
-    {"steps", "gaussians", "seconds": {stage: s}, "cpu_seconds", "peak_memory_mb"}; of a refinement also what
+    {"steps", "gaussians", "seconds": {stage: s}, "cpu_seconds", "peak_memory_mb", "own_memory_mb" (of the peak, what
+    the loaded program does not take)}; of a refinement also what
     ``measure.measure_run`` gives, "findings" (a line per stage), "voxel_size" and "training_pixels".
     """
     from beags_plugin.plugin.launch import train
+    from beags_plugin.plugin.refinement import peak_memory_mb
 
+    start_memory_mb = peak_memory_mb()
     config = trial_config(request, run_folder)
     model = config.model_config
     train(config)
-    cpu_seconds = _cpu_seconds()
-    training = json.loads((run_folder / "training.json").read_text())
-    steps = model.base_steps + model.refine_steps
-    result = {"steps": steps, "cpu_seconds": cpu_seconds, **training}
+    result = {"steps": model.base_steps + model.refine_steps, "cpu_seconds": _cpu_seconds()}
+    result |= json.loads((run_folder / "training.json").read_text())
+    result["own_memory_mb"] = result["peak_memory_mb"] - start_memory_mb
     if model.refine_steps == 0:
         return {**result, "gaussians": _gaussians(config)}
     from beags_plugin.bench.measure import measure_run
@@ -107,7 +158,7 @@ def _pixels(masks: Path) -> int:
 
 
 def _cpu_seconds() -> float:
-    """Of this process so far, start and loading included: it does not grow while other programs have the cores."""
+    """Of this process so far: it does not grow while other programs have the cores."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
 
@@ -124,4 +175,4 @@ def _write(path: Path, content: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1])))
+    serve()
