@@ -93,16 +93,15 @@ def load_experiment(name: str) -> Experiment:
 
 def check_keys(experiment: Experiment, source: Path) -> None:
     """Raise ``UserError`` unless the preset exists and takes every override of every variant."""
-    from beags_plugin.plugin.presets import load_preset, override, preset_names
+    from beags_plugin.plugin.presets import preset_config, preset_names
 
     if experiment.preset not in preset_names():
         raise UserError(
             f"{source}: there is no preset {experiment.preset!r}: choose one of {', '.join(preset_names())}."
         )
     for variant in experiment.variants:
-        config = load_preset(experiment.preset).config
-        for key, value in [*variant.base.items(), *variant.refine.items()]:
-            override(config, key, value, source)
+        for overrides in (variant.base, variant.refine):
+            preset_config(experiment.preset, overrides, source)
 
 
 class _Reader:

@@ -2,47 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from beags_plugin.errors import UserError
-from beags_plugin.evaluation.report import finite
-from beags_plugin.evaluation.run_metrics import ObjectMetrics, SceneMetrics
+from beags_plugin.rasterizers.interface import IGNORE
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.training_masks import TrainingMasks
 
 
 def measure_run(config_path: Path) -> dict[str, Any]:
-    """{"before": figures, "after": figures, "gaussians": n} of a run that refined (or only assigned).
+    """{"evaluation", "mask_error_given", "mask_error_used"} of a refined run.
 
-    figures: {"psnr": dB, "ssim": 0..1, "extracted": {"acc", "iou", "biou"}, "rendered": {...},
-    "objects": {name: {"extracted": {...}, "rendered": {...}}}}; mask figures in 0..1, None where unknown.
-    before: what assignment alone gives, as the run has kept it. Raises ``UserError`` for a run that has not.
+    evaluation: ``RunMetrics.to_json`` without its single masks and views; its "before" is the base with the classes of
+    this very run, which is what assignment alone gives. mask_error_...: see ``mask_errors``.
     """
-    from beags_plugin.plugin.evaluate import EvaluatedRun
+    from beags_plugin.plugin.evaluate import evaluate_run
+    from beags_plugin.plugin.extract import load_run_config
+    from beags_plugin.plugin.training_masks import training_masks
 
-    run = EvaluatedRun(config_path)
-    found = run.metrics()
-    if found.before is None:
-        raise UserError(f"{config_path.parent} has kept no base with classes: name a run that refined.")
-    return {
-        "before": _plain(found.before, found.classes),
-        "after": _plain(found.after, found.classes),
-        "gaussians": len(run.stages["after"].surfels()),
-    }
+    found = evaluate_run(config_path).to_json()
+    evaluation = {name: value for name, value in found.items() if name not in ("masks", "views")}
+    return {"evaluation": evaluation, **mask_errors(training_masks(load_run_config(config_path)))}
 
 
-def _plain(metrics: SceneMetrics, classes: Mapping[int, str]) -> dict[str, Any]:
-    return {
-        "psnr": finite(metrics.psnr),
-        "ssim": finite(metrics.ssim),
-        **_masks(metrics.mean),
-        "objects": {classes[class_id]: _masks(found) for class_id, found in metrics.objects.items()},
-    }
+def mask_errors(views: Sequence[TrainingMasks]) -> dict[str, float | None]:
+    """{"mask_error_given", "mask_error_used"}: shares in 0..1 of wrong pixels in the training masks, as the data has
+    them and after reprojection; over the pixels that are labelled in both the mask and the truth; None without truth.
+    """
 
+    def error(kind: str) -> float | None:
+        wrong = counted = 0
+        for view in views:
+            mask = getattr(view, kind)
+            if mask is not None and view.exact is not None:
+                known = (mask != IGNORE) & (view.exact != IGNORE)
+                wrong += int(((mask != view.exact) & known).sum())
+                counted += int(known.sum())
+        return wrong / counted if counted else None
 
-def _masks(metrics: ObjectMetrics) -> dict[str, Any]:
-    kinds = {"extracted": metrics.extracted, "rendered": metrics.rendered}
-    return {
-        kind: None if found is None else {"acc": found.acc, "iou": found.iou, "biou": found.biou}
-        for kind, found in kinds.items()
-    }
+    return {f"mask_error_{kind}": error(kind) for kind in ("given", "used")}

@@ -84,21 +84,27 @@ def _bars(
 
 
 def _curves(axes: Axes, rows: Sequence[Row], sweep: str, metric: str, title: str, factor: float) -> None:
-    """Thick lines: means; thin: scenes; a colour per line of the sweep."""
+    """Thick lines: means; dashed: of assignment alone; thin: scenes; a colour per line of the sweep."""
     lines = list(dict.fromkeys(row.variant.line for row in rows))
     for line, color in zip(lines, _colors(len(lines)), strict=True):
         of_line = [row for row in rows if row.variant.line == line]
         for scene, seed in dict.fromkeys((row.scene, row.seed) for row in of_line):
             points = _points([row for row in of_line if (row.scene, row.seed) == (scene, seed)], metric, factor)
             axes.plot(*points, lw=0.6, alpha=0.6, color=color)
-        axes.plot(*_points(means(of_line), metric, factor), "o-", lw=2, ms=4, color=color, label=line or None)
+        averaged = means(of_line)
+        axes.plot(*_points(averaged, metric, factor), "o-", lw=2, ms=4, color=color, label=line or "refined")
+        if metric.endswith("_after"):
+            before = _points(averaged, metric.replace("_after", "_before"), factor)
+            label = ", ".join(filter(None, [line, "assignment alone"]))
+            axes.plot(*before, "--", lw=1.2, color=color, label=label)
     values = [row.variant.x for row in rows if row.variant.x is not None]
     if min(values) > 0 and max(values) / min(values) > _LOGARITHMIC:
         axes.set_xscale("log")
     if title.startswith("peak"):
         axes.set_ylim(bottom=0)
-    if lines != [""]:
-        axes.legend(fontsize="small")
+    if title.startswith("extracted IoU"):
+        axes.legend(fontsize="x-small")
+    axes.ticklabel_format(axis="y", useOffset=False)
     axes.set_xlabel(sweep)
     axes.set_title(title)
 

@@ -11,19 +11,20 @@ from pathlib import Path
 from typing import Any
 
 from beags_plugin.bench.experiment import Experiment, Variant
+from beags_plugin.evaluation.metrics import METRICS
+from beags_plugin.evaluation.report import STAGES as MOMENTS
+from beags_plugin.evaluation.run_metrics import KINDS
 
 STAGES = ("base training", "reprojection", "assignment", "voxel grids", "refinement")
-MOMENTS = ("before", "after")  # refinement
-KINDS = ("extracted", "rendered")
-MASK_METRICS = ("acc", "iou", "biou")
 MEAN = "mean"  # in the column "object": over all masks of the scene
 _PLACE = ("scene", "seed", "variant", "sweep", "line", "x", "object", "failed")
 _COSTS = ("cpu_seconds", "peak_memory_mb", "own_memory_mb", "steps", "gaussians")
 _QUALITY = tuple(f"{metric}_{moment}" for metric in ("psnr", "ssim") for moment in MOMENTS) + tuple(
-    f"{kind}_{metric}_{moment}" for kind in KINDS for metric in MASK_METRICS for moment in MOMENTS
+    f"{kind}_{metric}_{moment}" for kind in KINDS for metric in METRICS for moment in MOMENTS
 )
+_MASKS = ("mask_error_given", "mask_error_used")
 _SCALE = ("voxel_size", "training_pixels")
-FIGURES = (*_QUALITY, *(f"seconds {stage}" for stage in STAGES), *_COSTS, *_SCALE)
+FIGURES = (*_QUALITY, *(f"seconds {stage}" for stage in STAGES), *_COSTS, *_MASKS, *_SCALE)
 COLUMNS = (*_PLACE, *FIGURES)
 
 
@@ -54,24 +55,24 @@ def make_row(
     if base is None or result is None:
         return Row(variant, scene, seed, dict.fromkeys(FIGURES), {}, failed or "it has no result")
     figures: dict[str, float | None] = dict.fromkeys(FIGURES)
-    figures |= _quality(result["before"], result["after"])
+    evaluation = result["evaluation"]
+    figures |= _masks(evaluation["mean"])
+    figures |= {f"{metric}_{m}": evaluation[metric][m] for metric in ("psnr", "ssim") for m in MOMENTS}
     seconds = {**result["seconds"], "base training": base["seconds"]["base training"]}
     figures |= {f"seconds {stage}": seconds.get(stage) for stage in STAGES}
-    figures |= {name: result[name] for name in (*_COSTS, *_SCALE)}
-    after = result["after"]["objects"]
-    objects = {name: _quality(found, after[name]) for name, found in result["before"]["objects"].items()}
+    figures |= {name: result[name] for name in (*_COSTS, *_MASKS, *_SCALE)}
+    objects = {name: _masks(found) for name, found in evaluation["objects"].items()}
     return Row(variant, scene, seed, figures, objects)
 
 
-def _quality(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, float | None]:
-    figures: dict[str, float | None] = {}
-    for moment, found in zip(MOMENTS, (before, after), strict=True):
-        for metric in ("psnr", "ssim"):
-            figures[f"{metric}_{moment}"] = found.get(metric)
-        for kind in KINDS:
-            for metric in MASK_METRICS:
-                figures[f"{kind}_{metric}_{moment}"] = None if found[kind] is None else found[kind][metric]
-    return figures
+def _masks(found: Mapping[str, Any]) -> dict[str, float | None]:
+    """Mask figures of ``RunMetrics.to_json``, {kind: {moment: {metric: value}}}, by their names here."""
+    return {
+        f"{kind}_{metric}_{moment}": found[kind][moment][metric]
+        for kind in KINDS
+        for metric in METRICS
+        for moment in MOMENTS
+    }
 
 
 def means(rows: Sequence[Row]) -> list[Row]:

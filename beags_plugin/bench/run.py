@@ -22,7 +22,7 @@ from beags_plugin.errors import UserError
 from beags_plugin.progress import progress_bar
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
-TABLE_WIDTH = 150  # cells that are cut short say nothing: rather let a narrow terminal break the lines
+TABLE_WIDTH = 170  # cells that are cut short say nothing: rather let a narrow terminal break the lines
 QUICK_SAMPLE = {"width": 96, "height": 72, "num_train": 16, "num_test": 3}
 QUICK_BASE = {"base_steps": 220, "densify.start": 50, "densify.stop": 180}
 QUICK_REFINE = {"refine_steps": 10}
@@ -48,6 +48,7 @@ def run_experiment(name: str, options: Options) -> list[Row]:
 
     Raises ``UserError`` for a mistake in the experiment or the options; a trial that fails is a row that says so.
     """
+    from beags_plugin.bench.confidence import draw_confidence
     from beags_plugin.bench.pictures import draw
     from beags_plugin.bench.provenance import commit, describe_machine
     from beags_plugin.bench.tables import tables
@@ -76,6 +77,9 @@ def run_experiment(name: str, options: Options) -> list[Row]:
     write_json(files["json"], report_json(experiment, rows, provenance))
     write_csv(files["csv"], rows)
     draw(files["picture"], experiment, rows)
+    if experiment.confidence:
+        files["confidence"] = files["picture"].with_stem(files["picture"].stem + "-confidence")
+        draw_confidence(files["confidence"], runs, outcomes)
     for kind, path in files.items():
         CONSOLE.print(f"{kind}: {path}")
     return rows

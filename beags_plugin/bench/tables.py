@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 _HEAD = (
     "extracted\nIoU",
     "\nBIoU",
-    "BIoU error\nleft, %",
     "rendered\nIoU",
     "\nBIoU",
     "PSNR, dB\nbefore",
@@ -52,10 +51,17 @@ def _table(experiment: Experiment, rows: Sequence[Row], title: str) -> Table:
     from rich.text import Text
 
     table = Table(title=Text(title), title_justify="left", box=SIMPLE)
-    table.add_column("variant")
+    table.add_column("variant", no_wrap=True)
     relative = any(row.variant.sweep in experiment.relative_to_pixels for row in rows)
     if relative:
         table.add_column("per 10^6\npixels", justify="right")
+    compared = experiment.reference is not None
+    masks = experiment.confidence and any(row.figures["mask_error_given"] is not None for row in rows)
+    if masks:
+        table.add_column("wrong, %\ngiven", justify="right")
+        table.add_column("mask pixels\nused", justify="right")
+    if compared:
+        table.add_column("BIoU error\nleft, %", justify="right")
     for head in _HEAD:
         table.add_column(head, justify="right")
     reference = find_reference(rows, experiment, rows[0].scene) if rows else None
@@ -66,7 +72,11 @@ def _table(experiment: Experiment, rows: Sequence[Row], title: str) -> Table:
         former = (row.variant.sweep, row.variant.line)
         name = row.variant.name + (f" ({row.count} of {row.count + row.failures} scenes)" if row.failures else "")
         cells = [per_million_pixels(row, experiment)] if relative else []
-        table.add_row(Text(name), *cells, *(["failed"] if row.failed else _cells(row, reference)))
+        if masks:
+            cells += [number(_percent(row.figures[f"mask_error_{kind}"]), 2) for kind in ("given", "used")]
+        if compared:
+            cells.append(percent(error_left(row, reference)))
+        table.add_row(Text(name), *cells, *(["failed"] if row.failed else _cells(row)))
     return table
 
 
@@ -78,14 +88,12 @@ def per_million_pixels(row: Row, experiment: Experiment) -> str:
     return f"{1e6 * row.variant.x / pixels:.3g}"
 
 
-def _cells(row: Row, reference: Row | None) -> list[str]:
+def _cells(row: Row) -> list[str]:
     figures = row.figures
     prepare = [figures[f"seconds {stage}"] for stage in STAGES[1:-1]]
-    left = error_left(row, reference)
     return [
         percent(figures["extracted_iou_after"]),
         percent(figures["extracted_biou_after"]),
-        percent(left),
         percent(figures["rendered_iou_after"]),
         percent(figures["rendered_biou_after"]),
         number(figures["psnr_before"], 2),
@@ -128,4 +136,8 @@ def number(value: float | None, digits: int) -> str:
 
 def percent(value: float | None) -> str:
     """A share in percent."""
-    return number(None if value is None else 100 * value, 1)
+    return number(_percent(value), 1)
+
+
+def _percent(share: float | None) -> float | None:
+    return None if share is None else 100 * share

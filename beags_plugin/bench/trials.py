@@ -96,10 +96,7 @@ def plan(
 
 def steps_of(trial: Trial) -> int:
     """How many steps it trains; raises ``UserError`` for overrides that the config does not take."""
-    from beags_plugin.plugin.presets import load_preset, override
+    from beags_plugin.plugin.presets import preset_config
 
-    config = load_preset(trial.preset).config
-    for key, value in trial.overrides.items():
-        override(config, key, value, Path(trial.scene.name))
-    model = config.pipeline.model
-    return model.base_steps + model.refine_steps  # type: ignore[attr-defined]
+    model = preset_config(trial.preset, trial.overrides, Path(trial.scene.name)).model_config
+    return model.base_steps + model.refine_steps

@@ -16,12 +16,13 @@ import sys
 import traceback
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from beags_plugin.errors import UserError
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
+    from beags_plugin.plugin.dataparser import BeagsDataParserConfig
 
 
 PR_SET_PDEATHSIG = 1  # of Linux's prctl
@@ -105,6 +106,7 @@ def run(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
 
     del result["seconds"]["base training"]  # that of loading one
     prepared = run_folder / "prepared"
+    result["gaussians"] = _gaussians(config)
     result["findings"] = json.loads((prepared / "report.json").read_text())["findings"]
     result["voxel_size"] = _voxel_size(prepared / "grid.pt")
     result["training_pixels"] = _pixels(prepared / "masks")
@@ -113,23 +115,22 @@ def run(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
 
 def trial_config(request: dict[str, Any], run_folder: Path) -> BeagsTrainerConfig:
     """The preset's config with the trial's overrides, data and seed."""
-    from beags_plugin.plugin.presets import load_preset, override
+    from beags_plugin.plugin.presets import preset_config
 
-    config = load_preset(request["preset"]).config
+    config = preset_config(request["preset"], request["overrides"], Path("trial.json"))
     config.run_dir = run_folder
     config.vis = "tensorboard"
     config.steps_per_eval_image = 0  # held-out views are for the end
     config.machine.seed = request["seed"]
     data = config.data_config
     data.train_cameras_sampling_seed = request["seed"]
-    data.dataparser.data = Path(request["data"])
-    data.dataparser.downscale_factor = request["downscale"]
+    parser = cast("BeagsDataParserConfig", data.dataparser)
+    parser.data = Path(request["data"])
+    parser.downscale_factor *= request["downscale"]  # a variant may shrink the images further
     if request["masks"] is not None:
-        data.dataparser.masks_path = Path(request["masks"])
+        parser.masks_path = Path(request["masks"])
     if request["base"] is not None:
         config.load_dir = Path(request["base"]) / "nerfstudio_models"
-    for key, value in request["overrides"].items():
-        override(config, key, value, Path("trial.json"))
     return config
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from nerfstudio.plugins.types import MethodSpecification
 
@@ -38,6 +39,14 @@ def load_preset(name: str, folder: Path | None = None) -> MethodSpecification:
     for key, value in content.get("overrides", {}).items():
         override(config, key, value, path)
     return MethodSpecification(config=config, description=content["description"])
+
+
+def preset_config(name: str, overrides: Mapping[str, Any], source: Path) -> BeagsTrainerConfig:
+    """The config of a preset with ``overrides`` besides; source: the file to blame for a wrong one (``UserError``)."""
+    config = cast(BeagsTrainerConfig, load_preset(name).config)
+    for key, value in overrides.items():
+        override(config, key, value, source)
+    return config
 
 
 def override(config: BeagsTrainerConfig, key: str, value: Any, source: Path) -> None:
