@@ -48,7 +48,7 @@ void bind(nb::module_& m, const char* name) {
                                    log_scales.data(),
                                    opacity_logits.data(),
                                    colors.data(),
-                                   data(class_ids)};
+                                   class_ids.data()};
             nb::gil_scoped_release release;
             new (self) Frame<T>(view, inputs, visible.data(), threads);
           },
@@ -60,9 +60,9 @@ void bind(nb::module_& m, const char* name) {
           [](Frame<T>& self, In background, Ids target, Out color, Out alpha, Out depth, Out median_depth, Out normal,
              Out distortion, Out boundary, bool keep, int threads) {
             nb::gil_scoped_release release;
-            self.forward({data(color), data(alpha), data(depth), data(median_depth), data(normal), data(distortion),
-                          data(boundary)},
-                         background.data(), data(target), keep, threads);
+            self.forward({color.data(), alpha.data(), depth.data(), median_depth.data(), normal.data(),
+                          distortion.data(), boundary.data()},
+                         background.data(), target.data(), keep, threads);
           },
           "background"_a, "target"_a.none(), "color"_a, "alpha"_a, "depth"_a.none(), "median_depth"_a.none(),
           "normal"_a.none(), "distortion"_a.none(), "boundary"_a.none(), "keep"_a, "threads"_a)
@@ -79,11 +79,11 @@ void bind(nb::module_& m, const char* name) {
                                    colors.data(),
                                    nullptr};
             nb::gil_scoped_release release;
-            self.backward(inputs, data(target),
-                          {data(color), data(alpha), data(depth), data(median_depth), data(normal), data(distortion),
-                           data(boundary)},
-                          {data(g_means), data(g_quats), data(g_log_scales), data(g_opacity_logits), data(g_colors),
-                           data(g_background)},
+            self.backward(inputs, target.data(),
+                          {color.data(), alpha.data(), depth.data(), median_depth.data(), normal.data(),
+                           distortion.data(), boundary.data()},
+                          {g_means.data(), g_quats.data(), g_log_scales.data(), g_opacity_logits.data(),
+                           g_colors.data(), g_background.data()},
                           threads);
           },
           "means"_a, "quats"_a, "log_scales"_a, "opacity_logits"_a, "colors"_a, "target"_a.none(), "color"_a.none(),

@@ -30,7 +30,7 @@ void bind(nb::module_& m, const std::string& suffix) {
         job.c2 = static_cast<T>(c2);
         job.l1_scale = static_cast<T>(l1_scale);
         job.ssim_scale = static_cast<T>(ssim_scale);
-        job.gradient = data(gradient);
+        job.gradient = gradient.data();
         PhotometricSums sums;
         {
           nb::gil_scoped_release release;
@@ -54,8 +54,8 @@ void bind(nb::module_& m, const std::string& suffix) {
           job.normal = normal.data();
           job.alpha = alpha.data();
           job.scale = static_cast<T>(scale);
-          job.g_depth = data(g_depth);
-          job.g_normal = data(g_normal);
+          job.g_depth = g_depth.data();
+          job.g_normal = g_normal.data();
           nb::gil_scoped_release release;
           return normal_consistency(job, threads);
         },

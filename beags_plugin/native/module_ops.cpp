@@ -89,10 +89,10 @@ void bind_functions(nb::module_& m, const char* suffix) {
           job.samples = samples;
           job.background = background;
           job.factor = 1.0 / (count && samples ? static_cast<double>(count) * static_cast<double>(samples) : 1.0);
-          job.g_means = data(g_means);
-          job.g_quats = data(g_quats);
-          job.g_log_scales = data(g_log_scales);
-          job.g_opacity_logits = data(g_opacity_logits);
+          job.g_means = g_means.data();
+          job.g_quats = g_quats.data();
+          job.g_log_scales = g_log_scales.data();
+          job.g_opacity_logits = g_opacity_logits.data();
           OccupancyResult result;
           {
             nb::gil_scoped_release release;
@@ -129,8 +129,8 @@ void bind_functions(nb::module_& m, const char* suffix) {
           job.means = means.data();
           job.clamped = clamped.data();
           job.g_colors = g_colors.data();
-          job.g_sh = data(g_sh);
-          job.g_means = data(g_means);
+          job.g_sh = g_sh.data();
+          job.g_means = g_means.data();
           nb::gil_scoped_release release;
           sh_colors_backward(job, static_cast<int64_t>(sh.shape(0)), threads);
         },
