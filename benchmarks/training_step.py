@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from beags_plugin.core.adam import clear_gradients, step_all
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.boundary import BoundaryLoss
@@ -62,15 +63,13 @@ class TrainingStep:
     def run(self) -> Seconds:
         """One step; how long it takes."""
         start = Seconds.now()
-        for optimizer in self.optimizers:
-            optimizer.zero_grad()
+        clear_gradients(self.optimizers)
         surfels = self._surfels()
         class_ids = self.scene.class_ids if self.refining else None
         render = self._rasterize(surfel_inputs(surfels, self.scene.camera, class_ids=class_ids))
         inputs = self._loss_inputs(surfels, render)
         torch.stack([loss.weight * loss.value(inputs) for loss in self.losses.values()]).sum().backward()
-        for optimizer in self.optimizers:
-            optimizer.step()
+        step_all(self.optimizers)
         self.step += 1
         return Seconds.now() - start
 
@@ -84,8 +83,7 @@ class TrainingStep:
             seconds[part] = Seconds.now() - clock
             clock = Seconds.now()
 
-        for optimizer in self.optimizers:
-            optimizer.zero_grad()
+        clear_gradients(self.optimizers)
         surfels = self._surfels()
         class_ids = self.scene.class_ids if self.refining else None
         inputs = surfel_inputs(surfels, self.scene.camera, class_ids=class_ids)
@@ -108,8 +106,7 @@ class TrainingStep:
         stop("rasterizer backward")
         torch.autograd.backward([getattr(inputs, name) for name in names], [getattr(cut, name).grad for name in names])
         stop("rest of the backward")
-        for optimizer in self.optimizers:
-            optimizer.step()
+        step_all(self.optimizers)
         stop("Adam")
         self.step += 1
         return seconds

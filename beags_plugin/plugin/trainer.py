@@ -14,6 +14,7 @@ from rich.markup import escape
 
 from beags_plugin.errors import UserError
 from beags_plugin.plugin.held_out import HeldOutCurve
+from beags_plugin.plugin.optimizers import JointOptimizers
 from beags_plugin.plugin.refinement import peak_memory_mb
 from beags_plugin.plugin.runs import newest_checkpoint, save_atomically
 
@@ -51,6 +52,10 @@ class BeagsTrainer(Trainer):
             super().setup(test_mode)
         except UserError as error:
             _stop(error)
+
+    def setup_optimizers(self) -> JointOptimizers:
+        """The optimizers that the config lists, one for each group of parameters."""
+        return JointOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
 
     def train(self) -> None:
         """Train to the end of the schedule, also after a resume (nerfstudio would train that many steps more)."""

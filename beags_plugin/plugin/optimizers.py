@@ -1,0 +1,24 @@
+"""nerfstudio's optimizers, one for each group of parameters, stepped together."""
+
+from __future__ import annotations
+
+from nerfstudio.engine.optimizers import Optimizers
+from torch.cuda.amp.grad_scaler import GradScaler
+
+from beags_plugin.core.adam import clear_gradients, step_all
+
+
+class JointOptimizers(Optimizers):
+    """``Optimizers`` whose groups are cleared and stepped in one go; optimizers, states and files are nerfstudio's."""
+
+    def zero_grad_some(self, param_groups: list[str]) -> None:
+        """See ``Optimizers.zero_grad_some``."""
+        clear_gradients(self.optimizers[name] for name in param_groups)
+
+    def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
+        """See ``Optimizers.optimizer_scaler_step_some``; scaled or clipped gradients go nerfstudio's way."""
+        if grad_scaler.is_enabled():
+            return super().optimizer_scaler_step_some(grad_scaler, param_groups)
+        clipped = [name for name in param_groups if self.config[name]["optimizer"].max_norm is not None]
+        super().optimizer_scaler_step_some(grad_scaler, clipped)
+        step_all(self.optimizers[name] for name in param_groups if name not in clipped)
