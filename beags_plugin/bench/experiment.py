@@ -200,7 +200,10 @@ class _Reader:
 
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise self.wrong(f"damage is {value!r}: give a number (1 is mild, 2 strong).")
-        degradation_of_degree(float(value))
+        try:
+            degradation_of_degree(float(value))
+        except UserError as error:
+            raise self.wrong(f"damage: {error}") from None
         return float(value)
 
     def whole_numbers(self, values: Any, what: str) -> tuple[int, ...]:

@@ -75,7 +75,7 @@ def _bars(
                 x, y = zip(*shown, strict=True)
                 axes.plot(x, y, mark, color="#d94801", fillstyle="none", label=f"the paper's {column}", zorder=2)
                 low += x
-        if labels:
+        if labels and axes.get_legend_handles_labels()[0]:
             axes.figure.legend(loc="outside lower left", ncols=4, fontsize="small")
     if low and min(low) > 0:
         axes.set_xlim(left=0 if factor == 1.0 and "PSNR" not in title else 0.95 * min(low))

@@ -112,9 +112,7 @@ def paper_table(paper: Paper, reference: str | None) -> Table:
     from rich.table import Table
     from rich.text import Text
 
-    title = (
-        f"For comparison, figures of the paper, not of this code: {paper.source}; IoU / BIoU, % (BIoU error left, %)"
-    )
+    title = f"For comparison, the paper's figures, not ours: {paper.source}; IoU / BIoU, % (BIoU error left, %)"
     table = Table(title=Text(title), title_justify="left", box=SIMPLE)
     table.add_column("variant")
     for column in paper.columns:
