@@ -1,4 +1,4 @@
-"""The command line: ``beags demo | sample | extract | doctor``."""
+"""The command line: ``beags demo | sample | extract | bench | doctor``."""
 
 from __future__ import annotations
 
@@ -53,11 +53,13 @@ class Sample:
     """Pixels."""
     degradation: str = "mild"
     """How masks are damaged: none, mild or strong."""
+    views: int = 60
+    """Views to train on; 12 more are held out."""
 
     def run(self) -> None:
         from beags_plugin.demo import make_sample
 
-        make_sample(self.output, self.seed, self.width, self.height, self.degradation)
+        make_sample(self.output, self.seed, self.width, self.height, self.degradation, self.views)
         CONSOLE.print(f"sample: {self.output}", markup=False)
 
 
@@ -85,6 +87,51 @@ class Extract:
 
 
 @dataclass
+class BenchReprojection:
+    """Time and accuracy of the mask reprojections against the number of views, on the sample."""
+
+    views: tuple[int, ...] = (30, 60, 120, 240)
+    """Numbers of training views; a base is trained for each."""
+    depths: tuple[str, ...] = ("trained", "exact")
+    """What is lifted: the trained base's depth, the sample's exact depth."""
+    methods: tuple[str, ...] = ("pairwise", "voxel")
+    """Names of reprojections; the others are compared with pairwise."""
+    preset: str = "beags-tiny"
+    """Preset whose base phase is trained."""
+    seed: int = 0
+    """Seed of the sample."""
+    width: int = 256
+    """Pixels."""
+    height: int = 192
+    """Pixels."""
+    calls: int = 3
+    """How often each is timed; the least time counts."""
+    output: Path = Path("outputs/bench")
+    """Folder of scenes, bases and results."""
+    json: Path | None = None
+    """File for all figures; <output>/reprojection.json if left out."""
+    csv: Path | None = None
+    """File for all figures as a table; <output>/reprojection.csv if left out."""
+    picture: Path | None = None
+    """File for the picture; <output>/reprojection.png if left out."""
+
+    def run(self) -> None:
+        from beags_plugin.bench.reprojection import Options, run_reprojection
+
+        run_reprojection(Options(**vars(self)))
+
+
+@dataclass
+class Bench:
+    """Run a measurement, with its table, files and picture."""
+
+    what: Annotated[BenchReprojection, tyro.conf.subcommand(name="reprojection")]
+
+    def run(self) -> None:
+        self.what.run()
+
+
+@dataclass
 class Doctor:
     """Say what this installation can do, and what is missing."""
 
@@ -98,13 +145,17 @@ Command = (
     Annotated[Demo, tyro.conf.subcommand(name="demo")]
     | Annotated[Sample, tyro.conf.subcommand(name="sample")]
     | Annotated[Extract, tyro.conf.subcommand(name="extract")]
+    | Annotated[Bench, tyro.conf.subcommand(name="bench")]
     | Annotated[Doctor, tyro.conf.subcommand(name="doctor")]
 )
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the command ``beags``; a user's mistake prints one sentence and ends with exit code 2."""
-    command = tyro.cli(Command, args=arguments, description="BEA-GS: clean objects out of Gaussian-splat scenes.")
+    config = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
+    command = tyro.cli(
+        Command, args=arguments, description="BEA-GS: clean objects out of Gaussian-splat scenes.", config=config
+    )
     try:
         command.run()
     except UserError as error:

@@ -66,13 +66,16 @@ def load_run_config(config_path: Path) -> BeagsTrainerConfig:
     return config
 
 
-def load_scene(config_path: Path) -> SavedScene:
-    """Read a run's newest checkpoint; raises ``UserError`` if the run is incomplete or no class was assigned."""
+def load_scene(config_path: Path, assigned: bool = True) -> SavedScene:
+    """Read a run's newest checkpoint.
+
+    Raises ``UserError`` if the run is incomplete or, where ``assigned`` asks for classes, no class was assigned.
+    """
     config = load_run_config(config_path)
     checkpoint = torch.load(newest_checkpoint(config.get_checkpoint_dir()), map_location="cpu", weights_only=True)
     prefix = "_model."
     state = {name[len(prefix) :]: value for name, value in checkpoint["pipeline"].items() if name.startswith(prefix)}
-    if not bool(state["assigned"]):
+    if assigned and not bool(state["assigned"]):
         raise UserError(
             f"{config_path.parent} is a base without classes: refine it first "
             f"(ns-train beags-refine --load-dir {config.get_checkpoint_dir()})."

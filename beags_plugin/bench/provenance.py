@@ -1,0 +1,52 @@
+"""Where, of what and how a measurement was made: what every published figure has to name."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from pathlib import Path
+
+_PACKAGE = Path(__file__).resolve().parents[1]  # where git is asked
+
+
+def describe_machine() -> dict[str, str | int]:
+    """CPU name, cores that this process may use, memory in MB, system."""
+    try:
+        cores = len(os.sched_getaffinity(0))
+    except AttributeError:  # not on macOS
+        cores = os.cpu_count() or 1
+    try:
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") >> 20
+    except (ValueError, OSError):
+        memory = 0
+    return {"cpu": _cpu_name(), "cores": cores, "memory_mb": memory, "system": platform.system()}
+
+
+def _cpu_name() -> str:
+    try:
+        with open("/proc/cpuinfo") as lines:
+            names = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
+        # x86 has a name; ARM, often, only numbers
+        family = " ".join(names[key] for key in ("cpu family", "model") if key in names)
+        if "model name" in names:
+            return f"{names['model name']} (family/model {family.replace(' ', '/')})" if family else names["model name"]
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def commit() -> str:
+    """The commit that is measured, with "+" if files differ from it; "unknown" outside a git clone of this package."""
+    found = _git("rev-parse", "--short", "HEAD")
+    if found is None or _git("ls-files", "--error-unmatch", str(Path(__file__))) is None:
+        return "unknown"
+    return found + ("+" if _git("status", "--porcelain", "--untracked-files=no") else "")
+
+
+def _git(*arguments: str) -> str | None:
+    try:
+        done = subprocess.run(["git", *arguments], cwd=_PACKAGE, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip()
