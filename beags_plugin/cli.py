@@ -11,6 +11,7 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
+from beags_plugin.bench.commands import Measurement
 from beags_plugin.errors import UserError
 
 CONSOLE = Console(soft_wrap=True, highlight=False)
@@ -53,11 +54,13 @@ class Sample:
     """Pixels."""
     degradation: str = "mild"
     """How masks are damaged: none, mild or strong, or any degree from 0 on (1 is mild, 2 strong)."""
+    views: int = 60
+    """Views to train on; 12 more are held out."""
 
     def run(self) -> None:
         from beags_plugin.demo import make_sample
 
-        make_sample(self.output, self.seed, self.width, self.height, self.degradation)
+        make_sample(self.output, self.seed, self.width, self.height, self.degradation, self.views)
         CONSOLE.print(f"sample: {self.output}", markup=False)
 
 
@@ -86,37 +89,12 @@ class Extract:
 
 @dataclass
 class Bench:
-    """Run an experiment: many short trainings that share bases, then tables, JSON, CSV and a picture.
+    """Measure, and leave tables, JSON, CSV and a picture behind."""
 
-    What is done is not done again: an interrupted experiment goes on where it was.
-    """
-
-    experiment: tyro.conf.Positional[str]
-    """Its name (ablation, sensitivity, depth, masks: the files of experiments/), or the path of a .toml file."""
-    data: tuple[Path, ...] = ()
-    """Folders with images, poses and masks to train on, instead of the experiment's samples."""
-    scenes: int | None = None
-    """How many of the experiment's sample scenes; all if left out, none where --data is given."""
-    preset: str | None = None
-    """What to train with: a preset of method_configs/; the experiment's own if left out."""
-    downscale: float | None = None
-    """Divide the image size of --data by this; chosen for a quick run if left out."""
-    quick: bool = False
-    """Try the experiment out in a minute or two: tiny scenes, few steps, figures that mean nothing."""
-    output: Path = Path("outputs/bench")
-    """Folder of scenes, trials and results."""
-    json: Path | None = None
-    """File for all figures; <output>/<experiment>.json if left out."""
-    csv: Path | None = None
-    """File for all figures as a table; <output>/<experiment>.csv if left out."""
-    picture: Path | None = None
-    """File for the picture; <output>/<experiment>.png if left out."""
+    what: Measurement
 
     def run(self) -> None:
-        from beags_plugin.bench.run import Options, run_experiment
-
-        options = {name: value for name, value in vars(self).items() if name != "experiment"}
-        run_experiment(self.experiment, Options(**options))
+        self.what.run()
 
 
 @dataclass
@@ -140,7 +118,10 @@ Command = (
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the command ``beags``; a user's mistake prints one sentence and ends with exit code 2."""
-    command = tyro.cli(Command, args=arguments, description="BEA-GS: clean objects out of Gaussian-splat scenes.")
+    config = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
+    command = tyro.cli(
+        Command, args=arguments, description="BEA-GS: clean objects out of Gaussian-splat scenes.", config=config
+    )
     try:
         command.run()
     except UserError as error:

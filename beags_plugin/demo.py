@@ -26,11 +26,11 @@ STAMP = "trained.json"  # beside the run: what it was made from
 SHEET_VIEWS = 3  # held-out views in the picture
 
 
-def make_sample(folder: Path, seed: int, width: int, height: int, degradation: str) -> None:
-    """Generate the sample in ``folder`` unless the same one lies there already."""
+def make_sample(folder: Path, seed: int, width: int, height: int, degradation: str, views: int = 60) -> None:
+    """Generate the sample with ``views`` training views in ``folder`` unless the same one lies there already."""
     from beags_plugin.sample.writer import SampleConfig, write_sample
 
-    config = SampleConfig(seed=seed, width=width, height=height, degradation=degradation)
+    config = SampleConfig(seed=seed, width=width, height=height, degradation=degradation, num_train=views)
     with progress_bar("Tracing the sample") as progress:
         write_sample(folder, config, progress)
 

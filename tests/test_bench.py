@@ -560,6 +560,6 @@ def test_the_command_tells_a_mistake_in_one_sentence(capsys, tmp_path):
     from beags_plugin.cli import main
 
     with pytest.raises(SystemExit) as end:
-        main(["bench", "ablatoin", "--output", str(tmp_path)])
+        main(["bench", "file", "ablatoin", "--output", str(tmp_path)])
     assert end.value.code == 2
     assert "there is no experiment 'ablatoin'" in capsys.readouterr().out

@@ -1,0 +1,234 @@
+"""``beags bench reprojection``: time and accuracy of the reprojections against the number of views."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from beags_plugin.bench.report import (
+    new_figure,
+    number,
+    plain_table,
+    provenance,
+    save_figure,
+    write_csv,
+    write_json,
+)
+from beags_plugin.core.cameras import Camera
+from beags_plugin.errors import UserError
+from beags_plugin.evaluation.metrics import mask_metrics, mean_metrics
+from beags_plugin.masks import REPROJECTIONS
+
+CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
+DEPTHS = ("trained", "exact")
+REFERENCE = "pairwise"  # what the others are compared with
+AS_GIVEN = "masks as given"
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command line asks for; see ``cli.BenchReprojection``."""
+
+    views: tuple[int, ...] = (30, 60, 120, 240)
+    depths: tuple[str, ...] = DEPTHS
+    methods: tuple[str, ...] = ("pairwise", "voxel")
+    preset: str = "beags-tiny"
+    seed: int = 0
+    width: int = 256
+    height: int = 192
+    calls: int = 3
+    output: Path = Path("outputs/bench")
+    json: Path | None = None
+    csv: Path | None = None
+    picture: Path | None = None
+
+    def check(self) -> None:
+        """Raise ``UserError`` for a value that cannot be measured."""
+        for depth in self.depths:
+            if depth not in DEPTHS:
+                raise UserError(f"there is no depth {depth!r} to lift: choose of {', '.join(DEPTHS)}.")
+        for method in self.methods:
+            REPROJECTIONS.get(method)
+        if not self.views or min(self.views) < 1 or self.calls < 1:
+            raise UserError("--views and --calls must be 1 or more.")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Training views of a sample.
+
+    cameras: V. labels: V x [H, W] int32 as given, None for views without a mask. exact: V x [H, W] int32, the truth.
+    depths: kind to V x [H, W] float32, world units along z. num_classes: the background included.
+    """
+
+    cameras: Sequence[Camera]
+    labels: Sequence[Tensor | None]
+    exact: Sequence[Tensor]
+    depths: Mapping[str, Sequence[Tensor]]
+    num_classes: int
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method on one scene.
+
+    seconds, cpu_seconds: least of all calls. iou, biou: against the exact masks, mean over views and objects; equal:
+    share of the pixels with the label that ``REFERENCE`` gives them; wrong: with another one than the exact. In 0..1.
+    """
+
+    views: int
+    depth: str
+    method: str
+    seconds: float | None
+    cpu_seconds: float | None
+    iou: float
+    biou: float
+    wrong: float
+    equal: float | None
+
+
+def run_reprojection(options: Options) -> list[Row]:
+    """Make samples, train a base for each, measure, print a table and write the files; returns the rows."""
+    options.check()
+    rows = []
+    for views in options.views:
+        scene = load_views(options, views)
+        for depth in options.depths:
+            rows += measure(scene, depth, options.methods, options.calls)
+    table = [cells(row, rows) for row in rows]
+    CONSOLE.print(plain_table("Reprojection", _COLUMNS, table))
+    content = {"experiment": "reprojection", "options": plain(options), **provenance()}
+    content |= {"threads": torch.get_num_threads(), "rows": [asdict(row) for row in rows]}
+    files = {kind: getattr(options, kind) or options.output / f"reprojection.{end}" for kind, end in _FILES}
+    write_json(files["json"], content)
+    write_csv(files["csv"], [asdict(row) for row in rows])
+    draw(files["picture"], rows)
+    for kind, path in files.items():
+        CONSOLE.print(f"{kind}: {path}")
+    return rows
+
+
+_FILES = (("json", "json"), ("csv", "csv"), ("picture", "png"))
+_COLUMNS = ("views, depth", "method", "wall, s", "CPU, s", "times as fast", "IoU, %", "BIoU, %", "wrong, %", "equal, %")
+
+
+def plain(options: Any) -> dict[str, Any]:
+    """Options as JSON holds them, without the paths."""
+    return {name: value for name, value in asdict(options).items() if not isinstance(value, Path | None)}
+
+
+def load_views(options: Options, views: int) -> Scene:
+    """The sample with so many training views, and its depth as a base trained on it shows it."""
+    from beags_plugin.bench.bases import trained_base
+    from beags_plugin.demo import make_sample
+    from beags_plugin.masks.classes import read_class_map
+    from beags_plugin.plugin.evaluate import raster_settings
+    from beags_plugin.plugin.extract import read_scene, read_transform
+    from beags_plugin.rasterizers import make_rasterizer
+    from beags_plugin.rasterizers.drawing import geometry_inputs, surface_depth
+
+    name = f"sample-{options.seed}-{options.width}x{options.height}-{views}"
+    data = options.output / "scenes" / name
+    make_sample(data, options.seed, options.width, options.height, "mild", views)
+    config = trained_base(data, options.output / "bases" / f"{name}-{options.preset}", options.preset)
+    scene = read_scene(config)
+    manager = scene.config.data_config.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
+    found = manager.views("train")
+    truth = manager.train_dataset.metadata["ground_truth"]
+    exact = [torch.from_numpy(read_class_map(path).astype(np.int32)) for path in truth["masks"]]
+    transform = read_transform(config.parent)
+    factor = 1.0 if transform is None else transform[1]  # from the sample's units to those of the run
+    of_sample = [torch.from_numpy(factor * np.load(data / f"ground_truth/depth/{view.name}.npy")) for view in found]
+    rasterizer = make_rasterizer(scene.config.model_config.rasterizer)
+    settings, surfels = raster_settings(scene), geometry_inputs(scene.surfels())
+    kind = scene.config.model_config.prepare.depth
+    with torch.no_grad():
+        trained = [
+            surface_depth(rasterizer.rasterize(surfels, view.camera, settings, torch.zeros(3)), kind) for view in found
+        ]
+    depths = {"trained": trained, "exact": of_sample}
+    return Scene([view.camera for view in found], [view.labels for view in found], exact, depths, len(scene.classes))
+
+
+def measure(scene: Scene, depth: str, methods: Sequence[str], calls: int) -> list[Row]:
+    """The masks as they are, then each method; the methods take turns, ``calls`` times each."""
+    depths = scene.depths[depth]
+    views = len(scene.cameras)
+    blank = [torch.zeros_like(mask) for mask in scene.exact]  # a view without a mask shows no object
+    given = [zeros if mask is None else mask for mask, zeros in zip(scene.labels, blank, strict=True)]
+    rows = [Row(views, depth, AS_GIVEN, None, None, *quality(given, scene.exact, scene.num_classes), None)]
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in methods}
+    labels: dict[str, list[Tensor]] = {}
+    for _ in range(calls):
+        for name in methods:
+            reproject = REPROJECTIONS.get(name)
+            wall, cpu = time.perf_counter(), time.process_time()
+            masks = reproject(depths, scene.cameras, scene.labels, scene.num_classes)
+            times[name].append((time.perf_counter() - wall, time.process_time() - cpu))
+            labels[name] = [mask.labels for mask in masks]
+    for name in methods:
+        least = [min(column) for column in zip(*times[name], strict=True)]
+        equal = same_share(labels[name], labels[REFERENCE]) if REFERENCE in labels else None
+        rows.append(Row(views, depth, name, *least, *quality(labels[name], scene.exact, scene.num_classes), equal))
+    return rows
+
+
+def quality(found: Sequence[Tensor], exact: Sequence[Tensor], num_classes: int) -> tuple[float, float, float]:
+    """IoU and BIoU, mean over views and objects, and the share of pixels with a wrong label (no label is wrong)."""
+    metrics = mean_metrics(
+        mask_metrics(a == class_id, b == class_id)
+        for a, b in zip(found, exact, strict=True)
+        for class_id in range(1, num_classes)
+    )
+    return metrics.iou, metrics.biou, 1.0 - same_share(found, exact)
+
+
+def same_share(a: Sequence[Tensor], b: Sequence[Tensor]) -> float:
+    """Share of the pixels of all views with equal labels."""
+    equal = sum(int((x == y).sum()) for x, y in zip(a, b, strict=True))
+    return equal / sum(x.numel() for x in a)
+
+
+def cells(row: Row, rows: Sequence[Row]) -> list[str]:
+    """A line of the table."""
+    place = (row.views, row.depth)
+    reference = next((r for r in rows if (r.views, r.depth) == place and r.method == REFERENCE), None)
+    faster = None
+    if reference is not None and row.cpu_seconds and reference.cpu_seconds:
+        faster = reference.cpu_seconds / row.cpu_seconds
+    first = f"{row.views}, {row.depth}" if row.method == AS_GIVEN else ""
+    shares = (row.iou, row.biou, row.wrong, row.equal)
+    return [
+        first, row.method, number(row.seconds, 2), number(row.cpu_seconds, 2), number(faster, 1),
+        *(number(None if share is None else 100 * share, 2) for share in shares),
+    ]  # fmt: skip
+
+
+def draw(path: Path, rows: Sequence[Row]) -> None:
+    """Time, IoU and BIoU over views, a line for each method and depth."""
+    figure, axes = new_figure(3)
+    shown = (("cpu_seconds", "CPU seconds", 1.0), ("iou", "IoU, %", 100.0), ("biou", "BIoU, %", 100.0))
+    for axis, (name, title, factor) in zip(axes[0], shown, strict=True):
+        for depth, style in zip(DEPTHS, ("o-", "s--"), strict=True):
+            for color, method in enumerate(dict.fromkeys(row.method for row in rows)):
+                line = [row for row in rows if row.depth == depth and row.method == method]
+                known = [(row.views, factor * value) for row in line if (value := getattr(row, name)) is not None]
+                if known and (method != AS_GIVEN or depth == DEPTHS[0]):
+                    label = method if method == AS_GIVEN else f"{method}, {depth} depth"
+                    axis.plot(*zip(*known, strict=True), style, color=f"C{color}", label=label)
+        axis.set_xscale("log")
+        axis.set_xticks(sorted({row.views for row in rows}), sorted({row.views for row in rows}))
+        axis.minorticks_off()
+        axis.set_xlabel("views")
+        axis.set_title(title)
+    axes[0][0].set_yscale("log")
+    axes[0][0].legend(fontsize="small")
+    save_figure(path, figure)
