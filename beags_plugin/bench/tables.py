@@ -21,6 +21,7 @@ _HEAD = (
     "SSIM\nafter",
     "prepare\ns",
     "refine\ns",
+    "CPU\ns",
     "memory, MB\npeak",
     "\nown",
 )
@@ -38,6 +39,7 @@ def tables(experiment: Experiment, rows: Sequence[Row]) -> list[Table | str]:
             printed.append(_table(experiment, of_scene, scene))
     if experiment.paper is not None:
         printed.append(paper_table(experiment.paper, experiment.reference))
+    printed.append("Seconds of stages are wall time; CPU: of the whole trial after its base, all threads.")
     printed.append("Memory: the peak of the trial's process, and what of it the loaded program does not take.")
     if experiment.reference is not None:
         printed.append(f"BIoU error left: (100 - extracted BIoU) as a share of that of {experiment.reference!r}.")
@@ -101,6 +103,7 @@ def _cells(row: Row) -> list[str]:
         number(figures["ssim_after"], 3),
         number(sum(value for value in prepare if value is not None), 1),
         number(figures["seconds refinement"], 1),
+        number(figures["cpu_seconds"], 1),
         number(figures["peak_memory_mb"], 0),
         number(figures["own_memory_mb"], 0),
     ]
