@@ -17,6 +17,7 @@ from beags_plugin.bench.experiment import Variant, experiment_names, load_experi
 from beags_plugin.bench.results import (
     COLUMNS,
     FIGURES,
+    Row,
     error_left,
     make_row,
     means,
@@ -308,7 +309,7 @@ def result(value: float, psnr: float | None = 30.0) -> dict:
     }
 
 
-BASE = {"seconds": {"base training": 60.0}}
+BASE = {"seconds": {"base training": 60.0}, "cpu_seconds": 50.0}
 
 
 @pytest.fixture
@@ -330,6 +331,7 @@ def test_means_are_over_the_scenes_that_finished(rows):
     assert none.figures["extracted_biou_after"] == pytest.approx((values + 0.1).mean())
     assert none.figures["seconds refinement"] == pytest.approx((10 * values).mean())
     assert none.figures["seconds base training"] == 60.0
+    assert none.figures["cpu_seconds total"] == 70.0
     assert none.figures["psnr_after"] == 30.0 and none.figures["mask_error_used"] is None
     assert every.figures["rendered_iou_after"] == pytest.approx(0.9)
     left = error_left(every, none)
@@ -373,6 +375,24 @@ def test_tables_say_what_failed_and_whose_figures_the_papers_are(rows):
     text = console.file.getvalue()
     assert "failed: k = 8 on b: k is 0." in text and "k = 8 (1 of 2 scenes)" in text
     assert "the paper's figures, not ours" in text and "92.0 / 85.8 (52)" in text  # (100 - 85.8) / (100 - 72.8)
+
+
+def test_the_front_is_what_nothing_beats(tmp_path):
+    from beags_plugin.bench.front import draw_front, pareto_front
+
+    points = [tuple(point) for point in np.random.default_rng(0).integers(0, 6, (40, 2)).tolist()]
+    rows = [
+        Row(Variant(str(i)), "a", 0, {**dict.fromkeys(FIGURES), "cpu_seconds total": x, "psnr_after": y}, {})
+        for i, (x, y) in enumerate(points)
+    ]
+    rows.append(Row(Variant("unknown"), "a", 0, dict.fromkeys(FIGURES), {}))
+    found = {row.variant.name for row in pareto_front(rows, "cpu_seconds total", "psnr_after")}
+    better = {
+        (x, y): any(c <= x and q >= y and (c, q) != (x, y) for c, q in points) for x, y in points
+    }  # by definition, pair by pair
+    assert found == {str(i) for i, point in enumerate(points) if not better[point]}
+    draw_front(tmp_path / "front.png", load_experiment("ablation"), rows)
+    assert (tmp_path / "front.png").stat().st_size > 10_000
 
 
 def test_the_axis_is_told_relative_to_the_pixels(rows, experiment):

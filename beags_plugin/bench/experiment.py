@@ -12,7 +12,8 @@ from beags_plugin.shipped import read_toml, shipped_folder
 
 PHASES = ("base", "refine", "both")
 DAMAGE = "damage"  # the axis that is no config key: the degree of mask damage
-_ENTRIES = {"description", "preset", "seeds", "sample", "reference", "confidence", "variant", "sweep", "paper", *PHASES}
+_ENTRIES = {"description", "preset", "seeds", "sample", "variant", "sweep", "paper", *PHASES}
+_ENTRIES |= {"reference", "confidence", "front"}
 _VARIANT = {"name", DAMAGE, *PHASES}
 _SWEEP = {"name", "key", "values", "phase", "lines", "relative_to_pixels"}
 
@@ -49,7 +50,7 @@ class Experiment:
 
     sample_seeds, sample: the generated scenes, and other options of ``SampleConfig`` for them.
     seeds: of the training. reference: the variant whose errors the others' are compared with.
-    confidence: whether a picture of the masks' confidence belongs to it.
+    confidence: whether a picture of the masks' confidence belongs to it; front: whether one of the Pareto front does.
     relative_to_pixels: sweeps whose axis is also told per million pixels of the training views.
     """
 
@@ -62,6 +63,7 @@ class Experiment:
     variants: tuple[Variant, ...]
     reference: str | None = None
     confidence: bool = False
+    front: bool = False
     relative_to_pixels: frozenset[str] = frozenset()
     paper: Paper | None = None
 
@@ -138,6 +140,7 @@ class _Reader:
             variants=tuple(variants),
             reference=reference,
             confidence=self.value(content, "confidence", bool, False),
+            front=self.value(content, "front", bool, False),
             relative_to_pixels=frozenset(s["name"] for s in sweeps if s.get("relative_to_pixels")),
             paper=self.paper(),
         )

@@ -24,7 +24,8 @@ _QUALITY = tuple(f"{metric}_{moment}" for metric in ("psnr", "ssim") for moment 
 )
 _MASKS = ("mask_error_given", "mask_error_used")
 _SCALE = ("voxel_size", "training_pixels")
-FIGURES = (*_QUALITY, *(f"seconds {stage}" for stage in STAGES), *_COSTS, *_MASKS, *_SCALE)
+_TOTAL = "cpu_seconds total"  # of the base and the refinement
+FIGURES = (*_QUALITY, *(f"seconds {stage}" for stage in STAGES), _TOTAL, *_COSTS, *_MASKS, *_SCALE)
 COLUMNS = (*_PLACE, *FIGURES)
 
 
@@ -61,6 +62,7 @@ def make_row(
     seconds = {**result["seconds"], "base training": base["seconds"]["base training"]}
     figures |= {f"seconds {stage}": seconds.get(stage) for stage in STAGES}
     figures |= {name: result[name] for name in (*_COSTS, *_MASKS, *_SCALE)}
+    figures[_TOTAL] = base["cpu_seconds"] + result["cpu_seconds"]
     objects = {name: _masks(found) for name, found in evaluation["objects"].items()}
     return Row(variant, scene, seed, figures, objects)
 

@@ -49,6 +49,7 @@ def run_experiment(name: str, options: Options) -> list[Row]:
     Raises ``UserError`` for a mistake in the experiment or the options; a trial that fails is a row that says so.
     """
     from beags_plugin.bench.confidence import draw_confidence
+    from beags_plugin.bench.front import draw_front
     from beags_plugin.bench.pictures import draw
     from beags_plugin.bench.provenance import commit, describe_machine
     from beags_plugin.bench.tables import tables
@@ -80,6 +81,9 @@ def run_experiment(name: str, options: Options) -> list[Row]:
     if experiment.confidence:
         files["confidence"] = files["picture"].with_stem(files["picture"].stem + "-confidence")
         draw_confidence(files["confidence"], runs, outcomes)
+    if experiment.front:
+        files["front"] = files["picture"].with_stem(files["picture"].stem + "-front")
+        draw_front(files["front"], experiment, rows)
     for kind, path in files.items():
         CONSOLE.print(f"{kind}: {path}")
     return rows

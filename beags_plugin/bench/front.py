@@ -1,0 +1,66 @@
+"""What is worth its price: the variants that no other beats in both cost and quality."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from beags_plugin.bench.experiment import Experiment
+from beags_plugin.bench.results import Row, means
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+COSTS = (("cpu_seconds total", "CPU seconds, base and refinement"), ("peak_memory_mb", "peak memory, MB"))
+QUALITIES = (("extracted_biou_after", "extracted BIoU, %", 100.0), ("psnr_after", "PSNR, dB", 1.0))
+
+
+def pareto_front(rows: Sequence[Row], cost: str, quality: str) -> list[Row]:
+    """The rows that no other row beats: none is as cheap and as good, and better in one of the two; cheapest first.
+
+    cost: figure to keep low; quality: figure to keep high. Rows that lack one of them are left out.
+    """
+    known = [(row, row.figures[cost], row.figures[quality]) for row in rows]
+    points = [(row, c, q) for row, c, q in known if c is not None and q is not None]
+    points.sort(key=lambda point: (point[1], -point[2]))
+    front: list[tuple[Row, float, float]] = []
+    for point in points:
+        if not front or point[2] > front[-1][2] or point[1:] == front[-1][1:]:
+            front.append(point)
+    return [row for row, _, _ in front]
+
+
+def draw_front(path: Path, experiment: Experiment, rows: Sequence[Row]) -> None:
+    """Write the picture: a panel for every pair of a cost and a quality, with the mean of every variant."""
+    import matplotlib
+
+    matplotlib.use("Agg")  # there may be no screen
+    from matplotlib import pyplot
+
+    shape = (len(QUALITIES), len(COSTS))
+    figure, axes = pyplot.subplots(*shape, figsize=(9 * shape[1], 6.5 * shape[0]), squeeze=False, layout="constrained")
+    averaged = means(rows)
+    for line, (quality, quality_title, factor) in enumerate(QUALITIES):
+        for column, (cost, cost_title) in enumerate(COSTS):
+            panel: Axes = axes[line, column]
+            _panel(panel, averaged, cost, quality, factor)
+            panel.set_xlabel(cost_title)
+            panel.set_ylabel(quality_title)
+    figure.suptitle(f"{experiment.description} Line: the Pareto front.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)
+    pyplot.close(figure)
+
+
+def _panel(axes: Axes, rows: Sequence[Row], cost: str, quality: str, factor: float) -> None:
+    front = pareto_front(rows, cost, quality)
+    for row in rows:
+        x, y = row.figures[cost], row.figures[quality]
+        if x is not None and y is not None:
+            color = "#d94801" if row in front else "#6baed6"
+            axes.plot(x, factor * y, "o", color=color, zorder=2)
+            axes.annotate(row.variant.name, (x, factor * y), (3, 3), textcoords="offset points", fontsize="x-small")
+    corners = [(row.figures[cost] or 0.0, factor * (row.figures[quality] or 0.0)) for row in front]
+    if corners:
+        axes.step([x for x, _ in corners], [y for _, y in corners], where="post", color="#d94801", lw=1, zorder=1)
