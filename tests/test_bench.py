@@ -583,3 +583,12 @@ def test_the_command_tells_a_mistake_in_one_sentence(capsys, tmp_path):
         main(["bench", "file", "ablatoin", "--output", str(tmp_path)])
     assert end.value.code == 2
     assert "there is no experiment 'ablatoin'" in capsys.readouterr().out
+
+
+def test_the_file_in_the_documentation_is_an_experiment(tmp_path):
+    text = (Path(__file__).parents[1] / "docs/experiments.md").read_text()
+    block = text.split("## The file")[1].split("Keys are")[0]
+    path = written(tmp_path, "\n".join(line.strip() for line in block.splitlines()))
+    found = load_experiment(path)
+    assert [variant.name for variant in found.variants][:2] == ["as it is", "worse masks"]
+    assert found.variants[1].damage == 2.0 and found.front and found.confidence and len(found.variants) == 5
