@@ -15,6 +15,7 @@ from beags_plugin.rasterizers.reference_geometry import project
 
 OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion", "boundary")
 CLASSES = 4  # 0, the background, and three objects
+SLANT = 0.3  # of the borders between classes: image widths per image height
 NEAREST, FARTHEST = 2.0, 6.0  # depth range of the centres, world units
 SIGMA_PER_RADIUS = 0.468  # standard deviation over half the screen box, as measured at these opacities and slants
 MARGIN = 0.03  # the cloud reaches over the image's border by this share of its size, so that borders are covered too
@@ -115,20 +116,20 @@ def make_scene(size: Size, seed: int = 0) -> Scene:
     return Scene(
         size=size,
         surfels=surfels,
-        class_ids=classes_at(across / width),
+        class_ids=classes_at(across / width, down / height),
         colors=uniform(n, 3),
         camera=camera,
         settings=RasterSettings(near=0.05, far=100.0, geometry=True, distortion=True),
         background=torch.tensor([0.1, 0.2, 0.3]),
-        target=classes_at(torch.linspace(0, 1, width)).expand(shape).contiguous(),
+        target=classes_at(torch.linspace(0, 1, width), torch.linspace(0, 1, height)[:, None]),
         image=uniform(*shape, 3),
         gradients=gradients,
     )
 
 
-def classes_at(across: Tensor) -> Tensor:
-    """Classes in vertical bands over the image, int32; ``across`` is 0 at the left border and 1 at the right."""
-    return (across.clamp(0, 0.999) * 2 * CLASSES).int() % CLASSES
+def classes_at(across: Tensor, down: Tensor) -> Tensor:
+    """Classes in slanted bands, whose borders follow no border of tiles: int32; 0 is left and top, 1 right and bottom."""
+    return ((across + SLANT * down) / (1 + SLANT) * 2 * CLASSES).clamp(0, 2 * CLASSES - 1).int() % CLASSES
 
 
 def surfel_inputs(scene: Scene) -> SurfelInputs:

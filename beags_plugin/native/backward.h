@@ -2,6 +2,7 @@
 #pragma once
 
 #include "composite.h"
+#include "labels.h"
 
 namespace beags {
 namespace BEAGS_ISA {
@@ -15,7 +16,8 @@ struct alignas(64) PixelGradients {
   T g_normal[3][kLanes<T>], g_depth[kLanes<T>], g_median_depth[kLanes<T>],
       median_pair[kLanes<T>];                                     // g_depth: of sum w d
   T first[kLanes<T>], g_alpha_m[kLanes<T>], g_moment[kLanes<T>];  // distortion: its gradient times A and sum w m
-  T g_boundary[kLanes<T>], target[kLanes<T>];
+  T g_boundary[kLanes<T>];
+  Labels<T> labels;
 };
 
 template <Parts kWanted, class T>
@@ -31,42 +33,68 @@ BEAGS_INLINE void load_saved(const Job<T>& job, int tile, PixelGradients<T>* pix
   }
 }
 
+// The gradients towards the images, as they are.
+template <Parts kWanted, class T>
+BEAGS_INLINE void read_gradients(const Job<T>& job, int tile, PixelGradients<T>* pixels) {
+  const Images<const T>& g = job.gradients;
+  const auto one = [&](const T* image, auto field) __attribute__((always_inline)) {
+    if (!image) return;
+    read_image<1>(job, tile, image, [&](int, int pack) __attribute__((always_inline)) { return pixels[pack].*field; });
+  };
+  const auto three = [&](const T* image, auto field) __attribute__((always_inline)) {
+    if (!image) return;
+    read_image<3>(job, tile, image,
+                  [&](int c, int pack) __attribute__((always_inline)) { return (pixels[pack].*field)[c]; });
+  };
+  three(g.color, &PixelGradients<T>::g_color);
+  one(g.alpha, &PixelGradients<T>::g_alpha);
+  if (kWanted & kGeometry) {
+    one(g.depth, &PixelGradients<T>::g_depth);
+    one(g.median_depth, &PixelGradients<T>::g_median_depth);
+    three(g.normal, &PixelGradients<T>::g_normal);
+  }
+  if (kWanted & kDistortion) one(g.distortion, &PixelGradients<T>::g_moment);
+  if ((kWanted & kBoundary) && g.boundary) {
+    load_labels(job, tile, pixels);
+    one(g.boundary, &PixelGradients<T>::g_boundary);
+  }
+}
+
+// Towards the sums that the images were made of: A is 1 - T at the end, which every surfel changes.
 template <Parts kWanted, class T>
 BEAGS_INLINE void load_gradients(const Job<T>& job, int tile, PixelGradients<T>* pixels) {
   load_saved<kWanted>(job, tile, pixels);
-  const Images<const T>& g = job.gradients;
-  T background[3] = {};
-  for_each_pixel(job, tile, [&](int64_t at, int pack, int lane) {
+  read_gradients<kWanted>(job, tile, pixels);
+  Vector<T> background[4] = {};
+  for (int pack = 0; pack < kTilePacks<T>; ++pack) {
     PixelGradients<T>& p = pixels[pack];
-    if (g.color) {
-      for (int c = 0; c < 3; ++c) {
-        p.g_color[c][lane] = g.color[3 * at + c];
-        background[c] += p.g_color[c][lane] * p.transmittance[lane];
-        p.behind[lane] += p.g_color[c][lane] * p.transmittance[lane] * job.background[c];
-      }
+    const Real<T> end = load(p.transmittance), alpha = all(T(1)) - end;
+    Real<T> behind = all(T(0)), g_alpha = load(p.g_alpha);
+    for (int c = 0; c < 3; ++c) {
+      const Real<T> through = load(p.g_color[c]) * end;
+      add(background[c], through);
+      behind = fma(through, all(job.background[c]), behind);
     }
-    if (g.alpha) p.g_alpha[lane] = g.alpha[at];
-    const T alpha = T(1) - p.transmittance[lane];
-    const int64_t saved = saved_at<T>(tile, pack) + lane;
-    if (kWanted & kGeometry) {
-      if (g.depth && alpha > T(0)) {
-        p.g_depth[lane] = g.depth[at] / alpha;
-        p.g_alpha[lane] -= p.g_depth[lane] * job.saved.depth_sum[saved] / alpha;
-      }
-      if (g.median_depth) p.g_median_depth[lane] = g.median_depth[at];
-      for (int c = 0; c < 3 && g.normal; ++c) p.g_normal[c][lane] = g.normal[3 * at + c];
+    store(p.behind, behind);
+    if ((kWanted & kGeometry) && job.saved.depth_sum) {
+      const Real<T> depth_sum = load(job.saved.depth_sum + saved_at<T>(tile, pack));
+      const Mask<T> seen = all(T(0)) < alpha;
+      const Real<T> g_depth = keep(seen, load(p.g_depth) / alpha);
+      store(p.g_depth, g_depth);
+      g_alpha = g_alpha - keep(seen, g_depth * depth_sum / alpha);
     }
-    if ((kWanted & kDistortion) && g.distortion) {
-      p.g_alpha_m[lane] = g.distortion[at] * alpha;
-      p.g_moment[lane] = g.distortion[at] * job.saved.moment1[saved];
-      p.g_alpha[lane] += g.distortion[at] * job.saved.moment2[saved];
+    if ((kWanted & kDistortion) && job.saved.first) {
+      const Real<T> g = load(p.g_moment);
+      store(p.g_alpha_m, g * alpha);
+      store(p.g_moment, g * load(job.saved.moment1 + saved_at<T>(tile, pack)));
+      g_alpha = fma(g, load(job.saved.moment2 + saved_at<T>(tile, pack)), g_alpha);
     }
-    if ((kWanted & kBoundary) && g.boundary) {
-      p.target[lane] = static_cast<T>(job.target[at]);
-      p.g_boundary[lane] = job.target[at] == kIgnore ? T(0) : g.boundary[at];
-    }
-  });
-  for (int c = 0; c < 3; ++c) job.g_background[3 * tile + c] = background[c];
+    store(p.g_alpha, g_alpha);
+    if (kWanted & kBoundary) store(p.g_boundary, drop(p.labels.ignored(), load(p.g_boundary)));
+  }
+  T sums[4];
+  Register<T>::sum4(background, sums);
+  for (int c = 0; c < 3; ++c) job.g_background[3 * tile + c] = sums[c];
 }
 
 // dL/dw of a hit, but for what lies behind it; sets `g_hit`, the gradient towards its depth.
@@ -97,7 +125,9 @@ BEAGS_INLINE Real<T> weight_gradient(const Job<T>& job, int k, const Splat<T>& s
     g_w = fma(m, slope - g_moment, g_w);
     g_hit = fma(w * slope, all(T(2) / job.mapping) * (nearness * nearness), g_hit);
   }
-  if (kWanted & kBoundary) g_w = g_w + drop(load(p.target) == all(static_cast<T>(s.class_id)), load(p.g_boundary));
+  if ((kWanted & kBoundary) && !p.labels.all_right(s.class_id)) {
+    g_w = g_w + drop(p.labels.right(s.class_id), load(p.g_boundary));
+  }
   return g_w;
 }
 

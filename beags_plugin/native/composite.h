@@ -13,9 +13,16 @@ constexpr int kPacks = kGroupPixels / kLanes<T>;  // packs of pixels, one lane e
 template <class T>
 constexpr int kTilePacks = kGroupPixels * kPacks<T>;
 
-// Calls visit(index into the image, pack, lane) for the pixels of a tile that lie inside the image, in a fixed order.
+// A number that is known when the program is compiled.
+template <int kValue>
+struct Number {
+  BEAGS_INLINE constexpr operator int() const { return kValue; }
+};
+
+// Calls visit(index into the image, pixel of the tile, columns) for the first pixel of every row of every group of the
+// tile, as far as they lie inside the image, in a fixed order; most rows have all of a group's columns.
 template <class T, class Visit>
-BEAGS_INLINE void for_each_pixel(const Job<T>& job, int tile, Visit visit) {
+BEAGS_INLINE void for_each_row(const Job<T>& job, int tile, Visit visit) {
   const int x0 = tile % job.tiles_x * kTile, y0 = tile / job.tiles_x * kTile;
   for (int group = 0; group < kGroupPixels; ++group) {
     const int x = x0 + group % kGroup * kGroup, y = y0 + group / kGroup * kGroup;
@@ -23,12 +30,38 @@ BEAGS_INLINE void for_each_pixel(const Job<T>& job, int tile, Visit visit) {
     const int rows = job.height - y < kGroup ? job.height - y : kGroup;
     for (int row = 0; row < rows; ++row) {
       const int64_t at = static_cast<int64_t>(y + row) * job.width + x;
-      for (int column = 0; column < columns; ++column) {
-        const int pixel = kGroupPixels * group + kGroup * row + column;
-        visit(at + column, pixel / kLanes<T>, pixel % kLanes<T>);
+      const int pixel = kGroupPixels * group + kGroup * row;
+      if (columns == kGroup) {
+        visit(at, pixel, Number<kGroup>{});
+      } else {
+        visit(at, pixel, columns);
       }
     }
   }
+}
+
+// Calls visit(index into the image, pack, lane) for the pixels of a tile that lie inside the image, in a fixed order.
+template <class T, class Visit>
+BEAGS_INLINE void for_each_pixel(const Job<T>& job, int tile, Visit visit) {
+  for_each_row(job, tile, [&](int64_t at, int pixel, auto columns) __attribute__((always_inline)) {
+    for (int i = 0; i < columns; ++i) visit(at + i, (pixel + i) / kLanes<T>, (pixel + i) % kLanes<T>);
+  });
+}
+
+// Copies a tile from an image, [height, width, kChannels]: lanes(channel, pack) is where a pack's values go.
+template <int kChannels, class T, class Lanes>
+BEAGS_INLINE void read_image(const Job<T>& job, int tile, const T* image, Lanes lanes) {
+  for_each_pixel(job, tile, [&](int64_t at, int pack, int lane) __attribute__((always_inline)) {
+    for (int c = 0; c < kChannels; ++c) lanes(c, pack)[lane] = image[kChannels * at + c];
+  });
+}
+
+// Copies a tile to an image; see read_image.
+template <int kChannels, class T, class Lanes>
+BEAGS_INLINE void write_image(const Job<T>& job, int tile, T* image, Lanes lanes) {
+  for_each_pixel(job, tile, [&](int64_t at, int pack, int lane) __attribute__((always_inline)) {
+    for (int c = 0; c < kChannels; ++c) image[kChannels * at + c] = lanes(c, pack)[lane];
+  });
 }
 
 // Where a pack's values lie among the 256 of a tile.

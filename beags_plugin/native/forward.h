@@ -2,6 +2,7 @@
 #pragma once
 
 #include "composite.h"
+#include "labels.h"
 
 namespace beags {
 namespace BEAGS_ISA {
@@ -9,10 +10,11 @@ namespace BEAGS_ISA {
 // Sums of one pack of pixels.
 template <class T>
 struct alignas(64) Pixels {
-  T color[3][kLanes<T>], normal[3][kLanes<T>], depth[kLanes<T>];
+  T color[3][kLanes<T>], alpha[kLanes<T>], normal[3][kLanes<T>], depth[kLanes<T>];
   T median_depth[kLanes<T>], median_pair[kLanes<T>];
-  T first[kLanes<T>], moment1[kLanes<T>], moment2[kLanes<T>];
-  T boundary[kLanes<T>], target[kLanes<T>];
+  T first[kLanes<T>], moment1[kLanes<T>], moment2[kLanes<T>], distortion[kLanes<T>];
+  T boundary[kLanes<T>];
+  Labels<T> labels;
 };
 
 template <class T>
@@ -42,9 +44,8 @@ BEAGS_INLINE void add_hit(int k, const Splat<T>& s, const Hits<T>& hits, int i, 
     store(p.moment1, load(p.moment1) + wm);
     store(p.moment2, fma(wm, m, load(p.moment2)));
   }
-  if (kWanted & kBoundary) {
-    const Mask<T> right = load(p.target) == all(static_cast<T>(s.class_id));  // E7
-    store(p.boundary, load(p.boundary) + drop(right, w));
+  if ((kWanted & kBoundary) && !p.labels.all_right(s.class_id)) {
+    store(p.boundary, load(p.boundary) + drop(p.labels.right(s.class_id), w));  // E7
   }
 }
 
@@ -68,48 +69,69 @@ BEAGS_INLINE void save(const Job<T>& job, int tile, const Walk<T>& walk, const P
   }
 }
 
+// Where T stays above 0.5 there is no median.
+template <class T>
+BEAGS_INLINE void finish_median(const Walk<T>& walk, Pixels<T>* pixels) {
+  for (int pack = 0; pack < kTilePacks<T>; ++pack) {
+    Pixels<T>& p = pixels[pack];
+    const Mask<T> never = all(T(0.5)) < load(walk.transmittance + pack * kLanes<T>);
+    store(p.median_depth, drop(never, load(p.median_depth)));
+    store(p.median_pair, select(never, all(T(-1)), load(p.median_pair)));
+  }
+}
+
+// From a pack's sums to the values of its pixels, in their place; `end`: T behind the last surfel.
+template <Parts kWanted, class T>
+BEAGS_INLINE void finish(const Job<T>& job, Real<T> end, Pixels<T>& p) {
+  const Real<T> alpha = all(T(1)) - end;  // E4: A = sum w = 1 - T
+  store(p.alpha, alpha);
+  for (int c = 0; c < 3; ++c) store(p.color[c], load(p.color[c]) + end * all(job.background[c]));
+  if (kWanted & kGeometry) store(p.depth, keep(all(T(0)) < alpha, load(p.depth) / alpha));
+  if (kWanted & kDistortion) {
+    // The sum over pairs, closed: A sum(w m^2) - (sum w m)^2; rounding must not make it negative.
+    const Real<T> moment1 = load(p.moment1), value = alpha * load(p.moment2) - moment1 * moment1;
+    store(p.distortion, keep(all(T(0)) < value, value));
+  }
+  if (kWanted & kBoundary) store(p.boundary, drop(p.labels.ignored(), load(p.boundary)));
+}
+
+template <Parts kWanted, class T>
+BEAGS_INLINE void write(const Job<T>& job, int tile, const Pixels<T>* pixels) {
+  const Images<T>& to = job.images;
+  const auto one = [&](T* image, auto field) __attribute__((always_inline)) {
+    write_image<1>(job, tile, image, [&](int, int pack) __attribute__((always_inline)) { return pixels[pack].*field; });
+  };
+  const auto three = [&](T* image, auto field) __attribute__((always_inline)) {
+    write_image<3>(job, tile, image,
+                   [&](int c, int pack) __attribute__((always_inline)) { return (pixels[pack].*field)[c]; });
+  };
+  three(to.color, &Pixels<T>::color);
+  one(to.alpha, &Pixels<T>::alpha);
+  if ((kWanted & kGeometry) && to.depth) {
+    one(to.depth, &Pixels<T>::depth);
+    one(to.median_depth, &Pixels<T>::median_depth);
+    three(to.normal, &Pixels<T>::normal);
+  }
+  if ((kWanted & kDistortion) && to.distortion) one(to.distortion, &Pixels<T>::distortion);
+  if ((kWanted & kBoundary) && to.boundary) one(to.boundary, &Pixels<T>::boundary);
+}
+
 template <Parts kWanted, class T>
 void forward(const Job<T>& job, int tile) {
   Walk<T> walk(job, tile);
   Pixels<T> pixels[kTilePacks<T>] = {};
-  if ((kWanted & kBoundary) && job.target) {
-    for_each_pixel(job, tile,
-                   [&](int64_t at, int pack, int lane) { pixels[pack].target[lane] = static_cast<T>(job.target[at]); });
-  }
+  if ((kWanted & kBoundary) && job.target) load_labels(job, tile, pixels);
   constexpr unsigned kNeeds = (kWanted & kGeometry ? kNeedDepth : 0) | (kWanted & kDistortion ? kNeedNearness : 0);
   composite<kNeeds>(
       job, tile, walk,
       [&](int k, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> w, Real<T> before)
           __attribute__((always_inline)) { add_hit<kWanted>(k, s, hits, i, w, before, pixels[hits.pack[i]]); });
-  if (kWanted & kGeometry) {
-    for (int pack = 0; pack < kTilePacks<T>; ++pack) {
-      Pixels<T>& p = pixels[pack];
-      const Mask<T> never = all(T(0.5)) < load(walk.transmittance + pack * kLanes<T>);
-      store(p.median_depth, drop(never, load(p.median_depth)));
-      store(p.median_pair, select(never, all(T(-1)), load(p.median_pair)));
-    }
-  }
+  if (kWanted & kGeometry) finish_median(walk, pixels);
   if (job.saved.end) save<kWanted>(job, tile, walk, pixels);
-  const Images<T>& to = job.images;
-  for_each_pixel(job, tile, [&](int64_t at, int pack, int lane) {
-    const Pixels<T>& p = pixels[pack];
-    const T end = walk.transmittance[pack * kLanes<T> + lane], alpha = T(1) - end;  // E4: A = sum w = 1 - T
-    for (int c = 0; c < 3; ++c) to.color[3 * at + c] = p.color[c][lane] + end * job.background[c];
-    to.alpha[at] = alpha;
-    if ((kWanted & kGeometry) && to.depth) {
-      to.depth[at] = alpha > T(0) ? p.depth[lane] / alpha : T(0);
-      to.median_depth[at] = p.median_depth[lane];
-      for (int c = 0; c < 3; ++c) to.normal[3 * at + c] = p.normal[c][lane];
-    }
-    if ((kWanted & kDistortion) && to.distortion) {
-      // The sum over pairs, closed: A sum(w m^2) - (sum w m)^2; rounding must not make it negative.
-      const T value = alpha * p.moment2[lane] - p.moment1[lane] * p.moment1[lane];
-      to.distortion[at] = value > T(0) ? value : T(0);
-    }
-    if ((kWanted & kBoundary) && to.boundary) {
-      to.boundary[at] = p.target[lane] == static_cast<T>(kIgnore) ? T(0) : p.boundary[lane];
-    }
-  });
+  for (int pack = 0; pack < kTilePacks<T>; ++pack) {
+    finish<kWanted>(job, load(walk.transmittance + pack * kLanes<T>), pixels[pack]);
+  }
+  write<kWanted>(job, tile, pixels);
 }
 
 }  // namespace BEAGS_ISA
