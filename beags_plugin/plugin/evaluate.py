@@ -11,6 +11,7 @@ from beags_plugin.errors import UserError
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.report import RunMetrics, Stage
 from beags_plugin.evaluation.run_metrics import SceneMetrics, evaluate_scene
+from beags_plugin.evaluation.worst_views import By, WorstMask, draw_worst
 from beags_plugin.plugin.evaluation_views import HeldOutViews
 from beags_plugin.plugin.extract import SavedScene, read_scene
 from beags_plugin.plugin.runs import BASE_SNAPSHOT, EXTRACTION_FILE
@@ -92,6 +93,15 @@ class EvaluatedRun:
             after=found["after"],
             notes=tuple(self._notes(found["after"])),
         )
+
+    def worst(self, metrics: RunMetrics, count: int, by: By = "iou") -> list[WorstMask]:
+        """The ``count`` worst masks of each kind, drawn; metrics: what ``metrics`` gave."""
+        scenes = {
+            stage: (scene.surfels(), scene.class_ids)
+            for stage, scene in self.stages.items()
+            if scene.class_ids is not None
+        }
+        return draw_worst(metrics, scenes, self.views, self.rasterizer, self.settings, count, by)
 
     def _notes(self, after: SceneMetrics) -> Iterator[str]:
         if not self.stages["after"].assigned:
