@@ -59,8 +59,11 @@ class EvaluatedRun:
     @cached_property
     def views(self) -> HeldOutViews:
         """The held-out views; raises ``UserError`` if the run's data cannot be read."""
+        config = self.stages["after"].config
+        if not (data := data_path(config)).exists():
+            raise UserError(f"{self.config_path} was trained on {data}, which is gone: put it back.")
         try:
-            return HeldOutViews(self.stages["after"].config, self.classes)
+            return HeldOutViews(config, self.classes)
         except UserError as error:
             raise UserError(f"the data of {self.config_path} cannot be read: {error}") from error
 
@@ -127,8 +130,13 @@ def present_classes(scene: SavedScene) -> dict[int, str]:
 
 def scene_name(config: BeagsTrainerConfig) -> str:
     """The name of the run's data folder."""
-    data = config.data_config.data or config.data_config.dataparser.data
-    return Path(data).stem if Path(data).suffix == ".json" else Path(data).name
+    data = data_path(config)
+    return data.stem if data.suffix == ".json" else data.name
+
+
+def data_path(config: BeagsTrainerConfig) -> Path:
+    """The folder (or transforms .json) that the run was trained on."""
+    return Path(config.data_config.data or config.data_config.dataparser.data)
 
 
 def raster_settings(scene: SavedScene) -> RasterSettings:
