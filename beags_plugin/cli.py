@@ -1,4 +1,4 @@
-"""The command line: ``beags demo | sample | extract | bench | doctor``."""
+"""The command line: ``beags demo | sample | extract | eval | bench | doctor``."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from rich.markup import escape
 
 from beags_plugin.bench.commands import Measurement
 from beags_plugin.errors import UserError
+from beags_plugin.evaluation.protocol import Protocol
 
 CONSOLE = Console(soft_wrap=True, highlight=False)
 
@@ -88,6 +89,34 @@ class Extract:
 
 
 @dataclass
+class Eval:
+    """Score runs on their held-out views: masks per object, PSNR and SSIM, before and after refinement.
+
+    Several runs are scenes of one data set: a table per scene, and their mean.
+    """
+
+    load_config: tuple[Path, ...]
+    """config.yml of one trained run or more."""
+    data_set_name: str = "mean"
+    """What the mean of several runs is called."""
+    json: Path | None = None
+    """File for all figures, down to single masks and views."""
+    csv: Path | None = None
+    """File for the figures of objects and scenes as a table."""
+    picture: Path | None = None
+    """File for a picture of the worst masks: what is right, missed and wrong, before and after."""
+    worst: int = 6
+    """How many masks of each kind the picture shows."""
+    protocol: tyro.conf.OmitArgPrefixes[Protocol] = Protocol()
+
+    def run(self) -> None:
+        from beags_plugin.evaluate import Outputs, run_evaluation
+
+        outputs = Outputs(self.json, self.csv, self.picture, self.worst)
+        run_evaluation(self.load_config, self.data_set_name, self.protocol, outputs)
+
+
+@dataclass
 class Bench:
     """Measure, and leave tables, JSON, CSV and a picture behind."""
 
@@ -111,6 +140,7 @@ Command = (
     Annotated[Demo, tyro.conf.subcommand(name="demo")]
     | Annotated[Sample, tyro.conf.subcommand(name="sample")]
     | Annotated[Extract, tyro.conf.subcommand(name="extract")]
+    | Annotated[Eval, tyro.conf.subcommand(name="eval")]
     | Annotated[Bench, tyro.conf.subcommand(name="bench")]
     | Annotated[Doctor, tyro.conf.subcommand(name="doctor")]
 )

@@ -118,6 +118,21 @@ def test_extraction_writes_a_run_and_a_ply_per_object(trained, extracted):
         assert {"scale_0", "scale_1", "scale_2"} <= {prop.name for prop in vertex.properties}
 
 
+def test_the_figures_are_those_of_ns_eval(trained, tmp_path):
+    folder, _ = trained
+    ours, theirs = tmp_path / "ours.json", tmp_path / "theirs.json"
+    code, text = run(
+        "beags", "eval", "--load-config", folder / "config.yml", "--json", ours, "--picture", tmp_path / "a.png"
+    )
+    assert code == 0, text[-3000:]
+    code, text = run("ns-eval", "--load-config", folder / "config.yml", "--output-path", theirs)
+    assert code == 0, text[-3000:]
+    found, expected = json.loads(ours.read_text())["scenes"][0], json.loads(theirs.read_text())["results"]
+    for metric in ("psnr", "ssim"):
+        assert found[metric]["after"] == pytest.approx(expected[metric], rel=1e-4)
+    assert len(found["objects"]) >= 5 and (tmp_path / "a.png").stat().st_size > 10_000
+
+
 def test_nerfstudio_commands_work_on_an_extracted_run(extracted, tmp_path):
     config = extracted[0]
     code, text = run("ns-export", "gaussian-splat", "--load-config", config, "--output-dir", tmp_path / "export")

@@ -264,6 +264,17 @@ def test_the_sheet_shows_objects_before_and_after(tmp_path):
         assert (sheet == grey).all(axis=-1).sum() > 1000
 
 
+def test_a_sheet_of_many_objects_is_no_wider_than_a_screen():
+    cell = np.zeros((SIZE, SIZE, 4), dtype=np.uint8)
+    shown = {index: np.where(np.arange(4) < 3, 30 * index, 255) + cell for index in range(1, 8)}
+    shown = {index: image.astype(np.uint8) for index, image in shown.items()}
+    row = SheetRow("v", None, None, np.zeros((SIZE, SIZE, 3), np.uint8), shown, shown)
+    sheet = contact_sheet([row], {index: str(index) for index in shown})
+    assert sheet.shape[1] <= 1920 and sheet.shape[0] == 3 * (220 + 18 + 4)  # 2, then 4, then 1 object
+    for index in shown:
+        assert (sheet == 30 * index).all(-1).sum() > 220 * 220  # of both stages, with the crop's margin
+
+
 def test_a_sheet_survives_absent_parts():
     blank = np.zeros((SIZE, 2 * SIZE, 3), dtype=np.uint8)
     nothing = {1: np.zeros((SIZE, 2 * SIZE, 4), dtype=np.uint8)}

@@ -25,6 +25,9 @@ CORE = [  # all that stands under the plugin layer
     "extraction.ply",
     "evaluation.run_metrics",
     "evaluation.contact_sheet",
+    "evaluation.report",
+    "evaluation.table",
+    "evaluation.worst_views",
     "sample.writer",
     "cli",
 ]

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from beags_plugin.evaluation.metrics import METRICS
+from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.report import DataSetMetrics, RunMetrics, Stage
 from beags_plugin.evaluation.run_metrics import KINDS, ObjectMetrics
 
@@ -80,6 +81,15 @@ def render_data_set(found: DataSetMetrics) -> RenderableType:
     return _mask_table(f"All scenes: masks, %{_meaning(stages)}", "scene", figures, stages, images)
 
 
+def render_protocol(protocol: Protocol) -> RenderableType:
+    """A line that names the choices that are not the defaults."""
+    from rich.text import Text
+
+    default = Protocol().to_json()
+    changed = [f"{name} {value}" for name, value in protocol.to_json().items() if value != default[name]]
+    return Text(f"Protocol: {', '.join(changed)}; else the defaults." if changed else "Protocol: the defaults.")
+
+
 def _meaning(stages: Sequence[Stage]) -> str:
     return " (before: assignment alone; after: after refinement)" if len(stages) == 2 else ""
 
@@ -96,12 +106,12 @@ def _mask_table(
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=title, title_justify="left", box=SIMPLE)
+    table = Table(title=title, title_justify="left", box=SIMPLE, collapse_padding=True, pad_edge=False)
     table.add_column(first)
     table.add_column("stage")
     for kind in KINDS:
         for heading in (f"{kind}\nAcc", "\nIoU", "\nBIoU"):
-            table.add_column(heading, justify="right")
+            table.add_column(heading, justify="right", min_width=9 if kind in heading else 5)
     for heading in ("\nPSNR", "\nSSIM") if images else ():
         table.add_column(heading, justify="right")
     for name, row in rows.items():

@@ -11,6 +11,7 @@ from beags_plugin.errors import UserError
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.report import RunMetrics, Stage
 from beags_plugin.evaluation.run_metrics import SceneMetrics, evaluate_scene
+from beags_plugin.evaluation.worst_views import By, WorstMask, draw_worst
 from beags_plugin.plugin.evaluation_views import HeldOutViews
 from beags_plugin.plugin.extract import SavedScene, read_scene
 from beags_plugin.plugin.runs import BASE_SNAPSHOT, EXTRACTION_FILE
@@ -58,8 +59,11 @@ class EvaluatedRun:
     @cached_property
     def views(self) -> HeldOutViews:
         """The held-out views; raises ``UserError`` if the run's data cannot be read."""
+        config = self.stages["after"].config
+        if not (data := data_path(config)).exists():
+            raise UserError(f"{self.config_path} was trained on {data}, which is gone: put it back.")
         try:
-            return HeldOutViews(self.stages["after"].config, self.classes)
+            return HeldOutViews(config, self.classes)
         except UserError as error:
             raise UserError(f"the data of {self.config_path} cannot be read: {error}") from error
 
@@ -93,6 +97,15 @@ class EvaluatedRun:
             notes=tuple(self._notes(found["after"])),
         )
 
+    def worst(self, metrics: RunMetrics, count: int, by: By = "iou") -> list[WorstMask]:
+        """The ``count`` worst masks of each kind, drawn; metrics: what ``metrics`` gave."""
+        scenes = {
+            stage: (scene.surfels(), scene.class_ids)
+            for stage, scene in self.stages.items()
+            if scene.class_ids is not None
+        }
+        return draw_worst(metrics, scenes, self.views, self.rasterizer, self.settings, count, by)
+
     def _notes(self, after: SceneMetrics) -> Iterator[str]:
         if not self.stages["after"].assigned:
             yield "This run has no classes (it is a base alone), so only images are scored."
@@ -117,8 +130,13 @@ def present_classes(scene: SavedScene) -> dict[int, str]:
 
 def scene_name(config: BeagsTrainerConfig) -> str:
     """The name of the run's data folder."""
-    data = config.data_config.data or config.data_config.dataparser.data
-    return Path(data).stem if Path(data).suffix == ".json" else Path(data).name
+    data = data_path(config)
+    return data.stem if data.suffix == ".json" else data.name
+
+
+def data_path(config: BeagsTrainerConfig) -> Path:
+    """The folder (or transforms .json) that the run was trained on."""
+    return Path(config.data_config.data or config.data_config.dataparser.data)
 
 
 def raster_settings(scene: SavedScene) -> RasterSettings:

@@ -1,0 +1,84 @@
+"""Runs on disk without training: a few discs in front of the ring of cameras of ``data_folders``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from data_folders import HEIGHT, WIDTH, write_image, write_transforms
+
+from beags_plugin.core.surfels import Surfels
+
+CLASSES = {0: "background", 1: "cup", 2: "box"}
+
+
+def discs(seed: int = 0, shift: float = 0.0) -> tuple[Surfels, torch.Tensor]:
+    """Two clouds of opaque discs, cup and box, and a few of the background; classes [N] int32."""
+    generator = torch.Generator().manual_seed(seed)
+    centers = {1: (-0.5 + shift, 0.0, 0.1), 2: (0.5, 0.1, 0.0), 0: (0.0, 0.0, -0.7)}
+    means, ids = [], []
+    for class_id, center in centers.items():
+        means.append(0.12 * torch.randn(25, 3, generator=generator) + torch.tensor(center))
+        ids += [class_id] * 25
+    count = len(ids)
+    surfels = Surfels(
+        torch.cat(means),
+        torch.randn(count, 4, generator=generator),
+        torch.full((count, 2), -2.0),
+        torch.full((count,), 3.0),
+        0.5 * torch.randn(count, 4, 3, generator=generator),
+    )
+    return surfels, torch.tensor(ids, dtype=torch.int32)
+
+
+def write_scene(root: Path, masks: bool = True, truth_factor: int = 1) -> Path:
+    """Nine views with id masks of two rectangles; if ``truth_factor`` > 1, ground truth so many times as large."""
+    write_transforms(root)
+    (root / "classes.json").write_text(json.dumps({str(index): name for index, name in CLASSES.items() if index}))
+    ids = np.zeros((HEIGHT, WIDTH), np.uint8)
+    ids[4:9, 4:9], ids[4:8, 11:15] = 1, 2
+    for index in range(9) if masks else ():
+        write_image(root / f"masks/v{index:02d}.png", np.roll(ids, index % 3, axis=1))
+    if masks and truth_factor > 1:
+        large = np.kron(ids, np.ones((truth_factor, truth_factor), np.uint8))
+        for name in ("v00", "v08"):
+            write_image(root / f"ground_truth/masks/{name}.png", large)
+            write_image(root / f"ground_truth/silhouettes/cup/{name}.png", np.uint8(255) * (large == 1))
+    return root
+
+
+def write_trained(
+    folder: Path, data: Path, assigned: bool = True, base: bool = True, background: str = "black"
+) -> Path:
+    """config.yml of a run, with its base if asked for, that holds ``discs``; before refinement the cup is off."""
+    from beags_plugin.plugin.config import base_config
+    from beags_plugin.plugin.runs import write_run
+
+    config = base_config()
+    config.run_dir = folder
+    parser = config.data_config.dataparser
+    parser.data, parser.orientation_method, parser.center_method = data, "none", "none"
+    parser.auto_scale_poses = False
+    config.model_config.background_color = background
+    if assigned and base:
+        write_run(config, folder / "base", _state(*discs(shift=0.15)), 99)
+    return write_run(config, folder, _state(*discs(), assigned=assigned), 199)
+
+
+def _state(surfels: Surfels, class_ids: torch.Tensor, assigned: bool = True) -> dict:
+    return {
+        "gauss_params.means": surfels.means,
+        "gauss_params.quats": surfels.quats,
+        "gauss_params.scales": surfels.log_scales,
+        "gauss_params.opacities": surfels.opacity_logits[:, None],
+        "gauss_params.features_dc": surfels.sh[:, 0],
+        "gauss_params.features_rest": surfels.sh[:, 1:],
+        "class_ids": class_ids,
+        "class_margin": torch.ones(len(class_ids)),
+        "assigned": torch.tensor(assigned),
+        "extent": torch.tensor(3.0),
+        "refined_steps": torch.tensor(0),
+        "_extra_state": {"classes": CLASSES if assigned else {0: "background"}},
+    }
