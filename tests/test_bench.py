@@ -14,6 +14,7 @@ pytest.importorskip("nerfstudio")
 
 from beags_plugin.bench import runner
 from beags_plugin.bench.experiment import Variant, experiment_names, load_experiment
+from beags_plugin.bench.report import write_csv, write_json
 from beags_plugin.bench.results import (
     COLUMNS,
     FIGURES,
@@ -22,8 +23,7 @@ from beags_plugin.bench.results import (
     make_row,
     means,
     report_json,
-    write_csv,
-    write_json,
+    table_rows,
 )
 from beags_plugin.bench.run import Options, adapted, rows_of, run_experiment, scenes_of
 from beags_plugin.bench.runner import Outcome, run_trials
@@ -347,7 +347,7 @@ def test_json_and_csv_hold_every_row_and_the_same_figures(rows, tmp_path, experi
     experiment = dataclasses.replace(experiment, variants=(Variant("none"), Variant("k = 8", sweep="k", x=8.0)))
     report = report_json(experiment, rows, {"commit": "abc", "quick": False})
     write_json(tmp_path / "deep/r.json", report)
-    write_csv(tmp_path / "deep/r.csv", rows)
+    write_csv(tmp_path / "deep/r.csv", table_rows(rows))
     read = json.loads((tmp_path / "deep/r.json").read_text())
     assert read["experiment"] == "mine" and read["commit"] == "abc" and read["paper"] is None
     assert all(set(row) == set(COLUMNS) for row in read["rows"])

@@ -87,6 +87,7 @@ class ExperimentFile(Trainings):
         return str(self.file)
 
 
+@dataclass
 class Reprojection:
     """Time and accuracy of the mask reprojections against the number of views, on the sample."""
 

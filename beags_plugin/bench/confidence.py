@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from beags_plugin.bench.report import new_figure, save_figure
 from beags_plugin.bench.runner import Outcome
 from beags_plugin.bench.trials import Run
 from beags_plugin.masks.classes import colorize
@@ -27,23 +28,15 @@ _WRONG, _MENDED, _SPOILT, _UNKNOWN = (230, 75, 45), (60, 160, 90), (200, 0, 200)
 
 def draw_confidence(path: Path, runs: Sequence[Run], outcomes: Mapping[str, Outcome]) -> None:
     """Write the picture: for every scene the views that tell most, of the run whose damage is nearest to strong."""
-    import matplotlib
-
-    matplotlib.use("Agg")  # there may be no screen
-    from matplotlib import pyplot
-
     rows = [(run.scene.name, view) for run in shown_runs(runs, outcomes) for view in _views(run, outcomes)]
-    count = max(len(rows), 1)
-    figure, axes = pyplot.subplots(count, 6, figsize=(18, 2.6 * count), squeeze=False, layout="constrained")
+    figure, axes = new_figure(6, max(len(rows), 1), size=(3.0, 2.6))
     for axis in axes.flat:
         axis.set_axis_off()
     for line, (scene, view) in zip(axes, rows, strict=False):
         _draw_view(line, scene, view)
     if not rows:
         axes[0, 0].set_title("no run with reprojection has finished", loc="left")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
-    pyplot.close(figure)
+    save_figure(path, figure)
 
 
 def shown_runs(runs: Sequence[Run], outcomes: Mapping[str, Outcome]) -> list[Run]:

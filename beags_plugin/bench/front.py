@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beags_plugin.bench.experiment import Experiment
+from beags_plugin.bench.report import new_figure, save_figure
 from beags_plugin.bench.results import Row, means
 
 if TYPE_CHECKING:
@@ -33,13 +34,7 @@ def pareto_front(rows: Sequence[Row], cost: str, quality: str) -> list[Row]:
 
 def draw_front(path: Path, experiment: Experiment, rows: Sequence[Row]) -> None:
     """Write the picture: a panel for every pair of a cost and a quality, with the mean of every variant."""
-    import matplotlib
-
-    matplotlib.use("Agg")  # there may be no screen
-    from matplotlib import pyplot
-
-    shape = (len(QUALITIES), len(COSTS))
-    figure, axes = pyplot.subplots(*shape, figsize=(9 * shape[1], 6.5 * shape[0]), squeeze=False, layout="constrained")
+    figure, axes = new_figure(len(COSTS), len(QUALITIES), size=(9.0, 6.5))
     averaged = means(rows)
     for line, (quality, quality_title, factor) in enumerate(QUALITIES):
         for column, (cost, cost_title) in enumerate(COSTS):
@@ -48,9 +43,7 @@ def draw_front(path: Path, experiment: Experiment, rows: Sequence[Row]) -> None:
             panel.set_xlabel(cost_title)
             panel.set_ylabel(quality_title)
     figure.suptitle(f"{experiment.description} Line: the Pareto front.")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
-    pyplot.close(figure)
+    save_figure(path, figure)
 
 
 def _panel(axes: Axes, rows: Sequence[Row], cost: str, quality: str, factor: float) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from beags_plugin.bench.experiment import Experiment
+from beags_plugin.bench.report import new_figure, save_figure
 from beags_plugin.bench.results import Row, means
 
 if TYPE_CHECKING:
@@ -26,17 +27,9 @@ _LOGARITHMIC = 20.0  # an axis that spans more than this factor is logarithmic
 
 def draw(path: Path, experiment: Experiment, rows: Sequence[Row]) -> None:
     """Write the picture as PNG (or what the suffix says): a row of bars for the variants, one of curves per sweep."""
-    import matplotlib
-
-    matplotlib.use("Agg")  # there may be no screen
-    from matplotlib import pyplot
-
     variants = [row for row in rows if not row.variant.sweep]
     height = 1 if variants else 0
-    count = height + len(experiment.sweeps)
-    figure, axes = pyplot.subplots(
-        count, len(_CURVES), figsize=(4.0 * len(_CURVES), 3.6 * count), squeeze=False, layout="constrained"
-    )
+    figure, axes = new_figure(len(_CURVES), height + len(experiment.sweeps))
     if variants:
         for column, (metric, title) in enumerate(_BARS):
             _bars(axes[0, column], experiment, variants, metric, title, column, labels=column == 0)
@@ -47,9 +40,7 @@ def draw(path: Path, experiment: Experiment, rows: Sequence[Row]) -> None:
         for column, curve in enumerate(_CURVES):
             _curves(axes[line, column], [row for row in rows if row.variant.sweep == sweep], sweep, *curve)
     figure.suptitle(experiment.description)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
+    save_figure(path, figure)
 
 
 def _bars(

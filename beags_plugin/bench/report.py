@@ -64,14 +64,16 @@ def number(value: float | None, digits: int) -> str:
     return "–" if value is None else f"{value:.{digits}f}"
 
 
-def new_figure(columns: int, rows: int = 1) -> tuple[Figure, Any]:
-    """A figure that needs no screen, and its axes [rows][columns]."""
+def new_figure(columns: int, rows: int = 1, size: tuple[float, float] = (4.4, 3.6)) -> tuple[Figure, Any]:
+    """A figure that needs no screen, and its axes [rows][columns]; size: of each, in inches."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    return pyplot.subplots(rows, columns, figsize=(4.4 * columns, 3.6 * rows), squeeze=False, layout="constrained")
+    return pyplot.subplots(
+        rows, columns, figsize=(size[0] * columns, size[1] * rows), squeeze=False, layout="constrained"
+    )
 
 
 def save_figure(path: Path, figure: Figure) -> None:

@@ -1,13 +1,10 @@
-"""From the outcomes of an experiment's trials to rows, means over scenes, JSON and CSV."""
+"""From the outcomes of an experiment's trials to rows and means over scenes, as plain values."""
 
 from __future__ import annotations
 
-import csv
-import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from beags_plugin.bench.experiment import Experiment, Variant
@@ -154,17 +151,6 @@ def report_json(experiment: Experiment, rows: Sequence[Row], provenance: Mapping
     }
 
 
-def write_json(path: Path, report: Mapping[str, Any]) -> None:
-    """Write the report; its folder is made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """Write every row, objects included, then the means (scene "mean"); its folder is made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        for row in [*rows, *means(rows)]:
-            writer.writerows(flat(row))
+def table_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Every row, objects included, then the means (scene "mean"), each with ``COLUMNS``."""
+    return [line for row in [*rows, *means(rows)] for line in flat(row)]

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import shlex
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
 from beags_plugin.bench.experiment import Experiment, Variant, check_keys, load_experiment
-from beags_plugin.bench.results import Row, make_row, report_json, write_csv, write_json
+from beags_plugin.bench.report import provenance, write_csv, write_json
+from beags_plugin.bench.results import Row, make_row, report_json, table_rows
 from beags_plugin.bench.runner import Outcome, run_trials
 from beags_plugin.bench.scenes import Scene, damaged_masks, given_scenes, sample_scene
 from beags_plugin.bench.trials import MODEL, Run, plan, steps_of
@@ -51,7 +49,6 @@ def run_experiment(name: str, options: Options) -> list[Row]:
     from beags_plugin.bench.confidence import draw_confidence
     from beags_plugin.bench.front import draw_front
     from beags_plugin.bench.pictures import draw
-    from beags_plugin.bench.provenance import commit, describe_machine
     from beags_plugin.bench.tables import tables
 
     experiment = adapted(load_experiment(name), options)
@@ -69,14 +66,8 @@ def run_experiment(name: str, options: Options) -> list[Row]:
     for table in tables(experiment, rows):
         wide.print(table)
     files = {kind: getattr(options, kind) or options.output / f"{experiment.name}.{end}" for kind, end in _FILES}
-    provenance: dict[str, Any] = {
-        "command": shlex.join(["beags", *sys.argv[1:]]),
-        "commit": commit(),
-        "machine": describe_machine(),
-        "quick": options.quick,
-    }
-    write_json(files["json"], report_json(experiment, rows, provenance))
-    write_csv(files["csv"], rows)
+    write_json(files["json"], report_json(experiment, rows, {**provenance(), "quick": options.quick}))
+    write_csv(files["csv"], table_rows(rows))
     draw(files["picture"], experiment, rows)
     if experiment.confidence:
         files["confidence"] = files["picture"].with_stem(files["picture"].stem + "-confidence")

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from beags_plugin.bench.experiment import Experiment, Paper
+from beags_plugin.bench.report import number
 from beags_plugin.bench.results import STAGES, Row, error_left, find_reference, means
 
 if TYPE_CHECKING:
@@ -128,11 +129,6 @@ def paper_table(paper: Paper, reference: str | None) -> Table:
             cells.append(f"{iou:.1f} / {biou:.1f}{left}")
         table.add_row(Text(name), *cells)
     return table
-
-
-def number(value: float | None, digits: int) -> str:
-    """A figure, or a dash where there is none."""
-    return "–" if value is None else f"{value:.{digits}f}"
 
 
 def percent(value: float | None) -> str:
