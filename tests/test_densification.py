@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import (
     DensifyConfig,
     GradientStatistics,
     densify,
     initial_surfels,
     reset_opacity,
-    screen_gradient,
 )
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.sh import sh_colors
@@ -120,25 +118,6 @@ def test_the_scale_of_the_scene_changes_nothing():
     large = densify(larger, gradients, EXTENT * factor, CONFIG, step, generator())
     assert torch.equal(small.source, large.source)
     torch.testing.assert_close(large.surfels.means / factor, small.surfels.means, rtol=1e-5, atol=1e-6)
-
-
-def test_screen_gradient_is_that_of_moving_the_centre_across_the_image():
-    """By the chain rule with the projection's own Jacobian, for a loss that sees only the projected centre."""
-    g = generator(5)
-    quat = torch.randn(4, generator=g, dtype=torch.float64)
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = rotation_from_quat(quat)
-    viewmat[:3, 3] = torch.tensor([0.1, -0.2, 6.0])
-    K = torch.tensor([[50.0, 0, 20], [0, 70.0, 11], [0, 0, 1]], dtype=torch.float64)
-    camera = Camera(viewmat, K, 48, 32)
-    means = torch.randn(6, 3, generator=g, dtype=torch.float64).requires_grad_()
-    pulls = torch.randn(6, 2, generator=g, dtype=torch.float64)  # dL/dc, per pixel
-    p = means @ camera.rotation.T + camera.translation
-    (pulls * (p @ K.T)[:, :2] / p[:, 2:]).sum().backward()
-    expected = (pulls * torch.tensor([24.0, 16.0])).norm(dim=-1)
-    torch.testing.assert_close(screen_gradient(means.grad, means.detach(), camera), expected)
-    behind = -20 * camera.rotation[2][None]
-    assert screen_gradient(torch.ones(1, 3, dtype=torch.float64), behind, camera).item() == 0.0
 
 
 def test_statistics_average_over_the_views_that_saw_a_surfel():

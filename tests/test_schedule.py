@@ -151,27 +151,32 @@ def test_official_learning_rates(model):
     assert all(configs[name]["optimizer"].eps == 1e-15 for name in configs)
 
 
-def test_growth_looks_at_the_pull_of_geometry_not_of_direction_dependent_colour(model):
-    """As officially: the gradient of the rasterizer's input, apart from that through the viewing direction."""
+def test_only_steps_of_growth_are_drawn_with_what_growth_looks_at(model):
+    from types import SimpleNamespace
+
     from nerfstudio.cameras.cameras import Cameras
+
+    from beags_plugin.plugin.training import Densifier
 
     pose = torch.eye(4)[None, :3]
     pose[0, 2, 3] = 4.0
-    camera = Cameras(
-        pose, torch.tensor([40.0]), torch.tensor([40.0]), torch.tensor([16.0]), torch.tensor([12.0]), 32, 24
-    )
+    one = torch.tensor([40.0])
+    camera = Cameras(pose, one, one, torch.tensor([16.0]), torch.tensor([12.0]), 32, 24)
     model.train()
-    model.step, model.schedule, model.extent = 5_000, PhaseSchedule(30_000, 0, 30_000), torch.tensor(1.0)
-    torch.nn.init.normal_(model.gauss_params["features_rest"], generator=torch.Generator().manual_seed(4))
+    model.schedule, model.extent = PhaseSchedule(30_000, 0, 30_000), torch.tensor(1.0)
+    densifier = Densifier(model, {})
 
-    def pulls():
-        model.zero_grad()
+    def gathered(step):
+        before = float(densifier.statistics.total.sum())
+        model.step = step
+        densifier.before_step(step)
         model.get_outputs(camera)["rgb"].square().sum().backward()
-        return model.drawn.means.grad.clone(), model.gauss_params["means"].grad.clone()
+        densifier.after_step(step)
+        return float(densifier.statistics.total.sum()) - before
 
-    geometry, everything = pulls()
-    assert float((geometry - everything).abs().max()) > 0.1 * float(everything.abs().max())
-    torch.nn.init.zeros_(model.gauss_params["features_rest"])  # no direction: both are the same
-    geometry, everything = pulls()
-    assert float(everything.abs().max()) > 0
-    assert torch.equal(geometry, everything)
+    assert gathered(5_000) > 0  # no multiple of 100 steps is done: nothing grows
+    assert float(densifier.statistics.views.max()) == 1
+    assert gathered(14_997) > 0 and model.drawn.screen_shift is not None
+    assert gathered(15_000) == 0 and model.drawn.screen_shift is None
+    densifier.config = SimpleNamespace(stop=10**9)
+    assert gathered(29_999) == 0  # the last step of the base prepares for what follows

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from beags_plugin.core.cameras import Camera
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.sh import num_sh_bases
 from beags_plugin.core.surfels import Surfels
@@ -96,21 +95,6 @@ class GradientStatistics:
     def mean(self) -> Tensor:
         """[N]; 0 for a surfel that no view saw."""
         return self.total / self.views.clamp_min(1.0)
-
-
-def screen_gradient(mean_grads: Tensor, means: Tensor, camera: Camera) -> Tensor:
-    """How strongly the loss pulls each surfel across the screen.
-
-    Moving the projected centre c by one pixel parallel to the image plane moves the mean by p_z / f, so
-    dL/dc = (W dL/dmean) p_z / f; half the image size turns pixels into the units the threshold is stated in.
-
-    mean_grads, means: [N, 3] world. Returns [N]; 0 behind the camera.
-    """
-    in_camera = mean_grads @ camera.rotation.T
-    depth = (means @ camera.rotation.T + camera.translation)[:, 2]
-    x = in_camera[:, 0] * depth / camera.K[0, 0] * (0.5 * camera.width)
-    y = in_camera[:, 1] * depth / camera.K[1, 1] * (0.5 * camera.height)
-    return torch.where(depth > 0, torch.hypot(x, y), torch.zeros_like(depth))
 
 
 def densify(

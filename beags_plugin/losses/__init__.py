@@ -9,6 +9,7 @@ LOSSES = Registry(
         "photometric": "beags_plugin.losses.photometric:PhotometricLoss",
         "normal": "beags_plugin.losses.normal:NormalConsistencyLoss",
         "distortion": "beags_plugin.losses.distortion:DistortionLoss",
+        "opacity": "beags_plugin.losses.opacity:OpacityLoss",
         "boundary": "beags_plugin.losses.boundary:BoundaryLoss",
         "occupancy": "beags_plugin.losses.occupancy:OccupancyLoss",
     },

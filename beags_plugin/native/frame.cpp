@@ -161,7 +161,7 @@ void Frame<T>::backward(const Inputs<T>& inputs, const int32_t* target, const Im
   job.gradients = from;
   const Parts parts = (from.depth || from.median_depth || from.normal ? kGeometry : 0) |
                       (from.distortion ? kDistortion : 0) | (from.boundary ? kBoundary : 0);
-  const bool only_colors = !to.means && !to.quats && !to.log_scales && !to.opacity_logits;
+  const bool only_colors = !to.means && !to.quats && !to.log_scales && !to.opacity_logits && !to.screen_shift;
   const Variant<T>& variant = kernels<T>().variants[parts];
   const auto kernel = only_colors ? kernels<T>().backward_colors : variant.backward;
   const int size = only_colors ? kColorRecord : variant.record_size;
@@ -187,7 +187,7 @@ void Frame<T>::reduce(const Inputs<T>& inputs, const T* records, int size, const
   const auto write = [](T* values, int64_t surfel, const double* numbers, int count) {
     for (int i = 0; values && i < count; ++i) values[count * surfel + i] = static_cast<T>(numbers[i]);
   };
-  const bool shape = to.means || to.quats || to.log_scales;
+  const bool shape = to.means || to.quats || to.log_scales || to.screen_shift;
   const int team = num_surfels_ < kTeamSurfels ? 1 : threads;
   // Determinism: each surfel's records are summed by one thread, in the order of their tiles.
 #pragma omp parallel for num_threads(team) schedule(dynamic, kChunk)
@@ -207,6 +207,7 @@ void Frame<T>::reduce(const Inputs<T>& inputs, const T* records, int size, const
     write(to.means, i, g.mean, 3);
     write(to.quats, i, g.quat, 4);
     write(to.log_scales, i, g.log_scale, 2);
+    write(to.screen_shift, i, g.screen_shift, 2);
   }
 }
 

@@ -25,7 +25,7 @@ struct Inputs {
 // Null: not wanted. The others are zero on entry: surfels that were not drawn are left alone.
 template <class T>
 struct InputGradients {
-  T *means, *quats, *log_scales, *opacity_logits, *colors, *background;
+  T *means, *quats, *log_scales, *opacity_logits, *colors, *screen_shift, *background;
 };
 
 // How much there is to do; see Work.

@@ -70,7 +70,8 @@ void bind(nb::module_& m, const char* name) {
           "backward",
           [](const Frame<T>& self, In means, In quats, In log_scales, In opacity_logits, In colors, Ids target,
              In color, In alpha, In depth, In median_depth, In normal, In distortion, In boundary, Out g_means,
-             Out g_quats, Out g_log_scales, Out g_opacity_logits, Out g_colors, Out g_background, int threads) {
+             Out g_quats, Out g_log_scales, Out g_opacity_logits, Out g_colors, Out g_screen_shift, Out g_background,
+             int threads) {
             const Inputs<T> inputs{static_cast<int64_t>(means.shape(0)),
                                    means.data(),
                                    quats.data(),
@@ -83,13 +84,14 @@ void bind(nb::module_& m, const char* name) {
                           {color.data(), alpha.data(), depth.data(), median_depth.data(), normal.data(),
                            distortion.data(), boundary.data()},
                           {g_means.data(), g_quats.data(), g_log_scales.data(), g_opacity_logits.data(),
-                           g_colors.data(), g_background.data()},
+                           g_colors.data(), g_screen_shift.data(), g_background.data()},
                           threads);
           },
           "means"_a, "quats"_a, "log_scales"_a, "opacity_logits"_a, "colors"_a, "target"_a.none(), "color"_a.none(),
           "alpha"_a.none(), "depth"_a.none(), "median_depth"_a.none(), "normal"_a.none(), "distortion"_a.none(),
           "boundary"_a.none(), "g_means"_a.none(), "g_quats"_a.none(), "g_log_scales"_a.none(),
-          "g_opacity_logits"_a.none(), "g_colors"_a.none(), "g_background"_a.none(), "threads"_a)
+          "g_opacity_logits"_a.none(), "g_colors"_a.none(),
+          "g_screen_shift"_a.none(), "g_background"_a.none(), "threads"_a)
       .def(
           "class_contributions",
           [](const Frame<T>& self, Ids labels, int num_classes, Out out, int threads) {

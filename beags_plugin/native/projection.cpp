@@ -131,15 +131,16 @@ ShapeGradients project_backward(const View& view, const SurfelParameters& s, con
   const double q1[3] = {mv[0] * g[kSx] - mu[0] * g[kSy], mv[0] * g[kSxx] - mu[0] * g[kSxy],
                         mv[0] * g[kSxy] - mu[0] * g[kSyy]};
   const double* q2 = g + kH;
-  // dx = x - cx: the centre moves every pixel's q, besides the low-pass disc.
-  const double g_cx = g[kCx] - (mv[1] * q0[0] - mv[0] * q1[0] + w_x * q2[0]);
-  const double g_cy = g[kCy] - (-mu[1] * q0[0] + mu[0] * q1[0] + w_y * q2[0]);
+  // dx = x - cx: the centre moves every pixel's q (and, apart from that, the low-pass disc).
+  const double g_cx = -(mv[1] * q0[0] - mv[0] * q1[0] + w_x * q2[0]);
+  const double g_cy = -(-mu[1] * q0[0] + mu[0] * q1[0] + w_y * q2[0]);
   const double g_w0 = q2[0] + at.z * g[kDet];
   double g_z = g[kZ] + w_0 * g[kDet];
   const double g_mu[2] = {q1[2] - at.b[2] * q2[2] + mv[1] * g_w0, -q0[2] + at.a[2] * q2[2] - mv[0] * g_w0};
   const double g_mv[2] = {-q1[1] + at.b[2] * q2[1] - mu[1] * g_w0, q0[1] - at.a[2] * q2[1] + mu[0] * g_w0};
-  const double g_cx_all = g_cx - at.a[2] * g_mu[0] - at.b[2] * g_mu[1];
-  const double g_cy_all = g_cy - at.a[2] * g_mv[0] - at.b[2] * g_mv[1];
+  const double g_disc_x = g_cx - at.a[2] * g_mu[0] - at.b[2] * g_mu[1];
+  const double g_disc_y = g_cy - at.a[2] * g_mv[0] - at.b[2] * g_mv[1];
+  const double g_cx_all = g_disc_x + g[kCx], g_cy_all = g_disc_y + g[kCy];
 
   double g_a[3], g_b[3], g_p[3];  // towards a, b, p over p_z; then towards a, b, p
   for (int i = 0; i < 3; ++i) {
@@ -158,6 +159,8 @@ ShapeGradients project_backward(const View& view, const SurfelParameters& s, con
   g_p[2] += g_z;
 
   ShapeGradients out;
+  out.screen_shift[0] = g_disc_x * view.width / 2;
+  out.screen_shift[1] = g_disc_y * view.height / 2;
   multiply_transposed(view.rotation, g_p, out.mean);
   const double g_normal[3] = {at.facing * g[kNormal], at.facing * g[kNormal + 1], at.facing * g[kNormal + 2]};
   double u[3], v[3], n[3];  // towards the columns of R

@@ -24,6 +24,7 @@ struct SurfelParameters {
 
 struct ShapeGradients {
   double mean[3], quat[4], log_scale[2];
+  double screen_shift[2];  // see rasterizers/interface.py
 };
 
 enum class Fate { kDrawn, kCulled, kNonFinite };
@@ -35,7 +36,7 @@ Fate project(const View& view, const SurfelParameters& surfel, Splat<double>& sp
 // maximum: most surfels, which the kernels then draw without these distinctions.
 bool is_plain(const View& view, const Splat<double>& splat);
 
-// The gradient towards mean, quat and log_scale, from that towards the splat's fields (`record`: kRecord sums).
+// The gradient towards mean, quat, log_scale and screen shift, from that towards the splat's fields (`record`: kRecord sums).
 ShapeGradients project_backward(const View& view, const SurfelParameters& surfel, const double* record);
 
 }  // namespace beags

@@ -90,6 +90,7 @@ def base_config() -> BeagsTrainerConfig:
                     "photometric": LossSpec(options={"ssim_weight": 0.2}),
                     "distortion": LossSpec(weight=0.0, start=3_000),
                     "normal": LossSpec(weight=0.05, start=7_000),
+                    "opacity": LossSpec(weight=0.0, phase="base"),
                     "boundary": LossSpec(weight=0.5, phase="refine"),
                     "occupancy": LossSpec(weight=10.0, phase="refine", options={"samples": 20, "background": True}),
                 },

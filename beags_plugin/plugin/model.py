@@ -103,11 +103,11 @@ class BeagsModelConfig(ModelConfig):
 
 @dataclass(frozen=True)
 class Drawn:
-    """What the last training step drew. means: [N, 3], the rasterizer's input, which keeps its own gradient."""
+    """What the last training step drew. screen_shift: [N, 2] of ``SurfelInputs``, whose gradient growth looks at."""
 
     camera: Camera
     render: RasterOutputs
-    means: Tensor
+    screen_shift: Tensor | None
 
 
 def fixed_background(config: BeagsModelConfig) -> Tensor:
@@ -167,6 +167,7 @@ class BeagsModel(SplatfactoModel):
         self.step = 0
         self.seed = 0
         self.frozen = False
+        self.growing = False
         self.prepared_seconds: dict[str, float] = {}
         self.refining_since = 0.0
         self.crop_box: OrientedBox | None = None
@@ -277,10 +278,8 @@ class BeagsModel(SplatfactoModel):
         inputs = surfel_inputs(
             self.surfels(), camera, self.active_sh_degree(), self.class_ids if target is not None else None
         )
-        # a node of its own: what pulls the surfels across the screen, without the pull of direction-dependent colour
-        inputs = replace(inputs, means=inputs.means.view_as(inputs.means))
-        if inputs.means.requires_grad:
-            inputs.means.retain_grad()
+        if self.growing:
+            inputs = replace(inputs, screen_shift=torch.zeros_like(inputs.means[:, :2]).requires_grad_())
         render = self.rasterizer.rasterize(
             inputs,
             camera,
@@ -288,7 +287,7 @@ class BeagsModel(SplatfactoModel):
             background,
             None if target is None else target.to(self.device, torch.int32),
         )
-        self.drawn = Drawn(camera, render, inputs.means)
+        self.drawn = Drawn(camera, render, inputs.screen_shift)
         outputs = {"rgb": render.color, "accumulation": render.alpha[..., None], "background": background}
         if render.depth is not None:
             outputs["depth"] = render.depth[..., None]

@@ -8,7 +8,7 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from torch import Tensor
 
-from beags_plugin.core.densification import GradientStatistics, densify, reset_opacity, screen_gradient
+from beags_plugin.core.densification import GradientStatistics, densify, reset_opacity
 from beags_plugin.plugin.refinement import RefinementSwitch
 from beags_plugin.plugin.schedule import log_linear
 
@@ -34,6 +34,7 @@ def training_callbacks(model: BeagsModel, attributes: TrainingCallbackAttributes
 
     def before(step: int) -> None:
         model.step = step
+        densifier.before_step(step)
         switch.before_step(step)
         set_learning_rates(model, optimizers, trainer.config.optimizers, step)
 
@@ -74,15 +75,18 @@ class Densifier:
         self.optimizers = optimizers
         self.statistics = GradientStatistics(model.num_points)
 
+    def before_step(self, step: int) -> None:
+        """Let the step be drawn with what is gathered, as long as the scene still grows."""
+        self.model.growing = step + 1 < min(self.config.stop, self.model.schedule.base_steps)
+
     def after_step(self, step: int) -> None:
         """Gather; densify and reset opacities when their step has come."""
-        model, config, drawn = self.model, self.config, self.model.drawn
+        config, drawn = self.config, self.model.drawn
         done = step + 1
-        if done >= min(config.stop, model.schedule.base_steps) or drawn is None:
+        if not self.model.growing or drawn is None:
             return
-        if drawn.means.grad is not None:
-            gradient = screen_gradient(drawn.means.grad, drawn.means.detach(), drawn.camera)
-            self.statistics.add(gradient, drawn.render.visible)
+        if drawn.screen_shift is not None and drawn.screen_shift.grad is not None:
+            self.statistics.add(drawn.screen_shift.grad.norm(dim=-1), drawn.render.visible)
         if config.grows_at(done):
             self._densify(done)
         if config.resets_at(done):

@@ -34,6 +34,7 @@ class InputGradients(NamedTuple):
     log_scales: Tensor | None
     opacity_logits: Tensor | None
     colors: Tensor | None
+    screen_shift: Tensor | None
     background: Tensor | None
 
 
@@ -45,6 +46,7 @@ class Needed(NamedTuple):
     log_scales: bool
     opacity_logits: bool
     colors: bool
+    screen_shift: bool
     background: bool
 
 
@@ -115,13 +117,14 @@ class KernelRasterizer(Rasterizer):
             if inputs.class_ids is None:
                 raise ValueError("class_ids must be given together with target")
         floats = (inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits, inputs.colors)
-        differentiable = torch.is_grad_enabled() and any(value.requires_grad for value in (*floats, background))
+        watched = [value for value in (*floats, inputs.screen_shift, background) if value is not None]
+        differentiable = torch.is_grad_enabled() and any(value.requires_grad for value in watched)
         bare = SurfelInputs(*(value.detach() for value in floats), class_ids=inputs.class_ids)
         drawing = Drawing(bare, camera, settings, background.detach().contiguous(), target, differentiable)
         if not differentiable:
             images, visible, num_nonfinite, _ = self.forward_kernel(drawing)
         else:
-            found: Any = _Rasterize.apply(self, drawing, *floats, background)
+            found: Any = _Rasterize.apply(self, drawing, *floats, inputs.screen_shift, background)
             *images, visible, num_nonfinite = found
         return RasterOutputs(*images, visible=visible, num_nonfinite=num_nonfinite)  # type: ignore
 
@@ -140,10 +143,10 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, *gradients):
-        *floats, background = (value.detach() for value in ctx.saved_tensors)
+        *floats, _, background = (value if value is None else value.detach() for value in ctx.saved_tensors)
         drawing = replace(ctx.drawing, inputs=SurfelInputs(*floats), background=background)
         images = Images(*(None if g is None else g.contiguous() for g in gradients[:-2]))
         if all(g is None for g in images):
-            return (None,) * 8
+            return (None,) * 9
         found = ctx.rasterizer.backward_kernel(drawing, ctx.state, images, Needed(*ctx.needs_input_grad[2:]))
         return None, None, *found

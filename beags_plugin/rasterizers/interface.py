@@ -39,6 +39,9 @@ class SurfelInputs:
     means [N, 3], quats [N, 4] wxyz, log_scales [N, 2], opacity_logits [N]: as in ``core.surfels.Surfels``.
     colors: [N, 3] linear RGB as seen from this view.
     class_ids: [N] int32, phi, or None; needed with ``target``.
+    screen_shift: [N, 2] zeros, or None. A shift of each disc across the screen, in halves of the image's width and
+        height, while its low-pass filter stays in place. Nothing is ever shifted; its gradient is what the official
+        densification looks at. Surfels too small for the disc to show have none.
     """
 
     means: Tensor
@@ -47,6 +50,7 @@ class SurfelInputs:
     opacity_logits: Tensor
     colors: Tensor
     class_ids: Tensor | None = None
+    screen_shift: Tensor | None = None
 
     def checked(self) -> SurfelInputs:
         """Itself, contiguous, after checking shapes and dtypes by name; raises ``ValueError``."""
@@ -54,6 +58,8 @@ class SurfelInputs:
         if dtype not in (torch.float32, torch.float64):
             raise ValueError(f"means must be float32 or float64, not {dtype}")
         shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 2), "opacity_logits": (n,), "colors": (n, 3)}
+        if self.screen_shift is not None:
+            shapes["screen_shift"] = (n, 2)
         for name, shape in shapes.items():
             value = getattr(self, name)
             if tuple(value.shape) != shape or value.dtype != dtype:

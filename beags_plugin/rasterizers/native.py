@@ -99,11 +99,12 @@ class NativeRasterizer(KernelRasterizer):
 
         Only what is needed is allocated and returned. The tiles do less where nothing but ``colors`` and ``background``
         is needed; for any other field they add up the sums of all fields, and what then saves work is to need none of
-        ``means``, ``quats`` and ``log_scales``, as the way back through the projection is skipped.
+        ``means``, ``quats``, ``log_scales`` and ``screen_shift``, as the way back through the projection is skipped.
         """
         floats = [getattr(drawing.inputs, name) for name in _FLOATS]
-        likes = zip((*floats, drawing.background), needed, strict=True)
-        found = InputGradients(*(torch.zeros_like(value) if wanted else None for value, wanted in likes))
+        shift = drawing.inputs.means[:, :2]
+        likes = zip((*floats, shift, drawing.background), needed, strict=True)
+        found = InputGradients(*(value.new_zeros(value.shape) if wanted else None for value, wanted in likes))
         state.backward(*floats, drawing.target, *gradients, *found, extension.threads())
         return found
 

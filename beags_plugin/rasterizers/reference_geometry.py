@@ -17,9 +17,10 @@ class ProjectedSurfels:
     """K surfels that survived culling, nearest first.
 
     index: [K] int64, their places among the inputs.
-    A, B, C: [K, 3] the ray-splat cross product is q = dx A + dy B + C, with (dx, dy) the pixel minus ``center``.
+    A, B, C: [K, 3] the ray-splat cross product is q = dx A + dy B + C, with (dx, dy) the pixel minus ``shifted``.
     det: [K] determinant of M; the plane's depth along a ray is det / q_z.
-    center: [K, 2] pixels, the projected mean c. depth: [K] its depth p_z.
+    center: [K, 2] pixels, the projected mean c, around which the low-pass filter lies; shifted: [K, 2] the same, moved
+        by the inputs' ``screen_shift``, with the disc. depth: [K] its depth p_z.
     normal: [K, 3] camera space, towards the camera. opacity: [K]. box: [K, 4] x0, y0, x1, y1 in pixels.
     num_nonfinite: how many of the inputs were dropped because they, or what they project to, are not finite.
     """
@@ -30,6 +31,7 @@ class ProjectedSurfels:
     C: Tensor
     det: Tensor
     center: Tensor
+    shifted: Tensor
     depth: Tensor
     normal: Tensor
     opacity: Tensor
@@ -82,10 +84,15 @@ def _project(inputs: SurfelInputs, index: Tensor, camera: Camera) -> ProjectedSu
     n = torch.where((n * p).sum(dim=-1, keepdim=True) > 0, -n, n)  # towards the camera
     M = camera.K @ torch.stack([a, b, p], dim=-1)  # (E1)
     center = M[:, :2, 2] / M[:, 2:, 2]
-    # With the pixel counted from c, large coordinates no longer cancel:
+    if inputs.screen_shift is not None:
+        half = center.new_tensor([camera.width / 2, camera.height / 2])
+        moved = torch.cat([M[:, :2, 2] + inputs.screen_shift[index] * half * M[:, 2:, 2], M[:, 2:, 2]], dim=-1)
+        M = torch.cat([M[:, :, :2], moved[:, :, None]], dim=-1)
+    shifted = M[:, :2, 2] / M[:, 2:, 2]
+    # With the pixel counted from the disc's centre, large coordinates no longer cancel:
     # (dx Mw - Mx') x (dy Mw - My') is affine in dx, dy, because Mw x Mw = 0. (E2)
     Mw = M[:, 2]
-    Mx, My = M[:, 0] - center[:, :1] * Mw, M[:, 1] - center[:, 1:] * Mw
+    Mx, My = M[:, 0] - shifted[:, :1] * Mw, M[:, 1] - shifted[:, 1:] * Mw
     C = torch.linalg.cross(Mx, My)
     return ProjectedSurfels(
         index=index,
@@ -94,6 +101,7 @@ def _project(inputs: SurfelInputs, index: Tensor, camera: Camera) -> ProjectedSu
         C=C,
         det=(Mw * C).sum(dim=-1),
         center=center,
+        shifted=shifted,
         depth=p[:, 2],
         normal=n,
         opacity=opacity,
@@ -129,10 +137,9 @@ def hits(projected: ProjectedSurfels, chosen: Tensor, pixels: Tensor, near: floa
 
     smooth_cutoff: fade alpha out above 1/255 instead of cutting it there, so that finite differences hold (tests).
     """
-    dx, dy = (pixels[:, None] - projected.center[chosen]).unbind(-1)
-    dx, dy = dx[..., None], dy[..., None]
+    dx, dy = (pixels[:, None] - projected.shifted[chosen])[..., None].unbind(-2)
     q = dx * projected.A[chosen] + dy * projected.B[chosen] + projected.C[chosen]  # (E2)
-    rho2d = 2.0 * (dx[..., 0] ** 2 + dy[..., 0] ** 2)
+    rho2d = 2.0 * (pixels[:, None] - projected.center[chosen]).square().sum(dim=-1)
     with torch.no_grad():
         # Decided first: where the low-pass wins q_z may be 0 (the ray runs along the plane) or so small that rho3d
         # overflows, and then the branch not taken would still send NaN back.
