@@ -153,11 +153,11 @@ def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
         shown = views[:: max(1, len(views) // SHEET_VIEWS)][:SHEET_VIEWS]
         objects = [index for index in classes if index != 0]
         base, refined = evaluated.stages["before"], evaluated.stages["after"]
-        assert refined.class_ids is not None
-        scenes = (base.surfels(), refined.surfels())
+        assert base.class_ids is not None and refined.class_ids is not None
+        scenes = ((base.surfels(), base.class_ids), (refined.surfels(), refined.class_ids))
         drawing = (evaluated.rasterizer, evaluated.settings)
         scenery = {"novel": novel_camera(views), "background": views.background}
-        rows = draw_rows(shown, *scenes, refined.class_ids, objects, *drawing, **scenery)
+        rows = draw_rows(shown, *scenes, objects, *drawing, **scenery)
         write_contact_sheet(picture, rows, classes)
     training = json.loads((run / "training.json").read_text())
     stages = {"sample": seconds.pop("sample", 0.0), **training["seconds"], **seconds}

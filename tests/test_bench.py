@@ -28,7 +28,7 @@ from beags_plugin.bench.results import (
 from beags_plugin.bench.run import Options, adapted, rows_of, run_experiment, scenes_of
 from beags_plugin.bench.runner import Outcome, run_trials
 from beags_plugin.bench.scenes import Scene, damaged_masks, given_scenes
-from beags_plugin.bench.tables import per_million_pixels, tables
+from beags_plugin.bench.tables import memory_line, per_million_pixels, tables
 from beags_plugin.bench.trials import MODEL, Run, Trial, plan, steps_of
 from beags_plugin.errors import UserError
 from beags_plugin.masks.classes import read_class_map
@@ -375,6 +375,11 @@ def test_tables_say_what_failed_and_whose_figures_the_papers_are(rows):
     text = console.file.getvalue()
     assert "failed: k = 8 on b: k is 0." in text and "k = 8 (1 of 2 scenes)" in text
     assert "the paper's figures, not ours" in text and "92.0 / 85.8 (52)" in text  # (100 - 85.8) / (100 - 72.8)
+
+
+def test_memory_along_a_sweep_is_told_in_a_sentence(rows):
+    assert memory_line(means(rows), "k") == "Along k the peak memory moves from 900 to 900 MB (own: 100 to 100)."
+    assert memory_line(means(rows[3:]), "k") is None
 
 
 def test_the_front_is_what_nothing_beats(tmp_path):

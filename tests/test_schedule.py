@@ -10,8 +10,9 @@ import torch
 pytest.importorskip("nerfstudio")
 
 from beags_plugin.core.densification import DensifyConfig
+from beags_plugin.plugin.scene_edits import move_adam_state
 from beags_plugin.plugin.schedule import PhaseSchedule, log_linear
-from beags_plugin.plugin.training import camera_extent, move_adam_state
+from beags_plugin.plugin.training import camera_extent
 
 
 def test_refinement_repeats_the_last_tenth_of_the_base_schedule():

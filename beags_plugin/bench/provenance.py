@@ -23,6 +23,17 @@ def describe_machine() -> dict[str, str | int]:
     return {"cpu": _cpu_name(), "cores": cores, "memory_mb": memory, "system": platform.system()}
 
 
+def busy_note(cores: int) -> str | None:
+    """A sentence if other programs were at work in the last minute; None if not, or where the system does not say."""
+    try:
+        load = os.getloadavg()[0]
+    except (AttributeError, OSError):
+        return None
+    if load < 0.5 * cores:
+        return None
+    return f"the machine was busy before the start (load {load:.1f} on {cores} cores): wall times mean little"
+
+
 def _cpu_name() -> str:
     try:
         with open("/proc/cpuinfo") as lines:

@@ -10,6 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from beags_plugin.bench.experiment import Experiment, Variant, check_keys, load_experiment
+from beags_plugin.bench.provenance import busy_note
 from beags_plugin.bench.report import provenance, write_csv, write_json
 from beags_plugin.bench.results import Row, make_row, report_json, table_rows
 from beags_plugin.bench.runner import Outcome, run_trials
@@ -52,6 +53,10 @@ def run_experiment(name: str, options: Options) -> list[Row]:
     from beags_plugin.bench.tables import tables
 
     experiment = adapted(load_experiment(name), options)
+    source = provenance()
+    busy = busy_note(int(source["machine"]["cores"]))  # before the trials: they keep the machine busy
+    if busy:
+        CONSOLE.print(f"Note: {busy}.")
     scenes = scenes_of(experiment, options)
     masks = {
         (scene.name, degree): damaged_masks(scene, degree, options.output / "scenes")
@@ -66,7 +71,7 @@ def run_experiment(name: str, options: Options) -> list[Row]:
     for table in tables(experiment, rows):
         wide.print(table)
     files = {kind: getattr(options, kind) or options.output / f"{experiment.name}.{end}" for kind, end in _FILES}
-    write_json(files["json"], report_json(experiment, rows, {**provenance(), "quick": options.quick}))
+    write_json(files["json"], report_json(experiment, rows, {**source, "busy": busy, "quick": options.quick}))
     write_csv(files["csv"], table_rows(rows))
     draw(files["picture"], experiment, rows)
     if experiment.confidence:

@@ -44,6 +44,7 @@ def tables(experiment: Experiment, rows: Sequence[Row]) -> list[Table | str]:
     printed.append("Memory: the peak of the trial's process, and what of it the loaded program does not take.")
     if experiment.reference is not None:
         printed.append(f"BIoU error left: (100 - extracted BIoU) as a share of that of {experiment.reference!r}.")
+    printed += [line for sweep in experiment.sweeps if (line := memory_line(averaged, sweep)) is not None]
     printed += [f"failed: {row.variant.name} on {row.scene}: {row.failed}" for row in rows if row.failed]
     return printed
 
@@ -129,6 +130,19 @@ def paper_table(paper: Paper, reference: str | None) -> Table:
             cells.append(f"{iou:.1f} / {biou:.1f}{left}")
         table.add_row(Text(name), *cells)
     return table
+
+
+def memory_line(averaged: Sequence[Row], sweep: str) -> str | None:
+    """How far memory moves along a sweep, in a sentence; None if nothing of it finished."""
+    rows = [row for row in averaged if row.variant.sweep == sweep]
+    pairs = [(row.figures["peak_memory_mb"], row.figures["own_memory_mb"]) for row in rows]
+    peaks, own = ([value for value in column if value is not None] for column in zip(*pairs, strict=True))
+    if not peaks or not own:
+        return None
+    return (
+        f"Along {sweep} the peak memory moves from {min(peaks):.0f} to {max(peaks):.0f} MB "
+        f"(own: {min(own):.0f} to {max(own):.0f})."
+    )
 
 
 def percent(value: float | None) -> str:

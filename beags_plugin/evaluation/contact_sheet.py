@@ -46,9 +46,8 @@ class SheetRow:
 
 def draw_rows(
     views: Sequence[EvalView],
-    before: Surfels,
-    after: Surfels,
-    class_ids: Tensor,
+    before: tuple[Surfels, Tensor],
+    after: tuple[Surfels, Tensor],
     objects: Sequence[int],
     rasterizer: Rasterizer,
     settings: RasterSettings,
@@ -58,7 +57,7 @@ def draw_rows(
 ) -> list[SheetRow]:
     """Draw the views and one novel view.
 
-    before, after: the N surfels with assignment alone and after refinement. class_ids: [N] int32, phi, of both.
+    before, after: the surfels with assignment alone and after refinement, each with phi, [N] int32.
     objects: ids to show alone. novel: its camera; ``novel_camera`` of the views if None. background: [3], black if
     None.
     No gradients.
@@ -68,11 +67,11 @@ def draw_rows(
         views = [*views, EvalView(novel, None, name="novel view")]
     settings = replace(settings, geometry=False, distortion=False)
     if background is None:
-        background = after.means.new_zeros(3)
+        background = after[0].means.new_zeros(3)
     rows = []
     with torch.no_grad():
         for view in views:
-            inputs = surfel_inputs(after.detach(), view.camera)
+            inputs = surfel_inputs(after[0].detach(), view.camera)
             render = _bytes(rasterizer.rasterize(inputs, view.camera, settings, background).color)
             size = render.shape[:2]
             truths = {c: extracted_truth(view, c) for c in objects}
@@ -81,8 +80,8 @@ def draw_rows(
                 photo=None if view.image is None else _bytes(view.image),
                 labels=None if view.visible is None else resize_nearest(view.visible.cpu().numpy(), *size),
                 render=render,
-                before={c: _alone(before, class_ids, c, view.camera, rasterizer, settings) for c in objects},
-                after={c: _alone(after, class_ids, c, view.camera, rasterizer, settings) for c in objects},
+                before={c: _alone(*before, c, view.camera, rasterizer, settings) for c in objects},
+                after={c: _alone(*after, c, view.camera, rasterizer, settings) for c in objects},
                 focus={c: resize_nearest(t[1].cpu().numpy(), *size) for c, t in truths.items() if t is not None},
             )
             rows.append(row)

@@ -30,6 +30,7 @@ from beags_plugin.plugin.training import training_callbacks
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.drawing import draw_class_map, surfel_inputs
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
+from beags_plugin.refiners.border_split import BorderSplitConfig
 from beags_plugin.refiners.preparation import PreparationConfig
 
 PARAMETER_GROUPS = ("means", "features_dc", "features_rest", "opacities", "scales", "quats")
@@ -89,6 +90,8 @@ class BeagsModelConfig(ModelConfig):
     """When and how the base grows and prunes its Gaussians."""
     prepare: PreparationConfig = field(default_factory=PreparationConfig)
     """Options of mask reprojection and of the voxel grids."""
+    split: BorderSplitConfig = field(default_factory=BorderSplitConfig)
+    """Which Gaussians at class borders are split before refinement; none unless rounds is 1 or more."""
     position_lr: tuple[float, float] = (1.6e-4, 1.6e-6)
     """First and last learning rate of the positions, log-linear, times the scene's extent."""
     near: float = 0.01

@@ -15,10 +15,12 @@ import numpy as np
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from beags_plugin.assignment.assignment import Assignment
 from beags_plugin.errors import UserError
 from beags_plugin.masks.classes import read_class_map, write_class_map
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.runs import BASE_SNAPSHOT, write_run
+from beags_plugin.plugin.scene_edits import edit_scene
 from beags_plugin.progress import progress_bar
 from beags_plugin.refiners import REFINERS
 from beags_plugin.refiners.preparation import Preparation, prepare
@@ -58,6 +60,7 @@ class RefinementSwitch:
         """Raise ``UserError`` at the start of a run whose options would stop it when it comes to refine."""
         if self.wanted:
             self.model.config.prepare.check()
+            self.model.config.split.check()
 
     def before_step(self, step: int) -> None:
         """Take up refinement that a checkpoint was in, or start it where no base step precedes it."""
@@ -92,22 +95,29 @@ class RefinementSwitch:
             model.settings(),
             self.refiner,
             model.config.prepare,
+            model.config.split,
             seed=model.seed,
             stage=progress_bar,
         )
         for finding in prepared.findings:
             CONSOLE.print(f"  {finding}", highlight=False, markup=False)
-        model.class_ids.copy_(prepared.assignment.class_ids)
-        model.class_margin.copy_(prepared.assignment.margin)
-        model.assigned.fill_(True)
+        self._take_classes(prepared.assignment)
         # the snapshot first: what _save writes last says that everything is there
         write_run(self.trainer.config, self.trainer.base_dir / BASE_SNAPSHOT, model.state_dict(), max(step, 0))
         self._save(prepared, [view.name for view in views])
+        if prepared.split is not None:
+            edit_scene(model, self.trainer.optimizers.optimizers, prepared.split.edited)
+            self._take_classes(prepared.split.assignment)
         self._start(prepared.grid, prepared.labels)
         model.prepared_seconds = prepared.seconds
         CONSOLE.print(
             f"  base kept in {self.trainer.base_dir / BASE_SNAPSHOT}", highlight=False, markup=False, soft_wrap=True
         )
+
+    def _take_classes(self, assignment: Assignment) -> None:
+        self.model.class_ids.copy_(assignment.class_ids)
+        self.model.class_margin.copy_(assignment.margin)
+        self.model.assigned.fill_(True)
 
     def _start(self, grid: VisibilityGrid | None, labels: list[torch.Tensor]) -> None:
         self.datamanager.replace_class_maps(labels)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from beags_plugin.core.densification import GradientStatistics, densify, reset_opacity
 from beags_plugin.plugin.refinement import RefinementSwitch
+from beags_plugin.plugin.scene_edits import edit_scene, move_adam_state
 from beags_plugin.plugin.schedule import log_linear
 
 if TYPE_CHECKING:
@@ -98,10 +99,7 @@ class Densifier:
         generator = torch.Generator().manual_seed(model.seed * 1_000_003 + step)
         surfels = model.surfels().detach()
         edited = densify(surfels, self.statistics.mean(), float(model.extent), self.config, step, generator)
-        former = dict(model.gauss_params.items())
-        model.replace_surfels(edited.surfels)
-        for name, optimizer in self.optimizers.items():
-            move_adam_state(optimizer, former[name], model.gauss_params[name], edited.source, edited.fresh)
+        edit_scene(model, self.optimizers, edited)
         self.statistics = GradientStatistics(model.num_points)
         model.drawn = None
 
@@ -113,21 +111,3 @@ class Densifier:
         everyone = torch.arange(logits.shape[0])
         start_anew = torch.ones_like(everyone, dtype=torch.bool)
         move_adam_state(self.optimizers["opacities"], parameter, parameter, everyone, start_anew)
-
-
-def move_adam_state(
-    optimizer: torch.optim.Optimizer, former: Tensor, parameter: Tensor, source: Tensor, fresh: Tensor
-) -> None:
-    """Let an optimizer go on with ``parameter`` in place of ``former``; Adam's moments follow their surfels.
-
-    source: [M] int64, the former index of each surfel; fresh: [M] bool, new ones, whose moments start at 0.
-    """
-    state = optimizer.state.pop(former, {})
-    for name in ("exp_avg", "exp_avg_sq"):
-        if name in state:
-            moved = state[name][source.to(state[name].device)]
-            moved[fresh.to(moved.device)] = 0.0
-            state[name] = moved
-    optimizer.state[parameter] = state
-    for group in optimizer.param_groups:
-        group["params"] = [parameter if held is former else held for held in group["params"]]

@@ -20,6 +20,7 @@ from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.rasterizers.drawing import check_surface_depth, geometry_inputs, surface_depth
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
 from beags_plugin.refiners.base import AssignedScene, Progress, Refiner
+from beags_plugin.refiners.border_split import BorderSplitConfig, SplitScene, split_at_borders
 
 Stage = Callable[[str], AbstractContextManager[Progress | None]]
 """Opens a named stage and gives its progress callback; a command line draws a bar with it."""
@@ -62,6 +63,8 @@ class Preparation:
     labels: per training view [H, W] int32, M'.
     confidence: per training view [H, W] float32, share of the winning votes; None where nothing was reprojected.
     assignment: the class of every surfel and its margin.
+    split: the scene and the classes that refinement starts from, where surfels were split; None where it starts from
+        the base.
     grid: the visibility voxel grids, or None if the refiner needs none.
     findings: one line for a reader per stage.
     seconds: wall time per stage.
@@ -71,6 +74,7 @@ class Preparation:
     confidence: list[Tensor] | None
     assignment: Assignment
     grid: VisibilityGrid | None
+    split: SplitScene | None = None
     findings: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -84,10 +88,11 @@ def prepare(
     settings: RasterSettings,
     refiner: Refiner,
     config: PreparationConfig,
+    split: BorderSplitConfig | None = None,
     seed: int = 0,
     stage: Stage = lambda name: nullcontext(),
 ) -> Preparation:
-    """Make masks consistent, assign classes, build the voxel grids.
+    """Make masks consistent, assign classes, split at borders if the refiner trains, build the voxel grids.
 
     surfels: the trained base, N surfels.
     cameras: V training views; labels: per view [H, W] int32 class ids or IGNORE, None where there is no mask.
@@ -131,16 +136,26 @@ def prepare(
     assignment = replace(assignment, class_ids=known.class_ids(assignment.class_ids))
     timed("assignment", start, _assignment_finding(assignment, class_names))
 
+    divided, class_ids = None, assignment.class_ids
+    if split is not None and split.rounds > 0 and refiner.trains:
+        start = time.perf_counter()
+        with stage("Splitting Gaussians at borders") as progress:
+            divided = split_at_borders(surfels, cameras, ranked, rasterizer, settings, len(known), split, progress)
+        class_ids = known.class_ids(divided.assignment.class_ids)
+        divided = replace(divided, assignment=replace(divided.assignment, class_ids=class_ids))
+        timed("border split", start, _split_finding(len(surfels), divided))
+        surfels = divided.edited.surfels
+
     start = time.perf_counter()
     num_classes = max(class_names) + 1
     scene = AssignedScene(
-        surfels, assignment.class_ids, cameras, consistent, num_classes, rasterizer, settings, seed, config.depth
+        surfels, class_ids, cameras, consistent, num_classes, rasterizer, settings, seed, config.depth
     )
     with stage("Building voxel grids") as progress:
         grid = refiner.build_grid(scene, config.k, progress)
     if grid is not None:
         timed("voxel grids", start, f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {config.k})")
-    return Preparation(consistent, confidence, assignment, grid, findings, seconds)
+    return Preparation(consistent, confidence, assignment, grid, divided, findings, seconds)
 
 
 def _known_classes(labels: Sequence[Tensor | None], class_names: dict[int, str]) -> ClassRanks:
@@ -192,6 +207,11 @@ def _reprojection_finding(before: Sequence[Tensor | None], after: Sequence[Tenso
         f"reprojection: {changed} of {pixels} labelled pixels changed ({100 * changed / max(pixels, 1):.2f} %), "
         f"{filled} views without a mask got one"
     )
+
+
+def _split_finding(before: int, divided: SplitScene) -> str:
+    after = len(divided.edited.surfels)
+    return f"border split: {int(divided.edited.fresh.sum())} halves, {before} Gaussians became {after}"
 
 
 def _assignment_finding(assignment: Assignment, class_names: dict[int, str]) -> str:
