@@ -25,7 +25,7 @@ from beags_plugin.plugin.extract import extract_objects, load_run_config
 from beags_plugin.plugin.model import BeagsModel
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.drawing import surfel_inputs
-from beags_plugin.rasterizers.interface import RasterSettings
+from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
 
 RASTER = RasterSettings(0.03, 300.0, geometry=False)
 
@@ -242,3 +242,23 @@ def test_data_that_has_gone_is_named(tmp_path):
     with pytest.raises(UserError, match=r"config.yml was trained on .*lab, which is gone: put it back"):
         evaluate_run(config)
     assert load_run_config(config).run_dir == tmp_path / "run"
+
+
+def test_truth_of_other_proportions_is_refused(tmp_path):
+    data = write_scene(tmp_path / "lab", truth_factor=2)
+    write_image(data / "ground_truth/masks/v08.png", np.zeros((2 * HEIGHT, WIDTH), np.uint8))
+    with pytest.raises(UserError, match=r"v08.png is 20x24 pixels but its image is 20x12"):
+        evaluate_run(write_trained(tmp_path / "run", data))
+
+
+def test_unlabelled_ids_of_the_truth_do_not_count(tmp_path):
+    data = write_scene(tmp_path / "lab", truth_factor=2)
+    ids = np.zeros((HEIGHT, WIDTH), np.uint8)
+    ids[2:5, 3:6], ids[7:] = 1, 255
+    write_image(data / "ground_truth/masks/v00.png", ids)
+    config = write_trained(tmp_path / "run", data)
+    config.write_text(config.read_text().replace("ignore_ids: !!python/tuple []", "ignore_ids: !!python/tuple [255]"))
+    view = EvaluatedRun(config).views[0]
+    assert view.visible is not None and view.silhouettes is not None
+    assert (view.visible[7:] == IGNORE).all() and (view.visible[:7] == torch.from_numpy(ids[:7].astype(np.int32))).all()
+    assert (view.silhouettes[1]).any()  # 255 is inside, there

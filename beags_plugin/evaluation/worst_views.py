@@ -103,11 +103,13 @@ def draw_worst(
             for index in worst_records(run, kind, count, by):
                 record = run.after.masks[index]
                 view = views[record.view]
-                errors = {}
+                errors: dict[Stage, np.ndarray] = {}
                 for stage, (surfels, class_ids) in scenes.items():
                     drawing = MaskDrawing(surfels.detach(), class_ids, view, rasterizer, settings, run.protocol)
                     errors[stage] = _errors(drawing, record, run.protocol)
-                metrics = {stage: scene.masks[index].metrics for stage, scene in run.stages().items()}
+                metrics: dict[Stage, MaskMetrics] = {}
+                for stage, scene in run.stages().items():
+                    metrics[stage] = scene.masks[index].metrics
                 photo = _photo(view, errors["after"].shape)
                 title = f"{run.scene}, {view.name}: {names[record.class_id]}"
                 found.append(WorstMask(title, kind, photo, errors, metrics))

@@ -7,6 +7,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from torch import Tensor
+
+from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.report import RunMetrics, Stage
@@ -99,11 +102,10 @@ class EvaluatedRun:
 
     def worst(self, metrics: RunMetrics, count: int, by: By = "iou") -> list[WorstMask]:
         """The ``count`` worst masks of each kind, drawn; metrics: what ``metrics`` gave."""
-        scenes = {
-            stage: (scene.surfels(), scene.class_ids)
-            for stage, scene in self.stages.items()
-            if scene.class_ids is not None
-        }
+        scenes: dict[Stage, tuple[Surfels, Tensor]] = {}
+        for stage, scene in self.stages.items():
+            if scene.class_ids is not None:
+                scenes[stage] = (scene.surfels(), scene.class_ids)
         return draw_worst(metrics, scenes, self.views, self.rasterizer, self.settings, count, by)
 
     def _notes(self, after: SceneMetrics) -> Iterator[str]:

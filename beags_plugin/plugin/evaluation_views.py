@@ -10,9 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from beags_plugin.errors import UserError
 from beags_plugin.evaluation.metrics import resize_nearest
 from beags_plugin.evaluation.run_metrics import EvalView
 from beags_plugin.masks.classes import read_class_map
+from beags_plugin.plugin.layout import image_size
 from beags_plugin.plugin.model import fixed_background
 from beags_plugin.rasterizers.interface import IGNORE
 
@@ -27,6 +29,7 @@ class HeldOutViews(Sequence[EvalView]):
     Visible masks come from ``ground_truth/masks``, or else from the data's own masks; silhouettes from
     ``ground_truth/silhouettes``, and what training photos show of them from ``ground_truth/seen``. All are undistorted
     like the photographs. Photographs with alpha stand on the background that the run was trained on.
+    Asking for a view raises ``UserError`` for a mask that cannot be read or has other proportions than its photograph.
     """
 
     def __init__(self, config: BeagsTrainerConfig, classes: Mapping[int, str]) -> None:
@@ -58,7 +61,9 @@ class HeldOutViews(Sequence[EvalView]):
         truth = self._metadata["ground_truth"] or {"masks": None, "silhouettes": {}, "seen": {}}
         exact = truth["masks"][index] if truth["masks"] else None
         file = exact or self._metadata["class_map_filenames"][index]
-        visible = None if file is None else self._read_ids(file, index)
+        visible = None
+        if file is not None:
+            visible = torch.from_numpy(self._read(file, index, self._metadata["ignore_ids"]).astype(np.int32))
         silhouettes = self._per_object(truth["silhouettes"], index)
         seen = self._per_object(truth["seen"], index)
         seen = {c: _of_size(mask, silhouettes[c]) for c, mask in seen.items() if c in silhouettes}
@@ -72,13 +77,21 @@ class HeldOutViews(Sequence[EvalView]):
         for class_id, name in self.classes.items():
             file = files[name][view] if name in files else None
             if file is not None:
-                ids = self.manager.undistort_eval_map(read_class_map(file), view)
+                ids = self._read(file, view)
                 masks[class_id] = torch.from_numpy((ids != 0) & (ids != IGNORE))
         return masks
 
-    def _read_ids(self, file: Path, view: int) -> Tensor:
-        ids = read_class_map(file, self._metadata["ignore_ids"])
-        return torch.from_numpy(self.manager.undistort_eval_map(ids, view).astype(np.int32))
+    def _read(self, file: Path, view: int, ignore_ids: Sequence[int] = ()) -> np.ndarray:
+        ids = read_class_map(file, ignore_ids)
+        photo = self.manager.eval_dataset.image_filenames[view]
+        (width, height), (mask_height, mask_width) = image_size(photo), ids.shape
+        expected = mask_width * height / width  # a smaller copy rounds each side by up to a pixel
+        if abs(expected - mask_height) > 1.0 + expected / mask_width:
+            raise UserError(
+                f"the mask {file} is {mask_width}x{mask_height} pixels but its image is {width}x{height}: "
+                f"make it in the proportions of the image."
+            )
+        return self.manager.undistort_eval_map(ids, view)
 
 
 def _of_size(mask: Tensor, other: Tensor) -> Tensor:
