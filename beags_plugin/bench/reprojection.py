@@ -188,6 +188,7 @@ def quality(found: Sequence[Tensor], exact: Sequence[Tensor], num_classes: int) 
         for a, b in zip(found, exact, strict=True)
         for class_id in range(1, num_classes)
     )
+    assert metrics is not None and metrics.iou is not None and metrics.biou is not None  # empty masks count
     return metrics.iou, metrics.biou, 1.0 - same_share(found, exact)
 
 
