@@ -56,7 +56,8 @@ def test_a_row_holds_the_curve_that_the_run_left_behind(experiment, tmp_path):
 def rows():
     long, short = [record(100, 20.0), record(900, 25.0)], [record(50, 19.0), record(300, 24.5)]
     return [
-        Row("a", 42, "long", long, 300.0), Row("a", 42, "short", short, 200.0), Row("a", 42, "none", (), failed="it broke"),
+        Row("a", 42, "long", long, 300.0), Row("a", 42, "short", short, 200.0),
+        Row("a", 42, "none", (), failed="it broke"),
         Row("b", 42, "long", short, 300.0), Row("b", 42, "short", long, 200.0),
     ]  # fmt: skip
 
