@@ -128,7 +128,7 @@ def make_scene(size: Size, seed: int = 0) -> Scene:
 
 
 def classes_at(across: Tensor, down: Tensor) -> Tensor:
-    """Classes in slanted bands, whose borders follow no border of tiles: int32; 0 is left and top, 1 right and bottom."""
+    """Classes in slanted bands, whose borders follow no tile border: int32; 0 is left and top, 1 right and bottom."""
     return ((across + SLANT * down) / (1 + SLANT) * 2 * CLASSES).clamp(0, 2 * CLASSES - 1).int() % CLASSES
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.surfels import opacities
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.boundary import BoundaryLoss
 from beags_plugin.losses.distortion import DistortionLoss
@@ -247,3 +248,11 @@ def test_missing_products_are_named():
     with pytest.raises(ValueError, match="target"):
         BoundaryLoss().value(_inputs(labels=torch.zeros(2, 2, dtype=torch.int32)))
     assert math.isfinite(BoundaryLoss().weight)
+
+
+def test_opacities_have_finite_gradients_everywhere_and_follow_the_logistic_function():
+    logits = torch.tensor([-1e4, -90.0, -5.0, 0.0, 3.0, 90.0, 1e4], dtype=torch.float64, requires_grad=True)
+    values = opacities(logits)
+    values.sum().backward()
+    assert torch.allclose(values, torch.sigmoid(logits), rtol=1e-12, atol=1e-34)
+    assert torch.allclose(logits.grad, values * (1 - values), rtol=1e-9, atol=1e-34)

@@ -77,6 +77,26 @@ class Masks(Trainings):
 
 
 @dataclass
+class Base(Trainings):
+    """How well bases of different lengths draw held-out views, against steps and number of Gaussians."""
+
+    EXPERIMENT: ClassVar[str] = "base"
+
+    def run(self) -> None:
+        from beags_plugin.bench.base_training import run_base
+        from beags_plugin.bench.run import Options
+
+        run_base(self.experiment(), Options(**vars(self)))
+
+
+@dataclass
+class BaseLimits(Base):
+    """What limits held-out quality of a short base: the same with one part of the schedule changed."""
+
+    EXPERIMENT: ClassVar[str] = "base-limits"
+
+
+@dataclass
 class ExperimentFile(Trainings):
     """An experiment of your own, described by a TOML file like those of experiments/."""
 
@@ -127,6 +147,8 @@ Measurement = (
     | Annotated[Sensitivity, tyro.conf.subcommand(name="sensitivity")]
     | Annotated[Depth, tyro.conf.subcommand(name="depth")]
     | Annotated[Masks, tyro.conf.subcommand(name="masks")]
+    | Annotated[Base, tyro.conf.subcommand(name="base")]
+    | Annotated[BaseLimits, tyro.conf.subcommand(name="base-limits")]
     | Annotated[Reprojection, tyro.conf.subcommand(name="reprojection")]
     | Annotated[ExperimentFile, tyro.conf.subcommand(name="file")]
 )

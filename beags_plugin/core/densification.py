@@ -10,7 +10,7 @@ from torch import Tensor
 
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.sh import num_sh_bases
-from beags_plugin.core.surfels import Surfels
+from beags_plugin.core.surfels import Surfels, opacities
 
 SPLIT_SHRINK = 1.6  # both halves of a split surfel are this much smaller (official value)
 INITIAL_OPACITY = 0.1
@@ -121,7 +121,7 @@ def densify(
     grown.means[halves] += _offsets(grown[halves], generator)
     grown.log_scales[halves] -= math.log(SPLIT_SHRINK)
 
-    keep = torch.sigmoid(grown.opacity_logits) >= config.prune_opacity
+    keep = opacities(grown.opacity_logits) >= config.prune_opacity
     if step > config.prune_scale_after:
         keep &= grown.log_scales.exp().amax(dim=-1) <= config.prune_scale * extent
     if not bool(keep.any()):

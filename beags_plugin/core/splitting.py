@@ -7,7 +7,7 @@ from torch import Tensor
 
 from beags_plugin.core.densification import Densified
 from beags_plugin.core.rotations import rotation_from_quat
-from beags_plugin.core.surfels import Surfels
+from beags_plugin.core.surfels import Surfels, opacities
 
 OFFSET = 0.5  # of both halves from the former centre, in former scales: far enough to learn different things
 
@@ -27,7 +27,7 @@ def split_in_two(surfels: Surfels, chosen: Tensor) -> Densified:
     fresh[len(kept) :] = True
     halves = surfels[source]
     if len(split):
-        log_scales, opacity = surfels.log_scales[split], torch.sigmoid(surfels.opacity_logits[split])
+        log_scales, opacity = surfels.log_scales[split], opacities(surfels.opacity_logits[split])
         longer = log_scales.argmax(dim=1, keepdim=True)
         axes = rotation_from_quat(surfels.quats[split])
         along = torch.where(longer == 0, axes[..., 0], axes[..., 1])

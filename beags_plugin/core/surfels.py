@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+import torch
 from torch import Tensor
 
 
@@ -34,3 +35,12 @@ class Surfels:
     def detach(self) -> Surfels:
         """The same values, without gradients."""
         return Surfels(**{field.name: getattr(self, field.name).detach() for field in fields(self)})
+
+
+def opacities(logits: Tensor) -> Tensor:
+    """Opacities 0..1 of logits of any shape; differentiable, with a gradient of 0 below logits of -80.
+
+    Determinism: torch.sigmoid rounds the ends of each thread's share differently; exp does not. Below -80, where the
+    opacity is 1e-35, 1 / (1 + exp) would have no finite gradient.
+    """
+    return 1.0 / (1.0 + torch.exp(-logits.clamp_min(-80.0)))

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.rotations import rotation_from_quat
+from beags_plugin.core.surfels import opacities as opacities_of
 from beags_plugin.errors import UserError
 from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.reduction import ordered_sum
@@ -90,8 +91,7 @@ class _Occupancy(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, r0, r1, log_scales, opacity_logits, class_ids, grid, counters) -> Tensor:
         scales = log_scales.exp()
-        # Determinism: torch.sigmoid rounds the ends of each thread's share differently.
-        opacities = 1.0 / (1.0 + torch.exp(-opacity_logits))
+        opacities = opacities_of(opacity_logits)
         s_u, s_v = scales[:, :1], scales[:, 1:]
         sums = _sums(means, s_u * r0, s_v * r1, class_ids, grid, *counters)
         g, gu, gv, guu, gvv, guv = sums[..., None].unbind(0)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
+from beags_plugin.core.surfels import opacities
 from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.reduction import ordered_mean
 
@@ -21,5 +21,4 @@ class OpacityLoss(Loss):
     weight: float = 0.0
 
     def value(self, inputs: LossInputs) -> Tensor:
-        # Determinism: torch.sigmoid rounds the ends of each thread's share differently.
-        return ordered_mean(1.0 / (1.0 + torch.exp(-inputs.surfels.opacity_logits)))
+        return ordered_mean(opacities(inputs.surfels.opacity_logits))

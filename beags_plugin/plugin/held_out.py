@@ -24,8 +24,8 @@ class HeldOutCurve:
     """Quality against steps, kept in ``<run>/held_out.json``.
 
     A record holds ``step`` (steps done), ``gaussians``, ``psnr`` (dB) and ``ssim`` of the held-out views (means over
-    them), ``train_psnr`` of as many training views spread over all, and ``seconds`` of training so far, without what
-    the measurements took. Only colours are drawn, so that a measurement costs a fraction of a step per view.
+    them), ``train_psnr`` of as many training views spread over all, and ``seconds`` and ``cpu_seconds`` of training so
+    far, without what the measurements took. Only colours are drawn: a view costs a fraction of a step.
     """
 
     def __init__(self, folder: Path, every: int, last: int, model: BeagsModel, datamanager: BeagsDataManager) -> None:
@@ -38,19 +38,20 @@ class HeldOutCurve:
         count = min(len(self.held_out), len(train))
         self.train = [train[index * len(train) // count] for index in range(count)]
         self.records: list[dict[str, float]] = []
-        self._started, self._measuring = time.perf_counter(), 0.0
+        self._started = _clocks()
 
     def after_step(self, step: int) -> None:
         """Measure if the time has come: at every multiple of ``every`` steps, and where a phase ends."""
         done = step + 1
         if done % self.every == 0 or done in self.ends:
-            began = time.perf_counter()
-            self.records.append(self._measure(done, began - self._started - self._measuring))
+            began = _clocks()
+            used = {name: began[name] - self._started[name] for name in began}
+            self.records.append({**self._measure(done), **used})
             self.file.parent.mkdir(parents=True, exist_ok=True)
             self.file.write_text(json.dumps(self.records, indent=1))
-            self._measuring += time.perf_counter() - began
+            self._started = {name: self._started[name] + now - began[name] for name, now in _clocks().items()}
 
-    def _measure(self, done: int, seconds: float) -> dict[str, float]:
+    def _measure(self, done: int) -> dict[str, float]:
         psnr, similarity = zip(*(self._quality(view) for view in self.held_out), strict=True)
         train_psnr = [self._quality(view)[0] for view in self.train]
         return {
@@ -59,7 +60,6 @@ class HeldOutCurve:
             "psnr": sum(psnr) / len(psnr),
             "ssim": sum(similarity) / len(similarity),
             "train_psnr": sum(train_psnr) / len(train_psnr),
-            "seconds": seconds,
         }
 
     @torch.no_grad()
@@ -75,3 +75,7 @@ class HeldOutCurve:
         ).color.clamp(0.0, 1.0)
         error = (drawn - image).square().mean().clamp_min(1e-10)
         return float(-10.0 * torch.log10(error)), float(ssim(drawn, image))
+
+
+def _clocks() -> dict[str, float]:
+    return {"seconds": time.perf_counter(), "cpu_seconds": time.process_time()}

@@ -84,19 +84,16 @@ class BeagsTrainer(Trainer):
             _stop(error)
 
     def train_iteration(self, step: int) -> Any:
-        """One step; after some of them, says how long the run will take."""
+        """One step; after some of them, says how long the run will take, or measures the held-out views."""
         done = step - self._start_step
         if done == ESTIMATE_STEPS[0]:
             self._estimate_from = time.perf_counter()
         if done == ESTIMATE_STEPS[1]:
             self._say_duration((time.perf_counter() - self._estimate_from) / (ESTIMATE_STEPS[1] - ESTIMATE_STEPS[0]))
-        return super().train_iteration(step)
-
-    def eval_iteration(self, step: int) -> None:
-        """nerfstudio's evaluation of single views, and the curve of all held-out ones."""
-        super().eval_iteration(step)
+        found = super().train_iteration(step)
         if self.curve is not None:
-            self.curve.after_step(step)
+            self.curve.after_step(step)  # before the scene grows, from which it needs some steps to recover
+        return found
 
     def _say_duration(self, seconds_per_step: float) -> None:
         left = (self.last_step - self._start_step) * seconds_per_step
