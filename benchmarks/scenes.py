@@ -107,7 +107,8 @@ def make_scene(size: Size, seed: int = 0) -> Scene:
         quats=torch.randn(n, 4, generator=g),
         log_scales=log_scales,
         opacity_logits=-1.6 + 0.8 * torch.randn(n, generator=g),
-        sh=torch.cat([uniform(n, 1, 3, low=-1.5, high=1.5), stripes[:, 1:]], dim=1),
+        sh_dc=uniform(n, 3, low=-1.5, high=1.5),
+        sh_rest=stripes[:, 1:].contiguous(),
     )
     shape = (height, width)
     gradients = {

@@ -45,8 +45,8 @@ class TrainingStep:
         surfels = scene.surfels
         self.parameters = {
             "means": surfels.means,
-            "features_dc": surfels.sh[:, 0],
-            "features_rest": surfels.sh[:, 1:],
+            "features_dc": surfels.sh_dc,
+            "features_rest": surfels.sh_rest,
             "opacities": surfels.opacity_logits,
             "scales": surfels.log_scales,
             "quats": surfels.quats,
@@ -123,8 +123,8 @@ class TrainingStep:
 
     def _surfels(self) -> Surfels:
         p = self.parameters
-        sh = torch.cat([p["features_dc"][:, None], p["features_rest"]], dim=1)
-        return Surfels(p["means"], p["quats"], p["scales"], p["opacities"], sh)
+        rest = (p["features_dc"], p["features_rest"])
+        return Surfels(p["means"], p["quats"], p["scales"], p["opacities"], *rest)
 
     def _rasterize(self, inputs: SurfelInputs) -> RasterOutputs:
         target = self.scene.target if self.refining else None

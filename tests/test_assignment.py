@@ -28,7 +28,7 @@ class _Stub:
 
 
 def _surfels(count: int) -> Surfels:
-    return Surfels(
+    return Surfels.of(
         torch.zeros(count, 3, requires_grad=True),
         torch.ones(count, 4),
         torch.zeros(count, 2),
@@ -64,7 +64,7 @@ def test_contributions_are_image_derivatives():
     """C[i, c] summed over classes is d(sum of the image over labelled pixels) / d(colour of i)."""
     scene = make_scene()
     inputs = scene.inputs
-    surfels = Surfels(
+    surfels = Surfels.of(
         inputs.means,
         inputs.quats,
         inputs.log_scales,

@@ -34,7 +34,7 @@ def scene(scales, opacities) -> Surfels:
     """Surfels whose larger scale and opacity are given, turned at random."""
     count, g = len(scales), generator(3)
     larger = torch.tensor(scales).log()
-    return Surfels(
+    return Surfels.of(
         means=torch.randn(count, 3, generator=g),
         quats=torch.randn(count, 4, generator=g),
         log_scales=torch.stack([larger - 0.7, larger], dim=-1),
@@ -143,7 +143,7 @@ def test_initial_surfels_are_as_large_as_their_neighbours_are_far(factor):
     torch.testing.assert_close(surfels.quats.norm(dim=-1), torch.ones(20))
     torch.testing.assert_close(torch.sigmoid(surfels.opacity_logits), torch.full((20,), 0.1))
     assert surfels.sh.shape == (20, 16, 3)
-    seen = sh_colors(surfels.sh, surfels.means, torch.zeros(3), 3)
+    seen = sh_colors(surfels.sh_dc, surfels.sh_rest, surfels.means, torch.zeros(3), 3)
     torch.testing.assert_close(seen, colors, rtol=1e-5, atol=1e-6)
 
 

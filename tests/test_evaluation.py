@@ -73,7 +73,7 @@ def scene(squares: list[tuple[float, float, float]], grey: float = 0.3) -> Surfe
     n = len(squares)
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1)
     sh = torch.full((n, 1, 3), (grey - 0.5) / 0.28209479177387814)
-    return Surfels(torch.tensor(squares), quats, torch.zeros(n, 2), torch.zeros(n), sh)
+    return Surfels.of(torch.tensor(squares), quats, torch.zeros(n, 2), torch.zeros(n), sh)
 
 
 def square_mask(x: float, y: float, half: float) -> torch.Tensor:

@@ -27,7 +27,7 @@ class Model:
 
     def __init__(self, rasterizer):
         g = torch.Generator().manual_seed(2)
-        self.scene = Surfels(
+        self.scene = Surfels.of(
             means=torch.randn(9, 3, generator=g) * 0.5 + torch.tensor([0.0, 0.0, 4.0]),
             quats=torch.randn(9, 4, generator=g),
             log_scales=torch.full((9, 2), -1.0),

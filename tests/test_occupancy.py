@@ -33,7 +33,7 @@ def _surfels(dtype=torch.float64, count: int = COUNT, factor: float = 1.0) -> Su
         torch.randn(count, generator=g, dtype=torch.float64),
         torch.zeros(count, 1, 3, dtype=torch.float64),
     )
-    return Surfels(*(value.to(dtype).requires_grad_() for value in values))
+    return Surfels.of(*(value.to(dtype).requires_grad_() for value in values))
 
 
 def _grid(factor: float = 1.0, dense_bytes: int = 1 << 28) -> VisibilityGrid:
@@ -108,7 +108,7 @@ def test_gradients_equal_finite_differences():
             for sign in (1, -1):
                 moved = {field: getattr(surfels, field).detach().clone() for field in FLOATS}
                 moved[name].view(-1)[place] += sign * step
-                values.append(float(_slow(Surfels(**moved, sh=surfels.sh), grid, ids, points, invalid)))
+                values.append(float(_slow(Surfels.of(**moved, sh=surfels.sh), grid, ids, points, invalid)))
             assert (values[0] - values[1]) / (2 * step) == pytest.approx(float(gradient.view(-1)[place]), abs=1e-8), (
                 name
             )
@@ -132,7 +132,7 @@ def test_skipped_gaussians_change_nothing():
 
 @both
 def test_everything_inside_gives_zero_with_gradients():
-    surfels = Surfels(**{name: getattr(_surfels(), name) for name in (*FLOATS, "sh")})
+    surfels = Surfels.of(**{name: getattr(_surfels(), name) for name in (*FLOATS, "sh")})
     with torch.no_grad():
         surfels.means.copy_(torch.tensor([0.5, 0.5, 1.0]).expand(COUNT, 3))
         surfels.log_scales.fill_(-5.0)
@@ -355,7 +355,7 @@ def test_a_gaussian_that_no_ray_sees_learns_position_scale_rotation_and_opacity(
     logits = torch.full((wall + 1,), 8.0)
     sh = torch.zeros(wall + 1, 1, 3)
     leaves = [value.requires_grad_() for value in (means, quats, log_scales, logits)]
-    surfels = Surfels(*leaves, sh)
+    surfels = Surfels.of(*leaves, sh)
     camera = Camera(torch.eye(4), torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 16, 16)
     render = make_rasterizer("torch").rasterize(
         surfel_inputs(surfels, camera), camera, RasterSettings(0.1, 10.0), torch.ones(3)

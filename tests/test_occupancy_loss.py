@@ -31,7 +31,7 @@ def make_surfels(count: int, dtype=torch.float64, shift: float = 0.0) -> Surfels
         2.0 * torch.randn(count, generator=g, dtype=torch.float64),
         torch.zeros(count, 1, 3, dtype=torch.float64),
     )
-    return Surfels(*(value.to(dtype).requires_grad_() for value in values))
+    return Surfels.of(*(value.to(dtype).requires_grad_() for value in values))
 
 
 def make_grid(stretch: float = 1.0, shift: float = 0.0) -> VisibilityGrid:
@@ -97,7 +97,7 @@ def test_a_gaussian_does_not_depend_on_its_neighbours():
     """Bit for bit: gradients of the first 300 alone (which lie elsewhere in the kernel's batches) are the same."""
     surfels, grid = make_surfels(500, torch.float32), make_grid()
     whole = evaluate(surfels, grid, ids=ids_of(500))
-    broken = Surfels(*(getattr(surfels, name).detach().clone().requires_grad_() for name in (*FLOATS, "sh")))
+    broken = Surfels.of(*(getattr(surfels, name).detach().clone().requires_grad_() for name in (*FLOATS, "sh")))
     with torch.no_grad():
         broken.means[::3] = math.nan
     part = evaluate(broken, grid, ids=ids_of(500))

@@ -23,8 +23,13 @@ def scene(count: int, bases: int, dtype=torch.float64):
     return *leaves, torch.tensor(CENTER, dtype=dtype), weight.to(dtype)
 
 
+def parts(sh):
+    """Leaves: band 0 and the others."""
+    return [value.detach().clone().requires_grad_() for value in (sh[:, 0], sh[:, 1:])]
+
+
 def evaluate(sh, means, center, weight, degree):
-    colors = reference.sh_colors(sh, means, center, degree)
+    colors = reference.sh_colors(sh[:, 0], sh[:, 1:], means, center, degree)
     found = torch.autograd.grad(colors, [sh, means], weight, allow_unused=True)
     return [
         colors.detach(),
@@ -49,7 +54,7 @@ def test_it_is_the_torch_version(degree, bases, dtype, without_extension):
 @pytest.mark.parametrize("degree", range(4))
 def test_gradients_are_finite_differences(degree):
     sh, means, center, _ = scene(7, 16)
-    assert torch.autograd.gradcheck(lambda *leaves: sh_colors(*leaves, center, degree), (sh, means))
+    assert torch.autograd.gradcheck(lambda *leaves: sh_colors(*leaves, center, degree), (*parts(sh), means))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -80,13 +85,27 @@ def test_awkward_numbers(without_extension):
 
 def test_no_surfels_and_unneeded_gradients():
     sh, means, center, _ = scene(0, 4)
-    colors = sh_colors(sh, means, center, 1)
+    dc, rest = parts(sh)
+    colors = sh_colors(dc, rest, means, center, 1)
     colors.sum().backward()
-    assert colors.shape == (0, 3) and sh.grad.shape == (0, 4, 3)
+    assert colors.shape == (0, 3) and dc.grad.shape == (0, 3) and rest.grad.shape == (0, 3, 3)
     sh, means, center, weight = scene(5, 4)
-    (sh_colors(sh, means.detach(), center, 1) * weight).sum().backward()
-    assert sh.grad is not None and means.grad is None
-    assert not sh_colors(sh.detach(), means.detach(), center, 1).requires_grad
+    dc, rest = parts(sh)
+    (sh_colors(dc, rest, means.detach(), center, 1) * weight).sum().backward()
+    assert dc.grad is not None and rest.grad is not None and means.grad is None
+    both = (dc.grad.clone(), rest.grad.clone())
+    dc.grad = rest.grad = None
+    (sh_colors(dc, rest.detach(), means, center, 1) * weight).sum().backward()
+    assert torch.equal(dc.grad, both[0]) and rest.grad is None and means.grad is not None
+    assert not sh_colors(dc.detach(), rest.detach(), means.detach(), center, 1).requires_grad
+
+
+def test_bands_that_are_not_shown_have_no_gradient():
+    sh, means, center, weight = scene(9, 16)
+    dc, rest = parts(sh)
+    (sh_colors(dc, rest, means, center, 1) * weight).sum().backward()
+    assert bool((rest.grad[:, :3] != 0).any())
+    assert (rest.grad[:, 3:] == 0).all()
 
 
 def test_a_strided_view_is_taken(without_extension):
@@ -100,17 +119,24 @@ def test_a_strided_view_is_taken(without_extension):
 
 def test_wrong_arguments_are_told_by_name():
     sh, means, center, _ = scene(5, 4)
-    with pytest.raises(ValueError, match="sh must be"):
-        sh_colors(sh, means, center, 2)
+    dc, rest = parts(sh)
+    with pytest.raises(ValueError, match="sh_rest must be"):
+        sh_colors(dc, rest, means, center, 2)
+    with pytest.raises(ValueError, match="sh_rest must be"):
+        sh_colors(dc, rest.float(), means, center, 1)
+    with pytest.raises(ValueError, match="sh_dc"):
+        sh_colors(sh, rest, means, center, 1)
     with pytest.raises(ValueError, match="means"):
-        sh_colors(sh, means[:4], center, 1)
+        sh_colors(dc, rest, means[:4], center, 1)
+    with pytest.raises(ValueError, match="camera_center"):
+        sh_colors(dc, rest, means, center[:2], 1)
     with pytest.raises(ValueError, match="0..3"):
-        sh_colors(sh, means, center, 4)
+        sh_colors(dc, rest, means, center, 4)
 
 
 def test_a_camera_that_learns_gets_its_gradient():
     """The op has none towards the camera: the torch version steps in."""
     sh, means, center, weight = scene(9, 4)
     center.requires_grad_()
-    (reference.sh_colors(sh, means, center, 1) * weight).sum().backward()
+    (reference.sh_colors(*parts(sh), means, center, 1) * weight).sum().backward()
     assert center.grad is not None and center.grad.abs().max() > 0

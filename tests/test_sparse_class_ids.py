@@ -37,7 +37,7 @@ def make_surfels() -> Surfels:
     g = torch.Generator().manual_seed(1)
     means = torch.rand(300, 3, generator=g) * torch.tensor([3.0, 2.0, 0.2]) + torch.tensor([-1.5, -1.0, 3.0])
     quats = torch.randn(300, 4, generator=g) * 0.1 + torch.tensor([1.0, 0, 0, 0])
-    return Surfels(means, quats, torch.full((300, 2), -2.3), torch.full((300,), 3.0), torch.zeros(300, 1, 3))
+    return Surfels.of(means, quats, torch.full((300, 2), -2.3), torch.full((300,), 3.0), torch.zeros(300, 1, 3))
 
 
 def make_views() -> tuple[list[Camera], list[torch.Tensor | None]]:
@@ -164,7 +164,7 @@ def test_the_occupancy_loss_is_the_same(background, ops):
     for grid, ids in zip(make_grids(), (NEAR, FAR), strict=True):
         leaves = [value.clone().requires_grad_() for value in (means, quats, scales, torch.zeros(400))]
         inputs = LossInputs(
-            step=5, seed=6, surfels=Surfels(*leaves, sh=torch.zeros(400, 1, 3)), camera=None, render=None, image=None,
+            step=5, seed=6, surfels=Surfels.of(*leaves, sh=torch.zeros(400, 1, 3)), camera=None, render=None, image=None,
             class_ids=renamed(classes, ids), grid=grid,
         )  # fmt: skip
         value = OccupancyLoss(background=background).value(inputs)

@@ -280,7 +280,7 @@ def _view(seed: int, width: int = 24, height: int = 18) -> _View:
 
 
 def _surfels(count: int = 1) -> Surfels:
-    return Surfels(*(torch.zeros(shape) for shape in [(count, 3), (count, 4), (count, 2), (count,), (count, 1, 3)]))
+    return Surfels.of(*(torch.zeros(shape) for shape in [(count, 3), (count, 4), (count, 2), (count,), (count, 1, 3)]))
 
 
 SETTINGS = RasterSettings(near=0.1, far=100.0, geometry=False)
@@ -332,7 +332,7 @@ def test_build_with_the_reference_rasterizer():
     x, y = torch.meshgrid(torch.linspace(-1, 1, 8), torch.linspace(-0.6, 0.6, 6), indexing="xy")
     means = torch.stack([x, y, torch.full_like(x, 4.0)], -1).view(-1, 3)
     count = len(means)
-    surfels = Surfels(
+    surfels = Surfels.of(
         means,
         torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
         torch.full((count, 2), math.log(0.15)),

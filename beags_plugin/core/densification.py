@@ -168,12 +168,11 @@ def initial_surfels(points: Tensor, colors: Tensor, sh_degree: int, generator: t
     spread = float((points - points.mean(dim=0)).norm(dim=-1).max()) if count > 1 else 1.0
     squared = distances.square().mean(dim=-1) if neighbours > 1 else torch.ones(count, dtype=torch.float64)
     scale = squared.sqrt().clamp_min(COINCIDENT * max(spread, 1e-30))
-    sh = torch.zeros(count, num_sh_bases(sh_degree), 3)
-    sh[:, 0] = (colors.float() - 0.5) / SH_C0
     return Surfels(
         means=points.float().clone(),
         quats=torch.nn.functional.normalize(torch.randn(count, 4, generator=generator), dim=-1),
         log_scales=scale.log().float()[:, None].repeat(1, 2),
         opacity_logits=torch.full((count,), math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY))),
-        sh=sh,
+        sh_dc=(colors.float() - 0.5) / SH_C0,
+        sh_rest=torch.zeros(count, num_sh_bases(sh_degree) - 1, 3),
     )

@@ -58,16 +58,17 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(values, dim=-1)
 
 
-def sh_colors(sh: Tensor, means: Tensor, camera_center: Tensor, degree: int) -> Tensor:
+def sh_colors(sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_center: Tensor, degree: int) -> Tensor:
     """Colour of each surfel as seen from ``camera_center``: SH + 0.5, clamped at 0.
 
-    sh: [N, K, 3], K >= (degree + 1)^2. means: [N, 3] world. camera_center: [3] world. Returns [N, 3]. Computed by the
-    compiled op where it can be.
+    sh_dc: [N, 3], band 0. sh_rest: [N, K, 3], the others, K >= (degree + 1)^2 - 1. means: [N, 3] world.
+    camera_center: [3] world. Returns [N, 3]. Computed by the compiled op where it can be.
     """
-    if extension.can_take(sh, means, camera_center) and not camera_center.requires_grad:
-        return compiled.sh_colors(sh, means, camera_center, degree)
+    if extension.can_take(sh_dc, sh_rest, means, camera_center) and not camera_center.requires_grad:
+        return compiled.sh_colors(sh_dc, sh_rest, means, camera_center, degree)
     if degree == 0:
-        return (_C0 * sh[:, 0] + 0.5).clamp_min(0.0)
+        return (_C0 * sh_dc + 0.5).clamp_min(0.0)
     directions = torch.nn.functional.normalize(means - camera_center, dim=-1)  # eps 1e-12: a surfel at the camera
     basis = sh_basis(directions, degree)
-    return (torch.einsum("nk,nkc->nc", basis, sh[:, : basis.shape[1]]) + 0.5).clamp_min(0.0)
+    sh = torch.cat([sh_dc[:, None], sh_rest[:, : basis.shape[1] - 1]], dim=1)
+    return (torch.einsum("nk,nkc->nc", basis, sh) + 0.5).clamp_min(0.0)

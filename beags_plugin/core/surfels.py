@@ -16,14 +16,32 @@ class Surfels:
     quats: [N, 4] wxyz, of any length but zero; normalised where they are used.
     log_scales: [N, 2] logs of the two scales, world units.
     opacity_logits: [N] logits of the opacity.
-    sh: [N, (degree + 1)^2, 3] spherical-harmonic coefficients of the colour, band 0 first.
+    sh_dc: [N, 3] spherical-harmonic coefficients of the colour, band 0. Apart from the others, for it learns at a rate
+        of its own, and joining them would copy the largest parameter in every step.
+    sh_rest: [N, (degree + 1)^2 - 1, 3] those of the higher bands.
     """
 
     means: Tensor
     quats: Tensor
     log_scales: Tensor
     opacity_logits: Tensor
-    sh: Tensor
+    sh_dc: Tensor
+    sh_rest: Tensor
+
+    @classmethod
+    def of(cls, means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: Tensor, sh: Tensor) -> Surfels:
+        """From all coefficients in one tensor: sh [N, (degree + 1)^2, 3], which is not copied."""
+        return cls(means, quats, log_scales, opacity_logits, sh[:, 0], sh[:, 1:])
+
+    @property
+    def sh(self) -> Tensor:
+        """[N, (degree + 1)^2, 3] a copy of all coefficients, band 0 first; differentiable."""
+        return torch.cat([self.sh_dc[:, None], self.sh_rest], dim=1)
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest degree of the spherical harmonics, 0..3."""
+        return round((1 + self.sh_rest.shape[1]) ** 0.5) - 1
 
     def __len__(self) -> int:
         return self.means.shape[0]

@@ -39,13 +39,12 @@ def to_input_frame(surfels: Surfels, transform: Tensor, scale: float) -> Surfels
     dtype = surfels.means.dtype
     means = (surfels.means.detach().double() / scale - translation) @ rotation  # rows: R^T (x' / scale - t)
     turn = quat_from_rotation(rotation.T)
-    degree = round(surfels.sh.shape[1] ** 0.5) - 1
-    return Surfels(
+    return Surfels.of(
         means=means.to(dtype),
         quats=quat_product(turn, surfels.quats.detach().double()).to(dtype),
         log_scales=surfels.log_scales.detach() - math.log(scale),
         opacity_logits=surfels.opacity_logits.detach(),
-        sh=rotate_sh(surfels.sh.detach(), rotation.T, degree),
+        sh=rotate_sh(surfels.sh.detach(), rotation.T, surfels.sh_degree),
     )
 
 
@@ -120,6 +119,7 @@ def _basis(directions: Tensor, degree: int) -> Tensor:
     count, bases = directions.shape[0], (degree + 1) ** 2
     sh = 0.1 * torch.eye(bases, dtype=directions.dtype, device=directions.device)[:, :, None].expand(-1, -1, 3)
     colors = sh_colors(
-        sh.repeat(count, 1, 1), directions.repeat_interleave(bases, 0), torch.zeros_like(directions[0]), degree
-    )
+        sh[:, 0].repeat(count, 1), sh[:, 1:].repeat(count, 1, 1), directions.repeat_interleave(bases, 0),
+        torch.zeros_like(directions[0]), degree,
+    )  # fmt: skip
     return ((colors[:, 0] - 0.5) / 0.1).reshape(count, bases)

@@ -62,12 +62,11 @@ def _columns(surfels: Surfels) -> dict[str, np.ndarray]:
     normals = rotation_from_quat(quats)[:, :, 2]
     log_scales = surfels.log_scales.detach()
     thin = log_scales.amin(dim=-1, keepdim=True) + float(np.log(THICKNESS))
-    sh = surfels.sh.detach()
-    rest = sh[:, 1:].transpose(1, 2).flatten(1)  # channel-major
+    rest = surfels.sh_rest.detach().transpose(1, 2).flatten(1)  # channel-major
     blocks = {
         ("x", "y", "z"): surfels.means.detach(),
         ("nx", "ny", "nz"): normals,
-        _numbered("f_dc", 3): sh[:, 0],
+        _numbered("f_dc", 3): surfels.sh_dc.detach(),
         _numbered("f_rest", rest.shape[1]): rest,
         ("opacity",): surfels.opacity_logits.detach()[:, None],
         _numbered("scale", 3): torch.cat([log_scales, thin], dim=-1),
@@ -112,16 +111,17 @@ def read_ply(path: str | Path) -> tuple[Surfels, Tensor | None]:
     rest_count = sum(name.startswith("f_rest_") for name in present)
     if rest_count not in (0, 9, 24, 45):
         raise UserError(f"{path} has {rest_count} f_rest columns, but 0, 9, 24 or 45 make whole colour bands.")
-    sh = take(*_numbered("f_dc", 3))[:, None]
+    dc = take(*_numbered("f_dc", 3))
+    rest = dc.new_zeros(len(dc), 0, 3)
     if rest_count:
-        rest = take(*_numbered("f_rest", rest_count)).reshape(len(sh), 3, rest_count // 3)
-        sh = torch.cat([sh, rest.transpose(1, 2)], dim=1)
+        rest = take(*_numbered("f_rest", rest_count)).reshape(len(dc), 3, rest_count // 3).transpose(1, 2)
     surfels = Surfels(
         means=take("x", "y", "z"),
         quats=take(*_numbered("rot", 4)),
         log_scales=log_scales,
         opacity_logits=take("opacity")[:, 0],
-        sh=sh.contiguous(),
+        sh_dc=dc,
+        sh_rest=rest.contiguous(),
     )
     class_ids = torch.from_numpy(np.array(vertex["class_id"], dtype=np.int32)) if "class_id" in present else None
     return surfels, class_ids

@@ -120,10 +120,11 @@ void colors_of_degree(const ColorJob<T>& job, int64_t first, int64_t last) {
   if (kDegree > 0) directions(job, first, count, d);
   basis(kDegree, count, d, b);
   for (int i = 0; i < count; ++i) {
-    const T* sh = job.sh + (first + i) * job.num_bases * 3;
-    T sum[3] = {};
-    for (int k = 0; k < kBases; ++k) {
-      for (int c = 0; c < 3; ++c) sum[c] += b[k][i] * sh[3 * k + c];
+    const T *dc = job.dc + 3 * (first + i), *rest = job.rest + (first + i) * job.num_rest * 3;
+    T sum[3];
+    for (int c = 0; c < 3; ++c) sum[c] = b[0][i] * dc[c];
+    for (int k = 1; k < kBases; ++k) {
+      for (int c = 0; c < 3; ++c) sum[c] += b[k][i] * rest[3 * (k - 1) + c];
     }
     uint8_t clamped = 0;
     for (int c = 0; c < 3; ++c) {
@@ -147,16 +148,22 @@ void colors_backward_of_degree(const ColorJob<T>& job, int64_t first, int64_t la
     const int64_t row = first + i;
     T g[3];
     for (int c = 0; c < 3; ++c) g[c] = job.clamped[row] >> c & 1 ? T(0) : job.g_colors[3 * row + c];
-    if (job.g_sh) {
-      T* to = job.g_sh + row * job.num_bases * 3;
-      for (int k = 0; k < kBases; ++k) {
-        for (int c = 0; c < 3; ++c) to[3 * k + c] = b[k][i] * g[c];
+    if (job.g_dc) {
+      for (int c = 0; c < 3; ++c) job.g_dc[3 * row + c] = b[0][i] * g[c];
+    }
+    if (job.g_rest) {
+      T* to = job.g_rest + row * job.num_rest * 3;
+      for (int k = 1; k < kBases; ++k) {
+        for (int c = 0; c < 3; ++c) to[3 * (k - 1) + c] = b[k][i] * g[c];
       }
-      for (int k = 3 * kBases; k < 3 * job.num_bases; ++k) to[k] = 0;
+      for (int k = 3 * (kBases - 1); k < 3 * job.num_rest; ++k) to[k] = 0;
     }
     if (kDegree > 0 && job.g_means) {
-      const T* sh = job.sh + row * job.num_bases * 3;
-      for (int k = 0; k < kBases; ++k) g_basis[k][i] = g[0] * sh[3 * k] + g[1] * sh[3 * k + 1] + g[2] * sh[3 * k + 2];
+      const T* rest = job.rest + row * job.num_rest * 3;
+      for (int k = 1; k < kBases; ++k) {  // the first function is constant
+        const T* sh = rest + 3 * (k - 1);
+        g_basis[k][i] = g[0] * sh[0] + g[1] * sh[1] + g[2] * sh[2];
+      }
     }
   }
   if constexpr (kDegree > 0) {

@@ -104,38 +104,41 @@ void bind_functions(nb::module_& m, const char* suffix) {
         "background"_a, "g_means"_a.none(), "g_quats"_a.none(), "g_log_scales"_a.none(), "g_opacity_logits"_a.none(),
         "threads"_a);
   m.def(("sh_colors_" + end).c_str(),
-        [](In sh, In means, const std::vector<double>& center, int degree, Out colors, Array<uint8_t> clamped,
-           int threads) {
+        [](In sh_dc, In sh_rest, In means, const std::vector<double>& center, int degree, Out colors,
+           Array<uint8_t> clamped, int threads) {
           ColorJob<T> job{};
           job.degree = degree;
-          job.num_bases = static_cast<int>(sh.shape(1));
+          job.num_rest = static_cast<int>(sh_rest.shape(1));
           for (int axis = 0; axis < 3; ++axis) job.center[axis] = static_cast<T>(center[axis]);
-          job.sh = sh.data();
+          job.dc = sh_dc.data();
+          job.rest = sh_rest.data();
           job.means = means.data();
           job.colors = colors.data();
           job.clamped = clamped.data();
           nb::gil_scoped_release release;
-          sh_colors(job, static_cast<int64_t>(sh.shape(0)), threads);
+          sh_colors(job, means.shape(0), threads);
         },
-        "sh"_a, "means"_a, "center"_a, "degree"_a, "colors"_a, "clamped"_a, "threads"_a);
+        "sh_dc"_a, "sh_rest"_a, "means"_a, "center"_a, "degree"_a, "colors"_a, "clamped"_a, "threads"_a);
   m.def(("sh_colors_backward_" + end).c_str(),
-        [](In sh, In means, const std::vector<double>& center, int degree, Array<uint8_t> clamped, In g_colors,
-           Out g_sh, Out g_means, int threads) {
+        [](In sh_dc, In sh_rest, In means, const std::vector<double>& center, int degree, Array<uint8_t> clamped,
+           In g_colors, Out g_dc, Out g_rest, Out g_means, int threads) {
           ColorJob<T> job{};
           job.degree = degree;
-          job.num_bases = static_cast<int>(sh.shape(1));
+          job.num_rest = static_cast<int>(sh_rest.shape(1));
           for (int axis = 0; axis < 3; ++axis) job.center[axis] = static_cast<T>(center[axis]);
-          job.sh = sh.data();
+          job.dc = sh_dc.data();
+          job.rest = sh_rest.data();
           job.means = means.data();
           job.clamped = clamped.data();
           job.g_colors = g_colors.data();
-          job.g_sh = g_sh.data();
+          job.g_dc = g_dc.data();
+          job.g_rest = g_rest.data();
           job.g_means = g_means.data();
           nb::gil_scoped_release release;
-          sh_colors_backward(job, static_cast<int64_t>(sh.shape(0)), threads);
+          sh_colors_backward(job, means.shape(0), threads);
         },
-        "sh"_a, "means"_a, "center"_a, "degree"_a, "clamped"_a, "g_colors"_a, "g_sh"_a.none(), "g_means"_a.none(),
-        "threads"_a);
+        "sh_dc"_a, "sh_rest"_a, "means"_a, "center"_a, "degree"_a, "clamped"_a, "g_colors"_a, "g_dc"_a.none(),
+        "g_rest"_a.none(), "g_means"_a.none(), "threads"_a);
   m.def(("reprojection_votes_" + end).c_str(),
         [](const std::vector<In>& depths, const std::vector<std::optional<Ids>>& labels, int first, const In& maps,
            const std::vector<Array<int32_t>>& voted, const std::vector<Array<float>>& confidence, int num_classes,

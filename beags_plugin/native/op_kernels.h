@@ -29,13 +29,13 @@ constexpr int kOccupancyBlock = 128;  // Gaussians of one call
 // Colours from spherical harmonics; see ops/sh_colors.py.
 template <class T>
 struct ColorJob {
-  int degree, num_bases;  // num_bases: of `sh`, at least (degree + 1)^2
+  int degree, num_rest;  // num_rest: coefficients of `rest`, at least (degree + 1)^2 - 1
   T center[3];
-  const T *sh, *means;  // [N, num_bases, 3], [N, 3]
-  T* colors;            // [N, 3]
-  uint8_t* clamped;     // [N] bit c: channel c was below 0
+  const T *dc, *rest, *means;  // [N, 3], [N, num_rest, 3], [N, 3]
+  T* colors;                   // [N, 3]
+  uint8_t* clamped;            // [N] bit c: channel c was below 0
   const T* g_colors;
-  T *g_sh, *g_means;  // null: not wanted
+  T *g_dc, *g_rest, *g_means;  // null: not wanted
 };
 
 constexpr int kColorBlock = 64;  // surfels of one call

@@ -61,8 +61,13 @@ def threads() -> int:
     return torch.get_num_threads()
 
 
+def check(name: str, value: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    """Raise ``ValueError`` unless ``value`` has this shape and dtype."""
+    if value.shape != shape or value.dtype != dtype:
+        raise ValueError(f"{name} must be {list(shape)} {dtype}, not {list(value.shape)} {value.dtype}")
+
+
 def plain(name: str, value: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     """``value``, contiguous and without gradient; raises ``ValueError`` unless it has this shape and dtype."""
-    if tuple(value.shape) != shape or value.dtype != dtype:
-        raise ValueError(f"{name} must be {list(shape)} {dtype}, not {list(value.shape)} {value.dtype}")
+    check(name, value, shape, dtype)
     return value.detach().contiguous()

@@ -9,42 +9,45 @@ from torch.autograd.function import once_differentiable
 from beags_plugin.ops import extension
 
 
-def sh_colors(sh: Tensor, means: Tensor, camera_center: Tensor, degree: int) -> Tensor:
+def sh_colors(sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_center: Tensor, degree: int) -> Tensor:
     """Colour of each surfel as seen from ``camera_center``: SH + 0.5, clamped at 0; [N, 3].
 
-    sh: [N, K, 3], K >= (degree + 1)^2. means: [N, 3] world. camera_center: [3] world, without gradient. degree: 0..3.
-    All float32 or all float64, on the CPU; differentiable, once, in ``sh`` and ``means``.
+    sh_dc: [N, 3], band 0. sh_rest: [N, K, 3], the others, K >= (degree + 1)^2 - 1. means: [N, 3] world.
+    camera_center: [3] world, without gradient. degree: 0..3. All float32 or all float64, on the CPU; differentiable,
+    once, in ``sh_dc``, ``sh_rest`` and ``means``.
     """
-    n, dtype = len(sh), sh.dtype
+    n, dtype = len(sh_dc), sh_dc.dtype
     if not 0 <= degree <= 3:
         raise ValueError(f"the degree of spherical harmonics must be 0..3, not {degree}")
-    if sh.dim() != 3 or sh.shape[1] < (degree + 1) ** 2 or sh.shape[2] != 3:
-        raise ValueError(f"sh must be [{n}, {(degree + 1) ** 2} or more, 3], not {list(sh.shape)}")
-    extension.plain("means", means, (n, 3), dtype)
-    center = extension.plain("camera_center", camera_center, (3,), dtype).tolist()
-    return _Colors.apply(sh, means, center, degree)  # type: ignore[return-value]
+    least, shape = (degree + 1) ** 2 - 1, tuple(sh_rest.shape)
+    if len(shape) != 3 or shape[0] != n or shape[1] < least or shape[2] != 3 or sh_rest.dtype != dtype:
+        raise ValueError(f"sh_rest must be [{n}, {least} or more, 3] {dtype}, not {list(shape)} {sh_rest.dtype}")
+    extension.check("sh_dc", sh_dc, (n, 3), dtype)
+    extension.check("means", means, (n, 3), dtype)
+    extension.check("camera_center", camera_center, (3,), dtype)
+    return _Colors.apply(sh_dc, sh_rest, means, camera_center.tolist(), degree)  # type: ignore[return-value]
 
 
 class _Colors(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, sh: Tensor, means: Tensor, center: list[float], degree: int) -> Tensor:
-        ctx.fixed = (center, degree)
-        plain = (sh.detach().contiguous(), means.detach().contiguous())
-        colors = torch.empty_like(plain[1])
-        clamped = torch.empty(len(sh), dtype=torch.uint8)
-        extension.function("sh_colors", sh)(*plain, center, degree, colors, clamped, extension.threads())
-        ctx.save_for_backward(sh, means, clamped)
+    def forward(ctx, sh_dc: Tensor, sh_rest: Tensor, means: Tensor, center: list[float], degree: int) -> Tensor:
+        plain = (sh_dc.contiguous(), sh_rest.contiguous(), means.contiguous())
+        colors = torch.empty_like(plain[2])
+        clamped = torch.empty(len(colors), dtype=torch.uint8)
+        extension.function("sh_colors", colors)(*plain, center, degree, colors, clamped, extension.threads())
+        ctx.fixed = (center, degree, clamped)
+        ctx.save_for_backward(sh_dc, sh_rest, means)
         return colors
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *grad_outputs: Tensor):
-        sh, means, clamped = ctx.saved_tensors
-        center, degree = ctx.fixed
-        plain = (sh.detach().contiguous(), means.detach().contiguous())
-        wanted = (ctx.needs_input_grad[0], ctx.needs_input_grad[1] and degree > 0)
+        center, degree, clamped = ctx.fixed
+        plain = [value.contiguous() for value in ctx.saved_tensors]
+        dc, rest, means = ctx.needs_input_grad[:3]
+        wanted = (dc, rest, means and degree > 0)
         found = [torch.empty_like(value) if want else None for value, want in zip(plain, wanted, strict=True)]
         if any(wanted):
-            backward = extension.function("sh_colors_backward", sh)
+            backward = extension.function("sh_colors_backward", plain[2])
             backward(*plain, center, degree, clamped, grad_outputs[0].contiguous(), *found, extension.threads())
         return *found, None, None

@@ -47,8 +47,7 @@ class SavedScene:
         """The scene's N surfels."""
         state = {name: self.state[f"gauss_params.{name}"] for name in ("means", "quats", "scales", "opacities")}
         dc, rest = self.state["gauss_params.features_dc"], self.state["gauss_params.features_rest"]
-        sh = torch.cat([dc[:, None], rest], dim=1)
-        return Surfels(state["means"], state["quats"], state["scales"], state["opacities"][:, 0], sh)
+        return Surfels(state["means"], state["quats"], state["scales"], state["opacities"][:, 0], dc, rest)
 
     @property
     def assigned(self) -> bool:

@@ -145,8 +145,8 @@ class BeagsModel(SplatfactoModel):
         self.gauss_params = nn.ParameterDict(
             {
                 "means": nn.Parameter(surfels.means),
-                "features_dc": nn.Parameter(surfels.sh[:, 0].contiguous()),
-                "features_rest": nn.Parameter(surfels.sh[:, 1:].contiguous()),
+                "features_dc": nn.Parameter(surfels.sh_dc),
+                "features_rest": nn.Parameter(surfels.sh_rest),
                 "opacities": nn.Parameter(surfels.opacity_logits[:, None].contiguous()),
                 "scales": nn.Parameter(surfels.log_scales),
                 "quats": nn.Parameter(surfels.quats),
@@ -192,13 +192,13 @@ class BeagsModel(SplatfactoModel):
 
     def surfels(self) -> Surfels:
         """The scene, sharing storage (and gradients) with the parameters."""
-        sh = torch.cat([self.gauss_params["features_dc"][:, None], self.gauss_params["features_rest"]], dim=1)
         return Surfels(
             means=self.gauss_params["means"],
             quats=self.gauss_params["quats"],
             log_scales=self.gauss_params["scales"],
-            opacity_logits=self.gauss_params["opacities"][:, 0],
-            sh=sh,
+            opacity_logits=self.gauss_params["opacities"].view(-1),
+            sh_dc=self.gauss_params["features_dc"],
+            sh_rest=self.gauss_params["features_rest"],
         )
 
     def replace_surfels(self, surfels: Surfels) -> None:
@@ -208,8 +208,8 @@ class BeagsModel(SplatfactoModel):
         """
         values = {
             "means": surfels.means,
-            "features_dc": surfels.sh[:, 0],
-            "features_rest": surfels.sh[:, 1:],
+            "features_dc": surfels.sh_dc,
+            "features_rest": surfels.sh_rest,
             "opacities": surfels.opacity_logits[:, None],
             "scales": surfels.log_scales,
             "quats": surfels.quats,

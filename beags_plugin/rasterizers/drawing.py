@@ -23,8 +23,8 @@ def surfel_inputs(
 
     surfels: N surfels. sh_degree: degrees to use, all if None. class_ids: [N] int32, phi, or None.
     """
-    degree = round(surfels.sh.shape[1] ** 0.5) - 1 if sh_degree is None else sh_degree
-    colors = sh_colors(surfels.sh, surfels.means, camera.center, degree)
+    degree = surfels.sh_degree if sh_degree is None else sh_degree
+    colors = sh_colors(surfels.sh_dc, surfels.sh_rest, surfels.means, camera.center, degree)
     return SurfelInputs(surfels.means, surfels.quats, surfels.log_scales, surfels.opacity_logits, colors, class_ids)
 
 
