@@ -74,7 +74,7 @@ void bind_functions(nb::module_& m, const char* suffix) {
         [](In means, In quats, In log_scales, In opacity_logits, Ids class_ids, const VoxelLookup& lookup,
            uint64_t stream, int64_t samples, bool background, Out g_means, Out g_quats, Out g_log_scales,
            Out g_opacity_logits, int threads) {
-          const VoxelTable valid = lookup.valid();
+          const auto cubes = lookup.valid_cubes();
           const int64_t count = rows(class_ids);
           OccupancyJob<T> job{};
           job.means = means.data();
@@ -82,7 +82,7 @@ void bind_functions(nb::module_& m, const char* suffix) {
           job.log_scales = log_scales.data();
           job.opacity_logits = opacity_logits.data();
           job.class_ids = class_ids.data();
-          job.valid = &valid;
+          job.valid = cubes.data();
           for (int axis = 0; axis < 3; ++axis) job.origin[axis] = static_cast<T>(lookup.origin()[axis]);
           job.voxel_size = static_cast<T>(lookup.voxel_size());
           job.stream = stream;

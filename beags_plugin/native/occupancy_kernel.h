@@ -26,13 +26,19 @@ enum OccupancyField {
   kOccupancyFields
 };
 
+constexpr int kFarOff = 1 << 20;  // size of a box that cannot be looked up
+// Where the samples of a batch are looked up: in registers, for discs within 4 x 4 x 4 voxels; in windows of bricks,
+// one for each disc; in the table, for large discs and for those far from all voxels.
+enum class Reach { kNear, kWindow, kFar };
+
 // One batch of as many Gaussians as there are lanes, ready to be sampled.
 template <class T>
 struct OccupancyBatch {
   T field[kOccupancyFields][Lanes<T>::kCount];
   uint64_t state[Lanes<T>::kCount];  // hash of stream and Gaussian
-  // Corner of the voxels around the disc, and which of them are valid: two words of 32 bits.
+  // Corner of the voxels around the disc, and which of them are valid: two words of 32 bits, or 3 x 3 x 3 bricks.
   typename Lanes<T>::Whole low[3][Lanes<T>::kCount], valid[2][Lanes<T>::kCount];
+  uint64_t bricks[Lanes<T>::kCount][kWindow * kWindow * kWindow];
   int64_t gaussian[Lanes<T>::kCount];
   int32_t class_id[Lanes<T>::kCount];
   int count;
@@ -50,30 +56,58 @@ BEAGS_OPS_INLINE void store(T* to, typename Lanes<T>::Real vector) {
   __builtin_memcpy(to, &vector, sizeof vector);
 }
 
-// The voxels that a batch's discs reach: `size` of them along each axis from `low` on; `small`: at most 4, near enough
-// to be looked up.
+// The voxels that a batch's discs reach: `size` of them along each axis from `low` on, at most `largest`, which is more
+// than all windows hold where they lie too far off to be looked up.
 template <class T>
 struct Boxes {
-  typename Lanes<T>::Int low[3], size[3], small;
+  typename Lanes<T>::Int low[3], size[3], largest;
 };
+
+// from[kStride * lane].
+template <int kStride, class T>
+BEAGS_OPS_INLINE typename Lanes<T>::Real strided(const T* from) {
+  typename Lanes<T>::Real out;
+  for (int lane = 0; lane < Lanes<T>::kCount; ++lane) out[lane] = from[kStride * lane];
+  return out;
+}
+
+// The parameters of as many Gaussians as there are lanes.
+template <class T>
+struct Parameters {
+  typename Lanes<T>::Real mean[3], quat[4], log_scale[2], logit;
+
+  BEAGS_OPS_INLINE Parameters(const T* means, const T* quats, const T* log_scales, const T* logits) {
+    for (int axis = 0; axis < 3; ++axis) mean[axis] = strided<3>(means + axis);
+    for (int part = 0; part < 4; ++part) quat[part] = strided<4>(quats + part);
+    for (int axis = 0; axis < 2; ++axis) log_scale[axis] = strided<2>(log_scales + axis);
+    logit = load(logits);
+  }
+};
+
+// Those of the Gaussians first .. first + count - 1; the first one's in the lanes that are left over.
+template <class T>
+BEAGS_OPS_INLINE Parameters<T> parameters(const OccupancyJob<T>& job, int64_t first, int count) {
+  constexpr int kCount = Lanes<T>::kCount;
+  const T *means = job.means + 3 * first, *quats = job.quats + 4 * first, *log_scales = job.log_scales + 2 * first,
+          *logits = job.opacity_logits + first;
+  if (count == kCount) return {means, quats, log_scales, logits};
+  T padded[10][kCount];
+  const auto pad = [&](const T* from, int stride, T* to) {
+    for (int i = 0; i < stride * kCount; ++i) to[i] = from[i < stride * count ? i : i % stride];
+    return to;
+  };
+  return {pad(means, 3, padded[0]), pad(quats, 4, padded[3]), pad(log_scales, 2, padded[7]), pad(logits, 1, padded[9])};
+}
 
 // The fields of the Gaussians first .. first + count - 1 and their boxes. Those that count as nothing get an opacity
 // of NaN.
 template <class T>
 BEAGS_OPS_INLINE Boxes<T> set_up(const OccupancyJob<T>& job, int64_t first, int count, OccupancyBatch<T>& batch) {
   using R = typename Lanes<T>::Real;
-  constexpr int kCount = Lanes<T>::kCount;
-  T raw[10][kCount];
-  for (int lane = 0; lane < kCount; ++lane) {
-    const int64_t i = first + (lane < count ? lane : 0);
-    for (int axis = 0; axis < 3; ++axis) raw[axis][lane] = job.means[3 * i + axis];
-    for (int part = 0; part < 4; ++part) raw[3 + part][lane] = job.quats[4 * i + part];
-    for (int axis = 0; axis < 2; ++axis) raw[7 + axis][lane] = job.log_scales[2 * i + axis];
-    raw[9][lane] = job.opacity_logits[i];
-  }
+  const Parameters<T> raw = parameters(job, first, count);
   const R zero = {}, one = zero + T(1);
   R q[4];
-  for (int part = 0; part < 4; ++part) q[part] = load(raw[3 + part]);
+  for (int part = 0; part < 4; ++part) q[part] = raw.quat[part];
   const R inverse_length = one / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
   for (int part = 0; part < 4; ++part) {
     q[part] *= inverse_length;
@@ -84,7 +118,7 @@ BEAGS_OPS_INLINE Boxes<T> set_up(const OccupancyJob<T>& job, int64_t first, int 
   const R two = zero + T(2);
   const R r0[3] = {one - two * (y * y + z * z), two * (x * y + w * z), two * (x * z - w * y)};
   const R r1[3] = {two * (x * y - w * z), one - two * (x * x + z * z), two * (y * z + w * x)};
-  const R log_u = load(raw[7]), log_v = load(raw[8]), logit = load(raw[9]);
+  const R log_u = raw.log_scale[0], log_v = raw.log_scale[1], logit = raw.logit;
   const R s_u = exponential(log_u), s_v = exponential(log_v);
   store(batch.field[kScale], s_u);
   store(batch.field[kScale + 1], s_v);
@@ -93,10 +127,11 @@ BEAGS_OPS_INLINE Boxes<T> set_up(const OccupancyJob<T>& job, int64_t first, int 
              nan_unless_finite(one / s_u) + nan_unless_finite(one / s_v);
   const T per_voxel = T(1) / job.voxel_size;
   Boxes<T> boxes;
-  boxes.small = ~(typename Lanes<T>::Int){};
+  boxes.largest = typename Lanes<T>::Int{};
+  const auto far_off = boxes.largest + kFarOff;
   constexpr T kEpsilon = sizeof(T) == 4 ? T(1.1920929e-7) : T(2.220446049250313e-16);
   for (int axis = 0; axis < 3; ++axis) {
-    const R mean = load(raw[axis]);
+    const R mean = raw.mean[axis];
     const R u = s_u * r0[axis] * per_voxel, v = s_v * r1[axis] * per_voxel;
     const R center = (mean - job.origin[axis]) * per_voxel;
     store(batch.field[kR0 + axis], r0[axis]);
@@ -110,7 +145,8 @@ BEAGS_OPS_INLINE Boxes<T> set_up(const OccupancyJob<T>& job, int64_t first, int 
     const R half = T(3) * sqrt(u * u + v * v) * (1 + 16 * kEpsilon) + 16 * kEpsilon * size;
     boxes.low[axis] = floor_to_int(center - half);
     boxes.size[axis] = floor_to_int(center + half) - boxes.low[axis] + 1;
-    boxes.small &= (boxes.size[axis] <= 4) & (size + half < static_cast<T>(kVoxelHalf));
+    const auto seen = select(size + half < static_cast<T>(kVoxelHalf), boxes.size[axis], far_off);
+    boxes.largest = select(seen > boxes.largest, seen, boxes.largest);
   }
   store(batch.field[kOpacity], one / (one + exponential(-logit)) + broken);
   return boxes;
@@ -158,9 +194,8 @@ BEAGS_OPS_INLINE double finish(const OccupancyJob<T>& job, const OccupancyBatch<
   return total * job.factor;
 }
 
-// Draws the samples of a batch and sums G Q times 1, u, v, u^2, v^2, u v. kLocal: every disc lies in the 4 x 4 x 4
-// voxels of `valid` (or far from all); otherwise each sample is looked up in the table.
-template <class T, bool kLocal>
+// Draws the samples of a batch and sums G Q times 1, u, v, u^2, v^2, u v.
+template <Reach kReach, class T>
 BEAGS_OPS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& batch) {
   using R = typename Lanes<T>::Real;
   using I = typename Lanes<T>::Int;
@@ -169,6 +204,7 @@ BEAGS_OPS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& ba
     for (auto& field : batch.field) field[lane] = field[0];
     for (auto& low : batch.low) low[lane] = low[0];
     for (auto& valid : batch.valid) valid[lane] = valid[0];
+    if (kReach == Reach::kWindow) __builtin_memcpy(batch.bricks[lane], batch.bricks[0], sizeof batch.bricks[0]);
     batch.state[lane] = batch.state[0];
     batch.class_id[lane] = batch.class_id[0];
   }
@@ -195,24 +231,29 @@ BEAGS_OPS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& ba
     R at[3];
     for (int axis = 0; axis < 3; ++axis) at[axis] = fma(v, axis_v[axis], fma(u, axis_u[axis], center[axis]));
     I valid;
-    if constexpr (kLocal) {
-      const I place =
-          (floor_to_int(at[0]) - low[0]) << 4 | (floor_to_int(at[1]) - low[1]) << 2 | (floor_to_int(at[2]) - low[2]);
-      const I half = -(place >> 5 & 1);
-      valid = -(((words[0] & ~half) | (words[1] & half)) >> (place & 31) & 1);
+    I index[3];
+    if constexpr (kReach != Reach::kFar) {
+      for (int axis = 0; axis < 3; ++axis) index[axis] = floor_to_int(at[axis]) - low[axis];
     } else {
       const R limit = R{} + static_cast<T>(kVoxelHalf + 4);
-      I index[3];
       for (int axis = 0; axis < 3; ++axis) {
         const R low_held = select(at[axis] > -limit, at[axis], -limit);
         index[axis] = floor_to_int(select(low_held < limit, low_held, limit)) + static_cast<int32_t>(kVoxelShift);
       }
+    }
+    if constexpr (kReach == Reach::kNear) {
+      const I place = index[0] << 4 | index[1] << 2 | index[2];
+      const I half = -(place >> 5 & 1);
+      valid = -(((words[0] & ~half) | (words[1] & half)) >> (place & 31) & 1);
+    } else {
       const I place = (index[0] & 3) << 4 | (index[1] & 3) << 2 | (index[2] & 3);
       for (int axis = 0; axis < 3; ++axis) index[axis] >>= 2;
+      const I brick = (index[0] * kWindow + index[1]) * kWindow + index[2];
       valid = I{};
       for (int lane = 0; lane < kCount; ++lane) {
-        const uint64_t bits =
-            brick_bits(*job.valid, batch.class_id[lane], index[0][lane], index[1][lane], index[2][lane]);
+        const uint64_t bits = kReach == Reach::kWindow ? batch.bricks[lane][brick[lane]]
+                                                       : brick_bits(*job.valid, batch.class_id[lane], index[0][lane],
+                                                                    index[1][lane], index[2][lane]);
         valid[lane] = -static_cast<int32_t>(bits >> place[lane] & 1);
       }
     }
@@ -231,12 +272,44 @@ BEAGS_OPS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& ba
   return total;
 }
 
-// Moves one lane to the end of another batch.
+// The Gaussians of a block that wait to be sampled, by how they are looked up.
 template <class T>
-BEAGS_OPS_INLINE void append(const OccupancyBatch<T>& from, int lane, OccupancyBatch<T>& to) {
-  const int at = to.count++;
-  for (int field = 0; field < kOccupancyFields; ++field) to.field[field][at] = from.field[field][lane];
-}
+struct Waiting {
+  const OccupancyJob<T>& job;
+  OccupancyBatch<T> near, window, far;
+  int64_t active = 0;
+  double total = 0;
+
+  BEAGS_OPS_INLINE explicit Waiting(const OccupancyJob<T>& whole) : job(whole) {
+    near.count = window.count = far.count = 0;
+  }
+
+  template <Reach kReach>
+  BEAGS_OPS_INLINE OccupancyBatch<T>& batch() {
+    return kReach == Reach::kNear ? near : kReach == Reach::kWindow ? window : far;
+  }
+
+  // Takes over one lane, and draws samples when a batch is full.
+  template <Reach kReach>
+  BEAGS_OPS_INLINE void add(const OccupancyBatch<T>& from, int lane, int64_t gaussian, const int64_t* low,
+                            uint64_t valid) {
+    OccupancyBatch<T>& to = batch<kReach>();
+    const int at = to.count++;
+    for (int field = 0; field < kOccupancyFields; ++field) to.field[field][at] = from.field[field][lane];
+    to.state[at] = mix(static_cast<uint64_t>(gaussian) * kGolden + job.stream);
+    for (int axis = 0; axis < 3; ++axis) to.low[axis][at] = static_cast<typename Lanes<T>::Whole>(low[axis]);
+    for (int word = 0; word < 2; ++word) to.valid[word][at] = static_cast<int32_t>(valid >> 32 * word);
+    to.gaussian[at] = gaussian;
+    to.class_id[at] = job.class_ids[gaussian];
+    ++active;
+    if (to.count == Lanes<T>::kCount) draw<kReach>();
+  }
+
+  template <Reach kReach>
+  void draw() {
+    if (batch<kReach>().count) total += sample<kReach>(job, batch<kReach>());
+  }
+};
 
 template <class T>
 double occupancy_block(const OccupancyJob<T>& job, int64_t first, int64_t last, int64_t* active) {
@@ -248,9 +321,8 @@ double occupancy_block(const OccupancyJob<T>& job, int64_t first, int64_t last, 
     __builtin_memset(job.g_log_scales + 2 * first, 0, 2 * count * sizeof(T));
     __builtin_memset(job.g_opacity_logits + first, 0, count * sizeof(T));
   }
-  OccupancyBatch<T> fresh, near, wide;  // near: within 4 x 4 x 4 voxels
-  near.count = wide.count = 0;
-  double total = 0;
+  OccupancyBatch<T> fresh;
+  Waiting<T> waiting(job);
   for (int64_t start = first; start < last; start += kCount) {
     const int here = static_cast<int>(last - start < kCount ? last - start : kCount);
     const Boxes<T> boxes = set_up(job, start, here, fresh);
@@ -259,36 +331,36 @@ double occupancy_block(const OccupancyJob<T>& job, int64_t first, int64_t last, 
       const int32_t class_id = job.class_ids[i];
       const T opacity = fresh.field[kOpacity][lane];
       if (opacity != opacity || (!job.background && class_id == 0)) continue;
-      const bool known = class_id >= 0 && class_id < job.valid->num_classes;
-      const bool small = boxes.small[lane] || !known;
-      int64_t corner[3] = {};
-      uint64_t valid = 0;
-      if (known && small) {
-        int n[3];
-        for (int axis = 0; axis < 3; ++axis) {
-          corner[axis] = boxes.low[axis][lane];
-          n[axis] = static_cast<int>(boxes.size[axis][lane]);
-        }
-        valid = voxel_box(*job.valid, class_id, corner, n);
-        const uint64_t box = box_bits(n[0], n[1], n[2]);
-        if ((valid & box) == box) continue;  // wholly inside: the loss is exactly 0
+      int64_t low[3] = {};
+      if (class_id < 0 || class_id >= job.valid->num_classes) {  // it has no voxels, wherever it lies
+        waiting.template add<Reach::kNear>(fresh, lane, i, low, 0);
+        continue;
       }
-      OccupancyBatch<T>& batch = small ? near : wide;
-      const int at = batch.count;
-      append(fresh, lane, batch);
-      batch.state[at] = mix(static_cast<uint64_t>(i) * kGolden + job.stream);
-      for (int axis = 0; axis < 3; ++axis) batch.low[axis][at] = static_cast<typename Lanes<T>::Whole>(corner[axis]);
-      for (int word = 0; word < 2; ++word) batch.valid[word][at] = static_cast<int32_t>(valid >> 32 * word);
-      batch.gaussian[at] = i;
-      batch.class_id[at] = class_id;
-      *active += 1;
-      if (near.count == kCount) total += sample<T, true>(job, near);
-      if (wide.count == kCount) total += sample<T, false>(job, wide);
+      int n[3];
+      for (int axis = 0; axis < 3; ++axis) {
+        low[axis] = boxes.low[axis][lane];
+        n[axis] = static_cast<int>(boxes.size[axis][lane]);
+      }
+      // Where a disc is wholly inside, its loss is exactly 0. Most lie in a cube of which one look tells.
+      const auto largest = boxes.largest[lane];
+      if (largest <= kLargestCube && voxel_bit(job.valid[largest - 1], class_id, low)) continue;
+      if (largest <= 4) {
+        const uint64_t valid = voxel_box(*job.valid, class_id, low, n), box = box_bits(n[0], n[1], n[2]);
+        if ((valid & box) != box) waiting.template add<Reach::kNear>(fresh, lane, i, low, valid);
+      } else if (largest <= kWindowVoxels) {
+        uint64_t* bricks = waiting.window.bricks[waiting.window.count];
+        const bool inside = fill_window(*job.valid, class_id, low, n, bricks);
+        if (!inside) waiting.template add<Reach::kWindow>(fresh, lane, i, low, 0);
+      } else {
+        waiting.template add<Reach::kFar>(fresh, lane, i, low, 0);
+      }
     }
   }
-  if (near.count) total += sample<T, true>(job, near);
-  if (wide.count) total += sample<T, false>(job, wide);
-  return total;
+  waiting.template draw<Reach::kNear>();
+  waiting.template draw<Reach::kWindow>();
+  waiting.template draw<Reach::kFar>();
+  *active += waiting.active;
+  return waiting.total;
 }
 
 }  // namespace BEAGS_ISA

@@ -15,7 +15,7 @@ template <class T>
 struct OccupancyJob {
   const T *means, *quats, *log_scales, *opacity_logits;  // [N, 3], [N, 4], [N, 2], [N]
   const int32_t* class_ids;                              // [N]
-  const VoxelTable* valid;
+  const VoxelTable* valid;  // [kLargestCube]: corners of cubes of 1, 2 and 3 valid voxels along each side
   T origin[3], voxel_size;
   uint64_t stream;  // hash of seed and step
   int64_t samples;
@@ -24,7 +24,7 @@ struct OccupancyJob {
   T *g_means, *g_quats, *g_log_scales, *g_opacity_logits;  // null: no gradients
 };
 
-constexpr int kOccupancyBlock = 128;  // Gaussians of one call
+constexpr int kOccupancyBlock = 512;  // Gaussians of one call
 
 // Colours from spherical harmonics; see ops/sh_colors.py.
 template <class T>

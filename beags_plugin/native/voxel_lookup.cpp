@@ -58,6 +58,28 @@ void add_neighbours(const int64_t* voxel, std::vector<Brick>& bricks) {
   }
 }
 
+int64_t coordinate(uint64_t key, int axis) { return static_cast<int64_t>(key >> (40 - 20 * axis) & 0xFFFFF); }
+
+// Of the voxels of `table`, whose bricks are `bricks`, those that are the corner of 2 x 2 x 2 of them.
+std::vector<std::vector<Brick>> corners(const VoxelTable& table, const std::vector<std::vector<Brick>>& bricks) {
+  std::vector<std::vector<Brick>> out(bricks.size());
+  const int sizes[3] = {4, 4, 4};
+  for (size_t c = 0; c < bricks.size(); ++c) {
+    for (const Brick& brick : bricks[c]) {
+      uint64_t bits = brick.bits;
+      for (int offset = 1; offset < 8 && bits; ++offset) {
+        int64_t low[3];
+        for (int axis = 0; axis < 3; ++axis) {
+          low[axis] = 4 * coordinate(brick.key, axis) - kVoxelShift + (offset >> axis & 1);
+        }
+        bits &= voxel_box(table, static_cast<int32_t>(c), low, sizes);
+      }
+      if (bits) out[c].push_back({brick.key, bits});
+    }
+  }
+  return out;
+}
+
 }  // namespace
 
 void VoxelLookup::Bricks::store(const std::vector<std::vector<Brick>>& bricks) {
@@ -65,9 +87,6 @@ void VoxelLookup::Bricks::store(const std::vector<std::vector<Brick>>& bricks) {
   int64_t low[3], high[3], count = 0;
   std::fill_n(low, 3, int64_t(1) << 20);
   std::fill_n(high, 3, int64_t(0));
-  const auto coordinate = [](uint64_t key, int axis) {
-    return static_cast<int64_t>(key >> (40 - 20 * axis) & 0xFFFFF);
-  };
   for (const std::vector<Brick>& of_class : bricks) {
     count += static_cast<int64_t>(of_class.size());
     for (const Brick& brick : of_class) {
@@ -154,7 +173,23 @@ VoxelLookup::VoxelLookup(const int64_t* keys, const int32_t* classes, int64_t co
     unite(valid[c]);
   }
   occupied_.store(occupied);
-  valid_.store(valid);
+  cubes_[0].store(valid);
+  for (int side = 1; side < kLargestCube; ++side) {
+    valid = corners(cubes_[side - 1].table(), valid);
+    cubes_[side].store(valid);
+  }
+}
+
+std::array<VoxelTable, kLargestCube> VoxelLookup::valid_cubes() const {
+  std::array<VoxelTable, kLargestCube> tables;
+  for (int side = 0; side < kLargestCube; ++side) tables[side] = cubes_[side].table();
+  return tables;
+}
+
+int64_t VoxelLookup::bytes() const {
+  int64_t sum = occupied_.bytes();
+  for (const Bricks& cubes : cubes_) sum += cubes.bytes();
+  return sum;
 }
 
 // As VisibilityGrid's _scaled: each step is monotonic.

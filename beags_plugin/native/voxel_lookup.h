@@ -2,6 +2,7 @@
 // an occupied one (method, section 5). Built once; queries are safe from any thread.
 #pragma once
 
+#include <array>
 #include <vector>
 
 #ifndef BEAGS_ISA
@@ -19,10 +20,12 @@ class VoxelLookup {
               double voxel_size);
 
   VoxelTable occupied() const { return occupied_.table(); }
-  VoxelTable valid() const { return valid_.table(); }
+  VoxelTable valid() const { return cubes_[0].table(); }
+  // The corners (of lowest indices) of cubes of valid voxels, 1, 2 and 3 along each side: one look tells of a cube.
+  std::array<VoxelTable, kLargestCube> valid_cubes() const;
   const double* origin() const { return origin_; }
   double voxel_size() const { return voxel_size_; }
-  int64_t bytes() const { return occupied_.bytes() + valid_.bytes(); }
+  int64_t bytes() const;
 
   // points: [count, 3]; class_ids: [count]. out: D_occ in 0..27.
   template <class T>
@@ -52,7 +55,7 @@ class VoxelLookup {
   template <class T>
   void scaled(const T* point, T* voxel) const;
 
-  Bricks occupied_, valid_;
+  Bricks occupied_, cubes_[kLargestCube];
   double origin_[3], voxel_size_;
 };
 

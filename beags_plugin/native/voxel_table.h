@@ -14,6 +14,7 @@ namespace ops {
 
 constexpr int64_t kVoxelHalf = int64_t(1) << 20;  // occupied voxels lie in -kVoxelHalf .. kVoxelHalf - 1
 constexpr int64_t kVoxelShift = kVoxelHalf + 8;   // added to an index before it is cut into brick and place
+constexpr int kLargestCube = 3;                   // see VoxelLookup
 constexpr uint64_t kNoBrick = ~uint64_t(0);       // key of an empty slot; bricks use 60 bits
 
 struct Brick {
@@ -123,16 +124,81 @@ inline uint64_t voxel_box(const VoxelTable& table, int32_t class_id, const int64
   return slab[0] >> 16 * place[0] | slab[1] << 1 << (63 - 16 * place[0]);
 }
 
+constexpr int kWindow = 3;                      // bricks along each side of a window
+constexpr int kWindowVoxels = 4 * kWindow - 3;  // boxes over so many voxels lie in a window, wherever they start
+
+// Copies the bricks that the box of sizes n[] in 1 .. kWindowVoxels from voxel low[] on reaches, and moves low[] to the
+// first voxel of the first one. Returns whether the box wholly lies in the set.
+inline bool fill_window(const VoxelTable& table, int32_t class_id, int64_t* low, const int* n, uint64_t* window) {
+  int64_t first[3];
+  unsigned reached[3];  // bit 4 b + i: voxel i of brick b
+  for (int axis = 0; axis < 3; ++axis) {
+    const int64_t index = low[axis] + kVoxelShift;
+    first[axis] = index >> 2;
+    low[axis] -= index & 3;
+    reached[axis] = ((1u << n[axis]) - 1) << (index & 3);
+  }
+  uint64_t box[3][kWindow];  // the box's voxels, by their index along one axis
+  for (int brick = 0; brick < kWindow; ++brick) {
+    const auto bits = [&](int axis) { return static_cast<uint64_t>(reached[axis] >> 4 * brick & 0xF); };
+    const uint64_t x = bits(0), y = bits(1), z = bits(2);
+    box[0][brick] =
+        (x & 1) * 0xFFFF | (x >> 1 & 1) * 0xFFFF0000 | (x >> 2 & 1) * (0xFFFFull << 32) | (x >> 3) * (0xFFFFull << 48);
+    box[1][brick] = in_slices((y & 1) * 0xF | (y >> 1 & 1) * 0xF0 | (y >> 2 & 1) * 0xF00 | (y >> 3) * 0xF000);
+    box[2][brick] = in_rows(z);
+  }
+  uint64_t missing = 0;
+  if (table.dense) {
+    int64_t place[3][kWindow];
+    for (int brick = 0; brick < kWindow; ++brick) {
+      for (int axis = 0; axis < 3; ++axis)
+        place[axis][brick] = dense_place(table, axis, first[axis] + brick, table.size[axis] - 1);
+    }
+    for (int i = 0; i < kWindow; ++i) {
+      for (int j = 0; j < kWindow; ++j) {
+        const uint64_t* row =
+            table.dense +
+            ((class_id * static_cast<int64_t>(table.size[0]) + place[0][i]) * table.size[1] + place[1][j]) *
+                table.size[2];
+        for (int k = 0; k < kWindow; ++k) {
+          const uint64_t bits = row[place[2][k]];
+          *window++ = bits;
+          missing |= box[0][i] & box[1][j] & box[2][k] & ~bits;
+        }
+      }
+    }
+    return missing == 0;
+  }
+  for (int i = 0; i < kWindow; ++i) {
+    for (int j = 0; j < kWindow; ++j) {
+      for (int k = 0; k < kWindow; ++k) {
+        const uint64_t needed = box[0][i] & box[1][j] & box[2][k];
+        const uint64_t bits = needed ? hashed_bits(table, class_id, first[0] + i, first[1] + j, first[2] + k) : 0;
+        *window++ = bits;
+        missing |= needed & ~bits;
+      }
+    }
+  }
+  return missing == 0;
+}
+
+// Membership of a voxel, |voxel| <= kVoxelHalf + 2.
+inline bool voxel_bit(const VoxelTable& table, int32_t class_id, const int64_t* voxel) {
+  if (class_id < 0 || class_id >= table.num_classes) return false;
+  int64_t index[3];
+  for (int axis = 0; axis < 3; ++axis) index[axis] = voxel[axis] + kVoxelShift;
+  const uint64_t bits = brick_bits(table, class_id, index[0] >> 2, index[1] >> 2, index[2] >> 2);
+  return bits >> (16 * (index[0] & 3) + 4 * (index[1] & 3) + (index[2] & 3)) & 1;
+}
+
 // Membership of the voxel that is given as whole numbers in floating point, which need not be finite.
 template <class T>
 inline bool voxel_member(const VoxelTable& table, int32_t class_id, const T* voxel) {
   const T limit = static_cast<T>(kVoxelHalf + 1);
   if (!(fabs(voxel[0]) <= limit && fabs(voxel[1]) <= limit && fabs(voxel[2]) <= limit)) return false;
-  if (class_id < 0 || class_id >= table.num_classes) return false;
-  int64_t index[3];
-  for (int axis = 0; axis < 3; ++axis) index[axis] = static_cast<int64_t>(voxel[axis]) + kVoxelShift;
-  const uint64_t bits = brick_bits(table, class_id, index[0] >> 2, index[1] >> 2, index[2] >> 2);
-  return bits >> (16 * (index[0] & 3) + 4 * (index[1] & 3) + (index[2] & 3)) & 1;
+  const int64_t index[3] = {static_cast<int64_t>(voxel[0]), static_cast<int64_t>(voxel[1]),
+                            static_cast<int64_t>(voxel[2])};
+  return voxel_bit(table, class_id, index);
 }
 
 // The voxels that a box reaches, from floats `low` to `high`. Returns whether they are at most 4 along each axis and
