@@ -39,7 +39,7 @@ def discs(centers, scales, opacities) -> Surfels:
     means = torch.tensor([[x, y, 4.0] for x, y in centers])
     sh = torch.full((count, 1, 3), 0.5 / 0.28209479177387814)
     quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1)
-    return Surfels(means, quats, torch.tensor(scales).log(), torch.tensor(opacities).logit(), sh)
+    return Surfels.of(means, quats, torch.tensor(scales).log(), torch.tensor(opacities).logit(), sh)
 
 
 def drawn_alpha(surfels: Surfels) -> torch.Tensor:
