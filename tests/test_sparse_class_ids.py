@@ -164,8 +164,8 @@ def test_the_occupancy_loss_is_the_same(background, ops):
     for grid, ids in zip(make_grids(), (NEAR, FAR), strict=True):
         leaves = [value.clone().requires_grad_() for value in (means, quats, scales, torch.zeros(400))]
         inputs = LossInputs(
-            step=5, seed=6, surfels=Surfels.of(*leaves, sh=torch.zeros(400, 1, 3)), camera=None, render=None, image=None,
-            class_ids=renamed(classes, ids), grid=grid,
+            step=5, seed=6, surfels=Surfels.of(*leaves, sh=torch.zeros(400, 1, 3)), camera=None, render=None,
+            image=None, class_ids=renamed(classes, ids), grid=grid,
         )  # fmt: skip
         value = OccupancyLoss(background=background).value(inputs)
         results.append([value.detach(), *torch.autograd.grad(value, leaves)])
