@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
@@ -124,7 +125,7 @@ def test_prepare_splits_only_for_refiners_that_train():
     arguments = (surfels, [camera()], [labels], {0: "background", 1: "thing"}, make_rasterizer("torch"), SETTINGS)
     config, split = PreparationConfig(reprojection="none", k=5), BorderSplitConfig(rounds=1, min_share=0.1)
     kept = prepare(*arguments, NoRefiner(), config, split)
-    assert kept.split is None and len(kept.assignment.class_ids) == 3
+    assert kept.edited is None and len(kept.assignment.class_ids) == 3
 
     seen: list[AssignedScene] = []
 
@@ -133,11 +134,32 @@ def test_prepare_splits_only_for_refiners_that_train():
             seen.append(scene)
 
     divided = prepare(*arguments, Recorder(), config, split)
-    assert divided.split is not None and len(divided.assignment.class_ids) == 3
-    assert len(divided.split.edited.surfels) == len(seen[0].surfels) == 4
-    assert torch.equal(seen[0].class_ids, divided.split.assignment.class_ids)
+    assert divided.edited is not None and len(divided.assignment.class_ids) == 3
+    assert len(divided.edited.edited.surfels) == len(seen[0].surfels) == 4
+    assert torch.equal(seen[0].class_ids, divided.edited.assignment.class_ids)
     assert any("became 4" in finding for finding in divided.findings) and "border split" in divided.seconds
-    assert prepare(*arguments, Recorder(), config, BorderSplitConfig()).split is None
+    assert prepare(*arguments, Recorder(), config, BorderSplitConfig()).edited is None
+
+
+def test_what_no_view_shows_is_removed_before_it_is_split():
+    """The tiny disc fills less than ten pixels; with a bound that none reaches, the strongest remains."""
+    surfels, labels = two_halves()
+    arguments = (surfels, [camera()], [labels], {0: "background", 1: "thing"}, make_rasterizer("torch"), SETTINGS)
+    config, split = PreparationConfig(reprojection="none", k=5, min_contribution=10.0), BorderSplitConfig()
+    assert prepare(*arguments, NoRefiner(), config, split).edited is None
+    removed = prepare(*arguments, BeaRefiner(), config, split)
+    assert removed.assignment.strongest[2] < 10.0 < removed.assignment.strongest[:2].min()
+    assert removed.edited.edited.source.tolist() == [0, 1]
+    assert torch.equal(removed.edited.edited.surfels.means, surfels.means[:2])
+    assert removed.edited.assignment.class_ids.tolist() == removed.assignment.class_ids[:2].tolist()
+    assert any("1 of 3 Gaussians" in finding for finding in removed.findings)
+
+    divided = prepare(*arguments, BeaRefiner(), config, BorderSplitConfig(rounds=1, min_share=0.1)).edited
+    assert divided.edited.source.tolist() == [1, 0, 0] and divided.edited.fresh.tolist() == [False, True, True]
+    least = prepare(*arguments, BeaRefiner(), dataclasses.replace(config, min_contribution=1e6), split).edited
+    assert least.edited.source.tolist() == [0]
+    with pytest.raises(UserError, match="min_contribution is nan"):
+        PreparationConfig(min_contribution=math.nan).check()
 
 
 @pytest.mark.parametrize(

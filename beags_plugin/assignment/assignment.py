@@ -22,11 +22,20 @@ class Assignment:
     class_ids: [N] int32, phi; background (0) where never seen.
     margin: [N] float32 in 0..1, the class's share of the Gaussian's contributions; 0 where never seen.
     never_seen: [N] bool, contributes to no labelled pixel of any view.
+    strongest: [N] float32, the sum of its contributions to all pixels, labelled or not, of the view where that is
+        largest; in pixels that it covers alone.
     """
 
     class_ids: Tensor
     margin: Tensor
     never_seen: Tensor
+    strongest: Tensor
+
+    def __getitem__(self, selection: Tensor) -> Assignment:
+        """Those of a part of the Gaussians; selection: [N] bool or [M] int64."""
+        return Assignment(
+            self.class_ids[selection], self.margin[selection], self.never_seen[selection], self.strongest[selection]
+        )
 
 
 def assign_classes(
@@ -47,18 +56,23 @@ def assign_classes(
     inputs = geometry_inputs(surfels)
     # float64: thousands of small weights of many views are added up.
     total = torch.zeros(len(surfels), num_classes, dtype=torch.float64, device=surfels.means.device)
+    strongest = torch.zeros_like(surfels.opacity_logits)
     for index, (camera, mask) in enumerate(zip(cameras, labels, strict=True)):
-        if mask is not None:
-            check_class_ids(mask, index, num_classes)
-            with torch.no_grad():
-                total += rasterizer.class_contributions(inputs, camera, settings, mask, num_classes).double()
+        if mask is None:
+            mask = torch.full((camera.height, camera.width), IGNORE, dtype=torch.int32, device=total.device)
+        check_class_ids(mask, index, num_classes)
+        every = mask.masked_fill(mask == IGNORE, num_classes)  # what is not labelled counts as one more class
+        with torch.no_grad():
+            of_view = rasterizer.class_contributions(inputs, camera, settings, every, num_classes + 1)
+        total += of_view[:, :num_classes].double()
+        strongest = torch.maximum(strongest, of_view.sum(dim=1))
         if progress:
             progress(index + 1, len(cameras))
     class_ids = total.argmax(dim=1).int()  # of equal values, the first
     top, everything = total.max(dim=1).values, total.sum(dim=1)
     never_seen = everything <= 0
     margin = torch.where(never_seen, 0.0, top / everything.masked_fill(never_seen, 1.0))
-    return Assignment(class_ids.masked_fill(never_seen, 0), margin.float(), never_seen)
+    return Assignment(class_ids.masked_fill(never_seen, 0), margin.float(), never_seen, strongest.float())
 
 
 def check_class_ids(mask: Tensor, index: int, num_classes: int) -> None:

@@ -78,6 +78,16 @@ class Densified:
     source: Tensor
     fresh: Tensor
 
+    @classmethod
+    def unchanged(cls, surfels: Surfels) -> Densified:
+        """Before any edit."""
+        count, device = len(surfels), surfels.means.device
+        return cls(surfels, torch.arange(count, device=device), torch.zeros(count, dtype=torch.bool, device=device))
+
+    def then(self, edited: Densified) -> Densified:
+        """This edit, and after it ``edited``, whose sources are this one's surfels."""
+        return Densified(edited.surfels, self.source[edited.source], self.fresh[edited.source] | edited.fresh)
+
 
 class GradientStatistics:
     """Mean screen gradient of N surfels over the views that saw them."""

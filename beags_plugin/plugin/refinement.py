@@ -105,9 +105,9 @@ class RefinementSwitch:
         # the snapshot first: what _save writes last says that everything is there
         write_run(self.trainer.config, self.trainer.base_dir / BASE_SNAPSHOT, model.state_dict(), max(step, 0))
         self._save(prepared, [view.name for view in views])
-        if prepared.split is not None:
-            edit_scene(model, self.trainer.optimizers.optimizers, prepared.split.edited)
-            self._take_classes(prepared.split.assignment)
+        if prepared.edited is not None:
+            edit_scene(model, self.trainer.optimizers.optimizers, prepared.edited.edited)
+            self._take_classes(prepared.edited.assignment)
         self._start(prepared.grid, prepared.labels)
         model.prepared_seconds = prepared.seconds
         CONSOLE.print(

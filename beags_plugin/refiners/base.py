@@ -8,7 +8,9 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from beags_plugin.assignment.assignment import Assignment
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.densification import Densified
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
@@ -37,6 +39,18 @@ class AssignedScene:
     settings: RasterSettings
     seed: int
     depth: str = "median"
+
+
+@dataclass(frozen=True)
+class EditedScene:
+    """A scene of M surfels that were removed or split before refinement, with classes of its own.
+
+    edited: the surfels, for each the index [M] of the one that it came from, and whether it is new [M] bool.
+    assignment: their classes.
+    """
+
+    edited: Densified
+    assignment: Assignment
 
 
 class Refiner(ABC):

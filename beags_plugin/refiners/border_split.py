@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from beags_plugin.assignment.assignment import Assignment, assign_classes
+from beags_plugin.assignment.assignment import assign_classes
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import Densified
 from beags_plugin.core.splitting import split_in_two
@@ -20,6 +20,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.rasterizers.drawing import geometry_inputs
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
+from beags_plugin.refiners.base import EditedScene
 
 
 @dataclass(frozen=True)
@@ -51,18 +52,6 @@ class BorderSplitConfig:
             )
 
 
-@dataclass(frozen=True)
-class SplitScene:
-    """A scene of M surfels after all rounds, with classes of its own.
-
-    edited: the surfels, for each the index [M] of the one that it came from, and whether it is a half [M] bool.
-    assignment: their classes.
-    """
-
-    edited: Densified
-    assignment: Assignment
-
-
 def split_at_borders(
     surfels: Surfels,
     cameras: Sequence[Camera],
@@ -72,7 +61,7 @@ def split_at_borders(
     num_classes: int,
     config: BorderSplitConfig,
     progress: Callable[[int, int], None] | None = None,
-) -> SplitScene:
+) -> EditedScene:
     """Split those at the borders of the masks ``config.rounds`` times and assign classes again.
 
     surfels: N surfels without gradients. labels: per camera [H, W] int32 class ids below ``num_classes`` or IGNORE, M'.
@@ -86,14 +75,13 @@ def split_at_borders(
             progress(done, total)
 
     bands = [border_band(mask, config.band) for mask in labels]
-    edited = Densified(surfels, torch.arange(len(surfels)), torch.zeros(len(surfels), dtype=torch.bool))
+    edited = Densified.unchanged(surfels)
     for _ in range(config.rounds):
         share = _share_of_class(edited.surfels, cameras, bands, rasterizer, settings, tick)
         sigma = largest_sigma(edited.surfels, cameras)
-        fresh = split_in_two(edited.surfels, (share >= config.min_share) & (sigma > config.min_sigma))
-        edited = Densified(fresh.surfels, edited.source[fresh.source], edited.fresh[fresh.source] | fresh.fresh)
+        edited = edited.then(split_in_two(edited.surfels, (share >= config.min_share) & (sigma > config.min_sigma)))
     assignment = assign_classes(edited.surfels, cameras, labels, rasterizer, settings, num_classes, tick)
-    return SplitScene(edited, assignment)
+    return EditedScene(edited, assignment)
 
 
 def border_band(labels: Tensor, width: int) -> Tensor:

@@ -13,14 +13,15 @@ from torch import Tensor
 from beags_plugin.assignment.assignment import Assignment, assign_classes, check_class_ids
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.class_ranks import ClassRanks
+from beags_plugin.core.densification import Densified
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.rasterizers.drawing import check_surface_depth, geometry_inputs, surface_depth
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
-from beags_plugin.refiners.base import AssignedScene, Progress, Refiner
-from beags_plugin.refiners.border_split import BorderSplitConfig, SplitScene, split_at_borders
+from beags_plugin.refiners.base import AssignedScene, EditedScene, Progress, Refiner
+from beags_plugin.refiners.border_split import BorderSplitConfig, split_at_borders
 
 Stage = Callable[[str], AbstractContextManager[Progress | None]]
 """Opens a named stage and gives its progress callback; a command line draws a bar with it."""
@@ -35,12 +36,15 @@ class PreparationConfig:
     tau: pairwise: a vote counts if its point is visible: |z - D| <= tau z; infinity counts every vote (E5).
     depth: which depth is lifted into space, "median" or "expected": see ``rasterizers.drawing.surface_depth``.
     k: neighbours that set the voxel size (E8).
+    min_contribution: Gaussians that fill less than so many pixels in every training view are removed before
+        refinement: no view tells what they should be. 0, as in the paper, keeps all.
     """
 
     reprojection: str = "pairwise"
     tau: float = 0.02
     depth: str = "median"
     k: int = 2000
+    min_contribution: float = 0.0
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that no stage can work with: hours before the stages would say so."""
@@ -54,6 +58,8 @@ class PreparationConfig:
             raise UserError(f"tau is {self.tau}: it must be 0 or more (inf counts every vote).")
         if not self.k >= 1:
             raise UserError(f"k is {self.k}: the voxel size needs at least 1 neighbour.")
+        if not self.min_contribution >= 0:
+            raise UserError(f"min_contribution is {self.min_contribution}: it must be 0 or more pixels.")
 
 
 @dataclass(frozen=True)
@@ -63,8 +69,8 @@ class Preparation:
     labels: per training view [H, W] int32, M'.
     confidence: per training view [H, W] float32, share of the winning votes; None where nothing was reprojected.
     assignment: the class of every surfel and its margin.
-    split: the scene and the classes that refinement starts from, where surfels were split; None where it starts from
-        the base.
+    edited: the scene and the classes that refinement starts from, where surfels were removed or split; None where it
+        starts from the base.
     grid: the visibility voxel grids, or None if the refiner needs none.
     findings: one line for a reader per stage.
     seconds: wall time per stage.
@@ -74,7 +80,7 @@ class Preparation:
     confidence: list[Tensor] | None
     assignment: Assignment
     grid: VisibilityGrid | None
-    split: SplitScene | None = None
+    edited: EditedScene | None = None
     findings: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -136,18 +142,24 @@ def prepare(
     assignment = replace(assignment, class_ids=known.class_ids(assignment.class_ids))
     timed("assignment", start, _assignment_finding(assignment, class_names))
 
-    divided, class_ids = None, assignment.class_ids
+    edited = None
+    if config.min_contribution > 0 and refiner.trains:
+        start = time.perf_counter()
+        edited = _without_unneeded(surfels, assignment, config.min_contribution)
+        timed("removal", start, _removal_finding(len(surfels), edited, config.min_contribution))
+        surfels = edited.edited.surfels
     if split is not None and split.rounds > 0 and refiner.trains:
         start = time.perf_counter()
         with stage("Splitting Gaussians at borders") as progress:
             divided = split_at_borders(surfels, cameras, ranked, rasterizer, settings, len(known), split, progress)
-        class_ids = known.class_ids(divided.assignment.class_ids)
-        divided = replace(divided, assignment=replace(divided.assignment, class_ids=class_ids))
         timed("border split", start, _split_finding(len(surfels), divided))
-        surfels = divided.edited.surfels
+        classes = replace(divided.assignment, class_ids=known.class_ids(divided.assignment.class_ids))
+        whole = divided.edited if edited is None else edited.edited.then(divided.edited)
+        edited, surfels = EditedScene(whole, classes), divided.edited.surfels
 
     start = time.perf_counter()
     num_classes = max(class_names) + 1
+    class_ids = (assignment if edited is None else edited.assignment).class_ids
     scene = AssignedScene(
         surfels, class_ids, cameras, consistent, num_classes, rasterizer, settings, seed, config.depth
     )
@@ -155,7 +167,7 @@ def prepare(
         grid = refiner.build_grid(scene, config.k, progress)
     if grid is not None:
         timed("voxel grids", start, f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {config.k})")
-    return Preparation(consistent, confidence, assignment, grid, divided, findings, seconds)
+    return Preparation(consistent, confidence, assignment, grid, edited, findings, seconds)
 
 
 def _known_classes(labels: Sequence[Tensor | None], class_names: dict[int, str]) -> ClassRanks:
@@ -209,7 +221,21 @@ def _reprojection_finding(before: Sequence[Tensor | None], after: Sequence[Tenso
     )
 
 
-def _split_finding(before: int, divided: SplitScene) -> str:
+def _without_unneeded(surfels: Surfels, assignment: Assignment, least: float) -> EditedScene:
+    """The scene without surfels that fill less than ``least`` pixels in every view; at least one remains."""
+    kept = assignment.strongest >= least
+    kept[assignment.strongest.argmax()] = True
+    source = torch.nonzero(kept)[:, 0]
+    return EditedScene(Densified(surfels[kept], source, torch.zeros_like(source, dtype=torch.bool)), assignment[kept])
+
+
+def _removal_finding(before: int, edited: EditedScene, least: float) -> str:
+    removed = before - len(edited.edited.surfels)
+    share = f"{removed} of {before} Gaussians ({100 * removed / before:.1f} %)"
+    return f"removal: {share} fill less than {least:g} pixels in every view"
+
+
+def _split_finding(before: int, divided: EditedScene) -> str:
     after = len(divided.edited.surfels)
     return f"border split: {int(divided.edited.fresh.sum())} halves, {before} Gaussians became {after}"
 
