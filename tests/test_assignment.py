@@ -107,9 +107,8 @@ def test_ids_out_of_range_are_told():
 def test_strongest_counts_pixels_without_a_label_too():
     scene = make_scene()
     inputs = scene.inputs
-    surfels = Surfels.of(
-        inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits, torch.zeros(len(inputs.means), 1, 3).double()
-    )  # fmt: skip
+    sh = torch.zeros(len(inputs.means), 1, 3).double()
+    surfels = Surfels.of(inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits, sh)
     rasterizer = make_rasterizer("torch")
     unlabelled = scene.target.clone()
     unlabelled[::2] = IGNORE
