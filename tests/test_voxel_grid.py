@@ -348,3 +348,19 @@ def test_build_with_the_reference_rasterizer():
     outer = means[:, 0].abs() > 3 * grid.voxel_size
     assert outer.any() and not grid.valid(means[outer], 3 - ids[outer]).any()
     assert not grid.valid(means - torch.tensor([0.0, 0.0, 3.0]), ids).any()
+
+
+@pytest.mark.parametrize("dense_bytes", [0, 2**28])
+def test_a_grid_of_some_classes_answers_the_same_about_them(dense_bytes, ops):
+    g = torch.Generator().manual_seed(9)
+    points, ids = torch.rand(3000, 3, generator=g) * 2, torch.randint(0, 4, (3000,), generator=g)
+    grid = VisibilityGrid.from_points([(points, ids)], 0.2, torch.zeros(3), 4, dense_bytes)
+    part = grid.only(torch.tensor([3, 1]))
+    asked = torch.rand(4000, 3, generator=g) * 2.4 - 0.2
+    classes = torch.arange(4000) % 4
+    kept = (classes == 1) | (classes == 3)
+    assert torch.equal(part.count(asked, classes)[kept], grid.count(asked, classes)[kept])
+    assert torch.equal(part.valid(asked, classes)[kept], grid.valid(asked, classes)[kept])
+    assert grid.valid(asked, classes)[~kept].any() and not part.valid(asked, classes)[~kept].any()
+    assert len(part.keys) < len(grid.keys)
+    assert not grid.only(torch.tensor([], dtype=torch.int64)).valid(asked, classes).any()

@@ -57,6 +57,11 @@ class Loss(ABC):
     start: int = 0
     stop: int | None = None
 
+    @property
+    def asks_grid_about_background(self) -> bool:
+        """Whether it looks up background's voxels; where no term does, the grid goes without them, its largest part."""
+        return False
+
     def active(self, step: int) -> bool:
         """Whether the term counts at this step."""
         return self.weight != 0.0 and self.start <= step and (self.stop is None or step < self.stop)

@@ -43,6 +43,10 @@ class OccupancyLoss(Loss):
         if not (self.samples >= 1 and float(self.samples).is_integer()):
             raise UserError(f"the occupancy loss has samples = {self.samples}: it must be a whole number, 1 or more.")
 
+    @property
+    def asks_grid_about_background(self) -> bool:
+        return self.background
+
     def value(self, inputs: LossInputs) -> Tensor:
         surfels, grid, class_ids = inputs.surfels, inputs.grid, inputs.class_ids
         if grid is None or class_ids is None:

@@ -45,20 +45,40 @@ class BeagsDataManagerConfig(FullImageDatamanagerConfig):
 class View:
     """One undistorted view, on the data manager's device.
 
-    image: [H, W, 3] float32 in 0..1, on black where it has alpha. labels: [H, W] int32 class ids or IGNORE; None if
-    the view has no mask. alpha: [H, W] float32 in 0..1, the image's alpha; None if it is opaque.
+    It shares the data manager's memory; what is asked of it is computed anew: of all views at once, the images in float
+    would take six times as much as their files, opened.
+
     name: the stem of the image file; where several share it, with the folders that tell them apart, joined by "_".
+    pixels: [H, W, 3 or more], uint8 or float32 in 0..1. class_map: [H, W] uint16, or None. opacity: [H, W] uint8, or
+        None.
     """
 
     camera: Camera
-    image: Tensor
-    labels: Tensor | None
     name: str
-    alpha: Tensor | None = None
+    pixels: Tensor
+    class_map: Tensor | None
+    opacity: Tensor | None = None
+
+    @property
+    def image(self) -> Tensor:
+        """[H, W, 3] float32 in 0..1, on black where it has alpha."""
+        pixels = self.pixels[..., :3]
+        return pixels.float() / 255.0 if pixels.dtype == torch.uint8 else pixels
+
+    @property
+    def labels(self) -> Tensor | None:
+        """[H, W] int32 class ids or IGNORE; None if the view has no mask."""
+        return None if self.class_map is None else self.class_map.to(torch.int32)
+
+    @property
+    def alpha(self) -> Tensor | None:
+        """[H, W] float32 in 0..1, the image's alpha; None if it is opaque."""
+        return None if self.opacity is None else self.opacity.float() / 255.0
 
     def image_on(self, background: Tensor) -> Tensor:
         """The image [H, W, 3] with ``background`` [3] behind what is transparent."""
-        return self.image if self.alpha is None else self.image + (1.0 - self.alpha)[..., None] * background
+        alpha = self.alpha
+        return self.image if alpha is None else self.image + (1.0 - alpha)[..., None] * background
 
 
 class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
@@ -157,16 +177,14 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
             data["class_map"] = labels.detach().to(torch.uint16).to(data["class_map"].device, copy=True)
 
     def _view(self, dataset: BeagsDataset, data: dict, index: int, name: str, original: bool) -> View:
-        image = data["image"].to(self.device)
-        image = image.float() / 255.0 if image.dtype == torch.uint8 else image
         replaced = "original_class_map" in data and not original
         labels = None
         if replaced or dataset.metadata["class_map_filenames"][index] is not None:
             key = "original_class_map" if original and "original_class_map" in data else "class_map"
-            labels = data[key].to(self.device).to(torch.int32)
+            labels = data[key].to(self.device)
         camera = camera_from_nerfstudio(dataset.cameras, index).to(self.device)
-        alpha = data["alpha"].to(self.device).float() / 255.0 if "alpha" in data else None
-        return View(camera, image[..., :3], labels, name, alpha)
+        alpha = data["alpha"].to(self.device) if "alpha" in data else None
+        return View(camera, name, data["image"].to(self.device), labels, alpha)
 
     def _on_device(self, data: dict) -> dict:
         return {key: value.to(self.device) if key in OWN_KEYS else value for key, value in data.items()}

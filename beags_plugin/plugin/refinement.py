@@ -96,6 +96,7 @@ class RefinementSwitch:
             self.refiner,
             model.config.prepare,
             model.config.split,
+            background_voxels=self._background_voxels(),
             seed=model.seed,
             stage=progress_bar,
         )
@@ -113,6 +114,9 @@ class RefinementSwitch:
         CONSOLE.print(
             f"  base kept in {self.trainer.base_dir / BASE_SNAPSHOT}", highlight=False, markup=False, soft_wrap=True
         )
+
+    def _background_voxels(self) -> bool:
+        return any(loss.asks_grid_about_background for loss in self.model.losses.values())
 
     def _take_classes(self, assignment: Assignment) -> None:
         self.model.class_ids.copy_(assignment.class_ids)
@@ -155,6 +159,11 @@ class RefinementSwitch:
                 f"or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
             )
         state = torch.load(folder / "grid.pt", weights_only=True)
+        if state and self._background_voxels() and not bool((state["classes"] == 0).any()):
+            raise UserError(
+                f"{folder / 'grid.pt'} has no voxels of the background, which a loss now asks about: set background of "
+                f"the occupancy loss to False, or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
+            )
         labels = [
             torch.from_numpy(read_class_map(folder / "masks" / f"{view.name}.png").astype(np.int32))
             for view in self.datamanager.views("train")

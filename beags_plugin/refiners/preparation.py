@@ -95,6 +95,7 @@ def prepare(
     refiner: Refiner,
     config: PreparationConfig,
     split: BorderSplitConfig | None = None,
+    background_voxels: bool = True,
     seed: int = 0,
     stage: Stage = lambda name: nullcontext(),
 ) -> Preparation:
@@ -103,6 +104,7 @@ def prepare(
     surfels: the trained base, N surfels.
     cameras: V training views; labels: per view [H, W] int32 class ids or IGNORE, None where there is no mask.
     class_names: id to name, background (0) included; ids may lie far apart: the stages work on their ranks.
+    background_voxels: whether a loss will ask the grid about the background; if none will, those voxels are not kept.
     Raises ``UserError`` if no view has a mask or no mask names an object.
     """
     if not any(mask is not None and bool(((mask > 0) & (mask != IGNORE)).any()) for mask in labels):
@@ -166,6 +168,8 @@ def prepare(
     with stage("Building voxel grids") as progress:
         grid = refiner.build_grid(scene, config.k, progress)
     if grid is not None:
+        asked = torch.unique(class_ids)  # classes are fixed: no loss can ask about one that has no Gaussians
+        grid = grid.only(asked if background_voxels else asked[asked != 0])
         timed("voxel grids", start, f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {config.k})")
     return Preparation(consistent, confidence, assignment, grid, edited, findings, seconds)
 
