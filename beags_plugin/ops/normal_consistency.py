@@ -20,7 +20,7 @@ def normal_consistency(depth: Tensor, normal: Tensor, alpha: Tensor, K: Tensor) 
     if len(shape) != 2:
         raise ValueError(f"depth must be [H, W], not {list(shape)}")
     extension.plain("normal", normal, (*shape, 3), dtype)
-    fixed = (extension.plain("alpha", alpha, shape, dtype), K.detach().cpu().double().tolist())
+    fixed = (extension.plain("alpha", alpha, shape, dtype), K.tolist())
     return _NormalConsistency.apply(depth, normal, fixed)  # type: ignore[return-value]
 
 
@@ -38,11 +38,12 @@ class _NormalConsistency(torch.autograd.Function):
         )
         if found[0] is not None:
             ctx.save_for_backward(*found)
-        return d.new_tensor(scale * total)
+        return d.new_full((), scale * total)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *grad_outputs: Tensor):
-        wanted = ctx.needs_input_grad
-        found = (grad_outputs[0] * g if want else None for g, want in zip(ctx.saved_tensors, wanted, strict=False))
-        return *found, None
+        depth, normal = ctx.saved_tensors
+        wanted, (factor,) = ctx.needs_input_grad, grad_outputs
+        found_depth = extension.scaled(depth, factor) if wanted[0] else None
+        return found_depth, extension.scaled(normal, factor) if wanted[1] else None, None

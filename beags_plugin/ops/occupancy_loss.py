@@ -53,9 +53,9 @@ class _OccupancyLoss(torch.autograd.Function):
         value, _ = compute(*plain, *fixed, *gradients, extension.threads())
         if wanted:
             ctx.save_for_backward(*gradients)
-        return torch.tensor(value, dtype=plain[0].dtype)
+        return plain[0].new_full((), value)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *grad_outputs: Tensor):
-        return None, *(gradient * grad_outputs[0] for gradient in ctx.saved_tensors)
+        return None, *(extension.scaled(gradient, grad_outputs[0]) for gradient in ctx.saved_tensors)
