@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.optim import Adam, Optimizer
 
+_ONE = torch.ones((), dtype=torch.float32, device="cpu")
+
 
 def clear_gradients(optimizers: Iterable[Optimizer]) -> None:
     """``Optimizer.zero_grad`` of each: no parameter has a gradient afterwards."""
@@ -36,8 +38,11 @@ def step_all(optimizers: Iterable[Optimizer]) -> None:
                 jobs.append((group, parameters, [_state(optimizer, value) for value in parameters]))
     if not jobs:
         return
-    # A tensor, for a number would be wrapped into one again for each parameter.
-    torch._foreach_add_([state["step"] for _, _, states in jobs for state in states], torch.ones(()), alpha=1.0)
+    counts = [state["step"] for _, _, states in jobs for state in states]
+    if all(count.is_cpu for count in counts):
+        torch._foreach_add_(counts, _ONE, alpha=1.0)  # a number would become a tensor again for each of them
+    else:
+        torch._foreach_add_(counts, 1)
     for group, parameters, states in jobs:
         first, second = group["betas"]
         torch._fused_adam_(

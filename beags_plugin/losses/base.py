@@ -62,7 +62,7 @@ class Loss(ABC):
         return self.weight != 0.0 and self.start <= step and (self.stop is None or step < self.stop)
 
     def weighted(self, inputs: LossInputs) -> Tensor:
-        """The term as it enters the sum."""
+        """The term as it enters the sum. A loss with a compiled op has the op scale it, there and back, for nothing."""
         value = self.value(inputs)
         return value if self.weight == 1.0 else self.weight * value
 
