@@ -10,7 +10,9 @@ from beags_plugin.ops import extension
 
 
 def normal_consistency(depth: Tensor, normal: Tensor, alpha: Tensor, K: Tensor, weight: float = 1.0) -> Tensor:
-    """weight * mean over the inner pixels of A (1 - n . n_depth): a scalar, differentiable, once, in ``depth`` and ``normal``.
+    """weight * mean over the inner pixels of A (1 - n . n_depth): a scalar.
+
+    It is differentiable, once, in ``depth`` and ``normal``.
 
     depth: [H, W], 0 where unknown. normal: [H, W, 3], camera space. alpha: [H, W], held constant. All float32 or all
     float64, on the CPU. K: [3, 3], pixels. See ``losses.normal`` for what counts. Bit for bit the same for any number

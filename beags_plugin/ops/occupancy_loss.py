@@ -22,7 +22,9 @@ def occupancy_loss(
     background: bool = True,
     weight: float = 1.0,
 ) -> Tensor:
-    """weight * L_occ (E9), a scalar; differentiable, once, in the four parameters. Its memory does not depend on ``samples``.
+    """weight * L_occ (E9), a scalar; differentiable, once, in the four parameters.
+
+    Its memory does not depend on ``samples``.
 
     means [N, 3], quats [N, 4] wxyz, log_scales [N, 2], opacity_logits [N]: as in ``core.surfels.Surfels``; float32 or
         float64, on the CPU. Surfels with a parameter that is not finite, or with a scale of 0, count as 0.
