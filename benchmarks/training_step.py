@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -68,7 +69,8 @@ class TrainingStep:
         class_ids = self.scene.class_ids if self.refining else None
         render = self._rasterize(surfel_inputs(surfels, self.scene.camera, class_ids=class_ids))
         inputs = self._loss_inputs(surfels, render)
-        torch.stack([loss.weight * loss.value(inputs) for loss in self.losses.values()]).sum().backward()
+        # as nerfstudio adds them up
+        reduce(torch.add, [loss.weighted(inputs) for loss in self.losses.values()]).backward()
         step_all(self.optimizers)
         self.step += 1
         return Seconds.now() - start
@@ -98,7 +100,7 @@ class TrainingStep:
         loss_inputs = self._loss_inputs(surfels, replace(render, **leaves))
         for name, loss in self.losses.items():
             clock = Seconds.now()
-            (loss.weight * loss.value(loss_inputs)).backward()
+            loss.weighted(loss_inputs).backward()
             stop(name)
         towards = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
         clock = Seconds.now()

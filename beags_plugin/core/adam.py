@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.optim import Adam, Optimizer
 
+_ONE = torch.ones((), dtype=torch.float32, device="cpu")
+
 
 def clear_gradients(optimizers: Iterable[Optimizer]) -> None:
     """``Optimizer.zero_grad`` of each: no parameter has a gradient afterwards."""
@@ -36,7 +38,11 @@ def step_all(optimizers: Iterable[Optimizer]) -> None:
                 jobs.append((group, parameters, [_state(optimizer, value) for value in parameters]))
     if not jobs:
         return
-    torch._foreach_add_([state["step"] for _, _, states in jobs for state in states], 1)
+    counts = [state["step"] for _, _, states in jobs for state in states]
+    if all(count.is_cpu for count in counts):
+        torch._foreach_add_(counts, _ONE, alpha=1.0)  # a number would become a tensor again for each of them
+    else:
+        torch._foreach_add_(counts, 1)
     for group, parameters, states in jobs:
         first, second = group["betas"]
         torch._fused_adam_(
@@ -62,13 +68,11 @@ def _is_plain(optimizer: Optimizer) -> bool:
     hooked = optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks
     if type(optimizer) is not Adam or patched or hooked:
         return False
-    return all(
-        group["fused"]
-        and isinstance(group["lr"], float)
-        and not group["amsgrad"]
-        and not group.get("decoupled_weight_decay", False)
-        for group in optimizer.param_groups
-    )
+    for group in optimizer.param_groups:
+        extended = group["amsgrad"] or group.get("decoupled_weight_decay", False)
+        if not group["fused"] or extended or not isinstance(group["lr"], float):
+            return False
+    return True
 
 
 def _state(optimizer: Optimizer, parameter: Tensor) -> dict[str, Tensor]:

@@ -66,6 +66,11 @@ class Loss(ABC):
         """Whether the term counts at this step."""
         return self.weight != 0.0 and self.start <= step and (self.stop is None or step < self.stop)
 
+    def weighted(self, inputs: LossInputs) -> Tensor:
+        """The term as it enters the sum. A loss with a compiled op has the op scale it, there and back, for nothing."""
+        value = self.value(inputs)
+        return value if self.weight == 1.0 else self.weight * value
+
     @abstractmethod
     def value(self, inputs: LossInputs) -> Tensor:
         """The unweighted term: a scalar with gradients towards what it supervises."""

@@ -31,15 +31,21 @@ class NormalConsistencyLoss(Loss):
     start: int = 7000
 
     def value(self, inputs: LossInputs) -> Tensor:
+        return self._scaled(inputs, 1.0)
+
+    def weighted(self, inputs: LossInputs) -> Tensor:
+        return self._scaled(inputs, self.weight)
+
+    def _scaled(self, inputs: LossInputs, weight: float) -> Tensor:
         render = inputs.render
         if render.depth is None or render.normal is None:
             raise ValueError("the normal loss needs a render with geometry")
         if extension.can_take(render.depth, render.normal, render.alpha):
-            return normal_consistency(render.depth, render.normal, render.alpha, inputs.camera.K)
+            return normal_consistency(render.depth, render.normal, render.alpha, inputs.camera.K, weight)
         slope, known = depth_normals(render.depth, inputs.camera)
         error = 1.0 - (render.normal[1:-1, 1:-1] * slope).sum(-1)
         error = torch.where(known, render.alpha.detach()[1:-1, 1:-1] * error, 0.0)
-        return ordered_sum(error) / max(error.numel(), 1)
+        return weight * ordered_sum(error) / max(error.numel(), 1)
 
 
 def depth_normals(depth: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:

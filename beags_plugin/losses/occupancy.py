@@ -48,6 +48,12 @@ class OccupancyLoss(Loss):
         return self.background
 
     def value(self, inputs: LossInputs) -> Tensor:
+        return self._scaled(inputs, 1.0)
+
+    def weighted(self, inputs: LossInputs) -> Tensor:
+        return self._scaled(inputs, self.weight)
+
+    def _scaled(self, inputs: LossInputs, weight: float) -> Tensor:
         surfels, grid, class_ids = inputs.surfels, inputs.grid, inputs.class_ids
         if grid is None or class_ids is None:
             raise ValueError("the occupancy loss needs class ids and a visibility grid")
@@ -56,7 +62,8 @@ class OccupancyLoss(Loss):
         lookup = grid.lookup()
         if lookup is not None and extension.can_take(*parameters):
             stream = sample_stream(inputs.seed, inputs.step)
-            return occupancy_loss(*parameters, class_ids.int(), lookup, stream, num_samples, self.background)
+            ids = class_ids.int()
+            return occupancy_loss(*parameters, ids, lookup, stream, num_samples, self.background, weight)
         active = _outside(*parameters, class_ids, grid)
         if not self.background:
             active = active[class_ids[active] != 0]
@@ -71,7 +78,7 @@ class OccupancyLoss(Loss):
             grid,
             (inputs.seed, inputs.step, active, num_samples),
         )
-        return ordered_sum(per_gaussian) / max(len(surfels) * num_samples, 1)
+        return weight * ordered_sum(per_gaussian) / max(len(surfels) * num_samples, 1)
 
 
 @torch.no_grad()

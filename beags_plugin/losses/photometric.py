@@ -34,9 +34,8 @@ class PhotometricLoss(Loss):
     def value(self, inputs: LossInputs) -> Tensor:
         drawn, photo = inputs.render.color, inputs.image.to(inputs.render.color)
         if _compiled_takes(drawn, photo):
-            return self.ssim_weight + compiled.photometric(
-                drawn, photo, 1.0 - self.ssim_weight, -self.ssim_weight, _C1, _C2
-            )
+            weight = self.ssim_weight
+            return compiled.photometric(drawn, photo, 1.0 - weight, -weight, _C1, _C2, offset=weight)
         absolute = ordered_mean((drawn - photo).abs())
         if self.ssim_weight == 0.0:
             return absolute

@@ -192,8 +192,16 @@ void Frame<T>::reduce(const Inputs<T>& inputs, const T* records, int size, const
   // Determinism: each surfel's records are summed by one thread, in the order of their tiles.
 #pragma omp parallel for num_threads(team) schedule(dynamic, kChunk)
   for (int64_t i = 0; i < num_surfels_; ++i) {
-    if (bins_.record_start[i] == bins_.record_start[i + 1]) continue;
     double sums[kRecord] = {};
+    if (bins_.record_start[i] == bins_.record_start[i + 1]) {
+      write(to.colors, i, sums, 3);
+      write(to.opacity_logits, i, sums, 1);
+      write(to.means, i, sums, 3);
+      write(to.quats, i, sums, 4);
+      write(to.log_scales, i, sums, 2);
+      write(to.screen_shift, i, sums, 2);
+      continue;
+    }
     for (int64_t record = bins_.record_start[i]; record < bins_.record_start[i + 1]; ++record) {
       for (int number = 0; number < size; ++number) sums[number] += records[record * size + number];
     }

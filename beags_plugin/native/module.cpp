@@ -3,6 +3,10 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
+#include <stdexcept>
+#include <vector>
+
 #include "arrays.h"
 #include "frame.h"
 #include "isa.h"
@@ -15,14 +19,19 @@ using namespace nb::literals;
 namespace beags {
 namespace {
 
-View make_view(const Array<const double>& viewmat, const Array<const double>& k, int width, int height,
-               double near_plane, double far_plane) {
+using Matrix = std::vector<std::vector<double>>;  // row by row
+
+View make_view(const Matrix& viewmat, const Matrix& k, int width, int height, double near_plane, double far_plane) {
+  const auto is = [](const Matrix& m, size_t size) {
+    return m.size() == size && std::all_of(m.begin(), m.end(), [&](const auto& row) { return row.size() == size; });
+  };
+  if (!is(viewmat, 4) || !is(k, 3)) throw std::invalid_argument("viewmat must be 4 x 4 and K 3 x 3");
   View view{};
   for (int row = 0; row < 3; ++row) {
-    for (int column = 0; column < 3; ++column) view.rotation[3 * row + column] = viewmat.data()[4 * row + column];
-    view.translation[row] = viewmat.data()[4 * row + 3];
-    view.kx[row] = k.data()[row];
-    view.ky[row] = k.data()[3 + row];
+    for (int column = 0; column < 3; ++column) view.rotation[3 * row + column] = viewmat[row][column];
+    view.translation[row] = viewmat[row][3];
+    view.kx[row] = k[0][row];
+    view.ky[row] = k[1][row];
   }
   view.width = width;
   view.height = height;
@@ -39,8 +48,8 @@ void bind(nb::module_& m, const char* name) {
       .def(
           "__init__",
           [](Frame<T>* self, In means, In quats, In log_scales, In opacity_logits, In colors, Ids class_ids,
-             Array<const double> viewmat, Array<const double> k, int width, int height, double near_plane,
-             double far_plane, Array<bool> visible, int threads) {
+             const Matrix& viewmat, const Matrix& k, int width, int height, double near_plane, double far_plane,
+             Array<bool> visible, int threads) {
             const View view = make_view(viewmat, k, width, height, near_plane, far_plane);
             const Inputs<T> inputs{static_cast<int64_t>(means.shape(0)),
                                    means.data(),

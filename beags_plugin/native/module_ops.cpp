@@ -73,7 +73,7 @@ void bind_functions(nb::module_& m, const char* suffix) {
   m.def(("occupancy_loss_" + end).c_str(),
         [](In means, In quats, In log_scales, In opacity_logits, Ids class_ids, const VoxelLookup& lookup,
            uint64_t stream, int64_t samples, bool background, Out g_means, Out g_quats, Out g_log_scales,
-           Out g_opacity_logits, int threads) {
+           Out g_opacity_logits, int threads, double weight) {
           const auto cubes = lookup.valid_cubes();
           const int64_t count = rows(class_ids);
           OccupancyJob<T> job{};
@@ -88,7 +88,7 @@ void bind_functions(nb::module_& m, const char* suffix) {
           job.stream = stream;
           job.samples = samples;
           job.background = background;
-          job.factor = 1.0 / (count && samples ? static_cast<double>(count) * static_cast<double>(samples) : 1.0);
+          job.factor = weight / (count && samples ? static_cast<double>(count) * static_cast<double>(samples) : 1.0);
           job.g_means = g_means.data();
           job.g_quats = g_quats.data();
           job.g_log_scales = g_log_scales.data();
@@ -102,7 +102,7 @@ void bind_functions(nb::module_& m, const char* suffix) {
         },
         "means"_a, "quats"_a, "log_scales"_a, "opacity_logits"_a, "class_ids"_a, "lookup"_a, "stream"_a, "samples"_a,
         "background"_a, "g_means"_a.none(), "g_quats"_a.none(), "g_log_scales"_a.none(), "g_opacity_logits"_a.none(),
-        "threads"_a);
+        "threads"_a, "weight"_a = 1.0);
   m.def(("sh_colors_" + end).c_str(),
         [](In sh_dc, In sh_rest, In means, const std::vector<double>& center, int degree, Out colors,
            Array<uint8_t> clamped, int threads) {

@@ -1,5 +1,6 @@
 #include "scratch.h"
 
+#include <algorithm>
 #include <cstdint>
 #include <mutex>
 #include <new>
@@ -9,6 +10,7 @@ namespace beags {
 namespace {
 
 constexpr size_t kMostKept = 64 << 20;
+constexpr size_t kLeast = 4096;  // of a block: small ones fit each other, so that few are kept and looked through
 constexpr std::align_val_t kAlignment{64};
 
 struct Block {
@@ -37,6 +39,7 @@ Kept& kept() {
 }  // namespace
 
 void* take_scratch(size_t& bytes) {
+  bytes = std::max(bytes, kLeast);
   {
     const std::lock_guard<std::mutex> lock(kept().mutex);
     size_t best = SIZE_MAX;

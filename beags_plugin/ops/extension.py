@@ -47,13 +47,20 @@ def load() -> ModuleType | None:
 def can_take(*tensors: Tensor) -> bool:
     """Whether the compiled ops are there and take these float tensors: on the CPU, all float32 or all float64."""
     dtype = tensors[0].dtype
-    fits = dtype in _SUFFIXES and all(value.device.type == "cpu" and value.dtype == dtype for value in tensors)
-    return fits and load() is not None
+    for value in tensors:
+        if not value.is_cpu or value.dtype != dtype:
+            return False
+    return dtype in _SUFFIXES and load() is not None
 
 
 def function(name: str, like: Tensor, owner: object | None = None):
     """``name`` of the compiled module (or of ``owner``, one of its objects) for the dtype of ``like``."""
     return getattr(load() if owner is None else owner, f"{name}_{_SUFFIXES[like.dtype]}")
+
+
+def scaled(gradient: Tensor, factor: Tensor) -> Tensor:
+    """``gradient`` times the scalar ``factor``; itself, not a copy, where that is 1, as it is for most losses."""
+    return gradient if factor.item() == 1.0 else gradient * factor
 
 
 def threads() -> int:

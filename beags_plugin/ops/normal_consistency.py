@@ -9,8 +9,10 @@ from torch.autograd.function import once_differentiable
 from beags_plugin.ops import extension
 
 
-def normal_consistency(depth: Tensor, normal: Tensor, alpha: Tensor, K: Tensor) -> Tensor:
-    """Mean over the inner pixels of A (1 - n . n_depth): a scalar, differentiable, once, in ``depth`` and ``normal``.
+def normal_consistency(depth: Tensor, normal: Tensor, alpha: Tensor, K: Tensor, weight: float = 1.0) -> Tensor:
+    """weight * mean over the inner pixels of A (1 - n . n_depth): a scalar.
+
+    It is differentiable, once, in ``depth`` and ``normal``.
 
     depth: [H, W], 0 where unknown. normal: [H, W, 3], camera space. alpha: [H, W], held constant. All float32 or all
     float64, on the CPU. K: [3, 3], pixels. See ``losses.normal`` for what counts. Bit for bit the same for any number
@@ -20,17 +22,17 @@ def normal_consistency(depth: Tensor, normal: Tensor, alpha: Tensor, K: Tensor) 
     if len(shape) != 2:
         raise ValueError(f"depth must be [H, W], not {list(shape)}")
     extension.plain("normal", normal, (*shape, 3), dtype)
-    fixed = (extension.plain("alpha", alpha, shape, dtype), K.detach().cpu().double().tolist())
+    fixed = (extension.plain("alpha", alpha, shape, dtype), K.tolist(), weight)
     return _NormalConsistency.apply(depth, normal, fixed)  # type: ignore[return-value]
 
 
 class _NormalConsistency(torch.autograd.Function):
     @staticmethod
     def forward(ctx, depth: Tensor, normal: Tensor, fixed) -> Tensor:
-        alpha, K = fixed
+        alpha, K, weight = fixed
         d, n = depth.detach().contiguous(), normal.detach().contiguous()
         height, width = d.shape
-        scale = 1.0 / max((height - 2) * (width - 2), 1) if min(height, width) > 2 else 1.0
+        scale = weight / max((height - 2) * (width - 2), 1) if min(height, width) > 2 else weight
         found = (torch.empty_like(d), torch.empty_like(n)) if any(ctx.needs_input_grad) else (None, None)
         intrinsics = (K[0][0], K[1][1], K[0][1], K[0][2], K[1][2])
         total = extension.function("normal_consistency", d)(
@@ -38,11 +40,12 @@ class _NormalConsistency(torch.autograd.Function):
         )
         if found[0] is not None:
             ctx.save_for_backward(*found)
-        return d.new_tensor(scale * total)
+        return d.new_full((), scale * total)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *grad_outputs: Tensor):
-        wanted = ctx.needs_input_grad
-        found = (grad_outputs[0] * g if want else None for g, want in zip(ctx.saved_tensors, wanted, strict=False))
-        return *found, None
+        depth, normal = ctx.saved_tensors
+        wanted, (factor,) = ctx.needs_input_grad, grad_outputs
+        found_depth = extension.scaled(depth, factor) if wanted[0] else None
+        return found_depth, extension.scaled(normal, factor) if wanted[1] else None, None

@@ -20,8 +20,11 @@ def occupancy_loss(
     stream: int,
     samples: int,
     background: bool = True,
+    weight: float = 1.0,
 ) -> Tensor:
-    """L_occ (E9), a scalar; differentiable, once, in the four parameters. Its memory does not depend on ``samples``.
+    """weight * L_occ (E9), a scalar; differentiable, once, in the four parameters.
+
+    Its memory does not depend on ``samples``.
 
     means [N, 3], quats [N, 4] wxyz, log_scales [N, 2], opacity_logits [N]: as in ``core.surfels.Surfels``; float32 or
         float64, on the CPU. Surfels with a parameter that is not finite, or with a scale of 0, count as 0.
@@ -39,7 +42,7 @@ def occupancy_loss(
     class_ids = extension.plain("class_ids", class_ids, (n,), torch.int32)
     if samples < 0:
         raise ValueError(f"samples must be 0 or more, not {samples}")
-    fixed = (lookup.ranks(class_ids), lookup.native, stream, samples, background)
+    fixed = (lookup.ranks(class_ids), lookup.native, stream, samples, background, weight)
     return _OccupancyLoss.apply(fixed, *parameters)  # type: ignore[return-value]
 
 
@@ -50,12 +53,13 @@ class _OccupancyLoss(torch.autograd.Function):
         wanted = any(ctx.needs_input_grad)
         gradients = [torch.empty_like(value) for value in plain] if wanted else [None] * 4
         compute = extension.function("occupancy_loss", plain[0])
-        value, _ = compute(*plain, *fixed, *gradients, extension.threads())
+        *arguments, weight = fixed
+        value, _ = compute(*plain, *arguments, *gradients, extension.threads(), weight)
         if wanted:
             ctx.save_for_backward(*gradients)
-        return torch.tensor(value, dtype=plain[0].dtype)
+        return plain[0].new_full((), value)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *grad_outputs: Tensor):
-        return None, *(gradient * grad_outputs[0] for gradient in ctx.saved_tensors)
+        return None, *(extension.scaled(gradient, grad_outputs[0]) for gradient in ctx.saved_tensors)

@@ -9,8 +9,10 @@ from torch.autograd.function import once_differentiable
 from beags_plugin.ops import extension
 
 
-def photometric(image: Tensor, reference: Tensor, l1_weight: float, ssim_weight: float, c1: float, c2: float) -> Tensor:
-    """l1_weight * mean |x - y| + ssim_weight * mean SSIM: a scalar, differentiable, once, in ``image``.
+def photometric(
+    image: Tensor, reference: Tensor, l1_weight: float, ssim_weight: float, c1: float, c2: float, offset: float = 0.0
+) -> Tensor:
+    """offset + l1_weight * mean |x - y| + ssim_weight * mean SSIM: a scalar, differentiable, once, in ``image``.
 
     image, reference: [H, W, 3], both float32 or both float64, on the CPU. c1, c2: the constants of SSIM. The window has
     11 pixels, sigma 1.5, and zeros outside the image. Bit for bit the same for any number of threads.
@@ -19,22 +21,23 @@ def photometric(image: Tensor, reference: Tensor, l1_weight: float, ssim_weight:
     if len(shape) != 3 or shape[2] != 3 or 0 in shape:
         raise ValueError(f"image must be [H, W, 3], not {list(shape)}")
     extension.plain("reference", reference, shape, image.dtype)
-    return _Photometric.apply(image, reference, l1_weight, ssim_weight, c1, c2)  # type: ignore[return-value]
+    return _Photometric.apply(image, reference, (l1_weight, ssim_weight, c1, c2, offset))  # type: ignore[return-value]
 
 
 class _Photometric(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, image: Tensor, reference: Tensor, l1_weight: float, ssim_weight: float, c1: float, c2: float):
+    def forward(ctx, image: Tensor, reference: Tensor, numbers: tuple[float, ...]) -> Tensor:
+        l1_weight, ssim_weight, c1, c2, offset = numbers
         x, y = image.detach().contiguous(), reference.detach().contiguous()
         gradient = torch.empty_like(x) if ctx.needs_input_grad[0] else None
         scales = (l1_weight / x.numel(), ssim_weight / x.numel())
         sums = extension.function("photometric", x)(x, y, c1, c2, *scales, gradient, extension.threads())
         if gradient is not None:
             ctx.save_for_backward(gradient)
-        return x.new_tensor(scales[0] * sums[0] + scales[1] * sums[1])
+        return x.new_full((), offset + scales[0] * sums[0] + scales[1] * sums[1])
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *grad_outputs: Tensor):
         (gradient,) = ctx.saved_tensors
-        return grad_outputs[0] * gradient, None, None, None, None, None
+        return extension.scaled(gradient, grad_outputs[0]), None, None

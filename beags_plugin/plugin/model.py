@@ -373,7 +373,7 @@ class BeagsModel(SplatfactoModel):
             class_ids=self.class_ids,
             grid=self.grid,
         )
-        terms = {name: loss.weight * loss.value(inputs) for name, loss in self.active_losses().items()}
+        terms = {name: loss.weighted(inputs) for name, loss in self.active_losses().items()}
         # a frozen scene still needs something to call backward on; no parameter hangs on it, so none moves
         return terms or {"none": torch.zeros((), device=self.device, requires_grad=True)}
 

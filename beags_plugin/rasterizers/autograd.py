@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -52,7 +52,7 @@ class Needed(NamedTuple):
 
 @dataclass(frozen=True)
 class Drawing:
-    """What one call draws; tensors are checked, contiguous and carry no gradient.
+    """What one call draws; tensors are checked and contiguous, and nothing that is done with them is recorded.
 
     inputs, camera, settings: as in ``Rasterizer.rasterize``.
     background: [3] of the inputs' dtype.
@@ -119,8 +119,7 @@ class KernelRasterizer(Rasterizer):
         floats = (inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits, inputs.colors)
         watched = [value for value in (*floats, inputs.screen_shift, background) if value is not None]
         differentiable = torch.is_grad_enabled() and any(value.requires_grad for value in watched)
-        bare = SurfelInputs(*(value.detach() for value in floats), class_ids=inputs.class_ids)
-        drawing = Drawing(bare, camera, settings, background.detach().contiguous(), target, differentiable)
+        drawing = Drawing(inputs, camera, settings, background.contiguous(), target, differentiable)
         if not differentiable:
             images, visible, num_nonfinite, _ = self.forward_kernel(drawing)
         else:
@@ -135,7 +134,8 @@ class _Rasterize(torch.autograd.Function):
         images, visible, num_nonfinite, state = rasterizer.forward_kernel(drawing)
         # The inputs are saved through autograd, which notices it if they are changed in place before the backward.
         ctx.save_for_backward(*floats)
-        ctx.rasterizer, ctx.drawing, ctx.state = rasterizer, replace(drawing, inputs=None, background=None), state
+        ctx.rasterizer, ctx.state = rasterizer, state
+        ctx.drawing = (drawing.camera, drawing.settings, drawing.target)  # not the inputs: they would live as long
         ctx.mark_non_differentiable(visible)
         ctx.set_materialize_grads(False)  # None tells the kernel what it need not compute
         return *images, visible, num_nonfinite
@@ -143,9 +143,10 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, *gradients):
-        *floats, _, background = (value if value is None else value.detach() for value in ctx.saved_tensors)
-        drawing = replace(ctx.drawing, inputs=SurfelInputs(*floats), background=background)
-        images = Images(*(None if g is None else g.contiguous() for g in gradients[:-2]))
+        *floats, _, background = ctx.saved_tensors
+        camera, settings, target = ctx.drawing
+        drawing = Drawing(SurfelInputs(*floats), camera, settings, background, target, True)
+        images = Images(*[None if g is None else g.contiguous() for g in gradients[:-2]])
         if all(g is None for g in images):
             return (None,) * 9
         found = ctx.rasterizer.backward_kernel(drawing, ctx.state, images, Needed(*ctx.needs_input_grad[2:]))

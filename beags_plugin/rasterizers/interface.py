@@ -60,14 +60,20 @@ class SurfelInputs:
         shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 2), "opacity_logits": (n,), "colors": (n, 3)}
         if self.screen_shift is not None:
             shapes["screen_shift"] = (n, 2)
+        scattered = []
         for name, shape in shapes.items():
             value = getattr(self, name)
-            if tuple(value.shape) != shape or value.dtype != dtype:
+            if value.shape != shape or value.dtype != dtype:
                 raise ValueError(f"{name} must be {list(shape)} {dtype}, not {list(value.shape)} {value.dtype}")
-        if self.class_ids is not None and (tuple(self.class_ids.shape) != (n,) or self.class_ids.dtype != torch.int32):
-            raise ValueError(f"class_ids must be [{n}] int32, not {list(self.class_ids.shape)} {self.class_ids.dtype}")
-        tensors = {name: getattr(self, name).contiguous() for name in shapes}
-        return replace(self, **tensors, class_ids=None if self.class_ids is None else self.class_ids.contiguous())
+            if not value.is_contiguous():
+                scattered.append(name)
+        if self.class_ids is not None:
+            ids = self.class_ids
+            if ids.shape != (n,) or ids.dtype != torch.int32:
+                raise ValueError(f"class_ids must be [{n}] int32, not {list(ids.shape)} {ids.dtype}")
+            if not ids.is_contiguous():
+                scattered.append("class_ids")
+        return replace(self, **{name: getattr(self, name).contiguous() for name in scattered}) if scattered else self
 
 
 @dataclass(frozen=True)

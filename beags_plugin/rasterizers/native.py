@@ -104,7 +104,8 @@ class NativeRasterizer(KernelRasterizer):
         floats = [getattr(drawing.inputs, name) for name in _FLOATS]
         shift = drawing.inputs.means[:, :2]
         likes = zip((*floats, shift, drawing.background), needed, strict=True)
-        found = InputGradients(*(value.new_zeros(value.shape) if wanted else None for value, wanted in likes))
+        # not torch.zeros: the kernel writes the zeros of the surfels that are not seen
+        found = InputGradients(*[value.new_empty(value.shape) if wanted else None for value, wanted in likes])
         state.backward(*floats, drawing.target, *gradients, *found, extension.threads())
         return found
 
@@ -156,7 +157,7 @@ def _frame(inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> tu
     if inputs.means.device.type != "cpu":
         raise ValueError(f"the native rasterizer takes CPU tensors, not {inputs.means.device}")
     make = module.FrameF32 if inputs.means.dtype == torch.float32 else module.FrameF64
-    matrices = [m.detach().to("cpu", torch.float64).contiguous() for m in (camera.viewmat, camera.K)]
+    matrices = (camera.viewmat.tolist(), camera.K.tolist())
     visible = torch.empty(inputs.means.shape[0], dtype=torch.bool)
     floats = [getattr(inputs, name) for name in _FLOATS]
     size = (camera.width, camera.height)
