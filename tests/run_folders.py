@@ -23,7 +23,7 @@ def discs(seed: int = 0, shift: float = 0.0) -> tuple[Surfels, torch.Tensor]:
         means.append(0.12 * torch.randn(25, 3, generator=generator) + torch.tensor(center))
         ids += [class_id] * 25
     count = len(ids)
-    surfels = Surfels(
+    surfels = Surfels.of(
         torch.cat(means),
         torch.randn(count, 4, generator=generator),
         torch.full((count, 2), -2.0),
@@ -73,8 +73,8 @@ def _state(surfels: Surfels, class_ids: torch.Tensor, assigned: bool = True) -> 
         "gauss_params.quats": surfels.quats,
         "gauss_params.scales": surfels.log_scales,
         "gauss_params.opacities": surfels.opacity_logits[:, None],
-        "gauss_params.features_dc": surfels.sh[:, 0],
-        "gauss_params.features_rest": surfels.sh[:, 1:],
+        "gauss_params.features_dc": surfels.sh_dc,
+        "gauss_params.features_rest": surfels.sh_rest,
         "class_ids": class_ids,
         "class_margin": torch.ones(len(class_ids)),
         "assigned": torch.tensor(assigned),

@@ -40,12 +40,14 @@ def step_all(optimizers: Iterable[Optimizer]) -> None:
         return
     counts = [state["step"] for _, _, states in jobs for state in states]
     if all(count.is_cpu for count in counts):
-        torch._foreach_add_(counts, _ONE, alpha=1.0)  # a number would become a tensor again for each of them
+        torch._foreach_add_(  # pyright: ignore[reportPrivateImportUsage]
+            counts, _ONE, alpha=1.0
+        )  # a number would become a tensor again for each of them
     else:
-        torch._foreach_add_(counts, 1)
+        torch._foreach_add_(counts, 1)  # pyright: ignore[reportPrivateImportUsage]
     for group, parameters, states in jobs:
         first, second = group["betas"]
-        torch._fused_adam_(
+        torch._fused_adam_(  # pyright: ignore[reportPrivateImportUsage]
             parameters,
             [value.grad for value in parameters],  # type: ignore[misc]
             [state["exp_avg"] for state in states],
