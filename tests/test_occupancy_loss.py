@@ -142,7 +142,11 @@ def test_whole_discs_inside_are_skipped_exactly():
     out = [torch.full_like(value, math.nan) for value in parameters]
     lookup, ids = grid.lookup(), ids_of(3000)
     compute = extension.load().occupancy_loss_f32
-    _, active = compute(*parameters, ids, lookup.native, 1, 400, True, *out, 1)
+    value, active = compute(*parameters, ids, lookup.native, 1, 400, True, *out, 1)
+    whole = [torch.full_like(value, math.nan) for value in parameters]
+    value_of_all, sampled = compute(*parameters, ids, lookup.native, 1, 400, True, *whole, 1, skip=False)
+    assert sampled == 3000 > active and value_of_all == pytest.approx(value, rel=1e-12)
+    assert all(torch.equal(a, b) for a, b in zip(out, whole, strict=True))
     axes = 3.0 * parameters[2].exp()[:, None, :] * rotation_from_quat(parameters[1])[..., :2]
     inside = inside_valid_voxels(parameters[0], axes, ids, grid)
     assert 100 < int(inside.sum()) < 2000

@@ -142,6 +142,23 @@ class Reprojection:
         run_reprojection(Options(**vars(self)))
 
 
+@dataclass
+class Required:
+    """What a refined run stores and computes for nothing, and what leaving it out saves."""
+
+    run_config: Annotated[Path, tyro.conf.arg(name="run")]
+    """config.yml of the run."""
+    json: Path | None = None
+    """File for all figures."""
+    csv: Path | None = None
+    """File for all figures as a table."""
+
+    def run(self) -> None:
+        from beags_plugin.bench.required import run_required
+
+        run_required(self.run_config, self.json, self.csv)
+
+
 Measurement = (
     Annotated[Ablation, tyro.conf.subcommand(name="ablation")]
     | Annotated[Sensitivity, tyro.conf.subcommand(name="sensitivity")]
@@ -150,5 +167,6 @@ Measurement = (
     | Annotated[Base, tyro.conf.subcommand(name="base")]
     | Annotated[BaseLimits, tyro.conf.subcommand(name="base-limits")]
     | Annotated[Reprojection, tyro.conf.subcommand(name="reprojection")]
+    | Annotated[Required, tyro.conf.subcommand(name="required")]
     | Annotated[ExperimentFile, tyro.conf.subcommand(name="file")]
 )

@@ -165,7 +165,7 @@ def samples(scene: Scene) -> list[Row]:
     def run(skip: bool) -> tuple[float, int, list[Tensor]]:
         out = [torch.empty_like(value) for value in parameters]
         value, active = compute(
-            *parameters, ranks, lookup.native, stream, scene.samples, background, skip, *out, extension.threads()
+            *parameters, ranks, lookup.native, stream, scene.samples, background, *out, extension.threads(), skip=skip
         )
         return value, active, out
 

@@ -73,7 +73,7 @@ void bind_functions(nb::module_& m, const char* suffix) {
   m.def(("occupancy_loss_" + end).c_str(),
         [](In means, In quats, In log_scales, In opacity_logits, Ids class_ids, const VoxelLookup& lookup,
            uint64_t stream, int64_t samples, bool background, Out g_means, Out g_quats, Out g_log_scales,
-           Out g_opacity_logits, int threads, double weight) {
+           Out g_opacity_logits, int threads, double weight, bool skip) {
           const auto cubes = lookup.valid_cubes();
           const int64_t count = rows(class_ids);
           OccupancyJob<T> job{};
@@ -86,6 +86,7 @@ void bind_functions(nb::module_& m, const char* suffix) {
           for (int axis = 0; axis < 3; ++axis) job.origin[axis] = static_cast<T>(lookup.origin()[axis]);
           job.voxel_size = static_cast<T>(lookup.voxel_size());
           job.stream = stream;
+          job.skip = skip;
           job.samples = samples;
           job.background = background;
           job.factor = weight / (count && samples ? static_cast<double>(count) * static_cast<double>(samples) : 1.0);
@@ -102,7 +103,7 @@ void bind_functions(nb::module_& m, const char* suffix) {
         },
         "means"_a, "quats"_a, "log_scales"_a, "opacity_logits"_a, "class_ids"_a, "lookup"_a, "stream"_a, "samples"_a,
         "background"_a, "g_means"_a.none(), "g_quats"_a.none(), "g_log_scales"_a.none(), "g_opacity_logits"_a.none(),
-        "threads"_a, "weight"_a = 1.0);
+        "threads"_a, "weight"_a = 1.0, "skip"_a = true);
   m.def(("sh_colors_" + end).c_str(),
         [](In sh_dc, In sh_rest, In means, const std::vector<double>& center, int degree, Out colors,
            Array<uint8_t> clamped, int threads) {

@@ -343,14 +343,14 @@ double occupancy_block(const OccupancyJob<T>& job, int64_t first, int64_t last, 
       }
       // Where a disc is wholly inside, its loss is exactly 0. Most lie in a cube of which one look tells.
       const auto largest = boxes.largest[lane];
-      if (largest <= kLargestCube && voxel_bit(job.valid[largest - 1], class_id, low)) continue;
+      if (job.skip && largest <= kLargestCube && voxel_bit(job.valid[largest - 1], class_id, low)) continue;
       if (largest <= 4) {
         const uint64_t valid = voxel_box(*job.valid, class_id, low, n), box = box_bits(n[0], n[1], n[2]);
-        if ((valid & box) != box) waiting.template add<Reach::kNear>(fresh, lane, i, low, valid);
+        if (!job.skip || (valid & box) != box) waiting.template add<Reach::kNear>(fresh, lane, i, low, valid);
       } else if (largest <= kWindowVoxels) {
         uint64_t* bricks = waiting.window.bricks[waiting.window.count];
         const bool inside = fill_window(*job.valid, class_id, low, n, bricks);
-        if (!inside) waiting.template add<Reach::kWindow>(fresh, lane, i, low, 0);
+        if (!job.skip || !inside) waiting.template add<Reach::kWindow>(fresh, lane, i, low, 0);
       } else {
         waiting.template add<Reach::kFar>(fresh, lane, i, low, 0);
       }

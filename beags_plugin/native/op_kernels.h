@@ -18,6 +18,7 @@ struct OccupancyJob {
   const VoxelTable* valid;  // [kLargestCube]: corners of cubes of 1, 2 and 3 valid voxels along each side
   T origin[3], voxel_size;
   uint64_t stream;  // hash of seed and step
+  bool skip;        // pass over discs that wholly lie in valid voxels; false: to see what that saves
   int64_t samples;
   bool background;
   double factor;                                           // 1 / (N Z)
