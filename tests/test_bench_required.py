@@ -22,7 +22,7 @@ def run(tmp_path):
     """A refined run whose grid has a voxel about each Gaussian of the refined scene, of all three classes."""
     config = write_trained(tmp_path / "run", write_scene(tmp_path / "data"))
     scene = load(config)
-    grid = VisibilityGrid.from_points([(scene.refined.means, scene.class_ids)], 0.5, torch.zeros(3), 3)
+    grid = VisibilityGrid.from_points([(scene.refined.means, scene.class_ids)], 0.25, torch.zeros(3), 3)
     (tmp_path / "run" / "prepared").mkdir()
     torch.save(grid.state_dict(), tmp_path / "run" / "prepared" / "grid.pt")
     return config
