@@ -153,3 +153,11 @@ def test_coincident_and_few_points_give_finite_surfels():
         surfels = initial_surfels(points, torch.full_like(points, 0.5), 0, generator())
         assert all(torch.isfinite(value).all() for value in vars(surfels).values())
         assert (surfels.log_scales.exp() > 0).all()
+
+
+def test_the_bound_by_pixels():
+    assert CONFIG.bounded(1000) == CONFIG
+    config = replace(CONFIG, pixels_per_surfel=50.0)
+    assert config.bounded(1000).max_surfels == 20 and config.bounded(10).max_surfels == 1
+    assert replace(config, max_surfels=7).bounded(1000).max_surfels == 7
+    assert replace(config, max_surfels=90).bounded(1000).max_surfels == 20

@@ -30,6 +30,8 @@ class DensifyConfig:
     prune_opacity: fainter surfels go. prune_scale: larger ones go, after step ``prune_scale_after``.
     reset_every: opacities are set to at most ``reset_opacity`` so often; 0 never.
     max_surfels: the scene grows no further than this; 0 sets no bound.
+    pixels_per_surfel: nor further than one surfel for so many pixels of all training images, so that what few images
+        show is not learned by heart; 0, as officially, sets no bound.
     """
 
     every: int = 100
@@ -43,6 +45,7 @@ class DensifyConfig:
     reset_every: int = 3_000
     reset_opacity: float = 0.01
     max_surfels: int = 0
+    pixels_per_surfel: float = 0.0
     min_every: int = 50
     min_reset_every: int = 1_000
 
@@ -60,6 +63,13 @@ class DensifyConfig:
             prune_scale_after=steps(self.prune_scale_after),
             reset_every=steps(self.reset_every, self.min_reset_every),
         )
+
+    def bounded(self, pixels: int) -> DensifyConfig:
+        """The same with ``max_surfels`` for this many training pixels."""
+        if not self.pixels_per_surfel > 0:
+            return self
+        by_pixels = max(int(pixels / self.pixels_per_surfel), 1)
+        return replace(self, max_surfels=min(by_pixels, self.max_surfels) if self.max_surfels > 0 else by_pixels)
 
     def grows_at(self, done: int) -> bool:
         """Whether the scene is densified after ``done`` steps."""

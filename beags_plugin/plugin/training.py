@@ -28,7 +28,8 @@ def training_callbacks(model: BeagsModel, attributes: TrainingCallbackAttributes
     optimizers = attributes.optimizers.optimizers
     model.seed = trainer.config.machine.seed
     model.extent = camera_extent(datamanager.train_dataset.cameras.camera_to_worlds).to(model.device)
-    densifier = Densifier(model, optimizers)
+    cameras = datamanager.train_dataset.cameras
+    densifier = Densifier(model, optimizers, int((cameras.height * cameras.width).sum()))
     switch = RefinementSwitch(model, trainer, datamanager)
     switch.check_options()
     switch.check_masks()
@@ -68,11 +69,11 @@ def set_learning_rates(model: BeagsModel, optimizers: dict, configs: dict, step:
 
 
 class Densifier:
-    """Grows and prunes the base by the screen gradients that it gathers."""
+    """Grows and prunes the base by the screen gradients that it gathers; pixels: of all training images."""
 
-    def __init__(self, model: BeagsModel, optimizers: dict) -> None:
+    def __init__(self, model: BeagsModel, optimizers: dict, pixels: int) -> None:
         self.model = model
-        self.config = model.config.densify.scaled(model.schedule.scale)
+        self.config = model.config.densify.scaled(model.schedule.scale).bounded(pixels)
         self.optimizers = optimizers
         self.statistics = GradientStatistics(model.num_points)
 
