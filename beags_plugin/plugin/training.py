@@ -63,6 +63,7 @@ def set_learning_rates(model: BeagsModel, optimizers: dict, configs: dict, step:
         rate = configs[name]["optimizer"].lr
         if name == "means":
             rate = log_linear(first, last, model.schedule.progress(step)) * float(model.extent)
+            rate *= model.config.refine_position_lr_factor if model.schedule.refining(step) else 1.0
         for group in optimizer.param_groups:
             group["lr"] = rate
 
