@@ -48,6 +48,13 @@ def test_without_a_decision_every_view_keeps_its_own():
     assert prepared([1, 1, None, 2, 2], voters=2) == [[1], [1], [IGNORE], [2], [2]]
 
 
-def test_a_negative_number_of_voters_is_refused():
+def test_doubtful_pixels_may_be_left_out():
+    assert prepared([1, 2, 2, 1, 2], min_confidence=0.5) == [[2]] * 5  # 3 of 5 votes
+    assert prepared([1, 2, 2, 1, 2], min_confidence=0.7) == [[IGNORE]] * 5
+
+
+def test_wrong_options_are_refused():
     with pytest.raises(UserError, match="voters is -1"):
         PreparationConfig(voters=-1).check()
+    with pytest.raises(UserError, match="min_confidence is 1.5"):
+        PreparationConfig(min_confidence=1.5).check()

@@ -95,7 +95,9 @@ class BeagsModelConfig(ModelConfig):
     position_lr: tuple[float, float] = (1.6e-4, 1.6e-6)
     """First and last learning rate of the positions, log-linear, times the scene's extent."""
     refine_position_lr_factor: float = 1.0
-    """Factor of the positions' learning rate while refining; 1, as in the paper: what the end of the base schedule has."""
+    """Factor of the positions' learning rate while refining; 1, as in the paper, is the end of the base schedule."""
+    refine_shape_lr_factor: float = 1.0
+    """The same of scales and rotations."""
     near: float = 0.01
     """Near plane in units of the scene's extent."""
     far: float = 100.0

@@ -34,6 +34,7 @@ class PreparationConfig:
     reprojection: how masks are made consistent: "pairwise", "voxel" or another name of ``masks.REPROJECTIONS``; "none"
         keeps them.
     voters: how many views vote, evenly spread among those with a mask; 0: all of them. Every view is voted on.
+    min_confidence: reprojected pixels whose winner has a smaller share of the votes become IGNORE.
     tau: pairwise: a vote counts if its point is visible: |z - D| <= tau z; infinity counts every vote (E5).
     depth: which depth is lifted into space, "median" or "expected": see ``rasterizers.drawing.surface_depth``.
     k: neighbours that set the voxel size (E8).
@@ -43,6 +44,7 @@ class PreparationConfig:
 
     reprojection: str = "pairwise"
     voters: int = 0
+    min_confidence: float = 0.0
     tau: float = 0.02
     depth: str = "median"
     k: int = 2000
@@ -57,6 +59,8 @@ class PreparationConfig:
             REPROJECTIONS.get(self.reprojection)  # one of another package may not load
         if self.voters < 0:
             raise UserError(f"voters is {self.voters}: it must be a number of views, or 0 for all of them.")
+        if not 0.0 <= self.min_confidence <= 1.0:
+            raise UserError(f"min_confidence is {self.min_confidence}: it must be a share of the votes, 0 to 1.")
         check_surface_depth(self.depth)
         if not self.tau >= 0:
             raise UserError(f"tau is {self.tau}: it must be 0 or more (inf counts every vote).")
@@ -142,6 +146,9 @@ def prepare(
             mask.labels if vote is not None or own is None else torch.where(mask.labels == IGNORE, own, mask.labels)
             for mask, vote, own in zip(refined, votes, ranked, strict=True)
         ]  # without a vote, a view that does not vote keeps its label too
+        if config.min_confidence > 0.0:
+            doubtful = [mask.confidence < config.min_confidence for mask in refined]
+            ranked = [mask.masked_fill(doubt, IGNORE) for mask, doubt in zip(ranked, doubtful, strict=True)]
         consistent = [_translated(mask, known, known.class_ids) for mask in ranked]
         confidence = [mask.confidence for mask in refined]
         timed("reprojection", start, _reprojection_finding(labels, consistent))
