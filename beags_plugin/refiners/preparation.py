@@ -34,7 +34,7 @@ class PreparationConfig:
     reprojection: how masks are made consistent: "pairwise", "voxel" or another name of ``masks.REPROJECTIONS``; "none"
         keeps them.
     voters: how many views vote, evenly spread among those with a mask; 0: all of them. Every view is voted on.
-    min_confidence: reprojected pixels whose winner has a smaller share of the votes become IGNORE.
+    min_confidence: reprojected pixels whose winner has a smaller share of the votes are IGNORE to the losses.
     tau: pairwise: a vote counts if its point is visible: |z - D| <= tau z; infinity counts every vote (E5).
     depth: which depth is lifted into space, "median" or "expected": see ``rasterizers.drawing.surface_depth``.
     k: neighbours that set the voxel size (E8).
@@ -146,11 +146,15 @@ def prepare(
             mask.labels if vote is not None or own is None else torch.where(mask.labels == IGNORE, own, mask.labels)
             for mask, vote, own in zip(refined, votes, ranked, strict=True)
         ]  # without a vote, a view that does not vote keeps its label too
-        if config.min_confidence > 0.0:
-            doubtful = [mask.confidence < config.min_confidence for mask in refined]
-            ranked = [mask.masked_fill(doubt, IGNORE) for mask, doubt in zip(ranked, doubtful, strict=True)]
         consistent = [_translated(mask, known, known.class_ids) for mask in ranked]
         confidence = [mask.confidence for mask in refined]
+        if (
+            config.min_confidence > 0.0
+        ):  # for the losses alone: the border split looks for the very rims that are doubtful
+            consistent = [
+                mask.masked_fill(share < config.min_confidence, IGNORE)
+                for mask, share in zip(consistent, confidence, strict=True)
+            ]
         timed("reprojection", start, _reprojection_finding(labels, consistent))
 
     start = time.perf_counter()
