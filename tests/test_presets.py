@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 pytest.importorskip("nerfstudio")
@@ -12,6 +14,7 @@ from beags_plugin.plugin import methods
 from beags_plugin.plugin.config import BeagsTrainerConfig, base_config
 from beags_plugin.plugin.presets import load_preset, override, preset_names
 from beags_plugin.refiners import REFINERS
+from beags_plugin.shipped import read_toml
 
 
 def write(folder, text):
@@ -19,8 +22,27 @@ def write(folder, text):
     return folder
 
 
-def test_the_four_presets_exist():
-    assert {"beags", "beags-base", "beags-refine", "beags-tiny"} <= set(preset_names())
+def test_the_documented_presets_exist():
+    documented = {"beags", "beags-base", "beags-paper", "beags-refine", "beags-tiny"}
+    assert documented <= set(preset_names())
+
+
+def test_every_preset_is_a_name_of_ns_train():
+    """In the checkout's pyproject.toml, whatever is installed."""
+    file = Path(__file__).parent.parent / "pyproject.toml"
+    if not file.exists():
+        pytest.skip("no pyproject.toml beside the tests")
+    project = read_toml(file, "project")
+    points = project["project"]["entry-points"]["nerfstudio.method_configs"]
+    assert points == {name: f"beags_plugin.plugin.methods:{name.replace('-', '_')}" for name in preset_names()}
+
+
+def test_the_papers_preset_changes_nothing():
+    """The documented base config is the paper's; extensions of ours are off."""
+    model, documented = load_preset("beags-paper").config.pipeline.model, base_config().pipeline.model
+    assert model == documented
+    assert (model.split.rounds, model.losses["silhouette"].weight, model.prepare.min_confidence) == (0, 0.0, 0.0)
+    assert model.refine_position_lr_factor == model.refine_shape_lr_factor == 1.0
 
 
 @pytest.mark.parametrize("name", preset_names())

@@ -150,6 +150,13 @@ def test_official_learning_rates(model):
     assert rates(15_000) == pytest.approx({"means": 2.5 * 1.6e-5, **constant})
     assert rates(29_999) == pytest.approx({"means": 2.5 * 1.6e-6, **constant}, rel=1e-3)
     assert all(configs[name]["optimizer"].eps == 1e-15 for name in configs)
+    model.config.refine_position_lr_factor = 10.0  # of refinement alone
+    model.config.refine_shape_lr_factor = 3.0
+    assert rates(29_999)["means"] == pytest.approx(2.5 * 1.6e-6, rel=1e-3)
+    model.schedule = PhaseSchedule(30_000, 3_000, 30_000)
+    assert rates(30_000) == pytest.approx(
+        {"means": 2.5 * 1.6e-4 * 100**-0.9 * 10, **constant, "scales": 0.015, "quats": 0.003}
+    )
 
 
 def test_only_steps_of_growth_are_drawn_with_what_growth_looks_at(model):

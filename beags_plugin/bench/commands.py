@@ -77,6 +77,20 @@ class Masks(Trainings):
 
 
 @dataclass
+class Tradeoff(Trainings):
+    """What time and memory buy: every choice moved alone, and the Pareto front of cost and quality."""
+
+    EXPERIMENT: ClassVar[str] = "tradeoff"
+
+
+@dataclass
+class Improvements(Trainings):
+    """What each extension of the paper's refinement gives, beside the paper's own method."""
+
+    EXPERIMENT: ClassVar[str] = "improvements"
+
+
+@dataclass
 class Base(Trainings):
     """How well bases of different lengths draw held-out views, against steps and number of Gaussians."""
 
@@ -164,6 +178,8 @@ Measurement = (
     | Annotated[Sensitivity, tyro.conf.subcommand(name="sensitivity")]
     | Annotated[Depth, tyro.conf.subcommand(name="depth")]
     | Annotated[Masks, tyro.conf.subcommand(name="masks")]
+    | Annotated[Tradeoff, tyro.conf.subcommand(name="tradeoff")]
+    | Annotated[Improvements, tyro.conf.subcommand(name="improvements")]
     | Annotated[Base, tyro.conf.subcommand(name="base")]
     | Annotated[BaseLimits, tyro.conf.subcommand(name="base-limits")]
     | Annotated[Reprojection, tyro.conf.subcommand(name="reprojection")]

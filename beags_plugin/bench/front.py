@@ -33,27 +33,33 @@ def pareto_front(rows: Sequence[Row], cost: str, quality: str) -> list[Row]:
 
 
 def draw_front(path: Path, experiment: Experiment, rows: Sequence[Row]) -> None:
-    """Write the picture: a panel for every pair of a cost and a quality, with the mean of every variant."""
-    figure, axes = new_figure(len(COSTS), len(QUALITIES), size=(9.0, 6.5))
-    averaged = means(rows)
+    """Write the picture: a panel for every pair of a cost and a quality, with the mean of every variant.
+
+    Points bear numbers, and a list says which variant each is: names would cover each other.
+    """
+    figure, axes = new_figure(len(COSTS), len(QUALITIES), size=(6.5, 5.0))
+    averaged = [row for row in means(rows) if not row.failed]
     for line, (quality, quality_title, factor) in enumerate(QUALITIES):
         for column, (cost, cost_title) in enumerate(COSTS):
             panel: Axes = axes[line, column]
             _panel(panel, averaged, cost, quality, factor)
             panel.set_xlabel(cost_title)
             panel.set_ylabel(quality_title)
+    names = [f"{number}  {row.variant.name}" for number, row in enumerate(averaged, start=1)]
+    handles = [axes[0, 0].plot([], [], " ")[0] for _ in names]
+    figure.legend(handles, names, loc="outside right upper", handlelength=0, handletextpad=0, fontsize="small")
     figure.suptitle(f"{experiment.description} Line: the Pareto front.")
     save_figure(path, figure)
 
 
 def _panel(axes: Axes, rows: Sequence[Row], cost: str, quality: str, factor: float) -> None:
     front = pareto_front(rows, cost, quality)
-    for row in rows:
+    for number, row in enumerate(rows, start=1):
         x, y = row.figures[cost], row.figures[quality]
         if x is not None and y is not None:
             color = "#d94801" if row in front else "#6baed6"
-            axes.plot(x, factor * y, "o", color=color, zorder=2)
-            axes.annotate(row.variant.name, (x, factor * y), (3, 3), textcoords="offset points", fontsize="x-small")
+            axes.plot(x, factor * y, "o", ms=4, color=color, zorder=2)
+            axes.annotate(str(number), (x, factor * y), (3, 3), textcoords="offset points", fontsize="x-small")
     corners = [(row.figures[cost] or 0.0, factor * (row.figures[quality] or 0.0)) for row in front]
     if corners:
         axes.step([x for x, _ in corners], [y for _, y in corners], where="post", color="#d94801", lw=1, zorder=1)

@@ -11,6 +11,7 @@ LOSSES = Registry(
         "distortion": "beags_plugin.losses.distortion:DistortionLoss",
         "opacity": "beags_plugin.losses.opacity:OpacityLoss",
         "boundary": "beags_plugin.losses.boundary:BoundaryLoss",
+        "silhouette": "beags_plugin.losses.silhouette:SilhouetteLoss",
         "occupancy": "beags_plugin.losses.occupancy:OccupancyLoss",
     },
 )

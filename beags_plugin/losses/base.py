@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.rasterizers.interface import RasterOutputs
+from beags_plugin.rasterizers.interface import RasterOutputs, SurfelInputs
 
 if TYPE_CHECKING:
     from beags_plugin.occupancy.grid import VisibilityGrid
@@ -29,6 +30,7 @@ class LossInputs:
     labels: [H, W] int32 class ids M' of the view, or IGNORE; None if the view has none.
     class_ids: [N] int32, phi; None before assignment.
     grid: the visibility voxel grids; None before refinement.
+    draw: draws other surfels than the render's, with geometry, on black; for losses that need a drawing of their own.
     """
 
     step: int
@@ -40,6 +42,7 @@ class LossInputs:
     labels: Tensor | None = None
     class_ids: Tensor | None = None
     grid: VisibilityGrid | None = None
+    draw: Callable[[SurfelInputs, Camera], RasterOutputs] | None = None
 
 
 @dataclass(frozen=True)

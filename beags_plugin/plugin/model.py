@@ -29,7 +29,7 @@ from beags_plugin.plugin.schedule import PhaseSchedule
 from beags_plugin.plugin.training import training_callbacks
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.drawing import draw_class_map, surfel_inputs
-from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
+from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings, SurfelInputs
 from beags_plugin.refiners.border_split import BorderSplitConfig
 from beags_plugin.refiners.preparation import PreparationConfig
 
@@ -94,6 +94,10 @@ class BeagsModelConfig(ModelConfig):
     """Which Gaussians at class borders are split before refinement; none unless rounds is 1 or more."""
     position_lr: tuple[float, float] = (1.6e-4, 1.6e-6)
     """First and last learning rate of the positions, log-linear, times the scene's extent."""
+    refine_position_lr_factor: float = 1.0
+    """Factor of the positions' learning rate while refining; 1, as in the paper, is the end of the base schedule."""
+    refine_shape_lr_factor: float = 1.0
+    """The same of scales and rotations."""
     near: float = 0.01
     """Near plane in units of the scene's extent."""
     far: float = 100.0
@@ -372,10 +376,15 @@ class BeagsModel(SplatfactoModel):
             labels=None if class_map is None else class_map.to(self.device, torch.int32),
             class_ids=self.class_ids,
             grid=self.grid,
+            draw=self._draw_apart,
         )
         terms = {name: loss.weighted(inputs) for name, loss in self.active_losses().items()}
         # a frozen scene still needs something to call backward on; no parameter hangs on it, so none moves
         return terms or {"none": torch.zeros((), device=self.device, requires_grad=True)}
+
+    def _draw_apart(self, inputs: SurfelInputs, camera: Camera) -> RasterOutputs:
+        """Surfels that a loss wants to see apart from the scene, with geometry, on black."""
+        return self.rasterizer.rasterize(inputs, camera, self.settings(), inputs.means.new_zeros(3))
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Any], batch: dict[str, Any]

@@ -15,7 +15,7 @@ from beags_plugin.plugin.schedule import log_linear
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.datamanager import BeagsDataManager
-    from beags_plugin.plugin.model import BeagsModel
+    from beags_plugin.plugin.model import BeagsModel, BeagsModelConfig
 
 EXTENT_MARGIN = 1.1  # the scene's extent is 1.1 x the largest distance of a camera from their mean (section 1)
 
@@ -64,8 +64,16 @@ def set_learning_rates(model: BeagsModel, optimizers: dict, configs: dict, step:
         rate = configs[name]["optimizer"].lr
         if name == "means":
             rate = log_linear(first, last, model.schedule.progress(step)) * float(model.extent)
+        if model.schedule.refining(step):
+            rate *= refinement_factor(model.config, name)
         for group in optimizer.param_groups:
             group["lr"] = rate
+
+
+def refinement_factor(config: BeagsModelConfig, group: str) -> float:
+    """What a group's learning rate is multiplied with while refining."""
+    shape, positions = config.refine_shape_lr_factor, config.refine_position_lr_factor
+    return {"means": positions, "scales": shape, "quats": shape}.get(group, 1.0)
 
 
 class Densifier:

@@ -33,6 +33,8 @@ class PreparationConfig:
 
     reprojection: how masks are made consistent: "pairwise", "voxel" or another name of ``masks.REPROJECTIONS``; "none"
         keeps them.
+    voters: how many views vote, evenly spread among those with a mask; 0: all of them. Every view is voted on.
+    min_confidence: reprojected pixels whose winner has a smaller share of the votes are IGNORE to the losses.
     tau: pairwise: a vote counts if its point is visible: |z - D| <= tau z; infinity counts every vote (E5).
     depth: which depth is lifted into space, "median" or "expected": see ``rasterizers.drawing.surface_depth``.
     k: neighbours that set the voxel size (E8).
@@ -41,6 +43,8 @@ class PreparationConfig:
     """
 
     reprojection: str = "pairwise"
+    voters: int = 0
+    min_confidence: float = 0.0
     tau: float = 0.02
     depth: str = "median"
     k: int = 2000
@@ -53,6 +57,10 @@ class PreparationConfig:
             raise UserError(f"there is no reprojection {self.reprojection!r}: choose one of {', '.join(choices)}.")
         if self.reprojection != "none":
             REPROJECTIONS.get(self.reprojection)  # one of another package may not load
+        if self.voters < 0:
+            raise UserError(f"voters is {self.voters}: it must be a number of views, or 0 for all of them.")
+        if not 0.0 <= self.min_confidence <= 1.0:
+            raise UserError(f"min_confidence is {self.min_confidence}: it must be a share of the votes, 0 to 1.")
         check_surface_depth(self.depth)
         if not self.tau >= 0:
             raise UserError(f"tau is {self.tau}: it must be 0 or more (inf counts every vote).")
@@ -132,10 +140,21 @@ def prepare(
             depths = _render_depths(surfels, cameras, rasterizer, settings, config.depth, progress)
         with stage("Reprojecting masks") as progress:
             reproject = REPROJECTIONS.get(config.reprojection)
-            refined = reproject(depths, cameras, ranked, len(known), tau=config.tau, progress=progress)
-        ranked = [mask.labels for mask in refined]
+            votes = _votes_of(ranked, config.voters)
+            refined = reproject(depths, cameras, votes, len(known), tau=config.tau, progress=progress)
+        ranked = [
+            mask.labels if vote is not None or own is None else torch.where(mask.labels == IGNORE, own, mask.labels)
+            for mask, vote, own in zip(refined, votes, ranked, strict=True)
+        ]  # without a vote, a view that does not vote keeps its label too
         consistent = [_translated(mask, known, known.class_ids) for mask in ranked]
         confidence = [mask.confidence for mask in refined]
+        if (
+            config.min_confidence > 0.0
+        ):  # for the losses alone: the border split looks for the very rims that are doubtful
+            consistent = [
+                mask.masked_fill(share < config.min_confidence, IGNORE)
+                for mask, share in zip(consistent, confidence, strict=True)
+            ]
         timed("reprojection", start, _reprojection_finding(labels, consistent))
 
     start = time.perf_counter()
@@ -206,6 +225,15 @@ def _render_depths(surfels, cameras, rasterizer, settings, depth, progress) -> l
             if progress:
                 progress(index + 1, len(cameras))
     return depths
+
+
+def _votes_of(labels: Sequence[Tensor | None], voters: int) -> list[Tensor | None]:
+    """The masks that vote: all, or ``voters`` of them at even distances; None in place of the others."""
+    having = [index for index, mask in enumerate(labels) if mask is not None]
+    if voters == 0 or voters >= len(having):
+        return list(labels)
+    chosen = {having[(2 * rank + 1) * len(having) // (2 * voters)] for rank in range(voters)}
+    return [mask if index in chosen else None for index, mask in enumerate(labels)]
 
 
 def _or_ignore(mask: Tensor | None, camera: Camera) -> Tensor:

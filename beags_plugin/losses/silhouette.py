@@ -1,0 +1,83 @@
+"""The silhouette loss: an object drawn alone covers its mask and nothing else that could be seen (our extension).
+
+The boundary loss (E7) looks at the composed picture, where a Gaussian that others cover weighs next to nothing; once
+the object is cut out, nothing covers it any more, and it shows. This term looks at the object as extraction draws it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from beags_plugin.errors import UserError
+from beags_plugin.losses.base import Loss, LossInputs
+from beags_plugin.losses.reduction import ordered_sum
+from beags_plugin.rasterizers.drawing import surfel_inputs
+from beags_plugin.rasterizers.interface import IGNORE
+
+
+@dataclass(frozen=True)
+class SilhouetteLoss(Loss):
+    """Mean over the labelled pixels of |A_c - [M' = c]|, summed over the objects c of the view.
+
+    A_c is the alpha of the Gaussians of class c drawn alone. Where M' is of another class and the object lies behind
+    what the whole scene shows there, it may be hidden rightly, and the pixel does not count.
+
+    objects: how many objects of the view are drawn each step, chosen at random and counted in proportion; each costs
+        a drawing of its Gaussians.
+    tau: the object is hidden where its depth z and the scene's D have z > (1 + tau) D; as in reprojection (E5).
+    """
+
+    needs: ClassVar[frozenset[str]] = frozenset({"geometry"})
+
+    weight: float = 0.5
+
+    objects: int = 1
+    tau: float = 0.02
+
+    def __post_init__(self) -> None:
+        if not (self.objects >= 1 and float(self.objects).is_integer()):
+            raise UserError(f"the silhouette loss has objects = {self.objects}: it must be a whole number, 1 or more.")
+        if not self.tau >= 0:
+            raise UserError(f"the silhouette loss has tau = {self.tau}: it must be 0 or more.")
+
+    def value(self, inputs: LossInputs) -> Tensor:
+        nothing = inputs.render.color.new_zeros(())
+        if inputs.labels is None:
+            return nothing
+        if inputs.draw is None or inputs.class_ids is None or inputs.render.median_depth is None:
+            raise ValueError("the silhouette loss needs class ids, a way to draw, and a render with geometry")
+        known = inputs.labels != IGNORE
+        present = torch.unique(inputs.labels[known & (inputs.labels != 0)])
+        if len(present) == 0:
+            return nothing
+        chosen = _chosen(len(present), int(self.objects), inputs.seed, inputs.step)
+        terms = [self._of_object(int(present[rank]), known, inputs) for rank in chosen]
+        return torch.stack(terms).sum() * (len(present) / len(terms) / int(known.sum()))
+
+    def _of_object(self, class_id: int, known: Tensor, inputs: LossInputs) -> Tensor:
+        """Sum over the pixels that count."""
+        assert inputs.draw is not None and inputs.class_ids is not None and inputs.labels is not None
+        part = inputs.surfels[(inputs.class_ids == class_id).nonzero()[:, 0]]
+        inside = inputs.labels == class_id
+        if len(part) == 0:
+            return inputs.render.color.new_zeros(())
+        alone = inputs.draw(surfel_inputs(part, inputs.camera, 0), inputs.camera)
+        assert alone.depth is not None and alone.median_depth is not None
+        assert inputs.render.median_depth is not None
+        # thin parts have no median: their expected depth tells where they are
+        depth = torch.where(alone.median_depth > 0, alone.median_depth, alone.depth).detach()
+        shown = inputs.render.median_depth.detach()
+        hidden = (shown > 0) & (depth > (1.0 + self.tau) * shown)
+        outside = known & ~inside & ~hidden
+        wrong = torch.where(inside, 1.0 - alone.alpha, torch.where(outside, alone.alpha, 0.0))
+        return ordered_sum(wrong)
+
+
+def _chosen(count: int, wanted: int, seed: int, step: int) -> list[int]:
+    """Ranks of the objects that are drawn, from (seed, step) alone."""
+    generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
+    return torch.randperm(count, generator=generator)[:wanted].tolist()

@@ -1,0 +1,100 @@
+"""The silhouette loss: an object drawn alone against its mask, with what may be hidden left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.errors import UserError
+from beags_plugin.losses.base import LossInputs
+from beags_plugin.losses.silhouette import SilhouetteLoss
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.drawing import surfel_inputs
+from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
+
+SETTINGS = RasterSettings(near=0.1, far=100.0)
+SIZE = 24
+CAMERA = Camera(torch.eye(4), torch.tensor([[20.0, 0.0, 12.0], [0.0, 20.0, 12.0], [0.0, 0.0, 1.0]]), SIZE, SIZE)
+RASTERIZER = make_rasterizer("torch")
+
+
+def draw(inputs, camera):
+    return RASTERIZER.rasterize(inputs, camera, SETTINGS, torch.zeros(3))
+
+
+def scene(depths) -> Surfels:
+    """Discs that face the camera, side by side, opaque."""
+    count = len(depths)
+    means = torch.tensor([[0.5 * index - 0.6, 0.1, depth] for index, depth in enumerate(depths)])
+    quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1)
+    log_scales = torch.full((count, 2), -1.3)
+    return Surfels.of(means, quats, log_scales, torch.full((count,), 2.0), torch.zeros(count, 1, 3))
+
+
+def inputs_of(surfels, class_ids, labels, step: int = 0) -> LossInputs:
+    render = draw(surfel_inputs(surfels, CAMERA), CAMERA)
+    return LossInputs(
+        step, 0, surfels, CAMERA, render, torch.zeros(SIZE, SIZE, 3), labels, torch.tensor(class_ids).int(), draw=draw
+    )
+
+
+def columns(*ids_and_widths) -> torch.Tensor:
+    """[SIZE, SIZE] int32 stripes."""
+    ids, widths = zip(*ids_and_widths, strict=True)
+    return torch.tensor(ids).repeat_interleave(torch.tensor(widths)).int().repeat(SIZE, 1)
+
+
+def test_equals_the_alpha_of_each_object_against_its_mask():
+    surfels, class_ids = scene([3.0, 3.0, 3.0]), [1, 2, 0]
+    labels = columns((1, 8), (2, 6), (IGNORE, 2), (0, 8))
+    found = SilhouetteLoss(objects=2).value(inputs_of(surfels, class_ids, labels))
+    expected = 0.0
+    for rank, class_id in enumerate([1, 2]):  # equally deep: nothing is hidden
+        alpha = draw(surfel_inputs(surfels[torch.tensor([rank])], CAMERA), CAMERA).alpha
+        wrong = (alpha - (labels == class_id).float()).abs()
+        expected += float(wrong[labels != IGNORE].sum())
+    assert float(found) == pytest.approx(expected / (SIZE * (SIZE - 2)), rel=1e-5)
+
+
+def test_what_lies_behind_another_surface_may_be_covered():
+    labels = columns((0, 12), (1, 12))
+    front = inputs_of(scene([3.0, 3.0]), [0, 1], labels)
+    behind = scene([3.0, 3.0])
+    behind.means[1] *= 2.0  # the object: where it was on the screen, twice as far and as large
+    behind.log_scales[1] += torch.log(torch.tensor(2.0))
+    hidden = inputs_of(behind, [0, 1], labels)
+    loss = SilhouetteLoss()
+    assert float(loss.value(hidden)) < float(loss.value(front))
+    everything = replace(loss, tau=1e9)  # nothing is ever taken for hidden
+    assert float(everything.value(hidden)) == pytest.approx(float(everything.value(front)), rel=1e-4)
+
+
+def test_gradients_reach_the_shape_and_the_object_alone():
+    surfels = scene([3.0, 3.2])
+    names = ("means", "quats", "log_scales", "opacity_logits")
+    leaves = {name: getattr(surfels, name).requires_grad_() for name in names}
+    SilhouetteLoss().value(inputs_of(surfels, [0, 1], columns((0, 10), (1, 14)))).backward()
+    for name, leaf in leaves.items():
+        assert leaf.grad is not None and float(leaf.grad[0].abs().max()) == 0.0, name
+    assert all(float(leaves[name].grad[1].abs().max()) > 0.0 for name in ("means", "log_scales", "opacity_logits"))
+
+
+def test_objects_take_turns_and_their_mean_is_the_whole():
+    surfels, labels = scene([3.0, 3.0, 3.0]), columns((1, 8), (2, 8), (3, 8))
+    whole = float(SilhouetteLoss(objects=3).value(inputs_of(surfels, [1, 2, 3], labels)))
+    turns = [float(SilhouetteLoss().value(inputs_of(surfels, [1, 2, 3], labels, step))) for step in range(40)]
+    assert len({round(turn, 6) for turn in turns}) == 3
+    assert sum(sorted({round(turn, 6) for turn in turns})) / 3 == pytest.approx(whole, rel=1e-4)
+
+
+def test_views_that_say_nothing_and_wrong_options():
+    surfels = scene([3.0])
+    assert float(SilhouetteLoss().value(inputs_of(surfels, [1], None))) == 0.0
+    assert float(SilhouetteLoss().value(inputs_of(surfels, [1], columns((0, 12), (IGNORE, 12))))) == 0.0
+    for options, words in (({"objects": 0}, "objects = 0"), ({"tau": -1.0}, "tau = -1")):
+        with pytest.raises(UserError, match=words):
+            SilhouetteLoss(**options)
