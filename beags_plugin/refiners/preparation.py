@@ -148,9 +148,8 @@ def prepare(
         ]  # without a vote, a view that does not vote keeps its label too
         consistent = [_translated(mask, known, known.class_ids) for mask in ranked]
         confidence = [mask.confidence for mask in refined]
-        if (
-            config.min_confidence > 0.0
-        ):  # for the losses alone: the border split looks for the very rims that are doubtful
+        if config.min_confidence > 0.0:
+            # for the losses alone: the border split looks for the very rims that are doubtful
             consistent = [
                 mask.masked_fill(share < config.min_confidence, IGNORE)
                 for mask, share in zip(consistent, confidence, strict=True)
