@@ -33,9 +33,9 @@ BEAGS_INLINE void load_saved(const Job<T>& job, int tile, PixelGradients<T>* pix
   }
 }
 
-// The gradients towards the images, as they are.
+// The gradients towards the images, as they are. Returns the label of the whole tile, see load_labels.
 template <Parts kWanted, class T>
-BEAGS_INLINE void read_gradients(const Job<T>& job, int tile, PixelGradients<T>* pixels) {
+BEAGS_INLINE int32_t read_gradients(const Job<T>& job, int tile, PixelGradients<T>* pixels) {
   const Images<const T>& g = job.gradients;
   const auto one = [&](const T* image, auto field) __attribute__((always_inline)) {
     if (!image) return;
@@ -55,16 +55,18 @@ BEAGS_INLINE void read_gradients(const Job<T>& job, int tile, PixelGradients<T>*
   }
   if (kWanted & kDistortion) one(g.distortion, &PixelGradients<T>::g_moment);
   if ((kWanted & kBoundary) && g.boundary) {
-    load_labels(job, tile, pixels);
     one(g.boundary, &PixelGradients<T>::g_boundary);
+    return load_labels(job, tile, pixels);
   }
+  return Labels<T>::kMixed;
 }
 
-// Towards the sums that the images were made of: A is 1 - T at the end, which every surfel changes.
+// Towards the sums that the images were made of: A is 1 - T at the end, which every surfel changes. Returns the label
+// of the whole tile.
 template <Parts kWanted, class T>
-BEAGS_INLINE void load_gradients(const Job<T>& job, int tile, PixelGradients<T>* pixels) {
+BEAGS_INLINE int32_t load_gradients(const Job<T>& job, int tile, PixelGradients<T>* pixels) {
   load_saved<kWanted>(job, tile, pixels);
-  read_gradients<kWanted>(job, tile, pixels);
+  const int32_t everywhere = read_gradients<kWanted>(job, tile, pixels);
   Vector<T> background[4] = {};
   for (int pack = 0; pack < kTilePacks<T>; ++pack) {
     PixelGradients<T>& p = pixels[pack];
@@ -95,12 +97,14 @@ BEAGS_INLINE void load_gradients(const Job<T>& job, int tile, PixelGradients<T>*
   T sums[4];
   Register<T>::sum4(background, sums);
   for (int c = 0; c < 3; ++c) job.g_background[3 * tile + c] = sums[c];
+  return everywhere;
 }
 
 // dL/dw of a hit, but for what lies behind it; sets `g_hit`, the gradient towards its depth.
 template <Parts kWanted, class T>
 BEAGS_INLINE Real<T> weight_gradient(const Job<T>& job, int k, const Splat<T>& s, const Hits<T>& hits, int i,
-                                     const PixelGradients<T>& p, Real<T> w, Vector<T>* sums, Real<T>& g_hit) {
+                                     int32_t everywhere, const PixelGradients<T>& p, Real<T> w, Vector<T>* sums,
+                                     Real<T>& g_hit) {
   Real<T> g_w = load(p.g_alpha);
   for (int c = 0; c < 3; ++c) {
     const Real<T> g = load(p.g_color[c]);
@@ -125,7 +129,7 @@ BEAGS_INLINE Real<T> weight_gradient(const Job<T>& job, int k, const Splat<T>& s
     g_w = fma(m, slope - g_moment, g_w);
     g_hit = fma(w * slope, all(T(2) / job.mapping) * (nearness * nearness), g_hit);
   }
-  if ((kWanted & kBoundary) && !p.labels.all_right(s.class_id)) {
+  if ((kWanted & kBoundary) && s.class_id != everywhere && !p.labels.all_right(s.class_id)) {
     g_w = g_w + drop(p.labels.right(s.class_id), load(p.g_boundary));
   }
   return g_w;
@@ -134,12 +138,12 @@ BEAGS_INLINE Real<T> weight_gradient(const Job<T>& job, int k, const Splat<T>& s
 // Adds one surfel's part at one pack of pixels, back to front.
 template <Parts kWanted, bool kPlain, class T>
 BEAGS_INLINE void add_gradients(const Job<T>& job, int k, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> dx,
-                                Real<T> dy, PixelGradients<T>& p, Vector<T>* sums) {
+                                Real<T> dy, int32_t everywhere, PixelGradients<T>& p, Vector<T>* sums) {
   constexpr bool kDepths = kWanted & (kGeometry | kDistortion);
   const Real<T> alpha = hits.get(hits.alpha, i), inverse_left = all(T(1)) / (all(T(1)) - alpha);
   const Real<T> before = load(p.transmittance) * inverse_left, w = alpha * before;
   Real<T> g_hit = all(T(0));
-  const Real<T> g_w = weight_gradient<kWanted>(job, k, s, hits, i, p, w, sums, g_hit);
+  const Real<T> g_w = weight_gradient<kWanted>(job, k, s, hits, i, everywhere, p, w, sums, g_hit);
   store(p.transmittance, before);
   // Towards log alpha: alpha dL/dalpha = w g_w - (what lies behind) alpha / (1 - alpha).
   const Real<T> behind = load(p.behind);
@@ -238,12 +242,13 @@ BEAGS_INLINE void walk_back(const Job<T>& job, int tile, PixelGradients<T>* pixe
 template <Parts kWanted, class T>
 void backward(const Job<T>& job, int tile) {
   PixelGradients<T> pixels[kTilePacks<T>] = {};
-  load_gradients<kWanted>(job, tile, pixels);
+  const int32_t everywhere = load_gradients<kWanted>(job, tile, pixels);
   constexpr unsigned kNeeds =
       kNeedShape | (kWanted & (kGeometry | kDistortion) ? kNeedDepth : 0) | (kWanted & kDistortion ? kNeedNearness : 0);
-  const auto add = [&job](auto plain, int k, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> dx, Real<T> dy,
-                          PixelGradients<T>& p, Vector<T>* sums) __attribute__((always_inline)) {
-    add_gradients<kWanted, decltype(plain)::value>(job, k, s, hits, i, dx, dy, p, sums);
+  const auto add = [&job, everywhere](auto plain, int k, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> dx,
+                                      Real<T> dy, PixelGradients<T>& p,
+                                      Vector<T>* sums) __attribute__((always_inline)) {
+    add_gradients<kWanted, decltype(plain)::value>(job, k, s, hits, i, dx, dy, everywhere, p, sums);
   };
   walk_back<record_size(kWanted), kNeeds>(job, tile, pixels, add);
 }

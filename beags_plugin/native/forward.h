@@ -22,9 +22,10 @@ BEAGS_INLINE void accumulate(T* sum, Real<T> w, T value) {
   store(sum, fma(w, all(value), load(sum)));
 }
 
+// `everywhere`: the label of the whole tile, see load_labels; it spares most hits a look at their pack's labels.
 template <Parts kWanted, class T>
 BEAGS_INLINE void add_hit(int k, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> w, Real<T> before,
-                          Pixels<T>& p) {
+                          int32_t everywhere, Pixels<T>& p) {
   for (int c = 0; c < 3; ++c) accumulate(p.color[c], w, s.color[c]);
   if (kWanted & kGeometry) {
     for (int c = 0; c < 3; ++c) accumulate(p.normal[c], w, s.normal[c]);
@@ -44,7 +45,7 @@ BEAGS_INLINE void add_hit(int k, const Splat<T>& s, const Hits<T>& hits, int i, 
     store(p.moment1, load(p.moment1) + wm);
     store(p.moment2, fma(wm, m, load(p.moment2)));
   }
-  if ((kWanted & kBoundary) && !p.labels.all_right(s.class_id)) {
+  if ((kWanted & kBoundary) && s.class_id != everywhere && !p.labels.all_right(s.class_id)) {
     store(p.boundary, load(p.boundary) + drop(p.labels.right(s.class_id), w));  // E7
   }
 }
@@ -120,12 +121,14 @@ template <Parts kWanted, class T>
 void forward(const Job<T>& job, int tile) {
   Walk<T> walk(job, tile);
   Pixels<T> pixels[kTilePacks<T>] = {};
-  if ((kWanted & kBoundary) && job.target) load_labels(job, tile, pixels);
+  int32_t everywhere = Labels<T>::kMixed;
+  if ((kWanted & kBoundary) && job.target) everywhere = load_labels(job, tile, pixels);
   constexpr unsigned kNeeds = (kWanted & kGeometry ? kNeedDepth : 0) | (kWanted & kDistortion ? kNeedNearness : 0);
-  composite<kNeeds>(
-      job, tile, walk,
-      [&](int k, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> w, Real<T> before)
-          __attribute__((always_inline)) { add_hit<kWanted>(k, s, hits, i, w, before, pixels[hits.pack[i]]); });
+  composite<kNeeds>(job, tile, walk,
+                    [&](int k, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> w, Real<T> before)
+                        __attribute__((always_inline)) {
+                          add_hit<kWanted>(k, s, hits, i, w, before, everywhere, pixels[hits.pack[i]]);
+                        });
   if (kWanted & kGeometry) finish_median(walk, pixels);
   if (job.saved.end) save<kWanted>(job, tile, walk, pixels);
   for (int pack = 0; pack < kTilePacks<T>; ++pack) {

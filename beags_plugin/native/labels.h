@@ -20,9 +20,9 @@ struct Labels {
   BEAGS_INLINE Mask<T> ignored() const { return load(target) == all(static_cast<T>(kIgnore)); }
 };
 
-// Whether all pixels of a tile have the same label, as those of most tiles do.
+// The label that all pixels of a tile have, as those of most tiles do; kMixed with several.
 template <class T>
-BEAGS_INLINE bool is_uniform(const Job<T>& job, int tile) {
+BEAGS_INLINE int32_t label_everywhere(const Job<T>& job, int tile) {
   const int x0 = tile % job.tiles_x * kTile, y0 = tile / job.tiles_x * kTile;
   const int columns = job.width - x0 < kTile ? job.width - x0 : kTile;
   const int rows = job.height - y0 < kTile ? job.height - y0 : kTile;
@@ -32,20 +32,19 @@ BEAGS_INLINE bool is_uniform(const Job<T>& job, int tile) {
   for (int y = 0; y < rows; ++y, row += job.width) {
     for (int x = 0; x < columns; ++x) different |= row[x] ^ first;
   }
-  return different == 0;
+  return different ? Labels<T>::kMixed : first;
 }
 
-// Fills the `labels` of each pack.
+// Fills the `labels` of each pack. Returns the tile's label, kMixed with several.
 template <class T, class Pixels>
-BEAGS_INLINE void load_labels(const Job<T>& job, int tile, Pixels* pixels) {
-  const bool uniform = is_uniform(job, tile);
-  const int x0 = tile % job.tiles_x * kTile, y0 = tile / job.tiles_x * kTile;
-  const int32_t first = job.target[static_cast<int64_t>(y0) * job.width + x0];
+BEAGS_INLINE int32_t load_labels(const Job<T>& job, int tile, Pixels* pixels) {
+  const int32_t everywhere = label_everywhere(job, tile),
+                filled = everywhere == Labels<T>::kMixed ? kIgnore : everywhere;
   for (int pack = 0; pack < kTilePacks<T>; ++pack) {
-    pixels[pack].labels.only = uniform ? first : kIgnore;
-    store(pixels[pack].labels.target, all(static_cast<T>(first)));
+    pixels[pack].labels.only = filled;
+    store(pixels[pack].labels.target, all(static_cast<T>(filled)));
   }
-  if (uniform) return;
+  if (everywhere != Labels<T>::kMixed) return everywhere;
   for_each_pixel(job, tile, [&](int64_t at, int pack, int lane) {
     Labels<T>& labels = pixels[pack].labels;
     const int32_t label = job.target[at];
@@ -53,6 +52,7 @@ BEAGS_INLINE void load_labels(const Job<T>& job, int tile, Pixels* pixels) {
     if (label == kIgnore) return;
     labels.only = labels.only == kIgnore || labels.only == label ? label : Labels<T>::kMixed;
   });
+  return everywhere;
 }
 
 }  // namespace BEAGS_ISA

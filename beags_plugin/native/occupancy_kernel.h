@@ -311,6 +311,40 @@ struct Waiting {
   }
 };
 
+// Bit l: the box of lane l lies in a cube of 1, 2 or 3 valid voxels along each side, of which one look tells. Without
+// branches, so that the looks of all lanes are under way at once. All tables must be arrays.
+template <class T>
+BEAGS_OPS_INLINE unsigned in_cubes(const VoxelTable* cubes, const Boxes<T>& boxes, const int32_t* class_ids) {
+  using I = typename Lanes<T>::Int;
+  using Whole = typename Lanes<T>::Whole;
+  constexpr int kCount = Lanes<T>::kCount;
+  static_assert(kLargestCube == 3, "one choice for each size");
+  const I zero = {}, is_two = boxes.largest == zero + 2, is_three = boxes.largest == zero + 3;
+  I offset;
+  for (int lane = 0; lane < kCount; ++lane) offset[lane] = class_ids[lane];
+  const I counted = (boxes.largest <= zero + kLargestCube) & (offset >= zero) & (offset < zero + cubes->num_classes);
+  offset &= counted;
+  I place = zero;
+  for (int axis = 0; axis < 3; ++axis) {
+    const I base = select(is_two, zero + cubes[1].base[axis],
+                          select(is_three, zero + cubes[2].base[axis], zero + cubes[0].base[axis]));
+    const I size = select(is_two, zero + cubes[1].size[axis],
+                          select(is_three, zero + cubes[2].size[axis], zero + cubes[0].size[axis]));
+    const I index = (boxes.low[axis] & counted) + static_cast<Whole>(kVoxelShift);
+    I at = (index >> 2) - base;
+    at &= at > zero;
+    at = select(at < size, at, size - 1);
+    offset = offset * size + at;
+    place = place << 2 | (index & 3);
+  }
+  unsigned inside = 0;
+  for (int lane = 0; lane < kCount; ++lane) {
+    const VoxelTable& cube = cubes[-is_two[lane] - 2 * is_three[lane]];
+    inside |= static_cast<unsigned>(cube.dense[offset[lane]] >> place[lane] & counted[lane] & 1) << lane;
+  }
+  return inside;
+}
+
 template <class T>
 double occupancy_block(const OccupancyJob<T>& job, int64_t first, int64_t last, int64_t* active) {
   constexpr int kCount = Lanes<T>::kCount;
@@ -321,14 +355,25 @@ double occupancy_block(const OccupancyJob<T>& job, int64_t first, int64_t last, 
     __builtin_memset(job.g_log_scales + 2 * first, 0, 2 * count * sizeof(T));
     __builtin_memset(job.g_opacity_logits + first, 0, count * sizeof(T));
   }
+  bool arrays = true;
+  for (int cube = 0; cube < kLargestCube; ++cube) arrays = arrays && job.valid[cube].dense;
   OccupancyBatch<T> fresh;
   Waiting<T> waiting(job);
   for (int64_t start = first; start < last; start += kCount) {
     const int here = static_cast<int>(last - start < kCount ? last - start : kCount);
     const Boxes<T> boxes = set_up(job, start, here, fresh);
-    for (int lane = 0; lane < here; ++lane) {
+    int32_t class_ids[kCount] = {};
+    if (here == kCount) {
+      __builtin_memcpy(class_ids, job.class_ids + start, sizeof class_ids);
+    } else {
+      for (int lane = 0; lane < here; ++lane) class_ids[lane] = job.class_ids[start + lane];
+    }
+    // Where a disc is wholly inside, its loss is exactly 0. Most lie in a cube.
+    const unsigned inside = job.skip && arrays ? in_cubes(job.valid, boxes, class_ids) : 0;
+    for (unsigned left = ~inside & ((1u << here) - 1); left; left &= left - 1) {
+      const int lane = __builtin_ctz(left);
       const int64_t i = start + lane;
-      const int32_t class_id = job.class_ids[i];
+      const int32_t class_id = class_ids[lane];
       const T opacity = fresh.field[kOpacity][lane];
       if (opacity != opacity || (!job.background && class_id == 0)) continue;
       int64_t low[3] = {};
@@ -341,16 +386,16 @@ double occupancy_block(const OccupancyJob<T>& job, int64_t first, int64_t last, 
         low[axis] = boxes.low[axis][lane];
         n[axis] = static_cast<int>(boxes.size[axis][lane]);
       }
-      // Where a disc is wholly inside, its loss is exactly 0. Most lie in a cube of which one look tells.
       const auto largest = boxes.largest[lane];
-      if (job.skip && largest <= kLargestCube && voxel_bit(job.valid[largest - 1], class_id, low)) continue;
+      const bool look = job.skip && !arrays && largest <= kLargestCube;
+      if (look && voxel_bit(job.valid[largest - 1], class_id, low)) continue;
       if (largest <= 4) {
         const uint64_t valid = voxel_box(*job.valid, class_id, low, n), box = box_bits(n[0], n[1], n[2]);
         if (!job.skip || (valid & box) != box) waiting.template add<Reach::kNear>(fresh, lane, i, low, valid);
       } else if (largest <= kWindowVoxels) {
         uint64_t* bricks = waiting.window.bricks[waiting.window.count];
-        const bool inside = fill_window(*job.valid, class_id, low, n, bricks);
-        if (!job.skip || !inside) waiting.template add<Reach::kWindow>(fresh, lane, i, low, 0);
+        const bool inside_window = fill_window(*job.valid, class_id, low, n, bricks);
+        if (!job.skip || !inside_window) waiting.template add<Reach::kWindow>(fresh, lane, i, low, 0);
       } else {
         waiting.template add<Reach::kFar>(fresh, lane, i, low, 0);
       }

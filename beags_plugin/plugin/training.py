@@ -36,6 +36,8 @@ def training_callbacks(model: BeagsModel, attributes: TrainingCallbackAttributes
 
     def before(step: int) -> None:
         model.step = step
+        every = trainer.config.logging.steps_per_log
+        model.measuring = every > 0 and step % every == 0  # nerfstudio reads no other step's
         densifier.before_step(step)
         switch.before_step(step)
         set_learning_rates(model, optimizers, trainer.config.optimizers, step)
