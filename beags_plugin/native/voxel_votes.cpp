@@ -1,145 +1,185 @@
 #include "voxel_votes.h"
 
 #include <algorithm>
-#include <cmath>
 
-#include "golden.h"
+#include "voxel_space.h"
 
 namespace beags {
 namespace ops {
 namespace {
 
-constexpr uint64_t kNowhere = ~uint64_t(0);  // points that are not finite or too far away
-constexpr int64_t kHalf = int64_t(1) << 20;  // 21 bits along each axis
+constexpr uint64_t kNowhere = ~uint64_t(0);  // pixels without a depth, or too far away
 constexpr int kShares = 64;
-
-uint64_t hash(uint64_t key) {
-  key = (key ^ key >> 32) * kGolden;
-  return key ^ key >> 29;
-}
-int share_of(uint64_t hash) { return static_cast<int>(hash >> 58); }
+constexpr int kKept = 128;  // bricks that were needed last, kept at hand
 
 }  // namespace
 
-VoxelVotes::VoxelVotes(const double* origin, double voxel_size, int threads)
-    : voxel_size_(voxel_size), threads_(threads), shares_(kShares) {
-  std::copy_n(origin, 3, origin_);
-}
+VoxelVotes::VoxelVotes(int threads) : threads_(threads), shares_(kShares) {}
 
 template <class T>
-uint64_t VoxelVotes::key(const T* point) const {
-  uint64_t key = 0;
-  for (int axis = 0; axis < 3; ++axis) {
-    const T index = std::floor((point[axis] - static_cast<T>(origin_[axis])) / static_cast<T>(voxel_size_));
-    if (!(std::abs(index) < static_cast<T>(kHalf))) return kNowhere;
-    key = key << 21 | static_cast<uint64_t>(static_cast<int64_t>(index) + kHalf);
-  }
-  return key;
-}
-
-template <class T>
-void VoxelVotes::add(int64_t count, const T* points, const int32_t* labels) {
+void VoxelVotes::add(const LiftedView<T>& view, const int32_t* labels, int32_t ignore) {
+  const int64_t count = static_cast<int64_t>(view.height) * view.width;
   keys_.resize(count);
+  labels_.resize(count);
+  const int rows = tile_rows(view);
   const int team = count < 4000 ? 1 : threads_;
 #pragma omp parallel for num_threads(team) schedule(static)
-  for (int64_t i = 0; i < count; ++i) keys_[i] = key(points + 3 * i);
+  for (int row = 0; row < rows; ++row) {
+    int64_t place = static_cast<int64_t>(row) * kTile * view.width;
+    each_pixel(view, row, [&](int x, int y) {
+      const int32_t label = labels[static_cast<int64_t>(y) * view.width + x];
+      T point[3], ray[3];
+      uint64_t& key = keys_[place];
+      labels_[place++] = label;
+      key = kNowhere;
+      if (label == ignore || !lift(view, x, y, point, ray)) return;
+      int32_t v[3];
+      for (int a = 0; a < 3; ++a) v[a] = floor_of(point[a]) + kHalf;
+      key = brick_key(v[0] >> 2, v[1] >> 2, v[2] >> 2) << 6 | cell_of(v[0], v[1], v[2]);
+    });
+  }
   // Every thread reads all keys and counts those of its own shares: no two write to one table.
 #pragma omp parallel for num_threads(team) schedule(static, 1)
   for (int part = 0; part < team; ++part) {
-    const int first = kShares * part / team, last = kShares * (part + 1) / team;
+    const uint64_t first = kShares * part / team, last = kShares * (part + 1) / team;
+    struct Kept {
+      uint64_t key = kNowhere;
+      Share* share = nullptr;  // null: another thread's
+      int32_t brick = 0;
+    };
+    std::vector<Kept> kept(kKept);
     for (int64_t i = 0; i < count; ++i) {
       if (keys_[i] == kNowhere) continue;
-      const int share = share_of(hash(keys_[i]));
-      if (share >= first && share < last) shares_[share].vote(keys_[i], labels[i]);
+      const uint64_t key = keys_[i] >> 6;
+      Kept& at = kept[(key ^ key >> 17 ^ key >> 35) & (kKept - 1)];
+      if (at.key != key) {
+        const uint64_t number = hash_of(key) >> 58;
+        Share* share = number >= first && number < last ? &shares_[number] : nullptr;
+        at = {key, share, share ? share->place(key) : 0};
+      }
+      if (at.share) at.share->vote(at.brick, static_cast<int>(keys_[i] & 63), labels_[i]);
     }
   }
 }
 
-void VoxelVotes::Share::vote(uint64_t key, int32_t label) {
-  if (2 * (used + 1) > static_cast<int64_t>(counts.size())) grow();
-  const uint64_t mask = counts.size() - 1;
-  for (uint64_t at = hash(key + kGolden * static_cast<uint64_t>(label)) & mask;; at = (at + 1) & mask) {
-    Count& slot = counts[at];
-    if (slot.votes == 0) {
-      slot = {key, label, 1};
-      ++used;
-      return;
-    }
-    if (slot.key == key && slot.label == label) {
-      ++slot.votes;
-      return;
-    }
+int32_t VoxelVotes::Share::place(uint64_t key) {
+  if (2 * (bricks.size() + 1) > slots.size()) grow_slots();
+  const uint64_t mask = slots.size() - 1;
+  uint64_t at = hash_of(key) & mask;
+  while (slots[at].brick >= 0 && slots[at].key != key) at = (at + 1) & mask;
+  if (slots[at].brick < 0) {
+    slots[at] = {key, static_cast<int32_t>(bricks.size())};
+    bricks.push_back({std::make_unique<Voxel[]>(kCells)});
   }
+  return slots[at].brick;
 }
 
-void VoxelVotes::Share::grow() {
-  std::vector<Count> larger(std::max<size_t>(256, 2 * counts.size()), Count{0, 0, 0});
+void VoxelVotes::Share::grow_slots() {
+  std::vector<Slot> larger(std::max<size_t>(64, 2 * slots.size()), Slot{0, -1});
   const uint64_t mask = larger.size() - 1;
-  for (const Count& count : counts) {
-    if (count.votes == 0) continue;
-    uint64_t at = hash(count.key + kGolden * static_cast<uint64_t>(count.label)) & mask;
-    while (larger[at].votes) at = (at + 1) & mask;
-    larger[at] = count;
+  for (const Slot& slot : slots) {
+    if (slot.brick < 0) continue;
+    uint64_t at = hash_of(slot.key) & mask;
+    while (larger[at].brick >= 0) at = (at + 1) & mask;
+    larger[at] = slot;
   }
-  counts.swap(larger);
+  slots.swap(larger);
 }
 
-// Determinism: the result does not depend on the order in which a voxel's classes come.
-void VoxelVotes::Share::decide() {
-  size_t size = 16;
-  while (size < 2 * static_cast<size_t>(used)) size *= 2;
-  winners.assign(size, Winner{0, 0, 0, 0, 0});
-  const uint64_t mask = size - 1;
-  for (const Count& count : counts) {
-    if (count.votes == 0) continue;
-    uint64_t at = hash(count.key) & mask;
-    while (winners[at].total && winners[at].key != count.key) at = (at + 1) & mask;
-    Winner& winner = winners[at];
-    winner.key = count.key;
-    winner.total += count.votes;
-    if (count.votes > winner.most) {
-      winner.most = count.votes;
-      winner.label = count.label;
-      winner.leaders = 1;
-    } else if (count.votes == winner.most) {
-      ++winner.leaders;
-    }
-  }
-  std::vector<Count>().swap(counts);
-  used = 0;
-}
-
-void VoxelVotes::decide() {
-#pragma omp parallel for num_threads(threads_) schedule(dynamic, 1)
-  for (int share = 0; share < kShares; ++share) shares_[share].decide();
-}
-
-const VoxelVotes::Winner* VoxelVotes::Share::find(uint64_t key) const {
-  const uint64_t mask = winners.size() - 1;
-  for (uint64_t at = hash(key) & mask; winners[at].total; at = (at + 1) & mask) {
-    if (winners[at].key == key) return &winners[at];
+const VoxelVotes::Brick* VoxelVotes::Share::find(uint64_t key, uint64_t hash) const {
+  if (slots.empty()) return nullptr;
+  const uint64_t mask = slots.size() - 1;
+  for (uint64_t at = hash & mask; slots[at].brick >= 0; at = (at + 1) & mask) {
+    if (slots[at].key == key) return &bricks[slots[at].brick];
   }
   return nullptr;
 }
 
-template <class T>
-void VoxelVotes::read(int64_t count, const T* points, int32_t* labels, float* confidence) const {
-  const int team = count < 4000 ? 1 : threads_;
-#pragma omp parallel for num_threads(team) schedule(static)
-  for (int64_t i = 0; i < count; ++i) {
-    const uint64_t at = key(points + 3 * i);
-    const Winner* winner = at == kNowhere ? nullptr : shares_[share_of(hash(at))].find(at);
-    confidence[i] = winner ? static_cast<float>(winner->most) / static_cast<float>(winner->total) : 0.0f;
-    if (winner && winner->leaders == 1) labels[i] = winner->label;
+void VoxelVotes::Share::vote(int32_t brick, int cell, int32_t label) {
+  Voxel& voxel = bricks[brick].voxels[cell];
+  if (voxel.votes == 0) voxel.label = label;
+  if (voxel.label == label) {
+    ++voxel.votes;
+  } else {
+    vote_extra(static_cast<uint64_t>(brick) * kCells + cell, label);
   }
 }
 
-#define BEAGS_INSTANTIATE(T)                                        \
-  template void VoxelVotes::add(int64_t, const T*, const int32_t*); \
-  template void VoxelVotes::read(int64_t, const T*, int32_t*, float*) const;
-BEAGS_INSTANTIATE(float)
-BEAGS_INSTANTIATE(double)
-#undef BEAGS_INSTANTIATE
+void VoxelVotes::Share::vote_extra(uint64_t voxel, int32_t label) {
+  if (2 * (extras_used + 1) > static_cast<int64_t>(extras.size())) grow_extras();
+  const uint64_t mask = extras.size() - 1;
+  uint64_t at = hash_of(voxel + kGolden * static_cast<uint64_t>(label)) & mask;
+  while (extras[at].votes && !(extras[at].voxel == voxel && extras[at].label == label)) at = (at + 1) & mask;
+  if (extras[at].votes == 0) {
+    extras[at] = {voxel, label, 0};
+    ++extras_used;
+  }
+  ++extras[at].votes;
+}
+
+void VoxelVotes::Share::grow_extras() {
+  std::vector<Extra> larger(std::max<size_t>(64, 2 * extras.size()), Extra{0, 0, 0});
+  const uint64_t mask = larger.size() - 1;
+  for (const Extra& extra : extras) {
+    if (extra.votes == 0) continue;
+    uint64_t at = hash_of(extra.voxel + kGolden * static_cast<uint64_t>(extra.label)) & mask;
+    while (larger[at].votes) at = (at + 1) & mask;
+    larger[at] = extra;
+  }
+  extras.swap(larger);
+}
+
+void VoxelVotes::Share::decide() {
+  extras.erase(std::remove_if(extras.begin(), extras.end(), [](const Extra& e) { return e.votes == 0; }), extras.end());
+  std::sort(extras.begin(), extras.end(), [](const Extra& a, const Extra& b) { return a.voxel < b.voxel; });
+  for (size_t i = 0; i < extras.size();) {
+    Voxel& voxel = bricks[extras[i].voxel / kCells].voxels[extras[i].voxel % kCells];
+    const size_t first = pairs.size();
+    pairs.push_back({voxel.label, voxel.votes});
+    for (const uint64_t same = extras[i].voxel; i < extras.size() && extras[i].voxel == same; ++i) {
+      pairs.push_back({extras[i].label, extras[i].votes});
+      if (pairs.back().votes > pairs[first].votes) std::swap(pairs.back(), pairs[first]);
+    }
+    voxel = {~static_cast<int32_t>(first), static_cast<uint32_t>(pairs.size() - first)};
+  }
+  std::vector<Extra>().swap(extras);
+  for (Brick& brick : bricks) {
+    brick.pairs = pairs.data();
+    brick.leader = leader(brick);
+  }
+}
+
+void VoxelVotes::decide() {
+  std::vector<uint64_t>().swap(keys_);
+  std::vector<int32_t>().swap(labels_);
+#pragma omp parallel for num_threads(threads_) schedule(dynamic, 1)
+  for (int share = 0; share < kShares; ++share) shares_[share].decide();
+}
+
+// The class with more than half of the votes of the voxel, or -1.
+int32_t VoxelVotes::leader_of(const Voxel& voxel, const Pair* pairs) {
+  if (voxel.label >= 0) return voxel.label;
+  const Pair* pair = pairs + ~voxel.label;
+  uint64_t total = 0;
+  for (uint32_t k = 0; k < voxel.votes; ++k) total += pair[k].votes;
+  return 2 * uint64_t(pair->votes) > total ? pair->label : -1;
+}
+
+// The class that leads in every voxel that has votes, or -1.
+int32_t VoxelVotes::Share::leader(const Brick& brick) const {
+  int32_t leader = -1;
+  for (int cell = 0; cell < kCells; ++cell) {
+    const Voxel& voxel = brick.voxels[cell];
+    if (voxel.votes == 0) continue;
+    const int32_t label = leader_of(voxel, pairs.data());
+    if (label < 0 || (leader >= 0 && leader != label)) return -1;
+    leader = label;
+  }
+  return leader;
+}
+
+template void VoxelVotes::add(const LiftedView<float>&, const int32_t*, int32_t);
+template void VoxelVotes::add(const LiftedView<double>&, const int32_t*, int32_t);
 
 }  // namespace ops
 }  // namespace beags
