@@ -87,7 +87,11 @@ def _origin(cameras: Sequence[Camera]) -> Tensor:
 
 
 def _to_voxels(camera: Camera, origin: Tensor, size: float) -> Tensor:
-    """[12] float64: A row by row, then b; a pixel (x, y) at depth d lies at d A (x, y, 1) + b, in voxels."""
+    """[13] float64: A row by row, b, and the depth that is one voxel long along the ray of the image's centre.
+
+    A pixel (x, y) at depth d lies at d A (x, y, 1) + b, in voxels.
+    """
     view = camera.to("cpu", torch.float64)
     A = view.rotation.T @ torch.linalg.inv(view.K) / size
-    return torch.cat([A.reshape(-1), (view.center - origin) / size])
+    centre = A @ torch.tensor([view.width / 2, view.height / 2, 1.0], dtype=torch.float64)
+    return torch.cat([A.reshape(-1), (view.center - origin) / size, 1.0 / centre.norm()[None]])

@@ -49,10 +49,11 @@ void bind_lookup(nb::class_<VoxelLookup>& lookup, const char* suffix) {
              "means"_a, "axes_u"_a, "axes_v"_a, "class_ids"_a, "out"_a, "threads"_a);
 }
 
-// to_voxels: [12], a row by row, then b.
+// to_voxels: [13], a row by row, b, the side of a voxel.
 template <class T>
 LiftedView<T> lifted_view(const Array<const T>& depth, const Array<const T>& to_voxels) {
-  LiftedView<T> view{static_cast<int>(depth.shape(0)), static_cast<int>(depth.shape(1)), depth.data(), {}, {}};
+  const int height = static_cast<int>(depth.shape(0)), width = static_cast<int>(depth.shape(1));
+  LiftedView<T> view{height, width, depth.data(), {}, {}, to_voxels.data()[12]};
   std::copy_n(to_voxels.data(), 9, view.a);
   std::copy_n(to_voxels.data() + 9, 3, view.b);
   return view;

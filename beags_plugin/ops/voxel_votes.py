@@ -13,8 +13,8 @@ from beags_plugin.ops import extension
 class VoxelVotes:
     """Counts votes per (voxel, class), then tells each pixel who leads about its point.
 
-    A pixel (x, y) at depth d lies at d A (x, y, 1) + b, in voxels; ``to_voxels`` [12] is A row by row, then b. Pixels
-    whose depth is not positive and finite, or whose point is 2^20 - 4 voxels or more from 0 along an axis, neither vote
+    A pixel (x, y) at depth d lies at d A (x, y, 1) + b, in voxels; ``to_voxels`` [13] is A row by row, b, and the depth
+    that is one voxel long along the ray of the image's centre. Pixels whose depth is not positive and finite, or whose point is 2^20 - 4 voxels or more from 0 along an axis, neither vote
     nor are told. ``masks.voxel_reprojection`` says how votes are read. Memory is linear in the voxels; neither time nor
     memory depends on how many classes there are.
 
@@ -52,4 +52,4 @@ class VoxelVotes:
 
 def _view(depth: Tensor, to_voxels: Tensor) -> tuple[Tensor, Tensor]:
     depth = extension.plain("depth", depth, (depth.shape[0], depth.shape[1]), depth.dtype)
-    return depth, extension.plain("to_voxels", to_voxels, (12,), depth.dtype)
+    return depth, extension.plain("to_voxels", to_voxels, (13,), depth.dtype)
