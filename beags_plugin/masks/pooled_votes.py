@@ -10,7 +10,6 @@ from torch import Tensor
 _BITS = 21  # of each of the three voxel indices in a key
 _HALF = 1 << (_BITS - 1)
 _MARGIN = 4  # what is read about a point is in reach too
-_ALONG_RAY = (-1, 0, 1)  # where votes are read: voxels behind and before the point
 _PARTS = 64  # of a voxel, in interpolation weights: whole numbers, whose sums have no order
 
 
@@ -33,67 +32,103 @@ class TorchVotes:
         self._voxels, voxel = torch.unique(torch.cat([empty, *keys]), return_inverse=True)
         every = torch.cat([empty, *labels])
         self._classes = int(every.max()) + 1 if len(every) else 1
-        pairs, self._votes = torch.unique(voxel * self._classes + every, return_counts=True)
-        self._labels = pairs % self._classes
-        counts = torch.bincount(pairs // self._classes, minlength=len(self._voxels))
-        self._first = torch.cat([counts.new_zeros(1), counts.cumsum(0)])  # of each voxel's pairs
+        # A pair is voxel * classes + label; those of a voxel lie together, from its `_first` on.
+        self._pairs, self._votes = torch.unique(voxel * self._classes + every, return_counts=True)
+        voxel = self._pairs // self._classes
+        counts = torch.bincount(voxel, minlength=len(self._voxels))
+        self._first = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+        self._totals = torch.zeros_like(self._voxels).scatter_add_(0, voxel, self._votes)
+        leads = 2 * self._votes > self._totals[voxel]
+        self._leaders = torch.full_like(self._voxels, -1)  # the class with more than half of a voxel's votes, or -1
+        self._leaders[voxel[leads]] = self._pairs[leads] % self._classes
 
     def read(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-        points, rays, near = _lift(depth, to_voxels)
+        points, steps, near = _lift(depth, to_voxels)
         voted = labels.clone()
         confidence = torch.zeros(depth.shape, dtype=torch.float32, device=depth.device)
-        voted[near], confidence[near] = self._winners(points[near], rays[near], labels[near])
+        if len(self._voxels):
+            voted[near], confidence[near] = self._winners(points[near], steps[near], labels[near])
         return voted, confidence
 
-    def _winners(self, points: Tensor, rays: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """[P] int32 and [P] float32. points: [P, 3], in voxels; rays: [P, 3], one voxel long; labels: [P] int32."""
-        keys, weights = zip(*(self._weighted_votes(points + step * rays - 0.5) for step in _ALONG_RAY), strict=True)
-        pairs, inverse = torch.unique(torch.cat(keys), return_inverse=True)
-        sums = torch.zeros_like(pairs).scatter_add_(0, inverse, torch.cat(weights))
+    def _winners(self, points: Tensor, steps: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+        """[P] int32 and [P] float32. points, steps along the rays: [P, 3], in voxels; labels: [P] int32."""
+        voxels, weights, own = self._about(points)
+        open_points = torch.nonzero(~self._agree(voxels))[:, 0]
+        polls = [self._poll(torch.arange(len(points), device=points.device), voxels, weights)]
+        for sign in (-1, 1):
+            moved = points[open_points] + sign * steps[open_points]
+            polls.append(self._poll(open_points, *self._about(moved)[:2]))
+        label, share = self._count(polls, labels)
+        # The pixel's own voxel says how sure its label is, if anybody voted there.
+        known = (own >= 0) & (label >= 0) & (label < self._classes)
+        pair = own.clamp(min=0) * self._classes + torch.where(known, label, 0)
+        at = torch.searchsorted(self._pairs, pair).clamp_(max=len(self._pairs) - 1)
+        own_votes = torch.where(known & (self._pairs[at] == pair), self._votes[at], 0)
+        own_share = own_votes.float() / self._totals[own.clamp(min=0)].float()
+        return label, torch.where(own >= 0, own_share, share)
+
+    def _about(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The eight voxels about each point [P, 3]: their numbers [8, P], -1 where nobody voted, and their weights
+        [8, P]; and the number [P] of the one that holds the point."""
+        corner = torch.floor(points - 0.5)
+        fraction = (((points - 0.5) - corner) * _PARTS).long()
+        numbers, weights = [], []
+        for step in itertools.product((0, 1), repeat=3):
+            offset = torch.tensor(step, device=points.device)
+            weights.append(torch.where(offset == 1, fraction, _PARTS - fraction).prod(-1))
+            numbers.append(self._number(corner.long() + offset))
+        own = self._number(corner.long() + (2 * fraction >= _PARTS))
+        return torch.stack(numbers), torch.stack(weights), own
+
+    def _number(self, voxels: Tensor) -> Tensor:
+        key = _keys(voxels)
+        at = torch.searchsorted(self._voxels, key).clamp_(max=len(self._voxels) - 1)
+        return torch.where(self._voxels[at] == key, at, -1)
+
+    def _agree(self, voxels: Tensor) -> Tensor:
+        """[P] whether one class has more than half of the votes of each of the voxels [8, P] that have any."""
+        leaders = self._leaders[voxels.clamp(min=0)]
+        least = torch.where(voxels >= 0, leaders, self._classes).amin(0)
+        return (least >= 0) & (least == torch.where(voxels >= 0, leaders, -1).amax(0))
+
+    def _poll(self, points: Tensor, voxels: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """Keys point * classes + label and weighted votes, [M]. points: [P]; voxels, weights: [8, P]."""
+        found = (voxels >= 0) & (weights > 0)
+        voxel = voxels[found]
+        counts = self._first[voxel + 1] - self._first[voxel]
+        starts = (counts.cumsum(0) - counts).repeat_interleave(counts)
+        pair = self._first[voxel].repeat_interleave(counts) + torch.arange(len(starts), device=points.device) - starts
+        point = points.expand(8, -1)[found].repeat_interleave(counts)
+        votes = weights[found].repeat_interleave(counts) * self._votes[pair]
+        return point * self._classes + self._pairs[pair] % self._classes, votes
+
+    def _count(self, polls: list[tuple[Tensor, Tensor]], labels: Tensor) -> tuple[Tensor, Tensor]:
+        """The winners [P] int32 (``labels`` where several lead or nobody voted) and their share of the votes."""
+        keys, votes = (torch.cat(column) for column in zip(*polls, strict=True))
+        pairs, inverse = torch.unique(keys, return_inverse=True)
+        sums = torch.zeros_like(pairs).scatter_add_(0, inverse, votes)
         point, label = pairs // self._classes, pairs % self._classes
-        zeros = torch.zeros(len(points), dtype=torch.int64, device=points.device)
+        zeros = torch.zeros(len(labels), dtype=torch.int64, device=labels.device)
         total = zeros.scatter_add(0, point, sums)
         most = zeros.scatter_reduce(0, point, sums, "amax")
         best = sums == most[point]
         leaders = zeros.scatter_add(0, point, best.long())
         winner = zeros.clone()
-        winner[point[best]] = label[best]  # where two lead, the label is not used
+        winner[point[best]] = label[best]  # where two lead, it is not used
         share = most.float() / total.clamp(min=1).float()
         return torch.where(leaders == 1, winner.int(), labels), share
 
-    def _weighted_votes(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Votes of the eight voxels about each point [P, 3]: keys point * classes + label and weighted votes, [M]."""
-        corner = torch.floor(points)
-        fraction = ((points - corner) * _PARTS).long()
-        number = torch.arange(len(points), device=points.device)
-        keys, weights = [number[:0]], [number[:0]]
-        for step in itertools.product((0, 1), repeat=3):
-            offset = torch.tensor(step, device=points.device)
-            weight = torch.where(offset == 1, fraction, _PARTS - fraction).prod(-1)
-            key = _keys(corner.long() + offset)
-            at = torch.searchsorted(self._voxels, key).clamp_(max=max(len(self._voxels) - 1, 0))
-            found = (weight > 0) & (self._voxels[at] == key) if len(self._voxels) else weight < 0
-            first, count = self._first[at[found]], self._first[at[found] + 1] - self._first[at[found]]
-            inside = torch.arange(int(count.sum()), device=points.device) - (count.cumsum(0) - count).repeat_interleave(
-                count
-            )
-            pair = first.repeat_interleave(count) + inside
-            keys.append(number[found].repeat_interleave(count) * self._classes + self._labels[pair])
-            weights.append(weight[found].repeat_interleave(count) * self._votes[pair])
-        return torch.cat(keys), torch.cat(weights)
-
 
 def _lift(depth: Tensor, to_voxels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Points [H, W, 3] in voxels, their rays [H, W, 3] one voxel long, and which of them [H, W] count."""
+    """Points [H, W, 3] in voxels, steps along their rays [H, W, 3], and which of them [H, W] count."""
     height, width = depth.shape
     x = torch.arange(width, dtype=depth.dtype, device=depth.device) + 0.5
     y = torch.arange(height, dtype=depth.dtype, device=depth.device)[:, None] + 0.5
-    A, b = to_voxels[:9].view(3, 3), to_voxels[9:]
+    A, b, voxel = to_voxels[:9].view(3, 3), to_voxels[9:12], to_voxels[12]
     rays = [A[r, 0] * x + (A[r, 1] * y + A[r, 2]) for r in range(3)]
     points = torch.stack([depth * ray + b[r] for r, ray in enumerate(rays)], dim=-1)
-    length = torch.sqrt(rays[0] * rays[0] + (rays[1] * rays[1] + rays[2] * rays[2]))
     near = (depth > 0) & (points.abs() < _HALF - _MARGIN).all(-1)  # False for NaN
-    return points, torch.stack([ray / length for ray in rays], dim=-1), near
+    return points, voxel * torch.stack(rays, dim=-1), near
 
 
 def _keys(voxels: Tensor) -> Tensor:

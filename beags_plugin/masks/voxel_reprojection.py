@@ -30,10 +30,11 @@ def reproject_voxel(
 
     Arguments and results are those of ``reprojection.reproject_pairwise``, and so is what a tie does. A pixel votes in
     the voxel that holds its lifted point; voxels are ``VOXEL_PIXELS`` pixels wide at the median depth of the objects.
-    A pixel reads the votes of the voxels about its own point, interpolated between the eight nearest, at the point
-    itself and one voxel before and behind it along its ray: so that votes count by how near they are, wherever the
-    borders of the voxels lie, and an error of the pixel's own depth does less harm. The points are lifted from what
-    each view sees, so no vote passes through a surface, and ``tau`` is not used.
+    It reads the votes of the eight voxels about its point, each weighted by how near it is (trilinear), so that it does
+    not matter where the borders of the voxels lie. Unless one class has more than half of the votes of each, it reads
+    them one voxel before and one behind its point along its ray too: an error of its own depth then does less harm.
+    The confidence is the label's share of the votes in the voxel of the point, or of those read if that has none.
+    The points are lifted from what each view sees, so no vote passes through a surface, and ``tau`` is not used.
     Cost O(V pixels), memory linear in the voxels; neither depends on the number of classes.
     """
     check_views(depths, cameras, labels, num_classes, tau)
@@ -42,9 +43,7 @@ def reproject_voxel(
     size, origin = _voxel_size(depths, cameras, labels), _origin(cameras)
     votes = VoxelVotes(IGNORE) if extension.can_take(*depths) else TorchVotes(IGNORE)
     views = len(cameras)
-    lifts = [
-        _to_voxels(camera, origin, size).to(depth) for depth, camera in zip(depths, cameras, strict=True)
-    ]
+    lifts = [_to_voxels(camera, origin, size).to(depth) for depth, camera in zip(depths, cameras, strict=True)]
     for i, (depth, mask) in enumerate(zip(depths, labels, strict=True)):
         if mask is not None:
             votes.add(depth, lifts[i], mask.int())

@@ -14,9 +14,9 @@ class VoxelVotes:
     """Counts votes per (voxel, class), then tells each pixel who leads about its point.
 
     A pixel (x, y) at depth d lies at d A (x, y, 1) + b, in voxels; ``to_voxels`` [13] is A row by row, b, and the depth
-    that is one voxel long along the ray of the image's centre. Pixels whose depth is not positive and finite, or whose point is 2^20 - 4 voxels or more from 0 along an axis, neither vote
-    nor are told. ``masks.voxel_reprojection`` says how votes are read. Memory is linear in the voxels; neither time nor
-    memory depends on how many classes there are.
+    that is one voxel long along the ray of the image's centre. Pixels whose depth is not positive and finite, or whose
+    point is 2^20 - 4 voxels or more from 0 along an axis, neither vote nor are told. ``masks.voxel_reprojection`` says
+    how votes are read. Memory is linear in the voxels; neither time nor memory depends on how many classes there are.
 
     ignore: the label that does not vote.
     """
@@ -38,7 +38,8 @@ class VoxelVotes:
         self._native.decide()
 
     def read(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """The winner about each pixel's point (its label where several lead or nobody voted), and its share.
+        """The winner about each pixel's point (its label where several lead or nobody voted), and its share of the votes
+        in the voxel of the point (of those that were read, if nobody voted there).
 
         depth: [H, W] float. labels: [H, W] int32, those that this view has added, or ``ignore`` everywhere.
         Returns [H, W] int32 and [H, W] float32 (0 where nobody voted).
