@@ -8,16 +8,16 @@ namespace beags {
 namespace ops {
 namespace {
 
-constexpr int kKept = 512;                   // bricks that were needed last, kept at hand
-constexpr int32_t kParts = 64;               // of a voxel, in interpolation weights
-constexpr int32_t kMany = -1, kNobody = -2;  // instead of a leading class
+constexpr int kKept = 512;      // bricks that were needed last, kept at hand
+constexpr int kSeen = 512;      // groups of eight voxels that were asked last and agreed
+constexpr int32_t kParts = 64;  // of a voxel, in interpolation weights
 
 }  // namespace
 
 // Reads pixels one after the other.
 class VoxelVotes::Reader {
  public:
-  explicit Reader(const VoxelVotes& votes) : votes_(votes), kept_(kKept), nothing_(new Voxel[kCells]()) {}
+  explicit Reader(const VoxelVotes& votes) : votes_(votes), kept_(kKept), seen_(kSeen), nothing_(new Voxel[kCells]()) {}
 
   // The pixel's confidence; sets its label. voted: whether it has voted itself.
   template <class T>
@@ -25,22 +25,37 @@ class VoxelVotes::Reader {
     T point[3], ray[3];
     if (!lift(view, x, y, point, ray)) return 0.0f;
     Place place = about(point);
-    const int32_t leader = gather(place);
+    Seen& seen = seen_[(place.corner[0] + 9 * place.corner[1] + 81 * place.corner[2]) & (kSeen - 1)];
+    if (voted && seen.is(place)) {
+      // Nobody about it voted otherwise than the pixel.
+      *label = seen.label;
+      return 1.0f;
+    }
+    bool alone;
+    int32_t leader = gather(place, &alone);
+    // A pixel that voted has votes about it. More than half of the votes of each voxel are more than half of any
+    // weighted sum.
+    if (leader < 0 || !voted) leader = ask(place, &alone);
+    if (leader >= 0 && voted && alone) {
+      seen = {{place.corner[0], place.corner[1], place.corner[2]}, leader};
+      *label = leader;
+      return 1.0f;
+    }
     int32_t own[3];
     for (int a = 0; a < 3; ++a) own[a] = place.corner[a] + (2 * place.fraction[a] >= kParts);
     const Found at = bricks_[place.brick(own)];
     const Voxel& voxel = at.voxels[cell_of(own[0], own[1], own[2])];
-    // More than half of the votes of every voxel are more than half of any weighted sum.
-    if (leader >= 0 && voted) {
+    if (leader >= 0 && voxel.votes) {
       *label = leader;
       return share_in(voxel, at.pairs, leader);
     }
     poll_.clear();
-    if (!count(place)) {
+    count(place);
+    if (leader < 0) {
       for (const T step : {-view.voxel, view.voxel}) {
         const T moved[3] = {point[0] + step * ray[0], point[1] + step * ray[1], point[2] + step * ray[2]};
         place = about(moved);
-        gather(place);
+        gather(place, &alone);
         count(place);
       }
     }
@@ -52,6 +67,7 @@ class VoxelVotes::Reader {
   // The eight voxels about a point: from `corner` on; `fraction` of kParts from the middle of the first to the second.
   struct Place {
     int32_t corner[3], fraction[3];
+    // Which of `bricks_` has one of the eight.
     int brick(const int32_t* voxel) const {
       return (voxel[0] >> 2 != corner[0] >> 2) << 2 | (voxel[1] >> 2 != corner[1] >> 2) << 1 |
              (voxel[2] >> 2 != corner[2] >> 2);
@@ -61,10 +77,18 @@ class VoxelVotes::Reader {
     const Voxel* voxels;
     const Pair* pairs;
     int32_t leader;
+    bool alone;
   };
   struct Kept {
     uint64_t key = ~uint64_t(0);
     Found found{};
+  };
+  struct Seen {  // nobody voted for another class than label in the eight voxels
+    int32_t corner[3] = {-1, -1, -1};
+    int32_t label = 0;
+    bool is(const Place& place) const {
+      return corner[0] == place.corner[0] && corner[1] == place.corner[1] && corner[2] == place.corner[2];
+    }
   };
   struct Entry {
     int32_t label;
@@ -84,14 +108,16 @@ class VoxelVotes::Reader {
   }
 
   // The bricks of the eight voxels: one to eight of them. `bricks_` has them by `Place::brick`; the others of it are
-  // not asked for. Returns the class that leads in all that have votes, kMany or kNobody.
-  int32_t gather(const Place& place) {
+  // not asked for. Returns the class that leads in all that have votes, kMany or kNobody; alone: nobody voted
+  // otherwise.
+  int32_t gather(const Place& place, bool* alone) {
     int32_t near[3], far[3];
     for (int a = 0; a < 3; ++a) {
       near[a] = place.corner[a] >> 2;
       far[a] = (place.corner[a] + 1) >> 2;
     }
     int32_t leader = kNobody;
+    *alone = true;
     const int x_end = far[0] != near[0], y_end = far[1] != near[1], z_end = far[2] != near[2];
     for (int x = 0; x <= x_end; ++x) {
       for (int y = 0; y <= y_end; ++y) {
@@ -99,6 +125,7 @@ class VoxelVotes::Reader {
           Found& found = bricks_[x << 2 | y << 1 | z];
           found = find(near[0] + x, near[1] + y, near[2] + z);
           leader = agreed(leader, found.leader);
+          *alone = *alone && found.alone;
         }
       }
     }
@@ -111,18 +138,15 @@ class VoxelVotes::Reader {
     if (kept.key != key) {
       const uint64_t hash = hash_of(key);
       const Brick* brick = votes_.shares_[hash >> 58].find(key, hash);
-      kept = {key, brick ? Found{brick->voxels.get(), brick->pairs, brick->leader}
-                         : Found{nothing_.get(), nullptr, kNobody}};
+      kept = {key, brick ? Found{brick->voxels.get(), brick->pairs, brick->leader, brick->alone}
+                         : Found{nothing_.get(), nullptr, kNobody, true}};
     }
     return kept.found;
   }
 
-  static int32_t agreed(int32_t one, int32_t other) {
-    return one == kNobody ? other : other == kNobody || one == other ? one : kMany;
-  }
-
-  // Adds the votes of the eight voxels, interpolated. Whether one class has more than half of the votes of each.
-  bool count(const Place& place) {
+  // do_voxel(brick, voxel, weight) for the eight voxels of gathered bricks.
+  template <class DoVoxel>
+  void each_voxel(const Place& place, DoVoxel do_voxel) const {
     int brick[3][2], cell[3][2];
     uint32_t weight[3][2];
     for (int a = 0; a < 3; ++a) {
@@ -133,23 +157,34 @@ class VoxelVotes::Reader {
         weight[a][step] = step ? place.fraction[a] : kParts - place.fraction[a];
       }
     }
-    int32_t leader = kNobody;
     for (int i = 0; i < 8; ++i) {
       const int x = i >> 2, y = i >> 1 & 1, z = i & 1;
       const Found& at = bricks_[brick[0][x] | brick[1][y] | brick[2][z]];
-      const Voxel& found = at.voxels[cell[0][x] | cell[1][y] | cell[2][z]];
-      const uint64_t share = weight[0][x] * weight[1][y] * weight[2][z];
-      if (found.votes == 0) continue;
-      if (found.label >= 0) {
-        leader = agreed(leader, found.label);
-        add(found.label, share * found.votes);
-      } else {
-        leader = agreed(leader, leader_of(found, at.pairs));
-        const Pair* pair = at.pairs + ~found.label;
-        for (uint32_t k = 0; k < found.votes; ++k) add(pair[k].label, share * pair[k].votes);
-      }
+      do_voxel(at, at.voxels[cell[0][x] | cell[1][y] | cell[2][z]], weight[0][x] * weight[1][y] * weight[2][z]);
     }
-    return leader >= 0;
+  }
+
+  // As `gather`, of the eight voxels alone.
+  int32_t ask(const Place& place, bool* alone) const {
+    int32_t least = INT32_MAX, most = kNobody;
+    uint32_t several = 0;
+    each_voxel(place, [&](const Found&, const Voxel& voxel, uint32_t) {
+      least = std::min(least, voxel.votes ? voxel.label : INT32_MAX);
+      most = std::max(most, voxel.votes ? voxel.label : kNobody);
+      several |= voxel.votes;
+    });
+    *alone = !(several & kSeveral);
+    return most == kNobody ? kNobody : least == most ? most : kMany;
+  }
+
+  // Adds the votes of the eight voxels, interpolated.
+  void count(const Place& place) {
+    each_voxel(place, [&](const Found& at, const Voxel& voxel, uint64_t weight) {
+      if (voxel.votes == 0) return;
+      if (!(voxel.votes & kSeveral)) return add(voxel.label, weight * voxel.votes);
+      const Pair* pair = at.pairs + (voxel.votes & ~kSeveral);
+      for (int32_t k = 1; k <= pair->label; ++k) add(pair[k].label, weight * pair[k].votes);
+    });
   }
 
   // Determinism: whole numbers, whose sums have no order.
@@ -181,20 +216,19 @@ class VoxelVotes::Reader {
     return total ? static_cast<float>(most) / static_cast<float>(total) : 0.0f;
   }
 
-  // The label's share of the votes of a voxel that has some, or 0.
+  // The label's share of the votes of a voxel that has some.
   static float share_in(const Voxel& voxel, const Pair* pairs, int32_t label) {
-    if (voxel.votes == 0 || voxel.label >= 0) return voxel.votes && voxel.label == label ? 1.0f : 0.0f;
-    uint64_t total = 0, own = 0;
-    for (uint32_t k = 0; k < voxel.votes; ++k) {
-      const Pair& pair = pairs[~voxel.label + k];
-      total += pair.votes;
-      if (pair.label == label) own = pair.votes;
+    if (!(voxel.votes & kSeveral)) return voxel.label == label ? 1.0f : 0.0f;
+    const Pair* pair = pairs + (voxel.votes & ~kSeveral);
+    for (int32_t k = 1; k <= pair->label; ++k) {
+      if (pair[k].label == label) return static_cast<float>(pair[k].votes) / static_cast<float>(pair->votes);
     }
-    return static_cast<float>(own) / static_cast<float>(total);
+    return 0.0f;
   }
 
   const VoxelVotes& votes_;
   std::vector<Kept> kept_;
+  std::vector<Seen> seen_;
   std::unique_ptr<Voxel[]> nothing_;
   Found bricks_[8];
   std::vector<Entry> poll_;

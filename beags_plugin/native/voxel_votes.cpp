@@ -10,7 +10,8 @@ namespace {
 
 constexpr uint64_t kNowhere = ~uint64_t(0);  // pixels without a depth, or too far away
 constexpr int kShares = 64;
-constexpr int kKept = 128;  // bricks that were needed last, kept at hand
+constexpr int kKept = 512;  // bricks that were needed last, kept at hand
+constexpr int kBlock = 64;  // voxels that are fetched at a time
 
 }  // namespace
 
@@ -45,19 +46,38 @@ void VoxelVotes::add(const LiftedView<T>& view, const int32_t* labels, int32_t i
     struct Kept {
       uint64_t key = kNowhere;
       Share* share = nullptr;  // null: another thread's
+      Voxel* voxels = nullptr;
       int32_t brick = 0;
     };
     std::vector<Kept> kept(kKept);
-    for (int64_t i = 0; i < count; ++i) {
-      if (keys_[i] == kNowhere) continue;
-      const uint64_t key = keys_[i] >> 6;
-      Kept& at = kept[(key ^ key >> 17 ^ key >> 35) & (kKept - 1)];
-      if (at.key != key) {
-        const uint64_t number = hash_of(key) >> 58;
-        Share* share = number >= first && number < last ? &shares_[number] : nullptr;
-        at = {key, share, share ? share->place(key) : 0};
+    struct Vote {
+      Share* share;
+      Voxel* voxel;
+      int32_t brick, label, cell;
+    } votes[kBlock];
+    for (int64_t first_key = 0; first_key < count; first_key += kBlock) {
+      const int64_t end = std::min(first_key + kBlock, count);
+      int ready = 0;
+      for (int64_t i = first_key; i < end; ++i) {
+        if (keys_[i] == kNowhere) continue;
+        const uint64_t key = keys_[i] >> 6;
+        Kept& at = kept[(key ^ key >> 17 ^ key >> 35) & (kKept - 1)];
+        if (at.key != key) {
+          const uint64_t number = hash_of(key) >> 58;
+          at = {key};
+          if (number >= first && number < last) {
+            at.share = &shares_[number];
+            at.brick = at.share->place(key);
+            at.voxels = at.share->bricks[at.brick].voxels.get();
+          }
+        }
+        if (!at.share) continue;
+        const int32_t cell = static_cast<int32_t>(keys_[i] & 63);
+        votes[ready] = {at.share, at.voxels + cell, at.brick, labels_[i], cell};
+        __builtin_prefetch(votes[ready++].voxel, 1);
       }
-      if (at.share) at.share->vote(at.brick, static_cast<int>(keys_[i] & 63), labels_[i]);
+      for (int k = 0; k < ready; ++k)
+        votes[k].share->vote(*votes[k].voxel, votes[k].brick, votes[k].cell, votes[k].label);
     }
   }
 }
@@ -95,8 +115,7 @@ const VoxelVotes::Brick* VoxelVotes::Share::find(uint64_t key, uint64_t hash) co
   return nullptr;
 }
 
-void VoxelVotes::Share::vote(int32_t brick, int cell, int32_t label) {
-  Voxel& voxel = bricks[brick].voxels[cell];
+void VoxelVotes::Share::vote(Voxel& voxel, int32_t brick, int cell, int32_t label) {
   if (voxel.votes == 0) voxel.label = label;
   if (voxel.label == label) {
     ++voxel.votes;
@@ -135,17 +154,22 @@ void VoxelVotes::Share::decide() {
   for (size_t i = 0; i < extras.size();) {
     Voxel& voxel = bricks[extras[i].voxel / kCells].voxels[extras[i].voxel % kCells];
     const size_t first = pairs.size();
-    pairs.push_back({voxel.label, voxel.votes});
+    Pair most{voxel.label, voxel.votes};
+    uint32_t total = voxel.votes;
+    pairs.insert(pairs.end(), {Pair{0, 0}, most});
     for (const uint64_t same = extras[i].voxel; i < extras.size() && extras[i].voxel == same; ++i) {
       pairs.push_back({extras[i].label, extras[i].votes});
-      if (pairs.back().votes > pairs[first].votes) std::swap(pairs.back(), pairs[first]);
+      total += extras[i].votes;
+      if (extras[i].votes > most.votes) most = pairs.back();
     }
-    voxel = {~static_cast<int32_t>(first), static_cast<uint32_t>(pairs.size() - first)};
+    pairs[first] = {static_cast<int32_t>(pairs.size() - first - 1), total};
+    const bool leads = 2 * uint64_t(most.votes) > total;
+    voxel = {leads ? most.label : kMany, kSeveral | static_cast<uint32_t>(first)};
   }
   std::vector<Extra>().swap(extras);
   for (Brick& brick : bricks) {
     brick.pairs = pairs.data();
-    brick.leader = leader(brick);
+    summarise(brick);
   }
 }
 
@@ -156,26 +180,15 @@ void VoxelVotes::decide() {
   for (int share = 0; share < kShares; ++share) shares_[share].decide();
 }
 
-// The class with more than half of the votes of the voxel, or -1.
-int32_t VoxelVotes::leader_of(const Voxel& voxel, const Pair* pairs) {
-  if (voxel.label >= 0) return voxel.label;
-  const Pair* pair = pairs + ~voxel.label;
-  uint64_t total = 0;
-  for (uint32_t k = 0; k < voxel.votes; ++k) total += pair[k].votes;
-  return 2 * uint64_t(pair->votes) > total ? pair->label : -1;
-}
-
-// The class that leads in every voxel that has votes, or -1.
-int32_t VoxelVotes::Share::leader(const Brick& brick) const {
-  int32_t leader = -1;
+void VoxelVotes::Share::summarise(Brick& brick) const {
+  brick.leader = kNobody;
+  brick.alone = true;
   for (int cell = 0; cell < kCells; ++cell) {
     const Voxel& voxel = brick.voxels[cell];
     if (voxel.votes == 0) continue;
-    const int32_t label = leader_of(voxel, pairs.data());
-    if (label < 0 || (leader >= 0 && leader != label)) return -1;
-    leader = label;
+    brick.leader = agreed(brick.leader, voxel.label);
+    brick.alone = brick.alone && !(voxel.votes & kSeveral);
   }
-  return leader;
 }
 
 template void VoxelVotes::add(const LiftedView<float>&, const int32_t*, int32_t);

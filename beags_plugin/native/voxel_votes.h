@@ -32,27 +32,31 @@ class VoxelVotes {
   void read(const LiftedView<T>& view, int32_t* labels, float* confidence, int32_t ignore) const;
 
  private:
-  static constexpr int kCells = 64;  // a brick is 4 x 4 x 4 voxels
+  static constexpr int kCells = 64;                   // a brick is 4 x 4 x 4 voxels
+  static constexpr int32_t kMany = -1, kNobody = -2;  // instead of a leading class
 
   // While counting: one class and its votes; 0 votes: an empty voxel. Further classes are among the `Extra`. After
-  // `decide`, where there are several: label is ~(index of the first pair), votes their number.
+  // `decide`: label has more than half of the votes, or is -1; where there are several classes, votes is kSeveral and
+  // the place of their `Pair`s.
   struct Voxel {
     int32_t label;
     uint32_t votes;
   };
+  static constexpr uint32_t kSeveral = 1u << 31;
   struct Extra {
     uint64_t voxel;  // place of the brick * 64 + cell
     int32_t label;
     uint32_t votes;  // 0: empty
   };
-  struct Pair {
-    int32_t label;  // of the first of a voxel: the one with more than half of its votes, if there is one
+  struct Pair {  // one class of a voxel; before them: how many there are, and all votes
+    int32_t label;
     uint32_t votes;
   };
   struct Brick {
     std::unique_ptr<Voxel[]> voxels;  // [64], x slowest
     const Pair* pairs = nullptr;      // of its share; after `decide`
-    int32_t leader = -1;              // after `decide`: has more than half of the votes of every voxel, or -1
+    int32_t leader = kMany;           // after `decide`: has more than half of the votes of every voxel, or kMany
+    bool alone = false;               // after `decide`: nobody voted for another class
   };
   struct Slot {
     uint64_t key;
@@ -67,15 +71,17 @@ class VoxelVotes {
     int64_t extras_used = 0;
     int32_t place(uint64_t key);
     const Brick* find(uint64_t key, uint64_t hash) const;
-    void vote(int32_t brick, int cell, int32_t label);
+    void vote(Voxel& voxel, int32_t brick, int cell, int32_t label);
     void vote_extra(uint64_t voxel, int32_t label);
     void grow_slots();
     void grow_extras();
     void decide();
-    int32_t leader(const Brick& brick) const;
+    void summarise(Brick& brick) const;
   };
   class Reader;
-  static int32_t leader_of(const Voxel& voxel, const Pair* pairs);
+  static int32_t agreed(int32_t one, int32_t other) {
+    return one == kNobody ? other : other == kNobody || one == other ? one : kMany;
+  }
 
   int threads_;
   std::vector<Share> shares_;
