@@ -77,7 +77,7 @@ class TorchVotes:
             offset = torch.tensor(step, device=points.device)
             weights.append(torch.where(offset == 1, fraction, _PARTS - fraction).prod(-1))
             numbers.append(self._number(corner.long() + offset))
-        own = self._number(corner.long() + (2 * fraction >= _PARTS))
+        own = self._number(torch.floor(points).long())
         return torch.stack(numbers), torch.stack(weights), own
 
     def _number(self, voxels: Tensor) -> Tensor:

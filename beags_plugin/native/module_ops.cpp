@@ -70,12 +70,11 @@ void bind_votes(nb::class_<VoxelVotes>& votes, const char* suffix) {
             },
             "depth"_a, "to_voxels"_a, "labels"_a, "ignore"_a);
   votes.def(("read_" + end).c_str(),
-            [](const VoxelVotes& self, In depth, In to_voxels, Array<int32_t> labels, Array<float> confidence,
-               int32_t ignore) {
+            [](const VoxelVotes& self, In depth, In to_voxels, Array<int32_t> labels, Array<float> confidence) {
               nb::gil_scoped_release release;
-              self.read(lifted_view<T>(depth, to_voxels), labels.data(), confidence.data(), ignore);
+              self.read(lifted_view<T>(depth, to_voxels), labels.data(), confidence.data());
             },
-            "depth"_a, "to_voxels"_a, "labels"_a, "confidence"_a, "ignore"_a);
+            "depth"_a, "to_voxels"_a, "labels"_a, "confidence"_a);
 }
 
 template <class T>

@@ -9,7 +9,6 @@ namespace ops {
 namespace {
 
 constexpr int kKept = 512;      // bricks that were needed last, kept at hand
-constexpr int kSeen = 512;      // groups of eight voxels that were asked last and agreed
 constexpr int32_t kParts = 64;  // of a voxel, in interpolation weights
 
 }  // namespace
@@ -17,34 +16,26 @@ constexpr int32_t kParts = 64;  // of a voxel, in interpolation weights
 // Reads pixels one after the other.
 class VoxelVotes::Reader {
  public:
-  explicit Reader(const VoxelVotes& votes) : votes_(votes), kept_(kKept), seen_(kSeen), nothing_(new Voxel[kCells]()) {}
+  explicit Reader(const VoxelVotes& votes) : votes_(votes), kept_(kKept), nothing_(new Voxel[kCells]()) {}
 
-  // The pixel's confidence; sets its label. voted: whether it has voted itself.
+  // The pixel's confidence; sets its label.
   template <class T>
-  float read(const LiftedView<T>& view, int x, int y, bool voted, int32_t* label) {
+  float read(const LiftedView<T>& view, int x, int y, int32_t* label) {
     T point[3], ray[3];
     if (!lift(view, x, y, point, ray)) return 0.0f;
-    Place place = about(point);
-    Seen& seen = seen_[(place.corner[0] + 9 * place.corner[1] + 81 * place.corner[2]) & (kSeen - 1)];
-    if (voted && seen.is(place)) {
-      // Nobody about it voted otherwise than the pixel.
-      *label = seen.label;
-      return 1.0f;
-    }
-    bool alone;
-    int32_t leader = gather(place, &alone);
-    // A pixel that voted has votes about it. More than half of the votes of each voxel are more than half of any
-    // weighted sum.
-    if (leader < 0 || !voted) leader = ask(place, &alone);
-    if (leader >= 0 && voted && alone) {
-      seen = {{place.corner[0], place.corner[1], place.corner[2]}, leader};
-      *label = leader;
-      return 1.0f;
-    }
     int32_t own[3];
-    for (int a = 0; a < 3; ++a) own[a] = place.corner[a] + (2 * place.fraction[a] >= kParts);
-    const Found at = bricks_[place.brick(own)];
-    const Voxel& voxel = at.voxels[cell_of(own[0], own[1], own[2])];
+    for (int a = 0; a < 3; ++a) own[a] = floor_of(point[a]) + kHalf;
+    const Found at = find(own[0] >> 2, own[1] >> 2, own[2] >> 2);
+    const int cell = cell_of(own[0], own[1], own[2]);
+    const Voxel& voxel = at.voxels[cell];
+    // More than half of the votes of each voxel are more than half of any weighted sum.
+    if (at.settled >> cell & 1) {
+      *label = at.label;
+      return at.pure >> cell & 1 ? 1.0f : share_in(voxel, at.pairs, at.label);
+    }
+    Place place = about(point);
+    gather(place);
+    const int32_t leader = agreed(place);
     if (leader >= 0 && voxel.votes) {
       *label = leader;
       return share_in(voxel, at.pairs, leader);
@@ -55,7 +46,7 @@ class VoxelVotes::Reader {
       for (const T step : {-view.voxel, view.voxel}) {
         const T moved[3] = {point[0] + step * ray[0], point[1] + step * ray[1], point[2] + step * ray[2]};
         place = about(moved);
-        gather(place, &alone);
+        gather(place);
         count(place);
       }
     }
@@ -67,28 +58,16 @@ class VoxelVotes::Reader {
   // The eight voxels about a point: from `corner` on; `fraction` of kParts from the middle of the first to the second.
   struct Place {
     int32_t corner[3], fraction[3];
-    // Which of `bricks_` has one of the eight.
-    int brick(const int32_t* voxel) const {
-      return (voxel[0] >> 2 != corner[0] >> 2) << 2 | (voxel[1] >> 2 != corner[1] >> 2) << 1 |
-             (voxel[2] >> 2 != corner[2] >> 2);
-    }
   };
   struct Found {
     const Voxel* voxels;
     const Pair* pairs;
-    int32_t leader;
-    bool alone;
+    int32_t label;
+    uint64_t pure, settled;
   };
   struct Kept {
     uint64_t key = ~uint64_t(0);
     Found found{};
-  };
-  struct Seen {  // nobody voted for another class than label in the eight voxels
-    int32_t corner[3] = {-1, -1, -1};
-    int32_t label = 0;
-    bool is(const Place& place) const {
-      return corner[0] == place.corner[0] && corner[1] == place.corner[1] && corner[2] == place.corner[2];
-    }
   };
   struct Entry {
     int32_t label;
@@ -107,39 +86,30 @@ class VoxelVotes::Reader {
     return place;
   }
 
-  // The bricks of the eight voxels: one to eight of them. `bricks_` has them by `Place::brick`; the others of it are
-  // not asked for. Returns the class that leads in all that have votes, kMany or kNobody; alone: nobody voted
-  // otherwise.
-  int32_t gather(const Place& place, bool* alone) {
-    int32_t near[3], far[3];
+  // The bricks of the eight voxels: one to eight of them. `bricks_` has them by bits 4, 2, 1 for one step along x, y,
+  // z; the others of it are not asked for.
+  void gather(const Place& place) {
+    int32_t near[3], end[3];
     for (int a = 0; a < 3; ++a) {
       near[a] = place.corner[a] >> 2;
-      far[a] = (place.corner[a] + 1) >> 2;
+      end[a] = (place.corner[a] + 1) >> 2;
     }
-    int32_t leader = kNobody;
-    *alone = true;
-    const int x_end = far[0] != near[0], y_end = far[1] != near[1], z_end = far[2] != near[2];
-    for (int x = 0; x <= x_end; ++x) {
-      for (int y = 0; y <= y_end; ++y) {
-        for (int z = 0; z <= z_end; ++z) {
-          Found& found = bricks_[x << 2 | y << 1 | z];
-          found = find(near[0] + x, near[1] + y, near[2] + z);
-          leader = agreed(leader, found.leader);
-          *alone = *alone && found.alone;
+    for (int32_t x = near[0]; x <= end[0]; ++x) {
+      for (int32_t y = near[1]; y <= end[1]; ++y) {
+        for (int32_t z = near[2]; z <= end[2]; ++z) {
+          bricks_[(x - near[0]) << 2 | (y - near[1]) << 1 | (z - near[2])] = find(x, y, z);
         }
       }
     }
-    return leader;
   }
 
-  Found find(int32_t x, int32_t y, int32_t z) {
+  const Found& find(int32_t x, int32_t y, int32_t z) {
     const uint64_t key = brick_key(x, y, z);
     Kept& kept = kept_[(x + 5 * y + 25 * z) & (kKept - 1)];
     if (kept.key != key) {
-      const uint64_t hash = hash_of(key);
-      const Brick* brick = votes_.shares_[hash >> 58].find(key, hash);
-      kept = {key, brick ? Found{brick->voxels.get(), brick->pairs, brick->leader, brick->alone}
-                         : Found{nothing_.get(), nullptr, kNobody, true}};
+      const Brick* brick = votes_.find(key);
+      kept = {key, {nothing_.get(), nullptr, 0, 0, 0}};
+      if (brick) kept.found = {brick->voxels.get(), brick->pairs, brick->label, brick->pure, brick->settled};
     }
     return kept.found;
   }
@@ -164,16 +134,13 @@ class VoxelVotes::Reader {
     }
   }
 
-  // As `gather`, of the eight voxels alone.
-  int32_t ask(const Place& place, bool* alone) const {
+  // The class with more than half of the votes of each of the eight voxels that has any, or kMany or kNobody.
+  int32_t agreed(const Place& place) const {
     int32_t least = INT32_MAX, most = kNobody;
-    uint32_t several = 0;
     each_voxel(place, [&](const Found&, const Voxel& voxel, uint32_t) {
       least = std::min(least, voxel.votes ? voxel.label : INT32_MAX);
       most = std::max(most, voxel.votes ? voxel.label : kNobody);
-      several |= voxel.votes;
     });
-    *alone = !(several & kSeveral);
     return most == kNobody ? kNobody : least == most ? most : kMany;
   }
 
@@ -228,14 +195,13 @@ class VoxelVotes::Reader {
 
   const VoxelVotes& votes_;
   std::vector<Kept> kept_;
-  std::vector<Seen> seen_;
   std::unique_ptr<Voxel[]> nothing_;
   Found bricks_[8];
   std::vector<Entry> poll_;
 };
 
 template <class T>
-void VoxelVotes::read(const LiftedView<T>& view, int32_t* labels, float* confidence, int32_t ignore) const {
+void VoxelVotes::read(const LiftedView<T>& view, int32_t* labels, float* confidence) const {
   const int rows = tile_rows(view);
   const int team = static_cast<int64_t>(view.height) * view.width < 4000 ? 1 : threads_;
 #pragma omp parallel num_threads(team)
@@ -245,14 +211,14 @@ void VoxelVotes::read(const LiftedView<T>& view, int32_t* labels, float* confide
     for (int row = 0; row < rows; ++row) {
       each_pixel(view, row, [&](int x, int y) {
         const int64_t i = static_cast<int64_t>(y) * view.width + x;
-        confidence[i] = reader.read(view, x, y, labels[i] != ignore, labels + i);
+        confidence[i] = reader.read(view, x, y, labels + i);
       });
     }
   }
 }
 
-template void VoxelVotes::read(const LiftedView<float>&, int32_t*, float*, int32_t) const;
-template void VoxelVotes::read(const LiftedView<double>&, int32_t*, float*, int32_t) const;
+template void VoxelVotes::read(const LiftedView<float>&, int32_t*, float*) const;
+template void VoxelVotes::read(const LiftedView<double>&, int32_t*, float*) const;
 
 }  // namespace ops
 }  // namespace beags

@@ -25,6 +25,10 @@ inline uint64_t brick_key(int32_t x, int32_t y, int32_t z) {
 // A voxel's place in its brick.
 inline int cell_of(int32_t x, int32_t y, int32_t z) { return (x & 3) << 4 | (y & 3) << 2 | (z & 3); }
 
+// The voxels of a brick, a bit each, whose place along an axis (0: x) is 0; one step along it is a shift by `kShift`.
+constexpr uint64_t kPlane[3] = {0xffff, 0x000f000f000f000f, 0x1111111111111111};
+constexpr int kShift[3] = {16, 4, 1};
+
 // Largest whole number that is not above x; |x| is small.
 template <class T>
 int32_t floor_of(T x) {

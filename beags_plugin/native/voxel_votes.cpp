@@ -178,17 +178,58 @@ void VoxelVotes::decide() {
   std::vector<int32_t>().swap(labels_);
 #pragma omp parallel for num_threads(threads_) schedule(dynamic, 1)
   for (int share = 0; share < kShares; ++share) shares_[share].decide();
+#pragma omp parallel for num_threads(threads_) schedule(dynamic, 1)
+  for (int share = 0; share < kShares; ++share) {
+    for (const Slot& slot : shares_[share].slots) {
+      if (slot.brick >= 0) settle(slot.key, shares_[share].bricks[slot.brick]);
+    }
+  }
 }
 
 void VoxelVotes::Share::summarise(Brick& brick) const {
-  brick.leader = kNobody;
-  brick.alone = true;
   for (int cell = 0; cell < kCells; ++cell) {
     const Voxel& voxel = brick.voxels[cell];
     if (voxel.votes == 0) continue;
-    brick.leader = agreed(brick.leader, voxel.label);
-    brick.alone = brick.alone && !(voxel.votes & kSeveral);
+    if (!brick.led && voxel.label >= 0) brick.label = voxel.label;
+    const uint64_t bit = uint64_t(1) << cell;
+    brick.voted |= bit;
+    if (voxel.label != brick.label) continue;
+    brick.led |= bit;
+    if (!(voxel.votes & kSeveral)) brick.pure |= bit;
   }
+}
+
+const VoxelVotes::Brick* VoxelVotes::find(uint64_t key) const {
+  const uint64_t hash = hash_of(key);
+  return shares_[hash >> 58].find(key, hash);
+}
+
+void VoxelVotes::settle(uint64_t key, Brick& brick) const {
+  uint64_t disputed = 0;
+  for (int side = 0; side < 27; ++side) {
+    const int step[3] = {side / 9 - 1, side / 3 % 3 - 1, side % 3 - 1};
+    // Keys are sums: no coordinate is so near its end that it would carry.
+    const Brick* other = side == 13 ? &brick
+                                    : find(key + (static_cast<uint64_t>(static_cast<int64_t>(step[0])) << 38) +
+                                           (static_cast<uint64_t>(static_cast<int64_t>(step[1])) << 19) +
+                                           static_cast<uint64_t>(static_cast<int64_t>(step[2])));
+    if (!other) continue;
+    uint64_t against = other->label == brick.label ? other->voted & ~other->led : other->voted;
+    // Spread to the voxels of this brick that it touches.
+    for (int axis = 0; axis < 3; ++axis) {
+      const uint64_t first = kPlane[axis], last = first << 3 * kShift[axis];
+      const int shift = kShift[axis];
+      if (step[axis] > 0) {
+        against = (against & first) << 3 * shift;
+      } else if (step[axis] < 0) {
+        against = (against & last) >> 3 * shift;
+      } else {
+        against |= (against & ~last) << shift | (against & ~first) >> shift;
+      }
+    }
+    disputed |= against;
+  }
+  brick.settled = brick.led & ~disputed;
 }
 
 template void VoxelVotes::add(const LiftedView<float>&, const int32_t*, int32_t);

@@ -27,13 +27,13 @@ class VoxelVotes {
   // Counts are complete.
   void decide();
   // Per pixel with a depth, after `decide`: the winner of the votes about it (its label stays where several lead or
-  // nobody voted) and its share of them. labels: those that the view has added, or `ignore` for all.
+  // nobody voted) and its share of them.
   template <class T>
-  void read(const LiftedView<T>& view, int32_t* labels, float* confidence, int32_t ignore) const;
+  void read(const LiftedView<T>& view, int32_t* labels, float* confidence) const;
 
  private:
   static constexpr int kCells = 64;                   // a brick is 4 x 4 x 4 voxels
-  static constexpr int32_t kMany = -1, kNobody = -2;  // instead of a leading class
+  static constexpr int32_t kNobody = -2, kMany = -1;  // instead of a leading class
 
   // While counting: one class and its votes; 0 votes: an empty voxel. Further classes are among the `Extra`. After
   // `decide`: label has more than half of the votes, or is -1; where there are several classes, votes is kSeveral and
@@ -55,8 +55,11 @@ class VoxelVotes {
   struct Brick {
     std::unique_ptr<Voxel[]> voxels;  // [64], x slowest
     const Pair* pairs = nullptr;      // of its share; after `decide`
-    int32_t leader = kMany;           // after `decide`: has more than half of the votes of every voxel, or kMany
-    bool alone = false;               // after `decide`: nobody voted for another class
+    // After `decide`, a bit for each voxel. The class `label` has in it: some votes but no others; more than half of
+    // its votes, and of those of all 26 voxels about it that have any.
+    int32_t label = 0;
+    uint64_t pure = 0, settled = 0;
+    uint64_t voted = 0, led = 0;  // has votes; more than half of them for `label`
   };
   struct Slot {
     uint64_t key;
@@ -79,9 +82,8 @@ class VoxelVotes {
     void summarise(Brick& brick) const;
   };
   class Reader;
-  static int32_t agreed(int32_t one, int32_t other) {
-    return one == kNobody ? other : other == kNobody || one == other ? one : kMany;
-  }
+  const Brick* find(uint64_t key) const;
+  void settle(uint64_t key, Brick& brick) const;
 
   int threads_;
   std::vector<Share> shares_;

@@ -41,13 +41,13 @@ class VoxelVotes:
         """The winner about each pixel's point (its label where several lead or nobody voted), and its share of the votes
         in the voxel of the point (of those that were read, if nobody voted there).
 
-        depth: [H, W] float. labels: [H, W] int32, those that this view has added, or ``ignore`` everywhere.
+        depth: [H, W] float. labels: [H, W] int32.
         Returns [H, W] int32 and [H, W] float32 (0 where nobody voted).
         """
         depth, to_voxels = _view(depth, to_voxels)
         labels = extension.plain("labels", labels, tuple(depth.shape), torch.int32).clone()
         confidence = torch.empty(tuple(depth.shape), dtype=torch.float32)
-        extension.function("read", depth, self._native)(depth, to_voxels, labels, confidence, self._ignore)
+        extension.function("read", depth, self._native)(depth, to_voxels, labels, confidence)
         return labels, confidence
 
 
