@@ -8,7 +8,6 @@ namespace beags {
 namespace ops {
 namespace {
 
-constexpr int kKept = 512;      // bricks that were needed last, kept at hand
 constexpr int32_t kParts = 64;  // of a voxel, in interpolation weights
 
 }  // namespace
@@ -105,7 +104,7 @@ class VoxelVotes::Reader {
 
   const Found& find(int32_t x, int32_t y, int32_t z) {
     const uint64_t key = brick_key(x, y, z);
-    Kept& kept = kept_[(x + 5 * y + 25 * z) & (kKept - 1)];
+    Kept& kept = kept_[kept_at(key)];
     if (kept.key != key) {
       const Brick* brick = votes_.find(key);
       kept = {key, {nothing_.get(), nullptr, 0, 0, 0}};

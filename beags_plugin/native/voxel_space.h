@@ -22,6 +22,9 @@ inline uint64_t hash_of(uint64_t key) {
 inline uint64_t brick_key(int32_t x, int32_t y, int32_t z) {
   return static_cast<uint64_t>(x) << 38 | static_cast<uint64_t>(y) << 19 | static_cast<uint64_t>(z);
 }
+// Bricks that were needed last are kept at hand: those of a cube of 16 bricks' side have places of their own.
+constexpr int kKept = 1 << 12;
+inline int kept_at(uint64_t key) { return static_cast<int>((key & 15) | (key >> 15 & 0xf0) | (key >> 30 & 0xf00)); }
 // A voxel's place in its brick.
 inline int cell_of(int32_t x, int32_t y, int32_t z) { return (x & 3) << 4 | (y & 3) << 2 | (z & 3); }
 

@@ -10,7 +10,6 @@ namespace {
 
 constexpr uint64_t kNowhere = ~uint64_t(0);  // pixels without a depth, or too far away
 constexpr int kShares = 64;
-constexpr int kKept = 512;  // bricks that were needed last, kept at hand
 constexpr int kBlock = 64;  // voxels that are fetched at a time
 
 }  // namespace
@@ -61,7 +60,7 @@ void VoxelVotes::add(const LiftedView<T>& view, const int32_t* labels, int32_t i
       for (int64_t i = first_key; i < end; ++i) {
         if (keys_[i] == kNowhere) continue;
         const uint64_t key = keys_[i] >> 6;
-        Kept& at = kept[(key ^ key >> 17 ^ key >> 35) & (kKept - 1)];
+        Kept& at = kept[kept_at(key)];
         if (at.key != key) {
           const uint64_t number = hash_of(key) >> 58;
           at = {key};
@@ -208,6 +207,11 @@ void VoxelVotes::settle(uint64_t key, Brick& brick) const {
   uint64_t disputed = 0;
   for (int side = 0; side < 27; ++side) {
     const int step[3] = {side / 9 - 1, side / 3 % 3 - 1, side % 3 - 1};
+    uint64_t touched = brick.led;
+    for (int axis = 0; axis < 3; ++axis) {
+      if (step[axis]) touched &= step[axis] > 0 ? kPlane[axis] << 3 * kShift[axis] : kPlane[axis];
+    }
+    if (!touched) continue;
     // Keys are sums: no coordinate is so near its end that it would carry.
     const Brick* other = side == 13 ? &brick
                                     : find(key + (static_cast<uint64_t>(static_cast<int64_t>(step[0])) << 38) +
