@@ -14,7 +14,7 @@ from beags_plugin.ops import extension
 from beags_plugin.ops.voxel_votes import VoxelVotes
 from beags_plugin.rasterizers.interface import IGNORE
 
-VOXEL_PIXELS = 1.5  # side of a voxel, in pixels seen at the objects' median depth
+VOXEL_PIXELS = 1.75  # side of a voxel, in pixels seen at the objects' median depth
 _FOOTPRINTS = 1 << 16  # pixels that measure the voxel size, spread over all views
 
 
