@@ -38,8 +38,8 @@ class VoxelVotes:
         self._native.decide()
 
     def read(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """The winner about each pixel's point (its label where several lead or nobody voted), and its share of the votes
-        in the voxel of the point (of those that were read, if nobody voted there).
+        """The winner about each pixel's point (its label where several lead or nobody voted), and its share of votes:
+        of those in the voxel of the point, or of those that were read, if nobody voted there.
 
         depth: [H, W] float. labels: [H, W] int32.
         Returns [H, W] int32 and [H, W] float32 (0 where nobody voted).
