@@ -179,15 +179,15 @@ class Scaling:
 
     classes: tuple[int, ...] = (1, 4, 16, 64, 256)
     """Numbers of object classes."""
-    views: tuple[int, ...] = (6, 12, 24, 48)
+    views: tuple[int, ...] = (4, 8, 16, 32)
     """Numbers of training views."""
-    gaussians: tuple[int, ...] = (5_000, 10_000, 20_000, 40_000)
+    gaussians: tuple[int, ...] = (2_500, 5_000, 10_000, 20_000)
     """Numbers of Gaussians."""
     pixels: tuple[int, ...] = (4_800, 10_800, 19_200, 43_200)
     """Pixels of a view."""
     channels: int = 16
     """Up to so many classes, the step of methods that draw a channel per class is measured beside ours."""
-    calls: int = 5
+    calls: int = 3
     """How often each is timed, in turn; the median counts."""
     quick: bool = False
     """Try it out in seconds: tiny sizes, figures that mean nothing."""

@@ -40,11 +40,11 @@ class Options:
     """What the command line asks for; see ``commands.Scaling``."""
 
     classes: tuple[int, ...] = (1, 4, 16, 64, 256)
-    views: tuple[int, ...] = (6, 12, 24, 48)
-    gaussians: tuple[int, ...] = (5_000, 10_000, 20_000, 40_000)
+    views: tuple[int, ...] = (4, 8, 16, 32)
+    gaussians: tuple[int, ...] = (2_500, 5_000, 10_000, 20_000)
     pixels: tuple[int, ...] = (4_800, 10_800, 19_200, 43_200)
     channels: int = 16
-    calls: int = 5
+    calls: int = 3
     quick: bool = False
     output: Path = Path("outputs/bench")
     json: Path | None = None
@@ -132,8 +132,7 @@ def measure(axis: str, sizes: Sequence[int], base: Sizes, channels: int, calls: 
     with progress_bar(f"Scaling with {axis}") as progress:
         for turn in range(calls + 1):
             for key, call in work.items():
-                if turn == 0:  # the first call warms up
-                    call()
+                if turn == 0:  # warms up too
                     memory[key] = peak_of(call)
                 else:
                     start = time.perf_counter()
@@ -157,7 +156,7 @@ def slopes(rows: Sequence[Row]) -> list[Slope]:
 
 
 def tables(rows: Sequence[Row], found: Sequence[Slope]):
-    """Slopes of time, slopes of memory, and the classes in milliseconds and MB."""
+    """Slopes of time and of memory, then both at each number of classes."""
     by_place = {(slope.axis, slope.stage): slope for slope in found}
     axes = list(dict.fromkeys(slope.axis for slope in found))
     for kind in ("time", "memory"):
@@ -165,14 +164,12 @@ def tables(rows: Sequence[Row], found: Sequence[Slope]):
         yield plain_table(f"Slope of {kind} (0 flat, 1 linear)", ("stage", *axes), lines)
     line = {(row.size, row.stage): row for row in rows if row.axis == "classes"}
     sizes = sorted({size for size, _ in line})
-    cells = []
-    for stage in STAGES:
-        known = [line.get((size, stage)) for size in sizes]
-        cells.append([
-            stage,
-            *("–" if r is None else f"{1000 * r.seconds:.1f} / {number(r.memory_mb, 1)}" for r in known),
-        ])  # fmt: skip
-    yield plain_table("Milliseconds / MB at so many classes", ("stage", *map(str, sizes)), cells)
+    for name, title, factor in (("seconds", "Milliseconds", 1000.0), ("memory_mb", "MB", 1.0)):
+        cells = []
+        for stage in STAGES:
+            known = [getattr(line[size, stage], name) if (size, stage) in line else None for size in sizes]
+            cells.append([stage, *(number(None if value is None else factor * value, 1) for value in known)])
+        yield plain_table(f"{title} at so many classes", ("stage", *map(str, sizes)), cells)
 
 
 def draw(path: Path, rows: Sequence[Row]) -> None:

@@ -24,8 +24,8 @@ class Sizes:
     """How much of everything there is. classes: objects, without the background; pixels: of one view (4 x 3)."""
 
     classes: int = 8
-    views: int = 12
-    gaussians: int = 20_000
+    views: int = 8
+    gaussians: int = 10_000
     pixels: int = 19_200
 
 
