@@ -23,7 +23,7 @@ from beags_plugin.bench.report import (
     write_json,
 )
 from beags_plugin.bench.scaling_scene import Sizes, make_scene
-from beags_plugin.bench.scaling_stages import CHANNELS, STAGES, stages
+from beags_plugin.bench.scaling_stages import CHANNELS, STAGES, STEP, stages
 from beags_plugin.errors import UserError
 from beags_plugin.progress import progress_bar
 
@@ -174,8 +174,10 @@ def tables(rows: Sequence[Row], found: Sequence[Slope]):
 
 def draw(path: Path, rows: Sequence[Row]) -> None:
     """Time above, memory below, a column for each axis, a line for each stage."""
+    from matplotlib.ticker import LogLocator, StrMethodFormatter
+
     axes = list(dict.fromkeys(row.axis for row in rows))
-    figure, plots = new_figure(len(axes), 2, (3.9, 3.2))
+    figure, plots = new_figure(len(axes), 2, (3.6, 3.2))
     shown = (("seconds", "milliseconds", 1000.0), ("memory_mb", "peak memory, MB", 1.0))
     for line, (name, title, factor) in enumerate(shown):
         for plot, axis in zip(plots[line], axes, strict=True):
@@ -187,15 +189,23 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
                 ]
                 if known:
                     style = "s--" if stage == CHANNELS else "o-"
-                    plot.plot(*zip(*known, strict=True), style, color=f"C{color}", label=stage, markersize=4)
+                    width = 2.5 if stage in (STEP, CHANNELS) else 1.2
+                    plot.plot(
+                        *zip(*known, strict=True), style, color=f"C{color}", label=stage, markersize=4, linewidth=width
+                    )
+            if plot is not plots[line][0]:
+                plot.sharey(plots[line][0])
+                plot.tick_params(labelleft=False)
             sizes = sorted({row.size for row in rows if row.axis == axis})
             plot.set_xscale("log")
             plot.set_yscale("log")
-            plot.set_xticks(sizes, [f"{size // 1000}k" if size >= 5000 else str(size) for size in sizes])
+            plot.set_xticks(sizes, [f"{size / 1000:g}k" if size >= 1000 else str(size) for size in sizes])
             plot.minorticks_off()
+            plot.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            plot.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
             plot.grid(alpha=0.3)
             plot.set_xlabel("Gaussians" if axis == "gaussians" else axis)
         plots[line][0].set_ylabel(title)
     handles, names = plots[0][0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=len(STAGES), fontsize="small")
+    figure.legend(handles, names, loc="outside lower center", ncols=len(STAGES), frameon=False)
     save_figure(path, figure)

@@ -25,7 +25,8 @@ from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, Raster
 
 STEP = "refinement step"
 CHANNELS = "step, a channel per class"
-STAGES = (STEP, "depth", "pairwise", "voxel", "assignment", "voxel grids", CHANNELS)
+PAIRWISE, VOXEL = "reprojection, pairwise", "reprojection, voxel"
+STAGES = (STEP, "depth", PAIRWISE, VOXEL, "assignment", "voxel grids", CHANNELS)
 _K = 50  # neighbours that set the voxel size, as in the presets for small scenes
 _NO_GEOMETRY = RasterSettings(SETTINGS.near, SETTINGS.far, geometry=False)
 _RATE = 1e-9  # of learning: every call shall find the same scene
@@ -43,8 +44,8 @@ def stages(scene: SyntheticScene, rasterizer: Rasterizer, channels: bool) -> dic
     calls: dict[str, Callable[[], object]] = {
         STEP: _Step(scene, rasterizer, grid),
         "depth": lambda: _depths(scene, rasterizer),
-        "pairwise": reproject("pairwise"),
-        "voxel": reproject("voxel"),
+        PAIRWISE: reproject("pairwise"),
+        VOXEL: reproject("voxel"),
         "assignment": lambda: assign_classes(
             scene.surfels, scene.cameras, labels, rasterizer, SETTINGS, scene.num_classes
         ),
