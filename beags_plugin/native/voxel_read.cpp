@@ -24,14 +24,15 @@ class VoxelVotes::Reader {
     if (!lift(view, x, y, point, ray)) return 0.0f;
     int32_t own[3];
     for (int a = 0; a < 3; ++a) own[a] = floor_of(point[a]) + kHalf;
-    const Found at = find(own[0] >> 2, own[1] >> 2, own[2] >> 2);
+    const Found& near = find(own[0] >> 2, own[1] >> 2, own[2] >> 2);
     const int cell = cell_of(own[0], own[1], own[2]);
-    const Voxel& voxel = at.voxels[cell];
     // More than half of the votes of each voxel are more than half of any weighted sum.
-    if (at.settled >> cell & 1) {
-      *label = at.label;
-      return at.pure >> cell & 1 ? 1.0f : share_in(voxel, at.pairs, at.label);
+    if (near.settled >> cell & 1) {
+      *label = near.label;
+      return near.pure >> cell & 1 ? 1.0f : share_in(near.voxels[cell], near.pairs, near.label);
     }
+    const Found at = near;  // what follows asks for others, which may take its place
+    const Voxel& voxel = at.voxels[cell];
     Place place = about(point);
     gather(place);
     const int32_t leader = agreed(place);

@@ -159,7 +159,10 @@ void VoxelVotes::Share::decide() {
     for (const uint64_t same = extras[i].voxel; i < extras.size() && extras[i].voxel == same; ++i) {
       pairs.push_back({extras[i].label, extras[i].votes});
       total += extras[i].votes;
-      if (extras[i].votes > most.votes) most = pairs.back();
+      if (extras[i].votes > most.votes) {
+        most = pairs.back();
+        std::swap(pairs.back(), pairs[first + 1]);  // the first that is looked at
+      }
     }
     pairs[first] = {static_cast<int32_t>(pairs.size() - first - 1), total};
     const bool leads = 2 * uint64_t(most.votes) > total;
