@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import pytest
@@ -85,39 +86,74 @@ def test_no_views_and_no_masks(method):
         assert (result.labels == IGNORE).all() and not result.confidence.any()
 
 
+def _poll(point, votes):
+    """Votes about a point, weighted in 64ths of a voxel by how near the eight voxels are; whether these agree."""
+    corner = [math.floor(value - 0.5) for value in point]
+    parts = [int(64 * (value - 0.5 - c)) for value, c in zip(point, corner, strict=True)]
+    poll: dict[int, int] = {}
+    leaders = set()
+    for offset in itertools.product((0, 1), repeat=3):
+        here = votes.get(tuple(c + o for c, o in zip(corner, offset, strict=True)))
+        weight = math.prod(part if o else 64 - part for part, o in zip(parts, offset, strict=True))
+        if here:
+            leaders.add(next((label for label, n in here.items() if 2 * n > sum(here.values())), None))
+        for label, n in (here or {}).items():
+            poll[label] = poll.get(label, 0) + weight * n
+    return poll, len(leaders) == 1 and None not in leaders
+
+
+def _read(point, step, label, votes):
+    """The label and the confidence of one pixel, and whether it was read before and behind its point."""
+    poll, agreed = _poll(point, votes)
+    if not agreed:
+        for sign in (-1, 1):
+            for other, n in _poll([p + sign * s for p, s in zip(point, step, strict=True)], votes)[0].items():
+                poll[other] = poll.get(other, 0) + n
+    leaders = [other for other, n in poll.items() if n and n == max(poll.values())]
+    label = leaders[0] if len(leaders) == 1 else label
+    own = votes.get(tuple(math.floor(value) for value in point))
+    if own:
+        return label, own.get(label, 0) / sum(own.values()), not agreed
+    total = sum(poll.values())
+    return label, max(poll.values()) / total if total else 0.0, not agreed
+
+
 @both
 def test_voxels_equal_loops(monkeypatch):
     """Each pixel's label from a dictionary of votes per voxel."""
-    monkeypatch.setattr(voxel_reprojection, "VOXEL_PIXELS", 3.0)
+    monkeypatch.setattr(voxel_reprojection, "VOXEL_PIXELS", 1.5)
     depths, cameras, labels = _scene()
+    g = torch.Generator().manual_seed(5)
+    labels = [None if m is None else torch.where(torch.rand(m.shape, generator=g) < 0.5, 1, m) for m in labels]
     calls = []
     results = reproject_voxel(depths, cameras, labels, 3, progress=lambda *state: calls.append(state))
-    footprints = [d / math.sqrt(9.0 * 8.5) for depth in depths for d in depth.view(-1).tolist() if d > 0]
-    size = 3.0 * sorted(footprints)[(len(footprints) - 1) // 2]
+    of_objects = [d[(d > 0) & (m > 0) & (m != IGNORE)] for d, m in zip(depths, labels, strict=True) if m is not None]
+    footprints = sorted((torch.cat(of_objects) / math.sqrt(9.0 * 8.5)).tolist())
+    size = 1.5 * footprints[(len(footprints) - 1) // 2]
     origin = torch.stack([camera.center for camera in cameras]).mean(0)
-    keys = [
-        torch.floor((lift(d, c) - origin) / size).view(-1, 3).tolist() for d, c in zip(depths, cameras, strict=True)
-    ]
+    points = [((lift(d, c) - origin) / size).view(-1, 3).tolist() for d, c in zip(depths, cameras, strict=True)]
     votes: dict[tuple, dict[int, int]] = {}
-    for depth, mask, voxels in zip(depths, labels, keys, strict=True):
+    for depth, mask, found in zip(depths, labels, points, strict=True):
         if mask is None:
             continue
-        for d, label, voxel in zip(depth.view(-1).tolist(), mask.view(-1).tolist(), voxels, strict=True):
+        for d, label, point in zip(depth.view(-1).tolist(), mask.view(-1).tolist(), found, strict=True):
             if d > 0 and label != IGNORE:
-                here = votes.setdefault(tuple(voxel), {})
+                here = votes.setdefault(tuple(math.floor(value) for value in point), {})
                 here[label] = here.get(label, 0) + 1
-    pooled = 0
-    for depth, mask, voxels, result in zip(depths, labels, keys, results, strict=True):
+    changed, along_ray = 0, []
+    for i, (depth, camera, mask, result) in enumerate(zip(depths, cameras, labels, results, strict=True)):
         old = [IGNORE] * depth.numel() if mask is None else mask.view(-1).tolist()
+        rays = (lift(torch.ones_like(depth), camera) - camera.center).view(-1, 3)
+        middle = torch.linalg.inv(camera.K) @ torch.tensor([camera.width / 2, camera.height / 2, 1.0]).double()
+        steps = (rays / middle.norm()).tolist()  # one voxel long where the ray is that of the image's centre
         found = zip(result.labels.view(-1).tolist(), result.confidence.view(-1).tolist(), strict=True)
-        for d, label, voxel, (new, confidence) in zip(depth.view(-1).tolist(), old, voxels, found, strict=True):
-            counts = sorted(votes.get(tuple(voxel), {}).items(), key=lambda pair: -pair[1]) if d > 0 else []
-            total = sum(count for _, count in counts)
-            pooled += total > 2
-            assert confidence == pytest.approx(counts[0][1] / total if counts else 0.0)
-            clear = counts and (len(counts) == 1 or counts[0][1] > counts[1][1])
-            assert new == (counts[0][0] if clear else label)
-    assert pooled > 30
+        for d, label, point, step, pair in zip(depth.view(-1).tolist(), old, points[i], steps, found, strict=True):
+            expected = _read(point, step, label, votes) if d > 0 else (label, 0.0, False)
+            assert pair == (expected[0], pytest.approx(expected[1]))
+            changed += expected[0] != label
+            along_ray.append(expected[2])
+    assert changed > 30
+    assert 10 < sum(along_ray) < len(along_ray) - 50  # both ways of reading occur
     assert calls == [(i, 8) for i in range(1, 9)]
 
 

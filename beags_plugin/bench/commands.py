@@ -173,6 +173,39 @@ class Required:
         run_required(self.run_config, self.json, self.csv)
 
 
+@dataclass
+class Scaling:
+    """Time and memory of a refinement step and of each stage before it against classes, views, Gaussians and pixels."""
+
+    classes: tuple[int, ...] = (1, 4, 16, 64, 256)
+    """Numbers of object classes."""
+    views: tuple[int, ...] = (4, 8, 16, 32)
+    """Numbers of training views."""
+    gaussians: tuple[int, ...] = (2_500, 5_000, 10_000, 20_000)
+    """Numbers of Gaussians."""
+    pixels: tuple[int, ...] = (4_800, 10_800, 19_200, 43_200)
+    """Pixels of a view."""
+    channels: int = 16
+    """Up to so many classes, the step of methods that draw a channel per class is measured beside ours."""
+    calls: int = 3
+    """How often each is timed, in turn; the median counts."""
+    quick: bool = False
+    """Try it out in seconds: tiny sizes, figures that mean nothing."""
+    output: Path = Path("outputs/bench")
+    """Folder of results."""
+    json: Path | None = None
+    """File for all figures; <output>/scaling.json if left out."""
+    csv: Path | None = None
+    """File for all figures as a table; <output>/scaling.csv if left out."""
+    picture: Path | None = None
+    """File for the picture; <output>/scaling.png if left out."""
+
+    def run(self) -> None:
+        from beags_plugin.bench.scaling import Options, run_scaling
+
+        run_scaling(Options(**vars(self)))
+
+
 Measurement = (
     Annotated[Ablation, tyro.conf.subcommand(name="ablation")]
     | Annotated[Sensitivity, tyro.conf.subcommand(name="sensitivity")]
@@ -184,5 +217,6 @@ Measurement = (
     | Annotated[BaseLimits, tyro.conf.subcommand(name="base-limits")]
     | Annotated[Reprojection, tyro.conf.subcommand(name="reprojection")]
     | Annotated[Required, tyro.conf.subcommand(name="required")]
+    | Annotated[Scaling, tyro.conf.subcommand(name="scaling")]
     | Annotated[ExperimentFile, tyro.conf.subcommand(name="file")]
 )

@@ -175,9 +175,9 @@ def measure(scene: Scene, depth: str, methods: Sequence[str], calls: int) -> lis
             times[name].append((time.perf_counter() - wall, time.process_time() - cpu))
             labels[name] = [mask.labels for mask in masks]
     for name in methods:
-        least = [min(column) for column in zip(*times[name], strict=True)]
+        wall, cpu = min(t[0] for t in times[name]), min(t[1] for t in times[name])
         equal = same_share(labels[name], labels[REFERENCE]) if REFERENCE in labels else None
-        rows.append(Row(views, depth, name, *least, *quality(labels[name], scene.exact, scene.num_classes), equal))
+        rows.append(Row(views, depth, name, wall, cpu, *quality(labels[name], scene.exact, scene.num_classes), equal))
     return rows
 
 

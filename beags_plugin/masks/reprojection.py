@@ -98,10 +98,10 @@ def check_views(depths, cameras, labels, num_classes: int, tau: float) -> None:
                 f"the mask of view {index} is {mask.shape[1]} x {mask.shape[0]} pixels but its image is "
                 f"{camera.width} x {camera.height}: give both the same size."
             )
-        known = mask[mask != IGNORE]
-        if known.numel() and (int(known.min()) < 0 or int(known.max()) >= num_classes):
+        low, high = (int(value) for value in torch.where(mask == IGNORE, 0, mask).aminmax())
+        if low < 0 or high >= num_classes:
             raise UserError(
-                f"the mask of view {index} holds class ids {int(known.min())}..{int(known.max())}, but only "
+                f"the mask of view {index} holds class ids {low}..{high}, but only "
                 f"0..{num_classes - 1} are known: name all classes."
             )
 

@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.lifting import lift
+from beags_plugin.masks.pooled_votes import TorchVotes
 from beags_plugin.masks.reprojection import ReprojectedMask, check_views
 from beags_plugin.ops import extension
 from beags_plugin.ops.voxel_votes import VoxelVotes
 from beags_plugin.rasterizers.interface import IGNORE
 
-VOXEL_PIXELS = 2.0  # side of a voxel, in pixels seen at the median depth
-_HALF = 1 << 20  # 21 bits for each of the three voxel indices in a key
+VOXEL_PIXELS = 1.75  # side of a voxel, in pixels seen at the objects' median depth
+_FOOTPRINTS = 1 << 16  # pixels that measure the voxel size, spread over all views
 
 
 def reproject_voxel(
@@ -26,103 +26,71 @@ def reproject_voxel(
     tau: float = 0.02,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[ReprojectedMask]:
-    """Give every pixel of every view the class that most lifted pixels of all views put into its voxel.
+    """Give every pixel of every view the class for which most lifted pixels of all views vote about its point.
 
-    Arguments and results are those of ``reprojection.reproject_pairwise``, and so is what a tie does. The points are
-    lifted from what each view sees, so no vote passes through a surface and ``tau`` is not used: a vote counts in its
-    voxel, whose side is ``VOXEL_PIXELS`` pixels at the median depth. What lies much farther away is voted on by few.
-    Cost O(V pixels), memory linear in the voxels.
+    Arguments and results are those of ``reprojection.reproject_pairwise``, and so is what a tie does. A pixel votes in
+    the voxel that holds its lifted point; voxels are ``VOXEL_PIXELS`` pixels wide at the median depth of the objects.
+    It reads the votes of the eight voxels about its point, each weighted by how near it is (trilinear), so that it does
+    not matter where the borders of the voxels lie. Unless one class has more than half of the votes of each, it reads
+    them one voxel before and one behind its point along its ray too: an error of its own depth then does less harm.
+    The confidence is the label's share of the votes in the voxel of the point, or of those read if that has none.
+    The points are lifted from what each view sees, so no vote passes through a surface, and ``tau`` is not used.
+    Cost O(V pixels), memory linear in the voxels; neither depends on the number of classes.
     """
     check_views(depths, cameras, labels, num_classes, tau)
     if not cameras:
         return []
-    size = _voxel_size(depths, cameras)
-    origin = _origin(cameras)
-    votes = VoxelVotes(origin, size) if extension.can_take(*depths) else _TorchVotes(origin, size)
+    size, origin = _voxel_size(depths, cameras, labels), _origin(cameras)
+    votes = VoxelVotes(IGNORE) if extension.can_take(*depths) else TorchVotes(IGNORE)
     views = len(cameras)
-    for i, (depth, camera, mask) in enumerate(zip(depths, cameras, labels, strict=True)):
+    lifts = [_to_voxels(camera, origin, size).to(depth) for depth, camera in zip(depths, cameras, strict=True)]
+    for i, (depth, mask) in enumerate(zip(depths, labels, strict=True)):
         if mask is not None:
-            known = _drawn(depth) & (mask != IGNORE)
-            votes.add(lift(depth, camera)[known], mask[known].int())
+            votes.add(depth, lifts[i], mask.int())
         if progress:
             progress(i + 1, 2 * views)
     votes.decide()
     results = []
-    for i, (depth, camera, mask) in enumerate(zip(depths, cameras, labels, strict=True)):
-        shape = (camera.height, camera.width)
-        voted = (
-            torch.full(shape, IGNORE, dtype=torch.int32, device=depth.device) if mask is None else mask.int().clone()
-        )
-        confidence = torch.zeros(shape, dtype=torch.float32, device=depth.device)
-        drawn = _drawn(depth)
-        voted[drawn], confidence[drawn] = votes.read(lift(depth, camera)[drawn], voted[drawn])
-        results.append(ReprojectedMask(voted, confidence))
+    for i, (depth, mask) in enumerate(zip(depths, labels, strict=True)):
+        known = torch.full_like(depth, IGNORE, dtype=torch.int32) if mask is None else mask.int()
+        results.append(ReprojectedMask(*votes.read(depth, lifts[i], known)))
         if progress:
             progress(views + i + 1, 2 * views)
     return results
 
 
-def _drawn(depth: Tensor) -> Tensor:
-    return (depth > 0) & depth.isfinite()
-
-
-def _voxel_size(depths: Sequence[Tensor], cameras: Sequence[Camera]) -> float:
-    """``VOXEL_PIXELS`` times the median of depth / focal length over the pixels that are drawn; world units."""
-    footprints = []
-    for depth, camera in zip(depths, cameras, strict=True):
+def _voxel_size(depths: Sequence[Tensor], cameras: Sequence[Camera], labels: Sequence[Tensor | None]) -> float:
+    """``VOXEL_PIXELS`` times the median of depth / focal length over the objects' pixels (over all that are drawn, if
+    there are none); world units. Objects, as it is about them that classes meet: what is behind them may be far away.
+    """
+    pixels = sum(depth.numel() for depth in depths)
+    step = max(1, pixels // _FOOTPRINTS)
+    everywhere, of_objects = [], []
+    for depth, camera, mask in zip(depths, cameras, labels, strict=True):
         focal = (float(camera.K[0, 0]) * float(camera.K[1, 1])) ** 0.5
-        footprints.append((depth[_drawn(depth)] / focal).double().cpu())
-    every = torch.cat(footprints)
-    return VOXEL_PIXELS * float(every.median()) if len(every) else 1.0
+        thinned = depth.reshape(-1)[::step]
+        drawn = (thinned > 0) & thinned.isfinite()
+        everywhere.append((thinned[drawn] / focal).double().cpu())
+        if mask is not None:
+            label = mask.reshape(-1)[::step]
+            of_objects.append((thinned[drawn & (label > 0) & (label != IGNORE)] / focal).double().cpu())
+    for footprints in (torch.cat([torch.zeros(0, dtype=torch.float64), *of_objects]), torch.cat(everywhere)):
+        if len(footprints):
+            return VOXEL_PIXELS * float(footprints.median())
+    return 1.0
 
 
 def _origin(cameras: Sequence[Camera]) -> Tensor:
-    """[3] float64: amid the cameras, as the keys reach equally far to all sides."""
+    """[3] float64: amid the cameras, as the voxels reach equally far to all sides."""
     return torch.stack([camera.to("cpu", torch.float64).center for camera in cameras]).mean(0)
 
 
-class _TorchVotes:
-    """What ``ops.voxel_votes.VoxelVotes`` does, in torch; its reference."""
+def _to_voxels(camera: Camera, origin: Tensor, size: float) -> Tensor:
+    """[13] float64: A row by row, b, and the depth that is one voxel long along the ray of the image's centre.
 
-    def __init__(self, origin: Tensor, voxel_size: float) -> None:
-        self._origin, self._size = origin, voxel_size
-        self._pending: list[tuple[Tensor, Tensor]] = []
-
-    def _keys(self, points: Tensor) -> Tensor:
-        """[P] int64, -1 for points that are not finite or too far away."""
-        index = torch.floor((points - self._origin.to(points)) / self._size)
-        near = (index.abs() < _HALF).all(-1)
-        x, y, z = (torch.where(near[:, None], index, torch.zeros_like(index)).long() + _HALF).unbind(-1)
-        return torch.where(near, x << 42 | y << 21 | z, -1)
-
-    def add(self, points: Tensor, labels: Tensor) -> None:
-        keys = self._keys(points)
-        self._pending.append((keys[keys >= 0], labels[keys >= 0]))
-
-    def decide(self) -> None:
-        device = self._pending[0][0].device if self._pending else None
-        keys, labels = zip(*self._pending, strict=True) if self._pending else ((), ())
-        empty = torch.zeros(0, dtype=torch.int64, device=device)
-        self._voxels, voxel = torch.unique(torch.cat([empty, *keys]), return_inverse=True)
-        every = torch.cat([empty, *labels])
-        classes = int(every.max()) + 1 if len(every) else 1
-        pairs, counts = torch.unique(voxel * classes + every, return_counts=True)
-        voxel, label = pairs // classes, pairs % classes
-        zeros = torch.zeros(len(self._voxels), dtype=torch.int64, device=device)
-        self._total = zeros.scatter_add(0, voxel, counts)
-        self._most = zeros.scatter_reduce(0, voxel, counts, "amax")
-        best = counts == self._most[voxel]
-        self._leaders = zeros.scatter_add(0, voxel, best.long())
-        self._winner = zeros.clone()
-        self._winner[voxel[best]] = label[best]  # where two lead, the label is not used
-
-    def read(self, points: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-        keys = self._keys(points)
-        confidence = torch.zeros(len(keys), dtype=torch.float32, device=points.device)
-        if len(self._voxels) == 0:
-            return labels, confidence
-        at = torch.searchsorted(self._voxels, keys).clamp_(max=len(self._voxels) - 1)
-        found = self._voxels[at] == keys
-        clear = found & (self._leaders[at] == 1)
-        share = self._most[at].float() / self._total[at].float()
-        return torch.where(clear, self._winner[at].int(), labels), torch.where(found, share, confidence)
+    A pixel (x, y) at depth d lies at d A (x, y, 1) + b, in voxels.
+    """
+    view = camera.to("cpu", torch.float64)
+    A = view.rotation.T @ torch.linalg.inv(view.K) / size
+    centre = A @ torch.tensor([view.width / 2, view.height / 2, 1.0], dtype=torch.float64)
+    return torch.cat([A.reshape(-1), (view.center - origin) / size, 1.0 / centre.norm()[None]])

@@ -4,6 +4,7 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <memory>
 
 #include "arrays.h"
@@ -48,21 +49,32 @@ void bind_lookup(nb::class_<VoxelLookup>& lookup, const char* suffix) {
              "means"_a, "axes_u"_a, "axes_v"_a, "class_ids"_a, "out"_a, "threads"_a);
 }
 
+// to_voxels: [13], a row by row, b, the side of a voxel.
+template <class T>
+LiftedView<T> lifted_view(const Array<const T>& depth, const Array<const T>& to_voxels) {
+  const int height = static_cast<int>(depth.shape(0)), width = static_cast<int>(depth.shape(1));
+  LiftedView<T> view{height, width, depth.data(), {}, {}, to_voxels.data()[12]};
+  std::copy_n(to_voxels.data(), 9, view.a);
+  std::copy_n(to_voxels.data() + 9, 3, view.b);
+  return view;
+}
+
 template <class T>
 void bind_votes(nb::class_<VoxelVotes>& votes, const char* suffix) {
+  using In = Array<const T>;
   const std::string end(suffix);
   votes.def(("add_" + end).c_str(),
-            [](VoxelVotes& self, Array<const T> points, Ids labels) {
+            [](VoxelVotes& self, In depth, In to_voxels, Ids labels, int32_t ignore) {
               nb::gil_scoped_release release;
-              self.add(rows(labels), points.data(), labels.data());
+              self.add(lifted_view<T>(depth, to_voxels), labels.data(), ignore);
             },
-            "points"_a, "labels"_a);
+            "depth"_a, "to_voxels"_a, "labels"_a, "ignore"_a);
   votes.def(("read_" + end).c_str(),
-            [](const VoxelVotes& self, Array<const T> points, Array<int32_t> labels, Array<float> confidence) {
+            [](const VoxelVotes& self, In depth, In to_voxels, Array<int32_t> labels, Array<float> confidence) {
               nb::gil_scoped_release release;
-              self.read(static_cast<int64_t>(labels.shape(0)), points.data(), labels.data(), confidence.data());
+              self.read(lifted_view<T>(depth, to_voxels), labels.data(), confidence.data());
             },
-            "points"_a, "labels"_a, "confidence"_a);
+            "depth"_a, "to_voxels"_a, "labels"_a, "confidence"_a);
 }
 
 template <class T>
@@ -176,12 +188,7 @@ void bind_ops(nb::module_& m) {
   bind_lookup<float>(lookup, "f32");
   bind_lookup<double>(lookup, "f64");
   nb::class_<VoxelVotes> votes(m, "VoxelVotes");
-  votes.def(
-      "__init__",
-      [](VoxelVotes* self, Array<const double> origin, double voxel_size, int threads) {
-        new (self) VoxelVotes(origin.data(), voxel_size, threads);
-      },
-      "origin"_a, "voxel_size"_a, "threads"_a);
+  votes.def(nb::init<int>(), "threads"_a);
   votes.def("decide", &VoxelVotes::decide, nb::call_guard<nb::gil_scoped_release>());
   bind_votes<float>(votes, "f32");
   bind_votes<double>(votes, "f64");

@@ -1,145 +1,246 @@
 #include "voxel_votes.h"
 
 #include <algorithm>
-#include <cmath>
 
-#include "golden.h"
+#include "voxel_space.h"
 
 namespace beags {
 namespace ops {
 namespace {
 
-constexpr uint64_t kNowhere = ~uint64_t(0);  // points that are not finite or too far away
-constexpr int64_t kHalf = int64_t(1) << 20;  // 21 bits along each axis
+constexpr uint64_t kNowhere = ~uint64_t(0);  // pixels without a depth, or too far away
 constexpr int kShares = 64;
-
-uint64_t hash(uint64_t key) {
-  key = (key ^ key >> 32) * kGolden;
-  return key ^ key >> 29;
-}
-int share_of(uint64_t hash) { return static_cast<int>(hash >> 58); }
+constexpr int kBlock = 64;  // voxels that are fetched at a time
 
 }  // namespace
 
-VoxelVotes::VoxelVotes(const double* origin, double voxel_size, int threads)
-    : voxel_size_(voxel_size), threads_(threads), shares_(kShares) {
-  std::copy_n(origin, 3, origin_);
-}
+VoxelVotes::VoxelVotes(int threads) : threads_(threads), shares_(kShares) {}
 
 template <class T>
-uint64_t VoxelVotes::key(const T* point) const {
-  uint64_t key = 0;
-  for (int axis = 0; axis < 3; ++axis) {
-    const T index = std::floor((point[axis] - static_cast<T>(origin_[axis])) / static_cast<T>(voxel_size_));
-    if (!(std::abs(index) < static_cast<T>(kHalf))) return kNowhere;
-    key = key << 21 | static_cast<uint64_t>(static_cast<int64_t>(index) + kHalf);
-  }
-  return key;
-}
-
-template <class T>
-void VoxelVotes::add(int64_t count, const T* points, const int32_t* labels) {
+void VoxelVotes::add(const LiftedView<T>& view, const int32_t* labels, int32_t ignore) {
+  const int64_t count = static_cast<int64_t>(view.height) * view.width;
   keys_.resize(count);
+  labels_.resize(count);
+  const int rows = tile_rows(view);
   const int team = count < 4000 ? 1 : threads_;
 #pragma omp parallel for num_threads(team) schedule(static)
-  for (int64_t i = 0; i < count; ++i) keys_[i] = key(points + 3 * i);
+  for (int row = 0; row < rows; ++row) {
+    int64_t place = static_cast<int64_t>(row) * kTile * view.width;
+    each_pixel(view, row, [&](int x, int y) {
+      const int32_t label = labels[static_cast<int64_t>(y) * view.width + x];
+      T point[3], ray[3];
+      uint64_t& key = keys_[place];
+      labels_[place++] = label;
+      key = kNowhere;
+      if (label == ignore || !lift(view, x, y, point, ray)) return;
+      int32_t v[3];
+      for (int a = 0; a < 3; ++a) v[a] = floor_of(point[a]) + kHalf;
+      key = brick_key(v[0] >> 2, v[1] >> 2, v[2] >> 2) << 6 | cell_of(v[0], v[1], v[2]);
+    });
+  }
   // Every thread reads all keys and counts those of its own shares: no two write to one table.
 #pragma omp parallel for num_threads(team) schedule(static, 1)
   for (int part = 0; part < team; ++part) {
-    const int first = kShares * part / team, last = kShares * (part + 1) / team;
-    for (int64_t i = 0; i < count; ++i) {
-      if (keys_[i] == kNowhere) continue;
-      const int share = share_of(hash(keys_[i]));
-      if (share >= first && share < last) shares_[share].vote(keys_[i], labels[i]);
+    const uint64_t first = kShares * part / team, last = kShares * (part + 1) / team;
+    struct Kept {
+      uint64_t key = kNowhere;
+      Share* share = nullptr;  // null: another thread's
+      Voxel* voxels = nullptr;
+      int32_t brick = 0;
+    };
+    std::vector<Kept> kept(kKept);
+    struct Vote {
+      Share* share;
+      Voxel* voxel;
+      int32_t brick, label, cell;
+    } votes[kBlock];
+    for (int64_t first_key = 0; first_key < count; first_key += kBlock) {
+      const int64_t end = std::min(first_key + kBlock, count);
+      int ready = 0;
+      for (int64_t i = first_key; i < end; ++i) {
+        if (keys_[i] == kNowhere) continue;
+        const uint64_t key = keys_[i] >> 6;
+        Kept& at = kept[kept_at(key)];
+        if (at.key != key) {
+          const uint64_t number = hash_of(key) >> 58;
+          at = {key};
+          if (number >= first && number < last) {
+            at.share = &shares_[number];
+            at.brick = at.share->place(key);
+            at.voxels = at.share->bricks[at.brick].voxels.get();
+          }
+        }
+        if (!at.share) continue;
+        const int32_t cell = static_cast<int32_t>(keys_[i] & 63);
+        votes[ready] = {at.share, at.voxels + cell, at.brick, labels_[i], cell};
+        __builtin_prefetch(votes[ready++].voxel, 1);
+      }
+      for (int k = 0; k < ready; ++k)
+        votes[k].share->vote(*votes[k].voxel, votes[k].brick, votes[k].cell, votes[k].label);
     }
   }
 }
 
-void VoxelVotes::Share::vote(uint64_t key, int32_t label) {
-  if (2 * (used + 1) > static_cast<int64_t>(counts.size())) grow();
-  const uint64_t mask = counts.size() - 1;
-  for (uint64_t at = hash(key + kGolden * static_cast<uint64_t>(label)) & mask;; at = (at + 1) & mask) {
-    Count& slot = counts[at];
-    if (slot.votes == 0) {
-      slot = {key, label, 1};
-      ++used;
-      return;
-    }
-    if (slot.key == key && slot.label == label) {
-      ++slot.votes;
-      return;
-    }
+int32_t VoxelVotes::Share::place(uint64_t key) {
+  if (2 * (bricks.size() + 1) > slots.size()) grow_slots();
+  const uint64_t mask = slots.size() - 1;
+  uint64_t at = hash_of(key) & mask;
+  while (slots[at].brick >= 0 && slots[at].key != key) at = (at + 1) & mask;
+  if (slots[at].brick < 0) {
+    slots[at] = {key, static_cast<int32_t>(bricks.size())};
+    bricks.push_back({std::make_unique<Voxel[]>(kCells)});
   }
+  return slots[at].brick;
 }
 
-void VoxelVotes::Share::grow() {
-  std::vector<Count> larger(std::max<size_t>(256, 2 * counts.size()), Count{0, 0, 0});
+void VoxelVotes::Share::grow_slots() {
+  std::vector<Slot> larger(std::max<size_t>(64, 2 * slots.size()), Slot{0, -1});
   const uint64_t mask = larger.size() - 1;
-  for (const Count& count : counts) {
-    if (count.votes == 0) continue;
-    uint64_t at = hash(count.key + kGolden * static_cast<uint64_t>(count.label)) & mask;
-    while (larger[at].votes) at = (at + 1) & mask;
-    larger[at] = count;
+  for (const Slot& slot : slots) {
+    if (slot.brick < 0) continue;
+    uint64_t at = hash_of(slot.key) & mask;
+    while (larger[at].brick >= 0) at = (at + 1) & mask;
+    larger[at] = slot;
   }
-  counts.swap(larger);
+  slots.swap(larger);
 }
 
-// Determinism: the result does not depend on the order in which a voxel's classes come.
-void VoxelVotes::Share::decide() {
-  size_t size = 16;
-  while (size < 2 * static_cast<size_t>(used)) size *= 2;
-  winners.assign(size, Winner{0, 0, 0, 0, 0});
-  const uint64_t mask = size - 1;
-  for (const Count& count : counts) {
-    if (count.votes == 0) continue;
-    uint64_t at = hash(count.key) & mask;
-    while (winners[at].total && winners[at].key != count.key) at = (at + 1) & mask;
-    Winner& winner = winners[at];
-    winner.key = count.key;
-    winner.total += count.votes;
-    if (count.votes > winner.most) {
-      winner.most = count.votes;
-      winner.label = count.label;
-      winner.leaders = 1;
-    } else if (count.votes == winner.most) {
-      ++winner.leaders;
-    }
-  }
-  std::vector<Count>().swap(counts);
-  used = 0;
-}
-
-void VoxelVotes::decide() {
-#pragma omp parallel for num_threads(threads_) schedule(dynamic, 1)
-  for (int share = 0; share < kShares; ++share) shares_[share].decide();
-}
-
-const VoxelVotes::Winner* VoxelVotes::Share::find(uint64_t key) const {
-  const uint64_t mask = winners.size() - 1;
-  for (uint64_t at = hash(key) & mask; winners[at].total; at = (at + 1) & mask) {
-    if (winners[at].key == key) return &winners[at];
+const VoxelVotes::Brick* VoxelVotes::Share::find(uint64_t key, uint64_t hash) const {
+  if (slots.empty()) return nullptr;
+  const uint64_t mask = slots.size() - 1;
+  for (uint64_t at = hash & mask; slots[at].brick >= 0; at = (at + 1) & mask) {
+    if (slots[at].key == key) return &bricks[slots[at].brick];
   }
   return nullptr;
 }
 
-template <class T>
-void VoxelVotes::read(int64_t count, const T* points, int32_t* labels, float* confidence) const {
-  const int team = count < 4000 ? 1 : threads_;
-#pragma omp parallel for num_threads(team) schedule(static)
-  for (int64_t i = 0; i < count; ++i) {
-    const uint64_t at = key(points + 3 * i);
-    const Winner* winner = at == kNowhere ? nullptr : shares_[share_of(hash(at))].find(at);
-    confidence[i] = winner ? static_cast<float>(winner->most) / static_cast<float>(winner->total) : 0.0f;
-    if (winner && winner->leaders == 1) labels[i] = winner->label;
+void VoxelVotes::Share::vote(Voxel& voxel, int32_t brick, int cell, int32_t label) {
+  if (voxel.votes == 0) voxel.label = label;
+  if (voxel.label == label) {
+    ++voxel.votes;
+  } else {
+    vote_extra(static_cast<uint64_t>(brick) * kCells + cell, label);
   }
 }
 
-#define BEAGS_INSTANTIATE(T)                                        \
-  template void VoxelVotes::add(int64_t, const T*, const int32_t*); \
-  template void VoxelVotes::read(int64_t, const T*, int32_t*, float*) const;
-BEAGS_INSTANTIATE(float)
-BEAGS_INSTANTIATE(double)
-#undef BEAGS_INSTANTIATE
+void VoxelVotes::Share::vote_extra(uint64_t voxel, int32_t label) {
+  if (2 * (extras_used + 1) > static_cast<int64_t>(extras.size())) grow_extras();
+  const uint64_t mask = extras.size() - 1;
+  uint64_t at = hash_of(voxel + kGolden * static_cast<uint64_t>(label)) & mask;
+  while (extras[at].votes && !(extras[at].voxel == voxel && extras[at].label == label)) at = (at + 1) & mask;
+  if (extras[at].votes == 0) {
+    extras[at] = {voxel, label, 0};
+    ++extras_used;
+  }
+  ++extras[at].votes;
+}
+
+void VoxelVotes::Share::grow_extras() {
+  std::vector<Extra> larger(std::max<size_t>(64, 2 * extras.size()), Extra{0, 0, 0});
+  const uint64_t mask = larger.size() - 1;
+  for (const Extra& extra : extras) {
+    if (extra.votes == 0) continue;
+    uint64_t at = hash_of(extra.voxel + kGolden * static_cast<uint64_t>(extra.label)) & mask;
+    while (larger[at].votes) at = (at + 1) & mask;
+    larger[at] = extra;
+  }
+  extras.swap(larger);
+}
+
+void VoxelVotes::Share::decide() {
+  extras.erase(std::remove_if(extras.begin(), extras.end(), [](const Extra& e) { return e.votes == 0; }), extras.end());
+  std::sort(extras.begin(), extras.end(), [](const Extra& a, const Extra& b) { return a.voxel < b.voxel; });
+  for (size_t i = 0; i < extras.size();) {
+    Voxel& voxel = bricks[extras[i].voxel / kCells].voxels[extras[i].voxel % kCells];
+    const size_t first = pairs.size();
+    Pair most{voxel.label, voxel.votes};
+    uint32_t total = voxel.votes;
+    pairs.insert(pairs.end(), {Pair{0, 0}, most});
+    for (const uint64_t same = extras[i].voxel; i < extras.size() && extras[i].voxel == same; ++i) {
+      pairs.push_back({extras[i].label, extras[i].votes});
+      total += extras[i].votes;
+      if (extras[i].votes > most.votes) {
+        most = pairs.back();
+        std::swap(pairs.back(), pairs[first + 1]);  // the first that is looked at
+      }
+    }
+    pairs[first] = {static_cast<int32_t>(pairs.size() - first - 1), total};
+    const bool leads = 2 * uint64_t(most.votes) > total;
+    voxel = {leads ? most.label : kMany, kSeveral | static_cast<uint32_t>(first)};
+  }
+  std::vector<Extra>().swap(extras);
+  for (Brick& brick : bricks) {
+    brick.pairs = pairs.data();
+    summarise(brick);
+  }
+}
+
+void VoxelVotes::decide() {
+  std::vector<uint64_t>().swap(keys_);
+  std::vector<int32_t>().swap(labels_);
+#pragma omp parallel for num_threads(threads_) schedule(dynamic, 1)
+  for (int share = 0; share < kShares; ++share) shares_[share].decide();
+#pragma omp parallel for num_threads(threads_) schedule(dynamic, 1)
+  for (int share = 0; share < kShares; ++share) {
+    for (const Slot& slot : shares_[share].slots) {
+      if (slot.brick >= 0) settle(slot.key, shares_[share].bricks[slot.brick]);
+    }
+  }
+}
+
+void VoxelVotes::Share::summarise(Brick& brick) const {
+  for (int cell = 0; cell < kCells; ++cell) {
+    const Voxel& voxel = brick.voxels[cell];
+    if (voxel.votes == 0) continue;
+    if (!brick.led && voxel.label >= 0) brick.label = voxel.label;
+    const uint64_t bit = uint64_t(1) << cell;
+    brick.voted |= bit;
+    if (voxel.label != brick.label) continue;
+    brick.led |= bit;
+    if (!(voxel.votes & kSeveral)) brick.pure |= bit;
+  }
+}
+
+const VoxelVotes::Brick* VoxelVotes::find(uint64_t key) const {
+  const uint64_t hash = hash_of(key);
+  return shares_[hash >> 58].find(key, hash);
+}
+
+void VoxelVotes::settle(uint64_t key, Brick& brick) const {
+  uint64_t disputed = 0;
+  for (int side = 0; side < 27; ++side) {
+    const int step[3] = {side / 9 - 1, side / 3 % 3 - 1, side % 3 - 1};
+    uint64_t touched = brick.led;
+    for (int axis = 0; axis < 3; ++axis) {
+      if (step[axis]) touched &= step[axis] > 0 ? kPlane[axis] << 3 * kShift[axis] : kPlane[axis];
+    }
+    if (!touched) continue;
+    // Keys are sums: no coordinate is so near its end that it would carry.
+    const Brick* other = side == 13 ? &brick
+                                    : find(key + (static_cast<uint64_t>(static_cast<int64_t>(step[0])) << 38) +
+                                           (static_cast<uint64_t>(static_cast<int64_t>(step[1])) << 19) +
+                                           static_cast<uint64_t>(static_cast<int64_t>(step[2])));
+    if (!other) continue;
+    uint64_t against = other->label == brick.label ? other->voted & ~other->led : other->voted;
+    // Spread to the voxels of this brick that it touches.
+    for (int axis = 0; axis < 3; ++axis) {
+      const uint64_t first = kPlane[axis], last = first << 3 * kShift[axis];
+      const int shift = kShift[axis];
+      if (step[axis] > 0) {
+        against = (against & first) << 3 * shift;
+      } else if (step[axis] < 0) {
+        against = (against & last) >> 3 * shift;
+      } else {
+        against |= (against & ~last) << shift | (against & ~first) >> shift;
+      }
+    }
+    disputed |= against;
+  }
+  brick.settled = brick.led & ~disputed;
+}
+
+template void VoxelVotes::add(const LiftedView<float>&, const int32_t*, int32_t);
+template void VoxelVotes::add(const LiftedView<double>&, const int32_t*, int32_t);
 
 }  // namespace ops
 }  // namespace beags

@@ -1,55 +1,94 @@
-// Votes for classes, pooled per voxel of the points that cast them (method, section 2).
+// Votes for classes, pooled per voxel of the points that cast them and read back softly (method, section 2).
 #pragma once
 
 #include <cstdint>
+#include <memory>
 #include <vector>
 
 namespace beags {
 namespace ops {
 
+// A pixel (x, y) at depth d lies at d a (x, y, 1) + b, in voxels. depth: [height, width]. voxel: its side, as a depth.
+template <class T>
+struct LiftedView {
+  int height, width;
+  const T* depth;
+  T a[9], b[3], voxel;
+};
+
 class VoxelVotes {
  public:
-  // origin: [3], corner of voxel (0, 0, 0); world units.
-  VoxelVotes(const double* origin, double voxel_size, int threads);
+  explicit VoxelVotes(int threads);
+  VoxelVotes(const VoxelVotes&) = delete;
 
-  // One vote of each point [count, 3] for its label, which may be any number of 0 or more.
+  // One vote of each pixel with a depth, for its label [height, width], 0 or more, unless that is `ignore`.
   template <class T>
-  void add(int64_t count, const T* points, const int32_t* labels);
-  // Counts are complete: finds every voxel's winner.
+  void add(const LiftedView<T>& view, const int32_t* labels, int32_t ignore);
+  // Counts are complete.
   void decide();
-  // Per point, after `decide`: the winner of its voxel (`labels` is left where several lead or nobody voted) and the
-  // share of its votes.
+  // Per pixel with a depth, after `decide`: the winner of the votes about it (its label stays where several lead or
+  // nobody voted) and its share of them.
   template <class T>
-  void read(int64_t count, const T* points, int32_t* labels, float* confidence) const;
+  void read(const LiftedView<T>& view, int32_t* labels, float* confidence) const;
 
  private:
-  struct Count {
-    uint64_t key;
+  static constexpr int kCells = 64;                   // a brick is 4 x 4 x 4 voxels
+  static constexpr int32_t kNobody = -2, kMany = -1;  // instead of a leading class
+
+  // While counting: one class and its votes; 0 votes: an empty voxel. Further classes are among the `Extra`. After
+  // `decide`: label has more than half of the votes, or is -1; where there are several classes, votes is kSeveral and
+  // the place of their `Pair`s.
+  struct Voxel {
+    int32_t label;
+    uint32_t votes;
+  };
+  static constexpr uint32_t kSeveral = 1u << 31;
+  struct Extra {
+    uint64_t voxel;  // place of the brick * 64 + cell
     int32_t label;
     uint32_t votes;  // 0: empty
   };
-  struct Winner {
+  struct Pair {  // one class of a voxel; before them: how many there are, and all votes
+    int32_t label;
+    uint32_t votes;
+  };
+  struct Brick {
+    std::unique_ptr<Voxel[]> voxels;  // [64], x slowest
+    const Pair* pairs = nullptr;      // of its share; after `decide`
+    // After `decide`, a bit for each voxel. The class `label` has in it: some votes but no others; more than half of
+    // its votes, and of those of all 26 voxels about it that have any.
+    int32_t label = 0;
+    uint64_t pure = 0, settled = 0;
+    uint64_t voted = 0, led = 0;  // has votes; more than half of them for `label`
+  };
+  struct Slot {
     uint64_t key;
-    int32_t label, leaders;
-    uint32_t most, total;  // 0: empty
+    int32_t brick;  // -1: empty
   };
-  // Hash tables of one share of the voxels; a thread works on one share at a time.
+  // One share of the bricks; a thread works on one share at a time.
   struct Share {
-    std::vector<Count> counts;
-    std::vector<Winner> winners;
-    int64_t used = 0;
-    void vote(uint64_t key, int32_t label);
-    void grow();
+    std::vector<Slot> slots;
+    std::vector<Brick> bricks;
+    std::vector<Extra> extras;
+    std::vector<Pair> pairs;
+    int64_t extras_used = 0;
+    int32_t place(uint64_t key);
+    const Brick* find(uint64_t key, uint64_t hash) const;
+    void vote(Voxel& voxel, int32_t brick, int cell, int32_t label);
+    void vote_extra(uint64_t voxel, int32_t label);
+    void grow_slots();
+    void grow_extras();
     void decide();
-    const Winner* find(uint64_t key) const;
+    void summarise(Brick& brick) const;
   };
-  template <class T>
-  uint64_t key(const T* point) const;
+  class Reader;
+  const Brick* find(uint64_t key) const;
+  void settle(uint64_t key, Brick& brick) const;
 
-  double origin_[3], voxel_size_;
   int threads_;
   std::vector<Share> shares_;
   std::vector<uint64_t> keys_;
+  std::vector<int32_t> labels_;
 };
 
 }  // namespace ops

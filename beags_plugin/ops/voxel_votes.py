@@ -1,4 +1,4 @@
-"""Votes for classes, pooled per voxel of the points that cast them (method, section 2)."""
+"""Votes for classes, pooled per voxel of the points that cast them and read back softly (method, section 2)."""
 
 from __future__ import annotations
 
@@ -11,36 +11,46 @@ from beags_plugin.ops import extension
 
 
 class VoxelVotes:
-    """Counts votes per (voxel, class), then tells each voxel's winner; memory is linear in the voxels.
+    """Counts votes per (voxel, class), then tells each pixel who leads about its point.
 
-    Points that are not finite, or 2^20 voxels or more from ``origin`` along an axis, neither vote nor are told.
+    A pixel (x, y) at depth d lies at d A (x, y, 1) + b, in voxels; ``to_voxels`` [13] is A row by row, b, and the depth
+    that is one voxel long along the ray of the image's centre. Pixels whose depth is not positive and finite, or whose
+    point is 2^20 - 4 voxels or more from 0 along an axis, neither vote nor are told. ``masks.voxel_reprojection`` says
+    how votes are read. Memory is linear in the voxels; neither time nor memory depends on how many classes there are.
 
-    origin: [3] float64, corner of voxel (0, 0, 0), world. voxel_size: world units.
+    ignore: the label that does not vote.
     """
 
-    def __init__(self, origin: Tensor, voxel_size: float) -> None:
+    def __init__(self, ignore: int) -> None:
         module = extension.load()
         assert module is not None, "the caller asks extension.load() first"
-        origin = extension.plain("origin", origin, (3,), torch.float64)
-        self._native: Any = module.VoxelVotes(origin, voxel_size, extension.threads())
+        self._native: Any = module.VoxelVotes(extension.threads())
+        self._ignore = ignore
 
-    def add(self, points: Tensor, labels: Tensor) -> None:
-        """One vote of each point. points: [P, 3] float32 or float64, world; labels: [P] int32, 0 or more."""
-        points = extension.plain("points", points, (len(points), 3), points.dtype)
-        labels = extension.plain("labels", labels, (len(points),), torch.int32)
-        extension.function("add", points, self._native)(points, labels)
+    def add(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> None:
+        """One vote of each pixel. depth: [H, W] float32 or float64; labels: [H, W] int32, 0 or more."""
+        depth, to_voxels = _view(depth, to_voxels)
+        labels = extension.plain("labels", labels, tuple(depth.shape), torch.int32)
+        extension.function("add", depth, self._native)(depth, to_voxels, labels, self._ignore)
 
     def decide(self) -> None:
         """All votes are in; now and only now ``read`` may be asked."""
         self._native.decide()
 
-    def read(self, points: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """The winner of each point's voxel (``labels`` where several lead or nobody voted), and its share of the votes.
+    def read(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+        """The winner about each pixel's point (its label where several lead or nobody voted), and its share of votes:
+        of those in the voxel of the point, or of those that were read, if nobody voted there.
 
-        points: [P, 3] float; labels: [P] int32. Returns [P] int32 and [P] float32 (0 where nobody voted).
+        depth: [H, W] float. labels: [H, W] int32.
+        Returns [H, W] int32 and [H, W] float32 (0 where nobody voted).
         """
-        points = extension.plain("points", points, (len(points), 3), points.dtype)
-        labels = extension.plain("labels", labels, (len(points),), torch.int32).clone()
-        confidence = torch.empty(len(points), dtype=torch.float32)
-        extension.function("read", points, self._native)(points, labels, confidence)
+        depth, to_voxels = _view(depth, to_voxels)
+        labels = extension.plain("labels", labels, tuple(depth.shape), torch.int32).clone()
+        confidence = torch.empty(tuple(depth.shape), dtype=torch.float32)
+        extension.function("read", depth, self._native)(depth, to_voxels, labels, confidence)
         return labels, confidence
+
+
+def _view(depth: Tensor, to_voxels: Tensor) -> tuple[Tensor, Tensor]:
+    depth = extension.plain("depth", depth, (depth.shape[0], depth.shape[1]), depth.dtype)
+    return depth, extension.plain("to_voxels", to_voxels, (13,), depth.dtype)

@@ -1,0 +1,140 @@
+"""The stages that ``beags bench scaling`` measures, each as a call on a synthetic scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+
+import torch
+from torch import Tensor
+from torch.optim import Adam
+
+from beags_plugin.assignment.assignment import assign_classes
+from beags_plugin.bench.scaling_scene import SETTINGS, SyntheticScene
+from beags_plugin.core.adam import clear_gradients, step_all
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.losses.base import LossInputs
+from beags_plugin.losses.boundary import BoundaryLoss
+from beags_plugin.losses.occupancy import OccupancyLoss
+from beags_plugin.losses.photometric import PhotometricLoss
+from beags_plugin.masks import REPROJECTIONS
+from beags_plugin.occupancy.build import build_visibility_grid
+from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.rasterizers.drawing import geometry_inputs, surface_depth, surfel_inputs
+from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
+
+STEP = "refinement step"
+CHANNELS = "step, a channel per class"
+PAIRWISE, VOXEL = "reprojection, pairwise", "reprojection, voxel"
+STAGES = (STEP, "depth", PAIRWISE, VOXEL, "assignment", "voxel grids", CHANNELS)
+_K = 50  # neighbours that set the voxel size, as in the presets for small scenes
+_NO_GEOMETRY = RasterSettings(SETTINGS.near, SETTINGS.far, geometry=False)
+_RATE = 1e-9  # of learning: every call shall find the same scene
+
+
+def stages(scene: SyntheticScene, rasterizer: Rasterizer, channels: bool) -> dict[str, Callable[[], object]]:
+    """Name to call. What a stage needs of another one is made here; channels: whether ``CHANNELS`` is wanted."""
+    depths = _depths(scene, rasterizer)
+    grid = _grid(scene, rasterizer)
+    labels = scene.labels
+
+    def reproject(name: str) -> Callable[[], object]:
+        return lambda: REPROJECTIONS.get(name)(depths, scene.cameras, labels, scene.num_classes)
+
+    calls: dict[str, Callable[[], object]] = {
+        STEP: _Step(scene, rasterizer, grid),
+        "depth": lambda: _depths(scene, rasterizer),
+        PAIRWISE: reproject("pairwise"),
+        VOXEL: reproject("voxel"),
+        "assignment": lambda: assign_classes(
+            scene.surfels, scene.cameras, labels, rasterizer, SETTINGS, scene.num_classes
+        ),
+        "voxel grids": lambda: _grid(scene, rasterizer),
+    }
+    if channels:
+        calls[CHANNELS] = _ChannelStep(scene, rasterizer)
+    return calls
+
+
+def _depths(scene: SyntheticScene, rasterizer: Rasterizer) -> list[Tensor]:
+    inputs = geometry_inputs(scene.surfels)
+    with torch.no_grad():
+        drawn = (rasterizer.rasterize(inputs, camera, SETTINGS, torch.zeros(3)) for camera in scene.cameras)
+        return [surface_depth(view, "median") for view in drawn]
+
+
+def _grid(scene: SyntheticScene, rasterizer: Rasterizer) -> VisibilityGrid:
+    return build_visibility_grid(
+        scene.surfels, scene.class_ids, scene.cameras, rasterizer, SETTINGS, scene.num_classes, _K
+    )
+
+
+class _Training:
+    """Steps of Adam on a scene, the views in turn."""
+
+    def __init__(self, scene: SyntheticScene, rasterizer: Rasterizer) -> None:
+        self.scene, self.rasterizer = scene, rasterizer
+        values = {field.name: getattr(scene.surfels, field.name) for field in fields(Surfels)}
+        self.parameters = {name: value.clone().requires_grad_() for name, value in values.items()}
+        self.optimizers = [Adam([value], lr=_RATE, eps=1e-15, fused=True) for value in self.parameters.values()]
+        self.step = 0
+
+    def loss(self, view: int) -> Tensor:
+        raise NotImplementedError
+
+    def __call__(self) -> float:
+        loss = self.loss(self.step % len(self.scene.cameras))
+        loss.backward()
+        step_all(self.optimizers)
+        clear_gradients(self.optimizers)
+        self.step += 1
+        return float(loss.detach())
+
+    def losses(self, view: int, drawn: RasterOutputs, grid: VisibilityGrid | None) -> LossInputs:
+        surfels = Surfels(**self.parameters)
+        scene = self.scene
+        return LossInputs(
+            self.step, 0, surfels, scene.cameras[view], drawn, scene.images[view], scene.labels[view], scene.class_ids,
+            grid,
+        )  # fmt: skip
+
+
+class _Step(_Training):
+    """Photometric, boundary and occupancy loss: what every step of refinement has."""
+
+    def __init__(self, scene: SyntheticScene, rasterizer: Rasterizer, grid: VisibilityGrid) -> None:
+        super().__init__(scene, rasterizer)
+        self.grid = grid
+
+    def loss(self, view: int) -> Tensor:
+        scene = self.scene
+        camera = scene.cameras[view]
+        inputs = surfel_inputs(Surfels(**self.parameters), camera, class_ids=scene.class_ids)
+        drawn = self.rasterizer.rasterize(inputs, camera, _NO_GEOMETRY, torch.zeros(3), scene.labels[view])
+        found = self.losses(view, drawn, self.grid)
+        terms = (PhotometricLoss(), BoundaryLoss(), OccupancyLoss())
+        return sum((term.weight * term.value(found) for term in terms), torch.zeros(()))
+
+
+class _ChannelStep(_Training):
+    """What methods do that learn a vector of class scores for each Gaussian: as many channels are drawn, three at a
+    time as colours, and compared with the mask by cross-entropy."""
+
+    def __init__(self, scene: SyntheticScene, rasterizer: Rasterizer) -> None:
+        super().__init__(scene, rasterizer)
+        self.renders = -(-scene.num_classes // 3)
+        self.scores = torch.zeros(self.renders, len(scene.surfels), 3, requires_grad=True)
+        self.optimizers.append(Adam([self.scores], lr=_RATE, eps=1e-15, fused=True))
+
+    def loss(self, view: int) -> Tensor:
+        scene = self.scene
+        camera, surfels = scene.cameras[view], Surfels(**self.parameters)
+        drawn = self._draw(surfel_inputs(surfels, camera), camera)
+        classes = [self._draw(surfel_inputs(surfels, camera), camera, colors).color for colors in self.scores.unbind()]
+        logits = torch.cat(classes, dim=-1)[..., : scene.num_classes].reshape(-1, scene.num_classes)
+        entropy = torch.nn.functional.cross_entropy(logits, scene.labels[view].reshape(-1).long())
+        return PhotometricLoss().value(self.losses(view, drawn, None)) + entropy
+
+    def _draw(self, inputs, camera, colors: Tensor | None = None) -> RasterOutputs:
+        inputs = inputs if colors is None else replace(inputs, colors=colors)
+        return self.rasterizer.rasterize(inputs, camera, _NO_GEOMETRY, torch.zeros(3))

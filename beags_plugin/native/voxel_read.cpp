@@ -1,0 +1,224 @@
+#include <algorithm>
+#include <cmath>
+
+#include "voxel_space.h"
+#include "voxel_votes.h"
+
+namespace beags {
+namespace ops {
+namespace {
+
+constexpr int32_t kParts = 64;  // of a voxel, in interpolation weights
+
+}  // namespace
+
+// Reads pixels one after the other.
+class VoxelVotes::Reader {
+ public:
+  explicit Reader(const VoxelVotes& votes) : votes_(votes), kept_(kKept), nothing_(new Voxel[kCells]()) {}
+
+  // The pixel's confidence; sets its label.
+  template <class T>
+  float read(const LiftedView<T>& view, int x, int y, int32_t* label) {
+    T point[3], ray[3];
+    if (!lift(view, x, y, point, ray)) return 0.0f;
+    int32_t own[3];
+    for (int a = 0; a < 3; ++a) own[a] = floor_of(point[a]) + kHalf;
+    const Found& near = find(own[0] >> 2, own[1] >> 2, own[2] >> 2);
+    const int cell = cell_of(own[0], own[1], own[2]);
+    // More than half of the votes of each voxel are more than half of any weighted sum.
+    if (near.settled >> cell & 1) {
+      *label = near.label;
+      return near.pure >> cell & 1 ? 1.0f : share_in(near.voxels[cell], near.pairs, near.label);
+    }
+    const Found at = near;  // what follows asks for others, which may take its place
+    const Voxel& voxel = at.voxels[cell];
+    Place place = about(point);
+    gather(place);
+    const int32_t leader = agreed(place);
+    if (leader >= 0 && voxel.votes) {
+      *label = leader;
+      return share_in(voxel, at.pairs, leader);
+    }
+    poll_.clear();
+    count(place);
+    if (leader < 0) {
+      for (const T step : {-view.voxel, view.voxel}) {
+        const T moved[3] = {point[0] + step * ray[0], point[1] + step * ray[1], point[2] + step * ray[2]};
+        place = about(moved);
+        gather(place);
+        count(place);
+      }
+    }
+    const float share = decide(label);
+    return voxel.votes ? share_in(voxel, at.pairs, *label) : share;
+  }
+
+ private:
+  // The eight voxels about a point: from `corner` on; `fraction` of kParts from the middle of the first to the second.
+  struct Place {
+    int32_t corner[3], fraction[3];
+  };
+  struct Found {
+    const Voxel* voxels;
+    const Pair* pairs;
+    int32_t label;
+    uint64_t pure, settled;
+  };
+  struct Kept {
+    uint64_t key = ~uint64_t(0);
+    Found found{};
+  };
+  struct Entry {
+    int32_t label;
+    uint64_t votes;
+  };
+
+  template <class T>
+  static Place about(const T* point) {
+    Place place;
+    for (int a = 0; a < 3; ++a) {
+      const T at = point[a] - T(0.5);
+      const int32_t whole = floor_of(at);
+      place.corner[a] = whole + kHalf;
+      place.fraction[a] = static_cast<int32_t>((at - static_cast<T>(whole)) * T(kParts));
+    }
+    return place;
+  }
+
+  // The bricks of the eight voxels: one to eight of them. `bricks_` has them by bits 4, 2, 1 for one step along x, y,
+  // z; the others of it are not asked for.
+  void gather(const Place& place) {
+    int32_t near[3], end[3];
+    for (int a = 0; a < 3; ++a) {
+      near[a] = place.corner[a] >> 2;
+      end[a] = (place.corner[a] + 1) >> 2;
+    }
+    for (int32_t x = near[0]; x <= end[0]; ++x) {
+      for (int32_t y = near[1]; y <= end[1]; ++y) {
+        for (int32_t z = near[2]; z <= end[2]; ++z) {
+          bricks_[(x - near[0]) << 2 | (y - near[1]) << 1 | (z - near[2])] = find(x, y, z);
+        }
+      }
+    }
+  }
+
+  const Found& find(int32_t x, int32_t y, int32_t z) {
+    const uint64_t key = brick_key(x, y, z);
+    Kept& kept = kept_[kept_at(key)];
+    if (kept.key != key) {
+      const Brick* brick = votes_.find(key);
+      kept = {key, {nothing_.get(), nullptr, 0, 0, 0}};
+      if (brick) kept.found = {brick->voxels.get(), brick->pairs, brick->label, brick->pure, brick->settled};
+    }
+    return kept.found;
+  }
+
+  // do_voxel(brick, voxel, weight) for the eight voxels of gathered bricks.
+  template <class DoVoxel>
+  void each_voxel(const Place& place, DoVoxel do_voxel) const {
+    int brick[3][2], cell[3][2];
+    uint32_t weight[3][2];
+    for (int a = 0; a < 3; ++a) {
+      for (int step = 0; step < 2; ++step) {
+        const int32_t voxel = place.corner[a] + step;
+        brick[a][step] = (voxel >> 2 != place.corner[a] >> 2) << (2 - a);
+        cell[a][step] = (voxel & 3) << (4 - 2 * a);
+        weight[a][step] = step ? place.fraction[a] : kParts - place.fraction[a];
+      }
+    }
+    for (int i = 0; i < 8; ++i) {
+      const int x = i >> 2, y = i >> 1 & 1, z = i & 1;
+      const Found& at = bricks_[brick[0][x] | brick[1][y] | brick[2][z]];
+      do_voxel(at, at.voxels[cell[0][x] | cell[1][y] | cell[2][z]], weight[0][x] * weight[1][y] * weight[2][z]);
+    }
+  }
+
+  // The class with more than half of the votes of each of the eight voxels that has any, or kMany or kNobody.
+  int32_t agreed(const Place& place) const {
+    int32_t least = INT32_MAX, most = kNobody;
+    each_voxel(place, [&](const Found&, const Voxel& voxel, uint32_t) {
+      least = std::min(least, voxel.votes ? voxel.label : INT32_MAX);
+      most = std::max(most, voxel.votes ? voxel.label : kNobody);
+    });
+    return most == kNobody ? kNobody : least == most ? most : kMany;
+  }
+
+  // Adds the votes of the eight voxels, interpolated.
+  void count(const Place& place) {
+    each_voxel(place, [&](const Found& at, const Voxel& voxel, uint64_t weight) {
+      if (voxel.votes == 0) return;
+      if (!(voxel.votes & kSeveral)) return add(voxel.label, weight * voxel.votes);
+      const Pair* pair = at.pairs + (voxel.votes & ~kSeveral);
+      for (int32_t k = 1; k <= pair->label; ++k) add(pair[k].label, weight * pair[k].votes);
+    });
+  }
+
+  // Determinism: whole numbers, whose sums have no order.
+  void add(int32_t label, uint64_t votes) {
+    for (Entry& entry : poll_) {
+      if (entry.label == label) {
+        entry.votes += votes;
+        return;
+      }
+    }
+    poll_.push_back({label, votes});
+  }
+
+  // The winner's share; 0 if nobody voted. Several that lead leave the label.
+  float decide(int32_t* label) const {
+    uint64_t most = 0, total = 0;
+    int32_t winner = 0, leaders = 0;
+    for (const Entry& entry : poll_) {
+      total += entry.votes;
+      if (entry.votes > most) {
+        most = entry.votes;
+        winner = entry.label;
+        leaders = 1;
+      } else if (entry.votes == most) {
+        ++leaders;
+      }
+    }
+    if (leaders == 1 && most) *label = winner;
+    return total ? static_cast<float>(most) / static_cast<float>(total) : 0.0f;
+  }
+
+  // The label's share of the votes of a voxel that has some.
+  static float share_in(const Voxel& voxel, const Pair* pairs, int32_t label) {
+    if (!(voxel.votes & kSeveral)) return voxel.label == label ? 1.0f : 0.0f;
+    const Pair* pair = pairs + (voxel.votes & ~kSeveral);
+    for (int32_t k = 1; k <= pair->label; ++k) {
+      if (pair[k].label == label) return static_cast<float>(pair[k].votes) / static_cast<float>(pair->votes);
+    }
+    return 0.0f;
+  }
+
+  const VoxelVotes& votes_;
+  std::vector<Kept> kept_;
+  std::unique_ptr<Voxel[]> nothing_;
+  Found bricks_[8];
+  std::vector<Entry> poll_;
+};
+
+template <class T>
+void VoxelVotes::read(const LiftedView<T>& view, int32_t* labels, float* confidence) const {
+  const int rows = tile_rows(view);
+  const int team = static_cast<int64_t>(view.height) * view.width < 4000 ? 1 : threads_;
+#pragma omp parallel num_threads(team)
+  {
+    Reader reader(*this);
+#pragma omp for schedule(static)
+    for (int row = 0; row < rows; ++row) {
+      each_pixel(view, row, [&](int x, int y) {
+        const int64_t i = static_cast<int64_t>(y) * view.width + x;
+        confidence[i] = reader.read(view, x, y, labels + i);
+      });
+    }
+  }
+}
+
+template void VoxelVotes::read(const LiftedView<float>&, int32_t*, float*) const;
+template void VoxelVotes::read(const LiftedView<double>&, int32_t*, float*) const;
+
+}  // namespace ops
+}  // namespace beags
