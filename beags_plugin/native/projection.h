@@ -36,7 +36,8 @@ Fate project(const View& view, const SurfelParameters& surfel, Splat<double>& sp
 // maximum: most surfels, which the kernels then draw without these distinctions.
 bool is_plain(const View& view, const Splat<double>& splat);
 
-// The gradient towards mean, quat, log_scale and screen shift, from that towards the splat's fields (`record`: kRecord sums).
+// The gradient towards mean, quat, log_scale and screen shift, from that towards the splat's fields (`record`: kRecord
+// sums).
 ShapeGradients project_backward(const View& view, const SurfelParameters& surfel, const double* record);
 
 }  // namespace beags

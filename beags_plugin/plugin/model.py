@@ -181,7 +181,6 @@ class BeagsModel(SplatfactoModel):
         self.background_color = fixed_background(self.config)
         self.drawn: Drawn | None = None
         self.measuring = True  # whether anyone will read this step's metrics
-        self._photograph: tuple[tuple[Tensor | None, ...], Tensor] | None = None  # what _truth made last, and of what
         self.object_choice = ViewerDropdown("Object", EVERYTHING, [EVERYTHING, *self._object_names()])
 
     def _object_names(self) -> list[str]:
@@ -345,14 +344,9 @@ class BeagsModel(SplatfactoModel):
 
     def _truth(self, batch: dict[str, Any], background: Tensor) -> Tensor:
         """The photograph [H, W, 3]; where it is transparent, the background shows, as it does behind the Gaussians."""
-        made_of = (batch["image"], batch.get("alpha"), background)
-        # A step asks twice, for its metrics and its losses.
-        if self._photograph is not None and all(a is b for a, b in zip(self._photograph[0], made_of, strict=True)):
-            return self._photograph[1]
         image = self.get_gt_img(batch["image"])
         if "alpha" in batch:  # it comes on black
             image = image + (1.0 - self.get_gt_img(batch["alpha"])[..., None]) * background
-        self._photograph = (made_of, image)
         return image
 
     def get_gt_img(self, image: Tensor) -> Tensor:
