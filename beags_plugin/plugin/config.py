@@ -54,6 +54,11 @@ class BeagsTrainerConfig(TrainerConfig):
         """Options of the data manager; nerfstudio's field promises no more than a ``DataManagerConfig``."""
         return cast(BeagsDataManagerConfig, self.pipeline.datamanager)
 
+    @property
+    def data_path(self) -> Path:
+        """The folder (or transforms .json) that the run is trained on: --data, or the data parser's own."""
+        return Path(self.data_config.data or self.data_config.dataparser.data)
+
     def get_base_dir(self) -> Path:
         """Folder of the run."""
         return self.run_dir if self.run_dir is not None else super().get_base_dir()

@@ -63,7 +63,7 @@ class EvaluatedRun:
     def views(self) -> HeldOutViews:
         """The held-out views; raises ``UserError`` if the run's data cannot be read."""
         config = self.stages["after"].config
-        if not (data := data_path(config)).exists():
+        if not (data := config.data_path).exists():
             raise UserError(f"{self.config_path} was trained on {data}, which is gone: put it back.")
         try:
             return HeldOutViews(config, self.classes)
@@ -132,13 +132,8 @@ def present_classes(scene: SavedScene) -> dict[int, str]:
 
 def scene_name(config: BeagsTrainerConfig) -> str:
     """The name of the run's data folder."""
-    data = data_path(config)
+    data = config.data_path
     return data.stem if data.suffix == ".json" else data.name
-
-
-def data_path(config: BeagsTrainerConfig) -> Path:
-    """The folder (or transforms .json) that the run was trained on."""
-    return Path(config.data_config.data or config.data_config.dataparser.data)
 
 
 def raster_settings(scene: SavedScene) -> RasterSettings:

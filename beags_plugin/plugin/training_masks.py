@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -40,7 +40,8 @@ def training_masks(config: BeagsTrainerConfig) -> list[TrainingMasks]:
 
     Masks and truth are compared as the files have them: for photos without lens distortion.
     """
-    outputs = config.data_config.dataparser.setup().get_dataparser_outputs("train")
+    parser = replace(config.data_config.dataparser, data=config.data_path)
+    outputs = parser.setup().get_dataparser_outputs("train")
     metadata = outputs.metadata
     exact = (metadata["ground_truth"] or {}).get("masks") or [None] * len(outputs.image_filenames)
     prepared = config.get_base_dir() / PREPARED
