@@ -56,7 +56,7 @@ def test_training_reports_what_it_found(trained):
     assert (folder / "config.yml").exists()
     assert sorted(path.name for path in (folder / "nerfstudio_models").iterdir()) == ["step-000000259.ckpt"]
     report = json.loads((folder / "prepared" / "report.json").read_text())
-    assert set(report["seconds"]) == {"reprojection", "assignment", "voxel grids"}
+    assert set(report["seconds"]) == {"reprojection", "assignment", "border split", "voxel grids"}
 
 
 def test_each_loss_has_its_own_curve(trained):
@@ -212,6 +212,37 @@ def test_a_run_that_was_refining_is_resumed_with_its_classes_and_masks(trained, 
     assert after.step == 263 and int(after.state["refined_steps"]) == 44
     assert (before.state["class_ids"] == after.state["class_ids"]).all()
     assert (tmp_path / "resumed" / "base" / "config.yml").exists()
+
+
+def test_a_second_round_makes_masks_again_also_after_a_resume(trained, data, tmp_path):
+    from beags_plugin.plugin.extract import load_scene
+    from beags_plugin.plugin.runs import last_prepared
+
+    folder, _ = trained
+    options = (
+        "--data", data, "--vis", "tensorboard", "--steps-per-eval-image", 0, "--pipeline.model.prepare.k", 200,
+        "--pipeline.model.refine-steps", 12, "--pipeline.model.refine-rounds", 2,
+    )  # fmt: skip
+    base = ("--load-dir", folder / "base" / "nerfstudio_models")
+    whole, half, resumed = tmp_path / "whole", tmp_path / "half", tmp_path / "resumed"
+    code, text = run("ns-train", "beags-refine", "--run-dir", whole, *options, *base)
+    assert code == 0, text[-4000:]
+    assert "Preparing refinement again" in text
+    first, second = (sorted((path / "masks").glob("*.png")) for path in (whole / "prepared", last_prepared(whole)))
+    assert [path.name for path in first] == [path.name for path in second] and first != second
+    assert any(a.read_bytes() != b.read_bytes() for a, b in zip(first, second, strict=True))
+    code, text = run("ns-train", "beags-refine", "--run-dir", half, "--max-num-iterations", 6, *options, *base)
+    assert code == 0, text[-4000:]
+    assert last_prepared(half) == half / "prepared"
+    code, text = run(
+        "ns-train", "beags-refine", "--run-dir", resumed, *options, "--load-dir", half / "nerfstudio_models"
+    )
+    assert code == 0, text[-4000:]
+    assert "refinement taken up" in text and "Preparing refinement again" in text
+    a, b = load_scene(whole / "config.yml"), load_scene(resumed / "config.yml")
+    assert int(b.state["refined_steps"]) == 12 and a.state["class_ids"].shape == b.state["class_ids"].shape
+    for mask in second:
+        assert mask.read_bytes() == (last_prepared(resumed) / "masks" / mask.name).read_bytes(), mask.name
 
 
 def test_the_viewer_shows_single_objects_and_crops(trained):

@@ -95,14 +95,14 @@ def run_required(config: Path, json: Path | None = None, csv: Path | None = None
 def load(config: Path) -> Scene:
     """Read the run, its data and what its preparation kept."""
     from beags_plugin.plugin.evaluate import EvaluatedRun
-    from beags_plugin.plugin.refinement import PREPARED
+    from beags_plugin.plugin.runs import last_prepared
 
     run = EvaluatedRun(config)
     if "before" not in run.stages:
         raise UserError(f"{config.parent} keeps no base beside its scene: name a run of beags that was refined.")
     before: SavedScene = run.stages["before"]
     after: SavedScene = run.stages["after"]
-    kept = config.parent / PREPARED / "grid.pt"
+    kept = last_prepared(config.parent) / "grid.pt"
     state = torch.load(kept, weights_only=True) if kept.exists() else {}
     manager: BeagsDataManager = after.config.data_config.setup(
         device="cpu", test_mode="test", world_size=1, local_rank=0

@@ -19,7 +19,7 @@ from beags_plugin.assignment.assignment import Assignment
 from beags_plugin.errors import UserError
 from beags_plugin.masks.classes import read_class_map, write_class_map
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.plugin.runs import BASE_SNAPSHOT, write_run
+from beags_plugin.plugin.runs import BASE_SNAPSHOT, PREPARED, round_folder, write_run
 from beags_plugin.plugin.scene_edits import edit_scene
 from beags_plugin.progress import progress_bar
 from beags_plugin.refiners import REFINERS
@@ -28,8 +28,6 @@ from beags_plugin.refiners.preparation import Preparation, prepare
 if TYPE_CHECKING:
     from beags_plugin.plugin.datamanager import BeagsDataManager
     from beags_plugin.plugin.model import BeagsModel
-
-PREPARED = "prepared"  # folder of the run that keeps masks, grids and what was found
 
 
 class RefinementSwitch:
@@ -59,6 +57,9 @@ class RefinementSwitch:
     def check_options(self) -> None:
         """Raise ``UserError`` at the start of a run whose options would stop it when it comes to refine."""
         if self.wanted:
+            rounds, steps = self.model.config.refine_rounds, self.model.schedule.refine_steps
+            if not 1 <= rounds <= steps:
+                raise UserError(f"refine_rounds is {rounds}: it must be 1 to refine_steps, which is {steps}.")
             self.model.config.prepare.check()
             self.model.config.split.check()
 
@@ -67,25 +68,37 @@ class RefinementSwitch:
         model = self.model
         if not self.wanted or not model.schedule.refining(step):
             return
-        if not self.ready:
-            if int(model.refined_steps) > 0:
-                self._take_up()
-            else:
-                self._switch(step - 1)
+        done = int(model.refined_steps)
+        if not self.ready and done > 0:
+            self._take_up()
+        if not self.ready or (done > 0 and done in self._round_starts()):
+            self._prepare(step - 1)
         model.refined_steps += 1
 
     def after_step(self, step: int) -> None:
         """Switch right after the last base step, so that a run that ends there has its classes too."""
         if self.wanted and not self.ready and step + 1 == self.model.schedule.base_steps:
-            self._switch(step)
+            self._prepare(step)
 
-    def _folder(self) -> Path:
-        return self.trainer.base_dir / PREPARED
+    def _round_starts(self) -> list[int]:
+        """The refinement steps before which masks, classes and grids are made, the first of them 0."""
+        steps, rounds = self.model.schedule.refine_steps, self.model.config.refine_rounds
+        return [steps * index // rounds for index in range(rounds)]
 
-    def _switch(self, step: int) -> None:
+    def _round(self) -> int:
+        """Index of the round that the next step belongs to."""
+        done = int(self.model.refined_steps)
+        return sum(start <= done for start in self._round_starts()) - 1
+
+    def _folder(self, index: int) -> Path:
+        return round_folder(self.trainer.base_dir, index)
+
+    def _prepare(self, step: int) -> None:
+        """Prepare a round from the scene as it is and the masks as the data has them. step: the last one done."""
         model = self.model
-        views = self.datamanager.views("train")
-        CONSOLE.rule("Preparing refinement")
+        first = self._round() == 0
+        views = self.datamanager.views("train", original=True)
+        CONSOLE.rule("Preparing refinement" if first else "Preparing refinement again, with the refined depth")
         prepared = prepare(
             model.surfels(),
             [view.camera for view in views],
@@ -103,17 +116,25 @@ class RefinementSwitch:
         for finding in prepared.findings:
             CONSOLE.print(f"  {finding}", highlight=False, markup=False)
         self._take_classes(prepared.assignment)
-        # the snapshot first: what _save writes last says that everything is there
-        write_run(self.trainer.config, self.trainer.base_dir / BASE_SNAPSHOT, model.state_dict(), max(step, 0))
+        if first:  # the snapshot first: what _save writes last says that everything is there
+            write_run(self.trainer.config, self.trainer.base_dir / BASE_SNAPSHOT, model.state_dict(), max(step, 0))
         self._save(prepared, [view.name for view in views])
         if prepared.edited is not None:
             edit_scene(model, self.trainer.optimizers.optimizers, prepared.edited.edited)
             self._take_classes(prepared.edited.assignment)
         self._start(prepared.grid, prepared.labels)
-        model.prepared_seconds = prepared.seconds
-        CONSOLE.print(
-            f"  base kept in {self.trainer.base_dir / BASE_SNAPSHOT}", highlight=False, markup=False, soft_wrap=True
-        )
+        self._count(prepared.seconds, first)
+        if first:
+            CONSOLE.print(
+                f"  base kept in {self.trainer.base_dir / BASE_SNAPSHOT}", highlight=False, markup=False, soft_wrap=True
+            )
+
+    def _count(self, seconds: dict[str, float], first: bool) -> None:
+        """Add the time of a preparation to that of the stages; it is none of the refinement's."""
+        model = self.model
+        model.refining_since = time.perf_counter() if first else model.refining_since + sum(seconds.values())
+        total = model.prepared_seconds
+        model.prepared_seconds = {name: total.get(name, 0.0) + seconds.get(name, 0.0) for name in {**total, **seconds}}
 
     def _background_voxels(self) -> bool:
         return any(loss.asks_grid_about_background for loss in self.model.losses.values())
@@ -127,12 +148,13 @@ class RefinementSwitch:
         self.datamanager.replace_class_maps(labels)
         self.model.grid = grid
         self.model.frozen = not self.refiner.trains
-        self.model.refining_since = time.perf_counter()
         self.ready = True
 
     def _save(self, prepared: Preparation, names: list[str]) -> None:
         """Keep what refinement needs; grid.pt is written last, so its presence says that all is there."""
-        folder = self._folder()
+        folder = self._folder(self._round())
+        if folder.name == PREPARED:  # what an earlier run left here
+            shutil.rmtree(folder, ignore_errors=True)
         (folder / "masks").mkdir(parents=True, exist_ok=True)
         (folder / "confidence").mkdir(exist_ok=True)
         for index, name in enumerate(names):
@@ -147,7 +169,8 @@ class RefinementSwitch:
 
     def _take_up(self) -> None:
         """Go on with the masks and grids of the run that the checkpoint came from, and keep them with this one."""
-        folder = self._folder()
+        done = int(self.model.refined_steps)
+        folder = self._folder(sum(start < done for start in self._round_starts()) - 1)
         former = self.trainer.loaded_run
         if former is not None and former != self.trainer.base_dir:
             for name in (PREPARED, BASE_SNAPSHOT):
@@ -169,6 +192,7 @@ class RefinementSwitch:
             for view in self.datamanager.views("train")
         ]
         self._start(VisibilityGrid.from_state_dict(state) if state else None, labels)
+        self.model.refining_since = time.perf_counter()
         CONSOLE.print(f"  refinement taken up from {folder}", highlight=False, markup=False, soft_wrap=True)
 
 

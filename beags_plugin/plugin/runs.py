@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 
 BASE_SNAPSHOT = "base"  # folder of the run that keeps the scene as it was when refinement started
+PREPARED = "prepared"  # folder of the run that keeps masks, grids and what was found
 EXTRACTION_FILE = "extraction.json"  # in a run that holds a part of another: of which, and what was taken
 TRANSFORM_FILE = "dataparser_transforms.json"  # nerfstudio's name for how the poses were normalised
 
@@ -68,3 +69,16 @@ def newest_checkpoint(folder: Path) -> Path:
     if not checkpoints:
         raise UserError(f"{folder} holds no checkpoint (step-….ckpt): train longer, or name another run.")
     return checkpoints[-1]
+
+
+def round_folder(run: Path, index: int) -> Path:
+    """Where a run keeps what the refinement round of this index was prepared with."""
+    return run / PREPARED if index == 0 else run / PREPARED / f"round_{index + 1}"
+
+
+def last_prepared(run: Path) -> Path:
+    """What the last round of a run was prepared with, whether or not anything was."""
+    index = 0
+    while (round_folder(run, index + 1) / "grid.pt").exists():
+        index += 1
+    return round_folder(run, index)

@@ -11,7 +11,7 @@ import numpy as np
 from beags_plugin.evaluation.metrics import resize_nearest
 from beags_plugin.masks.classes import read_class_map
 from beags_plugin.plugin.datamanager import unique_names
-from beags_plugin.plugin.refinement import PREPARED
+from beags_plugin.plugin.runs import last_prepared
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -44,7 +44,7 @@ def training_masks(config: BeagsTrainerConfig) -> list[TrainingMasks]:
     outputs = parser.setup().get_dataparser_outputs("train")
     metadata = outputs.metadata
     exact = (metadata["ground_truth"] or {}).get("masks") or [None] * len(outputs.image_filenames)
-    prepared = config.get_base_dir() / PREPARED
+    prepared = last_prepared(config.get_base_dir())
     views = []
     for index, (name, photo) in enumerate(
         zip(unique_names(outputs.image_filenames), outputs.image_filenames, strict=True)
