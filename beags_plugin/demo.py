@@ -67,7 +67,7 @@ def run_demo(
 
 def quick_downscale(data: Path) -> float:
     """Whole factor that brings the images of ``data`` to ``QUICK_PIXELS`` or less."""
-    from beags_plugin.plugin.layout import image_size
+    from beags_plugin.data.files import image_size
 
     images = sorted(path for path in data.glob("images*/**/*") if path.suffix.lower() in {".jpg", ".jpeg", ".png"})
     if not images:

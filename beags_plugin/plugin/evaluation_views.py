@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from beags_plugin.data.files import image_size
 from beags_plugin.errors import UserError
 from beags_plugin.evaluation.metrics import resize_nearest
 from beags_plugin.evaluation.run_metrics import EvalView
 from beags_plugin.masks.classes import read_class_map
-from beags_plugin.plugin.layout import image_size
 from beags_plugin.plugin.model import fixed_background
 from beags_plugin.rasterizers.interface import IGNORE
 
