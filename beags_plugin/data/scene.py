@@ -81,6 +81,7 @@ class Scene:
 
     layout: what to call it. root: its folder. poses: where they come from.
     masks, mask_kind: the folder of the masks <stem>.png to train on, which may be missing, and what they are.
+    mask_files: stem of an image to its mask, where they are called otherwise; or None.
     class_names: id to name, or None; class_names_file: where they stand (for messages).
     visible, silhouettes: object name to its exact masks for evaluation: of what is seen of it, and of what it covers
         with nothing before it. More may lie in the folder of the ground truth.
@@ -95,6 +96,7 @@ class Scene:
     split: Split = Split()
     masks: Path = Path("masks")
     mask_kind: MaskKind = "ids"
+    mask_files: Mapping[str, Path] | None = None
     class_names: Mapping[int, str] | None = None
     class_names_file: Path | None = None
     visible: Mapping[str, FilesOfObject] = field(default_factory=dict)

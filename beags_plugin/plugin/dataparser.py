@@ -137,6 +137,8 @@ class BeagsDataParser(DataParser):
         images_root = _images_root(scene)
         folder, kind = self._masks(scene)
         masks = files_of_views(folder, views.images, images_root)
+        if self.config.masks_path is None and scene.mask_files is not None:
+            masks = [scene.mask_files.get(image.stem) for image in views.images]
         if not any(masks) and any(folder.glob("**/*.png")):
             raise UserError(
                 f"no mask in {folder} has the name of an image ({views.images[0].stem}.png, ...): "
@@ -198,6 +200,11 @@ class BeagsDataParser(DataParser):
             f"The protocol holds out {name}, which no image here is called: name that view with --held-out."
             for name in absent
         ]
+        if unknown := sorted(self._scored_names() - set(self._metadata["classes"].values())):
+            notes.append(
+                f"Exact masks of {', '.join(map(repr, unknown))} do not count, as no class is called so: "
+                f'name the classes in {scene.root / self.config.classes_path}, {{"id": "name"}}.'
+            )
         masks = self._metadata["class_map_filenames"]
         points = "random" if self._metadata["points3D_random"] else len(self._metadata["points3D_xyz"])
         line = (
@@ -206,6 +213,11 @@ class BeagsDataParser(DataParser):
             f"{sum(mask is not None for mask in masks) or 'no'} masks, {points} seed points."
         )
         return [line, *notes, *scene.notes]
+
+    def _scored_names(self) -> set[str]:
+        """Names of the objects that have exact masks of their own."""
+        truth = self._metadata["ground_truth"]
+        return set() if truth is None else {name for kind in ("visible", "silhouettes") for name in truth[kind]}
 
     def _split_in_words(self, views: PosedViews, scene: Scene) -> str:
         if views.members is not None:

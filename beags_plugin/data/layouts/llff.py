@@ -8,7 +8,7 @@ from beags_plugin.data.files import choose_images, image_folders, list_images
 from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.colmap import complete_model
 from beags_plugin.data.poses_bounds import FILE, read_poses_bounds, seed_points
-from beags_plugin.data.scene import ColmapModel, Scene, Split
+from beags_plugin.data.scene import ColmapModel, PoseTable, Scene, Split
 
 NVOS_TARGETS = {
     "fern": "IMG_4027",
@@ -31,21 +31,33 @@ class Llff(Layout):
     refines = ("colmap", "mipnerf360")
 
     def missing(self, root: Path) -> str | None:
-        if root.is_file() or not ((root / FILE).is_file() or complete_model(root)):
-            return f"neither {FILE} nor a complete COLMAP model (sparse/0)"
-        return None
+        return lacks_poses(root)
 
     def recognises(self, root: Path) -> bool:
         return (root / FILE).is_file() or (root.name in NVOS_TARGETS and complete_model(root) is not None)
 
     def read(self, root: Path, images: Path | None) -> Scene:
         folder = choose_images(root, images)
-        model = complete_model(root)
-        if model is not None:
-            poses, points = ColmapModel(model, folder, in_order=True), None
-        else:
-            poses, points = read_poses_bounds(root / FILE, folder), seed_points(root)
+        poses, points = model_or_bounds(root, folder)
         return Scene(self.title, root, poses, Split(nvos_target(root, folder)), seed_points=points)
+
+
+def lacks_poses(root: Path) -> str | None:
+    """What a scene lacks where neither of the two sources of poses is there; else None."""
+    if root.is_dir() and ((root / FILE).is_file() or complete_model(root) is not None):
+        return None
+    return f"neither {FILE} nor a complete COLMAP model (sparse/0)"
+
+
+def model_or_bounds(root: Path, images: Path) -> tuple[ColmapModel | PoseTable, Path | None]:
+    """The poses of the images in the folder ``images``: COLMAP's, which know the lens, else LLFF's; and seed points.
+
+    Smaller copies of the images may have other names in the same order, as LLFF makes them.
+    """
+    model = complete_model(root)
+    if model is not None:
+        return ColmapModel(model, images, in_order=True), None
+    return read_poses_bounds(root / FILE, images), seed_points(root)
 
 
 def nvos_target(root: Path, folder: Path) -> tuple[str, ...]:
