@@ -239,6 +239,40 @@ def test_lerf_mask(tmp_path, capsys):
     assert "do not count" not in capsys.readouterr().out
 
 
+def test_prompts_of_lerf_mask_are_scored_by_class_name(tmp_path):
+    """A run with the classes cup and box, of which the second test view alone has a mask of the cup."""
+    from run_folders import write_trained
+
+    from beags_plugin.plugin.evaluate import EvaluatedRun, evaluate_run
+
+    write_lerf_mask(tmp_path / "figurines")
+    write_image(tmp_path / "figurines/test_mask/1/cup.png", 255 * ids())
+    config = write_trained(tmp_path / "run", tmp_path / "figurines")
+    first, second = EvaluatedRun(config).views
+    assert first.visible_objects is None and first.visible is None
+    assert second.visible_objects is not None and list(second.visible_objects) == [1]
+    assert (second.visible_objects[1].numpy() == (ids() > 0)).all()
+    scored = {(mask.kind, mask.class_id, mask.view) for mask in evaluate_run(config).after.masks}
+    assert scored == {("extracted", 1, 1), ("rendered", 1, 1)}
+
+
+def test_the_masks_of_dtu_train_and_evaluate(tmp_path):
+    """Three-channel masks as class maps of a data manager, and as silhouettes of the class called object."""
+    from beags_plugin.plugin.config import base_config
+    from beags_plugin.plugin.datamanager import BeagsDataManagerConfig
+    from beags_plugin.plugin.evaluation_views import HeldOutViews
+
+    write_dtu(tmp_path)
+    config = base_config()
+    config.pipeline.datamanager = BeagsDataManagerConfig(dataparser=BeagsDataParserConfig(data=tmp_path))
+    views = HeldOutViews(config, {0: "background", 1: "object"})
+    labels = views.manager.views("train")[2].labels
+    assert labels is not None and (labels.numpy() == ids()).all()
+    view = views[1]
+    assert view.visible is not None and (view.visible.numpy() == ids()).all()
+    assert view.silhouettes is not None and (view.silhouettes[1].numpy() == (ids() > 0)).all()
+
+
 def test_3dovs(tmp_path):
     stems = write_3dovs(tmp_path)
     assert title(tmp_path) == "3D-OVS"
