@@ -77,5 +77,5 @@ def find_layout(data: Path, wanted: str = "auto") -> Layout:
         )
     if len(special) > 1:
         found = " and ".join(f"{layouts[name].marks} ({name})" for name in special)
-        raise UserError(f"{data} holds {found}: choose one of them with --layout.")
+        raise UserError(f"{data} holds {found}: choose one of them with beags-data --layout NAME.")
     return layouts[special[0]]

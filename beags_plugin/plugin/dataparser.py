@@ -197,7 +197,7 @@ class BeagsDataParser(DataParser):
         stems = set().union(*views.stems)
         absent = [name for name in scene.split.held_out if name not in stems]
         notes = [
-            f"The protocol holds out {name}, which no image here is called: name that view with --held-out."
+            f"The protocol holds out {name}, which no image here is called: name that view with beags-data --held-out."
             for name in absent
         ]
         if unknown := sorted(self._scored_names() - set(self._metadata["classes"].values())):
