@@ -93,5 +93,5 @@ def decompose(projection: npt.NDArray[np.float64]) -> tuple[np.ndarray, np.ndarr
     signs = np.sign(np.diag(K))
     K, rotation = K * signs, signs[:, None] * rotation
     if np.linalg.det(rotation) < 0:  # the projection's scale was negative
-        rotation = -rotation
+        rotation = np.negative(rotation)
     return K / K[2, 2], rotation, np.linalg.solve(projection[:, :3], -projection[:, 3])
