@@ -386,6 +386,7 @@ def test_another_package_can_add_a_layout(tmp_path, monkeypatch):
 MISTAKES = {
     "poses": (lambda root: np.save(root / "poses_bounds.npy", np.ones((10, 15))), "no finite .views, 17. numbers"),
     "text": (lambda root: (root / "poses_bounds.npy").write_text("x"), r"poses_bounds\.npy cannot be read"),
+    "empty": (lambda root: (root / "poses_bounds.npy").write_bytes(b""), r"poses_bounds\.npy cannot be read"),
     "image gone": (lambda root: (root / "images_4/image003.png").unlink(), "has 10 poses but .*images_4 9 images"),
     "no images": (lambda root: [p.unlink() for p in (root / "images_4").iterdir()], "images_4 holds no images"),
 }
@@ -401,16 +402,38 @@ def test_mistakes_are_told_in_one_sentence(tmp_path, mistake):
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("entry", ["world_mat_3", None])
-def test_a_dtu_camera_that_is_missing_is_told(tmp_path, entry):
+def without_camera(root: Path) -> None:
+    with np.load(root / "cameras_sphere.npz") as cameras:
+        kept = {name: cameras[name] for name in cameras.files if name != "world_mat_3"}
+    np.savez(root / "cameras_sphere.npz", **kept)
+
+
+def with_skew(root: Path) -> None:
+    with np.load(root / "cameras_sphere.npz") as cameras:
+        entries = dict(cameras)
+    entries["world_mat_2"] = (
+        np.array([[1.0, 0.4, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ entries["world_mat_2"]
+    )
+    np.savez(root / "cameras_sphere.npz", **entries)
+
+
+DTU_MISTAKES = {
+    "camera gone": (without_camera, "has 8 cameras but there are 9 images"),
+    "image gone": (lambda root: (root / "image/000003.png").unlink(), "has 9 cameras but there are 8 images"),
+    "mask gone": (lambda root: (root / "mask/003.png").unlink(), "mask holds 8 masks for 9 images"),
+    "skew": (with_skew, "world_mat_2 in .* is no camera with axes at right angles"),
+    "half a file": (lambda root: (root / "cameras_sphere.npz").write_bytes(b"PK\x03\x04"), "cannot be read: restore"),
+}
+
+
+@pytest.mark.parametrize("mistake", DTU_MISTAKES)
+def test_mistakes_in_dtu_are_told_in_one_sentence(tmp_path, mistake):
     write_dtu(tmp_path)
-    with np.load(tmp_path / "cameras_sphere.npz") as cameras:
-        kept = {name: cameras[name] for name in cameras.files if name != entry}
-    if entry is None:
-        (tmp_path / "image/000003.png").unlink()
-    np.savez(tmp_path / "cameras_sphere.npz", **kept)
-    with pytest.raises(UserError, match="has 8 cameras but there are 9|has 9 cameras but there are 8"):
+    make, message = DTU_MISTAKES[mistake]
+    make(tmp_path)
+    with pytest.raises(UserError, match=message) as raised:
         parse(tmp_path)
+    assert "\n" not in str(raised.value)
 
 
 def test_a_test_mask_of_no_view_is_told(tmp_path):

@@ -26,7 +26,7 @@ def read_poses_bounds(file: Path, images: Path) -> PoseTable:
     """
     try:
         rows = np.load(file, allow_pickle=False)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EOFError) as error:
         raise UserError(f"the poses {file} cannot be read: save them as LLFF does ({error}).") from error
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f" or not np.isfinite(rows).all():
         raise UserError(f"the poses {file} are no finite [views, 17] numbers: save them as LLFF does.")

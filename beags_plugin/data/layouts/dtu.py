@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
@@ -64,7 +65,7 @@ def read_cameras(
     try:
         with np.load(file, allow_pickle=False) as entries:
             table = {name: entries[name].astype(np.float64) for name in entries.files if "_mat_" in name}
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
         raise UserError(f"the cameras {file} cannot be read: restore the file ({error}).") from error
     count = sum(name.startswith("world_mat_") and not name.startswith("world_mat_inv_") for name in table)
     if count != len(images):

@@ -34,7 +34,7 @@ class Llff(Layout):
         return lacks_poses(root)
 
     def recognises(self, root: Path) -> bool:
-        return (root / FILE).is_file() or (root.name in NVOS_TARGETS and complete_model(root) is not None)
+        return (root / FILE).is_file() or (root.name.lower() in NVOS_TARGETS and complete_model(root) is not None)
 
     def read(self, root: Path, images: Path | None) -> Scene:
         folder = choose_images(root, images)
@@ -66,7 +66,7 @@ def nvos_target(root: Path, folder: Path) -> tuple[str, ...]:
     LLFF numbers its smaller copies (image000.png, ...) in the order of the camera's names, which are those in images/,
     or the second column of original_names.txt.
     """
-    target = next((stem for scene, stem in NVOS_TARGETS.items() if root.name.lower() == scene), None)
+    target = NVOS_TARGETS.get(root.name.lower())
     if target is None:
         return ()
     stems = [path.stem for path in list_images(folder)]
