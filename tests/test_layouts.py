@@ -294,6 +294,8 @@ def test_spin_nerf(tmp_path, capsys):
     assert title(tmp_path) == "SPIn-NeRF"
     outputs, test = parse(tmp_path), parse(tmp_path, "test")
     assert names(test) == [stems[3], stems[11]] and names(outputs) == stems[4:11]
+    also = parse(tmp_path, "test", held_out=(stems[0], stems[5]))  # the first is left out unless one asks for it
+    assert names(also) == [stems[i] for i in (0, 3, 5, 11)]
     assert "3 images before the first label are left out" in " ".join(capsys.readouterr().out.split())
     camera = camera_from_nerfstudio(outputs.cameras, 0)
     assert (camera.width, camera.height) == (WIDTH // 4, HEIGHT // 4)

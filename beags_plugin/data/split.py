@@ -21,9 +21,9 @@ def split_views(
     if unknown := sorted(set(held_out) - set().union(*names)):
         raise UserError(f"held_out names {unknown[0]!r}, but no image has that stem: correct the name.")
     kept = [index for index, own in enumerate(names) if own.isdisjoint(split.left_out)]
-    chosen = {*held_out, *split.held_out}
-    regular = set(kept[::interval]) if split.every and interval > 0 else set()
-    out = {index for index in kept if index in regular or not names[index].isdisjoint(chosen)}
+    out = set(kept[::interval]) if split.every and interval > 0 else set()
+    out |= {index for index in kept if not names[index].isdisjoint(split.held_out)}
+    out |= {index for index, own in enumerate(names) if not own.isdisjoint(held_out)}  # left out or not
     train = [index for index in kept if index not in out]
     if not train:
         raise UserError(f"all {len(kept)} views are held out for evaluation: add views or change eval_interval.")
