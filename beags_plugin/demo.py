@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import subprocess
@@ -67,11 +68,9 @@ def run_demo(
 
 def quick_downscale(data: Path) -> float:
     """Whole factor that brings the images of ``data`` to ``QUICK_PIXELS`` or less."""
-    from beags_plugin.plugin.layout import image_size
+    from beags_plugin.data.files import image_size
 
-    images = sorted(path for path in data.glob("images*/**/*") if path.suffix.lower() in {".jpg", ".jpeg", ".png"})
-    if not images:
-        images = _first_frame(data)
+    images = _images(data) or _first_frame(data)
     if not images:
         return 1.0  # the data parser names what is missing
     width, height = image_size(images[0])
@@ -79,6 +78,21 @@ def quick_downscale(data: Path) -> float:
     while width * height / factor**2 > QUICK_PIXELS:
         factor += 1
     return float(factor)
+
+
+def _images(data: Path) -> list[Path]:
+    """The images that the layout of ``data`` takes, or where it is not known, those in images/."""
+    from beags_plugin.data.layout import read_scene
+    from beags_plugin.data.scene import ColmapModel, PoseTable
+
+    folder, pattern = data, "images*/**/*"
+    with contextlib.suppress(UserError):  # the data parser names what is missing
+        poses = read_scene(data).poses
+        if isinstance(poses, PoseTable):
+            return list(poses.images)
+        if isinstance(poses, ColmapModel):
+            folder, pattern = poses.images, "**/*"
+    return sorted(path for path in folder.glob(pattern) if path.suffix.lower() in {".jpg", ".jpeg", ".png"})
 
 
 def _first_frame(data: Path) -> list[Path]:

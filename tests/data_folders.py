@@ -70,14 +70,21 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
     return np.linalg.eigh(matrix)[1][:, -1]
 
 
-def write_colmap(root: Path, count: int = 9, text: bool = False, folder: str = "sparse/0", points=None) -> np.ndarray:
-    """A COLMAP PINHOLE model whose image ids run against the name order; returns world-to-camera [V, 4, 4], OpenCV."""
+def write_colmap(
+    root: Path, count: int = 9, text: bool = False, folder: str = "sparse/0", points=None, names=None
+) -> np.ndarray:
+    """A COLMAP PINHOLE model whose image ids run against the name order; returns world-to-camera [V, 4, 4], OpenCV.
+
+    names: of the images, sorted; v00.png, ... if None.
+    """
+    names = [f"v{index:02d}.png" for index in range(count)] if names is None else list(names)
+    count = len(names)
     model = root / folder
     model.mkdir(parents=True)
     matrices = np.stack([np.linalg.inv(pose @ np.diag([1.0, -1.0, -1.0, 1.0])) for pose in ring(count)])
     lines, binary = [], struct.pack("<Q", count)
     for index, matrix in enumerate(matrices):
-        name, image_id = f"v{index:02d}.png", count - index
+        name, image_id = names[index], count - index
         write_image(root / "images" / name, noise(index))
         values = [*quaternion(matrix[:3, :3]), *matrix[:3, 3]]
         lines.append(f"{image_id} {' '.join(map(repr, map(float, values)))} 1 {name}\n\n")

@@ -7,7 +7,14 @@ import pytest
 from PIL import Image
 
 from beags_plugin.errors import UserError
-from beags_plugin.masks.classes import colorize, read_class_map, read_classes, write_class_map
+from beags_plugin.masks.classes import (
+    colorize,
+    read_binary_mask,
+    read_class_map,
+    read_classes,
+    read_mask,
+    write_class_map,
+)
 from beags_plugin.rasterizers.interface import IGNORE
 
 
@@ -39,6 +46,35 @@ def test_palette_images_give_indices_not_colours(tmp_path):
     image.putpalette([0, 0, 0, 200, 10, 10, 10, 200, 10])
     image.save(tmp_path / "a.png")
     assert read_class_map(tmp_path / "a.png").tolist() == [[0, 2], [1, 2]]
+
+
+GREY = np.array([[0, 100, 128], [255, 1, 127]], dtype=np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("array", "inside"),
+    [
+        (GREY, GREY >= 128),  # rims that were blended
+        (np.repeat(GREY[..., None], 3, axis=2), GREY >= 128),
+        (np.stack([GREY, 0 * GREY, 0 * GREY, 255 - GREY], axis=2), GREY >= 128),  # alpha says nothing
+        (np.minimum(GREY, 1), GREY > 0),  # labels
+        (np.array([[0, 300], [IGNORE, 1]], dtype=np.uint16), [[False, True], [False, True]]),
+        (np.array([[True, False]]), [[True, False]]),
+        (0 * GREY, GREY < 0),
+    ],
+)
+def test_binary_masks_of_all_kinds(tmp_path, array, inside):
+    Image.fromarray(array).save(tmp_path / "a.png")
+    mask = read_binary_mask(tmp_path / "a.png")
+    assert mask.dtype == bool and np.array_equal(mask, inside)
+    ones = read_mask(tmp_path / "a.png", "binary")
+    assert ones.dtype == np.uint16 and np.array_equal(ones, np.asarray(inside, int))
+
+
+def test_binary_masks_with_loss_are_refused(tmp_path):
+    Image.fromarray(GREY).save(tmp_path / "a.jpg")
+    with pytest.raises(UserError, match=r"a\.jpg is a JPEG"):
+        read_binary_mask(tmp_path / "a.jpg")
 
 
 def test_one_bit_images_are_ids_0_and_1(tmp_path):

@@ -331,7 +331,7 @@ def test_data_is_kept_absolute(tmp_path, monkeypatch):
     assert all(path.is_absolute() for path in outputs.image_filenames)
 
 
-@pytest.mark.parametrize("module", ["dataparser", "layout", "cameras", "seed_points"])
+@pytest.mark.parametrize("module", ["dataparser", "poses", "colmap_files", "cameras", "seed_points"])
 def test_no_import_of_a_data_manager(module):
     import beags_plugin.plugin
 
@@ -410,7 +410,7 @@ def test_mistakes_are_told_in_one_sentence(tmp_path, mistake):
         (dict(downscale_factor=float("nan")), "downscale_factor is nan"),
         (dict(eval_interval=1), "held out for evaluation"),
         (dict(held_out=("nobody",)), "held_out names 'nobody'"),
-        (dict(source="colmap"), "no COLMAP model"),
+        (dict(layout="colmap"), "no COLMAP model"),
     ],
 )
 def test_wrong_options(tmp_path, options, message):

@@ -28,6 +28,15 @@ def test_images_elsewhere_are_found_through_the_poses(tmp_path):
     assert quick_downscale(tmp_path) == 2.0
 
 
+def test_the_images_that_the_layout_takes_decide(tmp_path):
+    """LLFF's poses_bounds.npy with originals too large to take, and copies."""
+    for name, shape in (("images/a.png", (1500, 2000)), ("images_4/a.png", (375, 500))):
+        write_image(tmp_path / name, np.zeros(shape, np.uint8))
+    assert quick_downscale(tmp_path) == 8.0
+    np.save(tmp_path / "poses_bounds.npy", np.eye(17)[:1])
+    assert quick_downscale(tmp_path) == 2.0  # 250 x 187 are 46,750 pixels
+
+
 def test_an_image_that_cannot_be_read_is_told_in_a_sentence(tmp_path):
     (tmp_path / "images").mkdir()
     (tmp_path / "images/a.png").write_text("no picture")

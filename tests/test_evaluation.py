@@ -120,6 +120,29 @@ def test_a_stray_surfel_costs_what_it_covers():
     assert metrics.psnr is None
 
 
+def test_only_labelled_objects_are_scored():
+    """Only the cup's visible mask is known: the box is not scored, though it is seen; the id image does not count."""
+    surfels, ids = scene([CUP, BOX, FLOOR]), torch.tensor([1, 2, 0], dtype=torch.int32)
+    wrong = torch.full((SIZE, SIZE), 2, dtype=torch.int32)
+    view = EvalView(camera(), None, wrong, visible_objects={1: square_mask(*CUP)})
+    metrics = evaluate_scene(surfels, ids, Squares(), SETTINGS, [view], CLASSES)
+    assert metrics.objects == {1: metrics.mean, 2: ObjectMetrics(None, None)}
+    assert metrics.mean == ObjectMetrics(MaskMetrics(1.0, 1.0, 1.0), MaskMetrics(1.0, 1.0, 1.0))
+    assert metrics.extracted_truth == "visible"
+
+
+def test_pixels_of_other_labelled_objects_are_left_out_of_extracted_masks():
+    """The box is whole behind the cup; its visible mask lacks the part that the cup, labelled too, covers."""
+    surfels, ids = scene([CUP, BOX, FLOOR]), torch.tensor([1, 2, 0], dtype=torch.int32)
+    seen = {1: square_mask(*CUP), 2: square_mask(*BOX) & ~square_mask(*CUP)}
+    both = EvalView(camera(), None, visible_objects=seen)
+    alone = EvalView(camera(), None, visible_objects={2: seen[2]})
+    for view, iou in ((both, 1.0), (alone, 0.5)):
+        box = evaluate_scene(surfels, ids, Squares(), SETTINGS, [view], CLASSES).objects[2]
+        assert box.extracted is not None and box.extracted.iou == pytest.approx(iou)
+        assert box.rendered is not None and box.rendered.iou == 1.0
+
+
 def test_without_silhouettes_what_lies_behind_others_is_left_out():
     """The box is complete behind the cup: compared with its visible half, the covered half must not count."""
     surfels, ids = scene([CUP, BOX, FLOOR]), torch.tensor([1, 2, 0], dtype=torch.int32)

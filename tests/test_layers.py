@@ -7,6 +7,7 @@ import sys
 
 import pytest
 
+LAYOUTS = ["colmap", "dtu", "lerf_mask", "llff", "mipnerf360", "nerfstudio", "spin_nerf", "three_d_ovs"]
 CORE = [  # all that stands under the plugin layer
     "core.surfels",
     "core.densification",
@@ -29,6 +30,10 @@ CORE = [  # all that stands under the plugin layer
     "evaluation.table",
     "evaluation.worst_views",
     "sample.writer",
+    "data.labels",
+    "data.ground_truth",
+    "data.split",
+    *(f"data.layouts.{name}" for name in LAYOUTS),
     "cli",
 ]
 

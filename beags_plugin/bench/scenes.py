@@ -15,7 +15,7 @@ import numpy as np
 
 from beags_plugin.digests import folder_digest, value_digest
 from beags_plugin.errors import UserError
-from beags_plugin.masks.classes import read_class_map, write_class_map
+from beags_plugin.masks.classes import read_mask, write_class_map
 from beags_plugin.progress import progress_bar
 from beags_plugin.rasterizers.interface import IGNORE
 
@@ -85,10 +85,11 @@ def damaged_masks(scene: Scene, degree: float, folder: Path) -> Path:
     dropped = dropped_views(stems, scene.seed, degradation.dropped)
     for split, outputs in splits.items():  # a view in both is for training
         classes = np.array(sorted(outputs.metadata["classes"]))
-        for image, mask in zip(outputs.image_filenames, _best_masks(outputs.metadata, split), strict=True):
+        masks = _best_masks(outputs.metadata, split)
+        for image, (mask, kind) in zip(outputs.image_filenames, masks, strict=True):
             if mask is None or (split == "train" and image.stem in dropped):
                 continue
-            labels = read_class_map(mask, outputs.metadata["ignore_ids"])
+            labels = read_mask(mask, kind, outputs.metadata["ignore_ids"])
             if split == "train":
                 ranks = np.where(labels == IGNORE, len(classes), np.searchsorted(classes, labels))
                 ranks = degrade_mask(ranks, len(classes), degradation, scene.seed, image.stem)
@@ -100,12 +101,13 @@ def damaged_masks(scene: Scene, degree: float, folder: Path) -> Path:
     return target
 
 
-def _best_masks(metadata: dict[str, Any], split: str) -> list[Path | None]:
-    """Per view its exact mask, in training views only; else the one it has."""
+def _best_masks(metadata: dict[str, Any], split: str) -> list[tuple[Path | None, str]]:
+    """Per view its exact mask, in training views only; else the one it has. With each, what kind it is."""
     given: list[Path | None] = metadata["class_map_filenames"]
     truth = metadata["ground_truth"]
     exact = truth["masks"] if truth and split == "train" else [None] * len(given)
-    return [best or mask for best, mask in zip(exact, given, strict=True)]
+    kind: str = metadata["mask_kind"]
+    return [(best, "ids") if best else (mask, kind) for best, mask in zip(exact, given, strict=True)]
 
 
 def _below(image: Path, root: Path) -> Path:

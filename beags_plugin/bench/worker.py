@@ -152,7 +152,7 @@ def _voxel_size(grid: Path) -> float | None:
 
 def _pixels(masks: Path) -> int:
     """Of all training views."""
-    from beags_plugin.plugin.layout import image_size
+    from beags_plugin.data.files import image_size
 
     sizes = [image_size(path) for path in masks.rglob("*.png")]
     return sum(width * height for width, height in sizes)

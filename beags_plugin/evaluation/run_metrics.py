@@ -33,6 +33,8 @@ class EvalView:
     silhouettes: object id to [h, w] bool, what the object covers when nothing stands before it; None if unknown.
     seen: object id to [h, w] bool, the part of the silhouette whose surface some training photo shows; the rest
         cannot be known and is left out of the extracted metrics. None counts whole silhouettes.
+    visible_objects: object id to [h, w] bool, what is seen of it, where single objects were labelled and nothing is
+        known of the others; it is scored instead of ``visible``. None if there are no such masks.
     """
 
     camera: Camera
@@ -41,6 +43,7 @@ class EvalView:
     silhouettes: Mapping[int, Tensor] | None = None
     name: str = ""
     seen: Mapping[int, Tensor] | None = None
+    visible_objects: Mapping[int, Tensor] | None = None
 
 
 @dataclass(frozen=True)
@@ -221,11 +224,19 @@ class MaskDrawing:
                 if (truth := extracted_truth(view, class_id, self.protocol)) is not None:
                     part = select_class(self.surfels, self.class_ids, class_id)[0]
                     found[class_id] = DrawnMask(extracted_mask(part, *drawing), truth[1], truth[2], truth[0])
-        elif view.visible is not None:
-            for class_id, prediction in rendered_masks(self.surfels, self.class_ids, objects, *drawing).items():
-                unlabelled = view.visible == IGNORE
-                found[class_id] = DrawnMask(prediction, view.visible == class_id, unlabelled, "visible")
+        else:
+            truths = {class_id: truth for class_id in objects if (truth := rendered_truth(view, class_id)) is not None}
+            for class_id, prediction in rendered_masks(self.surfels, self.class_ids, list(truths), *drawing).items():
+                found[class_id] = DrawnMask(prediction, *truths[class_id], "visible")
         return found
+
+
+def rendered_truth(view: EvalView, class_id: int) -> tuple[Tensor, Tensor | None] | None:
+    """What is seen of an object, [h, w] bool, and the unlabelled pixels; None if the view has no mask of it."""
+    if view.visible_objects is not None:
+        truth = view.visible_objects.get(class_id)
+        return None if truth is None else (truth, None)
+    return None if view.visible is None else (view.visible == class_id, view.visible == IGNORE)
 
 
 def extracted_truth(
@@ -241,9 +252,21 @@ def extracted_truth(
         scored_whole = (protocol or Protocol()).silhouettes == "whole"
         known = None if scored_whole or view.seen is None else view.seen.get(class_id)
         return "silhouette", silhouette, None if known is None else silhouette & ~known
+    if view.visible_objects is not None:
+        truth = view.visible_objects.get(class_id)
+        return None if truth is None else ("visible", truth, _of_others(view.visible_objects, class_id) & ~truth)
     if view.visible is None:
         return None
     return "visible", view.visible == class_id, (view.visible != class_id) & (view.visible != 0)
+
+
+def _of_others(masks: Mapping[int, Tensor], class_id: int) -> Tensor:
+    """[h, w] bool: pixels of the masks of other objects that are as large as this one's."""
+    others = torch.zeros_like(masks[class_id])
+    for other, mask in masks.items():
+        if other != class_id and mask.shape == others.shape:
+            others |= mask
+    return others
 
 
 def extracted_mask(

@@ -14,6 +14,7 @@ from beags_plugin.rasterizers.interface import IGNORE
 
 BACKGROUND = 0
 _ID_MODES = {"1", "L", "P", "I", "I;16", "I;16L", "I;16B"}  # Pillow's names of images with one integer per pixel
+_COLOR_MODES = {"RGB", "RGBA", "LA"}
 
 
 def read_class_map(path: Path | str, ignore_ids: Iterable[int] = ()) -> np.ndarray:
@@ -22,17 +23,7 @@ def read_class_map(path: Path | str, ignore_ids: Iterable[int] = ()) -> np.ndarr
     ignore_ids: ids of an 8-bit image that mean "unlabelled", e.g. 255; they become IGNORE.
     Returns [H, W] uint16; 65535 is IGNORE. Raises ``UserError`` for a file that is no such image.
     """
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as image:
-            form, mode, values = image.format, image.mode, np.asarray(image)
-    except FileNotFoundError:
-        raise UserError(f"the mask {path} does not exist: check the path.") from None
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
-        raise UserError(f"the mask {path} cannot be read as an image ({error}): save it as PNG again.") from None
-    if form == "JPEG":
-        raise UserError(f"the mask {path} is a JPEG, which blurs class ids: save it as 8-bit or 16-bit grey PNG.")
+    mode, values = _read_pixels(path)
     if mode not in _ID_MODES or values.ndim != 2:
         raise UserError(
             f"the mask {path} has colours (mode {mode}) where class ids are needed: save it as 8-bit or 16-bit grey, "
@@ -44,6 +35,44 @@ def read_class_map(path: Path | str, ignore_ids: Iterable[int] = ()) -> np.ndarr
     if mode in {"1", "L", "P"}:
         class_map[np.isin(class_map, list(ignore_ids))] = IGNORE
     return class_map
+
+
+def read_binary_mask(path: Path | str) -> np.ndarray:
+    """Where the mask of one object is inside, [H, W] bool.
+
+    Brightness (8-bit grey or colours that reach 128 somewhere) is inside from 128 on, as rims may be blended; in other
+    images, such as labels 0 and 1, all but 0 and IGNORE is inside. Alpha says nothing.
+    Raises ``UserError`` for a file that is no such image.
+    """
+    mode, values = _read_pixels(path)
+    if mode in _COLOR_MODES:
+        values = values[..., : 1 if mode == "LA" else 3].max(axis=2)
+    elif mode not in _ID_MODES or values.ndim != 2:
+        raise UserError(f"the mask {path} is of mode {mode}: save it as grey PNG.")
+    if mode in {"L", *_COLOR_MODES} and values.max(initial=0) >= 128:
+        return values >= 128
+    return (values != 0) & (values != IGNORE)
+
+
+def read_mask(path: Path | str, kind: str, ignore_ids: Iterable[int] = ()) -> np.ndarray:
+    """[H, W] uint16, the class ids in a file of id images ("ids"), or 1 inside and 0 outside of a "binary" mask."""
+    return read_binary_mask(path).astype(np.uint16) if kind == "binary" else read_class_map(path, ignore_ids)
+
+
+def _read_pixels(path: Path | str) -> tuple[str, np.ndarray]:
+    """Pillow's mode and the values of an image without loss."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            form, mode, values = image.format, image.mode, np.asarray(image)
+    except FileNotFoundError:
+        raise UserError(f"the mask {path} does not exist: check the path.") from None
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
+        raise UserError(f"the mask {path} cannot be read as an image ({error}): save it as PNG again.") from None
+    if form == "JPEG":
+        raise UserError(f"the mask {path} is a JPEG, which blurs class ids: save it as 8-bit or 16-bit grey PNG.")
+    return mode, values
 
 
 def write_class_map(path: Path | str, array: np.ndarray) -> None:

@@ -1,35 +1,30 @@
-"""Data parser ``beags-data``: nerfstudio or COLMAP poses, images, and id images of the classes.
+"""Data parser ``beags-data``: the images, poses and class masks of a scene in any registered layout.
 
 Nothing here may import a data manager: nerfstudio loads this module while it is importing its own.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
-from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
 
+from beags_plugin.data.files import check_same_size, files_of_views, image_size
+from beags_plugin.data.ground_truth import find_ground_truth, of_views
+from beags_plugin.data.labels import read_class_names
+from beags_plugin.data.layout import read_scene
+from beags_plugin.data.scene import ColmapModel, MaskKind, Scene, TransformsFile
+from beags_plugin.data.split import split_views
 from beags_plugin.errors import UserError
-from beags_plugin.plugin import layout
-from beags_plugin.plugin.cameras import (
-    camera_from_nerfstudio,
-    check_cameras,
-    concatenate_cameras,
-    downscaled_size,
-    resize_cameras,
-)
-from beags_plugin.plugin.seed_points import random_points, read_ply_points
+from beags_plugin.plugin.cameras import check_cameras, downscaled_size, resize_cameras
+from beags_plugin.plugin.poses import Normalization, PosedViews, read_poses
+from beags_plugin.plugin.seed_points import starting_points
 
 
 @dataclass
@@ -38,25 +33,26 @@ class BeagsDataParserConfig(DataParserConfig):
 
     _target: type = field(default_factory=lambda: BeagsDataParser)
     data: Path = Path()
-    """Folder of the scene, with transforms.json or COLMAP's sparse/0; or the transforms .json itself."""
-    source: Literal["auto", "transforms", "colmap"] = "auto"
-    """Where poses come from; auto prefers transforms.json."""
+    """Folder of the scene; or a transforms .json itself."""
+    layout: str = "auto"
+    """How the data set lays out its files: nerfstudio, colmap, llff, ... (docs/data.md); auto recognises it."""
     images_path: Path | None = None
-    """Folder of the images. COLMAP: "images" if not given. transforms.json: replaces the folder its file_path names.
+    """Folder of the images, if not the layout's own. transforms.json: replaces the folder its file_path names.
     The images may be smaller than the poses say (images_4): the cameras follow the images."""
-    masks_path: Path = Path("masks")
-    """Folder of the id images <stem>.png; some or all may be missing."""
+    masks_path: Path | None = None
+    """Folder of the id images <stem>.png, if not the layout's own, mostly "masks"; some or all may be missing."""
     classes_path: Path = Path("classes.json")
     """File {"id": "name"} of the classes; without it they are called class_<id>."""
     ground_truth_path: Path = Path("ground_truth")
-    """Folder with exact masks for evaluation: masks/<stem>.png, silhouettes/<object>/<stem>.png; may be missing."""
+    """Folder with exact masks for evaluation: masks/<stem>.png, visible/<object>/<stem>.png,
+    silhouettes/<object>/<stem>.png; may be missing."""
     ignore_ids: tuple[int, ...] = ()
     """Ids in the masks that mean "not labelled"."""
     downscale_factor: float = 1.0
     """Divide the images' width and height by this when loading; nothing is written to disk."""
     eval_interval: int = 8
     """Every so many of the name-sorted views is held out for evaluation; 0: all views serve both.
-    Splits that the data names itself (transforms.json, train_list.txt) come first."""
+    Splits that the data or its protocol names come first."""
     held_out: tuple[str, ...] = ()
     """Stems of images to hold out for evaluation besides."""
     orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
@@ -84,46 +80,13 @@ def absolute(path: object) -> object:
     return Path(path).expanduser().absolute() if isinstance(path, (str, Path)) and Path(path) != Path() else path
 
 
-class _Transforms(Nerfstudio):
-    """nerfstudio's parser of transforms.json, reading .ply without open3d and a global k4, which it overlooks."""
-
-    global_k4 = 0.0
-
-    def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
-        outputs = super()._generate_dataparser_outputs(split)
-        parameters = outputs.cameras.distortion_params
-        if self.global_k4 != 0.0 and parameters is not None:
-            k4 = torch.full_like(parameters[..., :1], self.global_k4)
-            outputs.cameras.distortion_params = torch.cat([parameters[..., :3], k4, parameters[..., 4:]], -1)
-        return outputs
-
-    def _load_3D_points(self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float) -> dict | None:
-        points, colors = read_ply_points(ply_file_path)
-        if len(points) == 0:
-            return None
-        moved = torch.from_numpy(points) @ transform_matrix[:, :3].T + transform_matrix[:, 3]
-        return {"points3D_xyz": moved * scale_factor, "points3D_rgb": torch.from_numpy(colors)}
-
-
-@dataclass
-class _Scene:
-    """All views of a scene, sorted by name, before they are split.
-
-    members: split name to indices of its views, where the data names splits itself; else None.
-    """
-
-    images: list[Path]
-    cameras: Cameras
-    members: dict[str, list[int]] | None
-    outputs: DataparserOutputs
-
-
 class BeagsDataParser(DataParser):
     """Parser behind ``beags-data``; see ``BeagsDataParserConfig`` for its options.
 
     Metadata of what it returns, per view of the split where it is a list: ``points3D_xyz`` [P, 3] float32 in the world
     of the cameras, ``points3D_rgb`` [P, 3] uint8, ``points3D_random`` bool, ``classes`` dict id -> name,
-    ``class_map_filenames`` list of Path or None, ``ignore_ids``, ``ground_truth`` (see ``layout.find_ground_truth``).
+    ``class_map_filenames`` list of Path or None, ``mask_kind`` (see ``data.scene.MaskKind``), ``ignore_ids``,
+    ``ground_truth`` (see ``data.ground_truth.GroundTruth``) or None.
     Every user's mistake is a ``UserError``.
     """
 
@@ -131,141 +94,80 @@ class BeagsDataParser(DataParser):
 
     def __init__(self, config: BeagsDataParserConfig) -> None:
         super().__init__(config)
-        self._scene: _Scene | None = None
-        self._metadata: dict | None = None
+        self._views: PosedViews | None = None
+        self._metadata: dict[str, Any] = {}
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
-        if self._scene is None:  # train and eval share one parser: the poses are read once
-            scene = self._read_scene()
-            self._metadata = self._read_metadata(scene)
-            self._scene = scene
-        scene = self._scene
-        chosen = self._views_of_split(scene, split)
-        metadata = dict(self._metadata or {})
+        if self._views is None:  # train and eval share one parser: the poses are read once
+            self._read()
+        views = self._views
+        assert views is not None
+        chosen = self._views_of_split(views, split)
+        metadata = dict(self._metadata)
         metadata["class_map_filenames"] = [metadata["class_map_filenames"][i] for i in chosen]
-        metadata["ground_truth"] = _select_ground_truth(metadata["ground_truth"], chosen)
+        if metadata["ground_truth"] is not None:
+            metadata["ground_truth"] = of_views(metadata["ground_truth"], chosen)
         return DataparserOutputs(
-            image_filenames=[scene.images[i] for i in chosen],
-            cameras=scene.cameras[torch.tensor(chosen)],
-            scene_box=scene.outputs.scene_box,
-            dataparser_transform=scene.outputs.dataparser_transform,
-            dataparser_scale=scene.outputs.dataparser_scale,
+            image_filenames=[views.images[i] for i in chosen],
+            cameras=views.cameras[torch.tensor(chosen)],
+            scene_box=views.outputs.scene_box,
+            dataparser_transform=views.outputs.dataparser_transform,
+            dataparser_scale=views.outputs.dataparser_scale,
             metadata=metadata,
         )
 
-    def _read_scene(self) -> _Scene:
+    def _read(self) -> None:
         config = self.config
         if not config.downscale_factor >= 1.0:
             raise UserError(f"downscale_factor is {config.downscale_factor}: give 1 (full size) or more.")
-        root = Path(config.data).absolute()
-        self._source = layout.find_source(root, config.source)
-        parser, named = self._transforms_parser() if self._source.kind == "transforms" else self._colmap_parser()
-        parts = [_delegate(parser, split, self._source.file) for split in named or ("train",)]
+        self._scene = scene = read_scene(Path(config.data).absolute(), config.layout, config.images_path)
+        options = {name: getattr(config, name) for name in Normalization.__dataclass_fields__}
+        views = read_poses(scene.poses, scene.root, Normalization(**options))
+        check_cameras(views.cameras, views.images)
+        self._metadata = self._read_metadata(scene, views)
+        for line in self._recognised(scene, views):
+            CONSOLE.print(line, markup=False, highlight=False, soft_wrap=True)
+        self._views = views
 
-        # A view may be in several named splits (val and test are often the same): keep it once.
-        paths = [self._image_path(path) for part in parts for path in part.image_filenames]
-        index_of = {path: index for index, path in enumerate(paths)}
-        images = sorted(index_of, key=lambda path: path.as_posix())
-        if not images:
-            raise UserError(f"{self._source.file} holds no images: give poses for at least two.")
-        cameras = concatenate_cameras([part.cameras for part in parts])[torch.tensor([index_of[i] for i in images])]
-        members = None
-        if named:
-            position = {path: index for index, path in enumerate(images)}
-            members = {
-                split: sorted(position[self._image_path(path)] for path in part.image_filenames)
-                for split, part in zip(named, parts, strict=True)
-            }
-        if any(part.mask_filenames for part in parts):
-            CONSOLE.print("[yellow]mask_path of transforms.json is not used: beags-data reads class maps only.")
-        check_cameras(cameras, images)
-        return _Scene(images, cameras, members, parts[0])
-
-    def _read_metadata(self, scene: _Scene) -> dict:
+    def _read_metadata(self, scene: Scene, views: PosedViews) -> dict[str, Any]:
         """Checks of files against each other, and what all splits share."""
-        config, root = self.config, self._source.root
-        sizes = [layout.image_size(path) for path in scene.images]
-        self._fit_cameras(scene, sizes)
-
-        images_root = root / (config.images_path or "images")
-        masks = layout.files_of_views(root / config.masks_path, scene.images, images_root)
-        if not any(masks) and any((root / config.masks_path).glob("**/*.png")):
+        config = self.config
+        sizes = [image_size(path) for path in views.images]
+        self._fit_cameras(views, sizes)
+        images_root = _images_root(scene)
+        folder, kind = self._masks(scene)
+        masks = files_of_views(folder, views.images, images_root)
+        if self.config.masks_path is None and scene.mask_files is not None:
+            masks = [scene.mask_files.get(image.stem) for image in views.images]
+        if not any(masks) and any(folder.glob("**/*.png")):
             raise UserError(
-                f"no mask in {root / config.masks_path} has the name of an image ({scene.images[0].stem}.png, ...): "
+                f"no mask in {folder} has the name of an image ({views.images[0].stem}.png, ...): "
                 f"rename the masks, or give another masks_path."
             )
-        layout.check_same_size(masks, sizes)
-        present = [mask for mask in masks if mask is not None]
-        classes = layout.read_class_names(root / config.classes_path, present, config.ignore_ids)
-
-        points = {name: scene.outputs.metadata.get(name) for name in ("points3D_xyz", "points3D_rgb")}
-        drawn = points["points3D_xyz"] is None or len(points["points3D_xyz"]) == 0
-        if drawn:
-            views = [camera_from_nerfstudio(scene.cameras, index) for index in range(len(scene.images))]
-            xyz, rgb = random_points(views, config.num_random_points, config.random_points_seed)
-            points = {"points3D_xyz": torch.from_numpy(xyz), "points3D_rgb": torch.from_numpy(rgb)}
+        check_same_size(masks, sizes)
+        present = [mask for mask in masks if mask is not None and kind == "ids"]
+        classes_file = scene.root / config.classes_path
+        known = (scene.class_names, scene.class_names_file)
         return {
-            **points,
-            "points3D_random": drawn,
-            "classes": classes,
+            **starting_points(scene, views, config.num_random_points, config.random_points_seed),
+            "classes": read_class_names(classes_file, present, config.ignore_ids, *known),
             "class_map_filenames": masks,
+            "mask_kind": kind,
             "ignore_ids": tuple(config.ignore_ids),
-            "ground_truth": layout.find_ground_truth(root / config.ground_truth_path, scene.images, images_root),
+            "ground_truth": find_ground_truth(scene.root / config.ground_truth_path, scene, views.images, images_root),
         }
 
-    def _transforms_parser(self) -> tuple[DataParser, list[str]]:
-        """nerfstudio's parser, and the splits that transforms.json names."""
-        file = self._source.file
-        try:
-            meta = json.loads(file.read_text(encoding="utf-8"))
-            frames = meta["frames"]
-        except (ValueError, KeyError, TypeError) as error:
-            raise UserError(f"{file} is not a nerfstudio transforms file: {error!r}.") from error
-        if not frames:
-            raise UserError(f"{file} names no frames: give poses for at least two images.")
-        parser = _Transforms(
-            NerfstudioDataParserConfig(
-                data=self._source.root if file.name == "transforms.json" else file,
-                downscale_factor=1,  # ours happens while loading; None would open images to guess one
-                train_split_fraction=1.0,  # all views; they are split here
-                load_3D_points="ply_file_path" in meta,  # without the key nerfstudio would ask on the terminal
-                **self._shared_options(),
-            )
-        )
-        parser.global_k4 = float(meta.get("k4", 0.0))
-        return parser, [split for split in ("train", "val", "test") if f"{split}_filenames" in meta]
+    def _masks(self, scene: Scene) -> tuple[Path, MaskKind]:
+        """The folder of the masks, and what they are."""
+        if self.config.masks_path is not None:
+            return scene.root / self.config.masks_path, "ids"
+        return scene.root / scene.masks, scene.mask_kind
 
-    def _colmap_parser(self) -> tuple[DataParser, list[str]]:
-        """nerfstudio's COLMAP parser, and the splits named by ``<split>_list.txt``."""
-        root, model = self._source.root, self._source.file
-        parser = ColmapDataParser(
-            ColmapDataParserConfig(
-                data=root,
-                downscale_factor=1,
-                eval_mode="fraction",
-                train_split_fraction=1.0,
-                images_path=self.config.images_path or Path("images"),
-                colmap_path=model.relative_to(root),
-                load_3D_points=layout.has_points(model),
-                **self._shared_options(),
-            )
-        )
-        return parser, [split for split in ("train", "val", "test") if (root / f"{split}_list.txt").is_file()]
-
-    def _shared_options(self) -> dict:
-        names = ("orientation_method", "center_method", "auto_scale_poses", "scale_factor", "scene_scale")
-        return {name: getattr(self.config, name) for name in names}
-
-    def _image_path(self, path: Path) -> Path:
-        if self._source.kind == "transforms" and self.config.images_path is not None:
-            path = self._source.root / self.config.images_path / path.name
-        return path.absolute()
-
-    def _fit_cameras(self, scene: _Scene, sizes: Sequence[tuple[int, int]]) -> None:
+    def _fit_cameras(self, views: PosedViews, sizes: Sequence[tuple[int, int]]) -> None:
         """Cameras of the size the images will have once loaded: that of the files, divided by the downscale factor."""
-        cameras = scene.cameras
+        cameras = views.cameras
         camera_sizes = torch.cat([cameras.width, cameras.height], 1).tolist()
-        for path, (width, height), (camera_width, camera_height) in zip(scene.images, sizes, camera_sizes, strict=True):
+        for path, (width, height), (camera_width, camera_height) in zip(views.images, sizes, camera_sizes, strict=True):
             # A smaller copy of the images rounds each side by up to a pixel; more is another picture.
             expected = width * camera_height / camera_width
             if abs(expected - height) > 1.0 + expected / width:
@@ -277,45 +179,71 @@ class BeagsDataParser(DataParser):
         size = downscaled_size(actual, self.config.downscale_factor)
         resize_cameras(cameras, size[:, :1], size[:, 1:])
 
-    def _views_of_split(self, scene: _Scene, split: str) -> list[int]:
+    def _views_of_split(self, views: PosedViews, split: str) -> list[int]:
         if split not in ("train", "val", "test"):
             raise ValueError(f"unknown split {split!r}")
-        if scene.members is not None:
+        if views.members is not None:
             # nerfstudio asks for val while training and for test in ns-eval; data often names one of them
             for name in {"train": ("train",), "val": ("val", "test"), "test": ("test", "val")}[split]:
-                if scene.members.get(name):
-                    return scene.members[name]
-            raise UserError(f"the data in {self._source.root} names splits but no views for {split}: name some.")
-        train, held_out = layout.split_views(
-            [path.stem for path in scene.images], self.config.eval_interval, self.config.held_out
-        )
+                if views.members.get(name):
+                    return views.members[name]
+            raise UserError(f"the data in {self._scene.root} names splits but no views for {split}: name some.")
+        config = self.config
+        train, held_out = split_views(views.stems, self._scene.split, config.eval_interval, config.held_out)
         return train if split == "train" else held_out
 
+    def _recognised(self, scene: Scene, views: PosedViews) -> list[str]:
+        """What the data was taken for, in a line, and what the user should know."""
+        stems = set().union(*views.stems)
+        absent = [name for name in scene.split.held_out if name not in stems]
+        notes = [
+            f"The protocol holds out {name}, which no image here is called: name that view with beags-data --held-out."
+            for name in absent
+        ]
+        if unknown := sorted(self._scored_names() - set(self._metadata["classes"].values())):
+            notes.append(
+                f"Exact masks of {', '.join(map(repr, unknown))} do not count, as no class is called so: "
+                f'name the classes in {scene.root / self.config.classes_path}, {{"id": "name"}}.'
+            )
+        masks = self._metadata["class_map_filenames"]
+        points = "random" if self._metadata["points3D_random"] else len(self._metadata["points3D_xyz"])
+        line = (
+            f"{scene.root}: {scene.layout} layout, poses of {_source(scene)}, {len(views.images)} images in "
+            f"{views.images[0].parent.name} ({self._split_in_words(views, scene)}), "
+            f"{sum(mask is not None for mask in masks) or 'no'} masks, {points} seed points."
+        )
+        return [line, *notes, *scene.notes]
 
-def _delegate(parser: DataParser, split: str, file: Path) -> DataparserOutputs:
-    """What nerfstudio's own parser reads; its failures told in one sentence."""
-    try:
-        return parser.get_dataparser_outputs(split)
-    except UserError:
-        raise
-    # nerfstudio asserts, and its readers let KeyError, struct.error and the like through
-    except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise UserError(
-            f"the poses in {file} cannot be read ({type(error).__name__}: {reason}): correct the file."
-        ) from error
+    def _scored_names(self) -> set[str]:
+        """Names of the objects that have exact masks of their own."""
+        truth = self._metadata["ground_truth"]
+        return set() if truth is None else {name for kind in ("visible", "silhouettes") for name in truth[kind]}
+
+    def _split_in_words(self, views: PosedViews, scene: Scene) -> str:
+        if views.members is not None:
+            return "splits named by the data"
+        train, out = (self._views_of_split(views, split) for split in ("train", "test"))
+        if train == out:
+            return "none held out"
+        named = [name for name in scene.split.held_out if any(name in views.stems[i] for i in out)]
+        also = f", {', '.join(named[:3])}{', ...' if len(named) > 3 else ''} by protocol" if named else ""
+        return f"{len(out)} held out{also}"
 
 
-def _select_ground_truth(ground_truth: dict | None, chosen: Sequence[int]) -> dict | None:
-    if ground_truth is None:
-        return None
-    selected: dict = {"masks": [ground_truth["masks"][i] for i in chosen]}
-    for kind in ("silhouettes", "seen"):
-        selected[kind] = {name: [files[i] for i in chosen] for name, files in ground_truth[kind].items()}
-    return selected
+def _images_root(scene: Scene) -> Path:
+    """The folder below which images and masks have the same paths."""
+    if isinstance(scene.poses, TransformsFile):
+        return scene.poses.images or scene.root / "images"
+    return scene.poses.images if isinstance(scene.poses, ColmapModel) else scene.poses.images[0].parent
+
+
+def _source(scene: Scene) -> str:
+    poses = scene.poses
+    file = poses.folder if isinstance(poses, ColmapModel) else poses.file
+    return f"{file.relative_to(scene.root) if file.is_relative_to(scene.root) else file}"
 
 
 beags_data = DataParserSpecification(
     config=BeagsDataParserConfig(),
-    description="Scenes with class id images: nerfstudio transforms.json or COLMAP poses (BEA-GS).",
+    description="Scenes with class id images: nerfstudio, COLMAP, LLFF and other layouts (BEA-GS).",
 )

@@ -58,7 +58,7 @@ class BeagsDataset(InputDataset):
 
     def get_metadata(self, data: dict) -> dict:
         """The class map that belongs to ``data["image_idx"]``."""
-        from beags_plugin.masks.classes import read_class_map
+        from beags_plugin.masks.classes import read_mask
 
         index = data["image_idx"]
         width, height = self._sizes[index]
@@ -66,7 +66,8 @@ class BeagsDataset(InputDataset):
         if path is None:
             class_map = np.full((height, width), IGNORE, np.uint16)
         else:
-            class_map = resize_nearest(read_class_map(path, self.metadata["ignore_ids"]), width, height)
+            ids = read_mask(path, self.metadata["mask_kind"], self.metadata["ignore_ids"])
+            class_map = resize_nearest(ids, width, height)
         return {"class_map": torch.from_numpy(class_map)}
 
 

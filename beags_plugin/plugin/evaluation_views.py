@@ -10,11 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from beags_plugin.data.files import image_size
+from beags_plugin.data.ground_truth import GroundTruth
 from beags_plugin.errors import UserError
 from beags_plugin.evaluation.metrics import resize_nearest
 from beags_plugin.evaluation.run_metrics import EvalView
-from beags_plugin.masks.classes import read_class_map
-from beags_plugin.plugin.layout import image_size
+from beags_plugin.masks.classes import read_binary_mask, read_mask
 from beags_plugin.plugin.model import fixed_background
 from beags_plugin.rasterizers.interface import IGNORE
 
@@ -23,12 +24,16 @@ if TYPE_CHECKING:
     from beags_plugin.plugin.datamanager import BeagsDataManager
 
 
+_NO_TRUTH = GroundTruth(masks=[], visible={}, silhouettes={}, seen={})
+
+
 class HeldOutViews(Sequence[EvalView]):
     """The test views of the data; masks and silhouettes are read when a view is asked for, at the size of their files.
 
-    Visible masks come from ``ground_truth/masks``, or else from the data's own masks; silhouettes from
-    ``ground_truth/silhouettes``, and what training photos show of them from ``ground_truth/seen``. All are undistorted
-    like the photographs. Photographs with alpha stand on the background that the run was trained on.
+    Visible masks come from ``ground_truth/visible``, else from ``ground_truth/masks``, else from the data's own masks;
+    silhouettes from ``ground_truth/silhouettes``, and what training photos show of them from ``ground_truth/seen``;
+    or from where the data's layout has them. All are undistorted like the photographs. Photographs with alpha stand on
+    the background that the run was trained on.
     Asking for a view raises ``UserError`` for a mask that cannot be read or has other proportions than its photograph.
     """
 
@@ -39,6 +44,7 @@ class HeldOutViews(Sequence[EvalView]):
         self.background = fixed_background(config.model_config)
         self._views = self.manager.views("test")
         self._metadata = self.manager.eval_dataset.metadata
+        self._kind: str = self._metadata["mask_kind"]
 
     def __len__(self) -> int:
         return len(self._views)
@@ -58,17 +64,24 @@ class HeldOutViews(Sequence[EvalView]):
 
     def _view(self, index: int) -> EvalView:
         view = self._views[index]
-        truth = self._metadata["ground_truth"] or {"masks": None, "silhouettes": {}, "seen": {}}
+        truth = self._metadata["ground_truth"] or _NO_TRUTH
         exact = truth["masks"][index] if truth["masks"] else None
-        file = exact or self._metadata["class_map_filenames"][index]
+        file, kind = (exact, "ids") if exact else (self._metadata["class_map_filenames"][index], self._kind)
         visible = None
         if file is not None:
-            visible = torch.from_numpy(self._read(file, index, self._metadata["ignore_ids"]).astype(np.int32))
+            ids = read_mask(file, kind, self._metadata["ignore_ids"])
+            visible = torch.from_numpy(self._straight(file, ids, index).astype(np.int32))
         silhouettes = self._per_object(truth["silhouettes"], index)
         seen = self._per_object(truth["seen"], index)
         seen = {c: _of_size(mask, silhouettes[c]) for c, mask in seen.items() if c in silhouettes}
         return EvalView(
-            view.camera, view.image_on(self.background), visible, silhouettes or None, view.name, seen or None
+            view.camera,
+            view.image_on(self.background),
+            visible,
+            silhouettes or None,
+            view.name,
+            seen or None,
+            self._per_object(truth["visible"], index) or None,
         )
 
     def _per_object(self, files: Mapping[str, Sequence[Path | None]], view: int) -> dict[int, Tensor]:
@@ -77,12 +90,12 @@ class HeldOutViews(Sequence[EvalView]):
         for class_id, name in self.classes.items():
             file = files[name][view] if name in files else None
             if file is not None:
-                ids = self._read(file, view)
-                masks[class_id] = torch.from_numpy((ids != 0) & (ids != IGNORE))
+                ids = self._straight(file, read_binary_mask(file).astype(np.uint16), view)
+                masks[class_id] = torch.from_numpy((ids != 0) & (ids != IGNORE))  # outside the lens is IGNORE
         return masks
 
-    def _read(self, file: Path, view: int, ignore_ids: Sequence[int] = ()) -> np.ndarray:
-        ids = read_class_map(file, ignore_ids)
+    def _straight(self, file: Path, ids: np.ndarray, view: int) -> np.ndarray:
+        """Ids without lens distortion; raises ``UserError`` if they have other proportions than the photograph."""
         photo = self.manager.eval_dataset.image_filenames[view]
         (width, height), (mask_height, mask_width) = image_size(photo), ids.shape
         expected = mask_width * height / width  # a smaller copy rounds each side by up to a pixel

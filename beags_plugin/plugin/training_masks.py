@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from beags_plugin.evaluation.metrics import resize_nearest
-from beags_plugin.masks.classes import read_class_map
+from beags_plugin.masks.classes import read_class_map, read_mask
 from beags_plugin.plugin.datamanager import unique_names
 from beags_plugin.plugin.runs import last_prepared
 
@@ -51,12 +51,12 @@ def training_masks(config: BeagsTrainerConfig) -> list[TrainingMasks]:
     ):
         used = read_class_map(prepared / "masks" / f"{name}.png")
 
-        def sized(path: Path | None, like: np.ndarray = used) -> np.ndarray | None:
+        def sized(path: Path | None, kind: str, like: np.ndarray = used) -> np.ndarray | None:
             if path is None:
                 return None
-            return resize_nearest(read_class_map(path, metadata["ignore_ids"]), *like.shape)
+            return resize_nearest(read_mask(path, kind, metadata["ignore_ids"]), *like.shape)
 
-        given = metadata["class_map_filenames"][index]
+        given = sized(metadata["class_map_filenames"][index], metadata["mask_kind"])
         confidence = prepared / "confidence" / f"{name}.png"
-        views.append(TrainingMasks(name, photo, sized(given), used, sized(exact[index]), confidence))
+        views.append(TrainingMasks(name, photo, given, used, sized(exact[index], "ids"), confidence))
     return views

@@ -1,0 +1,18 @@
+"""What data sets look like on disk, as registered layouts (entry points: ``beags.layouts``); nothing of nerfstudio."""
+
+from beags_plugin.registry import Registry
+
+LAYOUTS = Registry(
+    "layout",
+    "beags.layouts",
+    {
+        "3dovs": "beags_plugin.data.layouts.three_d_ovs:ThreeDOvs",
+        "colmap": "beags_plugin.data.layouts.colmap:Colmap",
+        "dtu": "beags_plugin.data.layouts.dtu:Dtu",
+        "lerf-mask": "beags_plugin.data.layouts.lerf_mask:LerfMask",
+        "llff": "beags_plugin.data.layouts.llff:Llff",
+        "mipnerf360": "beags_plugin.data.layouts.mipnerf360:MipNerf360",
+        "nerfstudio": "beags_plugin.data.layouts.nerfstudio:NerfstudioLayout",
+        "spin-nerf": "beags_plugin.data.layouts.spin_nerf:SpinNerf",
+    },
+)

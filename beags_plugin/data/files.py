@@ -1,0 +1,112 @@
+"""Images and masks of a scene on disk, and cheap checks that they fit together."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from beags_plugin.errors import UserError
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+LARGEST_WIDTH = 1600  # pixels; with it Mip-NeRF 360 gets images_4 outdoors and images_2 indoors, LLFF images_4
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The images right in a folder, sorted by name; none where it does not exist."""
+    if not folder.is_dir():
+        return []
+    files = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
+    return sorted(files, key=lambda path: path.name)
+
+
+def image_folders(root: Path) -> list[Path]:
+    """The folders ``images``, ``images_2``, ... of a scene that hold images, the largest images first."""
+    numbered = {}
+    for folder in root.glob("images*"):
+        if (match := re.fullmatch(r"images(?:_(\d+))?", folder.name)) and list_images(folder):
+            numbered[folder] = int(match[1] or 1)
+    return sorted(numbered, key=lambda folder: numbered[folder])
+
+
+def choose_images(root: Path, chosen: Path | None = None) -> Path:
+    """The folder of images to use: ``chosen``, else the largest copies that are at most 1600 pixels on a side.
+
+    Raises ``UserError`` if there is no image.
+    """
+    folders = [chosen] if chosen is not None else image_folders(root)
+    folders = [folder for folder in folders if list_images(folder)]
+    if not folders:
+        where = chosen or f"{root / 'images'} (or images_2, images_4, images_8)"
+        raise UserError(f"{where} holds no images: restore them, or give --images-path.")
+    fitting = (folder for folder in folders if max(image_size(list_images(folder)[0])) <= LARGEST_WIDTH)
+    return next(fitting, folders[-1])
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height in pixels, from the file's header; raises ``UserError`` if it is no readable image."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except FileNotFoundError:
+        raise UserError(f"the image {path} does not exist: restore it, or remove it from the poses.") from None
+    except (UnidentifiedImageError, OSError) as error:
+        raise UserError(f"{path} cannot be read as an image: replace it ({error}).") from error
+
+
+def existing_images(named: Sequence[Path], folder: Path, in_order: bool) -> list[Path]:
+    """The files for the images that a COLMAP model names, smaller copies of which may have other names.
+
+    A name that does not exist stands for the file of the same stem in ``folder``. If ``in_order`` and not one image is
+    found so, the files in ``folder`` stand for the images in the order of their names, if there are as many.
+    """
+    files = list_images(folder)
+    if all(path.exists() for path in named):
+        return list(named)
+    by_stem = {path.stem: path for path in files}
+    found = [path if path.exists() else by_stem.get(path.stem, path) for path in named]
+    if in_order and len(files) == len(named) and not any(path.exists() for path in found):
+        order = sorted(range(len(named)), key=lambda index: named[index].as_posix())
+        found = list(named)
+        for index, file in zip(order, files, strict=True):
+            found[index] = file
+    return found
+
+
+def files_of_views(folder: Path, images: Sequence[Path], images_root: Path) -> list[Path | None]:
+    """For each image its .png in ``folder``: at the image's path below ``images_root``, else by its stem, else None.
+
+    Raises ``UserError`` if a stem that several images share would give them the same file.
+    """
+    if not folder.is_dir():
+        return [None] * len(images)
+    present = {path.relative_to(folder) for path in folder.rglob("*.png")}
+    stems = Counter(image.stem for image in images)
+    files: list[Path | None] = []
+    for image in images:
+        below = image.relative_to(images_root) if image.is_relative_to(images_root) else Path(image.name)
+        if below.with_suffix(".png") in present:
+            files.append(folder / below.with_suffix(".png"))
+        elif Path(f"{image.stem}.png") not in present:
+            files.append(None)
+        elif stems[image.stem] > 1:
+            raise UserError(
+                f"{folder / image.stem}.png could belong to {stems[image.stem]} images called {image.stem}: "
+                f"put it at the image's own path below {folder}."
+            )
+        else:
+            files.append(folder / f"{image.stem}.png")
+    return files
+
+
+def check_same_size(masks: Sequence[Path | None], sizes: Sequence[tuple[int, int]]) -> None:
+    """Raise ``UserError`` for the first mask that is not as large as its image, ``sizes`` (width, height)."""
+    for mask, (width, height) in zip(masks, sizes, strict=True):
+        if mask is not None and (found := image_size(mask)) != (width, height):
+            raise UserError(
+                f"the mask {mask} is {found[0]}x{found[1]} pixels but its image is {width}x{height}: "
+                f"make the mask from the image at its full size."
+            )

@@ -1,0 +1,63 @@
+"""Exact masks kept for evaluation only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TypedDict
+
+from beags_plugin.data.files import files_of_views
+from beags_plugin.data.scene import FilesOfObject, Scene
+
+FilesPerView = list[Path | None]
+
+
+class GroundTruth(TypedDict):
+    """Files of exact masks, one or None per view.
+
+    masks: id images of what is seen. visible: object name to binary masks of what is seen of it. silhouettes: object
+    name to occlusion-free ones. seen: likewise, the part of the silhouette that training photos show.
+    """
+
+    masks: FilesPerView
+    visible: dict[str, FilesPerView]
+    silhouettes: dict[str, FilesPerView]
+    seen: dict[str, FilesPerView]
+
+
+def of_views(truth: GroundTruth, chosen: Sequence[int]) -> GroundTruth:
+    """The ground truth of some of the views."""
+
+    def each(files: dict[str, FilesPerView]) -> dict[str, FilesPerView]:
+        return {name: [of_object[i] for i in chosen] for name, of_object in files.items()}
+
+    return GroundTruth(
+        masks=[truth["masks"][i] for i in chosen],
+        visible=each(truth["visible"]),
+        silhouettes=each(truth["silhouettes"]),
+        seen=each(truth["seen"]),
+    )
+
+
+def find_ground_truth(folder: Path, scene: Scene, images: Sequence[Path], images_root: Path) -> GroundTruth | None:
+    """The ground truth in ``folder`` with what the layout brings; None where there is neither.
+
+    In ``folder``: masks/<stem>.png, and <kind>/<object>/<stem>.png for visible, silhouettes and seen.
+    """
+    if not (folder.is_dir() or scene.visible or scene.silhouettes):
+        return None
+
+    def per_object(kind: str, own: Mapping[str, FilesOfObject]) -> dict[str, FilesPerView]:
+        found = {name: [files.get(image.stem) for image in images] for name, files in own.items()}
+        for path in sorted(path for path in (folder / kind).glob("*") if path.is_dir()):
+            better = files_of_views(path, images, images_root)
+            given = found.get(path.name, [None] * len(images))
+            found[path.name] = [mask or former for mask, former in zip(better, given, strict=True)]
+        return found
+
+    return GroundTruth(
+        masks=files_of_views(folder / "masks", images, images_root),
+        visible=per_object("visible", scene.visible),
+        silhouettes=per_object("silhouettes", scene.silhouettes),
+        seen=per_object("seen", {}),
+    )

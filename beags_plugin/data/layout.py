@@ -1,0 +1,81 @@
+"""The interface of layouts, and finding the one that a folder has."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import ClassVar
+
+from beags_plugin.data import LAYOUTS
+from beags_plugin.data.scene import Scene
+from beags_plugin.errors import UserError
+
+
+class Layout(ABC):
+    """How one data set lays out its scenes.
+
+    title: what to call it. marks: the files by which it is known, for messages. refines: names of the layouts that
+    folders of this one fit too; this one is taken then.
+    """
+
+    title: ClassVar[str]
+    marks: ClassVar[str]
+    refines: ClassVar[tuple[str, ...]] = ()
+
+    @abstractmethod
+    def missing(self, root: Path) -> str | None:
+        """What ``root`` lacks to be read as this layout, as in "no poses_bounds.npy"; None if nothing.
+
+        root: a folder that exists, or a .json file.
+        """
+
+    def recognises(self, root: Path) -> bool:
+        """Whether to take ``root`` for this layout where the user named none."""
+        return self.missing(root) is None
+
+    @abstractmethod
+    def read(self, root: Path, images: Path | None) -> Scene:
+        """The scene in ``root``, which lacks nothing.
+
+        images: the folder of the images that the user chose, absolute, or None. Raises ``UserError``.
+        """
+
+
+def read_scene(data: Path, layout: str = "auto", images: Path | None = None) -> Scene:
+    """The scene in ``data``, a folder or a transforms .json; arguments as of ``find_layout`` and ``Layout.read``."""
+    found = find_layout(data, layout)
+    root = data if data.is_dir() else data.parent
+    return found.read(data, None if images is None else root / images)
+
+
+def find_layout(data: Path, wanted: str = "auto") -> Layout:
+    """The layout called ``wanted``, or the one that ``data`` has.
+
+    Raises ``UserError`` if ``data`` does not exist, lacks what the wanted layout needs, or fits none or several.
+    """
+    if not data.exists():
+        raise UserError(f"the data folder {data} does not exist: give --data the folder that holds the scene.")
+    if data.is_file() and data.suffix != ".json":
+        raise UserError(f"{data} is neither a folder nor a .json file: give --data the folder that holds the scene.")
+    if wanted != "auto":
+        layout: Layout = LAYOUTS.get(wanted)()
+        if lacks := layout.missing(data):
+            raise UserError(
+                f"{data} holds {lacks}, which the layout {wanted} needs: correct --data, or choose another layout."
+            )
+        return layout
+    layouts: dict[str, Layout] = {name: LAYOUTS.get(name)() for name in LAYOUTS.names()}
+    fitting = {name for name, layout in layouts.items() if layout.recognises(data)}
+    special = sorted(fitting - {coarser for name in fitting for coarser in layouts[name].refines})
+    if not special:
+        others = ", ".join(
+            f"{layout.marks} ({name})" for name, layout in layouts.items() if name not in ("nerfstudio", "colmap")
+        )
+        raise UserError(
+            f"{data} holds neither transforms.json nor a COLMAP model (sparse/0) nor another layout's files, {others}: "
+            f"run ns-process-data or COLMAP first, or correct --data."
+        )
+    if len(special) > 1:
+        found = " and ".join(f"{layouts[name].marks} ({name})" for name in special)
+        raise UserError(f"{data} holds {found}: choose one of them with beags-data --layout NAME.")
+    return layouts[special[0]]

@@ -1,0 +1,64 @@
+"""Any scene with a COLMAP model, binary or text; and what other layouts share with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from beags_plugin.data.layout import Layout
+from beags_plugin.data.scene import ColmapModel, Scene
+from beags_plugin.errors import UserError
+
+FOLDERS = ("sparse/0", "colmap/sparse/0", "sparse")
+
+
+def model_folder(root: Path) -> Path | None:
+    """The folder of a COLMAP model in a scene, complete or not; None without."""
+    for name in FOLDERS:
+        if any((root / name / f"{part}.{end}").is_file() for part in ("cameras", "images") for end in ("bin", "txt")):
+            return root / name
+    return None
+
+
+def missing_part(folder: Path) -> str | None:
+    """The file that a COLMAP model lacks, or None."""
+    end = "txt" if (folder / "cameras.txt").is_file() else "bin"  # the order in which nerfstudio looks
+    return next((f"{part}.{end}" for part in ("cameras", "images") if not (folder / f"{part}.{end}").is_file()), None)
+
+
+def complete_model(root: Path) -> Path | None:
+    """The folder of a complete COLMAP model in a scene, or None."""
+    folder = model_folder(root)
+    return folder if folder is not None and missing_part(folder) is None else None
+
+
+def checked_model(root: Path) -> Path:
+    """The folder of the scene's COLMAP model; raises ``UserError`` if a part is missing."""
+    folder = model_folder(root)
+    if folder is None:
+        raise UserError(f"{root} holds no COLMAP model (sparse/0): run COLMAP first.")
+    if part := missing_part(folder):
+        raise UserError(f"the COLMAP model {folder} lacks {part}: export the complete model again.")
+    return folder
+
+
+def points_file(folder: Path) -> Path | None:
+    """The seed points of a COLMAP model, or None without any (nerfstudio fails on an empty list of them)."""
+    binary, text = folder / "points3D.bin", folder / "points3D.txt"
+    if binary.is_file():  # the order in which nerfstudio looks; the file starts with a 64-bit count
+        return binary if any(binary.open("rb").read(8)) else None
+    if not text.is_file():
+        return None
+    return text if any(line.strip() and not line.startswith("#") for line in text.open(encoding="utf-8")) else None
+
+
+class Colmap(Layout):
+    """A COLMAP model in sparse/0 with its images in images/."""
+
+    title = "COLMAP"
+    marks = "sparse/0"
+
+    def missing(self, root: Path) -> str | None:
+        return "no COLMAP model (sparse/0)" if root.is_file() or model_folder(root) is None else None
+
+    def read(self, root: Path, images: Path | None) -> Scene:
+        return Scene(self.title, root, ColmapModel(checked_model(root), images or root / "images"))

@@ -1,0 +1,98 @@
+"""DTU as NeuS and its followers keep it: projection matrices in cameras_sphere.npz."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+import numpy.typing as npt
+
+from beags_plugin.data.files import choose_images, image_size, list_images
+from beags_plugin.data.layout import Layout
+from beags_plugin.data.scene import PoseTable, Scene
+from beags_plugin.errors import UserError
+
+FILE = "cameras_sphere.npz"
+IMAGES = ("image", "images")
+LARGEST_SKEW = 1.0  # pixels; the rasterizers know none
+
+
+class Dtu(Layout):
+    """image/*.png, mask/*.png and cameras_sphere.npz, in the world in which the object fills the unit sphere.
+
+    Masks belong to images in the order of names. Nothing stands before the object: its masks are its silhouettes.
+    """
+
+    title = "DTU"
+    marks = FILE
+    refines = ("colmap", "mipnerf360")
+
+    def missing(self, root: Path) -> str | None:
+        if root.is_file() or not (root / FILE).is_file():
+            return f"no {FILE}"
+        return None if any(list_images(root / name) for name in IMAGES) else "no images (image)"
+
+    def read(self, root: Path, images: Path | None) -> Scene:
+        original = next(list_images(root / name) for name in IMAGES if list_images(root / name))
+        files = list_images(choose_images(root, images)) if images is not None else original
+        poses = read_cameras(root / FILE, original)
+        if len(files) != len(original):
+            raise UserError(f"{images} holds {len(files)} images, not {len(original)}: keep a copy of every one.")
+        masks = list_images(root / "mask")
+        if masks and len(masks) != len(files):
+            raise UserError(f"{root / 'mask'} holds {len(masks)} masks for {len(files)} images: keep one for each.")
+        by_stem = {file.stem: mask for file, mask in zip(files, masks, strict=False)}
+        return Scene(
+            self.title,
+            root,
+            PoseTable(root / FILE, tuple(files), *poses),
+            mask_kind="binary" if masks else "ids",
+            mask_files=by_stem if masks else None,
+            class_names={1: "object"} if masks else None,
+            silhouettes={"object": by_stem} if masks else {},
+        )
+
+
+def read_cameras(
+    file: Path, images: list[Path]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+    """Camera to world [V, 3, 4] (OpenGL axes), K [V, 3, 3] and sizes [V, 2] of images, the originals.
+
+    Entry i has ``world_mat_i`` [4, 4], which projects the world to pixels, and ``scale_mat_i``, which takes the unit
+    sphere to the world. Raises ``UserError`` if an entry is missing or is no camera's.
+    """
+    try:
+        with np.load(file, allow_pickle=False) as entries:
+            table = {name: entries[name].astype(np.float64) for name in entries.files if "_mat_" in name}
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
+        raise UserError(f"the cameras {file} cannot be read: restore the file ({error}).") from error
+    count = sum(name.startswith("world_mat_") and not name.startswith("world_mat_inv_") for name in table)
+    if count != len(images):
+        raise UserError(f"{file} has {count} cameras but there are {len(images)} images: keep the images it is of.")
+    poses, intrinsics = [], []
+    for index in range(count):
+        projection = table.get(f"world_mat_{index}")
+        if projection is None or projection.shape != (4, 4):
+            raise UserError(f"{file} lacks the 4 x 4 matrix world_mat_{index}: restore the file.")
+        K, rotation, center = decompose((projection @ table.get(f"scale_mat_{index}", np.eye(4)))[:3])
+        if not np.isfinite(K).all() or abs(K[0, 1]) > LARGEST_SKEW:
+            raise UserError(f"world_mat_{index} in {file} is no camera with axes at right angles: correct the file.")
+        K[0, 1] = 0.0
+        K[:2, 2] += 0.5  # here pixel centres are whole numbers
+        intrinsics.append(K)
+        poses.append(np.concatenate([rotation.T * [1.0, -1.0, -1.0], center[:, None]], axis=1))
+    sizes = np.array([image_size(image) for image in images], np.int64)
+    return np.stack(poses), np.stack(intrinsics), sizes
+
+
+def decompose(projection: npt.NDArray[np.float64]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """K [3, 3], world-to-camera rotation [3, 3] (OpenCV) and centre [3] of K [R | -R c], given up to scale."""
+    from scipy.linalg import rq
+
+    K, rotation = (np.asarray(part) for part in rq(projection[:, :3]))
+    signs = np.sign(np.diag(K))
+    K, rotation = K * signs, signs[:, None] * rotation
+    if np.linalg.det(rotation) < 0:  # the projection's scale was negative
+        rotation = np.negative(rotation)
+    return K / K[2, 2], rotation, np.linalg.solve(projection[:, :3], -projection[:, 3])

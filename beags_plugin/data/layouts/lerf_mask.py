@@ -1,0 +1,58 @@
+"""LERF-Mask: id images of the training views, and masks by text prompt of the test views."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from beags_plugin.data.files import choose_images, list_images
+from beags_plugin.data.layout import Layout
+from beags_plugin.data.layouts.colmap import checked_model, model_folder
+from beags_plugin.data.scene import ColmapModel, Scene, Split
+from beags_plugin.errors import UserError
+
+
+class LerfMask(Layout):
+    """images, images_train, object_mask/<stem>.png (ids), test_mask/<n>/<prompt>.png and sparse/0.
+
+    Test views are those of images/ that images_train/ lacks; <n> counts them from 0 in the order of their names.
+    """
+
+    title = "LERF-Mask"
+    marks = "object_mask and test_mask"
+    refines = ("colmap", "mipnerf360")
+
+    def missing(self, root: Path) -> str | None:
+        if root.is_file() or model_folder(root) is None:
+            return "no COLMAP model (sparse/0)"
+        return next((f"no folder {name}" for name in ("images_train", "test_mask") if not (root / name).is_dir()), None)
+
+    def read(self, root: Path, images: Path | None) -> Scene:
+        folder = choose_images(root, images or root / "images")
+        trained = {path.stem for path in list_images(root / "images_train")}
+        test = [path.stem for path in list_images(folder) if path.stem not in trained]
+        return Scene(
+            self.title,
+            root,
+            ColmapModel(checked_model(root), folder),
+            Split(tuple(test), every=False),
+            masks=root / "object_mask",
+            visible=_masks_by_prompt(root / "test_mask", test),
+        )
+
+
+def _masks_by_prompt(folder: Path, test: list[str]) -> dict[str, dict[str, Path]]:
+    """Prompt to the masks of the test views, by stem; raises ``UserError`` for a folder that is no test view's."""
+    found: dict[str, dict[str, Path]] = {}
+    for view in sorted(path for path in folder.iterdir() if path.is_dir()):
+        if view.name in test:
+            stem = view.name
+        elif view.name.isdigit() and int(view.name) < len(test):
+            stem = test[int(view.name)]
+        else:
+            raise UserError(
+                f"{view} is for no test view, of which there are {len(test)} (the images that images_train lacks): "
+                f"name it 0 to {len(test) - 1}, or like an image."
+            )
+        for file in sorted(view.glob("*.png")):
+            found.setdefault(file.stem, {})[stem] = file
+    return found

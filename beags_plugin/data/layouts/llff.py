@@ -1,0 +1,84 @@
+"""LLFF's forward-facing scenes, with the view that NVOS scores held out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from beags_plugin.data.files import choose_images, image_folders, list_images
+from beags_plugin.data.layout import Layout
+from beags_plugin.data.layouts.colmap import complete_model
+from beags_plugin.data.poses_bounds import FILE, read_poses_bounds, seed_points
+from beags_plugin.data.scene import ColmapModel, PoseTable, Scene, Split
+
+NVOS_TARGETS = {
+    "fern": "IMG_4027",
+    "flower": "IMG_2962",
+    "fortress": "IMG_1800",
+    "horns": "DJI_20200223_163024_597",
+    "leaves": "IMG_2997",
+    "orchids": "IMG_4480",
+    "trex": "DJI_20200223_163619_411",
+}
+"""Scene to the stem of the camera's file of the view whose mask NVOS scores (method, section 9)."""
+ORIGINAL_NAMES = "original_names.txt"
+
+
+class Llff(Layout):
+    """images_4 or another size, and poses in a complete COLMAP model, else in poses_bounds.npy."""
+
+    title = "LLFF"
+    marks = FILE
+    refines = ("colmap", "mipnerf360")
+
+    def missing(self, root: Path) -> str | None:
+        return lacks_poses(root)
+
+    def recognises(self, root: Path) -> bool:
+        return (root / FILE).is_file() or (root.name.lower() in NVOS_TARGETS and complete_model(root) is not None)
+
+    def read(self, root: Path, images: Path | None) -> Scene:
+        folder = choose_images(root, images)
+        poses, points = model_or_bounds(root, folder)
+        return Scene(self.title, root, poses, Split(nvos_target(root, folder)), seed_points=points)
+
+
+def lacks_poses(root: Path) -> str | None:
+    """What a scene lacks where neither of the two sources of poses is there; else None."""
+    if root.is_dir() and ((root / FILE).is_file() or complete_model(root) is not None):
+        return None
+    return f"neither {FILE} nor a complete COLMAP model (sparse/0)"
+
+
+def model_or_bounds(root: Path, images: Path) -> tuple[ColmapModel | PoseTable, Path | None]:
+    """The poses of the images in the folder ``images``: COLMAP's, which know the lens, else LLFF's; and seed points.
+
+    Smaller copies of the images may have other names in the same order, as LLFF makes them.
+    """
+    model = complete_model(root)
+    if model is not None:
+        return ColmapModel(model, images, in_order=True), None
+    return read_poses_bounds(root / FILE, images), seed_points(root)
+
+
+def nvos_target(root: Path, folder: Path) -> tuple[str, ...]:
+    """The stem in ``folder`` of the view that NVOS scores; the camera's own where that is not known; else nothing.
+
+    LLFF numbers its smaller copies (image000.png, ...) in the order of the camera's names, which are those in images/,
+    or the second column of original_names.txt.
+    """
+    target = NVOS_TARGETS.get(root.name.lower())
+    if target is None:
+        return ()
+    stems = [path.stem for path in list_images(folder)]
+    pairs = dict(zip((path.stem for path in _originals(root, len(stems))), stems, strict=False))
+    if (root / ORIGINAL_NAMES).is_file():
+        lines = (line.split() for line in (root / ORIGINAL_NAMES).read_text(encoding="utf-8").splitlines())
+        pairs |= {Path(names[1]).stem: Path(names[0]).stem for names in lines if len(names) == 2}
+    return (target,) if target in stems else (pairs.get(target, target),)
+
+
+def _originals(root: Path, count: int) -> list[Path]:
+    """The images as the camera named them, if there are ``count``."""
+    folders = image_folders(root)
+    files = list_images(folders[0]) if folders else []
+    return files if len(files) == count else []

@@ -1,0 +1,69 @@
+"""3D-OVS: masks of every class in a few views."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from beags_plugin.data.files import choose_images, list_images
+from beags_plugin.data.layout import Layout
+from beags_plugin.data.layouts.llff import lacks_poses, model_or_bounds
+from beags_plugin.data.scene import Scene, Split
+from beags_plugin.errors import UserError
+
+CLASSES = "segmentations/classes.txt"
+
+
+class ThreeDOvs(Layout):
+    """images, segmentations/classes.txt, segmentations/<NN>/<class>.png, and poses_bounds.npy or sparse/0.
+
+    The views in segmentations/ are held out, by the stem <NN> or, where no image is called so, by its place in the
+    order of names. Ids are the lines of classes.txt from 1 on.
+    """
+
+    title = "3D-OVS"
+    marks = CLASSES
+    refines = ("colmap", "llff", "mipnerf360")
+
+    def missing(self, root: Path) -> str | None:
+        if root.is_file() or not (root / CLASSES).is_file():
+            return f"no {CLASSES}"
+        return lacks_poses(root)
+
+    def read(self, root: Path, images: Path | None) -> Scene:
+        folder = choose_images(root, images)
+        stems = [path.stem for path in list_images(folder)]
+        names = _class_names(root / CLASSES)
+        visible: dict[str, dict[str, Path]] = {}
+        held_out = []
+        for view in sorted(path for path in (root / CLASSES).parent.iterdir() if path.is_dir()):
+            stem = _stem_of(view, stems)
+            held_out.append(stem)
+            for name in names:
+                if (view / f"{name}.png").is_file():
+                    visible.setdefault(name, {})[stem] = view / f"{name}.png"
+        poses, points = model_or_bounds(root, folder)
+        return Scene(
+            self.title,
+            root,
+            poses,
+            Split(tuple(held_out), every=not held_out),
+            class_names=dict(enumerate(names, start=1)),
+            class_names_file=root / CLASSES,
+            visible=visible,
+            seed_points=points,
+        )
+
+
+def _class_names(file: Path) -> list[str]:
+    names = [line.strip() for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
+    if not names or len(set(names)) < len(names):
+        raise UserError(f"{file} names {'a class twice' if names else 'no class'}: write one name on each line.")
+    return names
+
+
+def _stem_of(view: Path, stems: list[str]) -> str:
+    if view.name in stems:
+        return view.name
+    if view.name.isdigit() and int(view.name) < len(stems):
+        return stems[int(view.name)]
+    raise UserError(f"{view} is for no image: name it like one, or with its place in the order of names, from 0.")

@@ -1,0 +1,55 @@
+"""LLFF's poses_bounds.npy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from beags_plugin.data.files import list_images
+from beags_plugin.data.layouts.colmap import points_file
+from beags_plugin.data.scene import PoseTable
+from beags_plugin.errors import UserError
+
+FILE = "poses_bounds.npy"
+# LLFF's camera axes are down, right, backward; OpenGL's right, up, backward.
+_TO_OPENGL = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def read_poses_bounds(file: Path, images: Path) -> PoseTable:
+    """The poses in ``file`` for the images in the folder ``images``, in the order of their names.
+
+    A row holds a 3 x 5 matrix [R | t | (height, width, focal length)], camera to world, in pixels of the original
+    images, then the nearest and the farthest depth. The principal point is the centre. Beside it COLMAP's
+    sparse/0/cameras tells the lens distortion, which the rows leave out.
+    Raises ``UserError`` if the file is something else or has another number of rows than there are images.
+    """
+    try:
+        rows = np.load(file, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise UserError(f"the poses {file} cannot be read: save them as LLFF does ({error}).") from error
+    if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f" or not np.isfinite(rows).all():
+        raise UserError(f"the poses {file} are no finite [views, 17] numbers: save them as LLFF does.")
+    files = list_images(images)
+    if len(files) != len(rows):
+        raise UserError(
+            f"{file} has {len(rows)} poses but {images} {len(files)} images: keep the images that the poses are of."
+        )
+    matrices = rows[:, :15].reshape(-1, 3, 5).astype(np.float64)
+    height, width, focal = matrices[:, :, 4].T
+    K = np.zeros((len(rows), 3, 3))
+    K[:, 0, 0] = K[:, 1, 1] = focal
+    K[:, 0, 2], K[:, 1, 2], K[:, 2, 2] = width / 2, height / 2, 1.0
+    poses = np.concatenate([matrices[:, :, :3] @ _TO_OPENGL.T, matrices[:, :, 3:4]], axis=2)
+    sizes = np.stack([width, height], axis=1).astype(np.int64)
+    return PoseTable(file, tuple(files), poses, K, sizes, rows[:, 15:].astype(np.float64), _cameras_file(file.parent))
+
+
+def seed_points(root: Path) -> Path | None:
+    """The points of the COLMAP model that LLFF made the poses from: they share its world."""
+    return points_file(root / "sparse" / "0")
+
+
+def _cameras_file(root: Path) -> Path | None:
+    files = (root / "sparse" / "0" / f"cameras.{end}" for end in ("txt", "bin"))
+    return next((file for file in files if file.is_file()), None)

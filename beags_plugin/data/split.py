@@ -1,0 +1,30 @@
+"""Which views are trained on and which are held out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from beags_plugin.data.scene import Split
+from beags_plugin.errors import UserError
+
+
+def split_views(
+    names: Sequence[set[str]], split: Split, interval: int, held_out: Sequence[str] = ()
+) -> tuple[list[int], list[int]]:
+    """Indices of the training and of the evaluation views.
+
+    names: of each view, sorted: the stem of its file, and the one by which its poses know it. interval: of
+    ``Split.every``, counted from the first view that is not left out; 0 for none. held_out: what the user names besides
+    (the protocol may name views that this copy of the data does not have). Without any held-out view, all serve both.
+    Raises ``UserError`` if a stem of ``held_out`` does not exist or if no view is left to train on.
+    """
+    if unknown := sorted(set(held_out) - set().union(*names)):
+        raise UserError(f"held_out names {unknown[0]!r}, but no image has that stem: correct the name.")
+    kept = [index for index, own in enumerate(names) if own.isdisjoint(split.left_out)]
+    out = set(kept[::interval]) if split.every and interval > 0 else set()
+    out |= {index for index in kept if not names[index].isdisjoint(split.held_out)}
+    out |= {index for index, own in enumerate(names) if not own.isdisjoint(held_out)}  # left out or not
+    train = [index for index in kept if index not in out]
+    if not train:
+        raise UserError(f"all {len(kept)} views are held out for evaluation: add views or change eval_interval.")
+    return train, sorted(out) or train
