@@ -12,20 +12,6 @@ namespace beags {
 namespace ops {
 namespace BEAGS_ISA {
 
-// What a Gaussian needs to be sampled, and to turn the sums into gradients. Positions are in voxels.
-enum OccupancyField {
-  kCenter,                      // of the disc
-  kAxisU = kCenter + 3,         // s R0
-  kAxisV = kAxisU + 3,          // s R1
-  kR0 = kAxisV + 3,             // columns of the rotation
-  kR1 = kR0 + 3,                //
-  kUnit = kR1 + 3,              // unit quaternion
-  kInverseLength = kUnit + 4,   // 1 / |q|
-  kScale = kInverseLength + 1,  // world units
-  kOpacity = kScale + 2,
-  kOccupancyFields
-};
-
 constexpr int kFarOff = 1 << 20;  // size of a box that cannot be looked up
 // Where the samples of a batch are looked up: in registers, for discs within 4 x 4 x 4 voxels; in windows of bricks,
 // one for each disc; in the table, for large discs and for those far from all voxels.
@@ -34,8 +20,6 @@ enum class Reach { kNear, kWindow, kFar };
 // One batch of as many Gaussians as there are lanes, ready to be sampled.
 template <class T>
 struct OccupancyBatch {
-  T field[kOccupancyFields][Lanes<T>::kCount];
-  uint64_t state[Lanes<T>::kCount];  // hash of stream and Gaussian
   // Corner of the voxels around the disc, and which of them are valid: two words of 32 bits, or 3 x 3 x 3 bricks.
   typename Lanes<T>::Whole low[3][Lanes<T>::kCount], valid[2][Lanes<T>::kCount];
   uint64_t bricks[Lanes<T>::kCount][kWindow * kWindow * kWindow];
@@ -76,70 +60,90 @@ template <class T>
 struct Parameters {
   typename Lanes<T>::Real mean[3], quat[4], log_scale[2], logit;
 
-  BEAGS_OPS_INLINE Parameters(const T* means, const T* quats, const T* log_scales, const T* logits) {
-    for (int axis = 0; axis < 3; ++axis) mean[axis] = strided<3>(means + axis);
-    for (int part = 0; part < 4; ++part) quat[part] = strided<4>(quats + part);
-    for (int axis = 0; axis < 2; ++axis) log_scale[axis] = strided<2>(log_scales + axis);
-    logit = load(logits);
+  // Of neighbours, from `first` on.
+  BEAGS_OPS_INLINE Parameters(const OccupancyJob<T>& job, int64_t first) {
+    for (int axis = 0; axis < 3; ++axis) mean[axis] = strided<3>(job.means + 3 * first + axis);
+    for (int part = 0; part < 4; ++part) quat[part] = strided<4>(job.quats + 4 * first + part);
+    for (int axis = 0; axis < 2; ++axis) log_scale[axis] = strided<2>(job.log_scales + 2 * first + axis);
+    logit = load(job.opacity_logits + first);
+  }
+  // Of any Gaussians.
+  BEAGS_OPS_INLINE Parameters(const OccupancyJob<T>& job, const int64_t* gaussian) {
+    for (int lane = 0; lane < Lanes<T>::kCount; ++lane) {
+      const int64_t i = gaussian[lane];
+      for (int axis = 0; axis < 3; ++axis) mean[axis][lane] = job.means[3 * i + axis];
+      for (int part = 0; part < 4; ++part) quat[part][lane] = job.quats[4 * i + part];
+      for (int axis = 0; axis < 2; ++axis) log_scale[axis][lane] = job.log_scales[2 * i + axis];
+      logit[lane] = job.opacity_logits[i];
+    }
   }
 };
 
-// Those of the Gaussians first .. first + count - 1; the first one's in the lanes that are left over.
+// Those of the Gaussians first .. first + count - 1; the last one's in the lanes that are left over.
 template <class T>
 BEAGS_OPS_INLINE Parameters<T> parameters(const OccupancyJob<T>& job, int64_t first, int count) {
   constexpr int kCount = Lanes<T>::kCount;
-  const T *means = job.means + 3 * first, *quats = job.quats + 4 * first, *log_scales = job.log_scales + 2 * first,
-          *logits = job.opacity_logits + first;
-  if (count == kCount) return {means, quats, log_scales, logits};
-  T padded[10][kCount];
-  const auto pad = [&](const T* from, int stride, T* to) {
-    for (int i = 0; i < stride * kCount; ++i) to[i] = from[i < stride * count ? i : i % stride];
-    return to;
-  };
-  return {pad(means, 3, padded[0]), pad(quats, 4, padded[3]), pad(log_scales, 2, padded[7]), pad(logits, 1, padded[9])};
+  if (count == kCount) return {job, first};
+  int64_t gaussian[kCount];
+  for (int lane = 0; lane < kCount; ++lane) gaussian[lane] = first + (lane < count ? lane : count - 1);
+  return {job, gaussian};
 }
 
-// The fields of the Gaussians first .. first + count - 1 and their boxes. Those that count as nothing get an opacity
-// of NaN.
+// Discs, and what turns the sums over their samples into gradients. What is not used costs nothing: all is inlined.
 template <class T>
-BEAGS_OPS_INLINE Boxes<T> set_up(const OccupancyJob<T>& job, int64_t first, int count, OccupancyBatch<T>& batch) {
+struct Discs {
   using R = typename Lanes<T>::Real;
-  const Parameters<T> raw = parameters(job, first, count);
-  const R zero = {}, one = zero + T(1);
-  R q[4];
-  for (int part = 0; part < 4; ++part) q[part] = raw.quat[part];
-  const R inverse_length = one / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-  for (int part = 0; part < 4; ++part) {
-    q[part] *= inverse_length;
-    store(batch.field[kUnit + part], q[part]);
+  R unit[4], inverse_length;          // the quaternion q / |q|, 1 / |q|
+  R r0[3], r1[3];                     // columns of the rotation
+  R scale[2];                         // world units
+  R center[3], axis_u[3], axis_v[3];  // voxels; s R0 and s R1
+
+  BEAGS_OPS_INLINE Discs(const OccupancyJob<T>& job, const Parameters<T>& raw) {
+    const R zero = {}, one = zero + T(1), two = zero + T(2);
+    const R* q = raw.quat;
+    inverse_length = one / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+    for (int part = 0; part < 4; ++part) unit[part] = q[part] * inverse_length;
+    const R w = unit[0], x = unit[1], y = unit[2], z = unit[3];
+    r0[0] = one - two * (y * y + z * z);
+    r0[1] = two * (x * y + w * z);
+    r0[2] = two * (x * z - w * y);
+    r1[0] = two * (x * y - w * z);
+    r1[1] = one - two * (x * x + z * z);
+    r1[2] = two * (y * z + w * x);
+    for (int axis = 0; axis < 2; ++axis) scale[axis] = exponential(raw.log_scale[axis]);
+    const T per_voxel = T(1) / job.voxel_size;
+    for (int axis = 0; axis < 3; ++axis) {
+      axis_u[axis] = scale[0] * r0[axis] * per_voxel;
+      axis_v[axis] = scale[1] * r1[axis] * per_voxel;
+      center[axis] = (raw.mean[axis] - job.origin[axis]) * per_voxel;
+    }
   }
-  store(batch.field[kInverseLength], inverse_length);
-  const R w = q[0], x = q[1], y = q[2], z = q[3];
-  const R two = zero + T(2);
-  const R r0[3] = {one - two * (y * y + z * z), two * (x * y + w * z), two * (x * z - w * y)};
-  const R r1[3] = {two * (x * y - w * z), one - two * (x * x + z * z), two * (y * z + w * x)};
-  const R log_u = raw.log_scale[0], log_v = raw.log_scale[1], logit = raw.logit;
-  const R s_u = exponential(log_u), s_v = exponential(log_v);
-  store(batch.field[kScale], s_u);
-  store(batch.field[kScale + 1], s_v);
-  // NaN if a number is not finite or a scale is 0
-  R broken = nan_unless_finite(logit) + nan_unless_finite(log_u) + nan_unless_finite(log_v) +
-             nan_unless_finite(one / s_u) + nan_unless_finite(one / s_v);
-  const T per_voxel = T(1) / job.voxel_size;
+
+  // NaN for those that count as nothing: a number is not finite or a scale is 0.
+  BEAGS_OPS_INLINE R nan_if_broken(const Parameters<T>& raw) const {
+    const R one = R{} + T(1);
+    R sum = nan_unless_finite(raw.logit);
+    for (int axis = 0; axis < 2; ++axis) {
+      sum += nan_unless_finite(raw.log_scale[axis]) + nan_unless_finite(one / scale[axis]);
+    }
+    for (int axis = 0; axis < 3; ++axis) {
+      sum += nan_unless_finite(raw.mean[axis]) +
+             nan_unless_finite(T(3) * scale[0] * r0[axis] + T(3) * scale[1] * r1[axis]);
+    }
+    return sum;
+  }
+};
+
+template <class T>
+BEAGS_OPS_INLINE Boxes<T> boxes_around(const Discs<T>& discs) {
+  using R = typename Lanes<T>::Real;
+  const R zero = {};
   Boxes<T> boxes;
   boxes.largest = typename Lanes<T>::Int{};
   const auto far_off = boxes.largest + kFarOff;
   constexpr T kEpsilon = sizeof(T) == 4 ? T(1.1920929e-7) : T(2.220446049250313e-16);
   for (int axis = 0; axis < 3; ++axis) {
-    const R mean = raw.mean[axis];
-    const R u = s_u * r0[axis] * per_voxel, v = s_v * r1[axis] * per_voxel;
-    const R center = (mean - job.origin[axis]) * per_voxel;
-    store(batch.field[kR0 + axis], r0[axis]);
-    store(batch.field[kR1 + axis], r1[axis]);
-    store(batch.field[kAxisU + axis], u);
-    store(batch.field[kAxisV + axis], v);
-    store(batch.field[kCenter + axis], center);
-    broken += nan_unless_finite(mean) + nan_unless_finite(T(3) * s_u * r0[axis] + T(3) * s_v * r1[axis]);
+    const R u = discs.axis_u[axis], v = discs.axis_v[axis], center = discs.center[axis];
     // The samples and this box round differently, by a few units in the last place.
     const R size = select(center < zero, -center, center);
     const R half = T(3) * sqrt(u * u + v * v) * (1 + 16 * kEpsilon) + 16 * kEpsilon * size;
@@ -148,39 +152,37 @@ BEAGS_OPS_INLINE Boxes<T> set_up(const OccupancyJob<T>& job, int64_t first, int 
     const auto seen = select(size + half < static_cast<T>(kVoxelHalf), boxes.size[axis], far_off);
     boxes.largest = select(seen > boxes.largest, seen, boxes.largest);
   }
-  store(batch.field[kOpacity], one / (one + exponential(-logit)) + broken);
   return boxes;
 }
 
 // Writes the gradients of a batch from its six sums; returns the sum of its losses.
 template <class T>
-BEAGS_OPS_INLINE double finish(const OccupancyJob<T>& job, const OccupancyBatch<T>& batch,
-                               const typename Lanes<T>::Real* sums) {
+BEAGS_OPS_INLINE double finish(const OccupancyJob<T>& job, const OccupancyBatch<T>& batch, const Discs<T>& discs,
+                               typename Lanes<T>::Real opacity, const typename Lanes<T>::Real* sums) {
   using R = typename Lanes<T>::Real;
   constexpr int kCount = Lanes<T>::kCount;
   const R g = sums[0], gu = sums[1], gv = sums[2], guu = sums[3], gvv = sums[4], guv = sums[5];
-  const R opacity = load(batch.field[kOpacity]);
   T value[kCount];
   store(value, opacity * g);
   double total = 0;
   for (int lane = 0; lane < batch.count; ++lane) total += value[lane];
   if (!job.g_means) return total * job.factor;
 
-  const R s_u = load(batch.field[kScale]), s_v = load(batch.field[kScale + 1]);
+  const R s_u = discs.scale[0], s_v = discs.scale[1];
   const R o = opacity * static_cast<T>(job.factor);
   T out[10][kCount];
   const R along_u = o * gu / s_u, along_v = o * gv / s_v;
   for (int axis = 0; axis < 3; ++axis) {  // dG/dp = G (u / s_u R0 + v / s_v R1)
-    store(out[axis], along_u * load(batch.field[kR0 + axis]) + along_v * load(batch.field[kR1 + axis]));
+    store(out[axis], along_u * discs.r0[axis] + along_v * discs.r1[axis]);
   }
   // With dG/dR0 = -G u (x - p) / s_u, dG/dR1 = -G v (x - p) / s_v and x - p = u s_u R0 + v s_v R1, the torque
   // R0 x dG/dR0 + R1 x dG/dR1 is t n, t = G u v (s_u / s_v - s_v / s_u): only a turn within the plane changes G.
   // A turn by w moves the unit quaternion q by (0, w) q / 2, hence dG/dq = 2 t (0, n) q = 2 t q (0, 0, 0, 1).
-  const R turn = T(2) * o * guv * (s_u / s_v - s_v / s_u) * load(batch.field[kInverseLength]);
-  store(out[3], -turn * load(batch.field[kUnit + 3]));
-  store(out[4], turn * load(batch.field[kUnit + 2]));
-  store(out[5], -turn * load(batch.field[kUnit + 1]));
-  store(out[6], turn * load(batch.field[kUnit]));
+  const R turn = T(2) * o * guv * (s_u / s_v - s_v / s_u) * discs.inverse_length;
+  store(out[3], -turn * discs.unit[3]);
+  store(out[4], turn * discs.unit[2]);
+  store(out[5], -turn * discs.unit[1]);
+  store(out[6], turn * discs.unit[0]);
   store(out[7], o * guu);  // dG/ds_u = G u^2 / s_u, so dG/d(log s_u) = G u^2
   store(out[8], o * gvv);
   store(out[9], o * (T(1) - opacity) * g);
@@ -201,23 +203,23 @@ BEAGS_OPS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& ba
   using I = typename Lanes<T>::Int;
   constexpr int kCount = Lanes<T>::kCount;
   for (int lane = batch.count; lane < kCount; ++lane) {  // fill up with copies
-    for (auto& field : batch.field) field[lane] = field[0];
     for (auto& low : batch.low) low[lane] = low[0];
     for (auto& valid : batch.valid) valid[lane] = valid[0];
     if (kReach == Reach::kWindow) __builtin_memcpy(batch.bricks[lane], batch.bricks[0], sizeof batch.bricks[0]);
-    batch.state[lane] = batch.state[0];
+    batch.gaussian[lane] = batch.gaussian[0];
     batch.class_id[lane] = batch.class_id[0];
   }
-  R center[3], axis_u[3], axis_v[3];
+  const Parameters<T> raw(job, batch.gaussian);
+  const Discs<T> discs(job, raw);
+  const R one = R{} + T(1), opacity = one / (one + exponential(-raw.logit));
   I low[3], words[2];
-  for (int axis = 0; axis < 3; ++axis) {
-    center[axis] = load(batch.field[kCenter + axis]);
-    axis_u[axis] = load(batch.field[kAxisU + axis]);
-    axis_v[axis] = load(batch.field[kAxisV + axis]);
-  }
   __builtin_memcpy(low, batch.low, sizeof low);
   __builtin_memcpy(words, batch.valid, sizeof words);
-  Counter<T> counter(batch.state);
+  uint64_t state[kCount];  // hash of stream and Gaussian
+  for (int lane = 0; lane < kCount; ++lane) {
+    state[lane] = mix(static_cast<uint64_t>(batch.gaussian[lane]) * kGolden + job.stream);
+  }
+  Counter<T> counter(state);
   R sums[6] = {};
   for (int64_t s = 0; s < job.samples; ++s) {
     I radial, angle;
@@ -229,7 +231,9 @@ BEAGS_OPS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& ba
     u *= radius;
     v *= radius;
     R at[3];
-    for (int axis = 0; axis < 3; ++axis) at[axis] = fma(v, axis_v[axis], fma(u, axis_u[axis], center[axis]));
+    for (int axis = 0; axis < 3; ++axis) {
+      at[axis] = fma(v, discs.axis_v[axis], fma(u, discs.axis_u[axis], discs.center[axis]));
+    }
     I valid;
     I index[3];
     if constexpr (kReach != Reach::kFar) {
@@ -266,8 +270,7 @@ BEAGS_OPS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& ba
     sums[4] = fma(wv, v, sums[4]);
     sums[5] = fma(wu, v, sums[5]);
   }
-  batch.count = batch.count < kCount ? batch.count : kCount;
-  const double total = finish(job, batch, sums);
+  const double total = finish(job, batch, discs, opacity, sums);
   batch.count = 0;
   return total;
 }
@@ -289,14 +292,11 @@ struct Waiting {
     return kReach == Reach::kNear ? near : kReach == Reach::kWindow ? window : far;
   }
 
-  // Takes over one lane, and draws samples when a batch is full.
+  // Takes over one Gaussian, and draws samples when a batch is full.
   template <Reach kReach>
-  BEAGS_OPS_INLINE void add(const OccupancyBatch<T>& from, int lane, int64_t gaussian, const int64_t* low,
-                            uint64_t valid) {
+  BEAGS_OPS_INLINE void add(int64_t gaussian, const int64_t* low, uint64_t valid) {
     OccupancyBatch<T>& to = batch<kReach>();
     const int at = to.count++;
-    for (int field = 0; field < kOccupancyFields; ++field) to.field[field][at] = from.field[field][lane];
-    to.state[at] = mix(static_cast<uint64_t>(gaussian) * kGolden + job.stream);
     for (int axis = 0; axis < 3; ++axis) to.low[axis][at] = static_cast<typename Lanes<T>::Whole>(low[axis]);
     for (int word = 0; word < 2; ++word) to.valid[word][at] = static_cast<int32_t>(valid >> 32 * word);
     to.gaussian[at] = gaussian;
@@ -334,13 +334,19 @@ BEAGS_OPS_INLINE unsigned in_cubes(const VoxelTable* cubes, const Boxes<T>& boxe
     I at = (index >> 2) - base;
     at &= at > zero;
     at = select(at < size, at, size - 1);
-    offset = offset * size + at;
+    offset = (offset * size + at) & counted;
     place = place << 2 | (index & 3);
   }
+  const uint64_t none = 0;
+  const uint64_t* const tables[] = {&none, cubes[0].dense, cubes[1].dense, cubes[2].dense};
+  const I table = boxes.largest & counted;
+  Whole tables_at[kCount], offsets[kCount], places[kCount];  // single lanes are quicker to read from memory
+  __builtin_memcpy(tables_at, &table, sizeof table);
+  __builtin_memcpy(offsets, &offset, sizeof offset);
+  __builtin_memcpy(places, &place, sizeof place);
   unsigned inside = 0;
   for (int lane = 0; lane < kCount; ++lane) {
-    const VoxelTable& cube = cubes[-is_two[lane] - 2 * is_three[lane]];
-    inside |= static_cast<unsigned>(cube.dense[offset[lane]] >> place[lane] & counted[lane] & 1) << lane;
+    inside |= static_cast<unsigned>(tables[tables_at[lane]][offsets[lane]] >> places[lane] & 1) << lane;
   }
   return inside;
 }
@@ -357,11 +363,12 @@ double occupancy_block(const OccupancyJob<T>& job, int64_t first, int64_t last, 
   }
   bool arrays = true;
   for (int cube = 0; cube < kLargestCube; ++cube) arrays = arrays && job.valid[cube].dense;
-  OccupancyBatch<T> fresh;
   Waiting<T> waiting(job);
   for (int64_t start = first; start < last; start += kCount) {
     const int here = static_cast<int>(last - start < kCount ? last - start : kCount);
-    const Boxes<T> boxes = set_up(job, start, here, fresh);
+    const Parameters<T> raw = parameters(job, start, here);
+    const Discs<T> discs(job, raw);
+    const Boxes<T> boxes = boxes_around(discs);
     int32_t class_ids[kCount] = {};
     if (here == kCount) {
       __builtin_memcpy(class_ids, job.class_ids + start, sizeof class_ids);
@@ -370,15 +377,18 @@ double occupancy_block(const OccupancyJob<T>& job, int64_t first, int64_t last, 
     }
     // Where a disc is wholly inside, its loss is exactly 0. Most lie in a cube.
     const unsigned inside = job.skip && arrays ? in_cubes(job.valid, boxes, class_ids) : 0;
-    for (unsigned left = ~inside & ((1u << here) - 1); left; left &= left - 1) {
+    unsigned left = ~inside & ((1u << here) - 1);
+    if (!left) continue;
+    T broken[kCount];
+    store(broken, discs.nan_if_broken(raw));
+    for (; left; left &= left - 1) {
       const int lane = __builtin_ctz(left);
       const int64_t i = start + lane;
       const int32_t class_id = class_ids[lane];
-      const T opacity = fresh.field[kOpacity][lane];
-      if (opacity != opacity || (!job.background && class_id == 0)) continue;
+      if (broken[lane] != broken[lane] || (!job.background && class_id == 0)) continue;
       int64_t low[3] = {};
       if (class_id < 0 || class_id >= job.valid->num_classes) {  // it has no voxels, wherever it lies
-        waiting.template add<Reach::kNear>(fresh, lane, i, low, 0);
+        waiting.template add<Reach::kNear>(i, low, 0);
         continue;
       }
       int n[3];
@@ -391,13 +401,13 @@ double occupancy_block(const OccupancyJob<T>& job, int64_t first, int64_t last, 
       if (look && voxel_bit(job.valid[largest - 1], class_id, low)) continue;
       if (largest <= 4) {
         const uint64_t valid = voxel_box(*job.valid, class_id, low, n), box = box_bits(n[0], n[1], n[2]);
-        if (!job.skip || (valid & box) != box) waiting.template add<Reach::kNear>(fresh, lane, i, low, valid);
+        if (!job.skip || (valid & box) != box) waiting.template add<Reach::kNear>(i, low, valid);
       } else if (largest <= kWindowVoxels) {
         uint64_t* bricks = waiting.window.bricks[waiting.window.count];
         const bool inside_window = fill_window(*job.valid, class_id, low, n, bricks);
-        if (!job.skip || !inside_window) waiting.template add<Reach::kWindow>(fresh, lane, i, low, 0);
+        if (!job.skip || !inside_window) waiting.template add<Reach::kWindow>(i, low, 0);
       } else {
-        waiting.template add<Reach::kFar>(fresh, lane, i, low, 0);
+        waiting.template add<Reach::kFar>(i, low, 0);
       }
     }
   }
