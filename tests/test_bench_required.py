@@ -38,7 +38,7 @@ def test_rows_are_what_a_count_by_hand_gives(run, tmp_path):
     assert all(row.seconds_whole > 0 and row.seconds_needed > 0 for row in rows.values() if row.timed)
     maps = rows["class maps of training views"]
     pixels = sum(view.camera.width * view.camera.height for view in scene.train)
-    assert (maps.whole, maps.needed, maps.difference) == (4 * pixels, 2 * pixels, 0.0)
+    assert (maps.whole, maps.needed, maps.difference) == (4 * pixels, pixels, 0.0)
     assert rows["training images as floats, in the preparation"].whole == 12 * pixels
     voxels = rows["voxels of the background"]
     assert 0 < voxels.needed < voxels.whole and voxels.difference == 0.0

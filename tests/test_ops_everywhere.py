@@ -35,7 +35,7 @@ def results() -> dict[str, list[torch.Tensor]]:
     for dtype in (torch.float32, torch.float64):
         found[f"occupancy {dtype}"] = evaluate(make_surfels(700, dtype), make_grid())
         found[f"colors {dtype}"] = evaluate_colors(*scene(200, 16, dtype), 3)
-        masks = reproject_pairwise(*larger_scene(dtype))
+        masks = list(reproject_pairwise(*larger_scene(dtype)))
         found[f"votes {dtype}"] = [value for mask in masks for value in (mask.labels, mask.confidence)]
         found[f"photometric {dtype}"] = photometric_results((50, 61), dtype)
         found[f"normal consistency {dtype}"] = normal_results((50, 61), dtype)

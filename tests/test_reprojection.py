@@ -89,7 +89,7 @@ def test_equals_loops(monkeypatch, tau, dense):
         monkeypatch.setattr(reprojection, "_DENSE_COUNTERS", 0)
     depths, cameras, labels = _scene()
     calls = []
-    results = reproject_pairwise(depths, cameras, labels, 3, tau=tau, progress=lambda *state: calls.append(state))
+    results = list(reproject_pairwise(depths, cameras, labels, 3, tau=tau, progress=lambda *state: calls.append(state)))
     for result, (expected, confidence) in zip(results, _by_loops(depths, cameras, labels, 3, tau), strict=True):
         assert result.labels.dtype == torch.int32 and result.confidence.dtype == torch.float32
         assert np.array_equal(result.labels.numpy(), expected)
@@ -100,7 +100,7 @@ def test_equals_loops(monkeypatch, tau, dense):
 
 def test_chunks_do_not_matter(monkeypatch):
     depths, cameras, labels = _scene(seed=1)
-    whole = reproject_pairwise(depths, cameras, labels, 3)
+    whole = list(reproject_pairwise(depths, cameras, labels, 3))
     monkeypatch.setattr(reprojection, "_CHUNK_PIXELS", 1)
     for a, b in zip(whole, reproject_pairwise(depths, cameras, labels, 3), strict=True):
         assert torch.equal(a.labels, b.labels) and torch.equal(a.confidence, b.confidence)
@@ -138,8 +138,8 @@ def test_hidden_points_do_not_vote():
     camera = _cameras([(1, 1)])[0]
     depths = [torch.tensor([[2.0]]), torch.tensor([[1.0]])]
     labels = [torch.tensor([[1]], dtype=torch.int32), None]
-    assert int(reproject_pairwise(depths, [camera] * 2, labels, 2)[1].labels) == IGNORE
-    assert int(reproject_pairwise(depths, [camera] * 2, labels, 2, tau=math.inf)[1].labels) == 1
+    assert int(list(reproject_pairwise(depths, [camera] * 2, labels, 2))[1].labels) == IGNORE
+    assert int(list(reproject_pairwise(depths, [camera] * 2, labels, 2, tau=math.inf))[1].labels) == 1
 
 
 @both
@@ -151,8 +151,8 @@ def test_scale_of_the_scene_does_not_matter(factor):
         viewmat = camera.viewmat.clone()
         viewmat[:3, 3] *= factor
         scaled.append(Camera(viewmat, camera.K, camera.width, camera.height))
-    before = reproject_pairwise(depths, cameras, labels, 3)
-    after = reproject_pairwise([factor * depth for depth in depths], scaled, labels, 3)
+    before = list(reproject_pairwise(depths, cameras, labels, 3))
+    after = list(reproject_pairwise([factor * depth for depth in depths], scaled, labels, 3))
     assert all(torch.equal(a.labels, b.labels) for a, b in zip(before, after, strict=True))
 
 
@@ -163,18 +163,18 @@ def test_depths_that_are_not_finite_do_not_vote():
         spoilt = [depth.clone() for depth in depths]
         cleared = [depth.clone() for depth in depths]
         spoilt[0][2, 3], cleared[0][2, 3] = value, 0.0
-        a, b = (reproject_pairwise(d, cameras, labels, 3, tau=0.5) for d in (spoilt, cleared))
+        a, b = (list(reproject_pairwise(d, cameras, labels, 3, tau=0.5)) for d in (spoilt, cleared))
         assert all(torch.equal(x.labels, y.labels) for x, y in zip(a, b, strict=True))
 
 
 def test_mistakes_are_told():
     depths, cameras, labels = _scene()
     with pytest.raises(UserError, match="view 0 holds class ids 0..2"):
-        reproject_pairwise(depths, cameras, labels, 2)
+        list(reproject_pairwise(depths, cameras, labels, 2))
     with pytest.raises(UserError, match="view 1 is 8 x 11"):
-        reproject_pairwise(depths, cameras, [None, labels[1].T, None, None], 3)
+        list(reproject_pairwise(depths, cameras, [None, labels[1].T, None, None], 3))
     with pytest.raises(UserError, match="tau"):
-        reproject_pairwise(depths, cameras, labels, 3, tau=-1.0)
+        list(reproject_pairwise(depths, cameras, labels, 3, tau=-1.0))
 
 
 def test_is_registered():

@@ -52,7 +52,7 @@ def same(found, expected) -> bool:
 @pytest.mark.parametrize("method", METHODS)
 def test_both_are_their_torch_versions(method, tau, dtype, without_extension):
     scene = larger_scene(dtype)
-    found, expected = method(*scene, tau=tau), without_extension(lambda: method(*scene, tau=tau))
+    found, expected = list(method(*scene, tau=tau)), without_extension(lambda: list(method(*scene, tau=tau)))
     assert same(found, expected)
     changed = [(new.labels != old).double().mean() for new, old in zip(found, scene[2], strict=True) if old is not None]
     assert min(changed) > 0.001
@@ -64,7 +64,7 @@ def test_both_are_their_torch_versions(method, tau, dtype, without_extension):
 @pytest.mark.parametrize("method", METHODS)
 def test_any_number_of_threads_gives_the_same_bits(method, for_threads):
     scene = larger_scene()
-    runs = for_threads(lambda: method(*scene))
+    runs = for_threads(lambda: list(method(*scene)))
     assert same(runs[0], runs[1]) and same(runs[0], runs[2])
 
 
@@ -73,14 +73,14 @@ def test_any_number_of_threads_gives_the_same_bits(method, for_threads):
 def test_the_masks_that_were_given_stay_as_they_were(method):
     depths, cameras, labels, num_classes = larger_scene()
     before = [None if mask is None else mask.clone() for mask in labels]
-    method(depths, cameras, labels, num_classes)
+    list(method(depths, cameras, labels, num_classes))
     assert all(a is None or torch.equal(a, b) for a, b in zip(before, labels, strict=True))
 
 
 @both
 @pytest.mark.parametrize("method", METHODS)
 def test_no_views_and_no_masks(method):
-    assert method([], [], [], 2) == []
+    assert list(method([], [], [], 2)) == []
     depths, cameras, _ = _scene()
     for result in method(depths, cameras, [None] * 4, 2):
         assert (result.labels == IGNORE).all() and not result.confidence.any()
@@ -126,7 +126,7 @@ def test_voxels_equal_loops(monkeypatch):
     g = torch.Generator().manual_seed(5)
     labels = [None if m is None else torch.where(torch.rand(m.shape, generator=g) < 0.5, 1, m) for m in labels]
     calls = []
-    results = reproject_voxel(depths, cameras, labels, 3, progress=lambda *state: calls.append(state))
+    results = list(reproject_voxel(depths, cameras, labels, 3, progress=lambda *state: calls.append(state)))
     of_objects = [d[(d > 0) & (m > 0) & (m != IGNORE)] for d, m in zip(depths, labels, strict=True) if m is not None]
     footprints = sorted((torch.cat(of_objects) / math.sqrt(9.0 * 8.5)).tolist())
     size = 1.5 * footprints[(len(footprints) - 1) // 2]
@@ -164,8 +164,8 @@ def test_voxels_scale_with_the_scene(factor):
     scaled = [type(c)(c.viewmat.clone(), c.K, c.width, c.height) for c in cameras]
     for camera in scaled:
         camera.viewmat[:3, 3] *= factor
-    before = reproject_voxel(depths, cameras, labels, 3)
-    after = reproject_voxel([factor * depth for depth in depths], scaled, labels, 3)
+    before = list(reproject_voxel(depths, cameras, labels, 3))
+    after = list(reproject_voxel([factor * depth for depth in depths], scaled, labels, 3))
     agree = [(a.labels == b.labels).double().mean() for a, b in zip(before, after, strict=True)]
     assert min(agree) > 0.95  # a point on a voxel's face may round to either side
 
@@ -174,7 +174,7 @@ def test_voxels_scale_with_the_scene(factor):
 def test_too_distant_points_neither_vote_nor_change():
     depths, cameras, labels = _scene()
     depths[0][2, 3] = 1e9
-    results = reproject_voxel(depths, cameras, labels, 3)
+    results = list(reproject_voxel(depths, cameras, labels, 3))
     assert int(results[0].labels[2, 3]) == int(labels[0][2, 3]) and float(results[0].confidence[2, 3]) == 0.0
 
 

@@ -171,7 +171,7 @@ def measure(scene: Scene, depth: str, methods: Sequence[str], calls: int) -> lis
         for name in methods:
             reproject = REPROJECTIONS.get(name)
             wall, cpu = time.perf_counter(), time.process_time()
-            masks = reproject(depths, scene.cameras, scene.labels, scene.num_classes)
+            masks = list(reproject(depths, scene.cameras, scene.labels, scene.num_classes))
             times[name].append((time.perf_counter() - wall, time.process_time() - cpu))
             labels[name] = [mask.labels for mask in masks]
     for name in methods:

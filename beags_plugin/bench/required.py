@@ -19,6 +19,7 @@ from beags_plugin.bench.run import TABLE_WIDTH
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.evaluation.metrics import psnr
+from beags_plugin.masks.label_maps import narrowed, widened
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.occupancy.sampling import sample_stream
 from beags_plugin.progress import progress_bar
@@ -194,10 +195,10 @@ def voxels(scene: Scene) -> list[Row]:
 
 
 def class_maps(scene: Scene) -> list[Row]:
-    """Class maps in 4 bytes, as kernels read them, against the type that the data manager keeps them in."""
-    maps = [view.class_map for view in scene.train if view.class_map is not None]
+    """Class maps in 4 bytes, as kernels read them, against the narrowest type, in which they are held."""
+    maps = [view.stored_labels for view in scene.train if view.stored_labels is not None]
     wide = sum(mask.numel() * 4 for mask in maps)
-    known = all(torch.equal(mask.to(torch.int32).to(mask.dtype), mask) for mask in maps)
+    known = all(torch.equal(narrowed(widened(mask)), mask) for mask in maps)
     narrow = sum(mask.numel() * mask.element_size() for mask in maps)
     return [Row("class maps of training views", "bytes", wide, narrow, measure="labels", difference=float(not known))]
 

@@ -39,7 +39,7 @@ def stages(scene: SyntheticScene, rasterizer: Rasterizer, channels: bool) -> dic
     labels = scene.labels
 
     def reproject(name: str) -> Callable[[], object]:
-        return lambda: REPROJECTIONS.get(name)(depths, scene.cameras, labels, scene.num_classes)
+        return lambda: list(REPROJECTIONS.get(name)(depths, scene.cameras, labels, scene.num_classes))
 
     calls: dict[str, Callable[[], object]] = {
         STEP: _Step(scene, rasterizer, grid),

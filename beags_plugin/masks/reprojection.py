@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.errors import UserError
+from beags_plugin.masks.label_maps import LabelMaps
 from beags_plugin.ops import extension
 from beags_plugin.ops.reprojection_votes import reprojection_votes
 from beags_plugin.rasterizers.interface import IGNORE
@@ -38,37 +39,49 @@ def reproject_pairwise(
     num_classes: int,
     tau: float = 0.02,
     progress: Callable[[int, int], None] | None = None,
-) -> list[ReprojectedMask]:
+) -> Iterator[ReprojectedMask]:
     """Give every pixel of every view the class that most lifted pixels of all views put there (E5).
 
     depths: V x [H, W] float, world units along z; 0 where nothing is drawn. Views may differ in size.
-    labels: V x [H, W] int32 class ids below ``num_classes`` or IGNORE; None for a view without a mask.
+    labels: V x [H, W] int32 class ids below ``num_classes`` or IGNORE; None for a view without a mask. ``LabelMaps``
+        are read as they are held.
     tau: a vote counts only if its point is visible, |z - D_i| <= tau z; ``inf`` counts all (the paper's literal text).
     IGNORE pixels and pixels without depth do not vote; a view votes in itself too. A tie or no vote keeps the original
     label; a view without a mask counts as all IGNORE, so there it leaves IGNORE (an ambiguous pixel is better left
     unlabelled than guessed). Cost O(V^2 pixels), memory O(pixels of one view x classes).
+    Yields the views in their order; none is kept here.
     Raises ``UserError`` for a mask of the wrong size or with ids out of range.
     """
     check_views(depths, cameras, labels, num_classes, tau)
-    results: list[ReprojectedMask] = []
     if not cameras:
-        return results
-    maps = _PixelMaps(cameras)
-    while len(results) < len(cameras):
-        i = len(results)
+        return
+    maps, held = _PixelMaps(cameras), _held(labels)
+    i = 0
+    while i < len(cameras):
         size = max(camera.height * camera.width for camera in cameras) * num_classes
         if extension.can_take(*depths) and size <= _DENSE_COUNTERS:
             # as many views at a time as there are threads, each with its own counters
             batch = range(i, min(i + max(1, min(extension.threads(), 2 * _DENSE_COUNTERS // size)), len(cameras)))
             towards = torch.stack([torch.cat([A.flatten(1), b], dim=1) for A, b in map(maps.towards, batch)])
-            found = reprojection_votes(depths, labels, towards.to(depths[0]), i, num_classes, tau, IGNORE)
-            results += [ReprojectedMask(*pair) for pair in zip(*found, strict=True)]
+            own = [labels[view] for view in batch]
+            found = reprojection_votes(depths, held, own, towards.to(depths[0]), i, num_classes, tau, IGNORE)
+            results = [ReprojectedMask(*pair) for pair in zip(*found, strict=True)]
         else:
-            results.append(_by_torch(depths, cameras, labels, num_classes, tau, i, maps))
-        if progress:
-            for done in range(i + 1, len(results) + 1):
-                progress(done, len(cameras))
-    return results
+            results = [_by_torch(depths, cameras, labels, num_classes, tau, i, maps)]
+        for result in results:
+            i += 1
+            if progress:
+                progress(i, len(cameras))
+            yield result
+
+
+def _held(labels: Sequence[Tensor | None]) -> list[Tensor | None]:
+    """The maps in the types that the compiled op reads: int32, or uint8 as ``label_maps.narrowed`` gives it."""
+    if not isinstance(labels, LabelMaps):
+        return list(labels)
+    return [
+        mask if mask is None or mask.dtype == torch.uint8 else labels[index] for index, mask in enumerate(labels.stored)
+    ]
 
 
 def _by_torch(depths, cameras, labels, num_classes: int, tau: float, i: int, maps: _PixelMaps) -> ReprojectedMask:

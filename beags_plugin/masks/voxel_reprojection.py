@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -25,7 +25,7 @@ def reproject_voxel(
     num_classes: int,
     tau: float = 0.02,
     progress: Callable[[int, int], None] | None = None,
-) -> list[ReprojectedMask]:
+) -> Iterator[ReprojectedMask]:
     """Give every pixel of every view the class for which most lifted pixels of all views vote about its point.
 
     Arguments and results are those of ``reprojection.reproject_pairwise``, and so is what a tie does. A pixel votes in
@@ -39,7 +39,7 @@ def reproject_voxel(
     """
     check_views(depths, cameras, labels, num_classes, tau)
     if not cameras:
-        return []
+        return
     size, origin = _voxel_size(depths, cameras, labels), _origin(cameras)
     votes = VoxelVotes(IGNORE) if extension.can_take(*depths) else TorchVotes(IGNORE)
     views = len(cameras)
@@ -50,13 +50,12 @@ def reproject_voxel(
         if progress:
             progress(i + 1, 2 * views)
     votes.decide()
-    results = []
     for i, (depth, mask) in enumerate(zip(depths, labels, strict=True)):
         known = torch.full_like(depth, IGNORE, dtype=torch.int32) if mask is None else mask.int()
-        results.append(ReprojectedMask(*votes.read(depth, lifts[i], known)))
+        found = ReprojectedMask(*votes.read(depth, lifts[i], known))
         if progress:
             progress(views + i + 1, 2 * views)
-    return results
+        yield found
 
 
 def _voxel_size(depths: Sequence[Tensor], cameras: Sequence[Camera], labels: Sequence[Tensor | None]) -> float:

@@ -153,13 +153,15 @@ void bind_functions(nb::module_& m, const char* suffix) {
         "sh_dc"_a, "sh_rest"_a, "means"_a, "center"_a, "degree"_a, "clamped"_a, "g_colors"_a, "g_dc"_a.none(),
         "g_rest"_a.none(), "g_means"_a.none(), "threads"_a);
   m.def(("reprojection_votes_" + end).c_str(),
-        [](const std::vector<In>& depths, const std::vector<std::optional<Ids>>& labels, int first, const In& maps,
+        [](const std::vector<In>& depths, const std::vector<std::optional<Ids>>& labels,
+           const std::vector<std::optional<Array<const uint8_t>>>& short_labels, int first, const In& maps,
            const std::vector<Array<int32_t>>& voted, const std::vector<Array<float>>& confidence, int num_classes,
            double tau, int threads) {
           std::vector<VotingView<T>> views;
           for (size_t v = 0; v < depths.size(); ++v) {
             views.push_back({static_cast<int>(depths[v].shape(0)), static_cast<int>(depths[v].shape(1)),
-                             depths[v].data(), labels[v] ? labels[v]->data() : nullptr});
+                             depths[v].data(), labels[v] ? labels[v]->data() : nullptr,
+                             short_labels[v] ? short_labels[v]->data() : nullptr});
           }
           std::vector<VotedView<T>> targets;
           for (size_t t = 0; t < voted.size(); ++t) {
@@ -169,7 +171,8 @@ void bind_functions(nb::module_& m, const char* suffix) {
           nb::gil_scoped_release release;
           reprojection_votes(views, targets, num_classes, tau, threads);
         },
-        "depths"_a, "labels"_a, "first"_a, "maps"_a, "voted"_a, "confidence"_a, "num_classes"_a, "tau"_a, "threads"_a);
+        "depths"_a, "labels"_a, "short_labels"_a, "first"_a, "maps"_a, "voted"_a, "confidence"_a, "num_classes"_a,
+        "tau"_a, "threads"_a);
 }
 
 }  // namespace

@@ -28,6 +28,19 @@ void decide(const uint32_t* votes, int num_classes, int32_t* label, float* confi
   *confidence = static_cast<float>(most) / static_cast<float>(std::max(total, 1u));
 }
 
+// Row y of a view's labels, as the kernels read them; `wide` is where a row of bytes is widened.
+template <class T>
+const int32_t* row_labels(const VotingView<T>& view, int y, std::vector<int32_t>* wide) {
+  const int64_t row = static_cast<int64_t>(y) * view.width;
+  if (view.labels) return view.labels + row;
+  wide->resize(view.width);
+  for (int x = 0; x < view.width; ++x) {
+    const uint8_t label = view.short_labels[row + x];
+    (*wide)[x] = label == kShortIgnore ? -1 : label;
+  }
+  return wide->data();
+}
+
 }  // namespace
 
 template <class T>
@@ -38,6 +51,7 @@ void reprojection_votes(const std::vector<VotingView<T>>& views, const std::vect
 #pragma omp parallel num_threads(team)
   {
     std::vector<uint32_t> votes;
+    std::vector<int32_t> wide;
     // Determinism: a target's votes are counted by one thread; sums of integers have no order anyway.
 #pragma omp for schedule(dynamic, 1)
     for (int64_t t = 0; t < count; ++t) {
@@ -54,13 +68,13 @@ void reprojection_votes(const std::vector<VotingView<T>>& views, const std::vect
       job.votes = votes.data();
       for (size_t v = 0; v < views.size(); ++v) {
         const VotingView<T>& view = views[v];
-        if (!view.labels) continue;
+        if (!view.labels && !view.short_labels) continue;
         std::copy_n(target.maps + 12 * v, 9, job.a);
         std::copy_n(target.maps + 12 * v + 9, 3, job.b);
         job.source_width = view.width;
         for (int y = 0; y < view.height; ++y) {
           const int64_t row = static_cast<int64_t>(y) * view.width;
-          best_table<OpKernels<T>>().cast_row(job, y, view.depth + row, view.labels + row);
+          best_table<OpKernels<T>>().cast_row(job, y, view.depth + row, row_labels(view, y, &wide));
         }
       }
       for (int64_t pixel = 0; pixel < pixels; ++pixel) {

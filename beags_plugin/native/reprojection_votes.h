@@ -12,8 +12,11 @@ template <class T>
 struct VotingView {
   int height, width;
   const T* depth;
-  const int32_t* labels;  // null: no mask
+  const int32_t* labels;        // null: no mask, or
+  const uint8_t* short_labels;  // one of a byte a pixel, in which kShortIgnore does not vote; null: none
 };
+
+constexpr uint8_t kShortIgnore = 255;
 
 template <class T>
 struct VotedView {

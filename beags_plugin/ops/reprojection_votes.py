@@ -13,6 +13,7 @@ from beags_plugin.ops import extension
 def reprojection_votes(
     depths: Sequence[Tensor],
     labels: Sequence[Tensor | None],
+    own: Sequence[Tensor | None],
     maps: Tensor,
     first: int,
     num_classes: int,
@@ -21,8 +22,9 @@ def reprojection_votes(
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Labels and confidence of the views first .. first + T - 1; the winner of each pixel's votes, or what it was.
 
-    depths: V x [H, W], float32 or float64, on the CPU, all of one dtype. labels: V x [H, W] int32, None: no mask;
-        ids that are not 0 .. num_classes - 1 do not vote.
+    depths: V x [H, W], float32 or float64, on the CPU, all of one dtype. labels: V x [H, W] int32 or uint8, None: no
+        mask; ids that are not 0 .. num_classes - 1 do not vote, nor does 255 of a uint8 map.
+    own: T x [H, W] int32, what the views that are voted on were; None: no mask.
     maps: [T, V, 12] of the same dtype, from view v to view first + t: A row-major, then b; a pixel (x, y) at depth d
         projects to d A (x, y, 1) + b = z (x', y', 1).
     tau: a vote counts where |z - D| <= tau z; infinity: everywhere. ignore: label of views without a mask.
@@ -31,16 +33,22 @@ def reprojection_votes(
     dtype = depths[0].dtype
     depths = [extension.plain(f"depths[{v}]", d, (d.shape[0], d.shape[1]), dtype) for v, d in enumerate(depths)]
     masks = [
-        None if mask is None else extension.plain(f"labels[{v}]", mask, tuple(depths[v].shape), torch.int32)
+        None if mask is None else extension.plain(f"labels[{v}]", mask, tuple(depths[v].shape), _type_of(mask))
         for v, mask in enumerate(labels)
     ]
+    wide = [mask if mask is not None and mask.dtype == torch.int32 else None for mask in masks]
+    narrow = [mask if mask is not None and mask.dtype == torch.uint8 else None for mask in masks]
     maps = extension.plain("maps", maps, (len(maps), len(depths), 12), dtype)
     voted, confidence = [], []
-    for view in range(first, first + len(maps)):
-        mask = masks[view]
+    for view, mask in zip(range(first, first + len(maps)), own, strict=True):
         blank = torch.full(tuple(depths[view].shape), ignore, dtype=torch.int32)
-        voted.append(blank if mask is None else mask.clone())
+        former = blank if mask is None else extension.plain("own", mask, tuple(blank.shape), torch.int32).clone()
+        voted.append(former)
         confidence.append(torch.empty(tuple(depths[view].shape), dtype=torch.float32))
     compute = extension.function("reprojection_votes", maps)
-    compute(depths, masks, first, maps, voted, confidence, num_classes, tau, extension.threads())
+    compute(depths, wide, narrow, first, maps, voted, confidence, num_classes, tau, extension.threads())
     return voted, confidence
+
+
+def _type_of(mask: Tensor) -> torch.dtype:
+    return torch.uint8 if mask.dtype == torch.uint8 else torch.int32

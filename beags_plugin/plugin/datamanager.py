@@ -20,13 +20,14 @@ from torch import Tensor
 
 import beags_plugin.plugin.nerfstudio_patches  # noqa: F401  (checkpoints load again)
 from beags_plugin.core.cameras import Camera
+from beags_plugin.masks.label_maps import narrowed, widened
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.dataparser import BeagsDataParserConfig, absolute
 from beags_plugin.plugin.dataset import BeagsDataset
 from beags_plugin.plugin.undistortion import undistort_alpha, undistort_class_map
 from beags_plugin.rasterizers.interface import IGNORE
 
-OWN_KEYS = ("class_map", "original_class_map", "alpha")
+OWN_KEYS = ("class_map", "alpha")
 
 
 @dataclass
@@ -49,14 +50,14 @@ class View:
     would take six times as much as their files, opened.
 
     name: the stem of the image file; where several share it, with the folders that tell them apart, joined by "_".
-    pixels: [H, W, 3 or more], uint8 or float32 in 0..1. class_map: [H, W] uint16, or None. opacity: [H, W] uint8, or
-        None.
+    pixels: [H, W, 3 or more], uint8 or float32 in 0..1. stored_labels: [H, W], as ``label_maps.narrowed`` gives them,
+        or None. opacity: [H, W] uint8, or None.
     """
 
     camera: Camera
     name: str
     pixels: Tensor
-    class_map: Tensor | None
+    stored_labels: Tensor | None
     opacity: Tensor | None = None
 
     @property
@@ -68,7 +69,7 @@ class View:
     @property
     def labels(self) -> Tensor | None:
         """[H, W] int32 class ids or IGNORE; None if the view has no mask."""
-        return None if self.class_map is None else self.class_map.to(torch.int32)
+        return None if self.stored_labels is None else widened(self.stored_labels)
 
     @property
     def alpha(self) -> Tensor | None:
@@ -84,9 +85,9 @@ class View:
 class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
     """nerfstudio's data manager of full images, for CPUs too, with class maps in every batch.
 
-    Batches hold ``image`` [H, W, 3], ``class_map`` [H, W] uint16, ``alpha`` [H, W] uint8 where the image has it, and,
-    once the class maps were replaced, ``original_class_map``, all on the device; a training camera's metadata holds its
-    ``class_map`` too. Training views come in a random order without repetition within a round, given by
+    Batches hold ``image`` [H, W, 3], ``class_map`` [H, W] int32 and ``alpha`` [H, W] uint8 where the image has it, all
+    on the device; a training camera's metadata holds its ``class_map`` too. The cache holds class maps in the narrowest
+    type. Training views come in a random order without repetition within a round, given by
     ``train_cameras_sampling_seed`` alone.
     """
 
@@ -97,6 +98,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
     def __init__(self, config: BeagsDataManagerConfig, *args, **kwargs) -> None:
         super().__init__(config, *args, **kwargs)
         self._distorted: dict[str, Cameras] = {}
+        self._replaced = False  # whether the training class maps are no longer those of the files
         # nerfstudio draws evaluation views from Python's global generator, which others use too.
         self._eval_order = random.Random(config.train_cameras_sampling_seed)
 
@@ -112,11 +114,11 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
             class_map = undistort_class_map(data["class_map"].numpy(), *lens)
             if class_map.shape != tuple(data["image"].shape[:2]):
                 raise RuntimeError(f"class map {class_map.shape} and image {data['image'].shape} differ in size")
-            data["class_map"] = torch.from_numpy(class_map)
+            data["class_map"] = narrowed(torch.from_numpy(class_map.astype(np.int32)))
             if (alpha := dataset.get_alpha(index)) is not None:
                 data["alpha"] = torch.from_numpy(undistort_alpha(alpha, *lens))
             if on_cpu or cache_images_device == "gpu":
-                data.update(self._on_device(data))
+                data.update({key: data[key].to(self.device) for key in OWN_KEYS if key in data})
         return cache
 
     def undistort_eval_map(self, class_map: np.ndarray, index: int) -> np.ndarray:
@@ -144,26 +146,21 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         """All evaluation views in order, as nerfstudio's evaluation reads them."""
         return [(camera, self._on_device(data)) for camera, data in super().fixed_indices_eval_dataloader]
 
-    def views(self, split: Literal["train", "val", "test", "eval"], original: bool = False) -> list[View]:
-        """All views of the training or (any other name) the evaluation split, in name order.
-
-        original: give the labels of the mask files also after ``replace_class_maps``.
-        """
+    def views(self, split: Literal["train", "val", "test", "eval"]) -> list[View]:
+        """All views of the training or (any other name) the evaluation split, in name order."""
         if split not in ("train", "val", "test", "eval"):
             raise ValueError(f"unknown split {split!r}")
         cache = self.cached_train if split == "train" else self.cached_eval
         dataset = self.train_dataset if split == "train" else self.eval_dataset
         names = unique_names(dataset.image_filenames)
         return [
-            self._view(dataset, data, index, name, original)
-            for index, (data, name) in enumerate(zip(cache, names, strict=True))
+            self._view(dataset, data, index, name) for index, (data, name) in enumerate(zip(cache, names, strict=True))
         ]
 
     def replace_class_maps(self, class_maps: Sequence[Tensor]) -> None:
         """Train on ``class_maps``, one [H, W] integer tensor per training view, instead of the mask files.
 
-        The first call keeps the class maps of the files as ``original_class_map``. Raises ``ValueError`` if their
-        number, a size or an id (0..IGNORE) is wrong.
+        Raises ``ValueError`` if their number, a size or an id (0..IGNORE) is wrong.
         """
         if len(class_maps) != len(self.cached_train):
             raise ValueError(f"{len(class_maps)} class maps for {len(self.cached_train)} training views")
@@ -173,21 +170,22 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
             if labels.numel() and not 0 <= int(labels.min()) <= int(labels.max()) <= IGNORE:
                 raise ValueError(f"class ids must lie in 0..{IGNORE}")
         for data, labels in zip(self.cached_train, class_maps, strict=True):
-            data.setdefault("original_class_map", data["class_map"])
-            data["class_map"] = labels.detach().to(torch.uint16).to(data["class_map"].device, copy=True)
+            data["class_map"] = narrowed(labels.detach().int()).to(data["class_map"].device)
+        self._replaced = True
 
-    def _view(self, dataset: BeagsDataset, data: dict, index: int, name: str, original: bool) -> View:
-        replaced = "original_class_map" in data and not original
+    def _view(self, dataset: BeagsDataset, data: dict, index: int, name: str) -> View:
         labels = None
+        replaced = self._replaced and dataset is self.train_dataset
         if replaced or dataset.metadata["class_map_filenames"][index] is not None:
-            key = "original_class_map" if original and "original_class_map" in data else "class_map"
-            labels = data[key].to(self.device)
+            labels = data["class_map"].to(self.device)
         camera = camera_from_nerfstudio(dataset.cameras, index).to(self.device)
         alpha = data["alpha"].to(self.device) if "alpha" in data else None
         return View(camera, name, data["image"].to(self.device), labels, alpha)
 
     def _on_device(self, data: dict) -> dict:
-        return {key: value.to(self.device) if key in OWN_KEYS else value for key, value in data.items()}
+        """The view's data for use: class map and alpha on the device, the class map as int32."""
+        moved = {key: value.to(self.device) if key in OWN_KEYS else value for key, value in data.items()}
+        return {**moved, "class_map": widened(moved["class_map"])}
 
 
 def unique_names(files: Sequence[Path]) -> list[str]:

@@ -18,6 +18,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from beags_plugin.assignment.assignment import Assignment
 from beags_plugin.errors import UserError
 from beags_plugin.masks.classes import read_class_map, write_class_map
+from beags_plugin.masks.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.runs import BASE_SNAPSHOT, PREPARED, round_folder, write_run
 from beags_plugin.plugin.scene_edits import edit_scene
@@ -102,7 +103,7 @@ class RefinementSwitch:
         prepared = prepare(
             model.surfels(),
             [view.camera for view in views],
-            [view.labels for view in views],
+            LabelMaps(view.stored_labels for view in views),
             model.classes,
             model.rasterizer,
             model.settings(),
@@ -144,7 +145,7 @@ class RefinementSwitch:
         self.model.class_margin.copy_(assignment.margin)
         self.model.assigned.fill_(True)
 
-    def _start(self, grid: VisibilityGrid | None, labels: list[torch.Tensor]) -> None:
+    def _start(self, grid: VisibilityGrid | None, labels: LabelMaps) -> None:
         self.datamanager.replace_class_maps(labels)
         self.model.grid = grid
         self.model.frozen = not self.refiner.trains
@@ -158,7 +159,8 @@ class RefinementSwitch:
         (folder / "masks").mkdir(parents=True, exist_ok=True)
         (folder / "confidence").mkdir(exist_ok=True)
         for index, name in enumerate(names):
-            write_class_map(folder / "masks" / f"{name}.png", prepared.labels[index].cpu().numpy().astype(np.uint16))
+            labels = prepared.labels[index]
+            write_class_map(folder / "masks" / f"{name}.png", labels.cpu().numpy().astype(np.uint16))
             if prepared.confidence is not None:
                 _write_grey(folder / "confidence" / f"{name}.png", prepared.confidence[index])
         report = {"findings": prepared.findings, "seconds": prepared.seconds, "peak_memory_mb": peak_memory_mb()}
@@ -187,10 +189,10 @@ class RefinementSwitch:
                 f"{folder / 'grid.pt'} has no voxels of the background, which a loss now asks about: set background of "
                 f"the occupancy loss to False, or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
             )
-        labels = [
+        labels = LabelMaps(
             torch.from_numpy(read_class_map(folder / "masks" / f"{view.name}.png").astype(np.int32))
             for view in self.datamanager.views("train")
-        ]
+        )
         self._start(VisibilityGrid.from_state_dict(state) if state else None, labels)
         self.model.refining_since = time.perf_counter()
         CONSOLE.print(f"  refinement taken up from {folder}", highlight=False, markup=False, soft_wrap=True)
@@ -204,7 +206,7 @@ def peak_memory_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
 
 
-def _write_grey(path: Path, share: torch.Tensor) -> None:
+def _write_grey(path: Path, values: torch.Tensor) -> None:
     import cv2
 
-    cv2.imwrite(str(path), (share.cpu().numpy() * 255.0 + 0.5).astype(np.uint8))
+    cv2.imwrite(str(path), values.cpu().numpy())

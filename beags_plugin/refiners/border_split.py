@@ -18,6 +18,7 @@ from beags_plugin.core.densification import Densified
 from beags_plugin.core.splitting import split_in_two
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
+from beags_plugin.masks.label_maps import LabelMaps
 from beags_plugin.rasterizers.drawing import geometry_inputs
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
 from beags_plugin.refiners.base import EditedScene
@@ -74,7 +75,7 @@ def split_at_borders(
         if progress:
             progress(done, total)
 
-    bands = [border_band(mask, config.band) for mask in labels]
+    bands = LabelMaps(border_band(mask, config.band) for mask in labels)
     edited = Densified.unchanged(surfels)
     for _ in range(config.rounds):
         share = _share_of_class(edited.surfels, cameras, bands, rasterizer, settings, tick)

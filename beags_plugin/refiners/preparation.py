@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -17,14 +17,13 @@ from beags_plugin.core.densification import Densified
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.masks import REPROJECTIONS
+from beags_plugin.masks.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.rasterizers.drawing import check_surface_depth, geometry_inputs, surface_depth
+from beags_plugin.rasterizers.drawing import check_surface_depth
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
-from beags_plugin.refiners.base import AssignedScene, EditedScene, Progress, Refiner
+from beags_plugin.refiners.base import AssignedScene, EditedScene, Refiner
 from beags_plugin.refiners.border_split import BorderSplitConfig, split_at_borders
-
-Stage = Callable[[str], AbstractContextManager[Progress | None]]
-"""Opens a named stage and gives its progress callback; a command line draws a bar with it."""
+from beags_plugin.refiners.consistent_masks import Stage, masks_as_they_are, reprojected_masks
 
 
 @dataclass(frozen=True)
@@ -74,8 +73,9 @@ class PreparationConfig:
 class Preparation:
     """What the stages made.
 
-    labels: per training view [H, W] int32, M'.
-    confidence: per training view [H, W] float32, share of the winning votes; None where nothing was reprojected.
+    labels: per training view [H, W] int32, M'; held in the narrowest type.
+    confidence: per training view [H, W] uint8, share of the winning votes times 255; None where nothing was
+        reprojected.
     assignment: the class of every surfel and its margin.
     edited: the scene and the classes that refinement starts from, where surfels were removed or split; None where it
         starts from the base.
@@ -84,7 +84,7 @@ class Preparation:
     seconds: wall time per stage.
     """
 
-    labels: list[Tensor]
+    labels: LabelMaps
     confidence: list[Tensor] | None
     assignment: Assignment
     grid: VisibilityGrid | None
@@ -110,19 +110,20 @@ def prepare(
     """Make masks consistent, assign classes, split at borders if the refiner trains, build the voxel grids.
 
     surfels: the trained base, N surfels.
-    cameras: V training views; labels: per view [H, W] int32 class ids or IGNORE, None where there is no mask.
+    cameras: V training views; labels: per view [H, W] int32 class ids or IGNORE, None where there is no mask; held in
+        the narrowest type, as ``LabelMaps`` already are.
     class_names: id to name, background (0) included; ids may lie far apart: the stages work on their ranks.
     background_voxels: whether a loss will ask the grid about the background; if none will, those voxels are not kept.
     Raises ``UserError`` if no view has a mask or no mask names an object.
     """
-    if not any(mask is not None and bool(((mask > 0) & (mask != IGNORE)).any()) for mask in labels):
+    maps = labels if isinstance(labels, LabelMaps) else LabelMaps(labels)
+    if not any(mask is not None and bool(((mask > 0) & (mask != IGNORE)).any()) for mask in maps):
         raise UserError(
             "no mask names an object: put id images into masks/<image name>.png, or train the preset beags-base, "
             "which needs none."
         )
     surfels = surfels.detach()
-    known = _known_classes(labels, class_names)
-    ranked = [None if mask is None else _translated(mask, known, known.ranks) for mask in labels]
+    known = _known_classes(maps, class_names)
     findings, seconds = [], {}
 
     def timed(name: str, start: float, finding: str) -> None:
@@ -130,31 +131,13 @@ def prepare(
         findings.append(finding)
 
     start = time.perf_counter()
-    confidence = None
     if config.reprojection == "none":
-        ranked = [_or_ignore(mask, camera) for mask, camera in zip(ranked, cameras, strict=True)]
-        consistent = [_or_ignore(mask, camera) for mask, camera in zip(labels, cameras, strict=True)]
+        masks = masks_as_they_are(maps, cameras, known)
         timed("reprojection", start, "reprojection: off, masks used as they are")
     else:
-        with stage("Rendering depth") as progress:
-            depths = _render_depths(surfels, cameras, rasterizer, settings, config.depth, progress)
-        with stage("Reprojecting masks") as progress:
-            reproject = REPROJECTIONS.get(config.reprojection)
-            votes = _votes_of(ranked, config.voters)
-            refined = reproject(depths, cameras, votes, len(known), tau=config.tau, progress=progress)
-        ranked = [
-            mask.labels if vote is not None or own is None else torch.where(mask.labels == IGNORE, own, mask.labels)
-            for mask, vote, own in zip(refined, votes, ranked, strict=True)
-        ]  # without a vote, a view that does not vote keeps its label too
-        consistent = [_translated(mask, known, known.class_ids) for mask in ranked]
-        confidence = [mask.confidence for mask in refined]
-        if config.min_confidence > 0.0:
-            # for the losses alone: the border split looks for the very rims that are doubtful
-            consistent = [
-                mask.masked_fill(share < config.min_confidence, IGNORE)
-                for mask, share in zip(consistent, confidence, strict=True)
-            ]
-        timed("reprojection", start, _reprojection_finding(labels, consistent))
+        masks = reprojected_masks(surfels, cameras, maps, known, rasterizer, settings, config, stage)
+        timed("reprojection", start, _reprojection_finding(maps, masks.labels))
+    ranked = masks.ranked
 
     start = time.perf_counter()
     with stage("Assigning classes") as progress:
@@ -181,7 +164,7 @@ def prepare(
     num_classes = max(class_names) + 1
     class_ids = (assignment if edited is None else edited.assignment).class_ids
     scene = AssignedScene(
-        surfels, class_ids, cameras, consistent, num_classes, rasterizer, settings, seed, config.depth
+        surfels, class_ids, cameras, masks.labels, num_classes, rasterizer, settings, seed, config.depth
     )
     with stage("Building voxel grids") as progress:
         grid = refiner.build_grid(scene, config.k, progress)
@@ -189,7 +172,7 @@ def prepare(
         asked = torch.unique(class_ids)  # classes are fixed: no loss can ask about one that has no Gaussians
         grid = grid.only(asked if background_voxels else asked[asked != 0])
         timed("voxel grids", start, f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {config.k})")
-    return Preparation(consistent, confidence, assignment, grid, edited, findings, seconds)
+    return Preparation(masks.labels, masks.confidence, assignment, grid, edited, findings, seconds)
 
 
 def _known_classes(labels: Sequence[Tensor | None], class_names: dict[int, str]) -> ClassRanks:
@@ -204,41 +187,6 @@ def _known_classes(labels: Sequence[Tensor | None], class_names: dict[int, str])
             check_class_ids(mask, index, last + 1)
             present[mask[mask != IGNORE].long().to(present.device)] = True
     return ClassRanks(torch.cat([named.ids, present.nonzero()[:, 0]]))
-
-
-def _translated(mask: Tensor, known: ClassRanks, table: Callable[[Tensor], Tensor]) -> Tensor:
-    """A mask [H, W] int32 with ``table`` of its values; IGNORE stays."""
-    if known.trivial:
-        return mask  # ranks are ids
-    unlabelled = mask == IGNORE
-    return table(mask.masked_fill(unlabelled, 0)).masked_fill_(unlabelled, IGNORE)
-
-
-def _render_depths(surfels, cameras, rasterizer, settings, depth, progress) -> list[Tensor]:
-    depths = []
-    with torch.no_grad():
-        for index, camera in enumerate(cameras):
-            background = surfels.means.new_zeros(3)
-            drawn = rasterizer.rasterize(geometry_inputs(surfels), camera, settings, background)
-            depths.append(surface_depth(drawn, depth))
-            if progress:
-                progress(index + 1, len(cameras))
-    return depths
-
-
-def _votes_of(labels: Sequence[Tensor | None], voters: int) -> list[Tensor | None]:
-    """The masks that vote: all, or ``voters`` of them at even distances; None in place of the others."""
-    having = [index for index, mask in enumerate(labels) if mask is not None]
-    if voters == 0 or voters >= len(having):
-        return list(labels)
-    chosen = {having[(2 * rank + 1) * len(having) // (2 * voters)] for rank in range(voters)}
-    return [mask if index in chosen else None for index, mask in enumerate(labels)]
-
-
-def _or_ignore(mask: Tensor | None, camera: Camera) -> Tensor:
-    if mask is not None:
-        return mask
-    return torch.full((camera.height, camera.width), IGNORE, dtype=torch.int32)
 
 
 def _reprojection_finding(before: Sequence[Tensor | None], after: Sequence[Tensor]) -> str:

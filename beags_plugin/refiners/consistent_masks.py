@@ -1,0 +1,115 @@
+"""Masks made consistent across views: depth of every view, then reprojection (method, section 2)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.class_ranks import ClassRanks
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.masks import REPROJECTIONS
+from beags_plugin.masks.label_maps import LabelMaps
+from beags_plugin.rasterizers.drawing import geometry_inputs, surface_depth
+from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
+from beags_plugin.refiners.base import Progress
+
+Stage = Callable[[str], AbstractContextManager[Progress | None]]
+"""Opens a named stage and gives its progress callback; a command line draws a bar with it."""
+
+
+@dataclass(frozen=True)
+class ConsistentMasks:
+    """M' of V views.
+
+    ranked: ranks of the classes, for the stages. labels: class ids, for the losses; the same maps where ids are ranks.
+    confidence: per view [H, W] uint8, the winner's share of the votes in steps of 1/255; None: nothing was reprojected.
+    """
+
+    ranked: LabelMaps
+    labels: LabelMaps
+    confidence: list[Tensor] | None
+
+
+def masks_as_they_are(labels: LabelMaps, cameras: Sequence[Camera], known: ClassRanks) -> ConsistentMasks:
+    """The masks without reprojection; a view that has none is all IGNORE."""
+    whole = LabelMaps(_or_ignore(mask, camera) for mask, camera in zip(labels, cameras, strict=True))
+    return ConsistentMasks(translated(whole, known, known.ranks), whole, None)
+
+
+def reprojected_masks(
+    surfels: Surfels,
+    cameras: Sequence[Camera],
+    labels: LabelMaps,
+    known: ClassRanks,
+    rasterizer: Rasterizer,
+    settings: RasterSettings,
+    config,
+    stage: Stage,
+) -> ConsistentMasks:
+    """The masks of all views, voted by those that vote; config: a ``preparation.PreparationConfig``.
+
+    The depth of all views is held while they are voted on, and no longer; of what the votes give, one view at a time.
+    """
+    with stage("Rendering depth") as progress:
+        depths = _render_depths(surfels, cameras, rasterizer, settings, config.depth, progress)
+    given = translated(labels, known, known.ranks)
+    votes = votes_of(given, config.voters)
+    ranked, consistent, confidence = LabelMaps(), LabelMaps(), []
+    with stage("Reprojecting masks") as progress:
+        reproject = REPROJECTIONS.get(config.reprojection)
+        found = reproject(depths, cameras, votes, len(known), tau=config.tau, progress=progress)
+        for index, mask in enumerate(found):
+            own = given[index] if votes.stored[index] is None else None
+            # without a vote, a view that does not vote keeps its label too
+            voted = mask.labels if own is None else torch.where(mask.labels == IGNORE, own, mask.labels)
+            ranked.append(voted)
+            confidence.append((mask.confidence * 255.0 + 0.5).to(torch.uint8))
+            if config.min_confidence > 0.0:
+                # for the losses alone: the border split looks for the very rims that are doubtful
+                doubtful = mask.confidence < config.min_confidence
+                consistent.append(_translated(voted, known.class_ids).masked_fill_(doubtful, IGNORE))
+    if len(ranked) != len(cameras):
+        raise ValueError(f"the reprojection {config.reprojection!r} gave {len(ranked)} masks for {len(cameras)} views")
+    if config.min_confidence == 0.0:
+        consistent = translated(ranked, known, known.class_ids)
+    return ConsistentMasks(ranked, consistent, confidence)
+
+
+def translated(labels: LabelMaps, known: ClassRanks, table: Callable[[Tensor], Tensor]) -> LabelMaps:
+    """The maps with ``table`` of their values, IGNORE as it is; the same maps where ranks are ids."""
+    return labels if known.trivial else LabelMaps(None if mask is None else _translated(mask, table) for mask in labels)
+
+
+def votes_of(labels: LabelMaps, voters: int) -> LabelMaps:
+    """The masks that vote: all, or ``voters`` of them at even distances; None in place of the others."""
+    having = [index for index, mask in enumerate(labels.stored) if mask is not None]
+    if voters == 0 or voters >= len(having):
+        return labels
+    chosen = {having[(2 * rank + 1) * len(having) // (2 * voters)] for rank in range(voters)}
+    return LabelMaps(mask if index in chosen else None for index, mask in enumerate(labels.stored))
+
+
+def _translated(mask: Tensor, table: Callable[[Tensor], Tensor]) -> Tensor:
+    unlabelled = mask == IGNORE
+    return table(mask.masked_fill(unlabelled, 0)).masked_fill_(unlabelled, IGNORE)
+
+
+def _render_depths(surfels, cameras, rasterizer, settings, depth, progress) -> list[Tensor]:
+    depths = []
+    with torch.no_grad():
+        for index, camera in enumerate(cameras):
+            background = surfels.means.new_zeros(3)
+            drawn = rasterizer.rasterize(geometry_inputs(surfels), camera, settings, background)
+            depths.append(surface_depth(drawn, depth))
+            if progress:
+                progress(index + 1, len(cameras))
+    return depths
+
+
+def _or_ignore(mask: Tensor | None, camera: Camera) -> Tensor:
+    return mask if mask is not None else torch.full((camera.height, camera.width), IGNORE, dtype=torch.int32)
