@@ -9,9 +9,10 @@ import torch
 from raster_scenes import CLASSES, make_scene
 
 from beags_plugin.assignment.assignment import assign_classes
+from beags_plugin.assignment.sparse_sums import SparseSums
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
-from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers import RASTERIZERS, make_rasterizer
 from beags_plugin.rasterizers.drawing import geometry_inputs
 from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
 
@@ -21,10 +22,13 @@ SETTINGS = RasterSettings(near=0.1, far=100.0)
 class _Stub:
     """Gives contributions to labelled pixels that were written down, one table per camera, and none to others."""
 
-    def class_contributions(self, inputs, camera, settings, labels, num_classes):
+    def contributing_classes(self, inputs, camera, settings, labels, num_classes):
         assert not settings.geometry and not settings.distortion
         assert inputs.means.requires_grad is False
-        return torch.nn.functional.pad(torch.tensor(camera.table, dtype=torch.float32), (0, 1))
+        table = torch.nn.functional.pad(torch.tensor(camera.table, dtype=torch.float32), (0, 1))
+        assert table.shape[1] == num_classes
+        surfel, class_id = torch.nonzero(table, as_tuple=True)
+        return surfel * num_classes + class_id, table[surfel, class_id]
 
 
 def _surfels(count: int) -> Surfels:
@@ -119,3 +123,47 @@ def test_strongest_counts_pixels_without_a_label_too():
     for labels in ([unlabelled, None], [None, scene.target]):
         found = assign_classes(surfels, [scene.camera] * 2, labels, rasterizer, scene.settings, CLASSES)
         torch.testing.assert_close(found.strongest, everything.float(), rtol=1e-5, atol=0)
+
+
+def test_sparse_sums_are_a_dense_table_bit_for_bit():
+    generator = torch.Generator().manual_seed(0)
+    rows, columns = 40, 30
+    dense, sparse = torch.zeros(rows, columns, dtype=torch.float64), SparseSums()
+    for _ in range(12):
+        chosen = torch.rand(rows * columns, generator=generator) < 0.05
+        values = torch.rand(rows * columns, generator=generator) * 10 ** torch.randint(-6, 3, (1,), generator=generator)
+        dense += torch.where(chosen, values, 0.0).view(rows, columns).double()
+        sparse.add(chosen.nonzero()[:, 0], values[chosen])
+    again = torch.zeros_like(dense).view(-1)
+    again[sparse.keys] = sparse.sums
+    assert torch.equal(again.view_as(dense), dense)
+    first, top, everything = sparse.largest(rows, columns)
+    assert torch.equal(first, dense.argmax(1)) and torch.equal(top, dense.max(1).values)
+    torch.testing.assert_close(everything, dense.sum(1), rtol=1e-15, atol=0)
+
+
+def test_sparse_sums_of_nothing_and_of_equals():
+    sums = SparseSums()
+    sums.add(torch.zeros(0, dtype=torch.int64), torch.zeros(0))
+    assert [value.tolist() for value in sums.largest(2, 3)] == [[0, 0], [0.0, 0.0], [0.0, 0.0]]
+    sums.add(torch.tensor([4, 5]), torch.tensor([2.0, 2.0]))
+    assert [value.tolist() for value in sums.largest(2, 3)] == [[0, 1], [0.0, 2.0], [0.0, 4.0]]
+
+
+@pytest.mark.parametrize("backend", ["torch", "native"])
+@pytest.mark.parametrize("num_classes", [2, 256])
+def test_lists_of_contributions_are_the_table(backend, num_classes):
+    if reason := RASTERIZERS.get(backend).unavailable():
+        pytest.skip(reason)
+    scene = make_scene(count=300, width=71, height=51, size=-2.0)
+    rasterizer, what = make_rasterizer(backend), (scene.inputs, scene.camera, scene.settings)
+    labels = (torch.arange(71 * 51, dtype=torch.int32) // 40 % num_classes).reshape(51, 71)
+    labels[3], labels[4] = IGNORE, -1
+    table = rasterizer.class_contributions(*what, labels, num_classes)
+    keys, values = rasterizer.contributing_classes(*what, labels, num_classes)
+    assert keys.dtype == torch.int64 and bool((keys.diff() > 0).all()) and bool((values != 0).all())
+    again = torch.zeros_like(table).view(-1)
+    again[keys] = values
+    assert torch.equal(again.view_as(table), table)
+    nothing = rasterizer.contributing_classes(*what, torch.full_like(labels, IGNORE), num_classes)
+    assert [len(value) for value in nothing] == [0, 0]

@@ -66,9 +66,9 @@ class Recorder:
     def rasterize(self, *arguments):
         return self.inner.rasterize(*arguments)
 
-    def class_contributions(self, *arguments):
+    def contributing_classes(self, *arguments):
         self.asked.append(arguments[-1])
-        return self.inner.class_contributions(*arguments)
+        return self.inner.contributing_classes(*arguments)
 
     def class_map(self, *arguments):
         self.asked.append(arguments[-1])

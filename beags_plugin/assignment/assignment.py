@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from beags_plugin.assignment.sparse_sums import SparseSums
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
@@ -50,29 +51,31 @@ def assign_classes(
     """phi_i = argmax_c C[i, c], C[i, c] = sum over views and pixels with M' = c of w_i (E6); ties to the lower id.
 
     surfels: N surfels. labels: per camera [H, W] int32 class ids below ``num_classes`` or IGNORE; None for no mask.
+    Memory is linear in the (Gaussian, class) pairs that occur: nearly the same for any number of classes.
     Raises ``UserError`` for ids out of range.
     """
     settings = replace(settings, geometry=False, distortion=False)
     inputs = geometry_inputs(surfels)
-    # float64: thousands of small weights of many views are added up.
-    total = torch.zeros(len(surfels), num_classes, dtype=torch.float64, device=surfels.means.device)
-    strongest = torch.zeros_like(surfels.opacity_logits)
+    # float64: thousands of small weights of many views are added up. A table of all classes would be mostly zeros.
+    total = SparseSums(surfels.means.device)
+    strongest = torch.zeros_like(surfels.opacity_logits, dtype=torch.float64)
     for index, (camera, mask) in enumerate(zip(cameras, labels, strict=True)):
         if mask is None:
-            mask = torch.full((camera.height, camera.width), IGNORE, dtype=torch.int32, device=total.device)
+            mask = torch.full((camera.height, camera.width), IGNORE, dtype=torch.int32, device=total.keys.device)
         check_class_ids(mask, index, num_classes)
         every = mask.masked_fill(mask == IGNORE, num_classes)  # what is not labelled counts as one more class
         with torch.no_grad():
-            of_view = rasterizer.class_contributions(inputs, camera, settings, every, num_classes + 1)
-        total += of_view[:, :num_classes].double()
-        strongest = torch.maximum(strongest, of_view.sum(dim=1))
+            keys, values = rasterizer.contributing_classes(inputs, camera, settings, every, num_classes + 1)
+        surfel, class_id = keys // (num_classes + 1), keys % (num_classes + 1)
+        strongest = torch.maximum(strongest, torch.zeros_like(strongest).index_add_(0, surfel, values.double()))
+        labelled = class_id < num_classes
+        total.add((surfel * num_classes + class_id)[labelled], values[labelled])
         if progress:
             progress(index + 1, len(cameras))
-    class_ids = total.argmax(dim=1).int()  # of equal values, the first
-    top, everything = total.max(dim=1).values, total.sum(dim=1)
+    class_ids, top, everything = total.largest(len(surfels), num_classes)
     never_seen = everything <= 0
     margin = torch.where(never_seen, 0.0, top / everything.masked_fill(never_seen, 1.0))
-    return Assignment(class_ids.masked_fill(never_seen, 0), margin.float(), never_seen, strongest.float())
+    return Assignment(class_ids.int(), margin.float(), never_seen, strongest.float())
 
 
 def check_class_ids(mask: Tensor, index: int, num_classes: int) -> None:

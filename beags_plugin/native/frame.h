@@ -35,6 +35,13 @@ struct WorkCounts {
   int64_t box_pairs;   // those that the usual bounds, boxes of 3.33 standard deviations, would give
 };
 
+// What surfels contribute to classes, where it is not zero: key = surfel * num_classes + class, ascending.
+template <class T>
+struct Contributions {
+  std::vector<int64_t> keys;
+  std::vector<T> values;
+};
+
 template <class T>
 class Frame {
  public:
@@ -54,12 +61,22 @@ class Frame {
 
   // labels: [height, width]; out: [N, num_classes], zero on entry; labels outside 0 .. num_classes - 1 do not count.
   void class_contributions(const int32_t* labels, int num_classes, T* out, int threads) const;
+  // The same as a list, whose size does not depend on the number of classes.
+  Contributions<T> contributing_classes(const int32_t* labels, int num_classes, int threads) const;
   // classes, share: [height, width]. Class ids lie in 0 .. num_classes - 1.
   void class_map(int num_classes, int32_t* classes, T* share, int threads) const;
   void heaviest(int32_t* indices, int threads) const;
   WorkCounts work_counts(int threads) const;
 
  private:
+  // What each record of a tile contributes to each label that the tile holds.
+  struct LabelSums {
+    std::vector<std::vector<int32_t>> tile_labels;
+    std::vector<T> sums;
+    std::vector<int64_t> row_of;   // [records], where the sums of a record start, in the order of its tile's labels
+    std::vector<int32_t> tile_of;  // [records]
+  };
+  LabelSums label_sums(const int32_t* labels, int num_classes, int threads) const;
   Job<T> job() const;
   int tiles() const { return tiles_x_ * tiles_y_; }
   // Calls work(tile) for every tile, on threads that share them out as they come.

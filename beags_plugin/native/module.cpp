@@ -5,6 +5,7 @@
 
 #include <algorithm>
 #include <stdexcept>
+#include <string>
 #include <vector>
 
 #include "arrays.h"
@@ -44,6 +45,15 @@ template <class T>
 void bind(nb::module_& m, const char* name) {
   using In = Array<const T>;
   using Out = Array<T>;
+  nb::class_<Contributions<T>>(m, (std::string("Contributions") + name).c_str())
+      .def_prop_ro("count", [](const Contributions<T>& self) { return self.keys.size(); })
+      .def(
+          "write",
+          [](const Contributions<T>& self, Array<int64_t> keys, Out values) {
+            std::copy(self.keys.begin(), self.keys.end(), keys.data());
+            std::copy(self.values.begin(), self.values.end(), values.data());
+          },
+          "keys"_a, "values"_a);
   nb::class_<Frame<T>>(m, name)
       .def(
           "__init__",
@@ -108,6 +118,13 @@ void bind(nb::module_& m, const char* name) {
             self.class_contributions(labels.data(), num_classes, out.data(), threads);
           },
           "labels"_a, "num_classes"_a, "out"_a, "threads"_a)
+      .def(
+          "contributing_classes",
+          [](const Frame<T>& self, Ids labels, int num_classes, int threads) {
+            nb::gil_scoped_release release;
+            return self.contributing_classes(labels.data(), num_classes, threads);
+          },
+          "labels"_a, "num_classes"_a, "threads"_a)
       .def(
           "class_map",
           [](const Frame<T>& self, int num_classes, Array<int32_t> classes, Out share, int threads) {

@@ -135,6 +135,23 @@ class Rasterizer(ABC):
     ) -> Tensor:
         """C[i, c] of this view: [N, num_classes], sum of w_i(u) over pixels u with labels(u) = c (E6). No gradient."""
 
+    def contributing_classes(
+        self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, labels: Tensor, num_classes: int
+    ) -> tuple[Tensor, Tensor]:
+        """What is not zero of ``class_contributions``: keys [M] int64, ascending, i * num_classes + c, and values [M].
+
+        A backend that can should not make a table of all classes; this one makes one of those that ``labels`` hold.
+        """
+        present = torch.unique(labels[(labels >= 0) & (labels < num_classes)])
+        if len(present) == 0:
+            return present.long(), inputs.means.new_zeros(0)
+        columns = torch.searchsorted(present, labels)
+        known = present[columns.clamp(max=len(present) - 1)] == labels
+        slots = torch.where(known, columns, IGNORE).int()
+        table = self.class_contributions(inputs, camera, settings, slots, len(present))
+        surfel, column = torch.nonzero(table, as_tuple=True)
+        return surfel * num_classes + present[column].long(), table[surfel, column]
+
     @abstractmethod
     def class_map(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int

@@ -122,6 +122,20 @@ class NativeRasterizer(KernelRasterizer):
         return out
 
     @torch.no_grad()
+    def contributing_classes(
+        self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, labels: Tensor, num_classes: int
+    ) -> tuple[Tensor, Tensor]:
+        """See ``Rasterizer.contributing_classes``."""
+        inputs = _detached(inputs.checked())
+        labels = check_image("labels", labels, camera)
+        frame, _ = _frame(inputs, camera, settings)
+        found = frame.contributing_classes(labels, num_classes, extension.threads())
+        keys = torch.empty(found.count, dtype=torch.int64)
+        values = inputs.means.new_empty(found.count)
+        found.write(keys, values)
+        return keys, values
+
+    @torch.no_grad()
     def class_map(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
     ) -> tuple[Tensor, Tensor]:
