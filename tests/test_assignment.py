@@ -9,7 +9,6 @@ import torch
 from raster_scenes import CLASSES, make_scene
 
 from beags_plugin.assignment.assignment import assign_classes
-from beags_plugin.assignment.sparse_sums import SparseSums
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.rasterizers import RASTERIZERS, make_rasterizer
@@ -123,31 +122,6 @@ def test_strongest_counts_pixels_without_a_label_too():
     for labels in ([unlabelled, None], [None, scene.target]):
         found = assign_classes(surfels, [scene.camera] * 2, labels, rasterizer, scene.settings, CLASSES)
         torch.testing.assert_close(found.strongest, everything.float(), rtol=1e-5, atol=0)
-
-
-def test_sparse_sums_are_a_dense_table_bit_for_bit():
-    generator = torch.Generator().manual_seed(0)
-    rows, columns = 40, 30
-    dense, sparse = torch.zeros(rows, columns, dtype=torch.float64), SparseSums()
-    for _ in range(12):
-        chosen = torch.rand(rows * columns, generator=generator) < 0.05
-        values = torch.rand(rows * columns, generator=generator) * 10 ** torch.randint(-6, 3, (1,), generator=generator)
-        dense += torch.where(chosen, values, 0.0).view(rows, columns).double()
-        sparse.add(chosen.nonzero()[:, 0], values[chosen])
-    again = torch.zeros_like(dense).view(-1)
-    again[sparse.keys] = sparse.sums
-    assert torch.equal(again.view_as(dense), dense)
-    first, top, everything = sparse.largest(rows, columns)
-    assert torch.equal(first, dense.argmax(1)) and torch.equal(top, dense.max(1).values)
-    torch.testing.assert_close(everything, dense.sum(1), rtol=1e-15, atol=0)
-
-
-def test_sparse_sums_of_nothing_and_of_equals():
-    sums = SparseSums()
-    sums.add(torch.zeros(0, dtype=torch.int64), torch.zeros(0))
-    assert [value.tolist() for value in sums.largest(2, 3)] == [[0, 0], [0.0, 0.0], [0.0, 0.0]]
-    sums.add(torch.tensor([4, 5]), torch.tensor([2.0, 2.0]))
-    assert [value.tolist() for value in sums.largest(2, 3)] == [[0, 1], [0.0, 2.0], [0.0, 4.0]]
 
 
 @pytest.mark.parametrize("backend", ["torch", "native"])

@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from beags_plugin.assignment.sparse_sums import SparseSums
+from beags_plugin.assignment.sparse_sums import TorchSparseSums, largest_in_rows
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
+from beags_plugin.ops import extension
+from beags_plugin.ops.sparse_sums import SparseSums
 from beags_plugin.rasterizers.drawing import geometry_inputs
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
 
@@ -57,11 +59,11 @@ def assign_classes(
     settings = replace(settings, geometry=False, distortion=False)
     inputs = geometry_inputs(surfels)
     # float64: thousands of small weights of many views are added up. A table of all classes would be mostly zeros.
-    total = SparseSums(surfels.means.device)
+    total = SparseSums() if extension.can_take(surfels.means) else TorchSparseSums(surfels.means.device)
     strongest = torch.zeros_like(surfels.opacity_logits, dtype=torch.float64)
     for index, (camera, mask) in enumerate(zip(cameras, labels, strict=True)):
         if mask is None:
-            mask = torch.full((camera.height, camera.width), IGNORE, dtype=torch.int32, device=total.keys.device)
+            mask = torch.full((camera.height, camera.width), IGNORE, dtype=torch.int32, device=surfels.means.device)
         check_class_ids(mask, index, num_classes)
         every = mask.masked_fill(mask == IGNORE, num_classes)  # what is not labelled counts as one more class
         with torch.no_grad():
@@ -72,7 +74,7 @@ def assign_classes(
         total.add((surfel * num_classes + class_id)[labelled], values[labelled])
         if progress:
             progress(index + 1, len(cameras))
-    class_ids, top, everything = total.largest(len(surfels), num_classes)
+    class_ids, top, everything = largest_in_rows(*total.found(), len(surfels), num_classes)
     never_seen = everything <= 0
     margin = torch.where(never_seen, 0.0, top / everything.masked_fill(never_seen, 1.0))
     return Assignment(class_ids.int(), margin.float(), never_seen, strongest.float())

@@ -6,45 +6,46 @@ import torch
 from torch import Tensor
 
 
-class SparseSums:
-    """Adds up values per key in float64, in the order in which they come; memory is linear in the keys that occurred.
+class TorchSparseSums:
+    """What the compiled ``ops.sparse_sums.SparseSums`` does, in torch: its reference, and where it is missing.
 
     The same bits as a dense table of zeros to which the values are added: adding 0 changes nothing.
     """
 
     def __init__(self, device: torch.device | str = "cpu") -> None:
-        self.keys = torch.zeros(0, dtype=torch.int64, device=device)  # ascending
-        self.sums = torch.zeros(0, dtype=torch.float64, device=device)
+        self._keys = torch.zeros(0, dtype=torch.int64, device=device)  # ascending
+        self._sums = torch.zeros(0, dtype=torch.float64, device=device)
 
     def add(self, keys: Tensor, values: Tensor) -> None:
-        """Add ``values`` [M] float to the sums of ``keys`` [M] int64, ascending, each at most once."""
-        at = torch.searchsorted(self.keys, keys)
+        at = torch.searchsorted(self._keys, keys)
         known = torch.zeros_like(keys, dtype=torch.bool)
-        if len(self.keys):
-            known = self.keys[at.clamp(max=len(self.keys) - 1)] == keys
-            self.sums[at[known]] += values[known].double()
-        if not bool(known.all()):
-            self._insert(keys[~known], values[~known].double(), at[~known])
-
-    def _insert(self, keys: Tensor, values: Tensor, at: Tensor) -> None:
-        """Put new keys before the present ones ``at`` [M] int64."""
-        place = at + torch.arange(len(at), device=at.device)
-        former = torch.ones(len(self.keys) + len(keys), dtype=torch.bool, device=at.device)
+        if len(self._keys):
+            known = self._keys[at.clamp(max=len(self._keys) - 1)] == keys
+            self._sums[at[known]] += values[known].double()
+        fresh, values, place = keys[~known], values[~known].double(), at[~known]
+        place = place + torch.arange(len(place), device=place.device)  # among all keys
+        former = torch.ones(len(self._keys) + len(fresh), dtype=torch.bool, device=place.device)
         former[place] = False
-        for name, fresh in (("keys", keys), ("sums", values)):
-            merged = fresh.new_empty(len(former))
-            merged[former] = getattr(self, name)
-            merged[place] = fresh
-            setattr(self, name, merged)
+        merged_keys, merged_sums = fresh.new_empty(len(former)), values.new_empty(len(former))
+        merged_keys[former], merged_keys[place] = self._keys, fresh
+        merged_sums[former], merged_sums[place] = self._sums, values
+        self._keys, self._sums = merged_keys, merged_sums
 
-    def largest(self, rows: int, columns: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Of each row, where key = row * columns + column: the column of its largest sum (of equals the first; 0 where
-        the row has none) [rows] int64, that sum and the sum of all, [rows] float64."""
-        row, column = self.keys // columns, self.keys % columns
-        zeros = torch.zeros(rows, dtype=torch.float64, device=self.keys.device)
-        top = zeros.scatter_reduce(0, row, self.sums, "amax")
-        leads = self.sums == top[row]
-        first = torch.full((rows,), columns, dtype=torch.int64, device=self.keys.device)
-        first = first.scatter_reduce(0, row[leads], column[leads], "amin")
-        # one after the other, in the order of the columns
-        return first.masked_fill(first == columns, 0), top, zeros.index_add(0, row, self.sums)
+    def found(self) -> tuple[Tensor, Tensor]:
+        return self._keys, self._sums
+
+
+def largest_in_rows(keys: Tensor, sums: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The column of each row's largest sum (of equals the first; 0 for a row without sums), that sum, and their sum.
+
+    keys: [K] int64, row * columns + column, ascending. sums: [K] float64, above 0.
+    Returns [rows] int64 and twice [rows] float64, 0 for a row without sums.
+    """
+    row, column = keys // columns, keys % columns
+    zeros = torch.zeros(rows, dtype=torch.float64, device=keys.device)
+    top = zeros.scatter_reduce(0, row, sums, "amax")
+    leads = sums == top[row]
+    first = torch.full((rows,), columns, dtype=torch.int64, device=keys.device)
+    first = first.scatter_reduce(0, row[leads], column[leads], "amin")
+    # one after the other, in the order of the columns
+    return first.masked_fill(first == columns, 0), top, zeros.index_add(0, row, sums)

@@ -11,6 +11,7 @@
 #include "occupancy_loss.h"
 #include "reprojection_votes.h"
 #include "sh_colors.h"
+#include "sparse_sums.h"
 #include "voxel_lookup.h"
 #include "voxel_votes.h"
 
@@ -23,6 +24,16 @@ namespace {
 using namespace ops;
 
 int64_t rows(const Ids& ids) { return static_cast<int64_t>(ids.shape(0)); }
+
+template <class T>
+void bind_sums(nb::class_<SparseSums>& sums, const char* suffix) {
+  sums.def((std::string("add_") + suffix).c_str(),
+           [](SparseSums& self, Array<const int64_t> keys, Array<const T> values) {
+             nb::gil_scoped_release release;
+             self.add(keys.data(), values.data(), keys.shape(0));
+           },
+           "keys"_a, "values"_a);
+}
 
 template <class T>
 void bind_lookup(nb::class_<VoxelLookup>& lookup, const char* suffix) {
@@ -190,6 +201,18 @@ void bind_ops(nb::module_& m) {
   lookup.def_prop_ro("bytes", &VoxelLookup::bytes);
   bind_lookup<float>(lookup, "f32");
   bind_lookup<double>(lookup, "f64");
+  nb::class_<SparseSums> sums(m, "SparseSums");
+  sums.def(nb::init<>());
+  sums.def_prop_ro("count", [](const SparseSums& self) { return self.keys().size(); });
+  sums.def(
+      "write",
+      [](const SparseSums& self, Array<int64_t> keys, Array<double> sums) {
+        std::copy(self.keys().begin(), self.keys().end(), keys.data());
+        std::copy(self.sums().begin(), self.sums().end(), sums.data());
+      },
+      "keys"_a, "sums"_a);
+  bind_sums<float>(sums, "f32");
+  bind_sums<double>(sums, "f64");
   nb::class_<VoxelVotes> votes(m, "VoxelVotes");
   votes.def(nb::init<int>(), "threads"_a);
   votes.def("decide", &VoxelVotes::decide, nb::call_guard<nb::gil_scoped_release>());

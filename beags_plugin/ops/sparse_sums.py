@@ -1,0 +1,35 @@
+"""Sums for the keys that occur, merged key by key."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from beags_plugin.ops import extension
+
+
+class SparseSums:
+    """Adds up values per key in float64, in the order in which they come; memory is linear in the keys that occurred.
+
+    Time of a call is linear in the keys so far and the new ones.
+    """
+
+    def __init__(self) -> None:
+        module = extension.load()
+        assert module is not None, "the caller asks extension.load() first"
+        self._native: Any = module.SparseSums()
+
+    def add(self, keys: Tensor, values: Tensor) -> None:
+        """Add ``values`` [M] float32 or float64 to the sums of ``keys`` [M] int64, ascending, each at most once."""
+        keys = extension.plain("keys", keys, (len(keys),), torch.int64)
+        values = extension.plain("values", values, (len(keys),), values.dtype)
+        extension.function("add", values, self._native)(keys, values)
+
+    def found(self) -> tuple[Tensor, Tensor]:
+        """The keys [K] int64, ascending, and their sums [K] float64."""
+        keys = torch.empty(self._native.count, dtype=torch.int64)
+        sums = torch.empty(len(keys), dtype=torch.float64)
+        self._native.write(keys, sums)
+        return keys, sums
