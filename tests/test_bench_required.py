@@ -40,6 +40,11 @@ def test_rows_are_what_a_count_by_hand_gives(run, tmp_path):
     pixels = sum(view.camera.width * view.camera.height for view in scene.train)
     assert (maps.whole, maps.needed, maps.difference) == (4 * pixels, pixels, 0.0)
     assert rows["training images as floats, in the preparation"].whole == 12 * pixels
+    colour = rows["coefficients of the colour that no view tells apart"]
+    assert colour.whole == 75 * 4 * 3 and 0 < colour.needed <= colour.whole
+    assert 0 < rows["Gaussians whose views do not resolve degree 1"].needed <= 75
+    (kept,) = [row for name, row in rows.items() if name.startswith("bands above degree 0") and row.timed]
+    assert (kept.whole, kept.needed) == (75 * 4 * 3 * 4, 75 * 3 * 4) and kept.seconds_needed > 0
     voxels = rows["voxels of the background"]
     assert 0 < voxels.needed < voxels.whole and voxels.difference == 0.0
     content = json.loads((tmp_path / "rows.json").read_text())
@@ -49,6 +54,13 @@ def test_rows_are_what_a_count_by_hand_gives(run, tmp_path):
         samples = rows["occupancy samples in discs that are wholly valid"]
         assert samples.whole == 20 * 75 and 0 < samples.needed < samples.whole and samples.difference == 0.0
     assert cells(voxels)[-1] == "none" and "PSNR" in cells(rows["Gaussians below 4 px in every view"])[-1]
+
+
+def test_a_base_without_classes_is_measured_as_far_as_it_goes(tmp_path):
+    config = write_trained(tmp_path / "run", write_scene(tmp_path / "data"), assigned=False)
+    found = {row.what for row in run_required(config)}
+    assert "coefficients of the colour that no view tells apart" in found and "class maps of training views" in found
+    assert not any("voxels" in what for what in found)
 
 
 def test_a_run_without_a_base_is_refused(tmp_path):

@@ -16,6 +16,7 @@ from torch import Tensor
 from beags_plugin.assignment.assignment import assign_classes
 from beags_plugin.bench.report import number, plain_table, provenance, write_csv, write_json
 from beags_plugin.bench.run import TABLE_WIDTH
+from beags_plugin.core.sh_resolution import seen_shares, with_degree
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.evaluation.metrics import psnr
@@ -25,6 +26,7 @@ from beags_plugin.occupancy.sampling import sample_stream
 from beags_plugin.progress import progress_bar
 from beags_plugin.rasterizers.drawing import surfel_inputs
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+from beags_plugin.refiners.fewer_bands import changes_of_fewer_bands
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.datamanager import BeagsDataManager, View
@@ -57,11 +59,14 @@ class Row:
 
 @dataclass(frozen=True)
 class Scene:
-    """A run as it is measured: the base that refinement started from, its views, and the refined surfels and grid."""
+    """A run as it is measured: the base that refinement started from, its views, and the refined surfels and grid.
+
+    Of a base without classes, ``refined`` is the base itself, and ``class_ids`` and ``grid`` are None.
+    """
 
     base: Surfels
     refined: Surfels
-    class_ids: Tensor
+    class_ids: Tensor | None
     grid: VisibilityGrid | None
     train: Sequence[View]
     test: Sequence[View]
@@ -72,13 +77,15 @@ class Scene:
 
 
 def run_required(config: Path, json: Path | None = None, csv: Path | None = None) -> list[Row]:
-    """Measure a refined run, print a table and write the files that are asked for; returns the rows.
+    """Measure a run, print a table and write the files that are asked for; returns the rows.
+
+    Of a base without classes, what does not take any is measured.
 
     config: config.yml of the run. Raises ``UserError`` if it is none, or holds no refinement.
     """
     scene = load(config)
     rows: list[Row] = []
-    parts: tuple[Callable[[Scene], list[Row]], ...] = (gaussians, samples, voxels, class_maps, images)
+    parts: tuple[Callable[[Scene], list[Row]], ...] = (gaussians, bands, samples, voxels, class_maps, images)
     with progress_bar("Measuring") as progress:
         for index, part in enumerate(parts):
             rows += part(scene)
@@ -99,17 +106,16 @@ def load(config: Path) -> Scene:
     from beags_plugin.plugin.runs import last_prepared
 
     run = EvaluatedRun(config)
-    if "before" not in run.stages:
-        raise UserError(f"{config.parent} keeps no base beside its scene: name a run of beags that was refined.")
-    before: SavedScene = run.stages["before"]
     after: SavedScene = run.stages["after"]
+    if "before" not in run.stages and after.class_ids is not None:
+        raise UserError(f"{config.parent} keeps no base beside its scene: name a run of beags that was refined.")
+    before: SavedScene = run.stages.get("before", after)
     kept = last_prepared(config.parent) / "grid.pt"
     state = torch.load(kept, weights_only=True) if kept.exists() else {}
     manager: BeagsDataManager = after.config.data_config.setup(
         device="cpu", test_mode="test", world_size=1, local_rank=0
     )
     occupancy = after.config.model_config.losses["occupancy"]
-    assert after.class_ids is not None  # a run with a base of its own was assigned
     return Scene(
         before.surfels(),
         after.surfels(),
@@ -149,12 +155,41 @@ def gaussians(scene: Scene) -> list[Row]:
     return rows
 
 
+def bands(scene: Scene) -> list[Row]:
+    """Coefficients of the colour that no view tells apart, and what the base loses with fewer bands."""
+    surfels, cameras = scene.base, [view.camera for view in scene.train]
+    degree = surfels.sh_degree
+    share, degrees = seen_shares(surfels.means, cameras, degree)
+    count = surfels.sh.numel()
+    rows = [Row("coefficients of the colour that no view tells apart", "coefficients", count, share * count)]
+    for band in range(1, degree + 1):
+        told = float(degrees[band + 1 :].sum()) * len(surfels)
+        rows.append(Row(f"Gaussians whose views do not resolve degree {band}", "Gaussians", len(surfels), told))
+    whole = [mean_psnr(draw(scene, surfels, views), views) for views in (scene.train, scene.test)]
+    found = changes_of_fewer_bands(surfels, cameras, scene.rasterizer, scene.settings)
+    for band, (fewer, change) in enumerate(found):
+        times, _ = in_turn(lambda: draw(scene, surfels), lambda part=fewer: draw(scene, part))
+        bare = with_degree(surfels, [], band)  # the bands left out, nothing in their stead
+        losses = {
+            "training views": whole[0] - mean_psnr(draw(scene, fewer, scene.train), scene.train),
+            "held-out views": whole[1] - mean_psnr(draw(scene, fewer), scene.test),
+            "training views, nothing in their stead": whole[0] - mean_psnr(draw(scene, bare, scene.train), scene.train),
+        }
+        size = 4.0 * fewer.sh.numel()
+        named = f"bands above degree {band}, RMS change {change:.5f}"
+        for where, loss in losses.items():
+            row = Row(f"{named}: {where}", "bytes", 4.0 * count, size, measure="PSNR, dB", difference=loss)
+            timed = {"timed": "drawing held-out views", "seconds_whole": times[0], "seconds_needed": times[1]}
+            rows.append(replace(row, **timed) if where == "held-out views" else row)
+    return rows
+
+
 def samples(scene: Scene) -> list[Row]:
     """Occupancy samples in discs that wholly lie in valid voxels."""
     from beags_plugin.ops import extension
 
     lookup = None if scene.grid is None else scene.grid.lookup()
-    if scene.grid is None or lookup is None:
+    if scene.grid is None or lookup is None or scene.class_ids is None:
         return []
     surfels = scene.refined
     parameters = [surfels.means, surfels.quats, surfels.log_scales, surfels.opacity_logits]
@@ -183,7 +218,7 @@ def samples(scene: Scene) -> list[Row]:
 
 def voxels(scene: Scene) -> list[Row]:
     """Voxels of the background where only objects are asked about, and of classes without Gaussians."""
-    if scene.grid is None or not bool((scene.grid.classes == 0).any()):
+    if scene.grid is None or scene.class_ids is None or not bool((scene.grid.classes == 0).any()):
         return []
     asked = torch.unique(scene.class_ids)
     part = scene.grid.only(asked[asked != 0])
@@ -221,13 +256,13 @@ def in_turn(*ways: Callable[[], object]) -> tuple[list[float], list]:
     return [median(values) for values in seconds], results
 
 
-def draw(scene: Scene, surfels: Surfels) -> list[Tensor]:
-    """Colours of the held-out views, on black."""
+def draw(scene: Scene, surfels: Surfels, views: Sequence[View] | None = None) -> list[Tensor]:
+    """Colours of the held-out (or other) views, on black."""
     settings = replace(scene.settings, geometry=False, distortion=False)
     with torch.no_grad():
         return [
             scene.rasterizer.rasterize(surfel_inputs(surfels, view.camera), view.camera, settings, torch.zeros(3)).color
-            for view in scene.test
+            for view in (scene.test if views is None else views)
         ]
 
 

@@ -210,7 +210,7 @@ class BeagsModel(SplatfactoModel):
         )
 
     def replace_surfels(self, surfels: Surfels) -> None:
-        """Put new parameters in place of all, of any number; classes are reset.
+        """Put new parameters in place of all, of any number and degree; classes are reset.
 
         New ones, since autograd still knows the size of those that the last step's graph holds.
         """
@@ -222,6 +222,7 @@ class BeagsModel(SplatfactoModel):
             "scales": surfels.log_scales,
             "quats": surfels.quats,
         }
+        self.config.sh_degree = surfels.sh_degree
         for name, value in values.items():
             self.gauss_params[name] = nn.Parameter(value.detach().to(self.device).contiguous())
         self.class_ids = torch.zeros(len(surfels), dtype=torch.int32, device=self.device)

@@ -24,7 +24,7 @@ def edit_scene(model: BeagsModel, optimizers: dict[str, torch.optim.Optimizer], 
 def move_adam_state(
     optimizer: torch.optim.Optimizer, former: Tensor, parameter: Tensor, source: Tensor, fresh: Tensor
 ) -> None:
-    """Let an optimizer go on with ``parameter`` in place of ``former``; Adam's moments follow their surfels.
+    """Let an optimizer go on with ``parameter`` in place of ``former``; Adam's moments follow their surfels and bands.
 
     source: [M] int64, the former index of each surfel; fresh: [M] bool, new ones, whose moments start at 0.
     """
@@ -32,6 +32,8 @@ def move_adam_state(
     for name in ("exp_avg", "exp_avg_sq"):
         if name in state:
             moved = state[name][source.to(state[name].device)]
+            if moved.dim() > 1:
+                moved = moved[:, : parameter.shape[1]].contiguous()  # of the bands that are left
             moved[fresh.to(moved.device)] = 0.0
             state[name] = moved
     optimizer.state[parameter] = state

@@ -24,6 +24,7 @@ from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSetting
 from beags_plugin.refiners.base import AssignedScene, EditedScene, Refiner
 from beags_plugin.refiners.border_split import BorderSplitConfig, split_at_borders
 from beags_plugin.refiners.consistent_masks import Stage, masks_as_they_are, reprojected_masks
+from beags_plugin.refiners.fewer_bands import without_unneeded_bands
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,8 @@ class PreparationConfig:
     tau: pairwise: a vote counts if its point is visible: |z - D| <= tau z; infinity counts every vote (E5).
     depth: which depth is lifted into space, "median" or "expected": see ``rasterizers.drawing.surface_depth``.
     k: neighbours that set the voxel size (E8).
+    trim_sh: the highest bands of the colour are left out before refinement if that changes the training views by at
+        most so much (root mean square, colours in 0..1). 0, as in the paper, keeps all.
     min_contribution: Gaussians that fill less than so many pixels in every training view are removed before
         refinement: no view tells what they should be. 0, as in the paper, keeps all.
     """
@@ -48,6 +51,7 @@ class PreparationConfig:
     depth: str = "median"
     k: int = 2000
     min_contribution: float = 0.0
+    trim_sh: float = 0.0
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that no stage can work with: hours before the stages would say so."""
@@ -67,6 +71,8 @@ class PreparationConfig:
             raise UserError(f"k is {self.k}: the voxel size needs at least 1 neighbour.")
         if not self.min_contribution >= 0:
             raise UserError(f"min_contribution is {self.min_contribution}: it must be 0 or more pixels.")
+        if not self.trim_sh >= 0:
+            raise UserError(f"trim_sh is {self.trim_sh}: it must be 0 or more, a difference of colours in 0..1.")
 
 
 @dataclass(frozen=True)
@@ -160,6 +166,15 @@ def prepare(
         whole = divided.edited if edited is None else edited.edited.then(divided.edited)
         edited, surfels = EditedScene(whole, classes), divided.edited.surfels
 
+    if config.trim_sh > 0 and refiner.trains:
+        start = time.perf_counter()
+        with stage("Leaving out bands of the colour") as progress:
+            fewer, change = without_unneeded_bands(surfels, cameras, rasterizer, settings, config.trim_sh, progress)
+        timed("bands", start, _bands_finding(surfels.sh_degree, fewer.sh_degree, change))
+        if fewer is not surfels:
+            edited = edited or EditedScene(Densified.unchanged(surfels), assignment)
+            edited, surfels = replace(edited, edited=replace(edited.edited, surfels=fewer)), fewer
+
     start = time.perf_counter()
     num_classes = max(class_names) + 1
     class_ids = (assignment if edited is None else edited.assignment).class_ids
@@ -217,6 +232,12 @@ def _removal_finding(before: int, edited: EditedScene, least: float) -> str:
 def _split_finding(before: int, divided: EditedScene) -> str:
     after = len(divided.edited.surfels)
     return f"border split: {int(divided.edited.fresh.sum())} halves, {before} Gaussians became {after}"
+
+
+def _bands_finding(before: int, after: int, change: float) -> str:
+    if after == before:
+        return f"bands: degree {before} stays, fewer would change the training views by more than is allowed"
+    return f"bands: degree {before} became {after}, which changes the training views by {change:.5f}"
 
 
 def _assignment_finding(assignment: Assignment, class_names: dict[int, str]) -> str:
