@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING
 
 import torch
@@ -15,65 +13,21 @@ from torch import Tensor
 
 from beags_plugin.assignment.assignment import assign_classes
 from beags_plugin.bench.report import number, plain_table, provenance, write_csv, write_json
+from beags_plugin.bench.required_rows import Row, Scene, draw, in_turn, mean_psnr
+from beags_plugin.bench.required_views import bands, objects
 from beags_plugin.bench.run import TABLE_WIDTH
-from beags_plugin.core.sh_resolution import seen_shares, with_degree
-from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
-from beags_plugin.evaluation.metrics import psnr
 from beags_plugin.masks.label_maps import narrowed, widened
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.occupancy.sampling import sample_stream
 from beags_plugin.progress import progress_bar
-from beags_plugin.rasterizers.drawing import surfel_inputs
-from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
-from beags_plugin.refiners.fewer_bands import changes_of_fewer_bands
 
 if TYPE_CHECKING:
-    from beags_plugin.plugin.datamanager import BeagsDataManager, View
+    from beags_plugin.plugin.datamanager import BeagsDataManager
     from beags_plugin.plugin.extract import SavedScene
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 PIXELS = (0.25, 0.5, 1.0, 2.0, 4.0)  # what a Gaussian must fill in some view to be kept
-CALLS = 5  # of which the median counts; both sides take turns
-
-
-@dataclass(frozen=True)
-class Row:
-    """One thing that may not be needed.
-
-    whole, needed: how much there is of it and how much is left, in ``unit``. seconds_whole, seconds_needed: of what
-    ``timed`` names, with all and with what is left. difference: what the result loses, in ``measure``; 0.0 where it is
-    the same bit for bit.
-    """
-
-    what: str
-    unit: str
-    whole: float
-    needed: float
-    timed: str = ""
-    seconds_whole: float | None = None
-    seconds_needed: float | None = None
-    measure: str = ""
-    difference: float | None = None
-
-
-@dataclass(frozen=True)
-class Scene:
-    """A run as it is measured: the base that refinement started from, its views, and the refined surfels and grid.
-
-    Of a base without classes, ``refined`` is the base itself, and ``class_ids`` and ``grid`` are None.
-    """
-
-    base: Surfels
-    refined: Surfels
-    class_ids: Tensor | None
-    grid: VisibilityGrid | None
-    train: Sequence[View]
-    test: Sequence[View]
-    num_classes: int
-    rasterizer: Rasterizer
-    settings: RasterSettings
-    samples: int
 
 
 def run_required(config: Path, json: Path | None = None, csv: Path | None = None) -> list[Row]:
@@ -85,7 +39,15 @@ def run_required(config: Path, json: Path | None = None, csv: Path | None = None
     """
     scene = load(config)
     rows: list[Row] = []
-    parts: tuple[Callable[[Scene], list[Row]], ...] = (gaussians, bands, samples, voxels, class_maps, images)
+    parts: tuple[Callable[[Scene], list[Row]], ...] = (
+        gaussians,
+        bands,
+        objects,
+        samples,
+        voxels,
+        class_maps,
+        images,
+    )
     with progress_bar("Measuring") as progress:
         for index, part in enumerate(parts):
             rows += part(scene)
@@ -155,35 +117,6 @@ def gaussians(scene: Scene) -> list[Row]:
     return rows
 
 
-def bands(scene: Scene) -> list[Row]:
-    """Coefficients of the colour that no view tells apart, and what the base loses with fewer bands."""
-    surfels, cameras = scene.base, [view.camera for view in scene.train]
-    degree = surfels.sh_degree
-    share, degrees = seen_shares(surfels.means, cameras, degree)
-    count = surfels.sh.numel()
-    rows = [Row("coefficients of the colour that no view tells apart", "coefficients", count, share * count)]
-    for band in range(1, degree + 1):
-        told = float(degrees[band + 1 :].sum()) * len(surfels)
-        rows.append(Row(f"Gaussians whose views do not resolve degree {band}", "Gaussians", len(surfels), told))
-    whole = [mean_psnr(draw(scene, surfels, views), views) for views in (scene.train, scene.test)]
-    found = changes_of_fewer_bands(surfels, cameras, scene.rasterizer, scene.settings)
-    for band, (fewer, change) in enumerate(found):
-        times, _ = in_turn(lambda: draw(scene, surfels), lambda part=fewer: draw(scene, part))
-        bare = with_degree(surfels, [], band)  # the bands left out, nothing in their stead
-        losses = {
-            "training views": whole[0] - mean_psnr(draw(scene, fewer, scene.train), scene.train),
-            "held-out views": whole[1] - mean_psnr(draw(scene, fewer), scene.test),
-            "training views, nothing in their stead": whole[0] - mean_psnr(draw(scene, bare, scene.train), scene.train),
-        }
-        size = 4.0 * fewer.sh.numel()
-        named = f"bands above degree {band}, RMS change {change:.5f}"
-        for where, loss in losses.items():
-            row = Row(f"{named}: {where}", "bytes", 4.0 * count, size, measure="PSNR, dB", difference=loss)
-            timed = {"timed": "drawing held-out views", "seconds_whole": times[0], "seconds_needed": times[1]}
-            rows.append(replace(row, **timed) if where == "held-out views" else row)
-    return rows
-
-
 def samples(scene: Scene) -> list[Row]:
     """Occupancy samples in discs that wholly lie in valid voxels."""
     from beags_plugin.ops import extension
@@ -242,34 +175,6 @@ def images(scene: Scene) -> list[Row]:
     """Training images in float while classes are prepared, which looks at none."""
     whole = sum(view.pixels[..., :3].numel() * 4 for view in scene.train)
     return [Row("training images as floats, in the preparation", "bytes", whole, 0.0)]
-
-
-def in_turn(*ways: Callable[[], object]) -> tuple[list[float], list]:
-    """Median seconds of each way, and what it returned; they take turns, ``CALLS`` times each."""
-    seconds: list[list[float]] = [[] for _ in ways]
-    results: list[object] = [None] * len(ways)
-    for _ in range(CALLS):
-        for index, way in enumerate(ways):
-            start = time.perf_counter()
-            results[index] = way()
-            seconds[index].append(time.perf_counter() - start)
-    return [median(values) for values in seconds], results
-
-
-def draw(scene: Scene, surfels: Surfels, views: Sequence[View] | None = None) -> list[Tensor]:
-    """Colours of the held-out (or other) views, on black."""
-    settings = replace(scene.settings, geometry=False, distortion=False)
-    with torch.no_grad():
-        return [
-            scene.rasterizer.rasterize(surfel_inputs(surfels, view.camera), view.camera, settings, torch.zeros(3)).color
-            for view in (scene.test if views is None else views)
-        ]
-
-
-def mean_psnr(pictures: Sequence[Tensor], views: Sequence[View]) -> float:
-    """Mean over views, dB."""
-    values = [psnr(picture, view.image) for picture, view in zip(pictures, views, strict=True)]
-    return sum(values) / len(values)
 
 
 def _bytes(grid: VisibilityGrid) -> float:

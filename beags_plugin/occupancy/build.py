@@ -23,19 +23,18 @@ MIN_ALPHA_LIFTED = 0.5  # pixels with less alpha are not lifted
 
 @dataclass(frozen=True)
 class _View:
-    """What one view shows: pixel [P] int32 (row-major), depth [P] float, class_id [P] int16 or int32."""
+    """What one view shows: solid [H, W] bool, with P True; of those, row by row, depth [P] float and class_id [P], of the
+    narrowest type that holds all class ids."""
 
     camera: Camera
-    pixel: Tensor
+    solid: Tensor
     depth: Tensor
     class_id: Tensor
 
     def points(self) -> Tensor:
         """[P, 3] world."""
-        depth = self.depth.new_zeros(self.camera.height * self.camera.width)
-        depth[self.pixel.long()] = self.depth
-        shape = (self.camera.height, self.camera.width)
-        return lift(depth.view(shape), self.camera).view(-1, 3)[self.pixel.long()]
+        depth = self.depth.new_zeros(self.solid.shape).masked_scatter_(self.solid, self.depth)
+        return lift(depth, self.camera)[self.solid]
 
 
 def build_visibility_grid(
@@ -55,7 +54,8 @@ def build_visibility_grid(
     surfels: N surfels. class_ids: [N] int32, phi, below ``num_classes``.
     k: sets the voxel size (E8); seed: of the points that measure it.
     depth: which depth is lifted: see ``surface_depth``.
-    Keeps a pixel's number, depth and class (10 bytes) of all views, and lifts them view by view.
+    Keeps whether a pixel is solid, and its depth and class if so, of all views (6 bytes for up to 256 class ids), and
+    lifts them view by view.
     Raises ``UserError`` if no pixel of any view reaches an alpha of 0.5.
     """
     settings = replace(settings, geometry=True, distortion=False)
@@ -78,15 +78,14 @@ def _render(surfels, class_ids, camera, rasterizer, settings, num_classes: int, 
         drawn = rasterizer.rasterize(geometry_inputs(surfels), camera, settings, surfels.means.new_zeros(3))
     classes, _ = draw_class_map(rasterizer, surfels, class_ids, camera, settings)
     surface = surface_depth(drawn, depth)
-    solid = ((drawn.alpha >= MIN_ALPHA_LIFTED) & torch.isfinite(surface) & (surface > 0)).reshape(-1)
-    pixel = torch.nonzero(solid)[:, 0]
-    small = torch.int16 if num_classes <= 1 << 15 else torch.int32
-    return _View(camera, pixel.int(), surface.reshape(-1)[pixel], classes.reshape(-1)[pixel].to(small))
+    solid = (drawn.alpha >= MIN_ALPHA_LIFTED) & torch.isfinite(surface) & (surface > 0)
+    small = torch.uint8 if num_classes <= 1 << 8 else torch.int16 if num_classes <= 1 << 15 else torch.int32
+    return _View(camera, solid, surface[solid], classes[solid].to(small))
 
 
 def _reference_cloud(views: Sequence[_View], k: int, seed: int) -> tuple[np.ndarray, int]:
     """The thinned cloud of all classes [R, 3], and how many points there are in all."""
-    counts = [len(view.pixel) for view in views]
+    counts = [len(view.depth) for view in views]
     chosen = reference_indices(sum(counts), k, seed)
     pieces = [_piece(view, chosen, first, count) for view, first, count in _spans(views, counts)]
     return np.concatenate([np.zeros((0, 3), dtype=np.float32), *pieces]), sum(counts)
@@ -101,4 +100,4 @@ def _spans(views: Sequence[_View], counts: Sequence[int]) -> Iterator[tuple[_Vie
 
 def _piece(view: _View, chosen: np.ndarray, first: int, count: int) -> np.ndarray:
     start, stop = np.searchsorted(chosen, [first, first + count])
-    return view.points()[torch.from_numpy(chosen[start:stop] - first).to(view.pixel.device)].cpu().numpy()
+    return view.points()[torch.from_numpy(chosen[start:stop] - first).to(view.depth.device)].cpu().numpy()
