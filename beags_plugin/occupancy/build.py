@@ -23,8 +23,8 @@ MIN_ALPHA_LIFTED = 0.5  # pixels with less alpha are not lifted
 
 @dataclass(frozen=True)
 class _View:
-    """What one view shows: solid [H, W] bool, with P True; of those, row by row, depth [P] float and class_id [P], of the
-    narrowest type that holds all class ids."""
+    """What one view shows: solid [H, W] bool, with P True; of those, row by row, depth [P] float and class_id [P], in
+    the narrowest type that holds all class ids."""
 
     camera: Camera
     solid: Tensor
