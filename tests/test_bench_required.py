@@ -46,6 +46,7 @@ def test_rows_are_what_a_count_by_hand_gives(run, tmp_path):
     (kept,) = [row for name, row in rows.items() if name.startswith("bands above degree 0") and row.timed]
     assert (kept.whole, kept.needed) == (75 * 4 * 3 * 4, 75 * 3 * 4) and kept.seconds_needed > 0
     alone = rows["objects alone in held-out views"]
+    assert rows["pairs of views in reprojection"].whole == 7 * 7 == rows["pairs of views in reprojection"].needed
     assert alone.whole == 2 * 2 and 0 < alone.needed <= 4
     voxels = rows["voxels of the background"]
     assert 0 < voxels.needed < voxels.whole and voxels.difference == 0.0

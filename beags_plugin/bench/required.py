@@ -14,7 +14,7 @@ from torch import Tensor
 from beags_plugin.assignment.assignment import assign_classes
 from beags_plugin.bench.report import number, plain_table, provenance, write_csv, write_json
 from beags_plugin.bench.required_rows import Row, Scene, draw, in_turn, mean_psnr
-from beags_plugin.bench.required_views import bands, objects
+from beags_plugin.bench.required_views import bands, objects, pairs
 from beags_plugin.bench.run import TABLE_WIDTH
 from beags_plugin.errors import UserError
 from beags_plugin.masks.label_maps import narrowed, widened
@@ -43,6 +43,7 @@ def run_required(config: Path, json: Path | None = None, csv: Path | None = None
         gaussians,
         bands,
         objects,
+        pairs,
         samples,
         voxels,
         class_maps,

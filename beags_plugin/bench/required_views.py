@@ -1,4 +1,4 @@
-"""What the views of a run have no use for: bands of the colour, objects that are out of view."""
+"""What the views of a run have no use for: bands of the colour, objects and points that are out of view."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from dataclasses import replace
 import torch
 
 from beags_plugin.bench.required_rows import Row, Scene, draw, in_turn, mean_psnr
-from beags_plugin.core.sh_resolution import seen_shares, with_degree
+from beags_plugin.core.lifting import lift
+from beags_plugin.core.sh_resolution import inside, seen_shares, with_degree
 from beags_plugin.extraction.select import select_class
-from beags_plugin.rasterizers.drawing import surfel_inputs
+from beags_plugin.rasterizers.drawing import geometry_inputs, surface_depth, surfel_inputs
 from beags_plugin.refiners.fewer_bands import changes_of_fewer_bands
+
+_POINTS = 500  # of a view that are looked for in the others
 
 
 def bands(scene: Scene) -> list[Row]:
@@ -60,3 +63,18 @@ def objects(scene: Scene) -> list[Row]:
         times, _ = in_turn(lambda: [run(*pair) for pair in pairs], lambda: [run(*pair) for pair in shown])
     what = "objects alone in held-out views"
     return [Row(what, "drawings", len(pairs), len(shown), "drawing them", times[0], times[1])]
+
+
+def pairs(scene: Scene) -> list[Row]:
+    """Pairs of training views, one of which sees no point of the other: nothing there to reproject."""
+    points = []
+    for view in scene.train:
+        with torch.no_grad():
+            drawn = scene.rasterizer.rasterize(
+                geometry_inputs(scene.base), view.camera, scene.settings, scene.base.means.new_zeros(3)
+            )
+        depth = surface_depth(drawn, "median")
+        found = lift(depth, view.camera)[depth > 0]
+        points.append(found[:: max(1, len(found) // _POINTS)])
+    shared = sum(bool(inside(part, view.camera).any()) for part in points for view in scene.train)
+    return [Row("pairs of views in reprojection", "pairs", len(scene.train) ** 2, shared)]

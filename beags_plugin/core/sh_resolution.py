@@ -29,15 +29,19 @@ def gram_matrices(means: Tensor, cameras: Sequence[Camera], degree: int) -> Tens
     gram = points.new_zeros(len(points), num_sh_bases(degree), num_sh_bases(degree))
     views = points.new_zeros(len(points))
     for camera in cameras:
-        view = camera.to(points.device, torch.float64)
-        in_camera = points @ view.rotation.T + view.translation
-        x, y, z = (in_camera @ view.K.T).unbind(1)
-        inside = (z > 0) & (x >= 0) & (y >= 0) & (x < view.width * z) & (y < view.height * z)
-        directions = torch.nn.functional.normalize(points[inside] - view.center, dim=1)
-        basis = sh_basis(directions, degree)
-        gram[inside] += basis[:, :, None] * basis[:, None, :]
-        views[inside] += 1
+        seen = inside(points, camera)
+        center = camera.to(points.device, torch.float64).center
+        basis = sh_basis(torch.nn.functional.normalize(points[seen] - center, dim=1), degree)
+        gram[seen] += basis[:, :, None] * basis[:, None, :]
+        views[seen] += 1
     return gram / views.clamp(min=1)[:, None, None]
+
+
+def inside(points: Tensor, camera: Camera) -> Tensor:
+    """[N] bool, whether the points [N, 3] float, world, lie before the camera and project into its image."""
+    view = camera.to(points.device, points.dtype)
+    x, y, z = ((points @ view.rotation.T + view.translation) @ view.K.T).unbind(1)
+    return (z > 0) & (x >= 0) & (y >= 0) & (x < view.width * z) & (y < view.height * z)
 
 
 def residual_gram(gram: Tensor, low: int, high: int) -> Tensor:
