@@ -183,11 +183,17 @@ def test_replaced_class_maps_reach_batches_and_views(tmp_path):
         assert (batch["class_map"].int() == 5 + batch["image_idx"]).all()
         assert torch.equal(camera.metadata["class_map"], batch["class_map"])
     assert all(torch.equal(view.labels, labels) for view, labels in zip(data.views("train"), new, strict=True))
-    assert [view.labels is None for view in data.views("test")] == [True] * 2
+    originals = [view.labels for view in data.views("train", original=True)]
+    assert (originals[0] == 1).all() and originals[1:] == [None] * 6
 
     new[0].fill_(9)  # the manager keeps its own copy
     data.replace_class_maps([labels + 1 for labels in new])
+    assert (data.views("train", original=True)[0].labels == 1).all()
     assert (data.views("train")[0].labels == 10).all()
+    data.replace_class_maps(new, keep=False)
+    assert (data.views("train")[1].labels == 6).all()
+    with pytest.raises(ValueError, match="were not kept"):
+        data.views("train", original=True)
 
 
 @pytest.mark.parametrize(

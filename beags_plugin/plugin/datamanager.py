@@ -99,6 +99,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         super().__init__(config, *args, **kwargs)
         self._distorted: dict[str, Cameras] = {}
         self._replaced = False  # whether the training class maps are no longer those of the files
+        self._originals: list[Tensor] | None = None  # those of the files, where they are kept beside the ones in use
         # nerfstudio draws evaluation views from Python's global generator, which others use too.
         self._eval_order = random.Random(config.train_cameras_sampling_seed)
 
@@ -146,20 +147,25 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         """All evaluation views in order, as nerfstudio's evaluation reads them."""
         return [(camera, self._on_device(data)) for camera, data in super().fixed_indices_eval_dataloader]
 
-    def views(self, split: Literal["train", "val", "test", "eval"]) -> list[View]:
-        """All views of the training or (any other name) the evaluation split, in name order."""
+    def views(self, split: Literal["train", "val", "test", "eval"], original: bool = False) -> list[View]:
+        """All views of the training or (any other name) the evaluation split, in name order.
+
+        original: give the labels of the mask files also after ``replace_class_maps``, if it kept them.
+        """
         if split not in ("train", "val", "test", "eval"):
             raise ValueError(f"unknown split {split!r}")
         cache = self.cached_train if split == "train" else self.cached_eval
         dataset = self.train_dataset if split == "train" else self.eval_dataset
         names = unique_names(dataset.image_filenames)
         return [
-            self._view(dataset, data, index, name) for index, (data, name) in enumerate(zip(cache, names, strict=True))
+            self._view(dataset, data, index, name, original)
+            for index, (data, name) in enumerate(zip(cache, names, strict=True))
         ]
 
-    def replace_class_maps(self, class_maps: Sequence[Tensor]) -> None:
+    def replace_class_maps(self, class_maps: Sequence[Tensor], keep: bool = True) -> None:
         """Train on ``class_maps``, one [H, W] integer tensor per training view, instead of the mask files.
 
+        keep: whether ``views`` may be asked for the labels of the files later on.
         Raises ``ValueError`` if their number, a size or an id (0..IGNORE) is wrong.
         """
         if len(class_maps) != len(self.cached_train):
@@ -169,15 +175,22 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
                 raise ValueError(f"class map {tuple(labels.shape)} for a view of {tuple(data['class_map'].shape)}")
             if labels.numel() and not 0 <= int(labels.min()) <= int(labels.max()) <= IGNORE:
                 raise ValueError(f"class ids must lie in 0..{IGNORE}")
+        if not self._replaced:
+            self._originals = [data["class_map"] for data in self.cached_train]
+        self._originals = self._originals if keep else None
         for data, labels in zip(self.cached_train, class_maps, strict=True):
             data["class_map"] = narrowed(labels.detach().int()).to(data["class_map"].device)
         self._replaced = True
 
-    def _view(self, dataset: BeagsDataset, data: dict, index: int, name: str) -> View:
-        labels = None
+    def _view(self, dataset: BeagsDataset, data: dict, index: int, name: str, original: bool) -> View:
+        labels, stored = None, data["class_map"]
         replaced = self._replaced and dataset is self.train_dataset
+        if replaced and original:
+            if self._originals is None:
+                raise ValueError("the labels of the mask files were not kept")
+            replaced, stored = False, self._originals[index]
         if replaced or dataset.metadata["class_map_filenames"][index] is not None:
-            labels = data["class_map"].to(self.device)
+            labels = stored.to(self.device)
         camera = camera_from_nerfstudio(dataset.cameras, index).to(self.device)
         alpha = data["alpha"].to(self.device) if "alpha" in data else None
         return View(camera, name, data["image"].to(self.device), labels, alpha)

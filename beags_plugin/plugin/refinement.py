@@ -123,7 +123,7 @@ class RefinementSwitch:
         if prepared.edited is not None:
             edit_scene(model, self.trainer.optimizers.optimizers, prepared.edited.edited)
             self._take_classes(prepared.edited.assignment)
-        self._start(prepared.grid, prepared.labels)
+        self._start(prepared.grid, prepared.labels, self._round() + 1 < model.config.refine_rounds)
         self._count(prepared.seconds, first)
         if first:
             CONSOLE.print(
@@ -145,8 +145,9 @@ class RefinementSwitch:
         self.model.class_margin.copy_(assignment.margin)
         self.model.assigned.fill_(True)
 
-    def _start(self, grid: VisibilityGrid | None, labels: LabelMaps) -> None:
-        self.datamanager.replace_class_maps(labels)
+    def _start(self, grid: VisibilityGrid | None, labels: LabelMaps, more_rounds: bool) -> None:
+        """more_rounds: whether one is still to be prepared, from the masks as the data has them."""
+        self.datamanager.replace_class_maps(labels, keep=more_rounds)
         self.model.grid = grid
         self.model.frozen = not self.refiner.trains
         self.ready = True
@@ -193,7 +194,8 @@ class RefinementSwitch:
             torch.from_numpy(read_class_map(folder / "masks" / f"{view.name}.png").astype(np.int32))
             for view in self.datamanager.views("train")
         )
-        self._start(VisibilityGrid.from_state_dict(state) if state else None, labels)
+        more_rounds = any(start >= int(self.model.refined_steps) for start in self._round_starts())
+        self._start(VisibilityGrid.from_state_dict(state) if state else None, labels, more_rounds)
         self.model.refining_since = time.perf_counter()
         CONSOLE.print(f"  refinement taken up from {folder}", highlight=False, markup=False, soft_wrap=True)
 
