@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -58,3 +60,27 @@ def test_wrong_options_are_refused():
         PreparationConfig(voters=-1).check()
     with pytest.raises(UserError, match="min_confidence is 1.5"):
         PreparationConfig(min_confidence=1.5).check()
+
+
+def test_k_follows_the_training_pixels_where_it_is_stated_for_more():
+    cameras = [SimpleNamespace(height=100, width=200)] * 5  # 1e5 pixels
+    assert PreparationConfig(k=2000).neighbours(cameras) == 2000
+    assert PreparationConfig(k=2000, k_pixels=400_000).neighbours(cameras) == 500
+    assert PreparationConfig(k=2000, k_pixels=50_000).neighbours(cameras) == 2000
+    assert PreparationConfig(k=2000, k_pixels=10**9).neighbours(cameras) == 10
+    assert PreparationConfig(k=4, k_pixels=10**9).neighbours(cameras) == 4
+    with pytest.raises(UserError, match="k_pixels is -1"):
+        PreparationConfig(k_pixels=-1).check()
+
+
+def test_a_run_says_which_rounds_it_could_not_make():
+    pytest.importorskip("nerfstudio")
+    from beags_plugin.plugin.config import base_config
+    from beags_plugin.plugin.refinement import RefinementSwitch
+
+    config = base_config().model_config
+    config.refine_steps = 3
+    for rounds in (0, 4):
+        config.refine_rounds = rounds
+        with pytest.raises(UserError, match=f"refine_rounds is {rounds}: it must be 1 to refine_steps, which is 3"):
+            RefinementSwitch(SimpleNamespace(config=config), None, None).check_options()

@@ -58,7 +58,7 @@ class RefinementSwitch:
     def check_options(self) -> None:
         """Raise ``UserError`` at the start of a run whose options would stop it when it comes to refine."""
         if self.wanted:
-            rounds, steps = self.model.config.refine_rounds, self.model.schedule.refine_steps
+            rounds, steps = self.model.config.refine_rounds, self.model.config.refine_steps
             if not 1 <= rounds <= steps:
                 raise UserError(f"refine_rounds is {rounds}: it must be 1 to refine_steps, which is {steps}.")
             self.model.config.prepare.check()

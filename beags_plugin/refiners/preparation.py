@@ -26,6 +26,8 @@ from beags_plugin.refiners.border_split import BorderSplitConfig, split_at_borde
 from beags_plugin.refiners.consistent_masks import Stage, masks_as_they_are, reprojected_masks
 from beags_plugin.refiners.fewer_bands import without_unneeded_bands
 
+LEAST_K = 10  # nearer neighbours tell the noise of the depth rather than the distance of points
+
 
 @dataclass(frozen=True)
 class PreparationConfig:
@@ -38,6 +40,8 @@ class PreparationConfig:
     tau: pairwise: a vote counts if its point is visible: |z - D| <= tau z; infinity counts every vote (E5).
     depth: which depth is lifted into space, "median" or "expected": see ``rasterizers.drawing.surface_depth``.
     k: neighbours that set the voxel size (E8).
+    k_pixels: training pixels for which k is stated; fewer of them lift a thinner cloud and take k in proportion, so that
+        voxels keep their size. 0, as in the paper, takes k as it is.
     trim_sh: the highest bands of the colour are left out before refinement if that changes the training views by at
         most so much (root mean square, colours in 0..1). 0, as in the paper, keeps all.
     min_contribution: Gaussians that fill less than so many pixels in every training view are removed before
@@ -50,6 +54,7 @@ class PreparationConfig:
     tau: float = 0.02
     depth: str = "median"
     k: int = 2000
+    k_pixels: int = 0
     min_contribution: float = 0.0
     trim_sh: float = 0.0
 
@@ -69,10 +74,19 @@ class PreparationConfig:
             raise UserError(f"tau is {self.tau}: it must be 0 or more (inf counts every vote).")
         if not self.k >= 1:
             raise UserError(f"k is {self.k}: the voxel size needs at least 1 neighbour.")
+        if not self.k_pixels >= 0:
+            raise UserError(f"k_pixels is {self.k_pixels}: it must be a number of pixels, or 0 to take k as it is.")
         if not self.min_contribution >= 0:
             raise UserError(f"min_contribution is {self.min_contribution}: it must be 0 or more pixels.")
         if not self.trim_sh >= 0:
             raise UserError(f"trim_sh is {self.trim_sh}: it must be 0 or more, a difference of colours in 0..1.")
+
+    def neighbours(self, cameras: Sequence[Camera]) -> int:
+        """The k of a scene with these training views, at least ``LEAST_K`` where it was made smaller."""
+        pixels = sum(camera.height * camera.width for camera in cameras)
+        if self.k_pixels == 0 or pixels >= self.k_pixels:
+            return self.k
+        return min(self.k, max(round(self.k * pixels / self.k_pixels), LEAST_K))
 
 
 @dataclass(frozen=True)
@@ -182,11 +196,12 @@ def prepare(
         surfels, class_ids, cameras, masks.labels, num_classes, rasterizer, settings, seed, config.depth
     )
     with stage("Building voxel grids") as progress:
-        grid = refiner.build_grid(scene, config.k, progress)
+        k = config.neighbours(cameras)
+        grid = refiner.build_grid(scene, k, progress)
     if grid is not None:
         asked = torch.unique(class_ids)  # classes are fixed: no loss can ask about one that has no Gaussians
         grid = grid.only(asked if background_voxels else asked[asked != 0])
-        timed("voxel grids", start, f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {config.k})")
+        timed("voxel grids", start, f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {k})")
     return Preparation(masks.labels, masks.confidence, assignment, grid, edited, findings, seconds)
 
 
