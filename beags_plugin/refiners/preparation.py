@@ -40,8 +40,8 @@ class PreparationConfig:
     tau: pairwise: a vote counts if its point is visible: |z - D| <= tau z; infinity counts every vote (E5).
     depth: which depth is lifted into space, "median" or "expected": see ``rasterizers.drawing.surface_depth``.
     k: neighbours that set the voxel size (E8).
-    k_pixels: training pixels for which k is stated; fewer of them lift a thinner cloud and take k in proportion, so that
-        voxels keep their size. 0, as in the paper, takes k as it is.
+    k_pixels: training pixels for which k is stated; fewer of them lift a thinner cloud and take k in proportion, so
+        that voxels keep their size. 0, as in the paper, takes k as it is.
     trim_sh: the highest bands of the colour are left out before refinement if that changes the training views by at
         most so much (root mean square, colours in 0..1). 0, as in the paper, keeps all.
     min_contribution: Gaussians that fill less than so many pixels in every training view are removed before
