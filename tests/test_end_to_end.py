@@ -78,9 +78,12 @@ def test_the_base_is_kept_apart_and_has_classes(trained):
 
     folder, _ = trained
     base, refined = load_scene(folder / "base" / "config.yml"), load_scene(folder / "config.yml")
-    assert base.state["gauss_params.means"].shape == refined.state["gauss_params.means"].shape
-    assert (base.state["class_ids"] == refined.state["class_ids"]).all()
-    assert not (base.state["gauss_params.means"] == refined.state["gauss_params.means"]).all()
+    means, moved = base.state["gauss_params.means"], refined.state["gauss_params.means"]
+    assert len(moved) > len(means)  # beags-tiny splits Gaussians at borders
+    for scene, count in ((base, len(means)), (refined, len(moved))):
+        assert scene.state["class_ids"].shape == (count,)
+    assert set(base.state["class_ids"].tolist()) == set(refined.state["class_ids"].tolist())
+    assert not any((moved == position).all(dim=1).any() for position in means[base.state["class_ids"] > 0])
     assert len(base.classes) >= 6
     assert (base.state["class_ids"] > 0).any()
 
