@@ -23,7 +23,7 @@ def write(folder, text):
 
 
 def test_the_documented_presets_exist():
-    documented = {"beags", "beags-base", "beags-paper", "beags-refine", "beags-tiny"}
+    documented = {"beags", "beags-accurate", "beags-base", "beags-fast", "beags-paper", "beags-refine", "beags-tiny"}
     assert documented <= set(preset_names())
 
 

@@ -84,6 +84,13 @@ class Tradeoff(Trainings):
 
 
 @dataclass
+class Presets(Trainings):
+    """What the refinements of the presets cost and give, from one base."""
+
+    EXPERIMENT: ClassVar[str] = "presets"
+
+
+@dataclass
 class Improvements(Trainings):
     """What each extension of the paper's refinement gives, beside the paper's own method."""
 
@@ -212,6 +219,7 @@ Measurement = (
     | Annotated[Depth, tyro.conf.subcommand(name="depth")]
     | Annotated[Masks, tyro.conf.subcommand(name="masks")]
     | Annotated[Tradeoff, tyro.conf.subcommand(name="tradeoff")]
+    | Annotated[Presets, tyro.conf.subcommand(name="presets")]
     | Annotated[Improvements, tyro.conf.subcommand(name="improvements")]
     | Annotated[Base, tyro.conf.subcommand(name="base")]
     | Annotated[BaseLimits, tyro.conf.subcommand(name="base-limits")]
