@@ -1,4 +1,4 @@
-"""The command line: ``beags demo | sample | extract | eval | bench | doctor``."""
+"""The command line: ``beags demo | sample | extract | export | eval | bench | doctor``."""
 
 from __future__ import annotations
 
@@ -89,6 +89,37 @@ class Extract:
 
 
 @dataclass
+class Export:
+    """Write objects as files for other programs, in the frame of the input poses or centred on each object."""
+
+    load_config: Path
+    """config.yml of a trained run."""
+    object: tuple[str, ...] = ()
+    """Names of the objects."""
+    all: bool = False
+    """Every object, the emptied background, and a manifest.json."""
+    format: tuple[str, ...] = ("ply",)
+    """What to write: ply (viewers of 3D Gaussians), ply-2dgs (the official 2DGS code), or another exporter's name."""
+    frame: str = "world"
+    """world, that of the input poses; or object, the same with the middle of the object's box as origin."""
+    output: Path | None = None
+    """Folder for the files; exports/ beside config.yml if left out."""
+
+    def run(self) -> None:
+        from beags_plugin.plugin.export import export_run
+        from beags_plugin.progress import progress_bar
+
+        with progress_bar("exporting") as progress:
+            exported = export_run(
+                self.load_config, self.object, self.all, self.format, self.frame, self.output, progress=progress
+            )
+        for one in exported:
+            CONSOLE.print(f"{one.name}: {one.gaussians} Gaussians", markup=False)
+            for file in one.files:
+                CONSOLE.print(f"  {file.path or f'no {file.format}: {file.reason}'}", markup=False)
+
+
+@dataclass
 class Eval:
     """Score runs on their held-out views: masks per object, PSNR and SSIM, before and after refinement.
 
@@ -140,6 +171,7 @@ Command = (
     Annotated[Demo, tyro.conf.subcommand(name="demo")]
     | Annotated[Sample, tyro.conf.subcommand(name="sample")]
     | Annotated[Extract, tyro.conf.subcommand(name="extract")]
+    | Annotated[Export, tyro.conf.subcommand(name="export")]
     | Annotated[Eval, tyro.conf.subcommand(name="eval")]
     | Annotated[Bench, tyro.conf.subcommand(name="bench")]
     | Annotated[Doctor, tyro.conf.subcommand(name="doctor")]

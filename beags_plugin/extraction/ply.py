@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import os
 from io import BytesIO
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from beags_plugin.core.rotations import rotation_from_quat
+from beags_plugin.core.sh import MAX_DEGREE, num_sh_bases
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
+from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.frames import to_input_frame
 
 THICKNESS = 1e-3
@@ -24,12 +26,14 @@ def write_ply(
     surfels: Surfels,
     class_ids: Tensor | None = None,
     transform: tuple[Tensor, float] | None = None,
+    layout: Literal["3dgs", "2dgs"] = "3dgs",
 ) -> None:
-    """Write surfels as a binary splat .ply: 3DGS's columns, then ``class_id`` (int32) if there are class ids.
+    """Write surfels as a binary splat .ply: 3DGS's or 2DGS's columns, then ``class_id`` (int32) if there are class ids.
 
     Columns: x y z; nx ny nz, the surfel's normal; f_dc_0..2; f_rest_* channel-major (all red coefficients, then
     green, then blue); opacity as a logit; scale_0..2 as logs, the third ``THICKNESS`` times the smaller of the two (a
-    viewer for 3D Gaussians needs one; a surfel has none); rot_0..3 wxyz, unit length.
+    viewer for 3D Gaussians needs one; a surfel has none); rot_0..3 wxyz, unit length. 2DGS's layout has two scales, and
+    always 45 f_rest columns, the rest 0: the official code asks for as many as its degree, 3 unless told.
 
     surfels: N surfels. class_ids: [N] integer, phi. transform: the dataparser's ([3, 4], scale); with it the
     file is in the frame of the input poses, without it in the surfels' own. Raises ``UserError`` if the file cannot be
@@ -39,7 +43,7 @@ def write_ply(
 
     if transform is not None:
         surfels = to_input_frame(surfels, *transform)
-    columns = _columns(surfels)
+    columns = _columns(surfels, layout)
     if class_ids is not None:
         if class_ids.shape != (len(surfels),):
             raise ValueError(f"class_ids must be [{len(surfels)}], not {list(class_ids.shape)}")
@@ -47,29 +51,27 @@ def write_ply(
     table = np.empty(len(surfels), dtype=[(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():
         table[name] = values
-    try:
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        # Written beside and moved: a program that has the old file mapped must not lose the ground under it.
-        part = Path(path).with_name(Path(path).name + ".part")
+    with whole_file(path) as part:
         PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(str(part))
-        os.replace(part, path)
-    except OSError as error:
-        raise UserError(f"{path} cannot be written ({error.strerror}): choose another place.") from error
 
 
-def _columns(surfels: Surfels) -> dict[str, np.ndarray]:
+def _columns(surfels: Surfels, layout: str) -> dict[str, np.ndarray]:
     quats = torch.nn.functional.normalize(surfels.quats.detach(), dim=-1)
     normals = rotation_from_quat(quats)[:, :, 2]
     log_scales = surfels.log_scales.detach()
     thin = log_scales.amin(dim=-1, keepdim=True) + float(np.log(THICKNESS))
-    rest = surfels.sh_rest.detach().transpose(1, 2).flatten(1)  # channel-major
+    scales = torch.cat([log_scales, thin], dim=-1) if layout == "3dgs" else log_scales
+    rest = surfels.sh_rest.detach()
+    if layout == "2dgs":
+        rest = torch.cat([rest, rest.new_zeros(len(rest), num_sh_bases(MAX_DEGREE) - 1 - rest.shape[1], 3)], dim=1)
+    rest = rest.transpose(1, 2).flatten(1)  # channel-major
     blocks = {
         ("x", "y", "z"): surfels.means.detach(),
         ("nx", "ny", "nz"): normals,
         _numbered("f_dc", 3): surfels.sh_dc.detach(),
         _numbered("f_rest", rest.shape[1]): rest,
         ("opacity",): surfels.opacity_logits.detach()[:, None],
-        _numbered("scale", 3): torch.cat([log_scales, thin], dim=-1),
+        _numbered("scale", scales.shape[1]): scales,
         _numbered("rot", 4): quats,
     }
     return {

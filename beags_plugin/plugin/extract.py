@@ -105,15 +105,10 @@ def extract_objects(
     Raises ``UserError`` for an unknown name, before anything is written.
     """
     scene = load_scene(config_path)
-    ids = {name: index for index, name in scene.classes.items()}
-    if unknown := [name for name in objects if name not in ids]:
-        raise UserError(f"there is no object {unknown[0]!r} in {config_path.parent}: choose of {', '.join(ids)}.")
-    class_ids = scene.state["class_ids"]
-    present = {name for name, index in ids.items() if bool((class_ids == index).any())}
-    if absent := [name for name in objects if name not in present]:
-        raise UserError(f"no Gaussian belongs to {absent[0]!r}: its masks cover too little of the scene.")
-    names = list(objects) or [name for name, index in ids.items() if index != 0 and name in present]
     run = config_path.parent
+    class_ids = scene.state["class_ids"]
+    ids = objects_with_gaussians(scene, objects, run)
+    names = list(objects) or [name for name, index in ids.items() if index != 0]
     transform = read_transform(run)
     select = remove_class if remove else select_class
     folders = folder_names(scene.classes)
@@ -130,6 +125,17 @@ def extract_objects(
         write_ply(ply, surfels, class_ids[index], transform)
         written.append(Extracted(title, config, ply, len(surfels)))
     return written
+
+
+def objects_with_gaussians(scene: SavedScene, objects: Sequence[str], run: Path) -> dict[str, int]:
+    """Name to class id of all classes that have Gaussians; raises ``UserError`` if one of ``objects`` is none."""
+    ids = {name: index for index, name in scene.classes.items()}
+    if unknown := [name for name in objects if name not in ids]:
+        raise UserError(f"there is no object {unknown[0]!r} in {run}: choose of {', '.join(ids)}.")
+    present = {name: index for name, index in ids.items() if bool((scene.state["class_ids"] == index).any())}
+    if absent := [name for name in objects if name not in present]:
+        raise UserError(f"no Gaussian belongs to {absent[0]!r}: its masks cover too little of the scene.")
+    return present
 
 
 def _rows(state: dict[str, Any], index: Tensor) -> dict[str, Any]:

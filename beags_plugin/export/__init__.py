@@ -1,0 +1,12 @@
+"""Exporters, each a registered component (entry points: ``beags.exporters``)."""
+
+from beags_plugin.registry import Registry
+
+EXPORTERS = Registry(
+    "exporter",
+    "beags.exporters",
+    {
+        "ply": "beags_plugin.export.splats:PlyExporter",
+        "ply-2dgs": "beags_plugin.export.splats:SurfelPlyExporter",
+    },
+)

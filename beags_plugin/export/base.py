@@ -1,0 +1,77 @@
+"""What an exporter is given, and what it does."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.errors import UserError
+from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+
+
+class NothingToExport(UserError):
+    """A piece has nothing of what a format holds; with --all the other pieces are written all the same."""
+
+
+@dataclass(frozen=True)
+class Viewpoints:
+    """Where the photos were taken, and what draws the piece from there; all in the frame of the file."""
+
+    cameras: Sequence[Camera]
+    rasterizer: Rasterizer
+    settings: RasterSettings
+
+
+@dataclass(frozen=True)
+class Piece:
+    """What is exported: an object, or the background; all of it in the frame of the file.
+
+    name: as the user calls it. surfels: N surfels. class_ids: [N] int32, phi.
+    views: of the training photos; None unless an exporter ``needs_views``.
+    shared: what exporters of one piece keep for each other, such as the mesh that two file types hold.
+    """
+
+    name: str
+    surfels: Surfels
+    class_ids: Tensor
+    views: Viewpoints | None = None
+    shared: dict[Any, Any] = field(default_factory=dict)
+
+
+class Exporter(ABC):
+    """One file format. Subclasses are frozen dataclasses; their own fields, all with defaults, are their options.
+
+    suffix: how the files' names end. needs_views: whether it draws the piece from the views of the training photos.
+    """
+
+    suffix: ClassVar[str]
+    needs_views: ClassVar[bool] = False
+
+    @classmethod
+    def unavailable(cls) -> str | None:
+        """None if this exporter can run here, else one sentence: why not and what to install."""
+        return None
+
+    @abstractmethod
+    def write(self, path: Path, piece: Piece) -> dict[str, Any]:
+        """Write ``piece`` to ``path``; returns what the manifest says of the file (plain values by name).
+
+        Raises ``UserError`` if the file cannot be written, ``NothingToExport`` if the piece has nothing for it.
+        """
+
+
+def make_exporter(name: str, **options: Any) -> Exporter:
+    """The exporter called ``name``; raises ``UserError`` for an unknown name, or if it cannot run here."""
+    from beags_plugin.export import EXPORTERS
+
+    exporter = EXPORTERS.get(name)
+    if reason := exporter.unavailable():
+        raise UserError(f"the exporter {name!r} cannot run here: {reason}")
+    return exporter(**options)

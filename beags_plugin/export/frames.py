@@ -1,0 +1,92 @@
+"""The frame of exported files: the input's world, or the same centred on the object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.rotations import rotation_from_quat
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.errors import UserError
+from beags_plugin.export.base import Viewpoints
+from beags_plugin.extraction.frames import to_input_frame
+
+Placement = Literal["world", "object"]
+_OUTLIERS = 1e-3  # share of the surfels that a box may leave out at each side: a stray one must not set the scale
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The frame of x, where the run's is x' = scale (R x + t).
+
+    transform: [3, 4] float64, R | t, R a rotation; scale: positive.
+    """
+
+    transform: Tensor
+    scale: float
+
+    @classmethod
+    def of_run(cls) -> Frame:
+        """The run's own frame."""
+        return cls(torch.eye(4, dtype=torch.float64)[:3], 1.0)
+
+    def centred(self, center: Tensor) -> Frame:
+        """The same, shifted: ``center`` [3], a point of this frame, becomes the origin."""
+        rotation, shift = self.transform[:, :3], self.transform[:, 3:]
+        return replace(self, transform=torch.cat([rotation, shift + rotation @ center.double()[:, None]], dim=1))
+
+    def surfels(self, surfels: Surfels) -> Surfels:
+        """Surfels of the run's frame in this one."""
+        return to_input_frame(surfels, self.transform, self.scale)
+
+    def camera(self, camera: Camera) -> Camera:
+        """A camera of the run's frame in this one: it sees the same, with depths divided by ``scale``."""
+        viewmat, rotation, shift = camera.viewmat.double(), self.transform[:, :3], self.transform[:, 3]
+        moved = viewmat.clone()
+        moved[:3, :3] = viewmat[:3, :3] @ rotation
+        moved[:3, 3] = viewmat[:3, :3] @ shift + viewmat[:3, 3] / self.scale
+        return replace(camera, viewmat=moved.to(camera.viewmat.dtype))
+
+    def views(self, views: Viewpoints) -> Viewpoints:
+        """Viewpoints of the run's frame in this one."""
+        settings = replace(views.settings, near=views.settings.near / self.scale, far=views.settings.far / self.scale)
+        return Viewpoints([self.camera(camera) for camera in views.cameras], views.rasterizer, settings)
+
+    def to_run(self) -> list[list[float]]:
+        """The 4 x 4 matrix that takes points of this frame to the run's."""
+        matrix = torch.eye(4, dtype=torch.float64)
+        matrix[:3] = self.scale * self.transform.double()
+        return matrix.tolist()
+
+
+def check_placement(placement: str) -> None:
+    """Raise ``UserError`` unless ``placement`` is one of ``Placement``."""
+    if placement not in get_args(Placement):
+        raise UserError(f"there is no frame {placement!r}: choose one of {', '.join(get_args(Placement))}.")
+
+
+def bounding_box(surfels: Surfels) -> tuple[Tensor, Tensor]:
+    """The box about the ellipses of one standard deviation of N surfels, but for a few stray ones.
+
+    Surfels that are not finite are left out; the box of none is the origin. Returns (low [3], high [3]) float64, in
+    the surfels' frame.
+    """
+    axes = rotation_from_quat(surfels.quats.detach().double())[:, :, :2]
+    # a disc's reach along a world axis: the length of its two half-axes' components there
+    reach = (axes * surfels.log_scales.detach().double().exp()[:, None, :]).square().sum(dim=2).sqrt()
+    means = surfels.means.detach().double()
+    low, high = (means - reach).cpu().numpy(), (means + reach).cpu().numpy()
+    finite = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1)
+    if not finite.any():
+        return torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    low, high = low[finite], high[finite]
+    # an actual value, not one between two: "lower" drops nothing of fewer than 1 / _OUTLIERS surfels
+    return (
+        torch.from_numpy(np.quantile(low, _OUTLIERS, axis=0, method="lower")),
+        torch.from_numpy(np.quantile(high, 1.0 - _OUTLIERS, axis=0, method="higher")),
+    )

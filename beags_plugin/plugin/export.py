@@ -1,0 +1,195 @@
+"""Export of runs: the files that other programs read, of each object and of the background."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from beags_plugin.errors import UserError
+from beags_plugin.export.base import Exporter, NothingToExport, Piece, Viewpoints, make_exporter
+from beags_plugin.export.frames import Frame, bounding_box, check_placement
+from beags_plugin.extraction.files import whole_file
+from beags_plugin.extraction.select import select_class
+from beags_plugin.plugin.extract import SavedScene, folder_names, load_scene, objects_with_gaussians, read_transform
+from beags_plugin.rasterizers import make_rasterizer
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.config import BeagsTrainerConfig
+
+MANIFEST = "manifest.json"
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class ExportedFile:
+    """One file: its format and path, and what its exporter says of it; path None: nothing to write, for ``reason``."""
+
+    format: str
+    path: Path | None
+    facts: dict[str, Any]
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """One object (or the background) and its files.
+
+    center: [3] the point of the world that is the files' origin. low, high: [3] its box, in the files' frame.
+    to_run: the 4 x 4 matrix from the files' frame to the run's normalised one.
+    """
+
+    name: str
+    class_id: int
+    gaussians: int
+    center: list[float]
+    low: list[float]
+    high: list[float]
+    to_run: list[list[float]]
+    files: list[ExportedFile]
+
+    def to_json(self, folder: Path) -> dict[str, Any]:
+        """Plain values for the manifest in ``folder``."""
+        return {
+            "name": self.name,
+            "class_id": self.class_id,
+            "gaussians": self.gaussians,
+            "center": self.center,
+            "box": {"low": self.low, "high": self.high},
+            "to_run": self.to_run,
+            "files": [
+                {"format": file.format, "path": file.path.relative_to(folder).as_posix()}
+                | {"bytes": file.path.stat().st_size, **file.facts}
+                for file in self.files
+                if file.path is not None
+            ],
+            "left_out": [{"format": file.format, "reason": file.reason} for file in self.files if file.path is None],
+        }
+
+
+def export_run(
+    config_path: Path,
+    objects: Sequence[str] = (),
+    everything: bool = False,
+    formats: Sequence[str] = ("ply",),
+    placement: str = "world",
+    output: Path | None = None,
+    options: Mapping[str, Mapping[str, Any]] | None = None,
+    progress: Progress | None = None,
+) -> list[Exported]:
+    """Write files of objects of a run.
+
+    config_path: config.yml of a refined (or assigned) run. objects: names; or everything: all that have Gaussians and
+    the emptied background, and a manifest. formats: names of exporters. placement: "world", the frame of the input
+    poses (the run's own if it has not kept how that was normalised), or "object", the same centred on each object.
+    output: folder; ``exports/`` in the run by default. options: format to its exporter's options.
+    progress: is told (done, total) files. Raises ``UserError`` for a mistake, before anything is written.
+    """
+    run, folder = config_path.parent, output or config_path.parent / "exports"
+    check_placement(placement)
+    exporters = {name: make_exporter(name, **(options or {}).get(name, {})) for name in formats}
+    if not exporters:
+        raise UserError("no format is named: name one with --format.")
+    scene = load_scene(config_path)
+    present = objects_with_gaussians(scene, objects, run)
+    if everything and objects:
+        raise UserError("--all exports every object: leave --object out.")
+    if not everything and not objects:
+        raise UserError(f"nothing to export is named: use --all, or --object with one of {', '.join(present)}.")
+
+    transform = read_transform(run)
+    job = _Job(
+        scene,
+        exporters,
+        Frame.of_run() if transform is None else Frame(*transform),
+        placement == "object",
+        _viewpoints(scene, config_path) if any(exporter.needs_views for exporter in exporters.values()) else None,
+        tolerant=everything,
+    )
+    names, titles = list(present) if everything else list(dict.fromkeys(objects)), folder_names(scene.classes)
+    exported, total = [], len(names) * len(exporters)
+    for number, name in enumerate(names):
+        if progress:
+            progress(number * len(exporters), total)
+        exported.append(job.export(name, present[name], folder / titles[present[name]]))
+    if progress:
+        progress(total, total)
+    if everything:
+        _write_manifest(folder, config_path, placement if transform or placement == "object" else "run", exported)
+    return exported
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What all pieces of an export have in common.
+
+    world: frame of the files, but for the shift if they are ``centred``. views: in the run's frame.
+    tolerant: leave out a format for which a piece has nothing.
+    """
+
+    scene: SavedScene
+    exporters: Mapping[str, Exporter]
+    world: Frame
+    centred: bool
+    views: Viewpoints | None
+    tolerant: bool
+
+    def export(self, name: str, class_id: int, stem: Path) -> Exported:
+        """All files of one class, called ``stem`` and their suffixes."""
+        chosen, index = select_class(self.scene.surfels(), self.scene.state["class_ids"], class_id)
+        low, high = bounding_box(self.world.surfels(chosen))
+        center = (low + high) / 2 if self.centred else torch.zeros(3, dtype=torch.float64)
+        frame = self.world.centred(center)
+        views = None if self.views is None else frame.views(self.views)
+        piece = Piece(name, frame.surfels(chosen), self.scene.state["class_ids"][index], views)
+        files = [
+            self._write(label, exporter, stem.with_name(f"{stem.name}.{exporter.suffix}"), piece)
+            for label, exporter in self.exporters.items()
+        ]
+        low, high = low - center, high - center
+        return Exported(
+            name, class_id, len(chosen), center.tolist(), low.tolist(), high.tolist(), frame.to_run(), files
+        )
+
+    def _write(self, label: str, exporter: Exporter, path: Path, piece: Piece) -> ExportedFile:
+        try:
+            return ExportedFile(label, path, exporter.write(path, piece))
+        except NothingToExport as error:
+            if not self.tolerant:
+                raise
+            return ExportedFile(label, None, {}, str(error))
+
+
+def _viewpoints(scene: SavedScene, config_path: Path) -> Viewpoints:
+    """The training views of a run, in its own frame; raises ``UserError`` if its data cannot be read."""
+    from beags_plugin.plugin.cameras import camera_from_nerfstudio
+    from beags_plugin.plugin.evaluate import raster_settings
+
+    config: BeagsTrainerConfig = scene.config
+    if not (data := config.data_path).exists():
+        raise UserError(f"{config_path} was trained on {data}, which is gone: put it back.")
+    try:
+        # Poses alone: no photo is read, and lens distortion does not matter to where one looks from.
+        parser = replace(config.data_config.dataparser, data=data).setup()
+        cameras = parser.get_dataparser_outputs(split="train").cameras
+    except UserError as error:
+        raise UserError(f"the data of {config_path} cannot be read: {error}") from error
+    return Viewpoints(
+        [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))],
+        make_rasterizer(config.model_config.rasterizer),
+        raster_settings(scene),
+    )
+
+
+def _write_manifest(folder: Path, config_path: Path, frame: str, exported: Sequence[Exported]) -> None:
+    content = {
+        "run": str(config_path.absolute()),
+        "frame": frame,
+        "objects": [one.to_json(folder) for one in exported],
+    }
+    with whole_file(folder / MANIFEST) as part:
+        part.write_text(json.dumps(content, indent=2), "utf8")

@@ -1,0 +1,206 @@
+"""``beags export``: files that other programs read, and what comes back from them."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData
+from run_folders import CLASSES, discs, write_scene, write_trained
+from test_extraction import a_rotation, random_surfels
+
+pytest.importorskip("nerfstudio")
+
+from beags_plugin.cli import main
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.export.base import Piece, Viewpoints, make_exporter
+from beags_plugin.export.frames import Frame, bounding_box
+from beags_plugin.extraction.ply import read_ply
+from beags_plugin.extraction.select import select_class
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.drawing import surfel_inputs
+from beags_plugin.rasterizers.interface import RasterSettings
+
+SETTINGS = RasterSettings(0.01, 100.0)
+
+
+def camera_at(eye: tuple[float, float, float], target: torch.Tensor | None = None, pixels: int = 48) -> Camera:
+    """A view of ``target`` from ``eye``, float32."""
+    position = torch.tensor(eye, dtype=torch.float64)
+    forward = torch.nn.functional.normalize((torch.zeros(3) if target is None else target).double() - position, dim=0)
+    right = torch.linalg.cross(forward, torch.tensor([0.1, 0.2, 1.0], dtype=torch.float64))
+    right = right / right.norm()
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
+    K = torch.tensor([[1.2 * pixels, 0, 0.5 * pixels], [0, 1.2 * pixels, 0.45 * pixels], [0, 0, 1]])
+    return Camera(viewmat.float(), K, pixels, pixels - 6)
+
+
+def drawn(surfels: Surfels, camera: Camera, settings: RasterSettings = SETTINGS) -> torch.Tensor:
+    with torch.no_grad():
+        render = make_rasterizer("auto").rasterize(surfel_inputs(surfels, camera), camera, settings, torch.ones(3))
+    return render.color
+
+
+def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
+    return -10 * math.log10(max(float((a - b).square().mean()), 1e-12))
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """config.yml of a run whose data parser has turned and scaled the world."""
+    root = tmp_path_factory.mktemp("lab")
+    config = write_trained(root / "run", write_scene(root / "lab"))
+    transform = torch.cat([a_rotation(3), torch.tensor([[0.4], [-0.2], [0.1]], dtype=torch.float64)], dim=1)
+    (root / "run/dataparser_transforms.json").write_text(json.dumps({"transform": transform.tolist(), "scale": 0.5}))
+    return config
+
+
+def world_frame(config) -> Frame:
+    content = json.loads((config.parent / "dataparser_transforms.json").read_text())
+    return Frame(torch.tensor(content["transform"], dtype=torch.float64), content["scale"])
+
+
+def test_a_camera_moves_with_the_frame():
+    """In another frame, with its camera moved along, the scene looks the same, and its depths are scaled."""
+    surfels, _ = discs()
+    rotation, shift = a_rotation(4), torch.tensor([[0.3], [0.1], [-0.2]], dtype=torch.float64)
+    frame = Frame(torch.cat([rotation, shift], dim=1), 0.4).centred(torch.tensor([1.0, 2.0, 3.0]))
+    view = Viewpoints([camera_at((2.0, 1.0, 1.5))], make_rasterizer("auto"), SETTINGS)
+    moved = frame.views(view)
+    there = frame.surfels(surfels)
+    before, after = drawn(surfels, view.cameras[0]), drawn(there, moved.cameras[0], moved.settings)
+    assert before.min() < 0.5 and psnr(before, after) > 60
+    assert moved.settings.far == pytest.approx(250.0)
+    point = torch.tensor([0.3, -0.1, 0.2, 1.0], dtype=torch.float64)
+    back = torch.tensor(frame.to_run(), dtype=torch.float64) @ point
+    assert torch.allclose(
+        moved.cameras[0].viewmat.double() @ point * torch.tensor([0.4, 0.4, 0.4, 1.0]),
+        view.cameras[0].viewmat.double() @ back,
+        atol=1e-5,
+    )
+
+
+def test_the_box_holds_the_discs_but_not_a_stray_one():
+    count = 4000
+    surfels = Surfels.of(
+        torch.cat([torch.rand(count - 1, 3), torch.tensor([[50.0, 0.0, 0.0]])]),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
+        torch.tensor([[math.log(0.2), math.log(0.1)]]).repeat(count, 1),
+        torch.zeros(count),
+        torch.zeros(count, 1, 3),
+    )
+    low, high = bounding_box(surfels)
+    # discs in the xy plane: they reach 0.2 along x, 0.1 along y, nothing along z
+    assert low.tolist() == pytest.approx([-0.2, -0.1, 0.0], abs=0.02)
+    assert high.tolist() == pytest.approx([1.2, 1.1, 1.0], abs=0.02)
+    surfels.means[5] = math.nan
+    assert bounding_box(surfels)[1].tolist() == pytest.approx([1.2, 1.1, 1.0], abs=0.02)
+    assert bounding_box(surfels[:0])[0].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_the_2dgs_ply_has_what_the_official_code_reads(tmp_path):
+    """The official reader takes columns by prefix in the order of their numbers, and wants 45 of f_rest_."""
+    surfels = random_surfels(degree=1)
+    piece = Piece("cup", surfels, torch.ones(7, dtype=torch.int32))
+    make_exporter("ply-2dgs").write(tmp_path / "cup.ply", piece)
+    element = PlyData.read(str(tmp_path / "cup.ply")).elements[0]
+
+    def columns(prefix: str) -> np.ndarray:
+        names = sorted(
+            (p.name for p in element.properties if p.name.startswith(prefix)), key=lambda name: int(name.split("_")[-1])
+        )
+        return np.stack([element[name] for name in names], axis=1)
+
+    assert np.array_equal(np.stack([element[axis] for axis in "xyz"], axis=1), surfels.means.numpy())
+    rest = columns("f_rest_").reshape(7, 3, 15)
+    assert np.array_equal(rest[:, :, :3], surfels.sh_rest.transpose(1, 2).numpy()) and not rest[:, :, 3:].any()
+    assert np.array_equal(columns("scale_"), surfels.log_scales.numpy())
+    assert np.allclose(columns("rot"), torch.nn.functional.normalize(surfels.quats, dim=1).numpy(), atol=1e-7)
+    assert np.array_equal(element["opacity"], surfels.opacity_logits.numpy())
+
+
+@pytest.mark.parametrize("kind", ["ply", "ply-2dgs"])
+@pytest.mark.parametrize("frame", ["world", "object"])
+def test_a_splat_file_looks_like_the_object(trained, tmp_path, kind, frame):
+    """Read back, drawn from where the run's camera is in that frame, compared with the object drawn in the run."""
+    main(["export", "--load-config", str(trained), "--object", "cup", "--format", kind, "--frame", frame,
+          "--output", str(tmp_path)])  # fmt: skip
+    (file,) = tmp_path.iterdir()
+    surfels, ids = discs()
+    cup, _ = select_class(surfels, ids, 1)
+    read, read_ids = read_ply(file)
+    assert read_ids is not None and read_ids.tolist() == [1] * len(cup)
+    place = world_frame(trained)
+    if frame == "object":
+        low, high = bounding_box(place.surfels(cup))
+        place = place.centred((low + high) / 2)
+        low, high = bounding_box(read)
+        assert (low + high).abs().max() < 1e-5
+    for eye in ((2.0, 1.0, 1.5), (-1.0, 2.0, -0.5)):
+        camera = camera_at(eye, cup.means.mean(dim=0))
+        before = drawn(cup, camera)
+        assert before.min() < 0.5
+        views = place.views(Viewpoints([camera], make_rasterizer("auto"), SETTINGS))
+        assert psnr(before, drawn(read, views.cameras[0], views.settings)) > 55
+
+
+def test_all_writes_every_object_the_background_and_a_manifest(trained, tmp_path):
+    main(["export", "--load-config", str(trained), "--all", "--frame", "object", "--format", "ply", "ply-2dgs",
+          "--output", str(tmp_path / "out")])  # fmt: skip
+    folder = tmp_path / "out"
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert manifest["run"] == str(trained) and manifest["frame"] == "object"
+    assert [(one["name"], one["class_id"]) for one in manifest["objects"]] == [(n, i) for i, n in CLASSES.items()]
+    files = {file["path"] for one in manifest["objects"] for file in one["files"]}
+    assert files == {path.name for path in folder.iterdir()} - {"manifest.json"} and len(files) == 6
+    surfels, ids = discs()
+    for one in manifest["objects"]:
+        assert not one["left_out"]
+        for file in one["files"]:
+            assert (folder / file["path"]).stat().st_size == file["bytes"]
+            vertex = PlyData.read(str(folder / file["path"]))["vertex"]
+            assert len(vertex) == one["gaussians"] and set(vertex["class_id"]) == {one["class_id"]}
+            there = np.stack([vertex["x"], vertex["y"], vertex["z"], np.ones(len(vertex))], axis=1)
+            # the manifest's matrix leads back to the run
+            expected = surfels.means[ids == one["class_id"]].numpy()
+            assert np.allclose((there @ np.array(one["to_run"]).T)[:, :3], expected, atol=1e-5)
+
+
+def test_extract_and_export_write_the_same_ply(trained, tmp_path):
+    main(["extract", "--load-config", str(trained), "--object", "cup", "--output", str(tmp_path / "runs")])
+    main(["export", "--load-config", str(trained), "--object", "cup", "--output", str(tmp_path)])
+    assert (tmp_path / "cup.ply").read_bytes() == (tmp_path / "runs/cup/cup.ply").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ((), "nothing to export is named: use --all, or --object with one of background, cup, box."),
+        (("--all", "--object", "cup"), "--all exports every object: leave --object out."),
+        (("--object", "spoon"), "there is no object 'spoon' in "),
+        (("--all", "--format", "usd"), "there is no exporter 'usd': choose one of "),
+        (("--all", "--frame", "camera"), "there is no frame 'camera': choose one of world, object."),
+        (("--all", "--output", "{file}/below"), "cannot be written"),
+    ],
+)
+def test_mistakes_get_one_sentence(trained, tmp_path, capsys, options, sentence):
+    (tmp_path / "file").write_text("")
+    arguments = [option.format(file=tmp_path / "file") for option in options]
+    with pytest.raises(SystemExit) as stopped:
+        main(["export", "--load-config", str(trained), *arguments])
+    assert stopped.value.code == 2
+    assert sentence in capsys.readouterr().out
+    assert not (trained.parent / "exports").exists()
+
+
+def test_a_base_without_classes_is_refused(tmp_path, capsys):
+    config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"), assigned=False)
+    with pytest.raises(SystemExit):
+        main(["export", "--load-config", str(config), "--all"])
+    assert "is a base without classes: refine it first" in capsys.readouterr().out
