@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +14,7 @@ from rich.markup import escape
 from beags_plugin.bench.commands import Measurement
 from beags_plugin.errors import UserError
 from beags_plugin.evaluation.protocol import Protocol
+from beags_plugin.export.mesh_options import MeshOptions
 
 CONSOLE = Console(soft_wrap=True, highlight=False)
 
@@ -99,19 +100,21 @@ class Export:
     all: bool = False
     """Every object, the emptied background, and a manifest.json."""
     format: tuple[str, ...] = ("ply",)
-    """What to write: ply (viewers of 3D Gaussians), ply-2dgs (the official 2DGS code), or another exporter's name."""
+    """ply (viewers of 3D Gaussians), ply-2dgs (the official 2DGS code), glb or obj (meshes), or another exporter."""
     frame: str = "world"
     """world, that of the input poses; or object, the same with the middle of the object's box as origin."""
     output: Path | None = None
     """Folder for the files; exports/ beside config.yml if left out."""
+    mesh: tyro.conf.OmitArgPrefixes[MeshOptions] = MeshOptions()
 
     def run(self) -> None:
         from beags_plugin.plugin.export import export_run
         from beags_plugin.progress import progress_bar
 
+        options = {name: asdict(self.mesh) for name in ("glb", "obj")}
         with progress_bar("exporting") as progress:
             exported = export_run(
-                self.load_config, self.object, self.all, self.format, self.frame, self.output, progress=progress
+                self.load_config, self.object, self.all, self.format, self.frame, self.output, options, progress
             )
         for one in exported:
             CONSOLE.print(f"{one.name}: {one.gaussians} Gaussians", markup=False)

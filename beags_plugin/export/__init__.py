@@ -8,5 +8,7 @@ EXPORTERS = Registry(
     {
         "ply": "beags_plugin.export.splats:PlyExporter",
         "ply-2dgs": "beags_plugin.export.splats:SurfelPlyExporter",
+        "glb": "beags_plugin.export.mesh:GlbExporter",
+        "obj": "beags_plugin.export.mesh:ObjExporter",
     },
 )

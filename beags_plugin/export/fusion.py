@@ -1,0 +1,175 @@
+"""A surface from an object's own depth: truncated signed distances of many views, averaged in a sparse voxel grid.
+
+The fusing is Open3D's (``VoxelBlockGrid``); what is here chooses the voxels and draws the views.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.lifting import lift
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.export.base import Viewpoints
+from beags_plugin.export.frames import bounding_box
+from beags_plugin.export.zoom import close_up
+from beags_plugin.rasterizers.drawing import surfel_inputs
+
+if TYPE_CHECKING:
+    from open3d.t.geometry import VoxelBlockGrid
+
+BLOCK = 16
+"""Voxels along a side of the blocks that Open3D allocates as a whole."""
+_VOXEL_BYTES = 20  # distance, weight and three colours, float32 each
+_SOLID = 0.5  # the median depth exists where more light than this is stopped
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles with a colour per vertex.
+
+    vertices: [V, 3] float64, world units. faces: [F, 3] int64, counter-clockwise from outside.
+    colors: [V, 3] float32, 0..1, as in the photos (sRGB). voxel: side of the voxels it was made of, world units.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colors: np.ndarray
+    voxel: float
+
+
+def voxel_size(low: Tensor, high: Tensor, resolution: int, truncation: float, memory_mb: float) -> float:
+    """The longest side of a box in ``resolution`` parts, or more where its grid might need more than ``memory_mb``.
+
+    The bound counts every block that the box and the truncation around it touch, as if all were filled; a surface
+    fills a small part of them. low, high: [3], world units. Returns world units.
+    """
+    sides = (high - low).double()
+    voxel = float(sides.max()) / resolution
+    while _grid_mb(sides, voxel, truncation) > memory_mb:
+        voxel *= 1.05
+    return voxel
+
+
+def _grid_mb(sides: Tensor, voxel: float, truncation: float) -> float:
+    # Two more blocks: the box starts and ends anywhere in one.
+    blocks = math.prod(math.ceil(float(side) / voxel / BLOCK + 2 * truncation / BLOCK) + 2 for side in sides)
+    return blocks * BLOCK**3 * _VOXEL_BYTES / 1e6
+
+
+@torch.no_grad()
+def fuse(
+    surfels: Surfels, views: Viewpoints, resolution: int, truncation: float, memory_mb: float, min_views: int
+) -> Mesh:
+    """The surface that at least ``min_views`` of the views show of an object drawn alone.
+
+    surfels: N surfels, in the frame of the views. resolution: voxels along the longest side of their box, and pixels
+    of each drawing, which is a close-up of the box. truncation: voxels on either side of the surface that a view
+    changes. memory_mb: bound of the grid, 10^6 bytes. Returns a mesh, maybe of no face, vertices and faces in an order
+    that does not depend on the number of threads.
+    """
+    low, high = bounding_box(surfels)
+    voxel = voxel_size(low, high, resolution, truncation, memory_mb)
+    grid = _new_grid()
+    for camera in views.cameras:
+        close = close_up(camera, low, high, views.settings.near, resolution)
+        depth, color = _draw(surfels, close, views, low - truncation * voxel, high + truncation * voxel)
+        if bool((depth > 0).any()):
+            _integrate(grid, depth / voxel, color, _in_voxels(close, low, voxel), truncation)
+    weight = min(min_views, len(views.cameras)) - 0.5
+    mesh = grid.extract_triangle_mesh(weight_threshold=weight)
+    if "positions" not in mesh.vertex or not len(mesh.vertex.positions):
+        return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32), voxel)
+    vertices = mesh.vertex.positions.numpy().astype(np.float64) * voxel + low.numpy()
+    colors = np.clip(mesh.vertex.colors.numpy(), 0.0, 1.0)
+    return sorted_mesh(Mesh(vertices, mesh.triangle.indices.numpy().astype(np.int64), colors, voxel))
+
+
+def _new_grid() -> VoxelBlockGrid:
+    import open3d
+
+    core = open3d.core
+    return open3d.t.geometry.VoxelBlockGrid(
+        attr_names=("tsdf", "weight", "color"),
+        attr_dtypes=(core.float32, core.float32, core.float32),
+        attr_channels=((1), (1), (3)),
+        voxel_size=1.0,  # lengths are counted in voxels: the scale of a scene changes nothing
+        block_resolution=BLOCK,
+        block_count=256,  # it grows
+        device=core.Device("CPU:0"),
+    )
+
+
+def _draw(surfels: Surfels, camera: Camera, views: Viewpoints, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """Median depth [H, W], 0 where nothing solid is or outside of the box low, high; and the colour [H, W, 3] there."""
+    black = torch.zeros(3, dtype=surfels.means.dtype)
+    drawn = views.rasterizer.rasterize(surfel_inputs(surfels, camera), camera, views.settings, black)
+    assert drawn.median_depth is not None  # geometry is on unless the settings turn it off
+    points = lift(drawn.median_depth, camera)
+    inside = ((points >= low) & (points <= high)).all(dim=-1) & (drawn.alpha > _SOLID)
+    depth = torch.where(inside, drawn.median_depth, 0.0)
+    # without the black that shines through
+    return depth, (drawn.color / drawn.alpha.clamp(min=_SOLID)[..., None]).clamp(0.0, 1.0)
+
+
+def _in_voxels(camera: Camera, low: Tensor, voxel: float) -> tuple[np.ndarray, np.ndarray]:
+    """(K [3, 3], viewmat [4, 4]) float64 of a camera in a world whose origin is ``low`` and whose unit is ``voxel``.
+
+    Open3D has pixel centres at whole numbers.
+    """
+    K, viewmat = camera.K.double().numpy().copy(), camera.viewmat.double().numpy().copy()
+    K[:2, 2] -= 0.5
+    viewmat[:3, 3] = (viewmat[:3, 3] + viewmat[:3, :3] @ low.numpy()) / voxel
+    return K, viewmat
+
+
+def _integrate(
+    grid: VoxelBlockGrid, depth: Tensor, color: Tensor, pose: tuple[np.ndarray, np.ndarray], truncation: float
+) -> None:
+    import open3d
+
+    K, viewmat = (open3d.core.Tensor(matrix) for matrix in pose)
+    depth_image = open3d.t.geometry.Image(open3d.core.Tensor(depth.float().contiguous().numpy()))
+    color_image = open3d.t.geometry.Image(open3d.core.Tensor(color.float().contiguous().numpy()))
+    limit = float(depth.max()) + 1.0
+    blocks = grid.compute_unique_block_coordinates(depth_image, K, viewmat, 1.0, limit, float(truncation))
+    grid.integrate(blocks, depth_image, color_image, K, viewmat, 1.0, limit, float(truncation))
+
+
+def sorted_mesh(mesh: Mesh) -> Mesh:
+    """The same mesh, its vertices in the order of their places and its faces in that of their vertices.
+
+    Determinism: Open3D's threads number both as they come.
+    """
+    order = np.lexsort(mesh.vertices.T[::-1])
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    faces = rank[mesh.faces]
+    first = faces.argmin(axis=1)  # turned so that the lowest comes first, which keeps the side
+    faces = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
+    return Mesh(mesh.vertices[order], faces[np.lexsort(faces.T[::-1])], mesh.colors[order], mesh.voxel)
+
+
+def without_small_parts(mesh: Mesh, share: float) -> Mesh:
+    """The mesh without connected parts of fewer faces than ``share`` of the largest one's."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    if not len(mesh.faces):
+        return mesh
+    edges: Sequence[np.ndarray] = (mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]])
+    rows, columns = np.concatenate(edges).T
+    count = len(mesh.vertices)
+    _, part = connected_components(coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(count, count)), False)
+    sizes = np.bincount(part[mesh.faces[:, 0]], minlength=part.max() + 1)
+    kept = (sizes >= max(1.0, share * sizes.max()))[part]  # a vertex without faces goes too
+    number = np.cumsum(kept) - 1
+    faces = mesh.faces[kept[mesh.faces[:, 0]]]
+    return Mesh(mesh.vertices[kept], number[faces], mesh.colors[kept], mesh.voxel)

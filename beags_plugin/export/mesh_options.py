@@ -1,0 +1,37 @@
+"""Options of the mesh exporters, on their own so that the command line can show them without loading anything."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from beags_plugin.errors import UserError
+
+
+@dataclass(frozen=True)
+class MeshOptions:
+    """How a mesh is made of the depth that the training views see."""
+
+    resolution: int = 128
+    """Meshes: voxels along the object's longest side."""
+    truncation: float = 6.0
+    """Meshes: voxels on either side of a surface that are averaged; more bridges depths that disagree, but the two
+    sides of a wall thinner than twice as many draw together."""
+    memory_mb: float = 500.0
+    """Meshes: bound of the voxel grid in MB; voxels grow to keep it."""
+    min_views: int = 3
+    """Meshes: views that must show a surface (all, if there are fewer)."""
+    smallest_part: float = 0.01
+    """Meshes: loose parts with fewer faces than this share of the largest part's are left out."""
+
+    def __post_init__(self) -> None:
+        if self.resolution < 8:
+            raise UserError(f"resolution is {self.resolution}: a mesh needs at least 8 voxels along its longest side.")
+        if not 1.0 <= self.truncation <= 64.0:
+            raise UserError(f"truncation is {self.truncation}: it must lie in 1..64 voxels.")
+        if not (self.memory_mb >= 50.0 and math.isfinite(self.memory_mb)):
+            raise UserError(f"memory_mb is {self.memory_mb}: give the voxel grid at least 50 MB.")
+        if self.min_views < 1:
+            raise UserError(f"min_views is {self.min_views}: a surface needs at least 1 view.")
+        if not 0.0 <= self.smallest_part <= 1.0:
+            raise UserError(f"smallest_part is {self.smallest_part}: it must lie in 0..1.")

@@ -1,0 +1,271 @@
+"""Meshes of objects: against the sample's exact surfaces, and read back by other programs' readers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+open3d = pytest.importorskip("open3d")
+trimesh = pytest.importorskip("trimesh")
+
+from scipy.spatial import cKDTree
+
+from beags_plugin.core.cameras import Camera, viewmat_from_opengl
+from beags_plugin.core.lifting import pixel_rays, project
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.errors import UserError
+from beags_plugin.export.base import NothingToExport, Piece, Viewpoints, make_exporter
+from beags_plugin.export.frames import bounding_box
+from beags_plugin.export.fusion import Mesh, _grid_mb, sorted_mesh, voxel_size, without_small_parts
+from beags_plugin.export.glb import linear_from_srgb
+from beags_plugin.export.mesh import GlbExporter
+from beags_plugin.export.mesh_options import MeshOptions
+from beags_plugin.export.zoom import close_up
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.interface import RasterSettings
+from beags_plugin.sample.arrangement import Thing, make_still
+from beags_plugin.sample.views import make_views
+
+OPTIONS = {"resolution": 96, "truncation": 4.0}  # the cup's wall is 9 voxels thick: its two sides stay apart
+C0 = 0.28209479177387814
+
+
+def cameras(count: int = 24) -> list[Camera]:
+    views = make_views(2, 64, 48, count, 1)
+    return [
+        Camera(
+            viewmat_from_opengl(torch.from_numpy(view.camera_to_world)).float(),
+            torch.tensor([[view.focal, 0, view.cx], [0, view.focal, view.cy], [0, 0, 1]]).float(),
+            view.width,
+            view.height,
+        )
+        for view in views
+        if view.split == "train"
+    ]
+
+
+def hits(thing: Thing, camera: Camera) -> np.ndarray:
+    """World points of the thing's surface under the pixels of a view, [P, 3]; computed by ray casting."""
+    rays = pixel_rays(camera, torch.zeros(1, dtype=torch.float64)).reshape(-1, 3).numpy()
+    directions = rays @ camera.rotation.double().numpy()
+    origin = camera.center.double().numpy()[None]
+    t = thing.solid.first_hit(np.repeat(thing.to_local(origin), len(rays), axis=0), directions @ thing.rotation)
+    return origin + directions[np.isfinite(t)] * t[np.isfinite(t), None]
+
+
+def color_at(points: np.ndarray) -> np.ndarray:
+    """A colour for each place, sRGB 0..1."""
+    return 0.5 + 0.35 * np.sin(7.0 * points + np.array([0.0, 1.0, 2.0]))
+
+
+@pytest.fixture(scope="module")
+def thing() -> Thing:
+    return next(thing for thing in make_still(1).things if thing.name == "cup")
+
+
+@pytest.fixture(scope="module")
+def piece(thing) -> Piece:
+    """The cup covered with small opaque discs where the views see it."""
+    generator = np.random.default_rng(0)
+    views = cameras()
+    low, high = torch.from_numpy(thing.position - 0.25), torch.from_numpy(thing.position + 0.25)
+    points = np.concatenate([hits(thing, close_up(camera, low, high, 0.05, 96)) for camera in views])
+    points = points[generator.permutation(len(points))[:25_000]]
+    normals = thing.solid.normals(thing.to_local(points)) @ thing.rotation.T
+    # the rotation that takes z to the normal: half way between them, turned by 180 degrees
+    half = torch.nn.functional.normalize(torch.from_numpy(normals) + torch.tensor([1e-6, 0.0, 1.0]), dim=1)
+    count = len(points)
+    surfels = Surfels.of(
+        torch.from_numpy(points).float(),
+        torch.cat([torch.zeros(count, 1), half.float()], dim=1),
+        torch.full((count, 2), float(np.log(0.004))),
+        torch.full((count,), 4.0),
+        torch.from_numpy((color_at(points) - 0.5) / C0).float()[:, None],
+    )
+    viewpoints = Viewpoints(views, make_rasterizer("auto"), RasterSettings(0.05, 50.0))
+    return Piece("cup", surfels, torch.ones(count, dtype=torch.int32), viewpoints)
+
+
+@pytest.fixture(scope="module")
+def mesh(piece) -> Mesh:
+    return GlbExporter(**OPTIONS).mesh(piece)
+
+
+def test_vertices_lie_on_the_exact_surface(thing, mesh):
+    assert mesh.voxel == pytest.approx(2 * 0.18 / 96, rel=0.15)
+    distance = np.abs(thing.distance(mesh.vertices))
+    # not all: at sharp edges discs stick out
+    assert np.quantile(distance, 0.95) < mesh.voxel and distance.max() < 4 * mesh.voxel
+    assert np.median(distance) < 0.25 * mesh.voxel
+
+
+def test_the_mesh_covers_what_the_views_see(thing, piece, mesh):
+    tree = cKDTree(mesh.vertices)
+    seen = np.concatenate([hits(thing, camera) for camera in piece.views.cameras[::4]])
+    assert len(seen) > 200
+    assert np.quantile(tree.query(seen)[0], 0.98) < 2 * mesh.voxel
+
+
+def test_faces_look_outwards_and_colours_are_those_of_the_place(thing, mesh):
+    corners = mesh.vertices[mesh.faces]
+    middle = corners.mean(axis=1)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    out = thing.distance(middle + 0.5 * mesh.voxel * normals / np.linalg.norm(normals, axis=1, keepdims=True))
+    assert (out > thing.distance(middle)).mean() > 0.95
+    assert np.abs(mesh.colors - color_at(mesh.vertices)).mean() < 0.02
+
+
+def test_a_glb_is_read_back(piece, mesh, tmp_path):
+    facts = make_exporter("glb", **OPTIONS).write(tmp_path / "cup.glb", piece)
+    assert facts == {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "voxel": mesh.voxel}
+    (read,) = trimesh.load_scene(tmp_path / "cup.glb", process=False).geometry.values()
+    assert np.allclose(read.vertices, mesh.vertices, atol=1e-6) and np.array_equal(read.faces, mesh.faces)
+    other = open3d.io.read_triangle_mesh(str(tmp_path / "cup.glb"))
+    tree = cKDTree(np.asarray(other.vertices))  # this reader may renumber
+    distance, index = tree.query(mesh.vertices)
+    assert distance.max() < 1e-6
+    # glTF's vertex colours are linear
+    colors = np.asarray(other.vertex_colors)[index]
+    assert np.abs(colors - linear_from_srgb(mesh.colors)).max() < 2e-3
+    raw = (tmp_path / "cup.glb").read_bytes()
+    content = json.loads(raw[20 : 20 + int.from_bytes(raw[12:16], "little")])
+    assert "KHR_materials_unlit" in content["materials"][0]["extensions"]
+
+
+def test_an_obj_is_read_back(piece, mesh, tmp_path):
+    make_exporter("obj", **OPTIONS).write(tmp_path / "cup.obj", piece)
+    read = trimesh.load_mesh(tmp_path / "cup.obj", process=False, maintain_order=True)
+    assert np.allclose(read.vertices, mesh.vertices, atol=1e-6) and np.array_equal(read.faces, mesh.faces)
+    assert np.abs(read.visual.vertex_colors[:, :3] / 255.0 - mesh.colors).max() < 3e-3
+
+
+def test_both_file_types_share_one_mesh(piece):
+    assert make_exporter("glb", **OPTIONS).mesh(piece) is make_exporter(
+        "obj", **OPTIONS
+    ).mesh(piece)  # fmt: skip
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_the_scale_of_a_scene_changes_nothing(piece, mesh, scale):
+    surfels, views = piece.surfels, piece.views
+
+    def scaled(camera: Camera) -> Camera:
+        viewmat = camera.viewmat.clone()
+        viewmat[:3, 3] *= scale
+        return replace(camera, viewmat=viewmat)
+
+    large = replace(surfels, means=scale * surfels.means, log_scales=surfels.log_scales + float(np.log(scale)))
+    settings = RasterSettings(scale * views.settings.near, scale * views.settings.far)
+    views = Viewpoints([scaled(camera) for camera in views.cameras], views.rasterizer, settings)
+    other = GlbExporter(**OPTIONS).mesh(replace(piece, surfels=large, views=views, shared={}))
+    assert other.voxel == pytest.approx(scale * mesh.voxel, rel=1e-5)
+    # not bit by bit: a pixel's depth may fall to the neighbouring disc
+    distance, _ = cKDTree(mesh.vertices).query(other.vertices / scale)
+    assert np.quantile(distance, 0.99) < 0.1 * mesh.voxel
+
+
+def test_the_same_mesh_for_any_number_of_threads(piece, mesh):
+    threads = torch.get_num_threads()
+    for count in (1, 4):
+        torch.set_num_threads(count)
+        try:
+            again = GlbExporter(**OPTIONS).mesh(replace(piece, shared={}))
+        finally:
+            torch.set_num_threads(threads)
+        for name in ("vertices", "faces", "colors"):
+            assert np.array_equal(getattr(again, name), getattr(mesh, name)), name
+
+
+def test_the_order_of_vertices_and_faces_is_a_matter_of_their_places():
+    generator = np.random.default_rng(1)
+    vertices, colors = generator.random((9, 3)), generator.random((9, 3)).astype(np.float32)
+    faces = np.array([[0, 1, 2], [2, 1, 3], [4, 5, 6], [8, 7, 0]])
+    order = generator.permutation(9)
+    renumbered = np.argsort(order)[faces][::-1]
+    other = Mesh(vertices[order], np.roll(renumbered, 1, axis=1), colors[order], 0.1)
+    one, two = sorted_mesh(Mesh(vertices, faces, colors, 0.1)), sorted_mesh(other)
+    for name in ("vertices", "faces", "colors"):
+        assert np.array_equal(getattr(one, name), getattr(two, name)), name
+    areas = [np.cross(m.vertices[m.faces[:, 1]] - m.vertices[m.faces[:, 0]],
+                      m.vertices[m.faces[:, 2]] - m.vertices[m.faces[:, 0]]).sum(axis=0)
+             for m in (one, Mesh(vertices, faces, colors, 0.1))]  # fmt: skip
+    assert np.allclose(*areas)  # no face was turned over
+
+
+def test_small_loose_parts_are_left_out():
+    fan = [[0, i, i + 1] for i in range(1, 11)]
+    faces = np.array([*fan, [12, 13, 14]])
+    vertices = np.random.default_rng(2).random((16, 3))  # the last belongs to no face
+    mesh = Mesh(vertices, faces, vertices.astype(np.float32), 0.1)
+    kept = without_small_parts(mesh, 0.2)
+    assert np.array_equal(kept.vertices, vertices[:12]) and np.array_equal(kept.faces, fan)
+    assert np.array_equal(kept.vertices[kept.faces], mesh.vertices[mesh.faces[:10]])
+    both = without_small_parts(mesh, 0.1)
+    assert len(both.vertices) == 15 and np.array_equal(both.vertices[both.faces], mesh.vertices[mesh.faces])
+
+
+def test_voxels_grow_to_keep_the_memory():
+    low, high = torch.zeros(3), torch.tensor([2.0, 1.0, 0.5])
+    assert voxel_size(low, high, 128, 8.0, 1e6) == 2.0 / 128
+    voxel = voxel_size(low, high, 4096, 8.0, 200.0)
+    assert voxel > 2.0 / 4096 and 100 < _grid_mb(high, voxel, 8.0) <= 200
+
+
+def test_the_grid_is_as_small_as_was_said(piece, monkeypatch):
+    """All blocks that Open3D allocates, at 20 bytes a voxel, stay within the bound."""
+    from beags_plugin.export import fusion
+
+    grids = []
+    make = fusion._new_grid
+    monkeypatch.setattr(fusion, "_new_grid", lambda: grids.append(make()) or grids[-1])
+    mesh = GlbExporter(resolution=400, memory_mb=60.0).mesh(replace(piece, shared={}))
+    low, high = bounding_box(piece.surfels)
+    assert mesh.voxel > float((high - low).max()) / 400
+    assert 0 < grids[0].hashmap().size() * 16**3 * 20 / 1e6 < 60.0
+
+
+def test_a_close_up_sees_the_same_larger():
+    camera = cameras()[3]
+    low, high = torch.tensor([0.1, -0.2, 0.0]), torch.tensor([0.4, 0.0, 0.3])
+    close = close_up(camera, low, high, 0.05, 100)
+    assert max(close.width, close.height) == 100
+    corners = torch.cartesian_prod(*torch.stack([low, high], dim=1))
+    xy, _ = project(corners, close)
+    assert xy.min() >= 1.9 and (xy.amax(dim=0) <= torch.tensor([close.width, close.height]) - 1.9).all()
+    before, _ = project(corners, camera)
+    zoom = close.K[0, 0] / camera.K[0, 0]
+    assert torch.allclose(xy[1:] - xy[:1], zoom * (before[1:] - before[:1]), atol=1e-2)
+    inside = close_up(camera, camera.center - 1, camera.center + 1, 0.05, 100)  # the camera is in the box
+    assert (inside.width, inside.height) == (100, 75)
+    assert torch.allclose(inside.K[0, 0], camera.K[0, 0] * 100 / 64)
+
+
+def test_what_no_view_shows_is_said(piece):
+    behind = replace(piece, surfels=replace(piece.surfels, means=piece.surfels.means + 1000.0), shared={})
+    with pytest.raises(NothingToExport, match="no surface of 'cup' is seen in 3 training views"):
+        make_exporter("glb").write(None, behind)
+
+
+def test_without_open3d_one_sentence_says_so(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "open3d", None)
+    with pytest.raises(UserError, match=r"the exporter 'obj' cannot run here: Open3D cannot be loaded .* pip install"):
+        make_exporter("obj")
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"resolution": 4}, "resolution is 4: a mesh needs at least 8 voxels"),
+        ({"truncation": 0.5}, "truncation is 0.5: it must lie in 1..64"),
+        ({"memory_mb": 1.0}, "memory_mb is 1.0: give the voxel grid at least 50 MB"),
+        ({"min_views": 0}, "min_views is 0: a surface needs at least 1 view"),
+        ({"smallest_part": float("nan")}, "smallest_part is nan: it must lie in 0..1"),
+    ],
+)
+def test_wrong_options(options, sentence):
+    with pytest.raises(UserError, match=sentence):
+        MeshOptions(**options)
