@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
 BLOCK = 16
 """Voxels along a side of the blocks that Open3D allocates as a whole."""
+PIXELS_PER_VOXEL = 2
+"""Of the drawings: discs smaller than a pixel are drawn a pixel wide at the depth of their middle, which on slanted
+surfaces comes out too near."""
 _VOXEL_BYTES = 20  # distance, weight and three colours, float32 each
 _SOLID = 0.5  # the median depth exists where more light than this is stopped
 
@@ -70,8 +73,8 @@ def fuse(
 ) -> Mesh:
     """The surface that at least ``min_views`` of the views show of an object drawn alone.
 
-    surfels: N surfels, in the frame of the views. resolution: voxels along the longest side of their box, and pixels
-    of each drawing, which is a close-up of the box. truncation: voxels on either side of the surface that a view
+    surfels: N surfels, in the frame of the views. resolution: voxels along the longest side of their box; the
+    drawings are close-ups of the box, ``PIXELS_PER_VOXEL`` times as many pixels long. truncation: voxels on either side of the surface that a view
     changes. memory_mb: bound of the grid, 10^6 bytes. Returns a mesh, maybe of no face, vertices and faces in an order
     that does not depend on the number of threads.
     """
@@ -79,7 +82,7 @@ def fuse(
     voxel = voxel_size(low, high, resolution, truncation, memory_mb)
     grid = _new_grid()
     for camera in views.cameras:
-        close = close_up(camera, low, high, views.settings.near, resolution)
+        close = close_up(camera, low, high, views.settings.near, PIXELS_PER_VOXEL * resolution)
         depth, color = _draw(surfels, close, views, low - truncation * voxel, high + truncation * voxel)
         if bool((depth > 0).any()):
             _integrate(grid, depth / voxel, color, _in_voxels(close, low, voxel), truncation)
