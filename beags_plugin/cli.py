@@ -100,7 +100,7 @@ class Export:
     all: bool = False
     """Every object, the emptied background, and a manifest.json."""
     format: tuple[str, ...] = ("ply",)
-    """ply (viewers of 3D Gaussians), ply-2dgs (the official 2DGS code), glb or obj (meshes), or another exporter."""
+    """ply (viewers of 3D Gaussians), ply-2dgs (the official 2DGS code), spz (small), glb, obj (meshes), or your own."""
     frame: str = "world"
     """world, that of the input poses; or object, the same with the middle of the object's box as origin."""
     output: Path | None = None

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -17,8 +20,10 @@ pytest.importorskip("nerfstudio")
 from beags_plugin.cli import main
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.export.base import Piece, Viewpoints, make_exporter
+from beags_plugin.export import EXPORTERS
+from beags_plugin.export.base import Exporter, Piece, Viewpoints, make_exporter
 from beags_plugin.export.frames import Frame, bounding_box
+from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.ply import read_ply
 from beags_plugin.extraction.select import select_class
 from beags_plugin.rasterizers import make_rasterizer
@@ -170,6 +175,65 @@ def test_all_writes_every_object_the_background_and_a_manifest(trained, tmp_path
             # the manifest's matrix leads back to the run
             expected = surfels.means[ids == one["class_id"]].numpy()
             assert np.allclose((there @ np.array(one["to_run"]).T)[:, :3], expected, atol=1e-5)
+
+
+def test_meshes_of_a_run_lie_where_its_discs_are(trained, tmp_path, monkeypatch):
+    """In the input's frame, from the run's own views; the manifest tells what was left out, and why."""
+    trimesh = pytest.importorskip("trimesh")
+    pytest.importorskip("open3d")
+    arguments = ["export", "--load-config", str(trained), "--format", "glb", "--resolution", "64", "--output"]
+    main([*arguments, str(tmp_path), "--all"])
+    surfels, ids = discs()
+    place = world_frame(trained)
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    for one in manifest["objects"]:
+        (file,) = one["files"]
+        vertices = trimesh.load_mesh(tmp_path / file["path"], process=False).vertices
+        assert len(vertices) == file["vertices"] > 100
+        there = place.surfels(surfels[ids == one["class_id"]])
+        distances = torch.cdist(torch.from_numpy(np.array(vertices)).float(), there.means)
+        radius = 3.0 * float(there.log_scales.exp().max())
+        assert float((distances.min(dim=1).values < radius).float().mean()) > 0.99
+
+    from beags_plugin.export import fusion
+
+    empty = fusion.Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32), 0.1)
+    monkeypatch.setattr("beags_plugin.export.mesh.fuse", lambda *_: empty)
+    main([*arguments, str(tmp_path / "none"), "--all"])
+    manifest = json.loads((tmp_path / "none/manifest.json").read_text())
+    assert [path.name for path in (tmp_path / "none").iterdir()] == ["manifest.json"]
+    assert all("is seen in 3 training views" in one["left_out"][0]["reason"] for one in manifest["objects"])
+    with pytest.raises(SystemExit):  # named alone it is a mistake
+        main([*arguments, str(tmp_path / "none"), "--object", "cup"])
+
+
+def test_meshes_need_the_data(tmp_path, capsys):
+    pytest.importorskip("open3d")
+    config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"))
+    (tmp_path / "lab").rename(tmp_path / "away")
+    with pytest.raises(SystemExit):
+        main(["export", "--load-config", str(config), "--all", "--format", "obj"])
+    assert "lab, which is gone: put it back." in capsys.readouterr().out
+    main(["export", "--load-config", str(config), "--all", "--format", "spz"])  # splats do not
+    assert len(list((config.parent / "exports").glob("*.spz"))) == 3
+
+
+def test_an_exporter_of_another_package(trained, tmp_path, monkeypatch):
+    """As docs/extending.md shows it."""
+    monkeypatch.setitem(EXPORTERS._specs, "xyz", "test_export:PointsExporter")
+    main(["export", "--load-config", str(trained), "--object", "cup", "--format", "xyz", "--output", str(tmp_path)])
+    assert np.loadtxt(tmp_path / "cup.xyz").shape == (25, 3)
+
+
+@dataclass(frozen=True)
+class PointsExporter(Exporter):
+    suffix: ClassVar[str] = "xyz"
+    digits: int = 6
+
+    def write(self, path: Path, piece: Piece) -> dict[str, Any]:
+        with whole_file(path) as part, open(part, "w") as file:
+            np.savetxt(file, piece.surfels.means.numpy(), f"%.{self.digits}g")
+        return {"points": len(piece.surfels)}
 
 
 def test_extract_and_export_write_the_same_ply(trained, tmp_path):

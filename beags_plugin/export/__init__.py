@@ -8,6 +8,7 @@ EXPORTERS = Registry(
     {
         "ply": "beags_plugin.export.splats:PlyExporter",
         "ply-2dgs": "beags_plugin.export.splats:SurfelPlyExporter",
+        "spz": "beags_plugin.export.spz:SpzExporter",
         "glb": "beags_plugin.export.mesh:GlbExporter",
         "obj": "beags_plugin.export.mesh:ObjExporter",
     },

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,9 +21,6 @@ from beags_plugin.export.base import Viewpoints
 from beags_plugin.export.frames import bounding_box
 from beags_plugin.export.zoom import close_up
 from beags_plugin.rasterizers.drawing import surfel_inputs
-
-if TYPE_CHECKING:
-    from open3d.t.geometry import VoxelBlockGrid
 
 BLOCK = 16
 """Voxels along a side of the blocks that Open3D allocates as a whole."""
@@ -73,10 +70,10 @@ def fuse(
 ) -> Mesh:
     """The surface that at least ``min_views`` of the views show of an object drawn alone.
 
-    surfels: N surfels, in the frame of the views. resolution: voxels along the longest side of their box; the
-    drawings are close-ups of the box, ``PIXELS_PER_VOXEL`` times as many pixels long. truncation: voxels on either side of the surface that a view
-    changes. memory_mb: bound of the grid, 10^6 bytes. Returns a mesh, maybe of no face, vertices and faces in an order
-    that does not depend on the number of threads.
+    surfels: N surfels, in the frame of the views. resolution: voxels along the longest side of their box; the drawings
+    are close-ups of the box, ``PIXELS_PER_VOXEL`` times as many pixels long. truncation: voxels on either side of the
+    surface that a view changes. memory_mb: bound of the grid, 10^6 bytes. Returns a mesh, maybe of no face, vertices
+    and faces in an order that does not depend on the number of threads.
     """
     low, high = bounding_box(surfels)
     voxel = voxel_size(low, high, resolution, truncation, memory_mb)
@@ -95,7 +92,8 @@ def fuse(
     return sorted_mesh(Mesh(vertices, mesh.triangle.indices.numpy().astype(np.int64), colors, voxel))
 
 
-def _new_grid() -> VoxelBlockGrid:
+def _new_grid() -> Any:
+    """An empty ``VoxelBlockGrid`` of Open3D, whose unit is a voxel."""
     import open3d
 
     core = open3d.core
@@ -103,7 +101,7 @@ def _new_grid() -> VoxelBlockGrid:
         attr_names=("tsdf", "weight", "color"),
         attr_dtypes=(core.float32, core.float32, core.float32),
         attr_channels=((1), (1), (3)),
-        voxel_size=1.0,  # lengths are counted in voxels: the scale of a scene changes nothing
+        voxel_size=1.0,  # so that the scale of a scene changes nothing
         block_resolution=BLOCK,
         block_count=256,  # it grows
         device=core.Device("CPU:0"),
@@ -133,9 +131,7 @@ def _in_voxels(camera: Camera, low: Tensor, voxel: float) -> tuple[np.ndarray, n
     return K, viewmat
 
 
-def _integrate(
-    grid: VoxelBlockGrid, depth: Tensor, color: Tensor, pose: tuple[np.ndarray, np.ndarray], truncation: float
-) -> None:
+def _integrate(grid: Any, depth: Tensor, color: Tensor, pose: tuple[np.ndarray, np.ndarray], truncation: float) -> None:
     import open3d
 
     K, viewmat = (open3d.core.Tensor(matrix) for matrix in pose)
