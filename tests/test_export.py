@@ -91,21 +91,27 @@ def test_a_camera_moves_with_the_frame():
     )
 
 
-def test_the_box_holds_the_discs_but_not_a_stray_one():
-    count = 4000
+@pytest.mark.parametrize("count", [60, 4000])
+def test_the_box_holds_the_discs_and_a_thin_part_but_not_a_stray(count):
+    generator = torch.Generator().manual_seed(count)
+    corners = torch.cartesian_prod(*3 * [torch.tensor([0.0, 1.0])])
+    cube = torch.cat([corners, torch.rand(count - 8, 3, generator=generator)])
     surfels = Surfels.of(
-        torch.cat([torch.rand(count - 1, 3), torch.tensor([[50.0, 0.0, 0.0]])]),
-        torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
-        torch.tensor([[math.log(0.2), math.log(0.1)]]).repeat(count, 1),
-        torch.zeros(count),
-        torch.zeros(count, 1, 3),
+        torch.cat([cube, torch.tensor([[1.4, 0.5, 0.5], [50.0, 0.0, 0.0]])]),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count + 2, 1),
+        torch.tensor([[math.log(0.2), math.log(0.1)]]).repeat(count + 2, 1),
+        torch.zeros(count + 2),
+        torch.zeros(count + 2, 1, 3),
     )
-    low, high = bounding_box(surfels)
     # discs in the xy plane: they reach 0.2 along x, 0.1 along y, nothing along z
-    assert low.tolist() == pytest.approx([-0.2, -0.1, 0.0], abs=0.02)
-    assert high.tolist() == pytest.approx([1.2, 1.1, 1.0], abs=0.02)
-    surfels.means[5] = math.nan
-    assert bounding_box(surfels)[1].tolist() == pytest.approx([1.2, 1.1, 1.0], abs=0.02)
+    for broken in (False, True):
+        low, high = bounding_box(surfels)
+        assert low.tolist() == pytest.approx([-0.2, -0.1, 0.0], abs=1e-6)
+        assert high.tolist() == pytest.approx([1.6, 1.1, 1.0], abs=1e-6)
+        if not broken:
+            surfels.means[count // 2, 1] = math.nan
+    low, high = bounding_box(surfels[:1])
+    assert low.tolist() == pytest.approx([-0.2, -0.1, 0.0]) and high.tolist() == pytest.approx([0.2, 0.1, 0.0])
     assert bounding_box(surfels[:0])[0].tolist() == [0.0, 0.0, 0.0]
 
 

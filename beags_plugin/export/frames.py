@@ -17,7 +17,8 @@ from beags_plugin.export.base import Viewpoints
 from beags_plugin.extraction.frames import to_input_frame
 
 Placement = Literal["world", "object"]
-_OUTLIERS = 1e-3  # share of the surfels that a box may leave out at each side: a stray one must not set the scale
+_BULK = 0.01  # share of the surfels at each side that say nothing of how large the thing is: some are strays
+_FENCE = 0.5  # how far beyond the bulk, as a share of its longest side, thin parts are looked for
 
 
 @dataclass(frozen=True)
@@ -71,10 +72,10 @@ def check_placement(placement: str) -> None:
 
 
 def bounding_box(surfels: Surfels) -> tuple[Tensor, Tensor]:
-    """The box about the ellipses of one standard deviation of N surfels, but for a few stray ones.
+    """The box about the ellipses of one standard deviation of N surfels, but for strays far from all others.
 
-    Surfels that are not finite are left out; the box of none is the origin. Returns (low [3], high [3]) float64, in
-    the surfels' frame.
+    It reaches at most half the bulk's longest side beyond the bulk, which is all but 1 % at each side. Surfels that are
+    not finite are left out; the box of none is the origin. Returns (low [3], high [3]) float64, in the surfels' frame.
     """
     axes = rotation_from_quat(surfels.quats.detach().double())[:, :, :2]
     # a disc's reach along a world axis: the length of its two half-axes' components there
@@ -85,8 +86,11 @@ def bounding_box(surfels: Surfels) -> tuple[Tensor, Tensor]:
     if not finite.any():
         return torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
     low, high = low[finite], high[finite]
-    # an actual value, not one between two: "lower" drops nothing of fewer than 1 / _OUTLIERS surfels
+    bulk_low, bulk_high = np.quantile(low, _BULK, axis=0), np.quantile(high, 1.0 - _BULK, axis=0)
+    fence = _FENCE * (bulk_high - bulk_low).max()
+    middle = (low + high) / 2
+    near = ((middle >= bulk_low - fence) & (middle <= bulk_high + fence)).all(axis=1)
     return (
-        torch.from_numpy(np.quantile(low, _OUTLIERS, axis=0, method="lower")),
-        torch.from_numpy(np.quantile(high, 1.0 - _OUTLIERS, axis=0, method="higher")),
+        torch.from_numpy(np.maximum(low[near].min(axis=0), bulk_low - fence)),
+        torch.from_numpy(np.minimum(high[near].max(axis=0), bulk_high + fence)),
     )

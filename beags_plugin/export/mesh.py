@@ -25,7 +25,7 @@ class MeshExporter(MeshOptions, Exporter):
     def unavailable(cls) -> str | None:
         try:
             import open3d  # noqa: F401
-        except ImportError as error:
+        except (ImportError, OSError) as error:  # a system library that it needs may be missing
             return f"Open3D cannot be loaded ({error}); pip install open3d, which needs libX11 and libGL."
         return None
 
