@@ -150,6 +150,22 @@ def test_nerfstudio_commands_work_on_an_extracted_run(extracted, tmp_path):
     assert len(list((tmp_path / "render").rglob("*.jpg"))) == 3
 
 
+def test_export_writes_every_object_and_the_background(trained, tmp_path):
+    folder, _ = trained
+    code, text = run(
+        "beags", "export", "--load-config", folder / "config.yml", "--all", "--format", "ply", "ply-2dgs", "spz", "glb",
+        "--resolution", 48, "--output", tmp_path,
+    )  # fmt: skip
+    assert code == 0, text[-3000:]
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    assert len(manifest["objects"]) >= 6 and manifest["frame"] == "world"
+    for one in manifest["objects"]:
+        written = {file["format"]: file for file in one["files"]}
+        assert {"ply", "ply-2dgs", "spz"} <= set(written) and all((tmp_path / f["path"]).exists() for f in one["files"])
+        assert len(plyfile.PlyData.read(str(tmp_path / written["ply"]["path"]))["vertex"]) == one["gaussians"]
+    assert sum(file["format"] == "glb" for one in manifest["objects"] for file in one["files"]) >= 3
+
+
 def test_removing_an_object_keeps_the_rest(trained):
     from beags_plugin.plugin.extract import extract_objects, load_scene
 

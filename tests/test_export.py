@@ -166,7 +166,7 @@ def test_all_writes_every_object_the_background_and_a_manifest(trained, tmp_path
           "--output", str(tmp_path / "out")])  # fmt: skip
     folder = tmp_path / "out"
     manifest = json.loads((folder / "manifest.json").read_text())
-    assert manifest["run"] == str(trained) and manifest["frame"] == "object"
+    assert manifest["run"] == str(trained) and (manifest["frame"], manifest["world"]) == ("object", "input")
     assert [(one["name"], one["class_id"]) for one in manifest["objects"]] == [(n, i) for i, n in CLASSES.items()]
     files = {file["path"] for one in manifest["objects"] for file in one["files"]}
     assert files == {path.name for path in folder.iterdir()} - {"manifest.json"} and len(files) == 6

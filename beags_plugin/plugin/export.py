@@ -119,7 +119,8 @@ def export_run(
     if progress:
         progress(total, total)
     if everything:
-        _write_manifest(folder, config_path, placement if transform or placement == "object" else "run", exported)
+        world = "run" if transform is None else "input"
+        _write_manifest(folder, {"run": str(config_path.absolute()), "frame": placement, "world": world}, exported)
     return exported
 
 
@@ -185,11 +186,7 @@ def _viewpoints(scene: SavedScene, config_path: Path) -> Viewpoints:
     )
 
 
-def _write_manifest(folder: Path, config_path: Path, frame: str, exported: Sequence[Exported]) -> None:
-    content = {
-        "run": str(config_path.absolute()),
-        "frame": frame,
-        "objects": [one.to_json(folder) for one in exported],
-    }
+def _write_manifest(folder: Path, origin: dict[str, str], exported: Sequence[Exported]) -> None:
+    content = {**origin, "objects": [one.to_json(folder) for one in exported]}
     with whole_file(folder / MANIFEST) as part:
         part.write_text(json.dumps(content, indent=2), "utf8")
