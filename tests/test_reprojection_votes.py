@@ -106,7 +106,7 @@ def _read(point, step, label, votes):
     """The label and the confidence of one pixel, and whether it was read before and behind its point."""
     poll, agreed = _poll(point, votes)
     if not agreed:
-        for k in (-2, -1, 1, 2):
+        for k in (-2, 2):
             for other, n in _poll([p + k * s for p, s in zip(point, step, strict=True)], votes)[0].items():
                 poll[other] = poll.get(other, 0) + n
     leaders = [other for other, n in poll.items() if n and n == max(poll.values())]

@@ -32,7 +32,7 @@ def reproject_voxel(
     the voxel that holds its lifted point; voxels are ``VOXEL_PIXELS`` pixels wide at the median depth of the objects.
     It reads the votes of the eight voxels about its point, each weighted by how near it is (trilinear), so that it does
     not matter where the borders of the voxels lie. Unless one class has more than half of the votes of each, it reads
-    them one and two voxels before and behind its point along its ray too: an error of its own depth then does less harm.
+    them two voxels before and two behind its point along its ray too: an error of its own depth then does less harm.
     The confidence is the label's share of the votes in the voxel of the point, or of those read if that has none.
     The points are lifted from what each view sees, so no vote passes through a surface, and ``tau`` is not used.
     Cost O(V pixels), memory linear in the voxels; neither depends on the number of classes.

@@ -9,7 +9,7 @@ namespace ops {
 namespace {
 
 constexpr int32_t kParts = 64;  // of a voxel, in interpolation weights
-constexpr int kLooks = 2;       // voxels before and behind a point along its ray, where votes disagree
+constexpr int kLook = 2;        // voxels before and behind a point along its ray, where votes disagree
 
 }  // namespace
 
@@ -102,9 +102,7 @@ class VoxelVotes::Reader {
     poll_.clear();
     count(place);
     if (leader < 0) {
-      for (int k = -kLooks; k <= kLooks; ++k) {
-        if (k == 0) continue;
-        const T step = static_cast<T>(k) * length;
+      for (const T step : {-kLook * length, kLook * length}) {
         T moved[3];
         for (int a = 0; a < 3; ++a) moved[a] = query.point[a] + step * query.ray[a];
         place = about(moved);
