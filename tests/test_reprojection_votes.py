@@ -106,8 +106,8 @@ def _read(point, step, label, votes):
     """The label and the confidence of one pixel, and whether it was read before and behind its point."""
     poll, agreed = _poll(point, votes)
     if not agreed:
-        for sign in (-1, 1):
-            for other, n in _poll([p + sign * s for p, s in zip(point, step, strict=True)], votes)[0].items():
+        for k in (-2, 2):
+            for other, n in _poll([p + k * s for p, s in zip(point, step, strict=True)], votes)[0].items():
                 poll[other] = poll.get(other, 0) + n
     leaders = [other for other, n in poll.items() if n and n == max(poll.values())]
     label = leaders[0] if len(leaders) == 1 else label

@@ -9,8 +9,9 @@ from torch import Tensor
 
 _BITS = 21  # of each of the three voxel indices in a key
 _HALF = 1 << (_BITS - 1)
-_MARGIN = 4  # what is read about a point is in reach too
+_MARGIN = 8  # what is read about a point is in reach too
 _PARTS = 64  # of a voxel, in interpolation weights: whole numbers, whose sums have no order
+LOOKS = (-2, 2)  # voxels before and behind a point along its ray, where votes disagree
 
 
 class TorchVotes:
@@ -55,8 +56,8 @@ class TorchVotes:
         voxels, weights, own = self._about(points)
         open_points = torch.nonzero(~self._agree(voxels))[:, 0]
         polls = [self._poll(torch.arange(len(points), device=points.device), voxels, weights)]
-        for sign in (-1, 1):
-            moved = points[open_points] + sign * steps[open_points]
+        for step in LOOKS:
+            moved = points[open_points] + step * steps[open_points]
             polls.append(self._poll(open_points, *self._about(moved)[:2]))
         label, share = self._count(polls, labels)
         # The pixel's own voxel says how sure its label is, if anybody voted there.

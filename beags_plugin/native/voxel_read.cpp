@@ -9,65 +9,118 @@ namespace ops {
 namespace {
 
 constexpr int32_t kParts = 64;  // of a voxel, in interpolation weights
+constexpr int kLook = 2;        // voxels before and behind a point along its ray, where votes disagree
 
 }  // namespace
 
-// Reads pixels one after the other.
+// Reads the pixels of one tile after the other.
 class VoxelVotes::Reader {
  public:
-  explicit Reader(const VoxelVotes& votes) : votes_(votes), kept_(kKept), nothing_(new Voxel[kCells]()) {}
+  explicit Reader(const VoxelVotes& votes) : votes_(votes), kept_(kKept) {}
+
+  // Sets labels and confidence. What all pixels of a tile will look at is fetched first, so that no pixel waits alone.
+  template <class T>
+  void read(const LiftedView<T>& view, int left, int right, int top, int bottom, int32_t* labels, float* confidence) {
+    Query<T> queries[kTile * kTile];
+    int count = 0;
+    for (int y = top; y < bottom; ++y) {
+      for (int x = left; x < right; ++x) {
+        Query<T>& query = queries[count];
+        query.pixel = static_cast<int64_t>(y) * view.width + x;
+        confidence[query.pixel] = 0.0f;
+        if (!lift(view, x, y, query.point, query.ray)) continue;
+        ++count;
+        locate(query);
+        if (kept_[kept_at(query.key)].key != query.key) votes_.fetch(query.key);
+      }
+    }
+    for (int i = 0; i < count; ++i) {
+      queries[i].brick = find(queries[i].key);
+      __builtin_prefetch(queries[i].brick->agreed + queries[i].eighth);
+      __builtin_prefetch(&queries[i].brick->pure);
+    }
+    int open[kTile * kTile], left_open = 0;
+    for (int i = 0; i < count; ++i) {
+      const Query<T>& query = queries[i];
+      const Brick& at = *query.brick;
+      // More than half of the votes of each voxel are more than half of any weighted sum.
+      if (at.agreed[query.eighth] & at.pure & uint64_t(1) << query.cell) {
+        labels[query.pixel] = at.label;
+        confidence[query.pixel] = 1.0f;
+      } else {
+        open[left_open++] = i;
+        if (at.voxels) __builtin_prefetch(&at.voxels[query.cell]);
+      }
+    }
+    for (int i = 0; i < left_open; ++i) {
+      const Query<T>& query = queries[open[i]];
+      confidence[query.pixel] = answer(query, view.voxel, labels + query.pixel);
+    }
+  }
+
+ private:
+  // A pixel's point, the way along its ray, and the voxel and the eighth of it that hold the point.
+  template <class T>
+  struct Query {
+    T point[3], ray[3];
+    int64_t pixel;
+    uint64_t key;
+    const Brick* brick;
+    int cell, eighth;
+  };
+
+  template <class T>
+  static void locate(Query<T>& query) {
+    int32_t own[3];
+    query.eighth = 0;
+    for (int a = 0; a < 3; ++a) {
+      const int32_t whole = floor_of(query.point[a]);
+      own[a] = whole + kHalf;
+      query.eighth = query.eighth << 1 | (floor_of(query.point[a] - T(0.5)) == whole);
+    }
+    query.key = brick_key(own[0] >> 2, own[1] >> 2, own[2] >> 2);
+    query.cell = cell_of(own[0], own[1], own[2]);
+  }
 
   // The pixel's confidence; sets its label.
   template <class T>
-  float read(const LiftedView<T>& view, int x, int y, int32_t* label) {
-    T point[3], ray[3];
-    if (!lift(view, x, y, point, ray)) return 0.0f;
-    int32_t own[3];
-    for (int a = 0; a < 3; ++a) own[a] = floor_of(point[a]) + kHalf;
-    const Found& near = find(own[0] >> 2, own[1] >> 2, own[2] >> 2);
-    const int cell = cell_of(own[0], own[1], own[2]);
-    // More than half of the votes of each voxel are more than half of any weighted sum.
-    if (near.settled >> cell & 1) {
-      *label = near.label;
-      return near.pure >> cell & 1 ? 1.0f : share_in(near.voxels[cell], near.pairs, near.label);
+  float answer(const Query<T>& query, T length, int32_t* label) {
+    const Brick& at = *query.brick;
+    const int cell = query.cell;
+    if (at.agreed[query.eighth] >> cell & 1) {
+      *label = at.label;
+      return share_in(at.voxels[cell], at.pairs, at.label);
     }
-    const Found at = near;  // what follows asks for others, which may take its place
-    const Voxel& voxel = at.voxels[cell];
-    Place place = about(point);
+    const bool voted = at.voted >> cell & 1;
+    Place place = about(query.point);
     gather(place);
     const int32_t leader = agreed(place);
-    if (leader >= 0 && voxel.votes) {
+    if (leader >= 0 && voted) {
       *label = leader;
-      return share_in(voxel, at.pairs, leader);
+      return share_in(at.voxels[cell], at.pairs, leader);
     }
     poll_.clear();
     count(place);
     if (leader < 0) {
-      for (const T step : {-view.voxel, view.voxel}) {
-        const T moved[3] = {point[0] + step * ray[0], point[1] + step * ray[1], point[2] + step * ray[2]};
+      for (const T step : {-kLook * length, kLook * length}) {
+        T moved[3];
+        for (int a = 0; a < 3; ++a) moved[a] = query.point[a] + step * query.ray[a];
         place = about(moved);
         gather(place);
         count(place);
       }
     }
     const float share = decide(label);
-    return voxel.votes ? share_in(voxel, at.pairs, *label) : share;
+    return voted ? share_in(at.voxels[cell], at.pairs, *label) : share;
   }
 
- private:
   // The eight voxels about a point: from `corner` on; `fraction` of kParts from the middle of the first to the second.
   struct Place {
     int32_t corner[3], fraction[3];
   };
-  struct Found {
-    const Voxel* voxels;
-    const Pair* pairs;
-    int32_t label;
-    uint64_t pure, settled;
-  };
   struct Kept {
     uint64_t key = ~uint64_t(0);
-    Found found{};
+    const Brick* brick = nullptr;
   };
   struct Entry {
     int32_t label;
@@ -97,24 +150,22 @@ class VoxelVotes::Reader {
     for (int32_t x = near[0]; x <= end[0]; ++x) {
       for (int32_t y = near[1]; y <= end[1]; ++y) {
         for (int32_t z = near[2]; z <= end[2]; ++z) {
-          bricks_[(x - near[0]) << 2 | (y - near[1]) << 1 | (z - near[2])] = find(x, y, z);
+          bricks_[(x - near[0]) << 2 | (y - near[1]) << 1 | (z - near[2])] = find(brick_key(x, y, z));
         }
       }
     }
   }
 
-  const Found& find(int32_t x, int32_t y, int32_t z) {
-    const uint64_t key = brick_key(x, y, z);
+  const Brick* find(uint64_t key) {
     Kept& kept = kept_[kept_at(key)];
     if (kept.key != key) {
       const Brick* brick = votes_.find(key);
-      kept = {key, {nothing_.get(), nullptr, 0, 0, 0}};
-      if (brick) kept.found = {brick->voxels.get(), brick->pairs, brick->label, brick->pure, brick->settled};
+      kept = {key, brick ? brick : &nothing_};
     }
-    return kept.found;
+    return kept.brick;
   }
 
-  // do_voxel(brick, voxel, weight) for the eight voxels of gathered bricks.
+  // do_voxel(brick, voxel, weight) for those of the eight voxels of gathered bricks that have votes.
   template <class DoVoxel>
   void each_voxel(const Place& place, DoVoxel do_voxel) const {
     int brick[3][2], cell[3][2];
@@ -129,25 +180,25 @@ class VoxelVotes::Reader {
     }
     for (int i = 0; i < 8; ++i) {
       const int x = i >> 2, y = i >> 1 & 1, z = i & 1;
-      const Found& at = bricks_[brick[0][x] | brick[1][y] | brick[2][z]];
-      do_voxel(at, at.voxels[cell[0][x] | cell[1][y] | cell[2][z]], weight[0][x] * weight[1][y] * weight[2][z]);
+      const Brick& at = *bricks_[brick[0][x] | brick[1][y] | brick[2][z]];
+      const int here = cell[0][x] | cell[1][y] | cell[2][z];
+      if (at.voted >> here & 1) do_voxel(at, at.voxels[here], weight[0][x] * weight[1][y] * weight[2][z]);
     }
   }
 
   // The class with more than half of the votes of each of the eight voxels that has any, or kMany or kNobody.
   int32_t agreed(const Place& place) const {
     int32_t least = INT32_MAX, most = kNobody;
-    each_voxel(place, [&](const Found&, const Voxel& voxel, uint32_t) {
-      least = std::min(least, voxel.votes ? voxel.label : INT32_MAX);
-      most = std::max(most, voxel.votes ? voxel.label : kNobody);
+    each_voxel(place, [&](const Brick&, const Voxel& voxel, uint32_t) {
+      least = std::min(least, voxel.label);
+      most = std::max(most, voxel.label);
     });
     return most == kNobody ? kNobody : least == most ? most : kMany;
   }
 
   // Adds the votes of the eight voxels, interpolated.
   void count(const Place& place) {
-    each_voxel(place, [&](const Found& at, const Voxel& voxel, uint64_t weight) {
-      if (voxel.votes == 0) return;
+    each_voxel(place, [&](const Brick& at, const Voxel& voxel, uint64_t weight) {
       if (!(voxel.votes & kSeveral)) return add(voxel.label, weight * voxel.votes);
       const Pair* pair = at.pairs + (voxel.votes & ~kSeveral);
       for (int32_t k = 1; k <= pair->label; ++k) add(pair[k].label, weight * pair[k].votes);
@@ -195,8 +246,8 @@ class VoxelVotes::Reader {
 
   const VoxelVotes& votes_;
   std::vector<Kept> kept_;
-  std::unique_ptr<Voxel[]> nothing_;
-  Found bricks_[8];
+  const Brick nothing_;  // where nobody voted
+  const Brick* bricks_[8];
   std::vector<Entry> poll_;
 };
 
@@ -209,9 +260,8 @@ void VoxelVotes::read(const LiftedView<T>& view, int32_t* labels, float* confide
     Reader reader(*this);
 #pragma omp for schedule(static)
     for (int row = 0; row < rows; ++row) {
-      each_pixel(view, row, [&](int x, int y) {
-        const int64_t i = static_cast<int64_t>(y) * view.width + x;
-        confidence[i] = reader.read(view, x, y, labels + i);
+      each_tile(view, row, [&](int left, int right, int top, int bottom) {
+        reader.read(view, left, right, top, bottom, labels, confidence);
       });
     }
   }

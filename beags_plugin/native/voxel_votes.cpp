@@ -12,6 +12,14 @@ constexpr uint64_t kNowhere = ~uint64_t(0);  // pixels without a depth, or too f
 constexpr int kShares = 64;
 constexpr int kBlock = 64;  // voxels that are fetched at a time
 
+// Of three bricks in a row along an axis, bits of the middle one: set there or in the next voxel below, or above.
+void with_next(int axis, const uint64_t* bricks, uint64_t* below, uint64_t* above) {
+  const uint64_t first = kPlane[axis], last = first << 3 * kShift[axis], own = bricks[1];
+  const int shift = kShift[axis];
+  *below = own | (own & ~last) << shift | (bricks[0] & last) >> 3 * shift;
+  *above = own | (own & ~first) >> shift | (bricks[2] & first) << 3 * shift;
+}
+
 }  // namespace
 
 VoxelVotes::VoxelVotes(int threads) : threads_(threads), shares_(kShares) {}
@@ -26,16 +34,20 @@ void VoxelVotes::add(const LiftedView<T>& view, const int32_t* labels, int32_t i
 #pragma omp parallel for num_threads(team) schedule(static)
   for (int row = 0; row < rows; ++row) {
     int64_t place = static_cast<int64_t>(row) * kTile * view.width;
-    each_pixel(view, row, [&](int x, int y) {
-      const int32_t label = labels[static_cast<int64_t>(y) * view.width + x];
-      T point[3], ray[3];
-      uint64_t& key = keys_[place];
-      labels_[place++] = label;
-      key = kNowhere;
-      if (label == ignore || !lift(view, x, y, point, ray)) return;
-      int32_t v[3];
-      for (int a = 0; a < 3; ++a) v[a] = floor_of(point[a]) + kHalf;
-      key = brick_key(v[0] >> 2, v[1] >> 2, v[2] >> 2) << 6 | cell_of(v[0], v[1], v[2]);
+    each_tile(view, row, [&](int left, int right, int top, int bottom) {
+      for (int y = top; y < bottom; ++y) {
+        for (int x = left; x < right; ++x) {
+          const int32_t label = labels[static_cast<int64_t>(y) * view.width + x];
+          T point[3], ray[3];
+          uint64_t& key = keys_[place];
+          labels_[place++] = label;
+          key = kNowhere;
+          if (label == ignore || !lift(view, x, y, point, ray)) continue;
+          int32_t v[3];
+          for (int a = 0; a < 3; ++a) v[a] = floor_of(point[a]) + kHalf;
+          key = brick_key(v[0] >> 2, v[1] >> 2, v[2] >> 2) << 6 | cell_of(v[0], v[1], v[2]);
+        }
+      }
     });
   }
   // Every thread reads all keys and counts those of its own shares: no two write to one table.
@@ -62,7 +74,7 @@ void VoxelVotes::add(const LiftedView<T>& view, const int32_t* labels, int32_t i
         const uint64_t key = keys_[i] >> 6;
         Kept& at = kept[kept_at(key)];
         if (at.key != key) {
-          const uint64_t number = hash_of(key) >> 58;
+          const uint64_t number = place_of(key) >> 58;
           at = {key};
           if (number >= first && number < last) {
             at.share = &shares_[number];
@@ -84,11 +96,12 @@ void VoxelVotes::add(const LiftedView<T>& view, const int32_t* labels, int32_t i
 int32_t VoxelVotes::Share::place(uint64_t key) {
   if (2 * (bricks.size() + 1) > slots.size()) grow_slots();
   const uint64_t mask = slots.size() - 1;
-  uint64_t at = hash_of(key) & mask;
-  while (slots[at].brick >= 0 && slots[at].key != key) at = (at + 1) & mask;
+  uint64_t at = place_of(key) & mask;
+  while (slots[at].brick >= 0 && slots[at].key != key) at = (at + kNextPlace) & mask;
   if (slots[at].brick < 0) {
     slots[at] = {key, static_cast<int32_t>(bricks.size())};
-    bricks.push_back({std::make_unique<Voxel[]>(kCells)});
+    bricks.emplace_back();
+    bricks.back().voxels = std::make_unique<Voxel[]>(kCells);
   }
   return slots[at].brick;
 }
@@ -98,17 +111,17 @@ void VoxelVotes::Share::grow_slots() {
   const uint64_t mask = larger.size() - 1;
   for (const Slot& slot : slots) {
     if (slot.brick < 0) continue;
-    uint64_t at = hash_of(slot.key) & mask;
-    while (larger[at].brick >= 0) at = (at + 1) & mask;
+    uint64_t at = place_of(slot.key) & mask;
+    while (larger[at].brick >= 0) at = (at + kNextPlace) & mask;
     larger[at] = slot;
   }
   slots.swap(larger);
 }
 
-const VoxelVotes::Brick* VoxelVotes::Share::find(uint64_t key, uint64_t hash) const {
+const VoxelVotes::Brick* VoxelVotes::Share::find(uint64_t key, uint64_t place) const {
   if (slots.empty()) return nullptr;
   const uint64_t mask = slots.size() - 1;
-  for (uint64_t at = hash & mask; slots[at].brick >= 0; at = (at + 1) & mask) {
+  for (uint64_t at = place & mask; slots[at].brick >= 0; at = (at + kNextPlace) & mask) {
     if (slots[at].key == key) return &bricks[slots[at].brick];
   }
   return nullptr;
@@ -189,25 +202,37 @@ void VoxelVotes::decide() {
 }
 
 void VoxelVotes::Share::summarise(Brick& brick) const {
+  int ahead = 0;  // `label` becomes the class that leads in most voxels, if that is more than half of them
   for (int cell = 0; cell < kCells; ++cell) {
     const Voxel& voxel = brick.voxels[cell];
     if (voxel.votes == 0) continue;
-    if (!brick.led && voxel.label >= 0) brick.label = voxel.label;
-    const uint64_t bit = uint64_t(1) << cell;
-    brick.voted |= bit;
-    if (voxel.label != brick.label) continue;
-    brick.led |= bit;
-    if (!(voxel.votes & kSeveral)) brick.pure |= bit;
+    brick.voted |= uint64_t(1) << cell;
+    if (voxel.label < 0) continue;
+    if (ahead == 0) brick.label = voxel.label;
+    ahead += voxel.label == brick.label ? 1 : -1;
+  }
+  for (int cell = 0; cell < kCells; ++cell) {
+    const Voxel& voxel = brick.voxels[cell];
+    if (voxel.votes == 0 || voxel.label != brick.label) continue;
+    brick.led |= uint64_t(1) << cell;
+    if (!(voxel.votes & kSeveral)) brick.pure |= uint64_t(1) << cell;
   }
 }
 
 const VoxelVotes::Brick* VoxelVotes::find(uint64_t key) const {
-  const uint64_t hash = hash_of(key);
-  return shares_[hash >> 58].find(key, hash);
+  const uint64_t place = place_of(key);
+  return shares_[place >> 58].find(key, place);
+}
+
+void VoxelVotes::fetch(uint64_t key) const {
+  const uint64_t place = place_of(key);
+  const std::vector<Slot>& slots = shares_[place >> 58].slots;
+  if (!slots.empty()) __builtin_prefetch(&slots[place & (slots.size() - 1)]);
 }
 
 void VoxelVotes::settle(uint64_t key, Brick& brick) const {
-  uint64_t disputed = 0;
+  if (!brick.led) return;
+  uint64_t against[27] = {};  // voxels of the bricks about it that do not agree
   for (int side = 0; side < 27; ++side) {
     const int step[3] = {side / 9 - 1, side / 3 % 3 - 1, side % 3 - 1};
     uint64_t touched = brick.led;
@@ -220,23 +245,22 @@ void VoxelVotes::settle(uint64_t key, Brick& brick) const {
                                     : find(key + (static_cast<uint64_t>(static_cast<int64_t>(step[0])) << 38) +
                                            (static_cast<uint64_t>(static_cast<int64_t>(step[1])) << 19) +
                                            static_cast<uint64_t>(static_cast<int64_t>(step[2])));
-    if (!other) continue;
-    uint64_t against = other->label == brick.label ? other->voted & ~other->led : other->voted;
-    // Spread to the voxels of this brick that it touches.
-    for (int axis = 0; axis < 3; ++axis) {
-      const uint64_t first = kPlane[axis], last = first << 3 * kShift[axis];
-      const int shift = kShift[axis];
-      if (step[axis] > 0) {
-        against = (against & first) << 3 * shift;
-      } else if (step[axis] < 0) {
-        against = (against & last) >> 3 * shift;
-      } else {
-        against |= (against & ~last) << shift | (against & ~first) >> shift;
-      }
-    }
-    disputed |= against;
+    if (other) against[side] = other->label == brick.label ? other->voted & ~other->led : other->voted;
   }
-  brick.settled = brick.led & ~disputed;
+  // Axis by axis: those of the voxel or of the next one, below ([0]) and above ([1]).
+  uint64_t by_z[2][9], by_yz[2][2][3];
+  for (int i = 0; i < 9; ++i) with_next(2, against + 3 * i, &by_z[0][i], &by_z[1][i]);
+  for (int z = 0; z < 2; ++z) {
+    for (int i = 0; i < 3; ++i) with_next(1, by_z[z] + 3 * i, &by_yz[0][z][i], &by_yz[1][z][i]);
+  }
+  for (int y = 0; y < 2; ++y) {
+    for (int z = 0; z < 2; ++z) {
+      uint64_t below, above;
+      with_next(0, by_yz[y][z], &below, &above);
+      brick.agreed[y << 1 | z] = brick.led & ~below;
+      brick.agreed[4 | y << 1 | z] = brick.led & ~above;
+    }
+  }
 }
 
 template void VoxelVotes::add(const LiftedView<float>&, const int32_t*, int32_t);

@@ -52,14 +52,17 @@ class VoxelVotes {
     int32_t label;
     uint32_t votes;
   };
-  struct Brick {
+  struct alignas(64) Brick {
+    // After `decide`, a bit for each voxel. Of the class `label`: more than half of the voxel's votes and of those of
+    // all that have any among the eight voxels about a point in it, by the eighth of the voxel that holds the point
+    // (bits 4, 2, 1: the upper half along x, y, z).
+    uint64_t agreed[8] = {};
+    uint64_t pure = 0;   // votes for `label` and no others
+    uint64_t voted = 0;  // any votes
+    uint64_t led = 0;    // more than half of the votes for `label`
+    int32_t label = 0;
     std::unique_ptr<Voxel[]> voxels;  // [64], x slowest
     const Pair* pairs = nullptr;      // of its share; after `decide`
-    // After `decide`, a bit for each voxel. The class `label` has in it: some votes but no others; more than half of
-    // its votes, and of those of all 26 voxels about it that have any.
-    int32_t label = 0;
-    uint64_t pure = 0, settled = 0;
-    uint64_t voted = 0, led = 0;  // has votes; more than half of them for `label`
   };
   struct Slot {
     uint64_t key;
@@ -73,7 +76,7 @@ class VoxelVotes {
     std::vector<Pair> pairs;
     int64_t extras_used = 0;
     int32_t place(uint64_t key);
-    const Brick* find(uint64_t key, uint64_t hash) const;
+    const Brick* find(uint64_t key, uint64_t place) const;
     void vote(Voxel& voxel, int32_t brick, int cell, int32_t label);
     void vote_extra(uint64_t voxel, int32_t label);
     void grow_slots();
@@ -83,6 +86,7 @@ class VoxelVotes {
   };
   class Reader;
   const Brick* find(uint64_t key) const;
+  void fetch(uint64_t key) const;  // what `find` will look at first
   void settle(uint64_t key, Brick& brick) const;
 
   int threads_;
