@@ -1,4 +1,4 @@
-"""Gaussians as .spz, version 2: some 10 times smaller than a .ply.
+"""Gaussians as .spz, version 2: several times smaller than a .ply.
 
 Written from the format's public description (nianticlabs/spz, README): gzip of a header of 16 bytes, then, each for all
 Gaussians: positions (24-bit fixed point), alphas, colours, scales, rotations and spherical harmonics (8 bits each).
