@@ -22,6 +22,8 @@ _CURVES = (
     ("peak_memory_mb", "peak memory, MB", 1.0),
 )
 _PAPER_MARKS = "ovs^Dp*X"
+_WIDTH, _HEIGHT = 4.4, 3.6  # of one diagram, inches
+_BAR_HEIGHT = 0.22  # so that the names of many bars do not touch
 _LOGARITHMIC = 20.0  # an axis that spans more than this factor is logarithmic
 
 
@@ -29,7 +31,9 @@ def draw(path: Path, experiment: Experiment, rows: Sequence[Row]) -> None:
     """Write the picture as PNG (or what the suffix says): a row of bars for the variants, one of curves per sweep."""
     variants = [row for row in rows if not row.variant.sweep]
     height = 1 if variants else 0
-    figure, axes = new_figure(len(_CURVES), height + len(experiment.sweeps))
+    names = len({row.variant.name for row in variants})
+    inches = max(_HEIGHT, _BAR_HEIGHT * names) if not experiment.sweeps else _HEIGHT
+    figure, axes = new_figure(len(_CURVES), height + len(experiment.sweeps), size=(_WIDTH, inches))
     if variants:
         for column, (metric, title) in enumerate(_BARS):
             _bars(axes[0, column], experiment, variants, metric, title, column, labels=column == 0)
