@@ -109,7 +109,7 @@ def _open3d() -> Check:
     try:
         import open3d
     except Exception as error:
-        advice = "ns-export and beags export (meshes) need it; version 0.19.0 needs the system libraries libX11 and libGL"
+        advice = "ns-export and exported meshes need it; version 0.19.0 needs the system libraries libX11 and libGL"
         return Check("open3d", False, f"{_first_line(error)}; {advice}", False)
     return Check("open3d", True, open3d.__version__, False)
 
