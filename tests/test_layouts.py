@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -394,14 +395,18 @@ MISTAKES = {
 }
 
 
+def check_refused(folder: Path, message: str, **options: Any) -> None:
+    with pytest.raises(UserError, match=message) as raised:
+        parse(folder, **options)
+    assert "\n" not in str(raised.value)
+
+
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_mistakes_are_told_in_one_sentence(tmp_path, mistake):
     write_llff(tmp_path)
     make, message = MISTAKES[mistake]
     make(tmp_path)
-    with pytest.raises(UserError, match=message) as raised:
-        parse(tmp_path, images_path=Path("images_4"))
-    assert "\n" not in str(raised.value)
+    check_refused(tmp_path, message, images_path=Path("images_4"))
 
 
 def without_camera(root: Path) -> None:
@@ -433,9 +438,7 @@ def test_mistakes_in_dtu_are_told_in_one_sentence(tmp_path, mistake):
     write_dtu(tmp_path)
     make, message = DTU_MISTAKES[mistake]
     make(tmp_path)
-    with pytest.raises(UserError, match=message) as raised:
-        parse(tmp_path)
-    assert "\n" not in str(raised.value)
+    check_refused(tmp_path, message)
 
 
 def test_a_test_mask_of_no_view_is_told(tmp_path):

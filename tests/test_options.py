@@ -32,7 +32,7 @@ def test_wrong_options_of_the_preparation(options, sentence):
 @pytest.mark.parametrize("reprojection", ["none", "pairwise", "voxel"])
 @pytest.mark.parametrize("tau", [0.0, math.inf])
 def test_options_at_their_limits_are_taken(reprojection, tau):
-    PreparationConfig(reprojection=reprojection, tau=tau, depth="expected", k=1).check()
+    PreparationConfig(reprojection=reprojection, tau=tau, depth="expected", k=1).check()  # raises nothing
 
 
 def test_a_reprojection_of_another_package_that_does_not_load(monkeypatch):

@@ -35,7 +35,7 @@ AS_GIVEN = "masks as given"
 
 @dataclass(frozen=True)
 class Options:
-    """What the command line asks for; see ``cli.BenchReprojection``."""
+    """What the command line asks for; see ``commands.Reprojection``."""
 
     views: tuple[int, ...] = (30, 60, 120, 240)
     depths: tuple[str, ...] = DEPTHS

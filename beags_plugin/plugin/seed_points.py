@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -94,14 +94,7 @@ def random_points(cameras: Sequence[Camera], count: int, seed: int) -> tuple[np.
         points = focus + radius * directions * np.cbrt(generator.uniform(size=(batch, 1)))
         return points, _share_of_views(points, rotations, centers, cameras)
 
-    points, share = draw()
-    threshold = min(0.5, float(np.quantile(share, 0.9)))
-    kept = [points[share >= threshold]]
-    while sum(map(len, kept)) < count:
-        points, share = draw()
-        kept.append(points[share >= threshold])
-    xyz = np.concatenate(kept)[:count].astype(np.float32)
-    return xyz, np.full((count, 3), 128, np.uint8)
+    return _seen_by_many(draw, count)
 
 
 def points_between(
@@ -128,13 +121,19 @@ def points_between(
         points = np.einsum("nji,nj->ni", rotations[view], local) + centers[view]
         return points, _share_of_views(points, rotations, centers, cameras)
 
+    return _seen_by_many(draw, count)
+
+
+def _seen_by_many(draw: Callable[[], tuple[np.ndarray, np.ndarray]], count: int) -> tuple[np.ndarray, np.ndarray]:
+    """``count`` of the points that ``draw`` gives with their share of views, those of large share; mid-grey colours."""
     points, share = draw()
     threshold = min(0.5, float(np.quantile(share, 0.9)))
     kept = [points[share >= threshold]]
     while sum(map(len, kept)) < count:
         points, share = draw()
         kept.append(points[share >= threshold])
-    return np.concatenate(kept)[:count].astype(np.float32), np.full((count, 3), 128, np.uint8)
+    xyz = np.concatenate(kept)[:count].astype(np.float32)
+    return xyz, np.full((count, 3), 128, np.uint8)
 
 
 def _within_bounds(points: np.ndarray, cameras: Sequence[Camera], bounds: np.ndarray) -> float:
