@@ -14,6 +14,7 @@ from beags_plugin.core.densification import (
     GradientStatistics,
     densify,
     initial_surfels,
+    length_units,
     reset_opacity,
 )
 from beags_plugin.core.rotations import rotation_from_quat
@@ -44,7 +45,8 @@ def scene(scales, opacities) -> Surfels:
 
 
 def run(surfels, gradients, step=1000, config=CONFIG, seed=0):
-    return densify(surfels, torch.tensor(gradients), EXTENT, config, step, generator(seed))
+    units = torch.full((len(surfels),), EXTENT)
+    return densify(surfels, torch.tensor(gradients), units, config, step, generator(seed))
 
 
 def test_a_quiet_scene_stays_as_it_is():
@@ -86,6 +88,19 @@ def test_faint_surfels_go_at_once_and_huge_ones_after_the_given_step():
     assert run(surfels, [LOW] * 3, step=CONFIG.prune_scale_after + 1).source.tolist() == [2]
 
 
+def test_far_surfels_are_measured_by_the_distance_of_the_nearest_camera():
+    means = torch.tensor([[0.5, 0.0, 0.0], [10.0, 0.0, 0.0], [0.0, 0.0, -30.0]])
+    centers = torch.tensor([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
+    assert length_units(means, centers, EXTENT, CONFIG).tolist() == [EXTENT] * 3
+    far = replace(CONFIG, far_limits=True)
+    assert length_units(means, centers, EXTENT, far).tolist() == [EXTENT, 6.0, 30.0]
+    assert length_units(means * math.nan, centers, EXTENT, far).shape == (3,)  # such surfels are dropped elsewhere
+    # a surfel that is too large beside the cameras is not thrown away behind them, nor split where it is small to look at
+    surfels, step = scene([HUGE, HUGE], [0.5, 0.5]), CONFIG.prune_scale_after + 1
+    edited = densify(surfels, torch.tensor([LOW, LOW]), torch.tensor([EXTENT, 3 * EXTENT]), far, step, generator())
+    assert edited.source.tolist() == [1]
+
+
 def test_growth_stops_at_the_bound_and_prefers_large_gradients():
     surfels = scene([SMALL, MIDDLE, SMALL, SMALL], [0.5] * 4)
     config = replace(CONFIG, max_surfels=6)
@@ -113,9 +128,9 @@ def test_the_scale_of_the_scene_changes_nothing():
     surfels = scene([SMALL, MIDDLE, HUGE], [0.5] * 3)
     factor = 2.0**17
     larger = replace(surfels, means=surfels.means * factor, log_scales=surfels.log_scales + math.log(factor))
-    gradients, step = torch.tensor([HIGH] * 3), 5000
-    small = densify(surfels, gradients, EXTENT, CONFIG, step, generator())
-    large = densify(larger, gradients, EXTENT * factor, CONFIG, step, generator())
+    gradients, step, units = torch.tensor([HIGH] * 3), 5000, torch.full((3,), EXTENT)
+    small = densify(surfels, gradients, units, CONFIG, step, generator())
+    large = densify(larger, gradients, units * factor, CONFIG, step, generator())
     assert torch.equal(small.source, large.source)
     torch.testing.assert_close(large.surfels.means / factor, small.surfels.means, rtol=1e-5, atol=1e-6)
 

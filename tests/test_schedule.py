@@ -185,7 +185,7 @@ def test_only_steps_of_growth_are_drawn_with_what_growth_looks_at(model):
     camera = Cameras(pose, one, one, torch.tensor([16.0]), torch.tensor([12.0]), 32, 24)
     model.train()
     model.schedule, model.extent = PhaseSchedule(30_000, 0, 30_000), torch.tensor(1.0)
-    densifier = Densifier(model, {}, 1000)
+    densifier = Densifier(model, {}, 1000, torch.zeros(1, 3))
 
     def gathered(step):
         before = float(densifier.statistics.total.sum())

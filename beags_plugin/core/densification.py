@@ -20,7 +20,7 @@ COINCIDENT = 1e-7  # smallest initial scale relative to the cloud's size: coinci
 
 @dataclass(frozen=True)
 class DensifyConfig:
-    """When and how the scene grows; lengths are relative to the scene's extent.
+    """When and how the scene grows; scales are relative to the scene's extent.
 
     every, start, stop: densify at multiples of ``every`` between ``start`` and ``stop``, both excluded (as officially).
     min_every: ``scaled`` makes ``every`` no shorter: an interval must show the surfels to many views.
@@ -28,6 +28,8 @@ class DensifyConfig:
     grad_threshold: mean screen gradient from which a surfel is cloned or split.
     clone_scale: a larger surfel is split, a smaller one cloned.
     prune_opacity: fainter surfels go. prune_scale: larger ones go, after step ``prune_scale_after``.
+    far_limits: both scales are relative to the distance of the nearest camera where that exceeds the scene's extent;
+        False, as officially: to the extent alone, which far backgrounds and forward-facing captures do not fit.
     reset_every: opacities are set to at most ``reset_opacity`` so often; 0 never.
     max_surfels: the scene grows no further than this; 0 sets no bound.
     pixels_per_surfel: nor further than one surfel for so many pixels of all training images, so that what few images
@@ -44,6 +46,7 @@ class DensifyConfig:
     prune_scale_after: int = 3_000
     reset_every: int = 3_000
     reset_opacity: float = 0.01
+    far_limits: bool = False
     max_surfels: int = 0
     pixels_per_surfel: float = 0.0
     min_every: int = 50
@@ -117,17 +120,32 @@ class GradientStatistics:
         return self.total / self.views.clamp_min(1.0)
 
 
+def length_units(means: Tensor, camera_centers: Tensor, extent: float, config: DensifyConfig) -> Tensor:
+    """[N] world units in which ``clone_scale`` and ``prune_scale`` of surfels at ``means`` [N, 3] are stated.
+
+    camera_centers: [V, 3]. The scene's extent, or with ``far_limits`` the distance of the nearest camera if larger.
+    """
+    units = means.new_full((means.shape[0],), extent)
+    if not config.far_limits:
+        return units
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
+
+    finite = torch.nan_to_num(means.double(), nan=0.0, posinf=0.0, neginf=0.0)
+    distances = torch.from_numpy(cKDTree(camera_centers.double().cpu().numpy()).query(finite.cpu().numpy())[0])
+    return torch.maximum(units, distances.to(units))
+
+
 def densify(
-    surfels: Surfels, mean_gradient: Tensor, extent: float, config: DensifyConfig, step: int, generator: torch.Generator
+    surfels: Surfels, mean_gradient: Tensor, units: Tensor, config: DensifyConfig, step: int, generator: torch.Generator
 ) -> Densified:
     """Clone, split, prune.
 
-    surfels: N surfels without gradients. mean_gradient: [N]. extent: world units. step: for ``prune_scale_after``.
-    At least one surfel always remains.
+    surfels: N surfels without gradients. mean_gradient: [N]. units: [N] of ``length_units``. step: for
+    ``prune_scale_after``. At least one surfel always remains.
     """
     size = surfels.log_scales.exp().amax(dim=-1)
     chosen = _within_budget(mean_gradient >= config.grad_threshold, mean_gradient, config.max_surfels)
-    small = size <= config.clone_scale * extent
+    small = size <= config.clone_scale * units
     clones = (chosen & small).nonzero()[:, 0]
     splits = (chosen & ~small).nonzero()[:, 0]
     kept = (~(chosen & ~small)).nonzero()[:, 0]
@@ -143,7 +161,7 @@ def densify(
 
     keep = opacities(grown.opacity_logits) >= config.prune_opacity
     if step > config.prune_scale_after:
-        keep &= grown.log_scales.exp().amax(dim=-1) <= config.prune_scale * extent
+        keep &= grown.log_scales.exp().amax(dim=-1) <= config.prune_scale * units[source]
     if not bool(keep.any()):
         keep[grown.opacity_logits.argmax()] = True
     return Densified(grown[keep], source[keep], fresh[keep])

@@ -8,7 +8,7 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from torch import Tensor
 
-from beags_plugin.core.densification import GradientStatistics, densify, reset_opacity
+from beags_plugin.core.densification import GradientStatistics, densify, length_units, reset_opacity
 from beags_plugin.plugin.refinement import RefinementSwitch
 from beags_plugin.plugin.scene_edits import edit_scene, move_adam_state
 from beags_plugin.plugin.schedule import log_linear
@@ -29,7 +29,8 @@ def training_callbacks(model: BeagsModel, attributes: TrainingCallbackAttributes
     model.seed = trainer.config.machine.seed
     model.extent = camera_extent(datamanager.train_dataset.cameras.camera_to_worlds).to(model.device)
     cameras = datamanager.train_dataset.cameras
-    densifier = Densifier(model, optimizers, int((cameras.height * cameras.width).sum()))
+    pixels = int((cameras.height * cameras.width).sum())
+    densifier = Densifier(model, optimizers, pixels, cameras.camera_to_worlds[:, :3, 3])
     switch = RefinementSwitch(model, trainer, datamanager)
     switch.check_options()
     switch.check_masks()
@@ -79,10 +80,14 @@ def refinement_factor(config: BeagsModelConfig, group: str) -> float:
 
 
 class Densifier:
-    """Grows and prunes the base by the screen gradients that it gathers; pixels: of all training images."""
+    """Grows and prunes the base by the screen gradients that it gathers.
 
-    def __init__(self, model: BeagsModel, optimizers: dict, pixels: int) -> None:
+    pixels: of all training images. camera_centers: [V, 3] world.
+    """
+
+    def __init__(self, model: BeagsModel, optimizers: dict, pixels: int, camera_centers: Tensor) -> None:
         self.model = model
+        self.camera_centers = camera_centers
         self.config = model.config.densify.scaled(model.schedule.scale).bounded(pixels)
         self.optimizers = optimizers
         self.statistics = GradientStatistics(model.num_points)
@@ -109,7 +114,8 @@ class Densifier:
         # drawn from (seed, step), so that a resumed run draws what the uninterrupted one did
         generator = torch.Generator().manual_seed(model.seed * 1_000_003 + step)
         surfels = model.surfels().detach()
-        edited = densify(surfels, self.statistics.mean(), float(model.extent), self.config, step, generator)
+        units = length_units(surfels.means, self.camera_centers, float(model.extent), self.config)
+        edited = densify(surfels, self.statistics.mean(), units, self.config, step, generator)
         edit_scene(model, self.optimizers, edited)
         self.statistics = GradientStatistics(model.num_points)
         model.drawn = None
