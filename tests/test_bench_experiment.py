@@ -1,0 +1,131 @@
+"""What the file of an experiment may say, and the trials that it plans."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("nerfstudio")
+
+from experiment_files import GOOD, masks_of, scene, written
+
+from beags_plugin.bench.experiment import experiment_names, load_experiment
+from beags_plugin.bench.scenes import Scene
+from beags_plugin.bench.trials import MODEL, Trial, plan, steps_of
+from beags_plugin.errors import UserError
+
+
+@pytest.fixture
+def experiment(tmp_path):
+    return load_experiment(written(tmp_path, GOOD))
+
+
+@pytest.mark.parametrize("name", experiment_names())
+def test_every_experiment_that_ships_loads(name):
+    assert load_experiment(name).variants
+
+
+def test_the_experiments_of_the_paper_ship():
+    assert {"ablation", "sensitivity", "depth", "masks"} <= set(experiment_names())
+
+
+def test_a_file_says_variants_and_sweeps(experiment):
+    variants = {variant.name: variant for variant in experiment.variants}
+    assert list(variants) == [
+        "none", "noisy", "k = 5, plain", "k = 10, plain", "k = 5, no R", "k = 10, no R", "damage = 0", "damage = 1.5",
+    ]  # fmt: skip
+    assert variants["none"].refine == {
+        "pipeline.model.sh_degree": 0,
+        "pipeline.model.refine_steps": 1,
+        "pipeline.model.refiner": "none",
+    }
+    assert variants["noisy"].base == {"pipeline.model.sh_degree": 0, "pipeline.model.losses.normal.weight": 0.0}
+    point = variants["k = 10, no R"]
+    assert (point.sweep, point.line, point.x, point.damage) == ("k", "no R", 10.0, None)
+    assert point.refine["pipeline.model.prepare.k"] == 10
+    assert point.refine["pipeline.model.prepare.reprojection"] == "none"
+    assert "pipeline.model.prepare.k" not in point.base
+    assert (variants["damage = 1.5"].damage, variants["damage = 1.5"].x) == (1.5, 1.5)
+    assert experiment.sample_seeds == (0,) and experiment.seeds == (42,) and experiment.sweeps == ("k", "damage")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('preset = "beags-tiny"', 'preset = "beags-huge"', "no preset 'beags-huge'"),
+        ('preset = "beags-tiny"', "", "has no preset"),
+        ('description = "d"', "description = 3", "description must be str"),
+        ('reference = "none"', 'reference = "nobody"', "'nobody', which is no variant"),
+        ('name = "noisy"', 'name = "none"', "two variants called 'none'"),
+        ('"pipeline.model.refiner"', '"pipeline.model.refinery"', "no config key 'pipeline.model.refinery'"),
+        ('"pipeline.model.refiner" = "none"', '"pipeline.model.refiner" = 3', "must be str"),
+        ("values = [5, 10]", "values = 5", "sweep 'k': values must be"),
+        ("values = [5, 10]", "values = []", "sweep 'k': values must be"),
+        ('key = "pipeline.model.prepare.k"', 'key = "pipeline.model.prepare.kk"', "no config key"),
+        ('key = "pipeline.model.prepare.k"', "", "sweep 'k': has no key"),
+        ("relative_to_pixels = true", 'phase = "after"', "phase is 'after'"),
+        ("relative_to_pixels = true", "absolute = true", "unknown entry 'absolute'"),
+        ("[0.0, 1.5]", "[-1.0]", "degree of mask degradation is -1"),
+        ("[0.0, 1.5]", "[99.0]", "number from 0 to 1"),
+        ('name = "noisy"', 'name = "noisy"\nextra = 1', "variant 'noisy': has an unknown entry 'extra'"),
+        ("[both]", "[neither]\n[both]", "unknown entry 'neither'"),
+        ("[both]", "[sample]\nseeds = [-1]\n[both]", "sample.seeds must be"),
+        ("[both]", "[sample]\nwidth = 2\n[both]", "sample: the sample's width is 2"),
+        ("[both]", "[sample]\nwidht = 64\n[both]", "widht"),
+        ("[both]", '[paper]\nsource = "p"\ncolumns = ["a", "b"]\n[paper.rows]\nx = [[1, 2]]\n[both]', "row 'x' must"),
+        ("[[variant]]", "[variant]", "cannot be read"),
+        ("description", "=", "cannot be read"),
+    ],
+)
+def test_a_mistake_in_the_file_gets_one_sentence(tmp_path, old, new, words):
+    assert old in GOOD
+    with pytest.raises(UserError) as error:
+        load_experiment(written(tmp_path, GOOD.replace(old, new, 1)))
+    assert words in str(error.value)
+    assert "mine.toml" in str(error.value)
+
+
+def test_an_experiment_without_variants_or_name_is_refused(tmp_path):
+    with pytest.raises(UserError, match="neither"):
+        load_experiment(written(tmp_path, 'description = "d"\npreset = "beags-tiny"'))
+    with pytest.raises(UserError, match="no experiment 'ablatoin': choose one of .*ablation"):
+        load_experiment("ablatoin")
+    with pytest.raises(UserError, match="cannot be read"):
+        load_experiment(str(tmp_path / "absent.toml"))
+
+
+def test_variants_share_bases_and_nothing_else(experiment):
+    first, second = scene("a", "1"), scene("b", "2")
+    runs = plan(experiment, [first, second], masks_of(first, second), "code")
+    assert len(runs) == 2 * len(experiment.variants)
+    of_first = [run.trial for run in runs if run.scene is first]
+    assert len({trial.digest for trial in of_first}) == len(of_first)
+    bases = {run.variant.name: run.trial.base.digest for run in runs if run.scene is first}
+    assert bases["noisy"] != bases["none"]
+    assert {base for name, base in bases.items() if name != "noisy"} == {bases["none"]}  # damaged masks need no other
+    assert not {trial.digest for trial in of_first} & {run.trial.digest for run in runs if run.scene is second}
+    base = of_first[0].base
+    assert base.overrides[MODEL + "refine_steps"] == 0 and of_first[0].overrides[MODEL + "base_steps"] == 0
+    assert steps_of(of_first[1]) == 7 and steps_of(base) == 1500
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"overrides": {"a": 2}},
+        {"seed": 1},
+        {"code": "newer"},
+        {"preset": "beags"},
+        {"masks": Path("other")},
+        {"scene": Scene("a", Path("/nowhere"), 2.0, "1")},
+        {"scene": Scene("a", Path("/nowhere"), 1.0, "2")},
+    ],
+)
+def test_a_trial_is_another_when_anything_that_matters_changes(change):
+    settings = {"scene": scene(), "preset": "beags-tiny", "overrides": {"a": 1}, "seed": 0, "code": "code"}
+    former = Trial(**settings)
+    assert Trial(**settings).digest == former.digest
+    moved = Scene("renamed", Path("/elsewhere"), 1.0, "1")
+    assert Trial(**{**settings, "scene": moved}).digest == former.digest
+    assert Trial(**{**settings, **change}).digest != former.digest

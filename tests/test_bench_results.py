@@ -1,0 +1,191 @@
+"""What is told of an experiment: means, tables, files, pictures."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("nerfstudio")
+
+from pathlib import Path
+
+from experiment_files import GOOD, masks_of, scene, written
+
+from beags_plugin.bench.experiment import Variant, load_experiment
+from beags_plugin.bench.report import write_csv, write_json
+from beags_plugin.bench.results import (
+    COLUMNS,
+    FIGURES,
+    Row,
+    error_left,
+    make_row,
+    means,
+    report_json,
+    table_rows,
+)
+from beags_plugin.bench.run import rows_of
+from beags_plugin.bench.runner import Outcome
+from beags_plugin.bench.tables import memory_line, per_million_pixels, tables
+from beags_plugin.bench.trials import Run, plan
+
+
+@pytest.fixture
+def experiment(tmp_path):
+    return load_experiment(written(tmp_path, GOOD))
+
+
+def masks(value: float) -> dict:
+    return {
+        kind: {moment: {metric: value + 0.1 * (moment == "after") for metric in ("acc", "iou", "biou")}
+               for moment in ("before", "after")}
+        for kind in ("extracted", "rendered")
+    }  # fmt: skip
+
+
+def result(value: float, psnr: float | None = 30.0) -> dict:
+    return {
+        "evaluation": {
+            "mean": masks(value),
+            "psnr": {"before": 29.0, "after": psnr},
+            "ssim": {"before": 0.8, "after": 0.9},
+            "objects": {"cup": masks(value / 2), "box": masks(value)},
+        },
+        "seconds": {"reprojection": 1.0, "assignment": 2.0, "voxel grids": 3.0, "refinement": 10 * value},
+        "cpu_seconds": 20.0,
+        "peak_memory_mb": 900.0,
+        "own_memory_mb": 100.0,
+        "steps": 400,
+        "gaussians": 1000,
+        "mask_error_given": 0.02,
+        "mask_error_used": None,
+        "voxel_size": 0.5,
+        "training_pixels": 4_000_000,
+    }
+
+
+BASE = {"seconds": {"base training": 60.0}, "cpu_seconds": 50.0}
+
+
+@pytest.fixture
+def rows():
+    none, every = Variant("none"), Variant("k = 8", sweep="k", x=8.0)
+    return [
+        make_row(none, "a", 0, BASE, result(0.5), None),
+        make_row(every, "a", 0, BASE, result(0.8), None),
+        make_row(none, "b", 0, BASE, result(0.3, psnr=None), None),
+        make_row(every, "b", 0, BASE, None, "k is 0."),
+    ]
+
+
+def test_means_are_over_the_scenes_that_finished(rows):
+    none, every = means(rows)
+    assert (none.count, none.failures, every.count, every.failures) == (2, 0, 1, 1)
+    values = np.array([0.5, 0.3])
+    assert none.figures["extracted_biou_before"] == pytest.approx(values.mean())
+    assert none.figures["extracted_biou_after"] == pytest.approx((values + 0.1).mean())
+    assert none.figures["seconds refinement"] == pytest.approx((10 * values).mean())
+    assert none.figures["seconds base training"] == 60.0
+    assert none.figures["cpu_seconds total"] == 70.0
+    assert none.figures["psnr_after"] == 30.0 and none.figures["mask_error_used"] is None
+    assert every.figures["rendered_iou_after"] == pytest.approx(0.9)
+    left = error_left(every, none)
+    assert left == pytest.approx((1 - 0.9) / (1 - 0.5))
+    assert error_left(every, None) is None
+    lost = means([rows[3]])[0]
+    assert lost.failed == "k is 0." and lost.figures == dict.fromkeys(FIGURES)
+
+
+def test_json_and_csv_hold_every_row_and_the_same_figures(rows, tmp_path, experiment):
+    import dataclasses
+
+    experiment = dataclasses.replace(experiment, variants=(Variant("none"), Variant("k = 8", sweep="k", x=8.0)))
+    report = report_json(experiment, rows, {"commit": "abc", "quick": False})
+    write_json(tmp_path / "deep/r.json", report)
+    write_csv(tmp_path / "deep/r.csv", table_rows(rows))
+    read = json.loads((tmp_path / "deep/r.json").read_text())
+    assert read["experiment"] == "mine" and read["commit"] == "abc" and read["paper"] is None
+    assert all(set(row) == set(COLUMNS) for row in read["rows"])
+    assert [(row["scene"], row["object"]) for row in read["rows"]] == [
+        ("a", "mean"), ("a", "cup"), ("a", "box"), ("a", "mean"), ("a", "cup"), ("a", "box"),
+        ("b", "mean"), ("b", "cup"), ("b", "box"), ("b", "mean"),
+    ]  # fmt: skip
+    assert read["rows"][1]["extracted_iou_after"] == pytest.approx(0.35)
+    assert read["rows"][-1]["failed"] == "k is 0."
+    assert [mean["error_left"] for mean in read["means"]] == [1.0, pytest.approx(0.2)]
+    with open(tmp_path / "deep/r.csv", newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert tuple(lines[0]) == COLUMNS and len(lines) == len(read["rows"]) + len(read["means"])
+    for line, row in zip(lines, read["rows"], strict=False):
+        for name in COLUMNS:
+            assert line[name] == ("" if row[name] is None else str(row[name]))
+
+
+def test_tables_say_what_failed_and_whose_figures_the_papers_are(rows):
+    from rich.console import Console
+
+    console = Console(width=200, file=io.StringIO())
+    for table in tables(load_experiment("ablation"), rows):
+        console.print(table)
+    text = console.file.getvalue()
+    assert "failed: k = 8 on b: k is 0." in text and "k = 8 (1 of 2 scenes)" in text
+    assert "the paper's figures, not ours" in text and "92.0 / 85.8 (52)" in text  # (100 - 85.8) / (100 - 72.8)
+
+
+def test_memory_along_a_sweep_is_told_in_a_sentence(rows):
+    assert memory_line(means(rows), "k") == "Along k the peak memory moves from 900 to 900 MB (own: 100 to 100)."
+    assert memory_line(means(rows[3:]), "k") is None
+
+
+def test_the_front_is_what_nothing_beats(tmp_path):
+    from beags_plugin.bench.front import draw_front, pareto_front
+
+    points = [tuple(point) for point in np.random.default_rng(0).integers(0, 6, (40, 2)).tolist()]
+    rows = [
+        Row(Variant(str(i)), "a", 0, {**dict.fromkeys(FIGURES), "cpu_seconds total": x, "psnr_after": y}, {})
+        for i, (x, y) in enumerate(points)
+    ]
+    rows.append(Row(Variant("unknown"), "a", 0, dict.fromkeys(FIGURES), {}))
+    found = {row.variant.name for row in pareto_front(rows, "cpu_seconds total", "psnr_after")}
+    better = {
+        (x, y): any(c <= x and q >= y and (c, q) != (x, y) for c, q in points) for x, y in points
+    }  # by definition, pair by pair
+    assert found == {str(i) for i, point in enumerate(points) if not better[point]}
+    draw_front(tmp_path / "front.png", load_experiment("ablation"), rows)
+    assert (tmp_path / "front.png").stat().st_size > 10_000
+
+
+def test_the_axis_is_told_relative_to_the_pixels(rows, experiment):
+    assert per_million_pixels(rows[1], experiment) == "2"  # 8 of 4 million
+    assert per_million_pixels(rows[0], experiment) == "–"
+
+
+def test_the_picture_is_drawn_with_failures_and_without(rows, tmp_path):
+    import dataclasses
+
+    from PIL import Image
+
+    from beags_plugin.bench.pictures import draw
+
+    pytest.importorskip("matplotlib")
+    variants = tuple({row.variant.name: row.variant for row in rows}.values())
+    experiment = dataclasses.replace(load_experiment("ablation"), variants=variants)
+    draw(tmp_path / "p.png", experiment, rows)
+    draw(tmp_path / "failed.png", experiment, [rows[3]])
+    for name in ("p.png", "failed.png"):
+        with Image.open(tmp_path / name) as image:
+            assert image.width > 1000 and len(image.convert("L").getcolors()) > 20
+
+
+def test_rows_come_from_outcomes_in_order(experiment):
+    variant = experiment.variants[0]
+    trial = plan(experiment, [scene()], masks_of(scene()), "code")[0].trial
+    outcomes = {
+        trial.base.digest: Outcome(Path("x"), BASE),
+        trial.digest: Outcome(Path("y"), result(0.5)),
+    }
+    (row,) = rows_of([Run(variant, scene(), 42, trial)], outcomes)
+    assert row.scene == "a" and row.seed == 42 and row.figures["seconds base training"] == 60.0

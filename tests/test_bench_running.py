@@ -1,0 +1,89 @@
+"""Trials run once, go on after an interruption, and say why they failed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("nerfstudio")
+
+from experiment_files import scene
+
+from beags_plugin.bench import runner
+from beags_plugin.bench.runner import run_trials
+from beags_plugin.bench.trials import Trial
+
+
+class FakeWorker:
+    """Writes what the real one would, without training; fails for overrides that say so."""
+
+    def __init__(self) -> None:
+        self.ran: list[dict] = []
+        self.interrupt_at = -1
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def run(self, folder: Path) -> int:
+        request = json.loads((folder / "trial.json").read_text())
+        if len(self.ran) == self.interrupt_at:
+            (folder / "half").write_text("done")
+            raise KeyboardInterrupt
+        self.ran.append(request)
+        if "fail" in request["overrides"]:
+            (folder / "failed.json").write_text('{"failed": "k is 0."}')
+            return 1
+        if "die" in request["overrides"]:
+            return -9
+        (folder / "result.json").write_text(json.dumps({"digest": request["digest"]}))
+        return 0
+
+
+@pytest.fixture
+def worker(monkeypatch):
+    fake = FakeWorker()
+    monkeypatch.setattr(runner, "Worker", lambda: fake)
+    return fake
+
+
+def trials(*overrides: dict) -> list[Trial]:
+    base = Trial(scene(), "beags-tiny", {"base": True}, 0, "code")
+    return [Trial(scene(), "beags-tiny", own, 0, "code", base=base) for own in overrides]
+
+
+def test_an_interrupted_experiment_goes_on_where_it_was(tmp_path, worker):
+    wanted = trials({"x": 1}, {"x": 2}, {"x": 3})
+    worker.interrupt_at = 2  # the base, the first, and then no more
+    with pytest.raises(KeyboardInterrupt):
+        run_trials(wanted, tmp_path, lambda _: 1)
+    worker.interrupt_at = -1
+    told = []
+    outcomes = run_trials(wanted, tmp_path, lambda _: 1, lambda done, total: told.append((done, total)))
+    assert [request["overrides"] for request in worker.ran] == [{"base": True}, {"x": 1}, {"x": 2}, {"x": 3}]
+    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    for trial in wanted:
+        outcome = outcomes[trial.digest]
+        assert outcome.failed is None and outcome.result == {"digest": trial.digest}
+        assert not (outcome.folder / "half").exists()
+    assert worker.ran[1]["base"] == str(outcomes[wanted[0].base.digest].folder / "run")
+
+
+def test_a_failed_trial_says_why_and_is_tried_again(tmp_path, worker):
+    wanted = trials({"fail": 1}, {"x": 1}, {"die": 1})
+    for _ in range(2):
+        outcomes = run_trials(wanted, tmp_path, lambda _: 1)
+        assert [outcomes[trial.digest].failed for trial in wanted[:2]] == ["k is 0.", None]
+        assert "exit code -9" in outcomes[wanted[2].digest].failed
+    assert len(worker.ran) == 4 + 2
+
+
+def test_a_failed_base_fails_what_starts_from_it(tmp_path, worker):
+    base = Trial(scene(), "beags-tiny", {"fail": 1}, 0, "code")
+    refined = Trial(scene(), "beags-tiny", {"x": 1}, 0, "code", base=base)
+    outcome = run_trials([refined], tmp_path, lambda _: 1)[refined.digest]
+    assert outcome.failed == "its base failed: k is 0." and len(worker.ran) == 1

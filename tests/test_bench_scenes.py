@@ -1,0 +1,93 @@
+"""Scenes of an experiment, damage done to their masks, and the options of the command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("nerfstudio")
+
+from experiment_files import GOOD, masks_of, scene, written
+
+from beags_plugin.bench.experiment import load_experiment
+from beags_plugin.bench.run import Options, adapted, scenes_of
+from beags_plugin.bench.scenes import Scene, damaged_masks, given_scenes
+from beags_plugin.bench.trials import plan, steps_of
+from beags_plugin.errors import UserError
+from beags_plugin.masks.classes import read_class_map
+from beags_plugin.sample.writer import SampleConfig, write_sample
+
+
+@pytest.fixture
+def experiment(tmp_path):
+    return load_experiment(written(tmp_path, GOOD))
+
+
+SMALL = {"width": 48, "height": 36, "num_train": 8, "num_test": 2, "num_points": 300, "antialias": 1}
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene") / "sample"
+    return Scene("sample 5", write_sample(folder, SampleConfig(seed=5, **SMALL)), 1.0, "digest", seed=5)
+
+
+def read_all(folder: Path) -> dict[str, np.ndarray]:
+    return {path.stem: read_class_map(path) for path in sorted(folder.glob("*.png"))}
+
+
+def same(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> bool:
+    return first.keys() == second.keys() and all((first[name] == second[name]).all() for name in first)
+
+
+def test_mild_damage_is_what_the_sample_has_and_none_is_the_truth(sample, tmp_path):
+    mild = damaged_masks(sample, 1.0, tmp_path)
+    assert same(read_all(mild), read_all(sample.data / "masks"))
+    assert same(read_all(damaged_masks(sample, 0.0, tmp_path)), read_all(sample.data / "ground_truth/masks"))
+    stamp = (mild / "complete").stat().st_mtime_ns
+    assert damaged_masks(sample, 1.0, tmp_path) == mild and (mild / "complete").stat().st_mtime_ns == stamp
+
+
+def test_more_damage_is_more_wrong_and_spares_held_out_views(sample, tmp_path):
+    truth = read_all(sample.data / "ground_truth/masks")
+    held_out = [Path(file).stem for file in json.loads((sample.data / "transforms.json").read_text())["test_filenames"]]
+    wrong = []
+    for degree in (0.5, 1.0, 2.0, 3.0):
+        found = read_all(damaged_masks(sample, degree, tmp_path))
+        assert all((found[name] == truth[name]).all() for name in held_out)
+        wrong.append(sum(int((found.get(name, np.full_like(mask, 9)) != mask).sum()) for name, mask in truth.items()))
+    assert wrong == sorted(wrong) and wrong[0] < wrong[-1]
+
+
+def test_scenes_are_the_samples_or_the_users_or_both(sample, tmp_path, experiment, monkeypatch):
+    import dataclasses
+
+    experiment = dataclasses.replace(experiment, sample=SMALL, sample_seeds=(5, 6))
+    options = Options(output=tmp_path)
+    assert [s.name for s in scenes_of(experiment, options)] == ["sample 5", "sample 6"]
+    assert [s.name for s in scenes_of(experiment, Options(data=(sample.data,), output=tmp_path))] == ["sample"]
+    both = scenes_of(experiment, Options(data=(sample.data,), scenes=1, output=tmp_path, downscale=2.0))
+    assert [(s.name, s.downscale) for s in both] == [("sample 5", 1.0), ("sample", 2.0)]
+    for wrong, words in [
+        (Options(scenes=3, output=tmp_path), "--scenes is 3"),
+        (Options(scenes=0, output=tmp_path), "no scene to train on"),
+        (Options(data=(tmp_path / "absent",), output=tmp_path), "is no folder"),
+        (Options(data=(sample.data, sample.data), output=tmp_path), "two of the given folders are called sample"),
+    ]:
+        with pytest.raises(UserError, match=words):
+            scenes_of(experiment, wrong)
+    assert given_scenes([sample.data], None)[0].downscale == 1.0
+
+
+def test_quick_keeps_the_ends_of_sweeps_and_trains_a_few_steps(experiment):
+    quick = adapted(experiment, Options(quick=True))
+    assert [v.name for v in quick.variants] == [v.name for v in experiment.variants]  # two points a line are its ends
+    longer = adapted(load_experiment("sensitivity"), Options(quick=True))
+    assert [v.x for v in longer.variants] == [5.0, 5000.0, 1.0, 1000.0]
+    trial = plan(quick, [scene()], masks_of(scene()), "code")[1].trial
+    assert steps_of(trial) == 7 and steps_of(trial.base) < 300
+    with pytest.raises(UserError, match="no preset 'beags-huge'"):
+        adapted(experiment, Options(preset="beags-huge"))
