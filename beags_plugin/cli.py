@@ -1,4 +1,4 @@
-"""The command line: ``beags demo | sample | extract | export | eval | bench | doctor``."""
+"""The command line: ``beags demo | resume | sample | extract | export | eval | bench | doctor``."""
 
 from __future__ import annotations
 
@@ -40,6 +40,22 @@ class Demo:
         from beags_plugin.demo import run_demo
 
         run_demo(self.data, self.output, self.preset, self.downscale, self.seed, self.fresh)
+
+
+@dataclass
+class Resume:
+    """Go on with a training that was broken off, in its own folder; it ends as it would have without the break."""
+
+    run_folder: tyro.conf.Positional[Path]
+    """Folder of the run (or its config.yml)."""
+
+    def run(self) -> None:
+        from beags_plugin.plugin.launch import resume
+
+        try:
+            resume(self.run_folder)
+        except KeyboardInterrupt:
+            sys.exit(130)
 
 
 @dataclass
@@ -172,6 +188,7 @@ class Doctor:
 
 Command = (
     Annotated[Demo, tyro.conf.subcommand(name="demo")]
+    | Annotated[Resume, tyro.conf.subcommand(name="resume")]
     | Annotated[Sample, tyro.conf.subcommand(name="sample")]
     | Annotated[Extract, tyro.conf.subcommand(name="extract")]
     | Annotated[Export, tyro.conf.subcommand(name="export")]

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import cast
 
 import torch
+import yaml
 from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
@@ -16,6 +17,7 @@ from beags_plugin.plugin import nerfstudio_patches  # noqa: F401  (lets torch lo
 from beags_plugin.plugin.datamanager import BeagsDataManagerConfig
 from beags_plugin.plugin.dataparser import BeagsDataParserConfig
 from beags_plugin.plugin.model import BeagsModelConfig, LossSpec
+from beags_plugin.plugin.runs import CONFIG_FILE, write_text_atomically
 from beags_plugin.plugin.trainer import BeagsTrainer
 
 
@@ -66,11 +68,13 @@ class BeagsTrainerConfig(TrainerConfig):
     def save_config(self) -> None:
         """Save config.yml with absolute paths, so that every command finds the run from any folder."""
         self.output_dir = Path(self.output_dir).absolute()
-        self.run_dir = self.run_dir.absolute() if self.run_dir is not None else None
+        for name in ("run_dir", "load_dir", "load_checkpoint"):
+            if (path := getattr(self, name)) is not None:
+                setattr(self, name, Path(path).absolute())
         for holder in (self, self.data_config, self.data_config.dataparser):
             if (data := getattr(holder, "data", None)) is not None:
                 holder.data = Path(data).absolute()
-        super().save_config()
+        write_text_atomically(yaml.dump(self), self.get_base_dir() / CONFIG_FILE)
 
 
 def base_config() -> BeagsTrainerConfig:

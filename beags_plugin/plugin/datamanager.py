@@ -9,13 +9,14 @@ from copy import deepcopy
 from dataclasses import dataclass, field
 from itertools import chain, count
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 import beags_plugin.plugin.nerfstudio_patches  # noqa: F401  (checkpoints load again)
@@ -141,6 +142,32 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         data = self.cached_eval[index].copy()  # before the camera: loading undistorts the cameras
         data["image"] = data["image"].to(self.device)
         return self.eval_dataset.cameras[index : index + 1].to(self.device), self._on_device(data)
+
+    def state(self) -> dict[str, Any]:
+        """Where the orders of the training and evaluation views are; see ``training_state.Part``."""
+        generator = getattr(self, "random_generator", None)  # nerfstudio's "fps" has none
+        epochs = getattr(self, "train_unsampled_epoch_count", None)
+        return {
+            "sizes": [len(self.train_dataset), len(self.eval_dataset)],
+            "train": [int(index) for index in self.train_unseen_cameras],
+            "eval": list(self.eval_unseen_cameras),
+            "train_generator": None if generator is None else generator.getstate(),
+            "train_epochs": None if epochs is None else epochs.tolist(),
+            "eval_generator": self._eval_order.getstate(),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on with the views in the order in which the run that gave ``state`` would have."""
+        if state["sizes"] != [len(self.train_dataset), len(self.eval_dataset)]:
+            CONSOLE.print("The data has another number of views than when training began: their order starts anew.")
+            return
+        self.train_unseen_cameras = list(state["train"])
+        self.eval_unseen_cameras = list(state["eval"])
+        self._eval_order.setstate(state["eval_generator"])
+        if state["train_generator"] is not None and hasattr(self, "random_generator"):
+            self.random_generator.setstate(state["train_generator"])
+        if state["train_epochs"] is not None:
+            self.train_unsampled_epoch_count = np.array(state["train_epochs"])
 
     @property
     def fixed_indices_eval_dataloader(self) -> list[tuple[Cameras, dict]]:

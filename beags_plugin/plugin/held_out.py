@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from beags_plugin.losses.photometric import ssim
+from beags_plugin.plugin.runs import write_text_atomically
 from beags_plugin.rasterizers.drawing import surfel_inputs
 
 if TYPE_CHECKING:
@@ -40,6 +41,16 @@ class HeldOutCurve:
         self.records: list[dict[str, float]] = []
         self._started = _clocks()
 
+    def state(self) -> dict[str, Any]:
+        """The curve so far, and the clocks; see ``training_state.Part``."""
+        now = _clocks()
+        return {"records": list(self.records), "clocks": {name: now[name] - self._started[name] for name in now}}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on with the curve of the run that gave ``state``."""
+        self.records = list(state["records"])
+        self._started = {name: now - state["clocks"][name] for name, now in _clocks().items()}
+
     def after_step(self, step: int) -> None:
         """Measure if the time has come: at every multiple of ``every`` steps, and where a phase ends."""
         done = step + 1
@@ -47,8 +58,7 @@ class HeldOutCurve:
             began = _clocks()
             used = {name: began[name] - self._started[name] for name in began}
             self.records.append({**self._measure(done), **used})
-            self.file.parent.mkdir(parents=True, exist_ok=True)
-            self.file.write_text(json.dumps(self.records, indent=1))
+            write_text_atomically(json.dumps(self.records, indent=1), self.file)
             self._started = {name: self._started[name] + now - began[name] for name, now in _clocks().items()}
 
     def _measure(self, done: int) -> dict[str, float]:

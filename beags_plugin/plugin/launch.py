@@ -1,10 +1,13 @@
-"""Training from Python, exactly as ``ns-train`` does it."""
+"""Training from Python, exactly as ``ns-train`` does it, and going on with a run that was broken off."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beags_plugin.errors import UserError
+from beags_plugin.plugin.runs import CONFIG_FILE, EXTRACTION_FILE, REPORT_FILE
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
@@ -17,11 +20,66 @@ def train(config: BeagsTrainerConfig) -> None:
     """
     from nerfstudio.scripts.train import main
 
+    _complete(lambda: main(config), config)
+
+
+def resume(run: Path) -> None:
+    """Train a run that was broken off to its end, in its own folder and with the config that it was started with.
+
+    run: its folder, or config.yml in there. Without a checkpoint it starts from the beginning. Raises ``UserError`` for
+    what is no such run, and for one that is complete.
+    """
+    from nerfstudio.scripts.train import launch, train_loop
+
+    config = resumed_config(run)
+    machine = config.machine
+    _complete(
+        lambda: launch(
+            main_func=train_loop,
+            num_devices_per_machine=machine.num_devices,
+            device_type=machine.device_type,
+            num_machines=machine.num_machines,
+            machine_rank=machine.machine_rank,
+            dist_url=machine.dist_url,
+            config=config,
+        ),
+        config,
+    )
+
+
+def resumed_config(run: Path) -> BeagsTrainerConfig:
+    """The config with which ``resume`` trains."""
+    from nerfstudio.utils.rich_utils import CONSOLE
+
+    from beags_plugin.plugin.extract import load_run_config
+    from beags_plugin.plugin.runs import newest_checkpoint
+    from beags_plugin.plugin.training_state import read_checkpoint, scene_alone
+
+    path = Path(run)
+    path = path / CONFIG_FILE if path.is_dir() else path
+    config = load_run_config(path)
+    folder = path.absolute().parent
+    config.run_dir = folder  # wherever it has been moved to
+    models = config.get_checkpoint_dir()
+    if not any(models.glob("step-*.ckpt")):
+        CONSOLE.print(f"{folder} holds no checkpoint yet: it starts from the beginning.", highlight=False, markup=False)
+        return config
+    if (folder / EXTRACTION_FILE).exists() or scene_alone(read_checkpoint(newest_checkpoint(models))):
+        raise UserError(
+            f"{folder} holds a scene without the state of its training: resume the run that it comes from, or refine "
+            f"it: ns-train beags-refine --load-dir {models}."
+        )
+    config.load_dir, config.load_checkpoint, config.load_step = models, None, None
+    return config
+
+
+def _complete(run: Callable[[], None], config: BeagsTrainerConfig) -> None:
+    """Run a training; raises what ended it early."""
     try:
-        main(config)
+        run()
     except SystemExit as end:
-        if isinstance(end.__cause__, UserError):
+        if isinstance(end.__cause__, (UserError, KeyboardInterrupt)):
             raise end.__cause__ from None
         raise
-    if not (config.get_base_dir() / "training.json").exists():
+    if not (config.get_base_dir() / REPORT_FILE).exists():
         raise KeyboardInterrupt  # nerfstudio prints an interrupt and returns

@@ -179,6 +179,7 @@ class BeagsModel(SplatfactoModel):
         self.frozen = False
         self.growing = False
         self.prepared_seconds: dict[str, float] = {}
+        self.preparing_seconds = 0.0
         self.refining_since = 0.0
         self.crop_box: OrientedBox | None = None
         self.background_color = fixed_background(self.config)

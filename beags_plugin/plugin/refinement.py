@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import resource
 import shutil
 import time
@@ -16,15 +15,18 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.assignment.assignment import Assignment
+from beags_plugin.digests import code_digest
 from beags_plugin.errors import UserError
 from beags_plugin.masks.classes import read_class_map, write_class_map
 from beags_plugin.masks.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.plugin.runs import BASE_SNAPSHOT, PREPARED, round_folder, write_run
+from beags_plugin.plugin.runs import BASE_SNAPSHOT, PREPARED, STAGES, round_folder, write_run
 from beags_plugin.plugin.scene_edits import edit_scene
 from beags_plugin.progress import progress_bar
 from beags_plugin.refiners import REFINERS
 from beags_plugin.refiners.preparation import Preparation, prepare
+from beags_plugin.refiners.stages import StageStore
+from beags_plugin.whole_files import write_whole
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.datamanager import BeagsDataManager
@@ -40,6 +42,7 @@ class RefinementSwitch:
         self.datamanager = datamanager
         self.refiner = REFINERS.get(model.config.refiner)()
         self.ready = False
+        self.rounds = 0  # prepared so far, in this process and those that it goes on from
 
     @property
     def wanted(self) -> bool:
@@ -64,15 +67,25 @@ class RefinementSwitch:
             self.model.config.prepare.check()
             self.model.config.split.check()
 
+    def state(self) -> dict[str, Any]:
+        """How many rounds have been prepared; see ``training_state.Part``."""
+        return {"rounds": self.rounds}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on in the round in which the run that gave ``state`` was."""
+        self.rounds = state["rounds"]
+
     def before_step(self, step: int) -> None:
         """Take up refinement that a checkpoint was in, or start it where no base step precedes it."""
         model = self.model
         if not self.wanted or not model.schedule.refining(step):
             return
         done = int(model.refined_steps)
-        if not self.ready and done > 0:
-            self._take_up()
-        if not self.ready or (done > 0 and done in self._round_starts()):
+        if not self.ready:
+            self.rounds = max(self.rounds, sum(start < done for start in self._round_starts()))
+            if self.rounds > 0:
+                self._take_up()
+        if sum(start <= done for start in self._round_starts()) > self.rounds:
             self._prepare(step - 1)
         model.refined_steps += 1
 
@@ -86,54 +99,56 @@ class RefinementSwitch:
         steps, rounds = self.model.schedule.refine_steps, self.model.config.refine_rounds
         return [steps * index // rounds for index in range(rounds)]
 
-    def _round(self) -> int:
-        """Index of the round that the next step belongs to."""
-        done = int(self.model.refined_steps)
-        return sum(start <= done for start in self._round_starts()) - 1
-
-    def _folder(self, index: int) -> Path:
-        return round_folder(self.trainer.base_dir, index)
-
     def _prepare(self, step: int) -> None:
         """Prepare a round from the scene as it is and the masks as the data has them. step: the last one done."""
-        model = self.model
-        first = self._round() == 0
-        views = self.datamanager.views("train", original=True)
+        model, first = self.model, self.rounds == 0
         CONSOLE.rule("Preparing refinement" if first else "Preparing refinement again, with the refined depth")
-        prepared = prepare(
-            model.surfels(),
-            [view.camera for view in views],
-            LabelMaps(view.stored_labels for view in views),
-            model.classes,
-            model.rasterizer,
-            model.settings(),
-            self.refiner,
-            model.config.prepare,
-            model.config.split,
-            background_voxels=self._background_voxels(),
-            seed=model.seed,
-            stage=progress_bar,
-        )
-        for finding in prepared.findings:
-            CONSOLE.print(f"  {finding}", highlight=False, markup=False)
-        self._take_classes(prepared.assignment)
-        if first:  # the snapshot first: what _save writes last says that everything is there
-            write_run(self.trainer.config, self.trainer.base_dir / BASE_SNAPSHOT, model.state_dict(), max(step, 0))
-        self._save(prepared, [view.name for view in views])
-        if prepared.edited is not None:
-            edit_scene(model, self.trainer.optimizers.optimizers, prepared.edited.edited)
-            self._take_classes(prepared.edited.assignment)
-        self._start(prepared.grid, prepared.labels, self._round() + 1 < model.config.refine_rounds)
-        self._count(prepared.seconds, first)
-        if first:
-            CONSOLE.print(
-                f"  base kept in {self.trainer.base_dir / BASE_SNAPSHOT}", highlight=False, markup=False, soft_wrap=True
+        start = time.perf_counter()
+        with self.trainer.long_stage(step):
+            views = self.datamanager.views("train", original=True)
+            prepared = prepare(
+                model.surfels(),
+                [view.camera for view in views],
+                LabelMaps(view.stored_labels for view in views),
+                model.classes,
+                model.rasterizer,
+                model.settings(),
+                self.refiner,
+                model.config.prepare,
+                model.config.split,
+                background_voxels=self._background_voxels(),
+                seed=model.seed,
+                stage=progress_bar,
+                store=self._stage_store(),
+                code=code_digest(),
             )
+            for finding in prepared.findings:
+                CONSOLE.print(f"  {finding}", highlight=False, markup=False)
+            self._take_classes(prepared.assignment)
+            if first:  # the snapshot first: what save_prepared writes last says that everything is there
+                snapshot = self.trainer.base_dir / BASE_SNAPSHOT
+                write_run(self.trainer.config, snapshot, model.state_dict(), max(step, 0))
+                CONSOLE.print(f"  base kept in {snapshot}", highlight=False, markup=False, soft_wrap=True)
+            save_prepared(prepared, [view.name for view in views], round_folder(self.trainer.base_dir, self.rounds))
+            if prepared.edited is not None:
+                edit_scene(model, self.trainer.optimizers.optimizers, prepared.edited.edited)
+                self._take_classes(prepared.edited.assignment)
+            self.rounds += 1
+            self._start(prepared.grid, prepared.labels)
+        self._count(prepared.seconds, time.perf_counter() - start, first)
 
-    def _count(self, seconds: dict[str, float], first: bool) -> None:
+    def _stage_store(self) -> StageStore:
+        """Where the stages of this round are kept; those of the run that this one goes on from are looked into too."""
+        former = self.trainer.loaded_run
+        runs = [self.trainer.base_dir] if former in (None, self.trainer.base_dir) else [self.trainer.base_dir, former]
+        own, *others = (run / PREPARED / STAGES / f"round_{self.rounds + 1}" for run in runs)
+        return StageStore(own, others)
+
+    def _count(self, seconds: dict[str, float], spent: float, first: bool) -> None:
         """Add the time of a preparation to that of the stages; it is none of the refinement's."""
         model = self.model
-        model.refining_since = time.perf_counter() if first else model.refining_since + sum(seconds.values())
+        model.preparing_seconds += spent
+        model.refining_since = time.perf_counter() if first else model.refining_since + spent
         total = model.prepared_seconds
         model.prepared_seconds = {name: total.get(name, 0.0) + seconds.get(name, 0.0) for name in {**total, **seconds}}
 
@@ -145,40 +160,22 @@ class RefinementSwitch:
         self.model.class_margin.copy_(assignment.margin)
         self.model.assigned.fill_(True)
 
-    def _start(self, grid: VisibilityGrid | None, labels: LabelMaps, more_rounds: bool) -> None:
-        """more_rounds: whether one is still to be prepared, from the masks as the data has them."""
+    def _start(self, grid: VisibilityGrid | None, labels: LabelMaps) -> None:
+        more_rounds = self.rounds < self.model.config.refine_rounds  # which need the masks as the data has them
         self.datamanager.replace_class_maps(labels, keep=more_rounds)
         self.model.grid = grid
         self.model.frozen = not self.refiner.trains
         self.ready = True
 
-    def _save(self, prepared: Preparation, names: list[str]) -> None:
-        """Keep what refinement needs; grid.pt is written last, so its presence says that all is there."""
-        folder = self._folder(self._round())
-        if folder.name == PREPARED:  # what an earlier run left here
-            shutil.rmtree(folder, ignore_errors=True)
-        (folder / "masks").mkdir(parents=True, exist_ok=True)
-        (folder / "confidence").mkdir(exist_ok=True)
-        for index, name in enumerate(names):
-            labels = prepared.labels[index]
-            write_class_map(folder / "masks" / f"{name}.png", labels.cpu().numpy().astype(np.uint16))
-            if prepared.confidence is not None:
-                _write_grey(folder / "confidence" / f"{name}.png", prepared.confidence[index])
-        report = {"findings": prepared.findings, "seconds": prepared.seconds, "peak_memory_mb": peak_memory_mb()}
-        (folder / "report.json").write_text(json.dumps(report, indent=2))
-        state = {} if prepared.grid is None else prepared.grid.state_dict()
-        torch.save(state, folder / "grid.pt.part")
-        os.replace(folder / "grid.pt.part", folder / "grid.pt")
-
     def _take_up(self) -> None:
         """Go on with the masks and grids of the run that the checkpoint came from, and keep them with this one."""
-        done = int(self.model.refined_steps)
-        folder = self._folder(sum(start < done for start in self._round_starts()) - 1)
+        folder = round_folder(self.trainer.base_dir, self.rounds - 1)
         former = self.trainer.loaded_run
         if former is not None and former != self.trainer.base_dir:
             for name in (PREPARED, BASE_SNAPSHOT):
                 if (former / name).is_dir():
-                    shutil.copytree(former / name, self.trainer.base_dir / name, dirs_exist_ok=True)
+                    skipped = shutil.ignore_patterns(STAGES)
+                    shutil.copytree(former / name, self.trainer.base_dir / name, dirs_exist_ok=True, ignore=skipped)
         if not (folder / "grid.pt").exists():
             raise UserError(
                 f"{former} was refining, but its folder {PREPARED} with masks and voxel grids is missing: restore it, "
@@ -194,10 +191,29 @@ class RefinementSwitch:
             torch.from_numpy(read_class_map(folder / "masks" / f"{view.name}.png").astype(np.int32))
             for view in self.datamanager.views("train")
         )
-        more_rounds = any(start >= int(self.model.refined_steps) for start in self._round_starts())
-        self._start(VisibilityGrid.from_state_dict(state) if state else None, labels, more_rounds)
+        self._start(VisibilityGrid.from_state_dict(state) if state else None, labels)
         self.model.refining_since = time.perf_counter()
         CONSOLE.print(f"  refinement taken up from {folder}", highlight=False, markup=False, soft_wrap=True)
+
+
+def save_prepared(prepared: Preparation, names: list[str], folder: Path) -> None:
+    """Keep what refinement needs; grid.pt is written last, so its presence says that all is there."""
+    (folder / "grid.pt").unlink(missing_ok=True)  # an earlier run's
+    if folder.name == PREPARED:
+        for path in folder.glob("*"):
+            if path.name != STAGES:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+    (folder / "masks").mkdir(parents=True, exist_ok=True)
+    (folder / "confidence").mkdir(exist_ok=True)
+    for index, name in enumerate(names):
+        labels = prepared.labels[index]
+        write_class_map(folder / "masks" / f"{name}.png", labels.cpu().numpy().astype(np.uint16))
+        if prepared.confidence is not None:
+            _write_grey(folder / "confidence" / f"{name}.png", prepared.confidence[index])
+    report = {"findings": prepared.findings, "seconds": prepared.seconds, "peak_memory_mb": peak_memory_mb()}
+    (folder / "report.json").write_text(json.dumps(report, indent=2))
+    state = {} if prepared.grid is None else prepared.grid.state_dict()
+    write_whole(folder / "grid.pt", lambda file: torch.save(state, file))
 
 
 def peak_memory_mb() -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from copy import deepcopy
 from pathlib import Path
@@ -13,27 +12,31 @@ import yaml
 from torch import Tensor
 
 from beags_plugin.errors import UserError
+from beags_plugin.whole_files import write_whole
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
 
 
+CONFIG_FILE = "config.yml"
 BASE_SNAPSHOT = "base"  # folder of the run that keeps the scene as it was when refinement started
 PREPARED = "prepared"  # folder of the run that keeps masks, grids and what was found
+STAGES = "stages"  # in there: results of single stages, for a preparation that is broken off or made again
 EXTRACTION_FILE = "extraction.json"  # in a run that holds a part of another: of which, and what was taken
+REPORT_FILE = "training.json"  # seconds and memory of a run that is complete
 TRANSFORM_FILE = "dataparser_transforms.json"  # nerfstudio's name for how the poses were normalised
 
 
 def save_atomically(content: Any, path: Path) -> None:
     """``torch.save`` that leaves either the old file or the whole new one, never half of one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     # beside the folder, not in it: nerfstudio takes any file among the checkpoints for one
-    part = path.parent.with_name(f".{path.name}.part")
-    with open(part, "wb") as file:
-        torch.save(content, file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(part, path)
+    write_whole(path, lambda file: torch.save(content, file), path.parent.parent)
+
+
+def write_text_atomically(text: str, path: Path) -> None:
+    """``Path.write_text`` (UTF-8) that leaves either the old file or the whole new one."""
+    write_whole(path, lambda file: file.write(text.encode("utf8")))
+
 
 
 def write_run(config: BeagsTrainerConfig, folder: Path, model_state: dict[str, Tensor], step: int) -> Path:
@@ -55,8 +58,8 @@ def write_run(config: BeagsTrainerConfig, folder: Path, model_state: dict[str, T
     for old in path.parent.glob("*.ckpt"):  # of an earlier run into the same folder
         if old != path:
             old.unlink()
-    config_path = folder / "config.yml"
-    config_path.write_text(yaml.dump(own), "utf8")
+    config_path = folder / CONFIG_FILE
+    write_text_atomically(yaml.dump(own), config_path)
     transform = config.get_base_dir() / TRANSFORM_FILE
     if transform.exists() and transform.parent != folder:
         shutil.copyfile(transform, folder / TRANSFORM_FILE)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
@@ -14,15 +17,19 @@ from rich.markup import escape
 
 from beags_plugin.errors import UserError
 from beags_plugin.plugin.held_out import HeldOutCurve
+from beags_plugin.plugin.interrupts import Interrupts
 from beags_plugin.plugin.optimizers import JointOptimizers
 from beags_plugin.plugin.refinement import peak_memory_mb
-from beags_plugin.plugin.runs import newest_checkpoint, save_atomically
+from beags_plugin.plugin.runs import REPORT_FILE, newest_checkpoint, save_atomically, write_text_atomically
+from beags_plugin.plugin.training_state import STATE, VERSION, GlobalRandom, Part, read_checkpoint, training_state
+from beags_plugin.whole_files import remove_unfinished
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
     from beags_plugin.plugin.datamanager import BeagsDataManager
     from beags_plugin.plugin.model import BeagsModel
 
+REPLACED = "replaced_models"  # checkpoints of an earlier run into the same folder, until the new one has its own
 QUICKER = "Quicker: ns-train beags-tiny, or end the command with: beags-data --downscale-factor 2."
 LONG_RUN_SECONDS = 20 * 60  # a run that is expected to take longer says which preset is quicker
 ESTIMATE_STEPS = (20, 120)  # the estimate is the mean step between these: after warm-up, soon enough to matter
@@ -39,7 +46,12 @@ class BeagsTrainer(Trainer):
         config.max_num_iterations = self.last_step
         self.loaded_run: Path | None = None
         self.curve: HeldOutCurve | None = None
-        self._started = 0.0
+        self._parts: dict[str, Part] = {}
+        self._loaded_states: dict[str, Any] = {}
+        self._interrupts = Interrupts()
+        self._saved_step: int | None = None
+        self._done = 0  # the last step that was trained
+        self._complete = False
         super().__init__(config, local_rank, world_size)
 
     @property
@@ -72,16 +84,27 @@ class BeagsTrainer(Trainer):
             f"{ESTIMATE_STEPS[1]} of them. {QUICKER}",
             highlight=False,
         )
-        self._started = time.perf_counter()
+        self._set_aside()
+        remove_unfinished(self.base_dir)
+        (self.base_dir / REPORT_FILE).unlink(missing_ok=True)  # it says that the run is complete
+        self._seconds = _StageSeconds(self._model)
+        self.keep("seconds", self._seconds)
         if self.config.steps_per_held_out > 0:
             datamanager = cast("BeagsDataManager", self.pipeline.datamanager)
             self.curve = HeldOutCurve(
                 self.base_dir, self.config.steps_per_held_out, self.last_step, self._model, datamanager
             )
+            self.keep("held_out", self.curve)
+        self.keep("random", GlobalRandom())
+        self._loaded_states = {}
         try:
-            super().train()
+            with self._interrupts:
+                super().train()
         except UserError as error:
             _stop(error)
+        except KeyboardInterrupt as interrupt:
+            CONSOLE.print(f"Stopped. To go on: beags resume {self.base_dir}", highlight=False, soft_wrap=True)
+            raise SystemExit(self._interrupts.exit_code) from interrupt
 
     def train_iteration(self, step: int) -> Any:
         """One step; after some of them, says how long the run will take, or measures the held-out views."""
@@ -91,6 +114,7 @@ class BeagsTrainer(Trainer):
         if done == ESTIMATE_STEPS[1]:
             self._say_duration((time.perf_counter() - self._estimate_from) / (ESTIMATE_STEPS[1] - ESTIMATE_STEPS[0]))
         found = super().train_iteration(step)
+        self._done = step
         if self.curve is not None:
             self.curve.after_step(step)  # before the scene grows, from which it needs some steps to recover
         return found
@@ -105,25 +129,50 @@ class BeagsTrainer(Trainer):
             message += f" {QUICKER}"
         CONSOLE.print(message, highlight=False)
 
+    # -- checkpoints -------------------------------------------------------------------------------------------------
+
+    def keep(self, name: str, part: Part) -> None:
+        """Let checkpoints hold the state of ``part``; it goes on from what the loaded one holds, if that does."""
+        self._parts[name] = part
+        if name in self._loaded_states:
+            part.restore(self._loaded_states[name])
+
     def _load_checkpoint(self) -> None:
-        config = self.config
-        if config.load_dir is not None and config.load_step is None:
-            config.load_checkpoint = newest_checkpoint(config.load_dir)
-            config.load_dir = None
-        if config.load_checkpoint is None and config.load_dir is None and self.schedule.base_steps == 0:
-            raise UserError(
-                f"{config.method_name} starts from a trained base: add --load-dir <run>/nerfstudio_models of one "
-                "(or <run>/base/nerfstudio_models)."
-            )
-        super()._load_checkpoint()
-        models = config.load_dir or (config.load_checkpoint.parent if config.load_checkpoint else None)
-        self.loaded_run = models.absolute().parent if models else None
+        path = self._checkpoint_path()
+        if path is None:
+            if self.schedule.base_steps == 0:
+                raise UserError(
+                    f"{self.config.method_name} starts from a trained base: add --load-dir <run>/nerfstudio_models of "
+                    "one (or <run>/base/nerfstudio_models)."
+                )
+            return super()._load_checkpoint()
+        checkpoint = read_checkpoint(path)
+        states = training_state(checkpoint, path)
+        self._start_step = checkpoint["step"] + 1
+        self.pipeline.load_pipeline(checkpoint["pipeline"], checkpoint["step"])
+        self.optimizers.load_optimizers(checkpoint["optimizers"])
+        self.grad_scaler.load_state_dict(checkpoint["scalers"])
+        CONSOLE.print(f"Loaded {path}", highlight=False, markup=False, soft_wrap=True)
+        self.loaded_run = path.absolute().parent.parent
         if self.schedule.base_steps == 0 and int(self._model.refined_steps) == 0:
-            self._start_step = 0  # a base that was loaded: refinement counts its own steps
+            self._start_step = 0  # a base that was loaded: refinement counts its own steps, and begins anew
+        else:
+            self._loaded_states = states
+
+    def _checkpoint_path(self) -> Path | None:
+        config = self.config
+        if config.load_dir is None:
+            return config.load_checkpoint
+        if config.load_step is None:
+            return newest_checkpoint(config.load_dir)
+        return config.load_dir / f"step-{config.load_step:09d}.ckpt"
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
-        """Save model and optimizers; the file appears whole or not at all, and only then are older ones removed."""
+        """Save all that decides the rest of the run; the file appears whole or not at all, and only then are older
+        ones removed."""
+        if self._complete:  # nerfstudio saves at the end too, under a number of its own
+            return
         path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
         content = {
             "step": step,
@@ -131,25 +180,91 @@ class BeagsTrainer(Trainer):
             "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()},
             "schedulers": {},
             "scalers": self.grad_scaler.state_dict(),
+            STATE: {"version": VERSION, "parts": {name: part.state() for name, part in self._parts.items()}},
         }
         save_atomically(content, path)
+        self._saved_step = step
         if self.config.save_only_latest_checkpoint:
             for old in self.checkpoint_dir.glob("*.ckpt"):
                 if old != path:
                     old.unlink()
+            shutil.rmtree(self.base_dir / REPLACED, ignore_errors=True)
+
+    def _set_aside(self) -> None:
+        """Move away the checkpoints of an earlier run into this folder, which a resume would take for this run's."""
+        if self.loaded_run != self.base_dir.absolute() and self.config.save_only_latest_checkpoint:
+            former = self.base_dir / REPLACED
+            if any(self.checkpoint_dir.glob("*.ckpt")):
+                shutil.rmtree(former, ignore_errors=True)
+                self.checkpoint_dir.rename(former)
+                CONSOLE.print(
+                    f"{self.base_dir} holds an earlier run; its checkpoint is in {REPLACED} until this one saves its "
+                    "first. (beags resume goes on with a run instead.)",
+                    highlight=False, markup=False, soft_wrap=True,
+                )  # fmt: skip
+
+    # -- breaks --------------------------------------------------------------------------------------------------------
+
+    def stop_if_asked(self, step: int) -> None:
+        """Before ``step``: save the one before it and end, if a signal asked for that."""
+        if self._interrupts.asked is not None:
+            if step > self._start_step:
+                self._save_once(step - 1)
+            raise KeyboardInterrupt
+
+    @contextmanager
+    def long_stage(self, step: int) -> Iterator[None]:
+        """What takes long and keeps its own results, after ``step``: a signal ends it at once, for that is saved."""
+        if step >= 0:
+            self._save_once(step)
+        self._interrupts.at_once = True
+        try:
+            if self._interrupts.asked is not None:
+                raise KeyboardInterrupt
+            yield
+        finally:
+            self._interrupts.at_once = False
+
+    def _save_once(self, step: int) -> None:
+        if self._saved_step != step:
+            self.save_checkpoint(step)
+
+    # -- the end -------------------------------------------------------------------------------------------------------
 
     def _after_train(self) -> None:
-        report = {"seconds": self._stage_seconds(), "peak_memory_mb": peak_memory_mb()}
+        self._interrupts.at_once = True  # a viewer may wait for Ctrl-C
+        self.save_checkpoint(self._done)
+        self._complete = True
+        report = {"seconds": self._seconds.total(), "peak_memory_mb": peak_memory_mb()}
         self.base_dir.mkdir(parents=True, exist_ok=True)
-        (self.base_dir / "training.json").write_text(json.dumps(report, indent=2))
+        write_text_atomically(json.dumps(report, indent=2), self.base_dir / REPORT_FILE)
         super()._after_train()
 
-    def _stage_seconds(self) -> dict[str, float]:
-        """Wall time of base training, each preparation stage and refinement in this process."""
-        total = time.perf_counter() - self._started
-        prepared = self._model.prepared_seconds
-        refining = time.perf_counter() - self._model.refining_since if prepared else 0.0
-        return {"base training": total - sum(prepared.values()) - refining, **prepared, "refinement": refining}
+
+class _StageSeconds:
+    """Wall time of base training, each preparation stage and refinement; a run that was broken off counts on."""
+
+    def __init__(self, model: BeagsModel) -> None:
+        self.model = model
+        self._started = time.perf_counter()
+        self._former: dict[str, float] = {}
+
+    def total(self) -> dict[str, float]:
+        """Seconds by name."""
+        model, now = self.model, time.perf_counter()
+        refining = now - model.refining_since if model.refining_since > 0 else 0.0
+        base = now - self._started - model.preparing_seconds - refining
+        own = {"base training": base, **model.prepared_seconds, "refinement": refining}
+        names = [name for name in {**self._former, **own} if name != "refinement"]
+        return {name: self._former.get(name, 0.0) + own.get(name, 0.0) for name in [*names, "refinement"]}
+
+    def state(self) -> dict[str, Any]:
+        """See ``training_state.Part``."""
+        return self.total()
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """See ``training_state.Part``."""
+        self._former = dict(state)
 
 
 def _duration(seconds: float) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
@@ -16,14 +16,15 @@ from beags_plugin.plugin.schedule import log_linear
 if TYPE_CHECKING:
     from beags_plugin.plugin.datamanager import BeagsDataManager
     from beags_plugin.plugin.model import BeagsModel, BeagsModelConfig
+    from beags_plugin.plugin.trainer import BeagsTrainer
 
 EXTENT_MARGIN = 1.1  # the scene's extent is 1.1 x the largest distance of a camera from their mean (section 1)
 
 
 def training_callbacks(model: BeagsModel, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
     """The callbacks of one run, in the order in which nerfstudio calls them."""
-    trainer, pipeline = attributes.trainer, attributes.pipeline
-    assert trainer is not None and pipeline is not None and attributes.optimizers is not None
+    trainer, pipeline = cast("BeagsTrainer", attributes.trainer), attributes.pipeline
+    assert pipeline is not None and attributes.optimizers is not None
     datamanager = cast("BeagsDataManager", pipeline.datamanager)
     optimizers = attributes.optimizers.optimizers
     model.seed = trainer.config.machine.seed
@@ -34,8 +35,11 @@ def training_callbacks(model: BeagsModel, attributes: TrainingCallbackAttributes
     switch = RefinementSwitch(model, trainer, datamanager)
     switch.check_options()
     switch.check_masks()
+    for name, part in {"views": datamanager, "densification": densifier, "refinement": switch}.items():
+        trainer.keep(name, part)
 
     def before(step: int) -> None:
+        trainer.stop_if_asked(step)
         model.step = step
         every = trainer.config.logging.steps_per_log
         model.measuring = every > 0 and step % every == 0  # nerfstudio reads no other step's
@@ -91,6 +95,15 @@ class Densifier:
         self.config = model.config.densify.scaled(model.schedule.scale).bounded(pixels)
         self.optimizers = optimizers
         self.statistics = GradientStatistics(model.num_points)
+
+    def state(self) -> dict[str, Any]:
+        """What was gathered since the scene last grew; see ``training_state.Part``."""
+        return {"total": self.statistics.total, "views": self.statistics.views}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on gathering."""
+        if len(state["total"]) == self.model.num_points:
+            self.statistics.total, self.statistics.views = state["total"].clone(), state["views"].clone()
 
     def before_step(self, step: int) -> None:
         """Let the step be drawn with what is gathered, as long as the scene still grows."""

@@ -42,37 +42,33 @@ def masks_as_they_are(labels: LabelMaps, cameras: Sequence[Camera], known: Class
 
 
 def reprojected_masks(
-    surfels: Surfels,
+    depths: list[Tensor],
     cameras: Sequence[Camera],
     labels: LabelMaps,
     known: ClassRanks,
-    rasterizer: Rasterizer,
-    settings: RasterSettings,
     config,
-    stage: Stage,
+    progress: Progress | None = None,
 ) -> ConsistentMasks:
-    """The masks of all views, voted by those that vote; config: a ``preparation.PreparationConfig``.
+    """The masks of all views, voted by those that vote.
 
-    The depth of all views is held while they are voted on, and no longer; of what the votes give, one view at a time.
+    depths: per view [H, W], of the surface. config: a ``preparation.PreparationConfig``. Of what the votes give, one
+    view is held at a time.
     """
-    with stage("Rendering depth") as progress:
-        depths = _render_depths(surfels, cameras, rasterizer, settings, config.depth, progress)
     given = translated(labels, known, known.ranks)
     votes = votes_of(given, config.voters)
     ranked, consistent, confidence = LabelMaps(), LabelMaps(), []
-    with stage("Reprojecting masks") as progress:
-        reproject = REPROJECTIONS.get(config.reprojection)
-        found = reproject(depths, cameras, votes, len(known), tau=config.tau, progress=progress)
-        for index, mask in enumerate(found):
-            own = given[index] if votes.stored[index] is None else None
-            # without a vote, a view that does not vote keeps its label too
-            voted = mask.labels if own is None else torch.where(mask.labels == IGNORE, own, mask.labels)
-            ranked.append(voted)
-            confidence.append((mask.confidence * 255.0 + 0.5).to(torch.uint8))
-            if config.min_confidence > 0.0:
-                # for the losses alone: the border split looks for the very rims that are doubtful
-                doubtful = mask.confidence < config.min_confidence
-                consistent.append(_translated(voted, known.class_ids).masked_fill_(doubtful, IGNORE))
+    reproject = REPROJECTIONS.get(config.reprojection)
+    found = reproject(depths, cameras, votes, len(known), tau=config.tau, progress=progress)
+    for index, mask in enumerate(found):
+        own = given[index] if votes.stored[index] is None else None
+        # without a vote, a view that does not vote keeps its label too
+        voted = mask.labels if own is None else torch.where(mask.labels == IGNORE, own, mask.labels)
+        ranked.append(voted)
+        confidence.append((mask.confidence * 255.0 + 0.5).to(torch.uint8))
+        if config.min_confidence > 0.0:
+            # for the losses alone: the border split looks for the very rims that are doubtful
+            doubtful = mask.confidence < config.min_confidence
+            consistent.append(_translated(voted, known.class_ids).masked_fill_(doubtful, IGNORE))
     if len(ranked) != len(cameras):
         raise ValueError(f"the reprojection {config.reprojection!r} gave {len(ranked)} masks for {len(cameras)} views")
     if config.min_confidence == 0.0:
@@ -99,7 +95,15 @@ def _translated(mask: Tensor, table: Callable[[Tensor], Tensor]) -> Tensor:
     return table(mask.masked_fill(unlabelled, 0)).masked_fill_(unlabelled, IGNORE)
 
 
-def _render_depths(surfels, cameras, rasterizer, settings, depth, progress) -> list[Tensor]:
+def render_depths(
+    surfels: Surfels,
+    cameras: Sequence[Camera],
+    rasterizer: Rasterizer,
+    settings: RasterSettings,
+    depth: str,
+    progress: Progress | None = None,
+) -> list[Tensor]:
+    """Per view [H, W], the depth of the surface: see ``rasterizers.drawing.surface_depth``."""
     depths = []
     with torch.no_grad():
         for index, camera in enumerate(cameras):

@@ -23,8 +23,23 @@ from beags_plugin.rasterizers.drawing import check_surface_depth
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
 from beags_plugin.refiners.base import AssignedScene, EditedScene, Refiner
 from beags_plugin.refiners.border_split import BorderSplitConfig, split_at_borders
-from beags_plugin.refiners.consistent_masks import Stage, masks_as_they_are, reprojected_masks
+from beags_plugin.refiners.consistent_masks import (
+    ConsistentMasks,
+    Stage,
+    masks_as_they_are,
+    render_depths,
+    reprojected_masks,
+)
 from beags_plugin.refiners.fewer_bands import without_unneeded_bands
+from beags_plugin.refiners.findings import (
+    assignment_finding,
+    bands_finding,
+    removal_finding,
+    reprojection_finding,
+    split_finding,
+)
+from beags_plugin.refiners.stage_forms import ASSIGNMENT, BANDS, DEPTHS, EDITED, GRID, MASKS
+from beags_plugin.refiners.stages import Stages, StageStore
 
 LEAST_K = 10  # nearer neighbours tell the noise of the depth rather than the distance of points
 
@@ -126,6 +141,8 @@ def prepare(
     background_voxels: bool = True,
     seed: int = 0,
     stage: Stage = lambda name: nullcontext(),
+    store: StageStore | None = None,
+    code: str = "",
 ) -> Preparation:
     """Make masks consistent, assign classes, split at borders if the refiner trains, build the voxel grids.
 
@@ -134,6 +151,8 @@ def prepare(
         the narrowest type, as ``LabelMaps`` already are.
     class_names: id to name, background (0) included; ids may lie far apart: the stages work on their ranks.
     background_voxels: whether a loss will ask the grid about the background; if none will, those voxels are not kept.
+    store: where finished stages are kept, and taken from if nothing that they depend on has changed; code: a digest of
+        the program, on which all of them depend.
     Raises ``UserError`` if no view has a mask or no mask names an object.
     """
     maps = labels if isinstance(labels, LabelMaps) else LabelMaps(labels)
@@ -144,65 +163,105 @@ def prepare(
         )
     surfels = surfels.detach()
     known = _known_classes(maps, class_names)
-    findings, seconds = [], {}
+    stages = Stages(store, code, surfels, list(cameras), settings, type(rasterizer), maps, known.ids, seed)
 
-    def timed(name: str, start: float, finding: str) -> None:
-        seconds[name] = time.perf_counter() - start
-        findings.append(finding)
-
-    start = time.perf_counter()
-    if config.reprojection == "none":
-        masks = masks_as_they_are(maps, cameras, known)
-        timed("reprojection", start, "reprojection: off, masks used as they are")
-    else:
-        masks = reprojected_masks(surfels, cameras, maps, known, rasterizer, settings, config, stage)
-        timed("reprojection", start, _reprojection_finding(maps, masks.labels))
+    masks = _consistent_masks(stages, surfels, cameras, maps, known, rasterizer, settings, config, stage)
     ranked = masks.ranked
 
-    start = time.perf_counter()
-    with stage("Assigning classes") as progress:
-        assignment = assign_classes(surfels, cameras, ranked, rasterizer, settings, len(known), progress=progress)
-    assignment = replace(assignment, class_ids=known.class_ids(assignment.class_ids))
-    timed("assignment", start, _assignment_finding(assignment, class_names))
+    def assigned() -> Assignment:
+        with stage("Assigning classes") as progress:
+            found = assign_classes(surfels, cameras, ranked, rasterizer, settings, len(known), progress=progress)
+        return replace(found, class_ids=known.class_ids(found.class_ids))
+
+    assignment = stages.run("assignment", stages.key("assignment"), assigned, ASSIGNMENT)
+    stages.found("assignment", assignment_finding(assignment, class_names))
 
     edited = None
     if config.min_contribution > 0 and refiner.trains:
         start = time.perf_counter()
         edited = _without_unneeded(surfels, assignment, config.min_contribution)
-        timed("removal", start, _removal_finding(len(surfels), edited, config.min_contribution))
+        stages.seconds["removal"] = time.perf_counter() - start
+        stages.key("removal", config.min_contribution)
+        stages.found("removal", removal_finding(len(surfels), edited, config.min_contribution))
         surfels = edited.edited.surfels
     if split is not None and split.rounds > 0 and refiner.trains:
-        start = time.perf_counter()
-        with stage("Splitting Gaussians at borders") as progress:
-            divided = split_at_borders(surfels, cameras, ranked, rasterizer, settings, len(known), split, progress)
-        timed("border split", start, _split_finding(len(surfels), divided))
+
+        def divided_scene() -> EditedScene:
+            with stage("Splitting Gaussians at borders") as progress:
+                return split_at_borders(surfels, cameras, ranked, rasterizer, settings, len(known), split, progress)
+
+        divided = stages.run("border split", stages.key("border split", split), divided_scene, EDITED)
+        stages.found("border split", split_finding(len(surfels), divided))
         classes = replace(divided.assignment, class_ids=known.class_ids(divided.assignment.class_ids))
         whole = divided.edited if edited is None else edited.edited.then(divided.edited)
         edited, surfels = EditedScene(whole, classes), divided.edited.surfels
 
     if config.trim_sh > 0 and refiner.trains:
-        start = time.perf_counter()
-        with stage("Leaving out bands of the colour") as progress:
-            fewer, change = without_unneeded_bands(surfels, cameras, rasterizer, settings, config.trim_sh, progress)
-        timed("bands", start, _bands_finding(surfels.sh_degree, fewer.sh_degree, change))
-        if fewer is not surfels:
+
+        def trimmed() -> tuple[Surfels | None, float]:
+            with stage("Leaving out bands of the colour") as progress:
+                fewer, change = without_unneeded_bands(surfels, cameras, rasterizer, settings, config.trim_sh, progress)
+            return None if fewer is surfels else fewer, change
+
+        fewer, change = stages.run("bands", stages.key("bands", config.trim_sh), trimmed, BANDS)
+        degree = surfels.sh_degree
+        if fewer is not None:
             edited = edited or EditedScene(Densified.unchanged(surfels), assignment)
             edited, surfels = replace(edited, edited=replace(edited.edited, surfels=fewer)), fewer
+        stages.found("bands", bands_finding(degree, surfels.sh_degree, change))
 
-    start = time.perf_counter()
-    num_classes = max(class_names) + 1
     class_ids = (assignment if edited is None else edited.assignment).class_ids
     scene = AssignedScene(
-        surfels, class_ids, cameras, masks.labels, num_classes, rasterizer, settings, seed, config.depth
+        surfels, class_ids, cameras, masks.labels, max(class_names) + 1, rasterizer, settings, seed, config.depth
     )
-    with stage("Building voxel grids") as progress:
-        k = config.neighbours(cameras)
-        grid = refiner.build_grid(scene, k, progress)
-    if grid is not None:
+    k = config.neighbours(cameras)
+
+    def built() -> VisibilityGrid | None:
+        with stage("Building voxel grids") as progress:
+            grid = refiner.build_grid(scene, k, progress)
+        if grid is None:
+            return None
         asked = torch.unique(class_ids)  # classes are fixed: no loss can ask about one that has no Gaussians
-        grid = grid.only(asked if background_voxels else asked[asked != 0])
-        timed("voxel grids", start, f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {k})")
-    return Preparation(masks.labels, masks.confidence, assignment, grid, edited, findings, seconds)
+        return grid.only(asked if background_voxels else asked[asked != 0])
+
+    key = stages.key("voxel grids", k, config.depth, type(refiner), max(class_names), background_voxels)
+    grid = stages.run("voxel grids", key, built, GRID)
+    if grid is None:
+        stages.drop("voxel grids")
+    else:
+        stages.found("voxel grids", f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {k})")
+    return Preparation(masks.labels, masks.confidence, assignment, grid, edited, stages.findings, stages.seconds)
+
+
+def _consistent_masks(
+    stages: Stages, surfels, cameras, maps: LabelMaps, known: ClassRanks, rasterizer, settings, config, stage: Stage
+) -> ConsistentMasks:
+    """The masks of all views, reprojected if that is asked for."""
+    if config.reprojection == "none":
+        start = time.perf_counter()
+        masks = masks_as_they_are(maps, cameras, known)
+        stages.seconds["reprojection"] = time.perf_counter() - start
+        stages.key("reprojection", "none")
+        stages.found("reprojection", "reprojection: off, masks used as they are")
+        return masks
+    reproject = REPROJECTIONS.get(config.reprojection)
+    options = (config.reprojection, config.voters, config.min_confidence, config.tau)
+    depth_key = stages.key("depth", config.depth)
+    key = stages.key("reprojection", *options, reproject)
+
+    def rendered() -> list[Tensor]:
+        with stage("Rendering depth") as progress:
+            return render_depths(surfels, cameras, rasterizer, settings, config.depth, progress)
+
+    def reprojected() -> ConsistentMasks:
+        depths = stages.run("depth", depth_key, rendered, DEPTHS)
+        with stage("Reprojecting masks") as progress:
+            return reprojected_masks(depths, cameras, maps, known, config, progress)
+
+    masks = stages.run("reprojection", key, reprojected, MASKS)
+    stages.drop("depth")  # as large as all photos in float, and quickly drawn
+    stages.found("reprojection", reprojection_finding(maps, masks.labels))
+    return masks
 
 
 def _known_classes(labels: Sequence[Tensor | None], class_names: dict[int, str]) -> ClassRanks:
@@ -219,43 +278,9 @@ def _known_classes(labels: Sequence[Tensor | None], class_names: dict[int, str])
     return ClassRanks(torch.cat([named.ids, present.nonzero()[:, 0]]))
 
 
-def _reprojection_finding(before: Sequence[Tensor | None], after: Sequence[Tensor]) -> str:
-    known = [(old, new) for old, new in zip(before, after, strict=True) if old is not None]
-    changed = sum(int((old != new).sum()) for old, new in known)
-    pixels = sum(old.numel() for old, _ in known)
-    filled = len(before) - len(known)
-    return (
-        f"reprojection: {changed} of {pixels} labelled pixels changed ({100 * changed / max(pixels, 1):.2f} %), "
-        f"{filled} views without a mask got one"
-    )
-
-
 def _without_unneeded(surfels: Surfels, assignment: Assignment, least: float) -> EditedScene:
     """The scene without surfels that fill less than ``least`` pixels in every view; at least one remains."""
     kept = assignment.strongest >= least
     kept[assignment.strongest.argmax()] = True
     source = torch.nonzero(kept)[:, 0]
     return EditedScene(Densified(surfels[kept], source, torch.zeros_like(source, dtype=torch.bool)), assignment[kept])
-
-
-def _removal_finding(before: int, edited: EditedScene, least: float) -> str:
-    removed = before - len(edited.edited.surfels)
-    share = f"{removed} of {before} Gaussians ({100 * removed / before:.1f} %)"
-    return f"removal: {share} fill less than {least:g} pixels in every view"
-
-
-def _split_finding(before: int, divided: EditedScene) -> str:
-    after = len(divided.edited.surfels)
-    return f"border split: {int(divided.edited.fresh.sum())} halves, {before} Gaussians became {after}"
-
-
-def _bands_finding(before: int, after: int, change: float) -> str:
-    if after == before:
-        return f"bands: degree {before} stays, fewer would change the training views by more than is allowed"
-    return f"bands: degree {before} became {after}, which changes the training views by {change:.5f}"
-
-
-def _assignment_finding(assignment: Assignment, class_names: dict[int, str]) -> str:
-    counts = torch.bincount(assignment.class_ids.long(), minlength=max(class_names) + 1)
-    per_class = ", ".join(f"{name} {int(counts[index])}" for index, name in sorted(class_names.items()))
-    return f"assignment: Gaussians per class: {per_class}; never seen: {int(assignment.never_seen.sum())}"

@@ -1,0 +1,45 @@
+"""Ctrl-C and SIGTERM during training: the step is finished and saved before the program ends."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from types import FrameType
+from typing import Any
+
+from nerfstudio.utils.rich_utils import CONSOLE
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Interrupts:
+    """Notes the first signal for the training loop to ask about; a second one ends the program at once.
+
+    at_once: whether the first does so too, as where no step is under way that could be finished.
+    """
+
+    def __init__(self) -> None:
+        self.asked: int | None = None
+        self.at_once = False
+        self._former: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> Interrupts:
+        if threading.current_thread() is threading.main_thread():  # Python allows it there alone
+            self._former = {number: signal.signal(number, self._note) for number in SIGNALS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._former.items():
+            signal.signal(number, handler)
+        self._former = {}
+
+    def _note(self, number: int, _: FrameType | None) -> None:
+        again, self.asked = self.asked is not None, number
+        if again or self.at_once:
+            raise KeyboardInterrupt
+        CONSOLE.print("Stopping after this step, and saving it. Once more ends at once.", highlight=False)
+
+    @property
+    def exit_code(self) -> int:
+        """What a shell expects of a program that a signal ended."""
+        return 128 + (self.asked or signal.SIGINT)

@@ -1,0 +1,50 @@
+"""What the stages of a preparation found, a line each for a reader."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from beags_plugin.assignment.assignment import Assignment
+from beags_plugin.refiners.base import EditedScene
+
+
+def reprojection_finding(before: Sequence[Tensor | None], after: Sequence[Tensor]) -> str:
+    """How much reprojection changed."""
+    known = [(old, new) for old, new in zip(before, after, strict=True) if old is not None]
+    changed = sum(int((old != new).sum()) for old, new in known)
+    pixels = sum(old.numel() for old, _ in known)
+    filled = len(before) - len(known)
+    return (
+        f"reprojection: {changed} of {pixels} labelled pixels changed ({100 * changed / max(pixels, 1):.2f} %), "
+        f"{filled} views without a mask got one"
+    )
+
+
+def removal_finding(before: int, edited: EditedScene, least: float) -> str:
+    """How many Gaussians were removed."""
+    removed = before - len(edited.edited.surfels)
+    share = f"{removed} of {before} Gaussians ({100 * removed / before:.1f} %)"
+    return f"removal: {share} fill less than {least:g} pixels in every view"
+
+
+def split_finding(before: int, divided: EditedScene) -> str:
+    """How many Gaussians were split."""
+    after = len(divided.edited.surfels)
+    return f"border split: {int(divided.edited.fresh.sum())} halves, {before} Gaussians became {after}"
+
+
+def bands_finding(before: int, after: int, change: float) -> str:
+    """What became of the bands of the colour."""
+    if after == before:
+        return f"bands: degree {before} stays, fewer would change the training views by more than is allowed"
+    return f"bands: degree {before} became {after}, which changes the training views by {change:.5f}"
+
+
+def assignment_finding(assignment: Assignment, class_names: dict[int, str]) -> str:
+    """How many Gaussians each class has."""
+    counts = torch.bincount(assignment.class_ids.long(), minlength=max(class_names) + 1)
+    per_class = ", ".join(f"{name} {int(counts[index])}" for index, name in sorted(class_names.items()))
+    return f"assignment: Gaussians per class: {per_class}; never seen: {int(assignment.never_seen.sum())}"

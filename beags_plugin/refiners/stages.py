@@ -1,0 +1,112 @@
+"""Stages that are kept on disk once they are finished, and taken from there while their inputs are the same."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import torch
+
+from beags_plugin.digests import input_digest
+from beags_plugin.whole_files import write_whole
+
+FORMAT = 1
+"""Of the files below; another number makes every stage be done again."""
+
+T = TypeVar("T")
+
+
+class StageStore:
+    """Results of stages: files ``<name>-<digest>.pt`` in ``folder``, one for each name; whole ones only.
+
+    former: folders of runs that this one goes on from, looked into too, but not written to.
+    """
+
+    def __init__(self, folder: Path, former: Sequence[Path] = ()) -> None:
+        self.folder = folder
+        self.former = former
+
+    def kept(self, name: str, digest: str) -> Any | None:
+        """What was kept of the stage with these inputs; None if it is not there or cannot be read."""
+        for folder in (self.folder, *self.former):
+            try:
+                return torch.load(_file(folder, name, digest), weights_only=True)
+            except FileNotFoundError:
+                continue
+            except Exception:  # damaged; torch raises many kinds: the stage is done again
+                continue
+        return None
+
+    def keep(self, name: str, digest: str, content: Any) -> None:
+        """Keep the stage's content (tensors and plain values) in place of what was there of it."""
+        path = _file(self.folder, name, digest)
+        write_whole(path, lambda file: torch.save(content, file))
+        for other in self.folder.glob(f"{name}-*.pt"):
+            if other != path:
+                other.unlink()
+
+    def drop(self, name: str) -> None:
+        """Forget the stage."""
+        for path in self.folder.glob(f"{name}-*.pt"):
+            path.unlink()
+
+
+def _file(folder: Path, name: str, digest: str) -> Path:
+    return folder / f"{name}-{digest[:24]}.pt"
+
+
+class Form(Generic[T]):
+    """How a stage's result lies on disk: ``pack`` makes tensors and plain values of it, ``unpack`` the result again."""
+
+    def __init__(self, pack: Callable[[T], Any], unpack: Callable[[Any], T]) -> None:
+        self.pack = pack
+        self.unpack = unpack
+
+
+class Stages:
+    """The stages of one preparation, in order: each depends on its own inputs and on all that came before.
+
+    inputs: what every stage depends on; see ``digests.input_digest``. store: where to keep them; None keeps nothing.
+    """
+
+    def __init__(self, store: StageStore | None, *inputs: Any) -> None:
+        self.store = store
+        self.findings: list[str] = []
+        self.seconds: dict[str, float] = {}
+        self._digest = "" if store is None else input_digest(FORMAT, *inputs)
+        self._aside = 0.0  # seconds that went into files, less those that stages took when they were computed
+        self._reused: set[str] = set()
+
+    def key(self, name: str, *inputs: Any) -> str:
+        """The digest of the next stage's inputs."""
+        if self.store is not None:
+            self._digest = input_digest(self._digest, name, *inputs)
+        return self._digest
+
+    def run(self, name: str, key: str, compute: Callable[[], T], form: Form[T]) -> T:
+        """The stage's result, computed, or from the store if it was computed with the same ``key`` before."""
+        start, aside = time.perf_counter(), self._aside
+        if self.store is not None and (kept := self.store.kept(name, key)) is not None:
+            self._reused.add(name)
+            self.seconds[name] = kept["seconds"]
+            self._aside += time.perf_counter() - start - kept["seconds"]
+            return form.unpack(kept["content"])
+        found = compute()
+        self.seconds[name] = time.perf_counter() - start - (self._aside - aside)
+        if self.store is not None:
+            start = time.perf_counter()
+            self.store.keep(name, key, {"seconds": self.seconds[name], "content": form.pack(found)})
+            self._aside += time.perf_counter() - start
+        return found
+
+    def drop(self, name: str) -> None:
+        """Forget a stage that nothing asks for again; its seconds are part of another's."""
+        self.seconds.pop(name, None)
+        if self.store is not None:
+            self.store.drop(name)
+
+    def found(self, name: str, finding: str) -> None:
+        """Note a line for a reader."""
+        self.findings.append(f"{finding} (kept from before)" if name in self._reused else finding)

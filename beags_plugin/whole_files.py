@@ -1,0 +1,48 @@
+"""Files that are there whole or not at all, whenever the program is killed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, BinaryIO
+
+PART = ".part"
+"""Ends the names of files that are being written; their names start with a dot."""
+
+
+def write_whole(path: Path, write: Callable[[BinaryIO], Any], beside: Path | None = None) -> None:
+    """Let ``write`` write a file that takes the place of ``path`` once it is safe on disk.
+
+    beside: folder of the unfinished file, on the same disk; that of ``path`` if None.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = (beside or path.parent) / f".{path.name}{PART}"
+    with open(part, "wb") as file:
+        write(file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(part, path)
+    _sync_folder(path.parent)
+
+
+def remove_unfinished(folder: Path) -> list[Path]:
+    """Remove what a killed program left half written in ``folder`` and below; returns the files."""
+    found = sorted(path for path in folder.rglob(f".*{PART}") if path.is_file())
+    for path in found:
+        path.unlink()
+    return found
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a new name in ``folder`` survive a power cut; not every system can."""
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError:  # Windows opens no folders
+        return
+    try:
+        os.fsync(handle)
+    except OSError:
+        pass
+    finally:
+        os.close(handle)
