@@ -62,7 +62,8 @@ def resumed_config(run: Path) -> BeagsTrainerConfig:
     config.run_dir = folder  # wherever it has been moved to
     models = config.get_checkpoint_dir()
     if not any(models.glob("step-*.ckpt")):
-        CONSOLE.print(f"{folder} holds no checkpoint yet: it starts from the beginning.", highlight=False, markup=False)
+        message = f"{folder} holds no checkpoint yet: it starts from the beginning."
+        CONSOLE.print(message, highlight=False, markup=False, soft_wrap=True)
         return config
     if (folder / EXTRACTION_FILE).exists() or scene_alone(read_checkpoint(newest_checkpoint(models))):
         raise UserError(

@@ -38,7 +38,6 @@ def write_text_atomically(text: str, path: Path) -> None:
     write_whole(path, lambda file: file.write(text.encode("utf8")))
 
 
-
 def write_run(config: BeagsTrainerConfig, folder: Path, model_state: dict[str, Tensor], step: int) -> Path:
     """Write a run of its own that holds ``model_state``; returns the path of its config.yml.
 

@@ -1,0 +1,107 @@
+"""Short runs in this process, broken off at chosen moments, and what is left of them on disk."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import torch
+
+STEPS = 45, 12  # of base and refinement
+
+
+class Killed(BaseException):
+    """What no program catches, as a kill is not."""
+
+
+def short_config(data: Path, run: Path, **overrides):
+    """A run of all phases in a second: growth, two rounds of preparation, a curve, frequent checkpoints."""
+    from beags_plugin.plugin.presets import preset_config
+
+    values = {
+        "pipeline.model.base_steps": STEPS[0],
+        "pipeline.model.refine_steps": STEPS[1],
+        "pipeline.model.refine_rounds": 2,
+        "pipeline.model.densify.start": 5,
+        "pipeline.model.densify.every": 10,
+        "pipeline.model.densify.stop": 40,
+        "pipeline.model.densify.reset_every": 15,
+        "optimizers.opacities.optimizer.lr": 0.5,  # opaque after so few steps
+        "pipeline.model.losses.normal.start": 12,
+        "pipeline.model.sh_degree_interval": 15,
+        "pipeline.model.background_color": "random",
+        "pipeline.model.prepare.k": 10,
+        "pipeline.model.prepare.min_confidence": 0.3,
+        "steps_per_save": 7,
+        "steps_per_eval_image": 10,
+        "steps_per_held_out": 10,
+        "vis": "tensorboard",
+        **overrides,
+    }
+    config = preset_config("beags-tiny", values, Path("test"))
+    config.data, config.run_dir = data, run
+    config.logging.local_writer.enable = False
+    return config
+
+
+def run_to_end(config):
+    """Train as ns-train does; the writers of nerfstudio are the process's, so they are forgotten afterwards."""
+    from beags_plugin.plugin.launch import train
+
+    try:
+        train(config)
+    finally:
+        forget_writers()
+
+
+def resume_to_end(run: Path):
+    """What ``beags resume`` does."""
+    from beags_plugin.plugin.launch import resume
+
+    try:
+        resume(run)
+    finally:
+        forget_writers()
+
+
+def forget_writers():
+    from nerfstudio.utils import writer
+
+    writer.EVENT_WRITERS.clear()
+    writer.EVENT_STORAGE.clear()
+
+
+def checkpoint_of(run: Path) -> dict:
+    """The only checkpoint of a run."""
+    (path,) = (run / "nerfstudio_models").iterdir()
+    return torch.load(path, weights_only=True)
+
+
+def without_clocks(value):
+    """The same without what a clock said."""
+    if isinstance(value, dict):
+        return {k: without_clocks(v) for k, v in value.items() if k not in ("seconds", "cpu_seconds", "clocks")}
+    return [without_clocks(item) for item in value] if isinstance(value, (list, tuple)) else value
+
+
+def differences(a, b, where="") -> list[str]:
+    """Where two checkpoints (or other plain values) are not the same bits."""
+    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
+        same = a.dtype == b.dtype and torch.equal(a, b)
+        return [] if same else [where]
+    if isinstance(a, dict) and isinstance(b, dict) and a.keys() == b.keys():
+        return [found for key in a for found in differences(a[key], b[key], f"{where}/{key}")]
+    if isinstance(a, (list, tuple)) and isinstance(b, (list, tuple)) and len(a) == len(b):
+        return [found for i, pair in enumerate(zip(a, b, strict=True)) for found in differences(*pair, f"{where}/{i}")]
+    return [] if a == b else [where]
+
+
+def assert_same_run(one: Path, other: Path):
+    """Both ended with the same checkpoint, bit for bit, the same curve and the same masks."""
+    assert differences(without_clocks(checkpoint_of(one)), without_clocks(checkpoint_of(other))) == []
+    curves = [without_clocks(json.loads((run / "held_out.json").read_text())) for run in (one, other)]
+    assert curves[0] == curves[1] and len(curves[0]) >= 5
+    for folder in ("prepared/masks", "prepared/round_2/masks"):
+        files = sorted(path.name for path in (one / folder).iterdir())
+        assert files and files == sorted(path.name for path in (other / folder).iterdir())
+        assert all((one / folder / name).read_bytes() == (other / folder / name).read_bytes() for name in files)
