@@ -63,10 +63,10 @@ def _add(digest: Any, value: Any) -> None:
         digest.update(f"{len(value)}:".encode())
         for item in value:
             _add(digest, item)
+    elif (stored := getattr(value, "stored", None)) is not None:
+        _add(digest, stored)
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         _add(digest, [(field.name, getattr(value, field.name)) for field in dataclasses.fields(value)])
-    elif hasattr(value, "stored"):
-        _add(digest, value.stored)
     elif inspect.isfunction(value) or isinstance(value, type):
         digest.update(f"{value.__module__}.{value.__qualname__}".encode())
         if source := inspect.getsourcefile(value):

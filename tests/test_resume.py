@@ -121,8 +121,9 @@ def test_a_kill_in_the_preparation_leaves_the_finished_stages(data, whole, tmp_p
     def count(patch, killed):
         for stage in STAGES:
             module = stage_module(stage)
+            compute = getattr(module, stage)
 
-            def counted(*args, stage=stage, compute=getattr(module, stage), **options):
+            def counted(*args, stage=stage, compute=compute, **options):
                 calls[stage] += 1
                 if killed and stage == name and calls[stage] == round_:
                     raise Killed
@@ -215,8 +216,9 @@ def test_stages_are_done_again_when_their_inputs_have_changed(data, whole, tmp_p
     run_to_end(short_config(data, run))
     for stage in STAGES:
         module = stage_module(stage)
+        compute = getattr(module, stage)
 
-        def counted(*args, stage=stage, compute=getattr(module, stage), **options):
+        def counted(*args, stage=stage, compute=compute, **options):
             done.append(stage)
             return compute(*args, **options)
 

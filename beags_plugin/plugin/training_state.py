@@ -35,7 +35,8 @@ class GlobalRandom:
 
     def state(self) -> dict[str, Any]:
         """See ``Part``."""
-        name, keys, *rest = np.random.get_state()
+        numpy_state: Any = np.random.get_state()  # noqa: NPY002  (that of others, not one to draw from)
+        name, keys, *rest = numpy_state
         return {"torch": torch.get_rng_state(), "python": random.getstate(), "numpy": (name, keys.tolist(), *rest)}
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -43,7 +44,7 @@ class GlobalRandom:
         torch.set_rng_state(state["torch"])
         random.setstate(state["python"])
         name, keys, *rest = state["numpy"]
-        np.random.set_state((name, np.array(keys, dtype=np.uint32), *rest))
+        np.random.set_state((name, np.array(keys, dtype=np.uint32), *rest))  # noqa: NPY002
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

@@ -37,8 +37,7 @@ def _expanded(data: Tensor) -> Tensor:
 
 
 def _pack_maps(maps: LabelMaps) -> list[Tensor]:
-    # int32 is taken where ids do not fit into 16 bits, of which there is none but IGNORE
-    return [_compressed(image if image.dtype != torch.int32 else image.to(torch.uint16)) for image in maps.stored]
+    return [_compressed(image) for image in maps.stored if image is not None]  # every view has one by now
 
 
 def _unpack_maps(packed: list[Tensor]) -> LabelMaps:
