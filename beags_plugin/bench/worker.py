@@ -91,7 +91,7 @@ def run(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
     ``measure.measure_run`` gives, "findings" (a line per stage), "voxel_size" and "training_pixels".
     """
     from beags_plugin.plugin.launch import train
-    from beags_plugin.plugin.refinement import peak_memory_mb
+    from beags_plugin.plugin.memory import peak_memory_mb
 
     start_memory_mb = peak_memory_mb()
     config = trial_config(request, run_folder)

@@ -37,9 +37,14 @@ class HeldOutViews(Sequence[EvalView]):
     Asking for a view raises ``UserError`` for a mask that cannot be read or has other proportions than its photograph.
     """
 
-    def __init__(self, config: BeagsTrainerConfig, classes: Mapping[int, str]) -> None:
-        manager = config.data_config.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
-        self.manager = cast("BeagsDataManager", manager)
+    def __init__(
+        self, config: BeagsTrainerConfig, classes: Mapping[int, str], manager: BeagsDataManager | None = None
+    ) -> None:
+        """manager: of the same config, if one is at hand."""
+        if manager is None:
+            made = config.data_config.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
+            manager = cast("BeagsDataManager", made)
+        self.manager = manager
         self.classes = classes
         self.background = fixed_background(config.model_config)
         self._views = self.manager.views("test")

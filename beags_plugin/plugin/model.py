@@ -26,6 +26,7 @@ from beags_plugin.masks.classes import colorize
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.schedule import PhaseSchedule
+from beags_plugin.plugin.step_clock import StepClock
 from beags_plugin.plugin.training import training_callbacks
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.drawing import draw_class_map, surfel_inputs
@@ -113,11 +114,16 @@ class BeagsModelConfig(ModelConfig):
 
 @dataclass(frozen=True)
 class Drawn:
-    """What the last training step drew. screen_shift: [N, 2] of ``SurfelInputs``, whose gradient growth looks at."""
+    """What the last training step drew.
+
+    screen_shift: [N, 2] of ``SurfelInputs``, whose gradient growth looks at. labels: [H, W] int32 M', against which the
+    boundary was drawn; None if it was not.
+    """
 
     camera: Camera
     render: RasterOutputs
     screen_shift: Tensor | None
+    labels: Tensor | None = None
 
 
 def fixed_background(config: BeagsModelConfig) -> Tensor:
@@ -184,6 +190,7 @@ class BeagsModel(SplatfactoModel):
         self.crop_box: OrientedBox | None = None
         self.background_color = fixed_background(self.config)
         self.drawn: Drawn | None = None
+        self.clock = StepClock()
         self.measuring = True  # whether anyone will read this step's metrics
         self.object_choice = ViewerDropdown("Object", EVERYTHING, [EVERYTHING, *self._object_names()])
 
@@ -284,6 +291,7 @@ class BeagsModel(SplatfactoModel):
             return self._viewer_outputs(camera_from_nerfstudio(camera, 0).to(self.device))
 
     def _training_outputs(self, cameras: Cameras) -> dict[str, Any]:
+        self.clock.mark("data")
         camera = camera_from_nerfstudio(cameras, 0).to(self.device)
         needs = frozenset().union(*(loss.needs for loss in self.active_losses().values()))
         target = (cameras.metadata or {}).get("class_map") if "boundary" in needs else None
@@ -293,14 +301,11 @@ class BeagsModel(SplatfactoModel):
         )
         if self.growing:
             inputs = replace(inputs, screen_shift=torch.zeros_like(inputs.means[:, :2]).requires_grad_())
-        render = self.rasterizer.rasterize(
-            inputs,
-            camera,
-            self.settings(geometry="geometry" in needs, distortion="distortion" in needs),
-            background,
-            None if target is None else target.to(self.device, torch.int32),
-        )
-        self.drawn = Drawn(camera, render, inputs.screen_shift)
+        labels = None if target is None else target.to(self.device, torch.int32)
+        settings = self.settings(geometry="geometry" in needs, distortion="distortion" in needs)
+        render = self.rasterizer.rasterize(inputs, camera, settings, background, labels)
+        self.drawn = Drawn(camera, render, inputs.screen_shift, labels)
+        self.clock.mark("drawing")
         outputs = {"rgb": render.color, "accumulation": render.alpha[..., None], "background": background}
         if render.depth is not None:
             outputs["depth"] = render.depth[..., None]
@@ -388,6 +393,7 @@ class BeagsModel(SplatfactoModel):
             draw=self._draw_apart,
         )
         terms = {name: loss.weighted(inputs) for name, loss in self.active_losses().items()}
+        self.clock.mark("losses")
         # a frozen scene still needs something to call backward on; no parameter hangs on it, so none moves
         return terms or {"none": torch.zeros((), device=self.device, requires_grad=True)}
 

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from nerfstudio.engine.optimizers import Optimizers
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from beags_plugin.core.adam import clear_gradients, step_all
+from beags_plugin.plugin.step_clock import StepClock
 
 
 class JointOptimizers(Optimizers):
     """``Optimizers`` whose groups are cleared and stepped in one go; optimizers, states and files are nerfstudio's."""
+
+    def __init__(self, config: dict[str, Any], param_groups: dict[str, Any], clock: StepClock | None = None) -> None:
+        super().__init__(config, param_groups)
+        self.clock = clock or StepClock()
 
     def zero_grad_some(self, param_groups: list[str]) -> None:
         """See ``Optimizers.zero_grad_some``."""
@@ -17,8 +24,14 @@ class JointOptimizers(Optimizers):
 
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
         """See ``Optimizers.optimizer_scaler_step_some``; scaled or clipped gradients go nerfstudio's way."""
+        self.clock.mark("backward")
         if grad_scaler.is_enabled():
-            return super().optimizer_scaler_step_some(grad_scaler, param_groups)
+            super().optimizer_scaler_step_some(grad_scaler, param_groups)
+        else:
+            self._step_together(grad_scaler, param_groups)
+        self.clock.mark("optimizer")
+
+    def _step_together(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
         clipped = [name for name in param_groups if self.config[name]["optimizer"].max_norm is not None]
         super().optimizer_scaler_step_some(grad_scaler, clipped)
         step_all(self.optimizers[name] for name in param_groups if name not in clipped)

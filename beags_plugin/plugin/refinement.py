@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import resource
 import shutil
 import time
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +18,7 @@ from beags_plugin.errors import UserError
 from beags_plugin.masks.classes import read_class_map, write_class_map
 from beags_plugin.masks.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.plugin.memory import peak_memory_mb
 from beags_plugin.plugin.runs import BASE_SNAPSHOT, PREPARED, STAGES, round_folder, write_run
 from beags_plugin.plugin.scene_edits import edit_scene
 from beags_plugin.progress import progress_bar
@@ -214,14 +213,6 @@ def save_prepared(prepared: Preparation, names: list[str], folder: Path) -> None
     (folder / "report.json").write_text(json.dumps(report, indent=2))
     state = {} if prepared.grid is None else prepared.grid.state_dict()
     write_whole(folder / "grid.pt", lambda file: torch.save(state, file))
-
-
-def peak_memory_mb() -> float:
-    """Largest resident memory of this process so far, MB of 10^6 bytes."""
-    with suppress(OSError, StopIteration):  # Linux only; getrusage's would count what the parent process once held
-        status = Path("/proc/self/status").read_text().splitlines()
-        return int(next(line for line in status if line.startswith("VmHWM:")).split()[1]) * 1024 / 1e6
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
 
 
 def _write_grey(path: Path, values: torch.Tensor) -> None:

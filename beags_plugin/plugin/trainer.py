@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
@@ -19,7 +20,7 @@ from beags_plugin.errors import UserError
 from beags_plugin.plugin.held_out import HeldOutCurve
 from beags_plugin.plugin.interrupts import Interrupts
 from beags_plugin.plugin.optimizers import JointOptimizers
-from beags_plugin.plugin.refinement import peak_memory_mb
+from beags_plugin.plugin.memory import peak_memory_mb
 from beags_plugin.plugin.runs import REPORT_FILE, newest_checkpoint, save_atomically, write_text_atomically
 from beags_plugin.plugin.training_state import STATE, VERSION, GlobalRandom, Part, read_checkpoint, training_state
 from beags_plugin.whole_files import remove_unfinished
@@ -62,12 +63,22 @@ class BeagsTrainer(Trainer):
         """Load data, build the model, load a checkpoint; a user's mistake ends here, with one sentence."""
         try:
             super().setup(test_mode)
+            if self.loaded_run == self.base_dir.absolute():
+                self._forget_events()
         except UserError as error:
             _stop(error)
 
+    def _forget_events(self) -> None:
+        """Let tensorboard forget what this run once did after the checkpoint: it does that again."""
+        for each in writer.EVENT_WRITERS:
+            if isinstance(each, writer.TensorboardWriter):
+                folder = each.tb_writer.log_dir
+                each.tb_writer.close()
+                each.tb_writer = type(each.tb_writer)(log_dir=folder, purge_step=self._start_step)
+
     def setup_optimizers(self) -> JointOptimizers:
         """The optimizers that the config lists, one for each group of parameters."""
-        return JointOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
+        return JointOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups(), self._model.clock)
 
     def train(self) -> None:
         """Train to the end of the schedule, also after a resume (nerfstudio would train that many steps more)."""
@@ -117,6 +128,7 @@ class BeagsTrainer(Trainer):
         self._done = step
         if self.curve is not None:
             self.curve.after_step(step)  # before the scene grows, from which it needs some steps to recover
+            self._model.clock.skip()
         return found
 
     def _say_duration(self, seconds_per_step: float) -> None:

@@ -14,6 +14,7 @@ from beags_plugin.plugin.scene_edits import edit_scene, move_adam_state
 from beags_plugin.plugin.schedule import log_linear
 
 if TYPE_CHECKING:
+    from beags_plugin.plugin.curves import Curves
     from beags_plugin.plugin.datamanager import BeagsDataManager
     from beags_plugin.plugin.model import BeagsModel, BeagsModelConfig
     from beags_plugin.plugin.trainer import BeagsTrainer
@@ -38,6 +39,8 @@ def training_callbacks(model: BeagsModel, attributes: TrainingCallbackAttributes
     for name, part in {"views": datamanager, "densification": densifier, "refinement": switch}.items():
         trainer.keep(name, part)
 
+    curves = _curves(model, trainer, datamanager)
+
     def before(step: int) -> None:
         trainer.stop_if_asked(step)
         model.step = step
@@ -45,16 +48,32 @@ def training_callbacks(model: BeagsModel, attributes: TrainingCallbackAttributes
         model.measuring = every > 0 and step % every == 0  # nerfstudio reads no other step's
         densifier.before_step(step)
         switch.before_step(step)
+        model.clock.start()
         set_learning_rates(model, optimizers, trainer.config.optimizers, step)
 
     def after(step: int) -> None:
         densifier.after_step(step)
+        model.clock.mark("growth")
         switch.after_step(step)
+        if curves is not None:
+            curves.after_step(step)
 
     return [
         TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before),
         TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], after),
     ]
+
+
+def _curves(model: BeagsModel, trainer: BeagsTrainer, datamanager: BeagsDataManager) -> Curves | None:
+    """What writes this run's curves; None where nobody would read them."""
+    from beags_plugin.plugin.curves import Curves
+    from beags_plugin.plugin.evaluation_views import HeldOutViews
+
+    config = trainer.config
+    if not (config.is_tensorboard_enabled() or config.is_wandb_enabled() or config.is_comet_enabled()):
+        return None
+    views = HeldOutViews(config, model.classes, datamanager)
+    return Curves(model, views, config.steps_per_objects, trainer.last_step, config.logging.steps_per_log)
 
 
 def camera_extent(camera_to_worlds: Tensor) -> Tensor:

@@ -1,0 +1,151 @@
+"""What a run writes for tensorboard, read back from its event files."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("nerfstudio")
+
+from resumed_runs import STEPS, Killed, resume_to_end, run_to_end, short_config
+from run_folders import CLASSES, discs, write_scene
+
+from beags_plugin.core.rotations import rotation_from_quat
+from beags_plugin.evaluation.violations import boundary_errors, occupancy_violations
+from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.plugin.step_clock import StepClock
+from beags_plugin.rasterizers.interface import IGNORE
+
+LAST = sum(STEPS) - 1
+
+
+def events_of(run):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(run), size_guidance={"scalars": 0, "images": 0})
+    events.Reload()
+    return events
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return write_scene(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture(scope="module")
+def run(data, tmp_path_factory):
+    run = tmp_path_factory.mktemp("curves") / "run"
+    config = short_config(data, run, steps_per_objects=5)
+    config.logging.steps_per_log = 3
+    run_to_end(config)
+    return run
+
+
+def test_every_curve_and_picture_is_in_the_event_file(run):
+    events = events_of(run)
+    scalars = {tag: events.Scalars(tag) for tag in events.Tags()["scalars"]}
+    assert all(np.isfinite(event.value) for each in scalars.values() for event in each)
+    for term in ("photometric", "normal", "boundary", "occupancy"):
+        assert f"Train Loss Dict/{term}" in scalars
+    assert {"Train Metrics Dict/gaussian_count", "Train Metrics Dict/psnr", "Eval Images Metrics/psnr"} <= set(scalars)
+    refining = {f"Boundary error/{name}" for name in CLASSES.values()}
+    refining |= {f"Occupancy violation/{name}" for name in CLASSES.values()}
+    for tag in refining:
+        assert all(event.step >= STEPS[0] - 1 and 0.0 <= event.value <= 1.0 for event in scalars[tag]), tag
+    iou = {name: [(e.step, e.value) for e in scalars[f"Extracted IoU/{name}"]] for name in ("cup", "box", "mean")}
+    assert [step for step, _ in iou["mean"]] == [44, 49, 54, LAST]  # after assignment, every 5, after the last
+    assert all(0.0 <= value <= 1.0 for each in iou.values() for _, value in each)
+    parts = {"data", "drawing", "losses", "backward", "optimizer", "growth"}
+    assert {f"Seconds per step/{part}" for part in parts} <= set(scalars)
+    assert [event.step for event in scalars["Seconds per step/drawing"]] == list(range(0, LAST + 1, 3))
+    now, peak = scalars["Memory (MB)/now"], scalars["Memory (MB)/peak"]
+    assert all(100 < a.value <= b.value + 1 for a, b in zip(now, peak, strict=True))
+    images = events.Tags()["images"]
+    assert {"Scene/class map", "Objects/cup", "Objects/box"} <= set(images)
+    assert [event.step for event in events.Images("Objects/cup")] == [44, 49, 54, LAST]
+
+
+def test_the_last_iou_is_that_of_the_evaluation(run):
+    from beags_plugin.plugin.evaluate import evaluate_run
+
+    metrics = evaluate_run(run / "config.yml").after
+    events = events_of(run)
+    assert len(metrics.views) <= 4  # all of them are looked at
+    for index, name in ((1, "cup"), (2, "box")):
+        assert events.Scalars(f"Extracted IoU/{name}")[-1].value == pytest.approx(
+            metrics.objects[index].extracted.iou, abs=1e-6
+        )
+
+
+def test_a_resumed_run_has_each_step_once(data, tmp_path, monkeypatch):
+    from beags_plugin.plugin.trainer import BeagsTrainer
+
+    run, train = tmp_path / "run", BeagsTrainer.train_iteration
+    config = short_config(data, run)
+    config.logging.steps_per_log = 1
+
+    def iteration(self, step):
+        if step == 26:
+            raise Killed
+        return train(self, step)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(BeagsTrainer, "train_iteration", iteration)
+        with pytest.raises(Killed):
+            run_to_end(config)
+    resume_to_end(run)
+    assert [event.step for event in events_of(run).Scalars("Train Loss")] == list(range(LAST + 1))
+
+
+def test_wandb_gets_the_same(data, tmp_path, monkeypatch):
+    wandb = pytest.importorskip("wandb")
+    got = {}
+    monkeypatch.setenv("WANDB_MODE", "disabled")  # no server, no files: what it is given is what counts
+    monkeypatch.setattr(wandb, "log", lambda values, step: got.setdefault(step, {}).update(values))
+    run_to_end(short_config(data, tmp_path / "run", vis="wandb", steps_per_objects=5))
+    assert {"Extracted IoU/mean", "Occupancy violation/cup", "Scene/class map", "Objects/box"} <= set(got[LAST])
+    assert "Train Loss Dict/photometric" in got[50] and "Boundary error/background" in got[50]
+
+
+def test_boundary_errors_are_means_over_the_pixels_of_a_class():
+    labels = torch.tensor([[0, 0, 7], [900, 7, IGNORE]], dtype=torch.int32)
+    boundary = torch.tensor([[0.2, 0.4, 0.0], [1.0, 0.5, 0.0]])
+    assert boundary_errors(boundary, labels) == pytest.approx({0: 0.3, 7: 0.25, 900: 1.0})
+    assert boundary_errors(boundary, torch.full_like(labels, IGNORE)) == {}
+
+
+def test_occupancy_violations_are_the_share_of_matter_outside():
+    """Against a plain sum over many points, from another generator."""
+    surfels, ids = discs()
+    grid = VisibilityGrid.from_points([(surfels.means[ids != 2], ids[ids != 2])], 0.05, torch.zeros(3), 3)
+    found = occupancy_violations(surfels, ids, grid, seed=1, step=2, samples=400)
+    assert found[2] == pytest.approx(1.0)  # its class was never seen
+    g = torch.Generator().manual_seed(5)
+    radius, angle = (
+        3 * torch.rand(len(ids), 4000, generator=g).sqrt(),
+        6.2831853 * torch.rand(len(ids), 4000, generator=g),
+    )
+    u, v = radius * angle.cos(), radius * angle.sin()
+    axes = surfels.log_scales.exp()[:, None, :] * rotation_from_quat(surfels.quats)[..., :2]
+    points = surfels.means[:, None] + u[..., None] * axes[:, None, :, 0] + v[..., None] * axes[:, None, :, 1]
+    inside = grid.count(points.reshape(-1, 3), ids.repeat_interleave(4000)).view_as(u) > 0
+    weight = torch.sigmoid(surfels.opacity_logits)[:, None] * torch.exp(-0.5 * (u * u + v * v))
+    for index in (0, 1):
+        expected = float(weight[ids == index][~inside[ids == index]].sum() / weight[ids == index].sum())
+        assert 0.05 < expected < 0.95
+        assert found[index] == pytest.approx(expected, abs=0.02)
+
+
+def test_the_clock_adds_up_parts_and_divides_by_steps(monkeypatch):
+    now = iter([0.0, 1.0, 1.5, 4.0, 10.0, 11.0, 12.0])
+    monkeypatch.setattr("time.perf_counter", lambda: next(now))
+    clock = StepClock()
+    clock.start()  # 1
+    clock.mark("data")  # 1.5
+    clock.mark("drawing")  # 4
+    clock.skip()  # 10
+    clock.mark("drawing")  # 11
+    clock.start()
+    assert clock.means() == {"data": 0.25, "drawing": 1.75}
+    assert clock.means() == {}
