@@ -6,7 +6,7 @@ import time
 
 
 class StepClock:
-    """Seconds per part of a step: a part lasts from the mark before to its own. A mark costs a tenth of a microsecond."""
+    """Seconds per part of a step: each lasts from the mark before to its own. A mark costs a tenth of a microsecond."""
 
     def __init__(self) -> None:
         self._last = time.perf_counter()

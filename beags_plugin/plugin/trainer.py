@@ -19,8 +19,8 @@ from rich.markup import escape
 from beags_plugin.errors import UserError
 from beags_plugin.plugin.held_out import HeldOutCurve
 from beags_plugin.plugin.interrupts import Interrupts
-from beags_plugin.plugin.optimizers import JointOptimizers
 from beags_plugin.plugin.memory import peak_memory_mb
+from beags_plugin.plugin.optimizers import JointOptimizers
 from beags_plugin.plugin.runs import REPORT_FILE, newest_checkpoint, save_atomically, write_text_atomically
 from beags_plugin.plugin.training_state import STATE, VERSION, GlobalRandom, Part, read_checkpoint, training_state
 from beags_plugin.whole_files import remove_unfinished
