@@ -97,8 +97,11 @@ class Extract:
 
     def run(self) -> None:
         from beags_plugin.plugin.extract import extract_objects
+        from beags_plugin.progress import progress_bar
 
-        for done in extract_objects(self.load_config, self.object, self.remove, self.output):
+        with progress_bar("extracting") as progress:
+            extracted = extract_objects(self.load_config, self.object, self.remove, self.output, progress)
+        for done in extracted:
             CONSOLE.print(
                 f"{done.name}: {done.gaussians} Gaussians\n  {done.ply}\n  ns-viewer --load-config {done.config}",
                 markup=False,

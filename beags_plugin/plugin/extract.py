@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -96,13 +96,17 @@ def load_scene(config_path: Path) -> SavedScene:
 
 
 def extract_objects(
-    config_path: Path, objects: Sequence[str] = (), remove: bool = False, output: Path | None = None
+    config_path: Path,
+    objects: Sequence[str] = (),
+    remove: bool = False,
+    output: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> list[Extracted]:
     """Write a run and a .ply per object.
 
     config_path: config.yml of a refined (or assigned) run. objects: names; none means every object that has Gaussians.
     remove: keep all but the object instead. output: folder for the runs; ``extracted/`` in the run by default.
-    Raises ``UserError`` for an unknown name, before anything is written.
+    progress: is told (done, total) objects. Raises ``UserError`` for an unknown name, before anything is written.
     """
     scene = load_scene(config_path)
     run = config_path.parent
@@ -124,6 +128,8 @@ def extract_objects(
         ply = folder / f"{title}.ply"
         write_ply(ply, surfels, class_ids[index], transform)
         written.append(Extracted(title, config, ply, len(surfels)))
+        if progress is not None:
+            progress(len(written), len(names))
     return written
 
 
