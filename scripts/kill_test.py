@@ -3,7 +3,7 @@
     python scripts/kill_test.py --kills 8
 
 Trains a short run of beags-tiny on a small generated scene once to its end. Then, again and again, starts the same run
-in a folder of its own with ns-train, ends it with SIGKILL after a random time, resumes it with ``beags resume`` (which
+in a folder of its own with ns-train, ends it with SIGKILL after a random amount of CPU time (Linux), resumes it with ``beags resume`` (which
 may be killed too), and compares what both left: the checkpoint with the optimizers' state, the curve of held-out
 quality, the masks, the voxel grids. Prints a line per kill and leaves a JSON behind. Exit code 1: something differed.
 """
@@ -45,13 +45,11 @@ def main() -> int:
     output.mkdir(parents=True)
     data, whole = output / "data", output / "whole"
     write_data(data)
-    start, started = time.monotonic(), time.time()
-    if (code := run_for(train_command(data, whole), output / "whole.log", None)) != 0:
+    code, first, seconds = run_whole(train_command(data, whole), output / "whole.log", whole / "config.yml")
+    if code != 0:
         print(f"the run without a kill ended with exit code {code}: see {output / 'whole.log'}")
         return 1
-    seconds = time.monotonic() - start
-    first = (whole / "config.yml").stat().st_mtime - started  # until then, programs are loaded
-    print(f"without a kill: {seconds:.1f} s, of which {first:.1f} s before the run began", flush=True)
+    print(f"without a kill: {seconds:.1f} s of CPU time, of which {first:.1f} s before the run began", flush=True)
     moments, kills, trials = random.Random(arguments.seed), 0, []
     while kills < arguments.kills:
         run = output / f"run_{len(trials)}"
@@ -59,7 +57,7 @@ def main() -> int:
         while kills < arguments.kills and (not killed or moments.random() < arguments.again):
             after = moments.uniform(first, seconds)
             log = output / f"{run.name}_{len(killed)}.log"
-            if run_for(command, log, after) == -signal.SIGKILL:
+            if run_for(command, log, after, moments.uniform(0.0, 0.1)) == -signal.SIGKILL:
                 kills += 1
                 killed.append({"after": round(after, 2), "at": state_of(run)})
             if (run / "config.yml").exists():
@@ -70,7 +68,7 @@ def main() -> int:
             run_for(command, output / f"{run.name}_end.log", None)
         found = differences(whole, run)
         trials.append({"killed": killed, "differs": found})
-        at = "; ".join(f"{one['after']} s: {one['at']}" for one in killed)
+        at = "; ".join(f"{one['after']} s of CPU time: {one['at']}" for one in killed)
         print(f"{run.name}: killed at {at}: {'; '.join(found[:3]) or 'the same bits'}", flush=True)
         if not found:
             shutil.rmtree(run)
@@ -98,15 +96,45 @@ def resume_command(run: Path) -> list[str]:
     return [sys.executable, "-m", "beags_plugin.cli", "resume", str(run)]
 
 
-def run_for(command: list[str], log: Path, seconds: float | None) -> int:
-    """Run a command, kill it with SIGKILL after ``seconds`` if given; returns its exit code (-9: killed)."""
+def run_for(command: list[str], log: Path, cpu_seconds: float | None, jitter: float = 0.0) -> int:
+    """Run a command; kill it once it has had so much CPU time, if given, and ``jitter`` seconds have passed.
+
+    Returns its exit code (-9: killed).
+    """
+    with open(log, "wb") as file, started(command, file) as process:
+        while cpu_seconds is not None and process.poll() is None:
+            if cpu_time(process.pid) >= cpu_seconds:
+                time.sleep(jitter)  # a program that waits for the disk uses no CPU time
+                process.kill()
+                break
+            time.sleep(0.002)
+        return process.wait()
+
+
+def run_whole(command: list[str], log: Path, config: Path) -> tuple[int, float, float]:
+    """Exit code of a command, and its CPU time until it had written ``config`` and in all."""
+    first = last = 0.0
+    with open(log, "wb") as file, started(command, file) as process:
+        while process.poll() is None:
+            last = max(last, cpu_time(process.pid))
+            first = first if config.exists() else last
+            time.sleep(0.02)
+    return process.returncode, first, last
+
+
+def started(command: list[str], log: Any) -> subprocess.Popen:
+    """A process that writes to ``log``."""
     environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ}
-    with open(log, "wb") as file, subprocess.Popen(command, stdout=file, stderr=file, env=environment) as process:
-        try:
-            return process.wait(timeout=seconds)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            return process.wait()
+    return subprocess.Popen(command, stdout=log, stderr=log, env=environment)
+
+
+def cpu_time(pid: int) -> float:
+    """Seconds of CPU time that a process has had (Linux): a moment in a run, however busy the machine is."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def state_of(run: Path) -> str:

@@ -26,6 +26,9 @@ def short_config(data: Path, run: Path, **overrides):
         "pipeline.model.densify.every": 10,
         "pipeline.model.densify.stop": 40,
         "pipeline.model.densify.reset_every": 15,
+        "pipeline.datamanager.dataparser.num_random_points": 300,
+        "pipeline.model.split.min_share": 0.05,
+        "pipeline.model.split.min_sigma": 0.1,
         "optimizers.opacities.optimizer.lr": 0.5,  # opaque after so few steps
         "pipeline.model.losses.normal.start": 12,
         "pipeline.model.sh_degree_interval": 15,
