@@ -3,9 +3,10 @@
     python scripts/kill_test.py --kills 8
 
 Trains a short run of beags-tiny on a small generated scene once to its end. Then, again and again, starts the same run
-in a folder of its own with ns-train, ends it with SIGKILL after a random amount of CPU time (Linux), resumes it with ``beags resume`` (which
-may be killed too), and compares what both left: the checkpoint with the optimizers' state, the curve of held-out
-quality, the masks, the voxel grids. Prints a line per kill and leaves a JSON behind. Exit code 1: something differed.
+in a folder of its own with ns-train, ends it with SIGKILL after a random amount of CPU time (Linux), resumes it with
+``beags resume`` (which may be killed too), and compares what both left: the checkpoint with the optimizers' state, the
+curve of held-out quality, the masks, the voxel grids. Prints a line per kill and leaves a JSON behind. Exit code 1:
+something differed.
 """
 
 from __future__ import annotations
