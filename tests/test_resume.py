@@ -80,7 +80,7 @@ def test_the_run_grows_splits_and_prepares_twice(whole):
     assert len(saved["pipeline"]["_model.gauss_params.means"]) > len(base["_model.gauss_params.means"])
     grown = [record["gaussians"] for record in json.loads((whole / "held_out.json").read_text())]
     assert len(set(grown)) > 2
-    assert saved["beags"]["parts"]["refinement"] == {"rounds": 2}
+    assert saved["beags"]["parts"]["refinement"] == {"rounds": 2, "evaluated": True}
 
 
 # before and after growth, in the last base step, in the first step of refinement, in both rounds

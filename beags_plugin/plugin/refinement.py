@@ -41,6 +41,8 @@ class RefinementSwitch:
         self.datamanager = datamanager
         self.refiner = REFINERS.get(model.config.refiner)()
         self.ready = False
+        self._switching = False  # in the middle of the last base step, before nerfstudio evaluates and saves it
+        self._evaluation_due = False
         self.rounds = 0  # prepared so far, in this process and those that it goes on from
 
     @property
@@ -67,12 +69,13 @@ class RefinementSwitch:
             self.model.config.split.check()
 
     def state(self) -> dict[str, Any]:
-        """How many rounds have been prepared; see ``training_state.Part``."""
-        return {"rounds": self.rounds}
+        """How many rounds have been prepared, and whether nerfstudio has evaluated the step; see ``Part``."""
+        return {"rounds": self.rounds, "evaluated": not self._switching}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on in the round in which the run that gave ``state`` was."""
         self.rounds = state["rounds"]
+        self._evaluation_due = not state["evaluated"]
 
     def before_step(self, step: int) -> None:
         """Take up refinement that a checkpoint was in, or start it where no base step precedes it."""
@@ -86,12 +89,17 @@ class RefinementSwitch:
                 self._take_up()
         if sum(start <= done for start in self._round_starts()) > self.rounds:
             self._prepare(step - 1)
+        if self._evaluation_due:
+            self.trainer.eval_iteration(step - 1)
+            self._evaluation_due = False
         model.refined_steps += 1
 
     def after_step(self, step: int) -> None:
         """Switch right after the last base step, so that a run that ends there has its classes too."""
         if self.wanted and not self.ready and step + 1 == self.model.schedule.base_steps:
+            self._switching = True
             self._prepare(step)
+            self._switching = False
 
     def _round_starts(self) -> list[int]:
         """The refinement steps before which masks, classes and grids are made, the first of them 0."""
