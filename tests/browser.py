@@ -37,9 +37,7 @@ class Page:
         target = self._wait_for(lambda: self._page_target(port))
         self._socket = connect(target, max_size=None, compression=None)
         self._number = 0
-        self._send(
-            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
-        )
+        self._send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
 
     def __enter__(self) -> Page:
         return self

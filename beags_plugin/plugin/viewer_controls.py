@@ -17,6 +17,7 @@ from nerfstudio.viewer.viewer_elements import (
     ViewerControl,
     ViewerDropdown,
     ViewerElement,
+    ViewerParameter,
     ViewerSlider,
 )
 
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
     from viser import ViserServer
 
-ACTIONS = ("Isolate", "Hide", "Remove", "Show")
 NONE = "none yet"  # the drop-down's entry while no Gaussian has a class: it must have one
 REFRESH_SECONDS = 0.3  # how often the panel follows what the scene and the render threads have changed
 
@@ -70,7 +70,9 @@ class ObjectPanel(ViewerElement[None]):
         self._said = ["", ""]
         self._exporting = threading.Lock()
         self.object = ViewerDropdown("Object", NONE, [NONE], hint="Also chosen by a click on the picture")
-        self.action = ViewerButtonGroup("Object is", ACTIONS[0], list(ACTIONS), cb_hook=lambda _: self.act())
+        # two rows: four buttons in one are cut off
+        self.look = ViewerButtonGroup("Look at it", "Isolate", ["Isolate", "Show"], cb_hook=self._act)
+        self.put_away = ViewerButtonGroup("Put it away", "Hide", ["Hide", "Remove"], cb_hook=self._act)
         self.show_all = ViewerButton("Show all objects", lambda _: self.choose(self.viewing.choice.show_all()))
         self.rest = ViewerSlider(
             "Rest", 0.0, 0.0, 1.0, 0.05, cb_hook=lambda slider: self._slide(rest=slider.value),
@@ -90,13 +92,22 @@ class ObjectPanel(ViewerElement[None]):
     def install(self, viser_server: ViserServer) -> None:
         """See ``ViewerElement.install``."""
         self.refresh_objects()
-        for element in (self.object, self.action, self.show_all, self.rest, self.min_opacity, self.clicks):
+        for element in (
+            self.object,
+            self.look,
+            self.put_away,
+            self.show_all,
+            self.rest,
+            self.min_opacity,
+            self.clicks,
+        ):
             element.install(viser_server)
         self._legend = viser_server.gui.add_markdown("")
         self.format.install(viser_server)
         self.export.install(viser_server)
         self._status = viser_server.gui.add_markdown("")
         self._said = ["", ""]
+        self.look.value = self.put_away.value = ""
 
     def _create_gui_handle(self, viser_server: ViserServer) -> None:
         raise NotImplementedError("this element has no handle of its own")
@@ -129,15 +140,20 @@ class ObjectPanel(ViewerElement[None]):
         self.viewing.choice = choice
         self._redraw()
 
-    def act(self) -> None:
-        """Do to the chosen object what the button says that was pressed."""
+    def _act(self, group: ViewerParameter) -> None:
+        if action := group.value:
+            self.act(action)
+            group.value = ""  # viser tells of a button of a group only if it is not the one that was pressed last
+
+    def act(self, action: str) -> None:
+        """Do to the chosen object what a button says: "Isolate", "Show", "Hide" or "Remove"."""
         class_id = self.labels.get(self.object.value)
         if class_id is None:
             self.notes = {**self.notes, "object": f"Nothing to choose: {NO_CLASSES}"}
             return
         choice = self.viewing.choice
         change = {"Isolate": choice.isolate, "Hide": choice.hide, "Remove": choice.remove, "Show": choice.show}
-        self.choose(change[self.action.value](class_id))
+        self.choose(change[action](class_id))
 
     def _slide(self, **values: float) -> None:
         self.choose(replace(self.viewing.choice, **values))
@@ -266,9 +282,10 @@ class ObjectPanel(ViewerElement[None]):
     def _offer(self, options: list[str]) -> None:
         if self.object.options == options:
             return
-        if self.object.value not in options:
-            self.object.default_value = options[0]  # what it starts with where no viewer has installed it yet
+        former = self.object.value
         self.object.set_options(options)
+        if former not in options:
+            self.object.value = next((label for label in options if self.labels.get(label)), options[0])  # an object
 
     def _say(self) -> None:
         """Write legend and notes, if they have changed."""
