@@ -245,13 +245,13 @@ def test_shares_are_zero_inside_one_outside_and_zero_for_what_is_not_asked(ops):
 
 
 def test_the_legend_names_colours_counts_and_states():
-    text = legend([LegendRow(1, "red cup", 1234), LegendRow(2, "box", 5, "hidden")])
-    lines = text.splitlines()
-    assert len(lines) == 4
+    rows = [LegendRow(1, "red cup", 1234), LegendRow(2, "box", 5, "hidden"), LegendRow(3, "lid", 6, "removed")]
+    lines = legend(rows).splitlines()
+    assert len(lines) == 5
     red, green, blue = colorize(np.array([[1]]))[0, 0]
     assert hex_color(1) == f"#{red:02x}{green:02x}{blue:02x}" and f"`{hex_color(1)}`" in lines[2]
-    assert "red cup" in lines[2] and "1,234" in lines[2] and "hidden" not in lines[2]
-    assert "box" in lines[3] and "&#40;hidden&#41;" not in lines[3] and "(hidden)" in lines[3]
+    assert "| red cup |" in lines[2] and "1,234" in lines[2]
+    assert "| ~~box~~ |" in lines[3] and "| ~~lid~~ removed |" in lines[4]
 
 
 def test_no_name_can_be_taken_for_a_program():

@@ -14,7 +14,7 @@ _LONGEST = 40  # characters of a name that the panel's width has room for
 
 @dataclass(frozen=True)
 class LegendRow:
-    """A class as the legend has it. count: of its Gaussians. state: e.g. "hidden"; "shown" is not said."""
+    """A class as the legend has it. count: of its Gaussians. state: what is not "shown" is struck out."""
 
     class_id: int
     name: str
@@ -27,8 +27,8 @@ def legend(rows: Iterable[LegendRow]) -> str:
     lines = ["| | object | Gaussians |", "|---|---|---:|"]
     for row in rows:
         name = escaped(shortened(row.name))
-        shown = name if row.state == "shown" else f"{name} ({row.state})"
-        lines.append(f"| `{hex_color(row.class_id)}` | {shown} | {row.count:,} |")
+        said = {"shown": name, "hidden": f"~~{name}~~"}.get(row.state, f"~~{name}~~ {row.state}")
+        lines.append(f"| `{hex_color(row.class_id)}` | {said} | {row.count:,} |")
     return "\n".join(lines)
 
 
