@@ -85,13 +85,17 @@ class Page:
         """All text that the page shows."""
         return self.evaluate("document.body?.innerText") or ""
 
+    def wait(self, true, seconds: float = 60.0) -> None:
+        """Wait until a function says so."""
+        end = time.monotonic() + seconds
+        while not true():
+            assert time.monotonic() < end, self.text()
+            time.sleep(0.3)
+
     def wait_for_text(self, wanted: str, seconds: float = 60.0) -> str:
         """The page's text, once ``wanted`` is part of it."""
-        end = time.monotonic() + seconds
-        while wanted not in (text := self.text()):
-            assert time.monotonic() < end, f"{wanted!r} did not appear in {text!r}"
-            time.sleep(0.3)
-        return text
+        self.wait(lambda: wanted in self.text(), seconds)
+        return self.text()
 
     def click(self, x: float, y: float) -> None:
         """Press and release the left button."""

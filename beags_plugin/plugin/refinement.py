@@ -7,8 +7,10 @@ import os
 import resource
 import shutil
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -100,20 +102,21 @@ class RefinementSwitch:
         first = self._round() == 0
         views = self.datamanager.views("train", original=True)
         CONSOLE.rule("Preparing refinement" if first else "Preparing refinement again, with the refined depth")
-        prepared = prepare(
-            model.surfels(),
-            [view.camera for view in views],
-            LabelMaps(view.stored_labels for view in views),
-            model.classes,
-            model.rasterizer,
-            model.settings(),
-            self.refiner,
-            model.config.prepare,
-            model.config.split,
-            background_voxels=self._background_voxels(),
-            seed=model.seed,
-            stage=progress_bar,
-        )
+        with released(self.trainer.train_lock):  # minutes, which read the scene only: a viewer may draw it
+            prepared = prepare(
+                model.surfels(),
+                [view.camera for view in views],
+                LabelMaps(view.stored_labels for view in views),
+                model.classes,
+                model.rasterizer,
+                model.settings(),
+                self.refiner,
+                model.config.prepare,
+                model.config.split,
+                background_voxels=self._background_voxels(),
+                seed=model.seed,
+                stage=progress_bar,
+            )
         for finding in prepared.findings:
             CONSOLE.print(f"  {finding}", highlight=False, markup=False)
         self._take_classes(prepared.assignment)
@@ -198,6 +201,16 @@ class RefinementSwitch:
         self._start(VisibilityGrid.from_state_dict(state) if state else None, labels, more_rounds)
         self.model.refining_since = time.perf_counter()
         CONSOLE.print(f"  refinement taken up from {folder}", highlight=False, markup=False, soft_wrap=True)
+
+
+@contextmanager
+def released(lock: Lock) -> Iterator[None]:
+    """Let others have a lock that is held, and take it back."""
+    lock.release()
+    try:
+        yield
+    finally:
+        lock.acquire()
 
 
 def peak_memory_mb() -> float:
