@@ -122,10 +122,12 @@ class Page:
         labelled = f"[...document.querySelectorAll('label')].find(l => l.innerText.trim() == {json.dumps(label)})"
         self.click_on(f"document.getElementById({labelled}.htmlFor)")
         time.sleep(0.5)
-        self.click_on(
+        listed = (
             "[...document.querySelectorAll('[role=option]')]"
             f".find(o => o.innerText.trim() == {json.dumps(option)} && o.offsetParent)"
         )
+        self.wait(lambda: self.evaluate(f"!!{listed}"))
+        self.evaluate(f"{listed}.click()")  # not with the mouse: the list may still be moving
         time.sleep(0.5)
 
     def picture(self) -> bytes:

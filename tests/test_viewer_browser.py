@@ -36,7 +36,7 @@ def served(tmp_path):
         process = subprocess.Popen(
             [sys.executable, "-c", ENTRY, *map(str, options)], stdout=out, stderr=subprocess.STDOUT, env=environment
         )
-    end = time.monotonic() + 240
+    end = time.monotonic() + 500
     while "disabled local writer" not in log.read_text():  # the last that it prints
         assert process.poll() is None and time.monotonic() < end, log.read_text()[-3000:]
         time.sleep(0.5)
