@@ -15,7 +15,6 @@ from run_folders import CLASSES, write_scene, write_trained
 pytest.importorskip("nerfstudio")
 
 from nerfstudio.cameras.cameras import CameraType
-from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import CameraState
@@ -81,7 +80,7 @@ class Window:
     def close(self) -> None:
         self.viewer.viser_server.stop()
 
-    def look(self, output: str = "rgb", obb: OrientedBox | None = None) -> dict[str, torch.Tensor]:
+    def look(self, output: str = "rgb") -> dict[str, torch.Tensor]:
         """Draw and send as the render thread does; the outputs of the model. An error there is raised here."""
         self.viewer.control_panel._output_render.set_options([output])
         machine = RenderStateMachine(self.viewer, 10.0, self.client)
@@ -113,7 +112,7 @@ class Stand:
         self.model, self.panel = pipeline.model, pipeline.model.viewer_panel
         change(self.model)
         self.panel._follow = lambda: None
-        self.controls = SimpleNamespace(output_render="rgb", split=False)
+        self.controls = SimpleNamespace(output_render="rgb", split=False, crop_viewport=False)
         viewer = SimpleNamespace(
             log_filename=config_path.parent / "viewer.log", pipeline=pipeline, trainer=trainer, train_lock=None,
             control_panel=self.controls, _trigger_rerender=lambda: None,
@@ -169,10 +168,12 @@ def test_every_output_is_a_picture_whatever_is_shown(window):
             assert window.sent[-1].shape == (*shape[:2], 3)
     assert float(window.look()["accumulation"].sum()) == 0.0  # the last choice leaves nothing
     panel.choose(Choice())
-    far = OrientedBox.from_params((9.0, 9.0, 9.0), (0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
-    model.set_crop(far)
-    assert len(model.viewing.shown().surfels) == 0
-    model.set_crop(None)
+    controls = window.viewer.control_panel
+    controls._crop_center.value, controls._crop_scale.value = (9.0, 9.0, 9.0), (0.1, 0.1, 0.1)
+    controls.crop_viewport = True
+    assert len(model.viewing.copy().surfels) == 0 and float(window.look()["accumulation"].sum()) == 0.0
+    controls.crop_viewport = False
+    assert len(model.viewing.copy().surfels) == model.num_points
 
 
 def test_what_is_hidden_in_the_viewer_changes_no_figure(window):

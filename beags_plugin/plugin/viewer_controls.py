@@ -29,6 +29,7 @@ from beags_plugin.viewing.legend import LegendRow, escaped, legend, unique_label
 from beags_plugin.viewing.picking import pick
 
 if TYPE_CHECKING:
+    from nerfstudio.data.scene_box import OrientedBox
     from nerfstudio.viewer.viewer import Viewer
     from viser import ViserServer
 
@@ -64,6 +65,7 @@ class ObjectPanel(ViewerElement[None]):
         self.notes: dict[str, str] = {}
         self.viewer: Viewer | None = None
         self._link: ViewerLink | None = None
+        self._listening = False
         self._legend: Any = None
         self._status: Any = None
         self._counted: tuple | None = None
@@ -117,16 +119,17 @@ class ObjectPanel(ViewerElement[None]):
         self.viewer, self._link = viewer, link
         run = ViewedRun(Path(viewer.log_filename).parent.absolute(), viewer.pipeline.datamanager)  # type: ignore[arg-type]
         self.viewing.attach(run, viewer.trainer is not None, viewer.train_lock)
-        self.viewing.wanted = self._wanted
+        self.viewing.wanted, self.viewing.crop_box = self._wanted, self._crop_box
         self._listen(self.clicks.value)
         threading.Thread(target=self._follow, name="beags panel", daemon=True).start()
 
     def _listen(self, wanted: bool) -> None:
-        if self._link is None:
+        if self._link is None or wanted == self._listening:
             return
+        self._listening = wanted
         if wanted:
             self._link.register_pointer_cb("click", self.clicked)
-        elif self._link.viser_server.scene._scene_pointer_cb is not None:
+        else:
             self._link.unregister_pointer_cb()
 
     def _redraw(self) -> None:
@@ -253,6 +256,11 @@ class ObjectPanel(ViewerElement[None]):
             return frozenset()
         controls = self.viewer.control_panel
         return frozenset({controls.output_render} | ({controls.split_output_render} if controls.split else set()))
+
+    def _crop_box(self) -> OrientedBox | None:
+        assert self.viewer is not None  # it is there when this is asked for
+        controls = self.viewer.control_panel
+        return controls.crop_obb if controls.crop_viewport else None
 
     def _load(self) -> bool:
         wanted, run, changed = self._wanted(), self.viewing.run, False

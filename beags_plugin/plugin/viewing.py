@@ -26,6 +26,8 @@ from beags_plugin.viewing.pictures import (
 )
 
 if TYPE_CHECKING:
+    from nerfstudio.data.scene_box import OrientedBox
+
     from beags_plugin.plugin.model import BeagsModel
     from beags_plugin.plugin.viewed_run import ViewedRun
 
@@ -53,7 +55,7 @@ def scene_outputs(model: BeagsModel, camera: Camera) -> dict[str, Tensor]:
     Each [H, W, 1 or 3] float32: rgb, depth (world units along z), normal, accumulation, background; with classes also
     class_map (colours) and class_confidence (the winner's share).
     """
-    scene = shown(model.surfels(), model.class_ids, Choice(), inside=cropped(model))
+    scene = shown(model.surfels(), model.class_ids, Choice(), inside=within(model, model.crop_box))
     outputs = plain_outputs(model, scene, camera, model.background_color)
     if bool(model.assigned):
         outputs.update(class_outputs(model, scene, camera))
@@ -81,9 +83,9 @@ def class_outputs(model: BeagsModel, scene: Shown, camera: Camera) -> dict[str, 
     return {"class_map": class_picture(classes), "class_confidence": share[..., None].float()}
 
 
-def cropped(model: BeagsModel) -> Tensor | None:
+def within(model: BeagsModel, box: OrientedBox | None) -> Tensor | None:
     """[N] bool, the surfels in nerfstudio's crop box; None without one."""
-    return None if model.crop_box is None else model.crop_box.within(model.means).reshape(-1)
+    return None if box is None else box.within(model.means).reshape(-1)
 
 
 @dataclass(frozen=True)
@@ -102,8 +104,8 @@ class Viewing:
     render thread for good: what a drawing changes is changed by one assignment, and what may fail becomes a note.
 
     choice: what is shown. background: [3], the viewer's. listed: names of ``CHANNELS`` that this run may be asked for;
-    the same ones as long as a viewer runs. wanted: gives those that it shows now. run: what the run has on disk.
-    notes: what is to be said of the pictures of the last drawing.
+    the same ones as long as a viewer runs. wanted: gives those that it shows now. crop_box: gives the viewer's.
+    run: what the run has on disk. notes: what is to be said of the pictures of the last drawing.
     """
 
     def __init__(self, model: BeagsModel) -> None:
@@ -112,6 +114,7 @@ class Viewing:
         self.background: Tensor | None = None
         self.listed: tuple[str, ...] = ()
         self.wanted: Callable[[], frozenset[str]] = frozenset
+        self.crop_box: Callable[[], OrientedBox | None] = lambda: None
         self.run: ViewedRun | None = None
         self.shares: Shares | None = None
         self.notes: dict[str, str] = {}
@@ -142,7 +145,7 @@ class Viewing:
         """The surfels that the choice leaves. rest: whether what is only faded counts."""
         model = self.model
         choice = self.choice if bool(model.assigned) else Choice(min_opacity=self.choice.min_opacity)
-        return shown(model.surfels().detach(), model.class_ids, choice, rest, cropped(model))
+        return shown(model.surfels().detach(), model.class_ids, choice, rest, within(model, self.crop_box()))
 
     def outputs(self, camera: Camera) -> dict[str, Tensor]:
         """Every picture that the viewer lists; those that it does not show at present are left black."""
