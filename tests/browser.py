@@ -114,8 +114,10 @@ class Page:
         self.click(*box)
 
     def press(self, label: str) -> None:
-        """Click on the button of that name."""
-        self.click_on(f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() == {json.dumps(label)})")
+        """Press the button of that name; not with the mouse: the panel may still be moving."""
+        self.evaluate(
+            f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() == {json.dumps(label)}).click()"
+        )
 
     def choose(self, label: str, option: str) -> None:
         """Choose an option of the drop-down list called ``label``."""
