@@ -264,10 +264,12 @@ def test_a_second_round_makes_masks_again_also_after_a_resume(trained, data, tmp
         assert mask.read_bytes() == (last_prepared(resumed) / "masks" / mask.name).read_bytes(), mask.name
 
 
-def test_the_viewer_shows_single_objects_and_crops(trained):
+def test_a_trained_scene_is_drawn_whole_cropped_and_in_the_viewer_by_object(trained):
     import torch
     from nerfstudio.data.scene_box import OrientedBox
     from nerfstudio.utils.eval_utils import eval_setup
+
+    from beags_plugin.plugin.cameras import camera_from_nerfstudio
 
     folder, _ = trained
     _, pipeline, _, _ = eval_setup(folder / "config.yml", test_mode="test")
@@ -276,10 +278,11 @@ def test_the_viewer_shows_single_objects_and_crops(trained):
     whole = model.get_outputs_for_camera(camera)
     assert {"rgb", "depth", "normal", "accumulation", "class_map"} <= set(whole)
     assert all(value.dtype == torch.float32 and value.shape[-1] in (1, 3) for value in whole.values())
-    model.object_choice.value = model.classes[1]
-    alone = model.get_outputs_for_camera(camera)
+    model.viewing.choice = model.viewing.choice.isolate(1)
+    with torch.no_grad():
+        alone = model.viewing.outputs(camera_from_nerfstudio(camera))
     assert 0 < float(alone["accumulation"].sum()) < 0.5 * float(whole["accumulation"].sum())
-    model.object_choice.value = "everything"
+    assert torch.equal(model.get_outputs_for_camera(camera)["rgb"], whole["rgb"])  # figures never see the choice
     box = OrientedBox.from_params((9.0, 9.0, 9.0), (0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
     assert float(model.get_outputs_for_camera(camera, obb_box=box)["accumulation"].sum()) == 0.0
 

@@ -54,6 +54,10 @@ class Surfels:
         """The same values, without gradients."""
         return Surfels(**{field.name: getattr(self, field.name).detach() for field in fields(self)})
 
+    def clone(self) -> Surfels:
+        """A copy in memory of its own, without gradients."""
+        return Surfels(**{field.name: getattr(self, field.name).detach().clone() for field in fields(self)})
+
 
 def opacities(logits: Tensor) -> Tensor:
     """Opacities 0..1 of logits of any shape; differentiable, with a gradient of 0 below logits of -80.

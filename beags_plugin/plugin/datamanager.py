@@ -128,6 +128,23 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         assert self.cached_eval is not None  # the cameras are straightened when the images load
         return undistort_class_map(class_map, self._distorted["eval"], self.eval_dataset.cameras, index)
 
+    def straighten_training_views(self) -> None:
+        """Have the training cameras without lens distortion; opens the images only if there is any to remove."""
+        parameters = self.train_dataset.cameras.distortion_params
+        if "train" not in self._distorted and parameters is not None and bool(parameters.any()):
+            assert self.cached_train is not None  # opening them straightens the cameras
+
+    def training_mask(self, index: int) -> np.ndarray | None:
+        """The class map [h, w] uint16 in a training view's mask file, without lens distortion; None without a file.
+
+        Call ``straighten_training_views`` before.
+        """
+        if self.train_dataset.metadata["class_map_filenames"][index] is None:
+            return None
+        ids = self.train_dataset.get_metadata({"image_idx": index})["class_map"].numpy()
+        straight = self.train_dataset.cameras
+        return undistort_class_map(ids, self._distorted.get("train", straight), straight, index)
+
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         camera, data = super().next_train(step)
         data = self._on_device(data)

@@ -5,18 +5,30 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 
+from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.export.base import Exporter, NothingToExport, Piece, Viewpoints, make_exporter
 from beags_plugin.export.frames import Frame, bounding_box, check_placement
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.select import select_class
-from beags_plugin.plugin.extract import SavedScene, folder_names, load_scene, objects_with_gaussians, read_transform
+from beags_plugin.plugin.extract import (
+    SavedScene,
+    file_name,
+    folder_names,
+    load_run_config,
+    load_scene,
+    objects_with_gaussians,
+    read_transform,
+)
 from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.interface import RasterSettings
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
@@ -101,13 +113,17 @@ def export_run(
     if not everything and not objects:
         raise UserError(f"nothing to export is named: use --all, or --object with one of {', '.join(present)}.")
 
+    from beags_plugin.plugin.evaluate import raster_settings
+
     transform = read_transform(run)
     job = _Job(
         scene,
         exporters,
         Frame.of_run() if transform is None else Frame(*transform),
         placement == "object",
-        _viewpoints(scene, config_path) if any(exporter.needs_views for exporter in exporters.values()) else None,
+        _viewpoints(scene.config, raster_settings(scene), config_path)
+        if any(exporter.needs_views for exporter in exporters.values())
+        else None,
         tolerant=everything,
     )
     names, titles = list(present) if everything else list(dict.fromkeys(objects)), folder_names(scene.classes)
@@ -165,12 +181,39 @@ class _Job:
             return ExportedFile(label, None, {}, str(error))
 
 
-def _viewpoints(scene: SavedScene, config_path: Path) -> Viewpoints:
+def export_shown(
+    config_path: Path, surfels: Surfels, class_ids: Tensor, title: str, format_name: str, settings: RasterSettings
+) -> Path:
+    """Write surfels that a viewer shows into ``exports/`` of the run, without replacing a file; returns its path.
+
+    config_path: config.yml of the run. surfels: M of its frame; class_ids: [M] int32. title: what the file is called,
+    before the suffix. settings: depth range of the scene. Raises ``UserError`` if nothing is shown, for an unknown
+    format, or a file that cannot be written.
+    """
+    exporter = make_exporter(format_name)
+    if len(surfels) == 0:
+        raise UserError("nothing is shown, so there is nothing to export: show an object, or lower the least opacity.")
+    transform = read_transform(config_path.parent)
+    frame = Frame.of_run() if transform is None else Frame(*transform)
+    views = None
+    if exporter.needs_views:
+        views = frame.views(_viewpoints(load_run_config(config_path), settings, config_path))
+    path = _free_path(config_path.parent / "exports", title, exporter.suffix)
+    exporter.write(path, Piece(title, frame.surfels(surfels), class_ids, views))
+    return path
+
+
+def _free_path(folder: Path, title: str, suffix: str) -> Path:
+    """``title`` as a file name that is not taken, with a number if need be."""
+    stem = file_name(title)
+    names = chain([stem], (f"{stem}_{number}" for number in count(2)))
+    return next(path for name in names if not (path := folder / f"{name}.{suffix}").exists())
+
+
+def _viewpoints(config: BeagsTrainerConfig, settings: RasterSettings, config_path: Path) -> Viewpoints:
     """The training views of a run, in its own frame; raises ``UserError`` if its data cannot be read."""
     from beags_plugin.plugin.cameras import camera_from_nerfstudio
-    from beags_plugin.plugin.evaluate import raster_settings
 
-    config: BeagsTrainerConfig = scene.config
     if not (data := config.data_path).exists():
         raise UserError(f"{config_path} was trained on {data}, which is gone: put it back.")
     try:
@@ -182,7 +225,7 @@ def _viewpoints(scene: SavedScene, config_path: Path) -> Viewpoints:
     return Viewpoints(
         [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))],
         make_rasterizer(config.model_config.rasterizer),
-        raster_settings(scene),
+        settings,
     )
 
 

@@ -6,14 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.models.base_model import Model, ModelConfig
 from nerfstudio.models.splatfacto import SplatfactoModel
-from nerfstudio.viewer.viewer_elements import ViewerDropdown
 from torch import Tensor, nn
 
 from beags_plugin.core.cameras import Camera
@@ -22,20 +20,20 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses import LOSSES
 from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.photometric import ssim
-from beags_plugin.masks.classes import colorize
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.schedule import PhaseSchedule
 from beags_plugin.plugin.step_clock import StepClock
 from beags_plugin.plugin.training import training_callbacks
+from beags_plugin.plugin.viewer_controls import ObjectPanel, ViewerLink
+from beags_plugin.plugin.viewing import Viewing, asked_by_viewer, scene_outputs
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.drawing import draw_class_map, surfel_inputs
+from beags_plugin.rasterizers.drawing import surfel_inputs
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings, SurfelInputs
 from beags_plugin.refiners.border_split import BorderSplitConfig
 from beags_plugin.refiners.preparation import PreparationConfig
 
 PARAMETER_GROUPS = ("means", "features_dc", "features_rest", "opacities", "scales", "quats")
-EVERYTHING = "everything"  # the viewer's choice that hides no object
 FLATNESS = 1e-3  # exported third scale, relative to the smaller of the two: flat, yet no viewer divides by 0
 
 
@@ -192,10 +190,9 @@ class BeagsModel(SplatfactoModel):
         self.drawn: Drawn | None = None
         self.clock = StepClock()
         self.measuring = True  # whether anyone will read this step's metrics
-        self.object_choice = ViewerDropdown("Object", EVERYTHING, [EVERYTHING, *self._object_names()])
-
-    def _object_names(self) -> list[str]:
-        return [name for _, name in sorted(self.classes.items())]
+        self.viewing = Viewing(self)
+        self.viewer_panel = ObjectPanel(self.viewing)  # nerfstudio finds both by being public attributes
+        self.viewer_link = ViewerLink(self.viewer_panel)
 
     # -- the scene ---------------------------------------------------------------------------------------------------
 
@@ -284,11 +281,12 @@ class BeagsModel(SplatfactoModel):
         return {name: loss for name, loss in self.losses.items() if loss.active(self.step)}
 
     def get_outputs(self, camera: Cameras) -> dict[str, Any]:
-        """Render one view: what training needs while training, everything a viewer shows otherwise."""
+        """Render one view: what training needs while training; else what a viewer is to show, or the whole scene."""
         if self.training:
             return self._training_outputs(camera)
         with torch.no_grad():
-            return self._viewer_outputs(camera_from_nerfstudio(camera, 0).to(self.device))
+            view = camera_from_nerfstudio(camera, 0).to(self.device)
+            return self.viewing.outputs(view) if asked_by_viewer() else scene_outputs(self, view)
 
     def _training_outputs(self, cameras: Cameras) -> dict[str, Any]:
         self.clock.mark("data")
@@ -317,38 +315,9 @@ class BeagsModel(SplatfactoModel):
             return torch.rand(3, generator=generator).to(self.device)
         return fixed_background(self.config).to(self.device)
 
-    def shown(self) -> Tensor:
-        """[N] bool, the surfels that the viewer's choices leave visible."""
-        shown = torch.ones(self.num_points, dtype=torch.bool, device=self.device)
-        chosen = {name: index for index, name in self.classes.items()}.get(self.object_choice.value)
-        if chosen is not None:
-            shown &= self.class_ids == chosen
-        if self.crop_box is not None:
-            shown &= self.crop_box.within(self.means).reshape(-1)
-        return shown
-
-    def _viewer_outputs(self, camera: Camera) -> dict[str, Tensor]:
-        shown = self.shown()
-        surfels, class_ids = self.surfels()[shown], self.class_ids[shown]
-        background = self.background_color.to(self.device)
-        settings = self.settings()
-        render = self.rasterizer.rasterize(
-            surfel_inputs(surfels, camera, self.active_sh_degree()), camera, settings, background
-        )
-        assert render.depth is not None and render.normal is not None  # the settings ask for geometry
-        outputs = {
-            "rgb": render.color.clamp(0.0, 1.0),
-            "depth": render.depth[..., None],
-            "normal": 0.5 - 0.5 * render.normal,  # towards the camera looks bluish, as in other viewers
-            "accumulation": render.alpha[..., None],
-            "background": background.expand(camera.height, camera.width, 3),
-        }
-        if bool(self.assigned):
-            classes, confidence = draw_class_map(self.rasterizer, surfels, class_ids, camera, settings)
-            colors = torch.from_numpy(colorize(classes.cpu().numpy().astype(np.uint16)))
-            outputs["class_map"] = colors.to(self.device).float() / 255.0
-            outputs["class_confidence"] = confidence[..., None].float()
-        return outputs
+    def set_background(self, background_color: Tensor) -> None:
+        """Take the viewer's background [3]: for its pictures alone, so that no figure depends on it."""
+        self.viewing.background = background_color
 
     # -- losses and metrics --------------------------------------------------------------------------------------------
 

@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import shutil
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -113,22 +116,23 @@ class RefinementSwitch:
         start = time.perf_counter()
         with self.trainer.long_stage(step):
             views = self.datamanager.views("train", original=True)
-            prepared = prepare(
-                model.surfels(),
-                [view.camera for view in views],
-                LabelMaps(view.stored_labels for view in views),
-                model.classes,
-                model.rasterizer,
-                model.settings(),
-                self.refiner,
-                model.config.prepare,
-                model.config.split,
-                background_voxels=self._background_voxels(),
-                seed=model.seed,
-                stage=progress_bar,
-                store=self._stage_store(),
-                code=code_digest(),
-            )
+            with released(self.trainer.train_lock):  # minutes, which read the scene only: a viewer may draw it
+                prepared = prepare(
+                    model.surfels(),
+                    [view.camera for view in views],
+                    LabelMaps(view.stored_labels for view in views),
+                    model.classes,
+                    model.rasterizer,
+                    model.settings(),
+                    self.refiner,
+                    model.config.prepare,
+                    model.config.split,
+                    background_voxels=self._background_voxels(),
+                    seed=model.seed,
+                    stage=progress_bar,
+                    store=self._stage_store(),
+                    code=code_digest(),
+                )
             for finding in prepared.findings:
                 CONSOLE.print(f"  {finding}", highlight=False, markup=False)
             self._take_classes(prepared.assignment)
@@ -221,6 +225,18 @@ def save_prepared(prepared: Preparation, names: list[str], folder: Path) -> None
     (folder / "report.json").write_text(json.dumps(report, indent=2))
     state = {} if prepared.grid is None else prepared.grid.state_dict()
     write_whole(folder / "grid.pt", lambda file: torch.save(state, file))
+
+
+@contextmanager
+def released(lock: Lock) -> Iterator[None]:
+    """Let others have a lock that is held, and take it back."""
+    lock.release()
+    try:
+        yield
+    finally:
+        lock.acquire()
+
+
 
 
 def _write_grey(path: Path, values: torch.Tensor) -> None:

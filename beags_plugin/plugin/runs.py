@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from copy import deepcopy
 from pathlib import Path
@@ -76,6 +77,14 @@ def newest_checkpoint(folder: Path) -> Path:
 def round_folder(run: Path, index: int) -> Path:
     """Where a run keeps what the refinement round of this index was prepared with."""
     return run / PREPARED if index == 0 else run / PREPARED / f"round_{index + 1}"
+
+
+def preparing_run(run: Path) -> Path:
+    """The run that prepared refinement for what ``run`` holds: itself, or the one it is the base or an extract of."""
+    origin = run / EXTRACTION_FILE
+    if origin.exists():
+        return preparing_run(Path(json.loads(origin.read_text("utf8"))["run"]).parent)
+    return run.parent if run.name == BASE_SNAPSHOT and (run.parent / PREPARED).is_dir() else run
 
 
 def last_prepared(run: Path) -> Path:

@@ -1,0 +1,85 @@
+"""What a viewer shows of a run besides its scene: the training views' masks, and the voxel grid."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.evaluation.metrics import resize_nearest
+from beags_plugin.masks.classes import read_class_map
+from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.plugin.cameras import camera_from_nerfstudio
+from beags_plugin.plugin.datamanager import unique_names
+from beags_plugin.plugin.runs import last_prepared, preparing_run
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.datamanager import BeagsDataManager
+
+_KEPT_MASKS = 8  # of the views that were looked at last
+
+
+class ViewedRun:
+    """A run on disk with its data manager; what takes time to read is read when ``load_`` is called, by the panel.
+
+    folder: of the run. names: of the training views. cameras: theirs, without lens distortion; None until
+    ``load_views``. grid: the voxel grid of a finished run; None until ``load_grid``.
+    """
+
+    def __init__(self, folder: Path, datamanager: BeagsDataManager) -> None:
+        self.folder = folder
+        self.datamanager = datamanager
+        dataset = datamanager.train_dataset
+        self.names = unique_names(dataset.image_filenames)
+        self.has_masks = any(path is not None for path in dataset.metadata["class_map_filenames"])
+        self.cameras: list[Camera] | None = None
+        self.grid: VisibilityGrid | None = None
+        self._before = lru_cache(_KEPT_MASKS)(datamanager.training_mask)
+        self._after = lru_cache(_KEPT_MASKS)(read_class_map)
+
+    @property
+    def prepared(self) -> Path | None:
+        """The folder of what refinement was last prepared with: of this run, or of that which it was taken from."""
+        folder = last_prepared(preparing_run(self.folder))
+        return folder if (folder / "grid.pt").exists() else None
+
+    @property
+    def has_grid(self) -> bool:
+        """Whether refinement was prepared with a voxel grid (some refiners need none, and keep an empty file)."""
+        return self.prepared is not None and bool(torch.load(self.prepared / "grid.pt", weights_only=True, mmap=True))
+
+    def load_views(self) -> bool:
+        """Make the cameras known; images are only opened if lens distortion has to be removed. Tells if it was due."""
+        if self.cameras is not None:
+            return False
+        self.datamanager.straighten_training_views()
+        cameras = self.datamanager.train_dataset.cameras
+        self.cameras = [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))]
+        return True
+
+    def load_grid(self) -> bool:
+        """Read the voxel grid; tells whether there was one to read."""
+        prepared = self.prepared
+        if self.grid is not None or prepared is None:
+            return False
+        state = torch.load(prepared / "grid.pt", weights_only=True)
+        if state:
+            self.grid = VisibilityGrid.from_state_dict(state)
+        return bool(state)
+
+    def mask(self, view: int, kind: str, width: int, height: int) -> Tensor | None:
+        """[height, width] int32 ids or IGNORE of a training view, "before" reprojection or "after"; None without one.
+
+        Raises ``UserError`` for a file that cannot be read.
+        """
+        if kind == "before":
+            ids = self._before(view)
+        else:
+            path = None if self.prepared is None else self.prepared / "masks" / f"{self.names[view]}.png"
+            ids = self._after(path) if path is not None and path.exists() else None
+        return None if ids is None else torch.from_numpy(resize_nearest(ids, height, width).astype(np.int32))

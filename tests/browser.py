@@ -1,0 +1,137 @@
+"""A page in a headless Chromium, driven over its debugging protocol."""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+import subprocess
+import tempfile
+import time
+import urllib.request
+from pathlib import Path
+
+from websockets.sync.client import connect
+
+_FLAGS = (
+    "--headless=new", "--no-sandbox", "--disable-gpu-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist", "--hide-scrollbars", "--no-first-run", "--mute-audio", "--remote-debugging-port=0",
+)  # fmt: skip
+
+
+def chromium() -> str | None:
+    """The program, or None."""
+    return shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+class Page:
+    """One page at ``url``; a context manager that ends the browser."""
+
+    def __init__(self, url: str, width: int = 1280, height: int = 800) -> None:
+        program = chromium()
+        assert program is not None, "there is no chromium"
+        self._profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        command = [program, *_FLAGS, f"--user-data-dir={self._profile.name}", f"--window-size={width},{height}", url]
+        self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        port = self._wait_for(lambda: (Path(self._profile.name) / "DevToolsActivePort").read_text().split()[0])
+        target = self._wait_for(lambda: self._page_target(port))
+        self._socket = connect(target, max_size=None, compression=None)
+        self._number = 0
+        self._send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+
+    def __enter__(self) -> Page:
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._socket.close()
+        self._process.kill()
+        self._process.wait()
+        self._profile.cleanup()
+
+    @staticmethod
+    def _page_target(port: str) -> str:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=5) as reply:
+            return next(page["webSocketDebuggerUrl"] for page in json.load(reply) if page["type"] == "page")
+
+    @staticmethod
+    def _wait_for(ask, seconds: float = 60.0):
+        end = time.monotonic() + seconds
+        while True:
+            try:
+                return ask()
+            except (OSError, StopIteration, IndexError):
+                if time.monotonic() > end:
+                    raise
+                time.sleep(0.2)
+
+    def _send(self, method: str, **parameters) -> dict:
+        self._number += 1
+        self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
+        while True:
+            reply = json.loads(self._socket.recv(timeout=120))
+            if reply.get("id") == self._number:
+                if "error" in reply:
+                    raise RuntimeError(f"{method}: {reply['error']}")
+                return reply["result"]
+
+    def evaluate(self, script: str):
+        """The value of a JavaScript expression."""
+        found = self._send("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        if "exceptionDetails" in found:
+            raise RuntimeError(found["exceptionDetails"])
+        return found["result"].get("value")
+
+    def text(self) -> str:
+        """All text that the page shows."""
+        return self.evaluate("document.body?.innerText") or ""
+
+    def wait(self, true, seconds: float = 60.0) -> None:
+        """Wait until a function says so."""
+        end = time.monotonic() + seconds
+        while not true():
+            assert time.monotonic() < end, self.text()
+            time.sleep(0.3)
+
+    def wait_for_text(self, wanted: str, seconds: float = 60.0) -> str:
+        """The page's text, once ``wanted`` is part of it."""
+        self.wait(lambda: wanted in self.text(), seconds)
+        return self.text()
+
+    def click(self, x: float, y: float) -> None:
+        """Press and release the left button."""
+        self._send("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+        for kind in ("mousePressed", "mouseReleased"):
+            self._send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+            time.sleep(0.05)
+
+    def click_on(self, selector: str) -> None:
+        """Click on the middle of what a JavaScript expression gives, an element, once scrolled into view."""
+        box = self.evaluate(
+            f"(() => {{ const e = {selector}; e.scrollIntoView({{block: 'center'}});"
+            " const b = e.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; })()"
+        )
+        time.sleep(0.2)
+        self.click(*box)
+
+    def press(self, label: str) -> None:
+        """Press the button of that name; not with the mouse: the panel may still be moving."""
+        self.evaluate(
+            f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() == {json.dumps(label)}).click()"
+        )
+
+    def choose(self, label: str, option: str) -> None:
+        """Choose an option of the drop-down list called ``label``."""
+        labelled = f"[...document.querySelectorAll('label')].find(l => l.innerText.trim() == {json.dumps(label)})"
+        self.click_on(f"document.getElementById({labelled}.htmlFor)")
+        time.sleep(0.5)
+        listed = (
+            "[...document.querySelectorAll('[role=option]')]"
+            f".find(o => o.innerText.trim() == {json.dumps(option)} && o.offsetParent)"
+        )
+        self.wait(lambda: self.evaluate(f"!!{listed}"))
+        self.evaluate(f"{listed}.click()")  # not with the mouse: the list may still be moving
+        time.sleep(0.5)
+
+    def picture(self) -> bytes:
+        """The page as a PNG file's content."""
+        return base64.b64decode(self._send("Page.captureScreenshot", format="png")["data"])

@@ -1,0 +1,271 @@
+"""What a viewer shows, without nerfstudio: choices of objects, picking, pictures, the legend's text."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from run_folders import discs
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.surfels import Surfels, opacities
+from beags_plugin.masks.classes import colorize
+from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.occupancy.violation import violation_shares
+from beags_plugin.rasterizers.drawing import geometry_inputs
+from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
+from beags_plugin.viewing.choice import Choice, shown
+from beags_plugin.viewing.legend import LegendRow, escaped, hex_color, legend, unique_labels
+from beags_plugin.viewing.picking import camera_along, pick
+from beags_plugin.viewing.pictures import (
+    boundary_picture,
+    class_picture,
+    fitted_camera,
+    framed,
+    nearest_view,
+    value_picture,
+)
+
+SETTINGS = RasterSettings(0.01, 100.0)
+
+
+def view(width: int = 32, height: int = 24, distance: float = 3.0, turn: float = 0.0) -> Camera:
+    """Looks at the origin from ``distance`` away, from an angle ``turn`` about the y axis."""
+    cos, sin = math.cos(turn), math.sin(turn)
+    viewmat = torch.tensor([[cos, 0, sin, 0], [0, 1, 0, 0], [-sin, 0, cos, distance], [0, 0, 0, 1]])
+    K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]])
+    return Camera(viewmat.float(), K.float(), width, height)
+
+
+def wall(z: float, x: float = 0.0, scale: float = 0.3, opacity: float = 0.9) -> Surfels:
+    """One disc that faces the z axis."""
+    return Surfels.of(
+        torch.tensor([[x, 0.0, z]]),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        torch.full((1, 2), math.log(scale)),
+        torch.logit(torch.tensor([opacity])),
+        torch.zeros(1, 1, 3),
+    )
+
+
+def joined(*parts: Surfels) -> Surfels:
+    return Surfels.of(
+        torch.cat([p.means for p in parts]),
+        torch.cat([p.quats for p in parts]),
+        torch.cat([p.log_scales for p in parts]),
+        torch.cat([p.opacity_logits for p in parts]),
+        torch.cat([p.sh for p in parts]),
+    )
+
+
+# -- choices ---------------------------------------------------------------------------------------------------------
+
+
+def test_nothing_chosen_shows_everything_without_copying():
+    surfels, ids = discs()
+    scene = shown(surfels, ids, Choice(rest=0.3))
+    assert scene.surfels is surfels and scene.index is None
+
+
+@pytest.mark.parametrize(
+    ("choice", "classes"),
+    [
+        (Choice().isolate(1), {1}),
+        (Choice().hide(1), {0, 2}),
+        (Choice().hide(1).show(1), {0, 1, 2}),
+        (Choice().remove(0).hide(2), {1}),
+        (Choice().hide(1).isolate(1), {1}),
+        (Choice().isolate(1).isolate(2), {2}),
+        (Choice().isolate(1).show(2), {0, 1, 2}),
+        (Choice().isolate(1).hide(1), {0, 2}),
+        (Choice().isolate(1).remove(2), {1}),
+        (Choice().remove(1).hide(2).isolate(0).show_all(), {0, 1, 2}),
+        (Choice().remove(0).remove(1).remove(2), set()),
+        (Choice().isolate(7), set()),
+    ],
+)
+def test_choices_leave_these_classes(choice, classes):
+    surfels, ids = discs()
+    scene = shown(surfels, ids, choice)
+    index = torch.arange(len(ids)) if scene.index is None else scene.index
+    assert set(scene.class_ids.tolist()) == classes
+    assert index.tolist() == [i for i, class_id in enumerate(ids.tolist()) if class_id in classes]
+    assert torch.equal(scene.surfels.means, surfels.means[index])
+    assert {c for c in (0, 1, 2) if choice.in_full(c)} == classes
+    assert {c for c in (0, 1, 2) if choice.state(c) == "shown"} == classes
+
+
+def test_the_rest_fades_and_what_is_removed_stays_away():
+    surfels, ids = discs()
+    choice = Choice(rest=0.25).isolate(1).remove(2)
+    scene = shown(surfels, ids, choice)
+    before = opacities(surfels.opacity_logits)[scene.index]
+    factor = torch.where(scene.class_ids == 1, 1.0, 0.25)
+    assert set(scene.class_ids.tolist()) == {0, 1}
+    torch.testing.assert_close(opacities(scene.surfels.opacity_logits), before * factor, rtol=1e-5, atol=1e-6)
+    assert set(shown(surfels, ids, choice, rest=False).class_ids.tolist()) == {1}
+    assert shown(surfels, ids, Choice(rest=1.0).hide(1)).surfels.opacity_logits.equal(surfels.opacity_logits)
+
+
+def test_the_least_opacity_and_a_crop_box_leave_surfels_out():
+    surfels = joined(wall(0.0, opacity=0.2), wall(1.0, opacity=0.6), wall(2.0, opacity=0.9))
+    ids = torch.tensor([0, 1, 1], dtype=torch.int32)
+    assert shown(surfels, ids, Choice(min_opacity=0.5)).index.tolist() == [1, 2]
+    inside = torch.tensor([True, True, False])
+    assert shown(surfels, ids, Choice(min_opacity=0.5), inside=inside).index.tolist() == [1]
+    assert shown(surfels, ids, Choice(min_opacity=1.0)).index.tolist() == []
+
+
+# -- picking -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_ray_of_a_pixel_picks_what_the_whole_picture_has_there(rasterizer):
+    """Same surfel as ``heaviest`` of a whole view whose pixels are as fine as the one that picking draws."""
+    surfels, ids = discs()
+    camera = view(24, 20)
+    K = torch.tensor([[1000.0, 0, 12.0], [0, 1000.0, 10.0], [0, 0, 1]])
+    for turn, lift in ((0.0, 0.0), (0.7, 0.2), (2.0, -0.1)):
+        viewmat = view(turn=turn).viewmat.clone()
+        viewmat[1, 3] += lift
+        camera = Camera(viewmat, K, 24, 20)
+        whole = rasterizer.heaviest(geometry_inputs(surfels), camera, SETTINGS)
+        for x, y in ((3, 4), (12, 10), (20, 15)):
+            local = torch.tensor([(x + 0.5 - 12.0) / 1000, (y + 0.5 - 10.0) / 1000, 1.0])
+            found = pick(
+                rasterizer, surfels, ids, SETTINGS, camera.center.tolist(), (camera.rotation.T @ local).tolist()
+            )
+            expected = int(whole[y, x])
+            assert (-1 if found is None else found.index) == expected
+            assert found is None or found.class_id == int(ids[expected])
+
+
+def test_picking_takes_the_heaviest_not_the_nearest(rasterizer):
+    veil, solid = wall(0.0, opacity=0.2), wall(1.0, opacity=0.9)
+    ids = torch.tensor([5, 7], dtype=torch.int32)
+    towards = ((0.0, 0.0, -3.0), (0.0, 0.0, 2.0))
+    found = pick(rasterizer, joined(veil, solid), ids, SETTINGS, *towards)
+    assert found is not None and (found.index, found.class_id) == (1, 7)
+    assert pick(rasterizer, joined(veil, solid), ids, SETTINGS, (9.0, 0.0, -3.0), (0.0, 0.0, 1.0)) is None
+    none = joined(veil, solid)[torch.zeros(0, dtype=torch.int64)]
+    assert pick(rasterizer, none, ids[:0], SETTINGS, *towards) is None
+
+
+@pytest.mark.parametrize("direction", [(0, 0, 1), (0, -1, 0), (1, 0, 0), (0.3, -5.0, 2.0)])
+def test_the_pixel_of_picking_looks_along_the_ray(direction):
+    camera = camera_along((1.0, 2.0, 3.0), direction)
+    point = torch.tensor([1.0, 2.0, 3.0]) + 4.0 * torch.nn.functional.normalize(torch.tensor(direction).float(), dim=0)
+    local = camera.rotation @ point + camera.translation
+    torch.testing.assert_close(local, torch.tensor([0.0, 0.0, 4.0]), rtol=0, atol=1e-5)
+    assert float(torch.linalg.det(camera.rotation)) == pytest.approx(1.0, abs=1e-5)
+
+
+# -- pictures ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_boundary_picture_is_the_share_of_another_class(rasterizer):
+    """One disc: the weight of its pixel where the mask says another class, 0 where it agrees or says nothing."""
+    surfels, ids, camera = wall(0.0), torch.tensor([3], dtype=torch.int32), view()
+    alpha = rasterizer.rasterize(geometry_inputs(surfels), camera, SETTINGS, torch.zeros(3)).alpha
+    mask = torch.full((24, 32), 3, dtype=torch.int32)
+    mask[:, 16:], mask[20:] = 1, IGNORE
+    picture = boundary_picture(rasterizer, surfels, ids, camera, SETTINGS, mask)
+    assert picture.shape == (24, 32, 1) and picture.dtype == torch.float32
+    torch.testing.assert_close(picture[..., 0], torch.where(mask == 1, alpha, torch.zeros(())))
+
+
+def test_values_are_composited_like_colours(rasterizer):
+    surfels, camera = joined(wall(0.0, opacity=0.5), wall(1.0, opacity=0.8)), view()
+    picture = value_picture(rasterizer, surfels, torch.tensor([0.25, 1.0]), camera, SETTINGS)
+    first, second = (
+        rasterizer.rasterize(geometry_inputs(part), camera, SETTINGS, torch.zeros(3)).alpha
+        for part in (surfels[:1], surfels[1:])
+    )
+    torch.testing.assert_close(picture[..., 0], 0.25 * first + (1.0 - first) * second)
+
+
+def test_class_pictures_have_the_colours_of_the_ids():
+    ids = torch.tensor([[0, 1], [700, IGNORE]], dtype=torch.int32)
+    assert np.array_equal((255 * class_picture(ids)).round().byte().numpy(), colorize(ids.numpy()))
+
+
+@pytest.mark.parametrize(("width", "height"), [(100, 40), (40, 100), (7, 5), (1, 1), (300, 2)])
+def test_a_view_fits_into_any_picture_and_sees_the_same(width, height):
+    camera = view(32, 24)
+    fitted = fitted_camera(camera, width, height)
+    assert 1 <= fitted.width <= width and 1 <= fitted.height <= height
+    assert fitted.width == width or fitted.height == height
+    corner = torch.tensor([0.5 * 32, 0.25 * 24, 1.0])  # of the view; the same share of the fitted one
+    ray = torch.linalg.inv(camera.K) @ corner
+    there = fitted.K @ ray
+    assert there.tolist() == pytest.approx([0.5 * fitted.width, 0.25 * fitted.height, 1.0], rel=1e-5)
+    picture = torch.ones(fitted.height, fitted.width, 3)
+    frame = framed(picture, width, height)
+    assert frame.shape == (height, width, 3) and float(frame.sum()) == picture.numel()
+
+
+def test_the_nearest_view_is_near_and_looks_the_same_way():
+    views = [view(turn=turn) for turn in (0.0, 1.0, 2.0, 3.0)]
+    assert nearest_view(view(turn=1.9), views, 3.0) == 2
+    behind = Camera(torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ views[0].viewmat, views[0].K, 32, 24)
+    assert nearest_view(view(turn=0.4), [behind, views[1]], 3.0) == 1
+
+
+# -- where the occupancy loss acts -----------------------------------------------------------------------------------
+
+
+def one_voxel_grid(classes: tuple[int, ...] = (1,)) -> VisibilityGrid:
+    """The 27 voxels of side 1 around the origin are valid for these classes: those next to voxel (0, 0, 0)."""
+    clouds = [(torch.tensor([[0.0, 0.0, 0.0]]), torch.tensor([class_id])) for class_id in classes]
+    return VisibilityGrid.from_points(clouds, 1.0, torch.full((3,), -0.5), 8)
+
+
+def test_shares_of_violation_agree_with_the_integral(ops):
+    """A disc cut by the border of the valid box: the share is the normal distribution's tail beyond it, in the disc."""
+    scale, offset = 0.4, 1.2  # valid is |x| <= 1.5: 0.3 from the centre, 0.75 of the scale
+    surfels = wall(0.0, x=offset, scale=scale)
+    shares = violation_shares(surfels, torch.tensor([1]), one_voxel_grid(), samples=20_000)
+    grid = np.linspace(-3, 3, 1201)
+    u, v = np.meshgrid(grid, grid)
+    weight = np.exp(-0.5 * (u * u + v * v)) * (u * u + v * v <= 9)
+    invalid = (offset + scale * u > 1.5) | (abs(scale * v) > 1.5)
+    assert float(shares[0]) == pytest.approx((weight * invalid).sum() / weight.sum(), abs=0.01)
+
+
+def test_shares_are_zero_inside_one_outside_and_zero_for_what_is_not_asked(ops):
+    surfels = joined(wall(0.0, scale=0.1), wall(9.0, scale=0.1), wall(9.0, scale=0.1), wall(0.0), wall(float("nan")))
+    ids = torch.tensor([1, 1, 0, 2, 1], dtype=torch.int32)
+    assert violation_shares(surfels, ids, one_voxel_grid()).tolist() == pytest.approx([0, 1, 1, 1, 0])
+    assert violation_shares(surfels, ids, one_voxel_grid(), background=False).tolist() == pytest.approx([0, 1, 0, 1, 0])
+    assert violation_shares(surfels[:0], ids[:0], one_voxel_grid()).tolist() == []
+
+
+# -- text --------------------------------------------------------------------------------------------------------------
+
+
+def test_the_legend_names_colours_counts_and_states():
+    rows = [LegendRow(1, "red cup", 1234), LegendRow(2, "box", 5, "hidden"), LegendRow(3, "lid", 6, "removed")]
+    lines = legend(rows).splitlines()
+    assert len(lines) == 5
+    red, green, blue = colorize(np.array([[1]]))[0, 0]
+    assert hex_color(1) == f"#{red:02x}{green:02x}{blue:02x}" and f"`{hex_color(1)}`" in lines[2]
+    assert "| red cup |" in lines[2] and "1,234" in lines[2]
+    assert "| ~~box~~ |" in lines[3] and "| ~~lid~~ removed |" in lines[4]
+
+
+def test_no_name_can_be_taken_for_a_program():
+    name = "äö 猫 {alert(1)} <b>|a| `x` [y](z)*w*_v_\\ \n"
+    text = legend([LegendRow(1, name, 1)])
+    assert len(text.splitlines()) == 3  # a line end would break the table
+    row = text.splitlines()[2]
+    assert row.count("|") == 4 and not set("{}<>[]*_\\") & set(row)
+    assert "äö 猫" in row and "&#123;alert&#40;1&#41;&#125;" in row
+    assert escaped("a.b") == "a.b"
+
+
+def test_labels_are_unique_never_empty_and_in_the_order_of_ids():
+    labels = unique_labels({3: "cup", 1: "cup", 2: " ", 0: "background", 5: "cup (1)", 9: "x" * 300})
+    assert list(labels.values()) == [0, 1, 2, 3, 5, 9]
+    assert all(label and len(label) < 60 for label in labels) and len(set(labels)) == 6
+    assert list(labels)[:2] == ["background", "cup (1)"]
