@@ -99,6 +99,8 @@ class Export:
     """Names of the objects."""
     all: bool = False
     """Every object, the emptied background, and a manifest.json."""
+    whole: bool = False
+    """The whole scene in one file; without --object and --all it needs no classes."""
     format: tuple[str, ...] = ("ply",)
     """ply (viewers of 3D Gaussians), ply-2dgs (the official 2DGS code), spz (small), glb, obj (meshes), or your own."""
     frame: str = "world"
@@ -114,7 +116,15 @@ class Export:
         options = {name: asdict(self.mesh) for name in ("glb", "obj")}
         with progress_bar("exporting") as progress:
             exported = export_run(
-                self.load_config, self.object, self.all, self.format, self.frame, self.output, options, progress
+                self.load_config,
+                self.object,
+                self.all,
+                self.format,
+                self.frame,
+                self.output,
+                options,
+                progress,
+                whole=self.whole,
             )
         for one in exported:
             CONSOLE.print(f"{one.name}: {one.gaussians} Gaussians", markup=False)

@@ -15,13 +15,21 @@ from beags_plugin.export.base import Exporter, NothingToExport, Piece, Viewpoint
 from beags_plugin.export.frames import Frame, bounding_box, check_placement
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.select import select_class
-from beags_plugin.plugin.extract import SavedScene, folder_names, load_scene, objects_with_gaussians, read_transform
+from beags_plugin.plugin.extract import (
+    SavedScene,
+    folder_names,
+    load_scene,
+    objects_with_gaussians,
+    read_scene,
+    read_transform,
+)
 from beags_plugin.rasterizers import make_rasterizer
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
 
 MANIFEST = "manifest.json"
+WHOLE = "whole scene"  # what stands for a class where all Gaussians go into one file
 Progress = Callable[[int, int], None]
 
 
@@ -37,14 +45,15 @@ class ExportedFile:
 
 @dataclass(frozen=True)
 class Exported:
-    """One object (or the background) and its files.
+    """One object (or the background, or the whole scene) and its files.
 
-    center: [3] the point of the world that is the files' origin. low, high: [3] its box, in the files' frame.
-    to_run: the 4 x 4 matrix from the files' frame to the run's normalised one.
+    class_id: None of the whole scene. center: [3] the point of the world that is the files' origin.
+    low, high: [3] its box, in the files' frame. to_run: the 4 x 4 matrix from the files' frame to the run's normalised
+    one.
     """
 
     name: str
-    class_id: int
+    class_id: int | None
     gaussians: int
     center: list[float]
     low: list[float]
@@ -80,26 +89,30 @@ def export_run(
     output: Path | None = None,
     options: Mapping[str, Mapping[str, Any]] | None = None,
     progress: Progress | None = None,
+    whole: bool = False,
 ) -> list[Exported]:
     """Write files of objects of a run.
 
     config_path: config.yml of a refined (or assigned) run. objects: names; or everything: all that have Gaussians and
-    the emptied background, and a manifest. formats: names of exporters. placement: "world", the frame of the input
-    poses (the run's own if it has not kept how that was normalised), or "object", the same centred on each object.
-    output: folder; ``exports/`` in the run by default. options: format to its exporter's options.
-    progress: is told (done, total) files. Raises ``UserError`` for a mistake, before anything is written.
+    the emptied background, and a manifest. whole: the whole scene too, in one file; alone it needs no classes.
+    formats: names of exporters. placement: "world", the frame of the input poses (the run's own if it has not kept how
+    that was normalised), or "object", the same centred on each object. output: folder; ``exports/`` in the run by
+    default. options: format to its exporter's options. progress: is told (done, total) files.
+    Raises ``UserError`` for a mistake, before anything is written.
     """
     run, folder = config_path.parent, output or config_path.parent / "exports"
     check_placement(placement)
     exporters = {name: make_exporter(name, **(options or {}).get(name, {})) for name in formats}
     if not exporters:
         raise UserError("no format is named: name one with --format.")
-    scene = load_scene(config_path)
-    present = objects_with_gaussians(scene, objects, run)
+    scene = load_scene(config_path) if everything or objects or not whole else read_scene(config_path)
+    present = objects_with_gaussians(scene, objects, run) if scene.assigned else {}
     if everything and objects:
         raise UserError("--all exports every object: leave --object out.")
-    if not everything and not objects:
-        raise UserError(f"nothing to export is named: use --all, or --object with one of {', '.join(present)}.")
+    if not (everything or objects or whole):
+        raise UserError(
+            f"nothing to export is named: use --all, --whole, or --object with one of {', '.join(present)}."
+        )
 
     transform = read_transform(run)
     job = _Job(
@@ -111,11 +124,14 @@ def export_run(
         tolerant=everything,
     )
     names, titles = list(present) if everything else list(dict.fromkeys(objects)), folder_names(scene.classes)
-    exported, total = [], len(names) * len(exporters)
-    for number, name in enumerate(names):
+    pieces: list[tuple[str, int | None, str]] = [(name, present[name], titles[present[name]]) for name in names]
+    if whole:
+        pieces.append((WHOLE, None, "whole_scene"))
+    exported, total = [], len(pieces) * len(exporters)
+    for number, (name, class_id, title) in enumerate(pieces):
         if progress:
             progress(number * len(exporters), total)
-        exported.append(job.export(name, present[name], folder / titles[present[name]]))
+        exported.append(job.export(name, class_id, folder / title))
     if progress:
         progress(total, total)
     if everything:
@@ -139,14 +155,18 @@ class _Job:
     views: Viewpoints | None
     tolerant: bool
 
-    def export(self, name: str, class_id: int, stem: Path) -> Exported:
-        """All files of one class, called ``stem`` and their suffixes."""
-        chosen, index = select_class(self.scene.surfels(), self.scene.state["class_ids"], class_id)
+    def export(self, name: str, class_id: int | None, stem: Path) -> Exported:
+        """All files of one class (None: of the whole scene), called ``stem`` and their suffixes."""
+        class_ids = self.scene.state["class_ids"]
+        chosen = self.scene.surfels()
+        if class_id is not None:
+            chosen, index = select_class(chosen, class_ids, class_id)
+            class_ids = class_ids[index]
         low, high = bounding_box(self.world.surfels(chosen))
         center = (low + high) / 2 if self.centred else torch.zeros(3, dtype=torch.float64)
         frame = self.world.centred(center)
         views = None if self.views is None else frame.views(self.views)
-        piece = Piece(name, frame.surfels(chosen), self.scene.state["class_ids"][index], views)
+        piece = Piece(name, frame.surfels(chosen), class_ids, views)
         files = [
             self._write(label, exporter, stem.with_name(f"{stem.name}.{exporter.suffix}"), piece)
             for label, exporter in self.exporters.items()

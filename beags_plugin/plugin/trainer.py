@@ -17,6 +17,7 @@ from beags_plugin.plugin.held_out import HeldOutCurve
 from beags_plugin.plugin.optimizers import JointOptimizers
 from beags_plugin.plugin.refinement import peak_memory_mb
 from beags_plugin.plugin.runs import newest_checkpoint, save_atomically
+from beags_plugin.plugin.warm_start import check_start, start_from_scene
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
@@ -49,12 +50,19 @@ class BeagsTrainer(Trainer):
     def setup(self, test_mode: Any = "val") -> None:
         """Load data, build the model, load a checkpoint; a user's mistake ends here, with one sentence."""
         try:
+            if not self._loads():
+                check_start(self.config.model_config)
             super().setup(test_mode)
         except UserError as error:
             _stop(error)
 
     def setup_optimizers(self) -> JointOptimizers:
-        """The optimizers that the config lists, one for each group of parameters."""
+        """The optimizers that the config lists, one for each group of parameters.
+
+        A scene to start from takes its place before: the optimizers hold what they are built with.
+        """
+        if self.config.model_config.start_from is not None and not self._loads():
+            start_from_scene(self._model, cast("BeagsDataManager", self.pipeline.datamanager), self.base_dir)
         return JointOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
 
     def train(self) -> None:
@@ -105,15 +113,19 @@ class BeagsTrainer(Trainer):
             message += f" {QUICKER}"
         CONSOLE.print(message, highlight=False)
 
+    def _loads(self) -> bool:
+        """Whether a checkpoint is loaded: what it holds counts, not the scene that its run may have started from."""
+        return self.config.load_dir is not None or self.config.load_checkpoint is not None
+
     def _load_checkpoint(self) -> None:
         config = self.config
         if config.load_dir is not None and config.load_step is None:
             config.load_checkpoint = newest_checkpoint(config.load_dir)
             config.load_dir = None
-        if config.load_checkpoint is None and config.load_dir is None and self.schedule.base_steps == 0:
+        if not self._loads() and config.model_config.start_from is None and self.schedule.base_steps == 0:
             raise UserError(
                 f"{config.method_name} starts from a trained base: add --load-dir <run>/nerfstudio_models of one "
-                "(or <run>/base/nerfstudio_models)."
+                "(or <run>/base/nerfstudio_models), or --pipeline.model.start-from with a splat .ply or another run."
             )
         super()._load_checkpoint()
         models = config.load_dir or (config.load_checkpoint.parent if config.load_checkpoint else None)
