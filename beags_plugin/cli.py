@@ -15,6 +15,7 @@ from beags_plugin.bench.commands import Measurement
 from beags_plugin.errors import UserError
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.export.mesh_options import MeshOptions
+from beags_plugin.turntable.options import RenderOptions
 
 CONSOLE = Console(soft_wrap=True, highlight=False)
 
@@ -133,6 +134,29 @@ class Export:
 
 
 @dataclass
+class Render:
+    """Draw objects alone: a turntable video, a contact sheet, or assignment alone beside the refined object."""
+
+    load_config: Path
+    """config.yml of a trained run."""
+    object: tuple[str, ...] = ()
+    """Names of the objects; all but the background if left out."""
+    format: str = "video"
+    """video (.mp4 or .gif), sheet (.png or .jpg), or before-after (any of these, by the name of the file)."""
+    output: Path | None = None
+    """The file; in renders/ beside config.yml if left out."""
+    options: tyro.conf.OmitArgPrefixes[RenderOptions] = RenderOptions()
+
+    def run(self) -> None:
+        from beags_plugin.plugin.render import render_run
+        from beags_plugin.progress import progress_bar
+
+        with progress_bar("rendering") as progress:
+            path = render_run(self.load_config, self.object, self.format, self.output, self.options, progress)
+        CONSOLE.print(f"{self.format}: {path}", markup=False)
+
+
+@dataclass
 class Eval:
     """Score runs on their held-out views: masks per object, PSNR and SSIM, before and after refinement.
 
@@ -185,6 +209,7 @@ Command = (
     | Annotated[Sample, tyro.conf.subcommand(name="sample")]
     | Annotated[Extract, tyro.conf.subcommand(name="extract")]
     | Annotated[Export, tyro.conf.subcommand(name="export")]
+    | Annotated[Render, tyro.conf.subcommand(name="render")]
     | Annotated[Eval, tyro.conf.subcommand(name="eval")]
     | Annotated[Bench, tyro.conf.subcommand(name="bench")]
     | Annotated[Doctor, tyro.conf.subcommand(name="doctor")]

@@ -120,7 +120,9 @@ def export_run(
         exporters,
         Frame.of_run() if transform is None else Frame(*transform),
         placement == "object",
-        _viewpoints(scene, config_path) if any(exporter.needs_views for exporter in exporters.values()) else None,
+        training_viewpoints(scene, config_path)
+        if any(exporter.needs_views for exporter in exporters.values())
+        else None,
         tolerant=everything,
     )
     names, titles = list(present) if everything else list(dict.fromkeys(objects)), folder_names(scene.classes)
@@ -185,7 +187,7 @@ class _Job:
             return ExportedFile(label, None, {}, str(error))
 
 
-def _viewpoints(scene: SavedScene, config_path: Path) -> Viewpoints:
+def training_viewpoints(scene: SavedScene, config_path: Path) -> Viewpoints:
     """The training views of a run, in its own frame; raises ``UserError`` if its data cannot be read."""
     from beags_plugin.plugin.cameras import camera_from_nerfstudio
     from beags_plugin.plugin.evaluate import raster_settings
