@@ -1,4 +1,4 @@
-"""The command line: ``beags demo | sample | extract | export | eval | bench | doctor``."""
+"""The command line: ``beags demo | sample | extract | export | render | eval | bench | doctor``."""
 
 from __future__ import annotations
 
@@ -79,11 +79,15 @@ class Extract:
     """Keep everything but the object."""
     output: Path | None = None
     """Folder for the runs; extracted/ beside config.yml if left out."""
+    json: Path | None = None
+    """File that lists what was written."""
 
     def run(self) -> None:
         from beags_plugin.plugin.extract import extract_objects
 
-        for done in extract_objects(self.load_config, self.object, self.remove, self.output):
+        extracted = extract_objects(self.load_config, self.object, self.remove, self.output)
+        write_json(self.json, [vars(done) for done in extracted])
+        for done in extracted:
             CONSOLE.print(
                 f"{done.name}: {done.gaussians} Gaussians\n  {done.ply}\n  ns-viewer --load-config {done.config}",
                 markup=False,
@@ -108,6 +112,8 @@ class Export:
     """world, that of the input poses; or object, the same with the middle of the object's box as origin."""
     output: Path | None = None
     """Folder for the files; exports/ beside config.yml if left out."""
+    json: Path | None = None
+    """File that lists what was written."""
     mesh: tyro.conf.OmitArgPrefixes[MeshOptions] = MeshOptions()
 
     def run(self) -> None:
@@ -127,6 +133,7 @@ class Export:
                 progress,
                 whole=self.whole,
             )
+        write_json(self.json, [asdict(one) for one in exported])
         for one in exported:
             CONSOLE.print(f"{one.name}: {one.gaussians} Gaussians", markup=False)
             for file in one.files:
@@ -196,12 +203,28 @@ class Bench:
 
 @dataclass
 class Doctor:
-    """Say what this installation can do, and what is missing."""
+    """Say what this installation can do, what is missing, and the one command that repairs each."""
+
+    json: Path | None = None
+    """File for the same."""
 
     def run(self) -> None:
         from beags_plugin.doctor import diagnose, print_report
 
-        print_report(diagnose())
+        checks = diagnose()
+        write_json(self.json, [check.to_json() for check in checks])
+        print_report(checks)
+
+
+def write_json(path: Path | None, content: object) -> None:
+    """Write plain values, and paths as text; None writes nothing. Raises ``UserError`` if it cannot be written."""
+    import json
+
+    from beags_plugin.extraction.files import whole_file
+
+    if path is not None:
+        with whole_file(path) as part:
+            part.write_text(json.dumps(content, indent=2, default=str) + "\n", "utf8")
 
 
 Command = (
@@ -227,6 +250,9 @@ def main(arguments: list[str] | None = None) -> None:
     except UserError as error:
         CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}")
         sys.exit(2)
+    except KeyboardInterrupt:
+        CONSOLE.print("[bold red]beags:[/bold red] interrupted.")
+        sys.exit(130)
 
 
 if __name__ == "__main__":
