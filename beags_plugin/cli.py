@@ -242,10 +242,9 @@ Command = (
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the command ``beags``; a user's mistake prints one sentence and ends with exit code 2."""
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
-    command = tyro.cli(
-        Command, args=arguments, description="BEA-GS: clean objects out of Gaussian-splat scenes.", config=config
-    )
+    description = "BEA-GS: clean objects out of Gaussian-splat scenes."
     try:
+        command = tyro.cli(Command, args=arguments, description=description, config=config)
         command.run()
     except UserError as error:
         CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}")

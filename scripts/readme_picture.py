@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from beags_plugin.evaluation.cells import below, beside, cell, write_picture
+from beags_plugin.evaluation.cells import GAP, below, beside, cell, write_picture
 from beags_plugin.evaluation.contact_sheet import mask_overlay
 from beags_plugin.evaluation.metrics import resize_nearest
 from beags_plugin.export.frames import bounding_box
@@ -45,7 +45,8 @@ class Picture:
         assert view.image is not None and view.visible is not None
         photo = (255 * view.image).round().byte().numpy()
         labels = resize_nearest(view.visible.numpy(), *photo.shape[:2])
-        size = (round(self.height * photo.shape[1] / photo.shape[0]), self.height)
+        width = len(self.object) * (self.height + GAP) - GAP  # two of them are as wide as the line below
+        size = (width, round(width * photo.shape[0] / photo.shape[1]))
         lines = [[cell(photo, size, "a photo"), cell(mask_overlay(photo, labels), size, "its mask")]]
         ids = {name: class_id for class_id, name in run.classes.items()}
         photos = training_viewpoints(run.stages["after"], self.load_config).cameras

@@ -1,9 +1,9 @@
 """The commands in README.md and docs/: every line of a code block that calls a program of ours or of nerfstudio.
 
 Names of the reader's own things (``my_scene``, ``outputs/.../config.yml``) are replaced by tiny ones: ``SUBSTITUTES``.
-Commands of ``beags`` that end in seconds then run as they stand, with small sizes appended: ``RUN``. All others (training,
-experiments, the viewer, other programs' commands) are parsed by the same parser that would run them, so that a wrong
-flag or value fails, but not run; the first ``ns-train`` of README.md does run, a few steps long. ``make`` targets, and
+Commands of ``beags`` that end in seconds then run as they stand, with small sizes appended: ``RUN``. All others
+(training, experiments, the viewer, other programs' commands) are parsed by the same parser that would run them, so that
+a wrong flag or value fails, but not run; the first ``ns-train`` of README.md does run, a few steps long. ``make`` targets, and
 scripts and files that ``python`` and ``pip`` name, must exist. New files in docs/ are found by themselves.
 """
 
@@ -158,7 +158,7 @@ def test_the_training_of_the_quick_start_runs(folder, monkeypatch):
     config = training_config(words_of(line)[1:])
     model = config.model_config
     model.base_steps, model.refine_steps, config.vis, config.run_dir = 3, 2, "tensorboard", folder / "trained"
-    model.densify.start, model.split = 100, type(model.split)()
+    model.prepare, model.split = type(model.prepare)(k=5), type(model.split)()
     config.data_config.data = config.data or config.data_config.data  # as ns-train does
     train(config)
     assert (folder / "trained" / "base" / "config.yml").exists()
