@@ -49,7 +49,7 @@ class Picture:
         size = (width, round(width * photo.shape[0] / photo.shape[1]))
         lines = [[cell(photo, size, "a photo"), cell(mask_overlay(photo, labels), size, "its mask")]]
         ids = {name: class_id for class_id, name in run.classes.items()}
-        photos = training_viewpoints(run.stages["after"], self.load_config).cameras
+        photos = training_viewpoints(run.stages["after"].config, run.settings, self.load_config).cameras
         for name, number in zip(self.object, self.camera, strict=True):
             parts = {
                 stage: select_class(scene.surfels(), scene.class_ids, ids[name])[0]

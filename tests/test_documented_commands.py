@@ -3,8 +3,8 @@
 Names of the reader's own things (``my_scene``, ``outputs/.../config.yml``) are replaced by tiny ones: ``SUBSTITUTES``.
 Commands of ``beags`` that end in seconds then run as they stand, with small sizes appended: ``RUN``. All others
 (training, experiments, the viewer, other programs' commands) are parsed by the same parser that would run them, so that
-a wrong flag or value fails, but not run; the first ``ns-train`` of README.md does run, a few steps long. ``make`` targets, and
-scripts and files that ``python`` and ``pip`` name, must exist. New files in docs/ are found by themselves.
+a wrong flag or value fails, but not run; the first ``ns-train`` of README.md does run, a few steps long. ``make``
+targets, and scripts and files that ``python`` and ``pip`` name, must exist. New files in docs/ are found by themselves.
 """
 
 from __future__ import annotations

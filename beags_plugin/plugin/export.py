@@ -24,6 +24,7 @@ from beags_plugin.plugin.extract import (
     read_transform,
 )
 from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.interface import RasterSettings
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
@@ -100,6 +101,8 @@ def export_run(
     default. options: format to its exporter's options. progress: is told (done, total) files.
     Raises ``UserError`` for a mistake, before anything is written.
     """
+    from beags_plugin.plugin.evaluate import raster_settings
+
     run, folder = config_path.parent, output or config_path.parent / "exports"
     check_placement(placement)
     exporters = {name: make_exporter(name, **(options or {}).get(name, {})) for name in formats}
@@ -120,7 +123,7 @@ def export_run(
         exporters,
         Frame.of_run() if transform is None else Frame(*transform),
         placement == "object",
-        training_viewpoints(scene, config_path)
+        training_viewpoints(scene.config, raster_settings(scene), config_path)
         if any(exporter.needs_views for exporter in exporters.values())
         else None,
         tolerant=everything,
@@ -187,12 +190,13 @@ class _Job:
             return ExportedFile(label, None, {}, str(error))
 
 
-def training_viewpoints(scene: SavedScene, config_path: Path) -> Viewpoints:
-    """The training views of a run, in its own frame; raises ``UserError`` if its data cannot be read."""
-    from beags_plugin.plugin.cameras import camera_from_nerfstudio
-    from beags_plugin.plugin.evaluate import raster_settings
+def training_viewpoints(config: BeagsTrainerConfig, settings: RasterSettings, config_path: Path) -> Viewpoints:
+    """The training views of a run, in its own frame; raises ``UserError`` if its data cannot be read.
 
-    config: BeagsTrainerConfig = scene.config
+    settings: depth range of the scene. config_path: of the run, for messages.
+    """
+    from beags_plugin.plugin.cameras import camera_from_nerfstudio
+
     if not (data := config.data_path).exists():
         raise UserError(f"{config_path} was trained on {data}, which is gone: put it back.")
     try:
@@ -204,7 +208,7 @@ def training_viewpoints(scene: SavedScene, config_path: Path) -> Viewpoints:
     return Viewpoints(
         [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))],
         make_rasterizer(config.model_config.rasterizer),
-        raster_settings(scene),
+        settings,
     )
 
 

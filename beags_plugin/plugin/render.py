@@ -99,9 +99,11 @@ def _subjects(
     moving: bool,
     options: RenderOptions,
 ) -> list[Subject]:
+    from beags_plugin.plugin.evaluate import raster_settings
+
     last = list(stages.values())[-1]
     try:
-        photos = training_viewpoints(last, config_path).cameras
+        photos = training_viewpoints(last.config, raster_settings(last), config_path).cameras
     except UserError:  # the data are gone: nerfstudio's frame has z up
         photos = []
     count = options.frames if moving else options.views
