@@ -1,4 +1,4 @@
-"""The command line: ``beags demo | resume | sample | extract | export | eval | bench | doctor``."""
+"""The command line: ``beags demo | resume | sample | extract | export | render | eval | bench | doctor``."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from beags_plugin.bench.commands import Measurement
 from beags_plugin.errors import UserError
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.export.mesh_options import MeshOptions
+from beags_plugin.turntable.options import RenderOptions
 
 CONSOLE = Console(soft_wrap=True, highlight=False)
 
@@ -94,6 +95,8 @@ class Extract:
     """Keep everything but the object."""
     output: Path | None = None
     """Folder for the runs; extracted/ beside config.yml if left out."""
+    json: Path | None = None
+    """File that lists what was written."""
 
     def run(self) -> None:
         from beags_plugin.plugin.extract import extract_objects
@@ -101,6 +104,7 @@ class Extract:
 
         with progress_bar("extracting") as progress:
             extracted = extract_objects(self.load_config, self.object, self.remove, self.output, progress)
+        write_json(self.json, [vars(done) for done in extracted])
         for done in extracted:
             CONSOLE.print(
                 f"{done.name}: {done.gaussians} Gaussians\n  {done.ply}\n  ns-viewer --load-config {done.config}",
@@ -118,12 +122,16 @@ class Export:
     """Names of the objects."""
     all: bool = False
     """Every object, the emptied background, and a manifest.json."""
+    whole: bool = False
+    """The whole scene in one file; without --object and --all it needs no classes."""
     format: tuple[str, ...] = ("ply",)
     """ply (viewers of 3D Gaussians), ply-2dgs (the official 2DGS code), spz (small), glb, obj (meshes), or your own."""
     frame: str = "world"
     """world, that of the input poses; or object, the same with the middle of the object's box as origin."""
     output: Path | None = None
     """Folder for the files; exports/ beside config.yml if left out."""
+    json: Path | None = None
+    """File that lists what was written."""
     mesh: tyro.conf.OmitArgPrefixes[MeshOptions] = MeshOptions()
 
     def run(self) -> None:
@@ -133,12 +141,44 @@ class Export:
         options = {name: asdict(self.mesh) for name in ("glb", "obj")}
         with progress_bar("exporting") as progress:
             exported = export_run(
-                self.load_config, self.object, self.all, self.format, self.frame, self.output, options, progress
+                self.load_config,
+                self.object,
+                self.all,
+                self.format,
+                self.frame,
+                self.output,
+                options,
+                progress,
+                whole=self.whole,
             )
+        write_json(self.json, [asdict(one) for one in exported])
         for one in exported:
             CONSOLE.print(f"{one.name}: {one.gaussians} Gaussians", markup=False)
             for file in one.files:
                 CONSOLE.print(f"  {file.path or f'no {file.format}: {file.reason}'}", markup=False)
+
+
+@dataclass
+class Render:
+    """Draw objects alone: a turntable video, a contact sheet, or assignment alone beside the refined object."""
+
+    load_config: Path
+    """config.yml of a trained run."""
+    object: tuple[str, ...] = ()
+    """Names of the objects; all but the background if left out."""
+    format: str = "video"
+    """video (.mp4 or .gif), sheet (.png or .jpg), or before-after (any of these, by the name of the file)."""
+    output: Path | None = None
+    """The file; in renders/ beside config.yml if left out."""
+    options: tyro.conf.OmitArgPrefixes[RenderOptions] = RenderOptions()
+
+    def run(self) -> None:
+        from beags_plugin.plugin.render import render_run
+        from beags_plugin.progress import progress_bar
+
+        with progress_bar("rendering") as progress:
+            path = render_run(self.load_config, self.object, self.format, self.output, self.options, progress)
+        CONSOLE.print(f"{self.format}: {path}", markup=False)
 
 
 @dataclass
@@ -181,12 +221,28 @@ class Bench:
 
 @dataclass
 class Doctor:
-    """Say what this installation can do, and what is missing."""
+    """Say what this installation can do, what is missing, and the one command that repairs each."""
+
+    json: Path | None = None
+    """File for the same."""
 
     def run(self) -> None:
         from beags_plugin.doctor import diagnose, print_report
 
-        print_report(diagnose())
+        checks = diagnose()
+        write_json(self.json, [check.to_json() for check in checks])
+        print_report(checks)
+
+
+def write_json(path: Path | None, content: object) -> None:
+    """Write plain values, and paths as text; None writes nothing. Raises ``UserError`` if it cannot be written."""
+    import json
+
+    from beags_plugin.extraction.files import whole_file
+
+    if path is not None:
+        with whole_file(path) as part:
+            part.write_text(json.dumps(content, indent=2, default=str) + "\n", "utf8")
 
 
 Command = (
@@ -195,6 +251,7 @@ Command = (
     | Annotated[Sample, tyro.conf.subcommand(name="sample")]
     | Annotated[Extract, tyro.conf.subcommand(name="extract")]
     | Annotated[Export, tyro.conf.subcommand(name="export")]
+    | Annotated[Render, tyro.conf.subcommand(name="render")]
     | Annotated[Eval, tyro.conf.subcommand(name="eval")]
     | Annotated[Bench, tyro.conf.subcommand(name="bench")]
     | Annotated[Doctor, tyro.conf.subcommand(name="doctor")]
@@ -204,14 +261,16 @@ Command = (
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the command ``beags``; a user's mistake prints one sentence and ends with exit code 2."""
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
-    command = tyro.cli(
-        Command, args=arguments, description="BEA-GS: clean objects out of Gaussian-splat scenes.", config=config
-    )
+    description = "BEA-GS: clean objects out of Gaussian-splat scenes."
     try:
+        command = tyro.cli(Command, args=arguments, description=description, config=config)
         command.run()
     except UserError as error:
         CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}")
         sys.exit(2)
+    except KeyboardInterrupt:
+        CONSOLE.print("[bold red]beags:[/bold red] interrupted.")
+        sys.exit(130)
 
 
 if __name__ == "__main__":

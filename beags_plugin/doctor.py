@@ -11,7 +11,7 @@ import subprocess
 import sys
 import sysconfig
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -23,13 +23,28 @@ class Check:
     """One thing looked at.
 
     name: what. ok: whether it is there. sentence: what was found, or what to do. required: whether beags cannot
-    run without it.
+    run without it. repair: the one command that mends it, or "" where it is there or no command does.
     """
 
     name: str
     ok: bool
     sentence: str
     required: bool = True
+    repair: str = ""
+
+    def to_json(self) -> dict[str, object]:
+        """Plain values by name."""
+        return asdict(self)
+
+
+_OPENCV = "pip install --force-reinstall --no-deps opencv-contrib-python-headless==4.10.0.84"
+_REBUILD = "pip install --force-reinstall --no-deps ."  # in the folder of the clone
+_REPAIRS = {  # by the name of what cannot even be looked at
+    "torch": "pip install torch",
+    "nerfstudio": "pip install nerfstudio==1.1.5",
+    "opencv": _OPENCV,
+    "presets": "pip install -c constraints.txt -e .",
+}
 
 
 def diagnose() -> list[Check]:
@@ -37,12 +52,18 @@ def diagnose() -> list[Check]:
     checks: list[Callable[[], Check]] = [
         _python,
         _torch,
-        _cuda,
         _nerfstudio,
+        _presets,
         _opencv,
         _open3d,
+        _cpu,
+        _cuda,
         *_rasterizers(),
+        _cuda_rasterizer,
         _compiler,
+        _pictures,
+        _films,
+        _formats,
         _ffmpeg,
     ]
     return [_safely(check) for check in checks]
@@ -56,7 +77,7 @@ def _safely(check: Callable[[], Check]) -> Check:
         raise
     except BaseException as error:
         name = getattr(check, "__name__", "check").strip("_")
-        return Check(name, False, f"cannot be used: {_first_line(error)}")
+        return Check(name, False, f"cannot be used: {_first_line(error)}", repair=_REPAIRS.get(name, ""))
 
 
 def _first_line(error: BaseException) -> str:
@@ -67,7 +88,8 @@ def _first_line(error: BaseException) -> str:
 def _python() -> Check:
     ok = (3, 10) <= sys.version_info[:2] <= (3, 12)
     advice = "" if ok else "; nerfstudio's dependencies need 3.10 to 3.12"
-    return Check("python", ok, f"{platform.python_version()}, {platform.system()} {platform.machine()}{advice}")
+    sentence = f"{platform.python_version()}, {platform.system()} {platform.machine()}{advice}"
+    return Check("python", ok, sentence, repair="" if ok else "PYTHON=python3.11 make setup")
 
 
 def _torch() -> Check:
@@ -84,6 +106,64 @@ def _cuda() -> Check:
     return Check("CUDA device", False, "none; not needed: the rasterizers run on the CPU", False)
 
 
+def _cuda_rasterizer() -> Check:
+    from beags_plugin.rasterizers import RASTERIZERS
+
+    if "cuda" in RASTERIZERS.names():  # from another package: it has a line of its own
+        return Check("CUDA rasterizer", True, "registered", False)
+    return Check("CUDA rasterizer", False, "not built: beags has none yet, so that no command adds it", False)
+
+
+def _cpu() -> Check:
+    cores = os.cpu_count() or 1
+    waiting = os.environ.get("OMP_WAIT_POLICY", "unset")
+    return Check("CPU", True, f"{cores} cores; OMP_WAIT_POLICY is {waiting} (PASSIVE is best where others compute too)")
+
+
+def _presets() -> Check:
+    from importlib.metadata import entry_points
+
+    found = [point.name for point in entry_points(group="nerfstudio.method_configs") if point.name.startswith("beags")]
+    if not found:
+        return Check("presets", False, "ns-train does not know any preset of beags", repair=_REPAIRS["presets"])
+    return Check("presets", True, f"ns-train knows {', '.join(sorted(found))}")
+
+
+def _pictures() -> Check:
+    """Photos and masks: PNG must come back exactly."""
+    import cv2
+    import numpy as np
+
+    image = np.arange(8 * 8 * 3, dtype=np.uint8).reshape(8, 8, 3)
+    for suffix, exact in ((".png", True), (".jpg", False)):
+        done, content = cv2.imencode(suffix, image)
+        back = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if done else None
+        if back is None or back.shape != image.shape or (exact and not np.array_equal(back, image)):
+            return Check("codecs png, jpg", False, f"{suffix} images do not come back", repair=_OPENCV)
+    return Check("codecs png, jpg", True, "read and written")
+
+
+def _films() -> Check:
+    from beags_plugin.turntable.video import REPAIR, encoder
+
+    name = encoder()
+    if name is None:
+        return Check("codec mp4", False, "beags render can write .gif only", False, REPAIR)
+    browsers = "" if name != "mpeg4" else "; browsers do not show it, players do"
+    return Check("codec mp4", True, f"{name}{browsers}", False)
+
+
+def _formats() -> Check:
+    from beags_plugin.export import EXPORTERS
+
+    reasons = {name: EXPORTERS.get(name).unavailable() for name in EXPORTERS.names()}
+    ready = ", ".join(name for name, reason in reasons.items() if reason is None)
+    if missing := {name: reason for name, reason in reasons.items() if reason is not None}:
+        sentence = f"{ready}; not {', '.join(missing)}: {next(iter(missing.values()))}"
+        return Check("export formats", False, sentence, False, "pip install open3d==0.19.0")
+    return Check("export formats", True, ready, False)
+
+
 def _nerfstudio() -> Check:
     from importlib.metadata import version
 
@@ -91,7 +171,8 @@ def _nerfstudio() -> Check:
 
     found = version("nerfstudio")
     if found != "1.1.5":
-        return Check("nerfstudio", False, f"{found}, but the plugin is made for 1.1.5: run make setup")
+        sentence = f"{found}, but the plugin is made for 1.1.5: run make setup"
+        return Check("nerfstudio", False, sentence, repair=_REPAIRS["nerfstudio"])
     return Check("nerfstudio", True, found)
 
 
@@ -101,7 +182,8 @@ def _opencv() -> Check:
     # Plain opencv installed over contrib leaves an empty ximgproc, so look for the function itself.
     if not hasattr(getattr(cv2, "ximgproc", None), "guidedFilter"):
         advice = "reinstall opencv-contrib-python-headless==4.10.0.84 last"
-        return Check("opencv contrib", False, f"{cv2.__version__} without cv2.ximgproc.guidedFilter: {advice}")
+        sentence = f"{cv2.__version__} without cv2.ximgproc.guidedFilter: {advice}"
+        return Check("opencv contrib", False, sentence, repair=_OPENCV)
     return Check("opencv contrib", True, f"{cv2.__version__} with cv2.ximgproc.guidedFilter")
 
 
@@ -110,7 +192,9 @@ def _open3d() -> Check:
         import open3d
     except Exception as error:
         advice = "ns-export and exported meshes need it; version 0.19.0 needs the system libraries libX11 and libGL"
-        return Check("open3d", False, f"{_first_line(error)}; {advice}", False)
+        absent = isinstance(error, ModuleNotFoundError)
+        repair = "pip install open3d==0.19.0" if absent else "apt install libx11-6 libgl1"
+        return Check("open3d", False, f"{_first_line(error)}; {advice}", False, repair)
     return Check("open3d", True, open3d.__version__, False)
 
 
@@ -174,15 +258,17 @@ def _try_in_process(name: str) -> Check:
     )
     if done.returncode < 0:
         cause = f"it ends with {signal.Signals(-done.returncode).name}, so it is damaged or made for another processor"
-        return Check(name, False, f"{cause}: reinstall beags from source; BEAGS_NATIVE=0 in the environment avoids it")
+        sentence = f"{cause}: reinstall beags from source; BEAGS_NATIVE=0 in the environment avoids it"
+        return Check(name, False, sentence, repair=_REBUILD)
     lines = done.stdout.strip().splitlines()
     if done.returncode != 0 or not lines:
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        return Check(name, False, f"it fails when it draws: {last}; BEAGS_NATIVE=0 in the environment avoids it")
+        sentence = f"it fails when it draws: {last}; BEAGS_NATIVE=0 in the environment avoids it"
+        return Check(name, False, sentence, repair=_REBUILD)
     ok, sentence, replaced = json.loads(lines[-1])
     if replaced and name == "native":
         sentence = f"{sentence.rstrip('.')}; until then the torch reference draws, some hundred times slower"
-    return Check(name, ok, sentence)
+    return Check(name, ok, sentence, repair=_REBUILD if replaced and name == "native" else "")
 
 
 def _compiler() -> Check:
@@ -192,7 +278,12 @@ def _compiler() -> Check:
         if path := shutil.which(command):
             return _compiles(path, advice)
     missing = f"CXX names {named[0]}, which is not there" if named else "none"
-    return Check("C++ compiler", False, f"{missing}: to build the fast rasterizer, install one {advice}", False)
+    sentence = f"{missing}: to build the fast rasterizer, install one {advice}"
+    return Check("C++ compiler", False, sentence, False, _compiler_command())
+
+
+def _compiler_command() -> str:
+    return "xcode-select --install" if platform.system() == "Darwin" else "apt install g++"
 
 
 def _compiles(path: str, advice: str) -> Check:
@@ -203,11 +294,12 @@ def _compiles(path: str, advice: str) -> Check:
         return subprocess.run(command, input=source, capture_output=True, text=True, timeout=60).returncode == 0
 
     if not accepts("#include <optional>\nstd::optional<int> value;\n"):
-        return Check("C++ compiler", False, f"{path} does not know C++17: install a newer one {advice}", False)
+        sentence = f"{path} does not know C++17: install a newer one {advice}"
+        return Check("C++ compiler", False, sentence, False, _compiler_command())
     headers = sysconfig.get_paths()["include"]
     if not accepts("#include <Python.h>\n", f"-I{headers}"):
         sentence = f"{path}, but Python's headers are not in {headers}: install them (Debian: apt install python3-dev)"
-        return Check("C++ compiler", False, sentence, False)
+        return Check("C++ compiler", False, sentence, False, "apt install python3-dev")
     if not accepts("#include <omp.h>\n", "-fopenmp"):
         return Check("C++ compiler", True, f"{path}, without OpenMP: what it builds uses one thread", False)
     return Check("C++ compiler", True, path, False)
@@ -216,11 +308,15 @@ def _compiles(path: str, advice: str) -> Check:
 def _ffmpeg() -> Check:
     if path := shutil.which("ffmpeg"):
         return Check("ffmpeg", True, path, False)
-    return Check("ffmpeg", False, "not on PATH: ns-render cannot write videos (Debian: apt install ffmpeg)", False)
+    sentence = "not on PATH: ns-render cannot write videos (Debian: apt install ffmpeg); beags render can"
+    return Check("ffmpeg", False, sentence, False, "apt install ffmpeg")
 
 
 def print_report(checks: list[Check], console: Console | None = None) -> None:
-    """Print the checks as a table: "ok", "missing" (beags cannot run) or "absent" (something optional)."""
+    """Print the checks as a table: "ok", "missing" (beags cannot run) or "absent" (something optional).
+
+    Below what does not work stands the one command that repairs it.
+    """
     from rich.console import Console
     from rich.table import Column, Table
     from rich.text import Text
@@ -229,4 +325,6 @@ def print_report(checks: list[Check], console: Console | None = None) -> None:
     for check in checks:
         word, style = ("ok", "green") if check.ok else ("missing", "red") if check.required else ("absent", "yellow")
         table.add_row(Text(word, style=style), Text(check.name), Text(check.sentence))
+        if check.repair:
+            table.add_row("", "", Text(f"repair: {check.repair}", style="bold"))
     (console or Console()).print(table)

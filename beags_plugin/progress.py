@@ -20,4 +20,8 @@ def progress_bar(name: str) -> Iterator[Callable[[int, int], None]]:
     )
     with Progress(*columns) as progress:
         task = progress.add_task(name, total=None)
-        yield lambda done, total: progress.update(task, completed=done, total=total)
+        try:
+            yield lambda done, total: progress.update(task, completed=done, total=total)
+        except BaseException:
+            progress.live.transient = True  # what stopped it says more than half a bar
+            raise

@@ -27,4 +27,5 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text("utf8"))
     except (OSError, ValueError) as error:
-        raise UserError(f"the {what} {path} cannot be read: {error}.") from error
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"the {what} {path} cannot be read ({reason}): name an existing file of that kind.") from error

@@ -19,8 +19,10 @@ def checks() -> dict[str, doctor.Check]:
 
 def test_everything_is_looked_at(checks):
     expected = {"python", "torch", "CUDA device", "nerfstudio", "opencv contrib", "open3d", "C++ compiler", "ffmpeg"}
+    expected |= {"CPU", "presets", "CUDA rasterizer", "codecs png, jpg", "codec mp4", "export formats"}
     assert expected | {f"rasterizer {name}" for name in RASTERIZERS.names()} <= set(checks)
     assert all(check.sentence and "\n" not in check.sentence for check in checks.values())
+    assert not any(check.repair for check in checks.values() if check.ok)
 
 
 def test_what_the_tests_use_is_there(checks):
@@ -34,6 +36,7 @@ def test_a_missing_package_is_a_finding(monkeypatch, module):
     check = {"torch": doctor._torch, "nerfstudio": doctor._nerfstudio, "cv2": doctor._opencv, "open3d": doctor._open3d}
     found = doctor._safely(check[module])
     assert not found.ok and module in found.sentence
+    assert found.repair.startswith("pip install") and {"cv2": "opencv"}.get(module, module) in found.repair
 
 
 def test_opencv_without_contrib_is_told_from_opencv_with_it(monkeypatch):
@@ -41,6 +44,7 @@ def test_opencv_without_contrib_is_told_from_opencv_with_it(monkeypatch):
     monkeypatch.setattr(cv2, "ximgproc", type(sys)("cv2.ximgproc"))  # an empty shell, as plain opencv leaves it
     found = doctor._opencv()
     assert not found.ok and "guidedFilter" in found.sentence
+    assert found.repair == "pip install --force-reinstall --no-deps opencv-contrib-python-headless==4.10.0.84"
 
 
 def test_a_check_that_breaks_in_any_way_is_reported():
@@ -56,6 +60,7 @@ def test_no_programs_on_the_path(monkeypatch):
     monkeypatch.delenv("CXX", raising=False)
     for check in (doctor._compiler(), doctor._ffmpeg()):
         assert not check.ok and not check.required and "install" in check.sentence
+        assert check.repair in ("apt install g++", "apt install ffmpeg", "xcode-select --install")
 
 
 def test_a_backend_that_kills_its_process_is_a_finding(monkeypatch):
@@ -63,6 +68,7 @@ def test_a_backend_that_kills_its_process_is_a_finding(monkeypatch):
     found = doctor._rasterizer("native")
     assert not found.ok and not found.required and found.name == "rasterizer native"
     assert "SIGILL" in found.sentence and "reinstall beags from source" in found.sentence
+    assert found.repair == "pip install --force-reinstall --no-deps ."
     monkeypatch.setattr(doctor, "_TRIAL", "raise ValueError('odd')")
     assert "it fails when it draws: ValueError: odd" in doctor._rasterizer("native").sentence
 
@@ -73,7 +79,25 @@ def test_an_absent_extension_says_what_to_install_and_what_draws_instead(monkeyp
     found = doctor._rasterizer("native")
     assert not found.ok and not found.required and "\n" not in found.sentence
     assert "install a C++ compiler and reinstall beags; until then the torch reference draws" in found.sentence
-    assert doctor._rasterizer("torch").ok
+    assert found.repair and doctor._rasterizer("torch").ok
+
+
+def test_missing_codecs_and_presets_are_findings(monkeypatch):
+    from importlib import metadata
+
+    from beags_plugin.export.mesh import GlbExporter
+    from beags_plugin.turntable import video
+
+    monkeypatch.setattr(video, "encoder", lambda: None)
+    monkeypatch.setattr(metadata, "entry_points", lambda group: [])
+    monkeypatch.setattr(GlbExporter, "unavailable", classmethod(lambda cls: "Open3D cannot be loaded."))
+    films, presets, formats = doctor._films(), doctor._presets(), doctor._formats()
+    assert not films.ok and not films.required and "pip install" in films.repair
+    assert not presets.ok and presets.required and presets.repair == "pip install -c constraints.txt -e ."
+    assert not formats.ok and formats.sentence == "obj, ply, ply-2dgs, spz; not glb: Open3D cannot be loaded."
+    cv2 = pytest.importorskip("cv2")
+    monkeypatch.setattr(cv2, "imencode", lambda suffix, image: (False, None))
+    assert not doctor._pictures().ok and "opencv" in doctor._pictures().repair
 
 
 def test_the_native_rasterizer_is_tried_with_its_kernels(checks):
@@ -124,8 +148,13 @@ def test_the_report_tells_missing_from_absent():
     found = [
         doctor.Check("a", True, "fine"),
         doctor.Check("b", False, "[gone]"),
-        doctor.Check("c", False, "optional", required=False),
+        doctor.Check("c", False, "optional", required=False, repair="apt install c"),
     ]
     doctor.print_report(found, Console(file=out, width=80))
     lines = [line.split() for line in out.getvalue().splitlines()]
-    assert lines == [["ok", "a", "fine"], ["missing", "b", "[gone]"], ["absent", "c", "optional"]]
+    assert lines == [
+        ["ok", "a", "fine"],
+        ["missing", "b", "[gone]"],
+        ["absent", "c", "optional"],
+        ["repair:", "apt", "install", "c"],
+    ]

@@ -251,7 +251,7 @@ def test_extract_and_export_write_the_same_ply(trained, tmp_path):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ((), "nothing to export is named: use --all, or --object with one of background, cup, box."),
+        ((), "nothing to export is named: use --all, --whole, or --object with one of background, cup, box."),
         (("--all", "--object", "cup"), "--all exports every object: leave --object out."),
         (("--object", "spoon"), "there is no object 'spoon' in "),
         (("--all", "--format", "usd"), "there is no exporter 'usd': choose one of "),

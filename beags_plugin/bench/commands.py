@@ -167,7 +167,7 @@ class Reprojection:
 class Required:
     """What a refined run stores and computes for nothing, and what leaving it out saves."""
 
-    run_config: Annotated[Path, tyro.conf.arg(name="run")]
+    load_config: Path
     """config.yml of the run."""
     json: Path | None = None
     """File for all figures."""
@@ -177,7 +177,7 @@ class Required:
     def run(self) -> None:
         from beags_plugin.bench.required import run_required
 
-        run_required(self.run_config, self.json, self.csv)
+        run_required(self.load_config, self.json, self.csv)
 
 
 @dataclass

@@ -91,4 +91,5 @@ def write_picture(path: str | Path, picture: np.ndarray) -> None:
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(picture).save(path)
     except (OSError, ValueError) as error:
-        raise UserError(f"the picture {path} cannot be written: {error}.") from error
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"the picture {path} cannot be written ({reason}): choose another place.") from error

@@ -161,7 +161,7 @@ def _groups(row: SheetRow, classes: Mapping[int, str], cell_height: int) -> Iter
     size = (max(1, round(cell_height * width / height)), cell_height)
     blank = np.full((height, width, 3), 255, dtype=np.uint8)
     photo = blank if row.photo is None else row.photo
-    overlay = blank if row.labels is None else _overlay(photo, row.labels, colorize(row.labels))
+    overlay = blank if row.labels is None else mask_overlay(photo, row.labels)
     yield [
         cell(photo, size, f"{row.name}: photo" if row.photo is not None else row.name),
         cell(overlay, size, "mask" if row.labels is not None else "no mask"),
@@ -179,8 +179,12 @@ def write_contact_sheet(path: str | Path, rows: Sequence[SheetRow], classes: Map
     write_picture(path, contact_sheet(rows, classes))
 
 
-def _overlay(photo: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """The photo in half its strength under the mask colours; background and IGNORE stay as they are."""
+def mask_overlay(photo: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """The photo in half its strength under the mask colours; background and IGNORE stay as they are.
+
+    photo: [h, w, 3] uint8. labels: [H, W] integer class ids. Returns [H, W, 3] uint8.
+    """
+    colors = colorize(labels)
     if photo.shape[:2] != labels.shape:
         photo = np.stack([resize_nearest(photo[..., i], *labels.shape) for i in range(3)], axis=-1)
     mixed = (photo.astype(np.uint16) + colors) // 2

@@ -1,4 +1,4 @@
-"""Back from nerfstudio's normalised frame to the frame of the input data."""
+"""From nerfstudio's normalised frame to the frame of the input data, and back."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from beags_plugin.core.rotations import quat_product
 from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
@@ -24,7 +25,24 @@ def to_input_frame(surfels: Surfels, transform: Tensor, scale: float) -> Surfels
     surfels: N surfels in the frame of x'. transform: [3, 4] float, R | t; R a rotation. scale: positive.
     Returns N surfels of the same dtype and device. Raises ``UserError`` if R is no rotation or scale is not positive.
     """
-    matrix = transform.detach().to(device=surfels.means.device, dtype=torch.float64)
+    rotation, translation = _checked(transform, scale, surfels.means)
+    means = (surfels.means.detach().double() / scale - translation) @ rotation  # rows: R^T (x' / scale - t)
+    return _turned(surfels, means, rotation.T, 1.0 / scale)
+
+
+def from_input_frame(surfels: Surfels, transform: Tensor, scale: float) -> Surfels:
+    """The same surfels, seen the same, in the frame of x' = scale (R x + t): undoes ``to_input_frame``.
+
+    surfels: N surfels in the frame of the input poses; the rest as of ``to_input_frame``.
+    """
+    rotation, translation = _checked(transform, scale, surfels.means)
+    means = scale * (surfels.means.detach().double() @ rotation.T + translation)
+    return _turned(surfels, means, rotation, scale)
+
+
+def _checked(transform: Tensor, scale: float, like: Tensor) -> tuple[Tensor, Tensor]:
+    """R [3, 3] and t [3] in float64, on the device of ``like``."""
+    matrix = transform.detach().to(device=like.device, dtype=torch.float64)
     if matrix.shape != (3, 4):
         raise ValueError(f"transform must be [3, 4], not {list(matrix.shape)}")
     rotation, translation = matrix[:, :3], matrix[:, 3]
@@ -35,31 +53,18 @@ def to_input_frame(surfels: Surfels, transform: Tensor, scale: float) -> Surfels
         raise UserError(
             f"the run's dataparser scale is {scale}, but it must be positive: export without a frame change."
         )
+    return rotation, translation
 
+
+def _turned(surfels: Surfels, means: Tensor, rotation: Tensor, factor: float) -> Surfels:
+    """Surfels at ``means`` [N, 3] float64, turned by ``rotation`` [3, 3] and ``factor`` times as large."""
     dtype = surfels.means.dtype
-    means = (surfels.means.detach().double() / scale - translation) @ rotation  # rows: R^T (x' / scale - t)
-    turn = quat_from_rotation(rotation.T)
     return Surfels.of(
         means=means.to(dtype),
-        quats=quat_product(turn, surfels.quats.detach().double()).to(dtype),
-        log_scales=surfels.log_scales.detach() - math.log(scale),
+        quats=quat_product(quat_from_rotation(rotation), surfels.quats.detach().double()).to(dtype),
+        log_scales=surfels.log_scales.detach() + math.log(factor),
         opacity_logits=surfels.opacity_logits.detach(),
-        sh=rotate_sh(surfels.sh.detach(), rotation.T, surfels.sh_degree),
-    )
-
-
-def quat_product(first: Tensor, second: Tensor) -> Tensor:
-    """The quaternion of "second, then first": first [..., 4] and second [..., 4], wxyz; broadcast. Returns [..., 4]."""
-    w1, x1, y1, z1 = first.unbind(-1)
-    w2, x2, y2, z2 = second.unbind(-1)
-    return torch.stack(
-        [
-            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
-            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
-            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
-            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
-        ],
-        dim=-1,
+        sh=rotate_sh(surfels.sh.detach(), rotation, surfels.sh_degree),
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from io import BytesIO
 from pathlib import Path
 from typing import Literal
 
@@ -16,6 +15,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.frames import to_input_frame
+from beags_plugin.extraction.splat_file import read_splat_file
 
 THICKNESS = 1e-3
 """Written third scale, relative to the smaller of the two: flat, yet no viewer divides by 0."""
@@ -91,39 +91,9 @@ def read_ply(path: str | Path) -> tuple[Surfels, Tensor | None]:
     Returns (N surfels in float32, class_ids [N] int32 or None if the file has none). Raises ``UserError`` if
     the file is missing, is no splat .ply, or holds Gaussians that are not flat along their third axis.
     """
-    from plyfile import PlyData, PlyParseError
-
-    try:
-        vertex = PlyData.read(BytesIO(Path(path).read_bytes()))["vertex"]
-    except OSError as error:
-        raise UserError(f"{path} cannot be read ({error.strerror}): name an existing .ply file.") from error
-    except (PlyParseError, KeyError, ValueError) as error:
-        raise UserError(f"{path} is not a splat .ply file: {error}.") from error
-    present = {prop.name for prop in vertex.properties}
-    needed = {"x", "y", "z", "opacity", *_numbered("f_dc", 3), *_numbered("scale", 2), *_numbered("rot", 4)}
-    if missing := sorted(needed - present):
-        raise UserError(f"{path} is not a splat .ply file: it has no column {missing[0]!r}.")
-
-    def take(*names: str) -> Tensor:
-        return torch.from_numpy(np.stack([np.asarray(vertex[name], dtype=np.float32) for name in names], axis=-1))
-
-    log_scales = take(*_numbered("scale", 2))
-    if "scale_2" in present and bool((take("scale_2") > log_scales.amin(dim=-1, keepdim=True)).any()):
+    read = read_splat_file(path)
+    found, flat = read.gaussians, read.gaussians.log_scales[:, :2]
+    if bool((found.log_scales[:, 2:] > flat.amin(dim=1, keepdim=True)).any()):
         raise UserError(f"{path} holds 3D Gaussians, not surfels: their third scale is not the smallest.")
-    rest_count = sum(name.startswith("f_rest_") for name in present)
-    if rest_count not in (0, 9, 24, 45):
-        raise UserError(f"{path} has {rest_count} f_rest columns, but 0, 9, 24 or 45 make whole colour bands.")
-    dc = take(*_numbered("f_dc", 3))
-    rest = dc.new_zeros(len(dc), 0, 3)
-    if rest_count:
-        rest = take(*_numbered("f_rest", rest_count)).reshape(len(dc), 3, rest_count // 3).transpose(1, 2)
-    surfels = Surfels(
-        means=take("x", "y", "z"),
-        quats=take(*_numbered("rot", 4)),
-        log_scales=log_scales,
-        opacity_logits=take("opacity")[:, 0],
-        sh_dc=dc,
-        sh_rest=rest.contiguous(),
-    )
-    class_ids = torch.from_numpy(np.array(vertex["class_id"], dtype=np.int32)) if "class_id" in present else None
-    return surfels, class_ids
+    surfels = Surfels(found.means, found.quats, flat.contiguous(), found.opacity_logits, found.sh_dc, found.sh_rest)
+    return surfels, read.class_ids

@@ -78,6 +78,8 @@ class BeagsTrainerConfig(TrainerConfig):
         for holder in (self, self.data_config, self.data_config.dataparser):
             if (data := getattr(holder, "data", None)) is not None:
                 holder.data = Path(data).absolute()
+        if (start := self.model_config.start_from) is not None:
+            self.model_config.start_from = Path(start).absolute()
         write_text_atomically(yaml.dump(self), self.get_base_dir() / CONFIG_FILE)
 
 

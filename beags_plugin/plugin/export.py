@@ -25,6 +25,7 @@ from beags_plugin.plugin.extract import (
     load_run_config,
     load_scene,
     objects_with_gaussians,
+    read_scene,
     read_transform,
 )
 from beags_plugin.rasterizers import make_rasterizer
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
 
 MANIFEST = "manifest.json"
+WHOLE = "whole scene"  # what stands for a class where all Gaussians go into one file
 Progress = Callable[[int, int], None]
 
 
@@ -49,14 +51,15 @@ class ExportedFile:
 
 @dataclass(frozen=True)
 class Exported:
-    """One object (or the background) and its files.
+    """One object (or the background, or the whole scene) and its files.
 
-    center: [3] the point of the world that is the files' origin. low, high: [3] its box, in the files' frame.
-    to_run: the 4 x 4 matrix from the files' frame to the run's normalised one.
+    class_id: None of the whole scene. center: [3] the point of the world that is the files' origin.
+    low, high: [3] its box, in the files' frame. to_run: the 4 x 4 matrix from the files' frame to the run's normalised
+    one.
     """
 
     name: str
-    class_id: int
+    class_id: int | None
     gaussians: int
     center: list[float]
     low: list[float]
@@ -92,28 +95,32 @@ def export_run(
     output: Path | None = None,
     options: Mapping[str, Mapping[str, Any]] | None = None,
     progress: Progress | None = None,
+    whole: bool = False,
 ) -> list[Exported]:
     """Write files of objects of a run.
 
     config_path: config.yml of a refined (or assigned) run. objects: names; or everything: all that have Gaussians and
-    the emptied background, and a manifest. formats: names of exporters. placement: "world", the frame of the input
-    poses (the run's own if it has not kept how that was normalised), or "object", the same centred on each object.
-    output: folder; ``exports/`` in the run by default. options: format to its exporter's options.
-    progress: is told (done, total) files. Raises ``UserError`` for a mistake, before anything is written.
+    the emptied background, and a manifest. whole: the whole scene too, in one file; alone it needs no classes.
+    formats: names of exporters. placement: "world", the frame of the input poses (the run's own if it has not kept how
+    that was normalised), or "object", the same centred on each object. output: folder; ``exports/`` in the run by
+    default. options: format to its exporter's options. progress: is told (done, total) files.
+    Raises ``UserError`` for a mistake, before anything is written.
     """
+    from beags_plugin.plugin.evaluate import raster_settings
+
     run, folder = config_path.parent, output or config_path.parent / "exports"
     check_placement(placement)
     exporters = {name: make_exporter(name, **(options or {}).get(name, {})) for name in formats}
     if not exporters:
         raise UserError("no format is named: name one with --format.")
-    scene = load_scene(config_path)
-    present = objects_with_gaussians(scene, objects, run)
+    scene = load_scene(config_path) if everything or objects or not whole else read_scene(config_path)
+    present = objects_with_gaussians(scene, objects, run) if scene.assigned else {}
     if everything and objects:
         raise UserError("--all exports every object: leave --object out.")
-    if not everything and not objects:
-        raise UserError(f"nothing to export is named: use --all, or --object with one of {', '.join(present)}.")
-
-    from beags_plugin.plugin.evaluate import raster_settings
+    if not (everything or objects or whole):
+        raise UserError(
+            f"nothing to export is named: use --all, --whole, or --object with one of {', '.join(present)}."
+        )
 
     transform = read_transform(run)
     job = _Job(
@@ -121,17 +128,20 @@ def export_run(
         exporters,
         Frame.of_run() if transform is None else Frame(*transform),
         placement == "object",
-        _viewpoints(scene.config, raster_settings(scene), config_path)
+        training_viewpoints(scene.config, raster_settings(scene), config_path)
         if any(exporter.needs_views for exporter in exporters.values())
         else None,
         tolerant=everything,
     )
     names, titles = list(present) if everything else list(dict.fromkeys(objects)), folder_names(scene.classes)
-    exported, total = [], len(names) * len(exporters)
-    for number, name in enumerate(names):
+    pieces: list[tuple[str, int | None, str]] = [(name, present[name], titles[present[name]]) for name in names]
+    if whole:
+        pieces.append((WHOLE, None, "whole_scene"))
+    exported, total = [], len(pieces) * len(exporters)
+    for number, (name, class_id, title) in enumerate(pieces):
         if progress:
             progress(number * len(exporters), total)
-        exported.append(job.export(name, present[name], folder / titles[present[name]]))
+        exported.append(job.export(name, class_id, folder / title))
     if progress:
         progress(total, total)
     if everything:
@@ -155,14 +165,18 @@ class _Job:
     views: Viewpoints | None
     tolerant: bool
 
-    def export(self, name: str, class_id: int, stem: Path) -> Exported:
-        """All files of one class, called ``stem`` and their suffixes."""
-        chosen, index = select_class(self.scene.surfels(), self.scene.state["class_ids"], class_id)
+    def export(self, name: str, class_id: int | None, stem: Path) -> Exported:
+        """All files of one class (None: of the whole scene), called ``stem`` and their suffixes."""
+        class_ids = self.scene.state["class_ids"]
+        chosen = self.scene.surfels()
+        if class_id is not None:
+            chosen, index = select_class(chosen, class_ids, class_id)
+            class_ids = class_ids[index]
         low, high = bounding_box(self.world.surfels(chosen))
         center = (low + high) / 2 if self.centred else torch.zeros(3, dtype=torch.float64)
         frame = self.world.centred(center)
         views = None if self.views is None else frame.views(self.views)
-        piece = Piece(name, frame.surfels(chosen), self.scene.state["class_ids"][index], views)
+        piece = Piece(name, frame.surfels(chosen), class_ids, views)
         files = [
             self._write(label, exporter, stem.with_name(f"{stem.name}.{exporter.suffix}"), piece)
             for label, exporter in self.exporters.items()
@@ -197,7 +211,7 @@ def export_shown(
     frame = Frame.of_run() if transform is None else Frame(*transform)
     views = None
     if exporter.needs_views:
-        views = frame.views(_viewpoints(load_run_config(config_path), settings, config_path))
+        views = frame.views(training_viewpoints(load_run_config(config_path), settings, config_path))
     path = _free_path(config_path.parent / "exports", title, exporter.suffix)
     exporter.write(path, Piece(title, frame.surfels(surfels), class_ids, views))
     return path
@@ -210,8 +224,11 @@ def _free_path(folder: Path, title: str, suffix: str) -> Path:
     return next(path for name in names if not (path := folder / f"{name}.{suffix}").exists())
 
 
-def _viewpoints(config: BeagsTrainerConfig, settings: RasterSettings, config_path: Path) -> Viewpoints:
-    """The training views of a run, in its own frame; raises ``UserError`` if its data cannot be read."""
+def training_viewpoints(config: BeagsTrainerConfig, settings: RasterSettings, config_path: Path) -> Viewpoints:
+    """The training views of a run, in its own frame; raises ``UserError`` if its data cannot be read.
+
+    settings: depth range of the scene. config_path: of the run, for messages.
+    """
     from beags_plugin.plugin.cameras import camera_from_nerfstudio
 
     if not (data := config.data_path).exists():

@@ -115,13 +115,17 @@ def extract_objects(
     names = list(objects) or [name for name, index in ids.items() if index != 0]
     transform = read_transform(run)
     select = remove_class if remove else select_class
-    folders = folder_names(scene.classes)
+    folders, target = folder_names(scene.classes), output or run / "extracted"
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{target} cannot be written ({error.strerror}): choose another place.") from error
     written = []
     for name in names:
         surfels, index = select(scene.surfels(), class_ids, ids[name])
         title = folders[ids[name]]
         title = f"without_{title}" if remove else title
-        folder = (output or run / "extracted") / title
+        folder = target / title
         config = write_run(scene.config, folder, _rows(scene.state, index), scene.step)
         origin = {"object": name, "removed": remove, "run": str(config_path.absolute())}
         (folder / EXTRACTION_FILE).write_text(json.dumps(origin, indent=2), "utf8")

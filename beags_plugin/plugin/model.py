@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -54,7 +55,7 @@ class LossSpec:
     def build(self, name: str, schedule: PhaseSchedule) -> Loss:
         """The loss, with its steps made absolute."""
         first = schedule.base_steps + self.start if self.phase == "refine" else schedule.scaled(self.start)
-        if self.phase != "refine" and schedule.base_steps == 0:
+        if self.phase != "refine" and (schedule.base_steps == 0 or schedule.warm):
             first = 0  # the base was trained elsewhere: its terms have long started
         last = schedule.base_steps if self.phase == "base" else None
         return LOSSES.get(name)(weight=self.weight, start=first, stop=last, **self.options)
@@ -74,6 +75,14 @@ class BeagsModelConfig(ModelConfig):
     background_color: Literal["black", "white", "random"] = "black"
     """Background behind the scene, and behind images with alpha; "random" draws one per training step, and is black
     elsewhere."""
+    start_from: Path | None = None
+    """A trained scene to start from instead of seed points: a 3DGS or 2DGS .ply, or a run of splatfacto or beags. 3D
+    Gaussians are flattened. base_steps then polish it, without growth."""
+    start_format: str = "auto"
+    """What start_from is: ply, checkpoint, or an importer of your own; auto recognises it."""
+    start_frame: Literal["auto", "world", "normalised"] = "auto"
+    """Frame of start_from: world, that of the input poses; normalised, that of this run; auto: world for a .ply, and
+    for a run what its dataparser_transforms.json says."""
     base_steps: int = 30_000
     """Steps of base training; 0 for a refinement that starts from a loaded base."""
     refine_steps: int = 3_000
@@ -107,7 +116,7 @@ class BeagsModelConfig(ModelConfig):
 
     def schedule(self) -> PhaseSchedule:
         """Steps of both phases."""
-        return PhaseSchedule(self.base_steps, self.refine_steps, self.schedule_steps)
+        return PhaseSchedule(self.base_steps, self.refine_steps, self.schedule_steps, self.start_from is not None)
 
 
 @dataclass(frozen=True)
@@ -269,7 +278,7 @@ class BeagsModel(SplatfactoModel):
 
     def active_sh_degree(self) -> int:
         """Degrees grow one by one while the base trains; a scene that is only looked at shows them all."""
-        if not self.training or self.schedule.refining(self.step):
+        if not self.training or self.schedule.warm or self.schedule.refining(self.step):
             return self.config.sh_degree
         interval = max(self.schedule.scaled(self.config.sh_degree_interval), 1)
         return min(self.step // interval, self.config.sh_degree)

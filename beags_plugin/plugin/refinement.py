@@ -237,8 +237,6 @@ def released(lock: Lock) -> Iterator[None]:
         lock.acquire()
 
 
-
-
 def _write_grey(path: Path, values: torch.Tensor) -> None:
     import cv2
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+POLISH_SCHEDULE_FROM = 0.5  # a base that starts from a trained scene repeats the second half of the base schedule
 REFINE_SCHEDULE_FROM = 0.9  # refinement repeats the learning rates of the last tenth (27,000..30,000) of the base
 
 
@@ -13,11 +14,13 @@ class PhaseSchedule:
     """Steps of the two phases: base is [0, base_steps), refinement [base_steps, base_steps + refine_steps).
 
     stated_for: length of the base for which the schedule's other steps are stated; 0 if they are stated for this one.
+    warm: the base starts from a trained scene and only polishes it.
     """
 
     base_steps: int
     refine_steps: int
     stated_for: int = 0
+    warm: bool = False
 
     @property
     def scale(self) -> float:
@@ -38,9 +41,10 @@ class PhaseSchedule:
         return step >= self.base_steps
 
     def progress(self, step: int) -> float:
-        """Position in the base's learning-rate schedule, 0..1; refinement runs from 0.9 to 1 again."""
+        """Position in the base's learning-rate schedule, 0..1; refinement runs from 0.9 to 1 again, polish from 0.5."""
         if not self.refining(step):
-            return step / max(self.base_steps, 1)
+            first = POLISH_SCHEDULE_FROM if self.warm else 0.0
+            return first + (1.0 - first) * step / max(self.base_steps, 1)
         done = (step - self.base_steps) / max(self.refine_steps, 1)
         return REFINE_SCHEDULE_FROM + (1.0 - REFINE_SCHEDULE_FROM) * min(done, 1.0)
 

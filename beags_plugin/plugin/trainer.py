@@ -23,6 +23,7 @@ from beags_plugin.plugin.memory import peak_memory_mb
 from beags_plugin.plugin.optimizers import JointOptimizers
 from beags_plugin.plugin.runs import REPORT_FILE, newest_checkpoint, save_atomically, write_text_atomically
 from beags_plugin.plugin.training_state import STATE, VERSION, GlobalRandom, Part, read_checkpoint, training_state
+from beags_plugin.plugin.warm_start import check_start, start_from_scene
 from beags_plugin.whole_files import remove_unfinished
 
 if TYPE_CHECKING:
@@ -62,6 +63,8 @@ class BeagsTrainer(Trainer):
     def setup(self, test_mode: Any = "val") -> None:
         """Load data, build the model, load a checkpoint; a user's mistake ends here, with one sentence."""
         try:
+            if not self._loads():
+                check_start(self.config.model_config)
             super().setup(test_mode)
             if self.loaded_run == self.base_dir.absolute():
                 self._forget_events()
@@ -77,7 +80,12 @@ class BeagsTrainer(Trainer):
                 each.tb_writer = type(each.tb_writer)(log_dir=folder, purge_step=self._start_step)
 
     def setup_optimizers(self) -> JointOptimizers:
-        """The optimizers that the config lists, one for each group of parameters."""
+        """The optimizers that the config lists, one for each group of parameters.
+
+        A scene to start from takes its place before: the optimizers hold what they are built with.
+        """
+        if self.config.model_config.start_from is not None and not self._loads():
+            start_from_scene(self._model, cast("BeagsDataManager", self.pipeline.datamanager), self.base_dir)
         return JointOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups(), self._model.clock)
 
     def train(self) -> None:
@@ -149,13 +157,18 @@ class BeagsTrainer(Trainer):
         if name in self._loaded_states:
             part.restore(self._loaded_states[name])
 
+    def _loads(self) -> bool:
+        """Whether a checkpoint is loaded: what it holds counts, not the scene that its run may have started from."""
+        return self.config.load_dir is not None or self.config.load_checkpoint is not None
+
     def _load_checkpoint(self) -> None:
         path = self._checkpoint_path()
         if path is None:
-            if self.schedule.base_steps == 0:
+            if self.schedule.base_steps == 0 and self.config.model_config.start_from is None:
                 raise UserError(
                     f"{self.config.method_name} starts from a trained base: add --load-dir <run>/nerfstudio_models of "
-                    "one (or <run>/base/nerfstudio_models)."
+                    "one (or <run>/base/nerfstudio_models), or --pipeline.model.start-from with a splat .ply or "
+                    "another run."
                 )
             return super()._load_checkpoint()
         checkpoint = read_checkpoint(path)

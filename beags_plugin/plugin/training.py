@@ -125,8 +125,9 @@ class Densifier:
             self.statistics.total, self.statistics.views = state["total"].clone(), state["views"].clone()
 
     def before_step(self, step: int) -> None:
-        """Let the step be drawn with what is gathered, as long as the scene still grows."""
-        self.model.growing = step + 1 < min(self.config.stop, self.model.schedule.base_steps)
+        """Let the step be drawn with what is gathered, as long as the scene still grows; a trained one does not."""
+        schedule = self.model.schedule
+        self.model.growing = not schedule.warm and step + 1 < min(self.config.stop, schedule.base_steps)
 
     def after_step(self, step: int) -> None:
         """Gather; densify and reset opacities when their step has come."""

@@ -1,0 +1,67 @@
+"""What an importer is: it reads a scene that another program, or another run, has trained."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from torch import Tensor
+
+from beags_plugin.core.flattening import Gaussians
+from beags_plugin.errors import UserError
+
+
+@dataclass(frozen=True)
+class ImportedScene:
+    """A scene as a file holds it.
+
+    kind: what to call it, as in "3DGS .ply". gaussians: N, flat or with volume; not yet checked for odd values.
+    normalization: None if the file lies in the world of the input poses; else ([3, 4] float64 R | t, scale) of the
+    frame x' = scale (R x + t) that it lies in.
+    note: a sentence that the user should read, or "".
+    """
+
+    kind: str
+    gaussians: Gaussians
+    normalization: tuple[Tensor, float] | None = None
+    note: str = ""
+
+
+class Importer(ABC):
+    """One kind of file or folder.
+
+    marks: what it reads, for messages.
+    """
+
+    marks: ClassVar[str]
+
+    @abstractmethod
+    def recognises(self, path: Path) -> bool:
+        """Whether to take ``path``, which exists, where the user named no importer; reads as little as it can."""
+
+    @abstractmethod
+    def read(self, path: Path) -> ImportedScene:
+        """The scene in ``path``; raises ``UserError`` if it cannot be read. Counts and sizes are not to be trusted."""
+
+
+def find_importer(path: Path, wanted: str = "auto") -> Importer:
+    """The importer called ``wanted``, or the one that ``path`` is for.
+
+    Raises ``UserError`` if there is no ``path``, no such importer, or none or several that take ``path``.
+    """
+    from beags_plugin.importers import IMPORTERS
+
+    if not path.exists():
+        raise UserError(f"{path} does not exist: name a .ply, a checkpoint or a run to start from.")
+    if wanted != "auto":
+        return IMPORTERS.get(wanted)()
+    importers: dict[str, Importer] = {name: IMPORTERS.get(name)() for name in IMPORTERS.names()}
+    fitting = [name for name, importer in importers.items() if importer.recognises(path)]
+    if not fitting:
+        known = "; ".join(importer.marks for importer in importers.values())
+        raise UserError(f"{path} is nothing to start from: name one of these: {known}.")
+    if len(fitting) > 1:
+        raise UserError(f"{path} can be read as {' or '.join(fitting)}: choose one with --pipeline.model.start-format.")
+    return importers[fitting[0]]

@@ -1,0 +1,122 @@
+"""Checkpoints of nerfstudio runs: of splatfacto (Gaussians with volume) and of ours (surfels)."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.flattening import Gaussians
+from beags_plugin.core.sh import sh_basis
+from beags_plugin.errors import UserError
+from beags_plugin.importers.base import ImportedScene, Importer
+
+_TRANSFORM = "dataparser_transforms.json"  # nerfstudio's name for how the poses were normalised
+_PREFIX = "_model.gauss_params."
+
+
+class CheckpointImporter(Importer):
+    """A run (its folder or config.yml), its nerfstudio_models, or one checkpoint of them.
+
+    The scene lies in the run's normalised frame, which dataparser_transforms.json beside config.yml describes.
+    """
+
+    marks: ClassVar[str] = "a run of splatfacto or beags (its folder, config.yml or a .ckpt)"
+
+    def recognises(self, path: Path) -> bool:
+        return _newest(path) is not None
+
+    def read(self, path: Path) -> ImportedScene:
+        checkpoint = _newest(path)
+        if checkpoint is None:
+            raise UserError(f"{path} holds no checkpoint (step-….ckpt): name a run of splatfacto or beags.")
+        gaussians = _gaussians(checkpoint)
+        flat = gaussians.log_scales.shape[1] == 2
+        run = checkpoint.absolute().parent.parent
+        normalization = _normalization(run / _TRANSFORM)
+        note = ""
+        if normalization is None:
+            note = f"{run / _TRANSFORM} is missing, so {checkpoint.name} is taken to lie in this run's own frame."
+        return ImportedScene("run of beags" if flat else "run of splatfacto", gaussians, normalization, note)
+
+
+def _newest(path: Path) -> Path | None:
+    """The checkpoint that ``path`` means: itself, or the newest of a run; None if it means none."""
+    if path.is_file() and path.suffix == ".ckpt":
+        return path
+    run = path.parent if path.name == "config.yml" else path
+    for folder in (run, run / "nerfstudio_models"):
+        if found := sorted(folder.glob("step-*.ckpt")):
+            return found[-1]
+    return None
+
+
+def _normalization(file: Path) -> tuple[Tensor, float] | None:
+    try:
+        content = json.loads(file.read_text("utf8"))
+        transform, scale = torch.tensor(content["transform"], dtype=torch.float64), float(content["scale"])
+        if transform.shape != (3, 4):
+            raise ValueError(f"its transform is {list(transform.shape)}, not [3, 4]")
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{file} cannot be read ({error}): restore it.") from error
+    return transform, scale
+
+
+def _gaussians(checkpoint: Path) -> Gaussians:
+    """The Gaussians of a checkpoint; tensors only are loaded, from a file that is mapped, not read into memory."""
+    try:
+        content = torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=True)
+        state = content["pipeline"]
+        found = {name[len(_PREFIX) :]: value for name, value in state.items() if name.startswith(_PREFIX)}
+    except OSError as error:
+        raise UserError(f"{checkpoint} cannot be read ({error.strerror}): name an existing checkpoint.") from error
+    # torch and pickle raise these, and more, for files that are damaged, or hold more than tensors
+    except (
+        pickle.UnpicklingError,
+        RuntimeError,
+        EOFError,
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+    ) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(f"{checkpoint} is not a checkpoint of nerfstudio ({reason}): name another.") from error
+    tensors = _checked(checkpoint, found)
+    dc, rest, scales = tensors["features_dc"], tensors["features_rest"], tensors["scales"]
+    if scales.shape[1] == 3 and rest.shape[1] == 0:
+        # splatfacto without bands optimises logits of the colour
+        dc = (torch.sigmoid(dc) - 0.5) / sh_basis(torch.tensor([[0.0, 0.0, 1.0]]), 0)
+    return Gaussians(tensors["means"], tensors["quats"], scales, tensors["opacities"][:, 0], dc, rest)
+
+
+def _checked(checkpoint: Path, found: dict[str, Any]) -> dict[str, Tensor]:
+    """Copies of the tensors in float32, of shapes that fit together and no larger than the file can hold."""
+    means = found.get("means")
+    count = means.shape[0] if isinstance(means, Tensor) and means.dim() == 2 else -1
+    shapes: dict[str, tuple[tuple[int, ...], ...]] = {
+        "means": ((3,),),
+        "quats": ((4,),),
+        "scales": ((2,), (3,)),
+        "opacities": ((1,),),
+        "features_dc": ((3,),),
+        "features_rest": ((0, 3), (3, 3), (8, 3), (15, 3)),
+    }
+    size = checkpoint.stat().st_size
+    tensors = {}
+    for name, allowed in shapes.items():
+        value = found.get(name)
+        if not isinstance(value, Tensor) or not value.is_floating_point():
+            raise UserError(f"{checkpoint} holds no splatfacto or beags scene: it has no gauss_params.{name}.")
+        if tuple(value.shape[:1]) != (count,) or tuple(value.shape[1:]) not in allowed:
+            raise UserError(f"{checkpoint} is damaged: gauss_params.{name} is {list(value.shape)}.")
+        if value.numel() * value.element_size() > size:  # a view of few numbers as many
+            raise UserError(f"{checkpoint} is damaged: gauss_params.{name} is larger than the file.")
+        tensors[name] = value.to(torch.float32, copy=True).contiguous()
+    return tensors

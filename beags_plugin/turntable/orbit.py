@@ -1,0 +1,119 @@
+"""Cameras that go round an object."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.lifting import project
+from beags_plugin.rasterizers.interface import RasterSettings
+
+_FIELD_OF_VIEW = math.radians(35.0)
+_MARGIN = 1.06  # around what the widest picture of the turn shows of the box: discs reach beyond it
+_NEAR, _FAR = 0.02, 100.0  # in units of the distance to the centre
+
+
+@dataclass(frozen=True)
+class Stand:
+    """Where the object stands, in the frame of its surfels.
+
+    center: [3] float64, what every camera looks at. up: [3] float64, unit. front: [3] float64, from where the photos
+    were taken, any length. corners: [8, 3] float64, of the box that the pictures hold.
+    """
+
+    center: Tensor
+    up: Tensor
+    front: Tensor
+    corners: Tensor
+
+    @property
+    def distance(self) -> float:
+        """Of the cameras from the centre: from there the ball around the box fills the field of view."""
+        radius = float((self.corners - self.center).norm(dim=1).max()) or 1.0
+        return radius / math.sin(_FIELD_OF_VIEW / 2)
+
+
+def stand_of(low: Tensor, high: Tensor, cameras: Sequence[Camera] = (), up: Tensor | None = None) -> Stand:
+    """The stand of a box; up is the mean of the cameras' ups unless given, front their mean direction.
+
+    low, high: [3] corners. cameras: of the photos. Without cameras, z is up and -y the front, as in nerfstudio's frame.
+    """
+    center = (low + high).double() / 2
+    front = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+    upwards = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    if cameras:
+        ups = -torch.stack([camera.rotation[1] for camera in cameras]).double().mean(dim=0)  # y of a camera is down
+        if float(ups.norm()) > 1e-3:  # cameras upside down and upright cancel out
+            upwards = ups
+        front = torch.stack([camera.center for camera in cameras]).double().mean(dim=0) - center
+    upwards = upwards if up is None else up.double()
+    corners = torch.cartesian_prod(*torch.stack([low, high], dim=1).double())
+    return Stand(center, upwards / upwards.norm(), front, corners)
+
+
+def orbit(stand: Stand, count: int, pixels: int, elevation: float = 20.0, turn: float = 360.0) -> list[Camera]:
+    """Cameras on a circle about the up axis, starting from the front, at even angles; the box fills the widest picture.
+
+    count: of cameras. pixels: side of the square pictures. elevation: degrees above the horizon. turn: degrees; a whole
+    turn comes back to the start, less swings to and fro about the front. Returns float32 cameras.
+    """
+    right, forward = _horizon(stand)
+    height = math.radians(elevation)
+    cameras = []
+    for index in range(count):
+        share = index / count
+        angle = math.radians(turn * share if turn >= 360.0 else 0.5 * turn * math.sin(2 * math.pi * share))
+        level = math.sin(angle) * right - math.cos(angle) * forward  # towards the camera
+        away = math.cos(height) * level + math.sin(height) * stand.up
+        cameras.append(_look_at(stand.center + stand.distance * away, stand, pixels))
+    reach = max(_reach(camera, stand.corners) for camera in cameras)
+    return [_zoomed(camera, 1.0 / (_MARGIN * max(reach, 1e-3))) for camera in cameras]
+
+
+def orbit_settings(stand: Stand) -> RasterSettings:
+    """Depth range of the orbit's cameras; colours only."""
+    return RasterSettings(_NEAR * stand.distance, _FAR * stand.distance, geometry=False, distortion=False)
+
+
+def _reach(camera: Camera, points: Tensor) -> float:
+    """How far from the middle of a square picture the points [P, 3] lie at most; 1 is its border."""
+    xy, _ = project(points, camera)
+    half = 0.5 * camera.width
+    return float((xy - half).abs().max()) / half
+
+
+def _zoomed(camera: Camera, factor: float) -> Camera:
+    K = camera.K.clone()
+    K[0, 0], K[1, 1] = factor * K[0, 0], factor * K[1, 1]
+    return replace(camera, K=K)
+
+
+def _horizon(stand: Stand) -> tuple[Tensor, Tensor]:
+    """Two unit vectors at right angles to the up axis: to the right of the front, and from the front to the object."""
+    level = stand.front - (stand.front @ stand.up) * stand.up
+    if float(level.norm()) < 1e-6 * max(float(stand.front.norm()), 1e-12):  # seen from straight above
+        axis = torch.zeros(3, dtype=torch.float64)
+        axis[int(stand.up.abs().argmin())] = 1.0
+        level = axis - (axis @ stand.up) * stand.up
+    forward = -level / level.norm()
+    return torch.linalg.cross(forward, stand.up), forward
+
+
+def _look_at(eye: Tensor, stand: Stand, pixels: int) -> Camera:
+    """A square view of the centre from ``eye``, the up axis upwards."""
+    forward = (stand.center - eye) / (stand.center - eye).norm()
+    right = torch.linalg.cross(forward, stand.up)
+    if float(right.norm()) < 1e-9:  # from straight above: any side is up
+        right = _horizon(stand)[0]
+    right = right / right.norm()
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])  # OpenCV: x right, y down, z forward
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+    focal = 0.5 * pixels / math.tan(_FIELD_OF_VIEW / 2)
+    K = torch.tensor([[focal, 0.0, 0.5 * pixels], [0.0, focal, 0.5 * pixels], [0.0, 0.0, 1.0]])
+    return Camera(viewmat.float(), K, pixels, pixels)

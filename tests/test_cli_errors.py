@@ -1,0 +1,149 @@
+"""What ``beags`` says of a user's mistakes, word for word: one sentence, exit code 2, and no traceback.
+
+``{tmp}`` is the test's folder, with: ``run`` (refined), ``plain`` (a base without classes), ``alone`` (refined, but its
+base is gone), the data ``lab``, a file ``file`` and ``notes.yml``, a YAML file that is no run.
+"""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+from run_folders import write_scene, write_trained
+
+pytest.importorskip("nerfstudio")
+
+from beags_plugin import cli
+
+RUN = "{tmp}/run/config.yml"
+PRESETS = "beags, beags-accurate, beags-base, beags-fast, beags-paper, beags-refine, beags-tiny"
+NO_FILE = "{tmp}/absent.yml cannot be read (No such file or directory): name the config.yml of a run."
+SENTENCES = {
+    # demo
+    "demo --data {tmp}/nowhere": "{tmp}/nowhere is no folder: name one with images, poses and masks.",
+    "demo --preset beags-huge": f"there is no preset 'beags-huge': choose one of {PRESETS}.",
+    "demo --preset beags-base": "the demo compares a base with its refinement, and beags-base trains only one: take "
+    "beags-tiny.",
+    # sample
+    "sample --output {tmp}/s --degradation heavy": "there is no mask degradation 'heavy': choose one of none, mild, "
+    "strong, or a degree from 0 on (1 is mild, 2 strong).",
+    "sample --output {tmp}/s --width 0": "the sample's width is 0: give at least 16.",
+    "sample --output {tmp}/file/s": "{tmp}/file/s cannot be written (File exists): choose another folder.",
+    "sample --output {tmp}/lab": "{tmp}/lab exists and is no sample scene: choose another folder or empty it.",
+    # extract
+    "extract --load-config {tmp}/absent.yml": NO_FILE,
+    "extract --load-config {tmp}/notes.yml": "{tmp}/notes.yml is not a run of ns-train beags: name the config.yml of "
+    "one.",
+    f"extract --load-config {RUN} --object unicorn": "there is no object 'unicorn' in {tmp}/run: choose of background, "
+    "cup, box.",
+    "extract --load-config {tmp}/plain/config.yml": "{tmp}/plain is a base without classes: refine it first (ns-train "
+    "beags-refine --load-dir {tmp}/plain/nerfstudio_models).",
+    f"extract --load-config {RUN} --output {{tmp}}/file/x": "{tmp}/file/x cannot be written (Not a directory): choose "
+    "another place.",
+    # export
+    f"export --load-config {RUN}": "nothing to export is named: use --all, --whole, or --object with one of "
+    "background, cup, box.",
+    f"export --load-config {RUN} --all --object cup": "--all exports every object: leave --object out.",
+    f"export --load-config {RUN} --object cup --format stl": "there is no exporter 'stl': choose one of glb, obj, ply, "
+    "ply-2dgs, spz.",
+    f"export --load-config {RUN} --object cup --frame moon": "there is no frame 'moon': choose one of world, object.",
+    f"export --load-config {RUN} --object cup --format glb --resolution 0": "resolution is 0: a mesh needs at least 8 "
+    "voxels along its longest side.",
+    f"export --load-config {RUN} --object cup --json {{tmp}}/file/x.json": "{tmp}/file/x.json cannot be written (File "
+    "exists): choose another place.",
+    # render
+    f"render --load-config {RUN} --object unicorn": "there is no object 'unicorn' in {tmp}/run: choose of background, "
+    "cup, box.",
+    f"render --load-config {RUN} --format hologram": "there is no format 'hologram': choose one of video, sheet, "
+    "before-after.",
+    f"render --load-config {RUN} --format sheet --output a.mp4": "the picture a.mp4 is no .png or .jpg: give it such a "
+    "name.",
+    f"render --load-config {RUN} --output a.png": "the film a.png is no .mp4 or .gif: give it such a name.",
+    f"render --load-config {RUN} --size 5": "size is 5: give pixels from 16 to 4096.",
+    "render --load-config {tmp}/alone/config.yml --format before-after": "{tmp}/alone has kept no state before "
+    "refinement (base/): name the run that was refined, or another --format.",
+    f"render --load-config {RUN} --format sheet --views 1 --size 16 --output {{tmp}}/file/x.png": "the picture "
+    "{tmp}/file/x.png cannot be written (File exists): choose another place.",
+    # eval
+    "eval --load-config {tmp}/absent.yml": NO_FILE,
+    f"eval --load-config {RUN} {RUN}": "{tmp}/run/config.yml is given twice: name each run once.",
+    f"eval --load-config {RUN} --threshold 2": "threshold is 2.0: give a number from 0 to below 1.",
+    f"eval --load-config {RUN} --picture a.txt": "the picture a.txt is no .png or .jpg: give it such a name.",
+    f"eval --load-config {RUN} --json {{tmp}}/lab": "{tmp}/lab is a folder: name the file to write.",
+    # bench
+    "bench ablation --preset beags-huge --output {tmp}/bench": "ablation.toml: there is no preset 'beags-huge': choose "
+    f"one of {PRESETS}.",
+    "bench file {tmp}/absent.toml --output {tmp}/bench": "the experiment {tmp}/absent.toml cannot be read (No such "
+    "file or directory): name an existing file of that kind.",
+    "bench required --load-config {tmp}/absent.yml": NO_FILE,
+    # doctor
+    "doctor --json {tmp}/file/x.json": "{tmp}/file/x.json cannot be written (File exists): choose another place.",
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    root = tmp_path_factory.mktemp("mistakes")
+    write_trained(root / "run", write_scene(root / "lab"))
+    write_trained(root / "plain", root / "lab", assigned=False)
+    write_trained(root / "alone", root / "lab", base=False)
+    (root / "file").write_text("x")
+    (root / "notes.yml").write_text("a: 1")
+    return root
+
+
+@pytest.mark.parametrize("arguments", SENTENCES)
+def test_a_mistake_is_told_in_this_sentence(folder, monkeypatch, arguments):
+    from beags_plugin import doctor
+
+    out = io.StringIO()
+    monkeypatch.setattr(cli, "CONSOLE", Console(file=out, soft_wrap=True, highlight=False))
+    monkeypatch.setattr(doctor, "diagnose", lambda: [])
+    monkeypatch.chdir(folder)
+    with pytest.raises(SystemExit) as end:
+        cli.main(arguments.replace("{tmp}", str(folder)).split())
+    assert end.value.code == 2
+    said = out.getvalue().replace(str(folder), "{tmp}")
+    assert said == f"beags: {SENTENCES[arguments]}\n"
+
+
+def test_every_subcommand_has_a_sentence():
+    import typing
+
+    names = {info.name for one in typing.get_args(cli.Command) for info in typing.get_args(one)[1:]}
+    assert {"demo", "sample", "extract", "export", "render", "eval", "bench", "doctor"} <= names
+    assert {arguments.split()[0] for arguments in SENTENCES} >= {
+        "demo",
+        "sample",
+        "extract",
+        "export",
+        "render",
+        "eval",
+    }
+
+
+def test_an_interrupt_is_no_traceback(monkeypatch, capsys):
+    def interrupted(self) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli.Doctor, "run", interrupted)
+    with pytest.raises(SystemExit) as end:
+        cli.main(["doctor"])
+    assert end.value.code == 130 and "interrupted" in capsys.readouterr().out
+
+
+def test_subcommands_read_alike():
+    """A flag that several subcommands have is of the same kind in all of them, and runs are named by one flag."""
+    import dataclasses
+    import typing
+
+    kinds: dict[str, set[str]] = {}
+    for one in typing.get_args(cli.Command):
+        command = typing.get_args(one)[0]
+        for field in dataclasses.fields(command):
+            kinds.setdefault(field.name, set()).add(str(field.type))
+    assert kinds["json"] == {"Path | None"} and kinds["object"] == {"tuple[str, ...]"}
+    assert kinds["load_config"] == {"Path", "tuple[Path, ...]"}  # eval takes several
+    assert kinds["output"] <= {"Path", "Path | None"}
+    assert not {"run", "config", "config_path", "objects", "out", "out_dir"} & set(kinds)

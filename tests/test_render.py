@@ -1,0 +1,85 @@
+"""``beags render`` on runs on disk."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+from run_folders import write_scene, write_trained
+
+pytest.importorskip("nerfstudio")
+
+from beags_plugin.cli import main
+from beags_plugin.errors import UserError
+from beags_plugin.plugin.render import render_run
+from beags_plugin.turntable.options import RenderOptions
+
+SMALL = RenderOptions(size=32, frames=3, views=4)
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    root = tmp_path_factory.mktemp("lab")
+    return write_trained(root / "run", write_scene(root / "lab"))
+
+
+def read(path) -> np.ndarray:
+    return np.asarray(Image.open(path).convert("RGB"))
+
+
+def test_a_sheet_of_one_object_and_of_all(config, tmp_path, capsys):
+    main(
+        ["render", "--load-config", str(config), "--object", "cup", "--format", "sheet", "--size", "32", "--views", "4"]
+    )
+    assert read(config.parent / "renders" / "cup_sheet.png").shape == (32 + 22, 4 * 36, 3)
+    assert "cup_sheet.png" in capsys.readouterr().out
+    everything = render_run(config, (), "sheet", tmp_path / "all.png", SMALL)
+    picture = read(everything)
+    assert picture.shape == (2 * 54, 4 * 36, 3) and (picture[18:50, :32] < 200).any()
+    assert render_run(config, ("background",), "sheet", tmp_path / "b.png", SMALL).exists()
+
+
+def test_before_and_after_differ_where_the_base_did(config, tmp_path):
+    picture = read(render_run(config, ("cup",), "before-after", tmp_path / "a.png", SMALL))
+    assert picture.shape == (2 * 54, 2 * 36, 3)
+    before, after = picture[18:50, :32], picture[18:50, 36:68]
+    assert not np.array_equal(before, after)  # the base's cup is off
+    assert render_run(config, ("cup",), "before-after", tmp_path / "a.gif", SMALL).exists()
+
+
+def test_a_video_is_the_default(config):
+    path = render_run(config, ("cup",), options=SMALL)
+    assert path.stem == "cup_video" and path.stat().st_size > 100
+
+
+def test_the_data_are_not_needed(tmp_path):
+    config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"))
+    shutil.rmtree(tmp_path / "lab")
+    assert render_run(config, ("cup",), "sheet", tmp_path / "a.png", SMALL).exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((("unicorn",), "sheet"), "there is no object 'unicorn'"),
+        (((), "hologram"), "there is no format 'hologram': choose one of video, sheet, before-after."),
+        (((), "sheet", "a.mp4"), "the picture a.mp4 is no .png or .jpg: give it such a name."),
+        (((), "video", "a.png"), "the film a.png is no .mp4 or .gif: give it such a name."),
+        (((), "before-after", "a.txt"), "the picture a.txt is no .png or .jpg (or .mp4, .gif): give it such a name."),
+    ],
+)
+def test_mistakes_are_told_before_anything_is_drawn(config, arguments, words):
+    from pathlib import Path
+
+    objects, form, *output = arguments
+    with pytest.raises(UserError) as error:
+        render_run(config, objects, form, Path(output[0]) if output else None, SMALL)
+    assert words in str(error.value)
+
+
+def test_a_run_that_has_kept_no_base_has_nothing_to_compare(tmp_path):
+    config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"), base=False)
+    with pytest.raises(UserError, match="has kept no state before refinement"):
+        render_run(config, (), "before-after", tmp_path / "a.png", SMALL)
