@@ -24,7 +24,7 @@ from beags_plugin.masks.label_maps import narrowed, widened
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.dataparser import BeagsDataParserConfig, absolute
 from beags_plugin.plugin.dataset import BeagsDataset
-from beags_plugin.plugin.undistortion import undistort_alpha, undistort_class_map
+from beags_plugin.plugin.undistortion import redistort_class_map, undistort_alpha, undistort_class_map
 from beags_plugin.rasterizers.interface import IGNORE
 
 OWN_KEYS = ("class_map", "alpha")
@@ -126,6 +126,13 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         """A class map [h, w] of an evaluation view, of any size, as it would be had the camera no lens distortion."""
         assert self.cached_eval is not None  # the cameras are straightened when the images load
         return undistort_class_map(class_map, self._distorted["eval"], self.eval_dataset.cameras, index)
+
+    def as_in_file(self, class_map: np.ndarray, index: int) -> np.ndarray:
+        """A class map [h', w'] of a training view with the lens distortion of its file, at the size it was read at."""
+        assert self.cached_train is not None  # the cameras are straightened when the images load
+        width, height = self.train_dataset.file_sizes[index]
+        lens = (self._distorted["train"], self.train_dataset.cameras, index)
+        return redistort_class_map(class_map, *lens, (height, width))
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         camera, data = super().next_train(step)

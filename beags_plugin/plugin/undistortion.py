@@ -23,6 +23,35 @@ def undistort_class_map(class_map: np.ndarray, distorted: Cameras, straight: Cam
     return cv2.remap(class_map, *maps, cv2.INTER_NEAREST, **options)
 
 
+def redistort_class_map(
+    class_map: np.ndarray, distorted: Cameras, straight: Cameras, index: int, shape: tuple[int, int]
+) -> np.ndarray:
+    """A class map of the straight view as the photograph's file has it: the inverse of ``undistort_class_map``.
+
+    class_map: [h', w'], the whole straight image. shape: (h, w) of the distorted image, at as many pixels per camera
+    pixel. Returns [h, w], the nearest id of each pixel; IGNORE where the straight image does not reach.
+    """
+    if distorted.distortion_params is None or not distorted.distortion_params[index].any():
+        return class_map
+    height, width = shape
+    parameters = distorted.distortion_params[index].double().numpy()
+    sizes = [[int(getattr(c, side)[index]) for side in ("width", "height")] for c in (distorted, straight)]
+    (full_width, full_height), (cropped_width, cropped_height) = sizes
+    K = _scaled_intrinsics(distorted, index, width / full_width, height / full_height)
+    new_K = _scaled_intrinsics(straight, index, class_map.shape[1] / cropped_width, class_map.shape[0] / cropped_height)
+    columns, rows = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    pixels = np.stack([columns, rows], axis=2).reshape(-1, 1, 2)
+    if int(distorted.camera_type[index]) == CameraType.FISHEYE.value:
+        found = cv2.fisheye.undistortPoints(pixels, K, parameters[:4], None, new_K)
+    else:
+        k1, k2, k3, _, p1, p2 = parameters  # nerfstudio's order; OpenCV wants k1, k2, p1, p2, k3
+        exact = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-4)
+        found = cv2.undistortPointsIter(pixels, K, np.array([k1, k2, p1, p2, k3]), np.eye(3), new_K, exact)
+    maps = found.reshape(height, width, 2).astype(np.float32)
+    options = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": (IGNORE,)}
+    return cv2.remap(class_map, maps[..., 0], maps[..., 1], cv2.INTER_NEAREST, **options)
+
+
 def undistort_alpha(alpha: np.ndarray, distorted: Cameras, straight: Cameras, index: int) -> np.ndarray:
     """Remove the lens distortion from an alpha channel [h, w] uint8, interpolated; outside the lens 0."""
     maps = _lens_maps(distorted, straight, index, alpha.shape)

@@ -143,7 +143,7 @@ def prepare(
             "which needs none."
         )
     surfels = surfels.detach()
-    known = _known_classes(maps, class_names)
+    known = known_classes(maps, class_names)
     findings, seconds = [], {}
 
     def timed(name: str, start: float, finding: str) -> None:
@@ -205,7 +205,7 @@ def prepare(
     return Preparation(masks.labels, masks.confidence, assignment, grid, edited, findings, seconds)
 
 
-def _known_classes(labels: Sequence[Tensor | None], class_names: dict[int, str]) -> ClassRanks:
+def known_classes(labels: Sequence[Tensor | None], class_names: dict[int, str]) -> ClassRanks:
     """The named classes and those between them that masks hold; ``UserError`` for ids above the last named one."""
     named = ClassRanks(torch.tensor(sorted(class_names)))
     if named.trivial:
