@@ -111,6 +111,41 @@ class Reproject:
             CONSOLE.print(line)
 
 
+@dataclass
+class Make:
+    """Make masks with a registered source (docs/masks.md) and write them where ns-train finds them."""
+
+    data: Path
+    """Folder of the scene."""
+    source: str
+    """id-images, object-images, coco, gaussian-grouping, langsplat, grabcut, sam2, or your own."""
+    options: tuple[str, ...] = ()
+    """Of the source, as key=value, e.g. prompts=prompts.json."""
+    load_config: Path | None = None
+    """config.yml of a run trained on the scene (beags-base will do), for sources that need its depth."""
+    output: Path | None = None
+    """Folder for masks/, classes.json and made.png; the scene's own if left out."""
+    overwrite: bool = False
+    """Replace masks that are there already."""
+    snap: int = 0
+    """Move rims to edges of the photo that are at most so many pixels away; 0 leaves them."""
+    layout: str = "auto"
+    """How the data set lays out its files (docs/data.md); auto recognises it."""
+    images_path: Path | None = None
+    """Folder of the images, if not the layout's own."""
+
+    def run(self) -> None:
+        from beags_plugin.plugin.made_masks import configured_source, make_masks
+        from beags_plugin.plugin.masks_check import data_options
+
+        if self.snap < 0:
+            raise UserError(f"snap is {self.snap}: give a radius in pixels, or 0.")
+        source = configured_source(self.source, self.options)
+        data = data_options(self.data, self.layout, self.images_path)
+        for line in make_masks(data, source, self.load_config, self.output, self.overwrite, self.snap):
+            CONSOLE.print(line)
+
+
 Action = (
     Annotated[Check, tyro.conf.subcommand(name="check")] | Annotated[Reproject, tyro.conf.subcommand(name="reproject")]
 )

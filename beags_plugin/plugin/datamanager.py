@@ -127,6 +127,11 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         assert self.cached_eval is not None  # the cameras are straightened when the images load
         return undistort_class_map(class_map, self._distorted["eval"], self.eval_dataset.cameras, index)
 
+    def straight_train_map(self, class_map: np.ndarray, index: int) -> np.ndarray:
+        """A class map [h, w] of a training view's file without its lens distortion."""
+        assert self.cached_train is not None  # the cameras are straightened when the images load
+        return undistort_class_map(class_map, self._distorted["train"], self.train_dataset.cameras, index)
+
     def as_in_file(self, class_map: np.ndarray, index: int) -> np.ndarray:
         """A class map [h', w'] of a training view with the lens distortion of its file, at the size it was read at."""
         assert self.cached_train is not None  # the cameras are straightened when the images load

@@ -86,7 +86,7 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     view has a mask.
     """
     scene = read_scene(config_path)
-    manager = _data(scene, config_path, options)
+    manager = data_of_run(scene, config_path, options)
     own = {"reprojection": options.method, "tau": options.tau, "voters": options.voters, "depth": options.depth}
     config = replace(scene.config.model_config.prepare, **{k: v for k, v in own.items() if v is not None})
     if config.reprojection == "none":
@@ -115,7 +115,8 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     return ReprojectedRun(scene, manager, names, classes, given, masks.labels, masks.confidence, seconds)
 
 
-def _data(scene: SavedScene, config_path: Path, options: ReprojectionOptions) -> BeagsDataManager:
+def data_of_run(scene: SavedScene, config_path: Path, options: ReprojectionOptions) -> BeagsDataManager:
+    """The data that a run was trained on, at the size and with the masks that ``options`` name."""
     config = scene.config
     if not config.data_path.exists():
         raise UserError(f"{config_path} was trained on {config.data_path}, which is gone: put it back.")

@@ -12,7 +12,7 @@ AGREEMENT = 0.6  # share of the other views' labels that must be one class for a
 LEAST_OTHERS = 3  # other views that must see the point
 LEAST_POINTS = 8  # points of an object in a view that say anything about it
 MOST = 0.5  # share of an object's points that must carry another label
-PARTLY = 0.2  # the same of the second of two exchanged objects, which the first may hide in part
+WHOLE, PARTLY = 0.75, 0.2  # the same of two exchanged objects the first of which hides the second in part
 GONE = 0.02  # share of an object's points that may carry its own label where it counts as absent
 ONE_OBJECT = 0.8  # share of the views of an id that must show it at a point
 
@@ -128,6 +128,8 @@ class Agreement:
     def _half_hidden(self, view: int, said: dict[int, int], start: int) -> list[dict[int, int]]:
         """Two exchanged objects one of which hides a part of the other: that part has the label of what hides it."""
         other = said[start]
+        if self.confusion[view, start, other] < WHOLE * self.confusion[view, start].sum():
+            return []
         back, points = int(self.confusion[view, other, start]), int(self.confusion[view, other].sum())
         if 0 in (start, other) or other == start or back < max(LEAST_POINTS, PARTLY * points):
             return []
