@@ -147,7 +147,9 @@ class Make:
 
 
 Action = (
-    Annotated[Check, tyro.conf.subcommand(name="check")] | Annotated[Reproject, tyro.conf.subcommand(name="reproject")]
+    Annotated[Check, tyro.conf.subcommand(name="check")]
+    | Annotated[Make, tyro.conf.subcommand(name="make")]
+    | Annotated[Reproject, tyro.conf.subcommand(name="reproject")]
 )
 
 

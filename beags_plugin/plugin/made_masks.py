@@ -108,7 +108,7 @@ def make_masks(
         raise UserError(f"{folder} has masks or a classes.json already: add --overwrite, or give another --output.")
     if source.needs_run and run is None:
         raise UserError(
-            "this mask source needs the scene's depth: train beags-base, then add --load-config of the run."
+            "this mask source needs the scene's depth: train beags-base, then add --load-config <run>/config.yml."
         )
     trained = set(parser.training_views(views))
     sizes = [image_size(path) for path in views.images]

@@ -95,7 +95,8 @@ def carry(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Of each view of ``geometry`` what the class maps of others (of the photographs; None: none) say there.
 
-    Returns per view labels [h, w] uint16 and [h, w] bool, whether more than half of the votes agree; without distortion.
+    Returns per view labels [h, w] uint16 and [h, w] bool, whether more than half of the votes agree; both without
+    distortion.
     """
     known = ClassRanks(torch.tensor([0, *ids]))
     straight = LabelMaps()

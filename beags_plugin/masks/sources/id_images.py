@@ -74,7 +74,7 @@ class IdImagesSource(MaskSource):
 
 @dataclass(frozen=True)
 class GaussianGroupingSource(IdImagesSource):
-    """The ``object_mask`` folder that Gaussian Grouping's tracker writes: grey ids, many of them in a few views only."""
+    """The ``object_mask`` folder that Gaussian Grouping's tracker writes: grey ids, many in few views only."""
 
     folder: Path = Path("object_mask")
     least_views: int = 3
