@@ -6,7 +6,7 @@ import numpy as np
 
 from beags_plugin.rasterizers.interface import IGNORE
 
-EPSILON = 1e-3  # variance of colour (0..1) below which the guide counts as flat
+EPSILON = 1e-2  # variance of colour (0..1) below which the guide counts as flat
 
 
 def snap_to_edges(class_map: np.ndarray, photo: np.ndarray, radius: int) -> np.ndarray:

@@ -5,8 +5,47 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
 
 from beags_plugin.rasterizers.interface import IGNORE
+
+
+def has_lens(cameras: Cameras, index: int) -> bool:
+    """Whether a view has lens distortion."""
+    return cameras.distortion_params is not None and bool(cameras.distortion_params[index].any())
+
+
+def undistort_image(image: np.ndarray, distorted: Cameras, index: int) -> np.ndarray:
+    """An image [H, W, C] without its lens distortion and cropped, as nerfstudio does it; for a view with a lens."""
+    return _by_nerfstudio(image, distorted, index)[1]
+
+
+def straighten(cameras: Cameras) -> None:
+    """Give cameras the K and size that their images have once undistorted, in place; no image is read for it."""
+    known: dict[tuple, tuple] = {}  # most scenes have one camera for all views
+    for index in range(len(cameras)):
+        if not has_lens(cameras, index):
+            continue
+        parts = (cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height, cameras.camera_type)
+        assert cameras.distortion_params is not None
+        key = (*(float(part[index]) for part in parts), *cameras.distortion_params[index].tolist())
+        if key not in known:
+            blank = np.zeros((int(cameras.height[index]), int(cameras.width[index]), 3), np.uint8)
+            K, image = _by_nerfstudio(blank, cameras, index)
+            known[key] = (K, image.shape[:2])
+        K, (height, width) = known[key]
+        cameras.fx[index], cameras.fy[index] = float(K[0, 0]), float(K[1, 1])
+        cameras.cx[index], cameras.cy[index] = float(K[0, 2]), float(K[1, 2])
+        cameras.width[index], cameras.height[index] = width, height
+
+
+def _by_nerfstudio(image: np.ndarray, distorted: Cameras, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """The new K [3, 3] and the image."""
+    camera = distorted[index].reshape(())
+    assert camera.distortion_params is not None
+    K = camera.get_intrinsics_matrices().numpy()
+    K, image, _ = _undistort_image(camera, camera.distortion_params.numpy(), {}, image, K)
+    return K, image
 
 
 def undistort_class_map(class_map: np.ndarray, distorted: Cameras, straight: Cameras, index: int) -> np.ndarray:

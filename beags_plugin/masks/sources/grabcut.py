@@ -21,6 +21,7 @@ from beags_plugin.rasterizers.interface import IGNORE
 _ITERATIONS = 5
 _BAND = 0.012  # of the image diagonal: how far a carried outline may be wrong
 _MARGIN = 0.3  # of an object's box: how much background around it GrabCut sees
+PIECE = 0.1  # share of an object's largest piece that another piece needs: smaller ones are colours found elsewhere
 _POINT = 0.006  # of the image diagonal: radius of a prompted point
 
 
@@ -130,22 +131,26 @@ def cut_by_box(photo: np.ndarray, prompt: Prompt) -> np.ndarray:
     radius = max(2, round(_POINT * np.hypot(height, width)))
     for (x, y), inside in zip(prompt.points, prompt.inside, strict=True):
         cv2.circle(start, (int(x), int(y)), radius, cv2.GC_FGD if inside else cv2.GC_BGD, -1)
-    return _cut(photo, start, (left, top, right, bottom))
+    return large_pieces(_cut(photo, start, (left, top, right, bottom)))
 
 
 def cut_from_labels(photo: np.ndarray, labels: np.ndarray, ids: Sequence[int]) -> np.ndarray:
     """[H, W] uint16 class map: GrabCut per object, started from carried labels [H, W] uint16 (IGNORE: unknown).
 
     Labels far enough from where they change are kept; between them, and where nothing was carried, colours decide.
+    An object stays within the convex hull of what was carried, and a band about it: where no view voted, as on far
+    walls, colours alone would find it again.
     """
     import cv2
 
     height, width = labels.shape
     radius = max(2, round(_BAND * np.hypot(height, width)))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    small = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
     objects = []
     for class_id in ids:
-        inside, outside = ((labels == class_id), (labels != class_id) & (labels != IGNORE))
+        outside = (labels != class_id) & (labels != IGNORE)
+        inside = large_pieces(cv2.morphologyEx((labels == class_id).astype(np.uint8), cv2.MORPH_OPEN, small) > 0)
         if not inside.any():
             continue
         box = _box_around(inside)
@@ -153,8 +158,28 @@ def cut_from_labels(photo: np.ndarray, labels: np.ndarray, ids: Sequence[int]) -
         start = np.where(nearest, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
         start[cv2.erode(inside.astype(np.uint8), disc) > 0] = cv2.GC_FGD
         start[cv2.erode(outside.astype(np.uint8), disc) > 0] = cv2.GC_BGD
-        objects.append((class_id, _cut(photo, start, box)))
+        start[cv2.dilate(_hull(inside), disc) == 0] = cv2.GC_BGD
+        objects.append((class_id, large_pieces(_cut(photo, start, box))))
     return stacked(objects, (height, width))
+
+
+def large_pieces(mask: np.ndarray) -> np.ndarray:
+    """[H, W] bool: the connected pieces of a mask that have at least a tenth of the largest one's pixels."""
+    import cv2
+
+    _, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    kept = 1 + np.flatnonzero(areas >= PIECE * areas.max(initial=0))
+    return np.isin(pieces, kept) & mask
+
+
+def _hull(mask: np.ndarray) -> np.ndarray:
+    """[H, W] uint8: 1 in the convex hull of a mask's pixels."""
+    import cv2
+
+    row, column = np.nonzero(mask)
+    corners = cv2.convexHull(np.stack([column, row], axis=1).astype(np.int32))
+    return cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), corners, 1)
 
 
 def _nearer(inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
