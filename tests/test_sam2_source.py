@@ -158,7 +158,7 @@ def dino(tmp_path_factory):
         text_config=BertConfig(
             vocab_size=len(words), hidden_size=16, num_hidden_layers=1, num_attention_heads=2, intermediate_size=16
         ),
-        d_model=32, encoder_layers=1, encoder_ffn_dim=16, encoder_attention_heads=2, decoder_layers=1,
+        d_model=32, encoder_layers=1, encoder_ffn_dim=16, encoder_attention_heads=2, decoder_layers=2,
         decoder_ffn_dim=16, decoder_attention_heads=2, num_queries=12, max_text_len=16, num_feature_levels=4,
     )  # fmt: skip
     GroundingDinoForObjectDetection(config).save_pretrained(folder)

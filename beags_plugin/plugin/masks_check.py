@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from beags_plugin.data.files import image_size
+from beags_plugin.data.scene import Scene
 from beags_plugin.errors import UserError
 from beags_plugin.masks.check.areas import Area, contradicted
 from beags_plugin.masks.check.consistency import Agreement, labels_at, ranks_of
@@ -75,6 +76,26 @@ def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Re
     """Check the masks of the scene that ``config`` names; raises ``UserError`` only where poses or photos are bad."""
     if few_views < 1:
         raise UserError(f"min_views is {few_views}: give a number of views, at least 1.")
+    scene, views, files = _files(config)
+    with progress_bar("Reading masks") as progress:
+        coverage = check_files(files, few_views, progress)
+    shown = dict(files.names or {})
+    shown = {i: shown.get(i, "background" if i == 0 else f"class_{i}") for i in coverage.ids}
+    findings = list(coverage.findings)
+    if coverage.usable.sum() > 3 and len(coverage.ids) > 1:
+        points = _points(scene, views, config)
+        findings += views_against_others(_agreement(files, coverage, views, points), files.stems, coverage, shown)
+    return Report(scene.root, list(files.stems), shown, coverage, ordered(findings))
+
+
+def agreement_of(config: BeagsDataParserConfig) -> tuple[np.ndarray, int]:
+    """What every view says of points in space, see ``consistency.Agreement``: labels [P, V], number of classes."""
+    scene, views, files = _files(config)
+    coverage = check_files(files)
+    return _agreement(files, coverage, views, _points(scene, views, config)).labels, len(coverage.ids)
+
+
+def _files(config: BeagsDataParserConfig) -> tuple[Scene, PosedViews, MaskFiles]:
     parser: BeagsDataParser = config.setup()
     scene, views = parser.posed_views()
     sizes = [image_size(path) for path in views.images]
@@ -94,18 +115,10 @@ def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Re
         names,
         names_file if names_file.is_file() else scene.class_names_file or names_file,
     )
-    with progress_bar("Reading masks") as progress:
-        coverage = check_files(files, few_views, progress)
-    shown = dict(names or {})
-    shown = {i: shown.get(i, "background" if i == 0 else f"class_{i}") for i in coverage.ids}
-    findings = list(coverage.findings)
-    if coverage.usable.sum() > 3 and len(coverage.ids) > 1:
-        points = _points(scene, views, config)
-        findings += views_against_others(_agreement(files, coverage, views, points), files.stems, coverage, shown)
-    return Report(scene.root, list(files.stems), shown, coverage, ordered(findings))
+    return scene, views, files
 
 
-def _points(scene: Any, views: PosedViews, config: BeagsDataParserConfig) -> np.ndarray:
+def _points(scene: Scene, views: PosedViews, config: BeagsDataParserConfig) -> np.ndarray:
     """[P, 3] float64 in the cameras' world: seed points and points drawn where the cameras look."""
     found = starting_points(scene, views, config.num_random_points, config.random_points_seed)
     seeds = found["points3D_xyz"].double().numpy()
