@@ -146,7 +146,7 @@ def cut_from_labels(photo: np.ndarray, labels: np.ndarray, ids: Sequence[int]) -
     height, width = labels.shape
     radius = max(2, round(_BAND * np.hypot(height, width)))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    small = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
+    small = np.ones((3, 3), np.uint8)
     objects = []
     for class_id in ids:
         outside = (labels != class_id) & (labels != IGNORE)
@@ -158,7 +158,7 @@ def cut_from_labels(photo: np.ndarray, labels: np.ndarray, ids: Sequence[int]) -
         start = np.where(nearest, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
         start[cv2.erode(inside.astype(np.uint8), disc) > 0] = cv2.GC_FGD
         start[cv2.erode(outside.astype(np.uint8), disc) > 0] = cv2.GC_BGD
-        start[cv2.dilate(_hull(inside), disc) == 0] = cv2.GC_BGD
+        start[cv2.dilate(_hull(inside), disc, iterations=3) == 0] = cv2.GC_BGD  # parts that no view has carried
         objects.append((class_id, large_pieces(_cut(photo, start, box))))
     return stacked(objects, (height, width))
 
