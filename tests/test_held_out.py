@@ -12,9 +12,9 @@ pytest.importorskip("nerfstudio")
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.photometric import ssim
-from beags_plugin.plugin.views import View
 from beags_plugin.plugin.held_out import HeldOutCurve
 from beags_plugin.plugin.schedule import PhaseSchedule
+from beags_plugin.plugin.views import View
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.drawing import surfel_inputs
 from beags_plugin.rasterizers.interface import RasterSettings

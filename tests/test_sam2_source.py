@@ -152,17 +152,17 @@ def dino(tmp_path_factory):
     tokenizer = BertTokenizerFast(str(folder / "vocab.txt"))
     config = GroundingDinoConfig(
         backbone_config=SwinConfig(
-            image_size=32, embed_dim=8, depths=[1, 1, 1, 1], num_heads=[1, 1, 2, 2], window_size=4,
+            image_size=64, embed_dim=8, depths=[1, 1, 1, 1], num_heads=[1, 1, 2, 2], window_size=4,
             out_features=["stage2", "stage3", "stage4"],
         ),
         text_config=BertConfig(
             vocab_size=len(words), hidden_size=16, num_hidden_layers=1, num_attention_heads=2, intermediate_size=16
         ),
         d_model=32, encoder_layers=1, encoder_ffn_dim=16, encoder_attention_heads=2, decoder_layers=2,
-        decoder_ffn_dim=16, decoder_attention_heads=2, num_queries=12, max_text_len=16, num_feature_levels=4,
+        decoder_ffn_dim=16, decoder_attention_heads=2, num_queries=12, max_text_len=16, num_feature_levels=3,
     )  # fmt: skip
     GroundingDinoForObjectDetection(config).save_pretrained(folder)
-    size = {"shortest_edge": 32, "longest_edge": 64}
+    size = {"shortest_edge": 64, "longest_edge": 96}
     GroundingDinoProcessor(GroundingDinoImageProcessor(size=size), tokenizer).save_pretrained(folder)
     return folder
 

@@ -28,6 +28,7 @@ from beags_plugin.refiners.preparation import known_classes
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.datamanager import BeagsDataManager
+    from beags_plugin.plugin.dataparser import BeagsDataParserConfig
     from beags_plugin.plugin.extract import SavedScene
 
 
@@ -120,7 +121,7 @@ def data_of_run(scene: SavedScene, config_path: Path, options: ReprojectionOptio
     config = scene.config
     if not config.data_path.exists():
         raise UserError(f"{config_path} was trained on {config.data_path}, which is gone: put it back.")
-    parser = replace(config.data_config.dataparser, data=config.data_path)
+    parser = cast("BeagsDataParserConfig", replace(config.data_config.dataparser, data=config.data_path))
     if options.masks is not None:
         if not options.masks.is_dir():
             raise UserError(f"the folder of masks {options.masks} does not exist: correct --masks-path.")

@@ -38,8 +38,15 @@ class Photo:
 class Geometry(Protocol):
     """The scene's own shape, from a trained run: of its training views, without lens distortion."""
 
-    stems: Sequence[str]
-    cameras: Sequence[Camera]
+    @property
+    def stems(self) -> Sequence[str]:
+        """Of the photographs of its views."""
+        ...
+
+    @property
+    def cameras(self) -> Sequence[Camera]:
+        """Without distortion, of the photographs' size."""
+        ...
 
     def depth(self, view: int) -> Tensor:
         """[h, w] float32, depth of the surface, 0 where nothing is."""

@@ -213,8 +213,8 @@ def _cut(photo: np.ndarray, start: np.ndarray, box: tuple[int, int, int, int]) -
         mask[rows, columns] = kinds
         return mask
     cv2.setRNGSeed(0)  # its mixture models start from k-means with OpenCV's own generator
-    models = [np.zeros((1, 65)), np.zeros((1, 65))]
+    background, foreground = np.zeros((1, 65)), np.zeros((1, 65))
     image = np.ascontiguousarray(photo[rows, columns, ::-1])
-    cv2.grabCut(image, part, None, *models, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(image, part, (0, 0, 1, 1), background, foreground, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
     mask[rows, columns] = np.isin(part, (cv2.GC_FGD, cv2.GC_PR_FGD))
     return mask

@@ -53,7 +53,8 @@ class ObjectImagesSource(MaskSource):
         sizes = {mask.shape for _, mask in masks}
         if len(sizes) > 1:
             raise UserError(f"{files[0][1]} and the other objects' masks of this view differ in size: make them alike.")
-        return stacked(masks, sizes.pop())
+        height, width = sizes.pop()
+        return stacked(masks, (height, width))
 
 
 def named_objects(objects: Sequence[str]) -> dict[int, str]:

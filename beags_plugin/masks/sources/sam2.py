@@ -75,7 +75,7 @@ class Sam2Source(MaskSource):
 
 def load(name: str, kind: str, local: bool = False) -> tuple[Any, Any]:
     """The model of this class and its processor, from a folder or the hub; ``UserError`` if they are not there."""
-    import transformers
+    import transformers  # pyright: ignore[reportMissingImports]
 
     try:
         model = getattr(transformers, kind).from_pretrained(name, local_files_only=local)
