@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-WIDTH, HEIGHT, STEPS, WORK_SECONDS = 1000, 750, 150, 0.06
+WIDTH, HEIGHT, STEPS, WORK_SECONDS = 1000, 750, 100, 0.06
 
 
 def write_views(root: Path, views: int) -> None:
