@@ -1,4 +1,4 @@
-"""The command line: ``beags demo | resume | sample | extract | export | render | eval | bench | doctor``."""
+"""The command line: ``beags demo | resume | sample | masks | extract | export | render | eval | bench | doctor``."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from beags_plugin.bench.commands import Measurement
 from beags_plugin.errors import UserError
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.export.mesh_options import MeshOptions
+from beags_plugin.masks_commands import Masks
 from beags_plugin.turntable.options import RenderOptions
 
 CONSOLE = Console(soft_wrap=True, highlight=False)
@@ -249,6 +250,7 @@ Command = (
     Annotated[Demo, tyro.conf.subcommand(name="demo")]
     | Annotated[Resume, tyro.conf.subcommand(name="resume")]
     | Annotated[Sample, tyro.conf.subcommand(name="sample")]
+    | Annotated[Masks, tyro.conf.subcommand(name="masks")]
     | Annotated[Extract, tyro.conf.subcommand(name="extract")]
     | Annotated[Export, tyro.conf.subcommand(name="export")]
     | Annotated[Render, tyro.conf.subcommand(name="render")]

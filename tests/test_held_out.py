@@ -12,9 +12,9 @@ pytest.importorskip("nerfstudio")
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.photometric import ssim
-from beags_plugin.plugin.datamanager import View
 from beags_plugin.plugin.held_out import HeldOutCurve
 from beags_plugin.plugin.schedule import PhaseSchedule
+from beags_plugin.plugin.views import View
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.drawing import surfel_inputs
 from beags_plugin.rasterizers.interface import RasterSettings
@@ -54,7 +54,7 @@ class Data:
 
     def views(self, split):
         greys = {"train": (0.1, 0.2, 0.3), "eval": (0.4, 0.6)}[split]
-        return [View(CAMERA, "view", torch.full((20, 24, 3), grey), None) for grey in greys]
+        return [View(CAMERA, "view", lambda g=grey: {"image": torch.full((20, 24, 3), g)}, None) for grey in greys]
 
 
 def test_it_measures_all_held_out_views_at_the_given_steps_and_where_phases_end(tmp_path):

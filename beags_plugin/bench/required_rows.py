@@ -18,7 +18,7 @@ from beags_plugin.rasterizers.drawing import surfel_inputs
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 
 if TYPE_CHECKING:
-    from beags_plugin.plugin.datamanager import View
+    from beags_plugin.plugin.views import View
 
 CALLS = 5  # of which the median counts; both sides take turns
 

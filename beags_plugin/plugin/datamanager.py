@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import random
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import chain, count
 from pathlib import Path
 from typing import Any, Literal
@@ -17,15 +20,24 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.progress import track
 from torch import Tensor
 
 import beags_plugin.plugin.nerfstudio_patches  # noqa: F401  (checkpoints load again)
-from beags_plugin.core.cameras import Camera
 from beags_plugin.masks.label_maps import narrowed, widened
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.dataparser import BeagsDataParserConfig, absolute
 from beags_plugin.plugin.dataset import BeagsDataset
-from beags_plugin.plugin.undistortion import undistort_alpha, undistort_class_map
+from beags_plugin.plugin.streaming import Lazy, PackedMap, StreamedViews
+from beags_plugin.plugin.undistortion import (
+    has_lens,
+    redistort_class_map,
+    straighten,
+    undistort_alpha,
+    undistort_class_map,
+    undistort_image,
+)
+from beags_plugin.plugin.views import View
 from beags_plugin.rasterizers.interface import IGNORE
 
 OWN_KEYS = ("class_map", "alpha")
@@ -37,50 +49,17 @@ class BeagsDataManagerConfig(FullImageDatamanagerConfig):
 
     _target: type = field(default_factory=lambda: BeagsDataManager)
     dataparser: AnnotatedDataParserUnion = field(default_factory=BeagsDataParserConfig)
+    stream: Literal["auto", "always", "never"] = "auto"
+    """Whether images are read from disk when they are needed instead of being kept in memory; auto: if the images of a
+    split would take more than stream_above_gb. Training gives the same, bit for bit."""
+    stream_above_gb: float = 0.5
+    """GB (10^9 bytes) that the images of a split may take in memory before they are streamed."""
+    stream_ahead: int = 8
+    """How many streamed images are read before their use."""
 
     def __setattr__(self, name: str, value: object) -> None:
         """Keep ``data`` absolute, so that a saved config.yml works from any folder."""
         super().__setattr__(name, absolute(value) if name == "data" else value)
-
-
-@dataclass(frozen=True)
-class View:
-    """One undistorted view, on the data manager's device.
-
-    It shares the data manager's memory; what is asked of it is computed anew: of all views at once, the images in float
-    would take six times as much as their files, opened.
-
-    name: the stem of the image file; where several share it, with the folders that tell them apart, joined by "_".
-    pixels: [H, W, 3 or more], uint8 or float32 in 0..1. stored_labels: [H, W], as ``label_maps.narrowed`` gives them,
-        or None. opacity: [H, W] uint8, or None.
-    """
-
-    camera: Camera
-    name: str
-    pixels: Tensor
-    stored_labels: Tensor | None
-    opacity: Tensor | None = None
-
-    @property
-    def image(self) -> Tensor:
-        """[H, W, 3] float32 in 0..1, on black where it has alpha."""
-        pixels = self.pixels[..., :3]
-        return pixels.float() / 255.0 if pixels.dtype == torch.uint8 else pixels
-
-    @property
-    def labels(self) -> Tensor | None:
-        """[H, W] int32 class ids or IGNORE; None if the view has no mask."""
-        return None if self.stored_labels is None else widened(self.stored_labels)
-
-    @property
-    def alpha(self) -> Tensor | None:
-        """[H, W] float32 in 0..1, the image's alpha; None if it is opaque."""
-        return None if self.opacity is None else self.opacity.float() / 255.0
-
-    def image_on(self, background: Tensor) -> Tensor:
-        """The image [H, W, 3] with ``background`` [3] behind what is transparent."""
-        alpha = self.alpha
-        return self.image if alpha is None else self.image + (1.0 - alpha)[..., None] * background
 
 
 class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
@@ -100,28 +79,70 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         super().__init__(config, *args, **kwargs)
         self._distorted: dict[str, Cameras] = {}
         self._replaced = False  # whether the training class maps are no longer those of the files
+        self._originals_kept = True
         self._originals: list[Tensor] | None = None  # those of the files, where they are kept beside the ones in use
         # nerfstudio draws evaluation views from Python's global generator, which others use too.
         self._eval_order = random.Random(config.train_cameras_sampling_seed)
 
-    def _load_images(self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]) -> list[dict]:
-        dataset = self.train_dataset if split == "train" else self.eval_dataset
-        # nerfstudio overwrites intrinsics and sizes while it undistorts
-        distorted = self._distorted[split] = deepcopy(dataset.cameras)
+    def _load_images(self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]) -> Any:
+        """The data of all views, in memory or streamed; the cameras are straightened."""
+        dataset = self._dataset(split)
+        self._distorted[split] = deepcopy(dataset.cameras)
+        straighten(dataset.cameras)
+        self.train_cameras = self.train_dataset.cameras.to(self.device)
+        load = partial(self._load_view, split)
+        if self.streams(split):
+            CONSOLE.print(
+                f"{len(dataset)} {split} images would take {self._cache_gb(split):.1f} GB: they are read when needed.",
+                highlight=False,
+            )
+            workers = self.config.max_thread_workers or min(4, os.cpu_count() or 1)
+            return StreamedViews(load, len(dataset), self.config.stream_ahead, workers)
+        with ThreadPoolExecutor(max_workers=self.config.max_thread_workers or 2) as pool:
+            found = pool.map(load, range(len(dataset)))
+            cache = list(track(found, f"Reading {split} images", total=len(dataset), transient=True))
         # "cpu" pins memory, which needs CUDA; "gpu" means self.device, whatever that is.
-        on_cpu = torch.device(self.device).type == "cpu"
-        cache = super()._load_images(split, cache_images_device="gpu" if on_cpu else cache_images_device)
-        for index, data in enumerate(cache):
-            lens = (distorted, dataset.cameras, index)
-            class_map = undistort_class_map(data["class_map"].numpy(), *lens)
-            if class_map.shape != tuple(data["image"].shape[:2]):
-                raise RuntimeError(f"class map {class_map.shape} and image {data['image'].shape} differ in size")
-            data["class_map"] = narrowed(torch.from_numpy(class_map.astype(np.int32)))
-            if (alpha := dataset.get_alpha(index)) is not None:
-                data["alpha"] = torch.from_numpy(undistort_alpha(alpha, *lens))
-            if on_cpu or cache_images_device == "gpu":
+        pinned = cache_images_device == "cpu" and torch.device(self.device).type != "cpu"
+        for data in cache:
+            data["image"] = data["image"].pin_memory() if pinned else data["image"].to(self.device)
+            if not pinned:
                 data.update({key: data[key].to(self.device) for key in OWN_KEYS if key in data})
         return cache
+
+    def streams(self, split: Literal["train", "eval"]) -> bool:
+        """Whether the images of a split are read from disk whenever they are needed."""
+        if self.config.stream == "auto":
+            return self._cache_gb(split) > self.config.stream_above_gb
+        return self.config.stream == "always"
+
+    def _cache_gb(self, split: Literal["train", "eval"]) -> float:
+        bytes_of_pixel = 3 * (1 if self.config.cache_images_type == "uint8" else 4)
+        return sum(width * height for width, height in self._dataset(split).file_sizes) * bytes_of_pixel / 1e9
+
+    def _dataset(self, split: str) -> BeagsDataset:
+        return self.train_dataset if split == "train" else self.eval_dataset
+
+    def _load_view(self, split: Literal["train", "eval"], index: int) -> dict[str, Any]:
+        """Image, class map and alpha of one view from its files, without lens distortion."""
+        dataset, distorted = self._dataset(split), self._distorted[split]
+        data = dataset.get_data(index, image_type=self.config.cache_images_type)
+        if has_lens(distorted, index):
+            data["image"] = torch.from_numpy(undistort_image(data["image"].numpy(), distorted, index))
+        lens = (distorted, dataset.cameras, index)
+        class_map = undistort_class_map(data["class_map"].numpy(), *lens)
+        if class_map.shape != tuple(data["image"].shape[:2]):
+            raise RuntimeError(f"class map {class_map.shape} and image {data['image'].shape} differ in size")
+        data["class_map"] = narrowed(torch.from_numpy(class_map.astype(np.int32)))
+        if (alpha := dataset.get_alpha(index)) is not None:
+            data["alpha"] = torch.from_numpy(undistort_alpha(alpha, *lens))
+        return data
+
+    def _labels_of_file(self, split: Literal["train", "eval"], index: int) -> Tensor:
+        """The labels of a view's mask file in the narrowest type, without its photo."""
+        dataset = self._dataset(split)
+        class_map = dataset.get_metadata({"image_idx": index})["class_map"].numpy()
+        straight = undistort_class_map(class_map, self._distorted[split], dataset.cameras, index)
+        return narrowed(torch.from_numpy(straight.astype(np.int32)))
 
     def undistort_eval_map(self, class_map: np.ndarray, index: int) -> np.ndarray:
         """A class map [h, w] of an evaluation view, of any size, as it would be had the camera no lens distortion."""
@@ -145,8 +166,22 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         straight = self.train_dataset.cameras
         return undistort_class_map(ids, self._distorted.get("train", straight), straight, index)
 
+    def straight_train_map(self, class_map: np.ndarray, index: int) -> np.ndarray:
+        """A class map [h, w] of a training view's file without its lens distortion."""
+        assert self.cached_train is not None  # the cameras are straightened when the images load
+        return undistort_class_map(class_map, self._distorted["train"], self.train_dataset.cameras, index)
+
+    def as_in_file(self, class_map: np.ndarray, index: int) -> np.ndarray:
+        """A class map [h', w'] of a training view with the lens distortion of its file, at the size it was read at."""
+        assert self.cached_train is not None  # the cameras are straightened when the images load
+        width, height = self.train_dataset.file_sizes[index]
+        lens = (self._distorted["train"], self.train_dataset.cameras, index)
+        return redistort_class_map(class_map, *lens, (height, width))
+
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         camera, data = super().next_train(step)
+        if isinstance(self.cached_train, StreamedViews):
+            self.cached_train.expect(self.train_unseen_cameras)
         data = self._on_device(data)
         # the boundary is computed inside the rasterizer, which sees the camera only: the mask travels with it
         camera.metadata = {**(camera.metadata or {}), "class_map": data["class_map"]}
@@ -156,7 +191,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         index = self.eval_unseen_cameras.pop(self._eval_order.randrange(len(self.eval_unseen_cameras)))
         if not self.eval_unseen_cameras:
             self.eval_unseen_cameras = list(range(len(self.eval_dataset)))
-        data = self.cached_eval[index].copy()  # before the camera: loading undistorts the cameras
+        data = self.cached_eval[index].copy()  # before the camera: it is straightened then
         data["image"] = data["image"].to(self.device)
         return self.eval_dataset.cameras[index : index + 1].to(self.device), self._on_device(data)
 
@@ -187,9 +222,16 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
             self.train_unsampled_epoch_count = np.array(state["train_epochs"])
 
     @property
-    def fixed_indices_eval_dataloader(self) -> list[tuple[Cameras, dict]]:
-        """All evaluation views in order, as nerfstudio's evaluation reads them."""
-        return [(camera, self._on_device(data)) for camera, data in super().fixed_indices_eval_dataloader]
+    def fixed_indices_eval_dataloader(self) -> Any:
+        """All evaluation views in order, as nerfstudio's evaluation reads them, one at a time."""
+        cache = self.cached_eval
+
+        def batch(index: int) -> tuple[Cameras, dict]:
+            data = self._on_device(cache[index].copy())
+            data["image"] = data["image"].to(self.device)
+            return self.eval_dataset.cameras[index : index + 1].to(self.device), data
+
+        return Lazy(batch, len(cache))
 
     def views(self, split: Literal["train", "val", "test", "eval"], original: bool = False) -> list[View]:
         """All views of the training or (any other name) the evaluation split, in name order.
@@ -198,13 +240,10 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         """
         if split not in ("train", "val", "test", "eval"):
             raise ValueError(f"unknown split {split!r}")
-        cache = self.cached_train if split == "train" else self.cached_eval
-        dataset = self.train_dataset if split == "train" else self.eval_dataset
-        names = unique_names(dataset.image_filenames)
-        return [
-            self._view(dataset, data, index, name, original)
-            for index, (data, name) in enumerate(zip(cache, names, strict=True))
-        ]
+        whose: Literal["train", "eval"] = "train" if split == "train" else "eval"
+        cache = self.cached_train if whose == "train" else self.cached_eval
+        names = unique_names(self._dataset(whose).image_filenames)
+        return [self._view(whose, cache, index, name, original) for index, name in enumerate(names)]
 
     def replace_class_maps(self, class_maps: Sequence[Tensor], keep: bool = True) -> None:
         """Train on ``class_maps``, one [H, W] integer tensor per training view, instead of the mask files.
@@ -212,32 +251,54 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         keep: whether ``views`` may be asked for the labels of the files later on.
         Raises ``ValueError`` if their number, a size or an id (0..IGNORE) is wrong.
         """
-        if len(class_maps) != len(self.cached_train):
-            raise ValueError(f"{len(class_maps)} class maps for {len(self.cached_train)} training views")
-        for data, labels in zip(self.cached_train, class_maps, strict=True):
-            if labels.shape != data["class_map"].shape:
-                raise ValueError(f"class map {tuple(labels.shape)} for a view of {tuple(data['class_map'].shape)}")
+        cache, cameras = self.cached_train, self.train_dataset.cameras
+        if len(class_maps) != len(cache):
+            raise ValueError(f"{len(class_maps)} class maps for {len(cache)} training views")
+        for index, labels in enumerate(class_maps):
+            shape = (int(cameras.height[index]), int(cameras.width[index]))
+            if labels.shape != shape:
+                raise ValueError(f"class map {tuple(labels.shape)} for a view of {shape}")
             if labels.numel() and not 0 <= int(labels.min()) <= int(labels.max()) <= IGNORE:
                 raise ValueError(f"class ids must lie in 0..{IGNORE}")
-        if not self._replaced:
-            self._originals = [data["class_map"] for data in self.cached_train]
+        if isinstance(cache, StreamedViews):
+            cache.class_maps = [PackedMap(labels.int()) for labels in class_maps]
+        else:
+            if not self._replaced:
+                self._originals = [data["class_map"] for data in cache]
+            for data, labels in zip(cache, class_maps, strict=True):
+                data["class_map"] = narrowed(labels.detach().int()).to(data["class_map"].device)
         self._originals = self._originals if keep else None
-        for data, labels in zip(self.cached_train, class_maps, strict=True):
-            data["class_map"] = narrowed(labels.detach().int()).to(data["class_map"].device)
+        self._originals_kept = keep
         self._replaced = True
 
-    def _view(self, dataset: BeagsDataset, data: dict, index: int, name: str, original: bool) -> View:
-        labels, stored = None, data["class_map"]
-        replaced = self._replaced and dataset is self.train_dataset
+    def _view(self, split: Literal["train", "eval"], cache: Any, index: int, name: str, original: bool) -> View:
+        dataset = self._dataset(split)
+        replaced = self._replaced and split == "train"
         if replaced and original:
-            if self._originals is None:
+            if not self._originals_kept:
                 raise ValueError("the labels of the mask files were not kept")
-            replaced, stored = False, self._originals[index]
+            replaced = False
+        labels: Callable[[], Tensor] | None = None
         if replaced or dataset.metadata["class_map_filenames"][index] is not None:
-            labels = stored.to(self.device)
+            labels = self._labels(split, cache, index, replaced)
         camera = camera_from_nerfstudio(dataset.cameras, index).to(self.device)
-        alpha = data["alpha"].to(self.device) if "alpha" in data else None
-        return View(camera, name, data["image"].to(self.device), labels, alpha)
+
+        def data() -> dict[str, Tensor]:
+            held = cache[index]
+            return {key: held[key].to(self.device) for key in ("image", "alpha") if key in held}
+
+        return View(camera, name, data, labels)
+
+    def _labels(self, split: Literal["train", "eval"], cache: Any, index: int, replaced: bool) -> Callable[[], Tensor]:
+        """What gives the labels that a view has now, also after they are replaced again."""
+        if isinstance(cache, StreamedViews):
+            packed = cache.class_maps[index] if replaced else None
+            if packed is None:
+                return lambda: self._labels_of_file(split, index).to(self.device)
+            return lambda: packed.unpacked().to(self.device)
+        original = self._replaced and split == "train" and not replaced
+        stored = self._originals[index] if original and self._originals is not None else cache[index]["class_map"]
+        return lambda: stored.to(self.device)
 
     def _on_device(self, data: dict) -> dict:
         """The view's data for use: class map and alpha on the device, the class map as int32."""

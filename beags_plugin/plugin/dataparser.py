@@ -116,7 +116,8 @@ class BeagsDataParser(DataParser):
             metadata=metadata,
         )
 
-    def _read(self) -> None:
+    def posed_views(self) -> tuple[Scene, PosedViews]:
+        """The scene and all its views, before anything is asked of masks."""
         config = self.config
         if not config.downscale_factor >= 1.0:
             raise UserError(f"downscale_factor is {config.downscale_factor}: give 1 (full size) or more.")
@@ -124,6 +125,21 @@ class BeagsDataParser(DataParser):
         options = {name: getattr(config, name) for name in Normalization.__dataclass_fields__}
         views = read_poses(scene.poses, scene.root, Normalization(**options))
         check_cameras(views.cameras, views.images)
+        return scene, views
+
+    def mask_files(self, scene: Scene, views: PosedViews) -> tuple[list[Path | None], Path, MaskKind]:
+        """Of each view the file of its mask or None; the folder where masks are looked for; and what they are."""
+        folder, kind = self._masks(scene)
+        if self.config.masks_path is None and scene.mask_files is not None:
+            return [scene.mask_files.get(image.stem) for image in views.images], folder, kind
+        return files_of_views(folder, views.images, _images_root(scene)), folder, kind
+
+    def training_views(self, views: PosedViews) -> list[int]:
+        """Indices of the views that are trained on."""
+        return self._views_of_split(views, "train")
+
+    def _read(self) -> None:
+        scene, views = self.posed_views()
         self._metadata = self._read_metadata(scene, views)
         for line in self._recognised(scene, views):
             CONSOLE.print(line, markup=False, highlight=False, soft_wrap=True)
@@ -133,12 +149,9 @@ class BeagsDataParser(DataParser):
         """Checks of files against each other, and what all splits share."""
         config = self.config
         sizes = [image_size(path) for path in views.images]
-        self._fit_cameras(views, sizes)
+        self.fit_cameras(views, sizes)
         images_root = _images_root(scene)
-        folder, kind = self._masks(scene)
-        masks = files_of_views(folder, views.images, images_root)
-        if self.config.masks_path is None and scene.mask_files is not None:
-            masks = [scene.mask_files.get(image.stem) for image in views.images]
+        masks, folder, kind = self.mask_files(scene, views)
         if not any(masks) and any(folder.glob("**/*.png")):
             raise UserError(
                 f"no mask in {folder} has the name of an image ({views.images[0].stem}.png, ...): "
@@ -163,7 +176,7 @@ class BeagsDataParser(DataParser):
             return scene.root / self.config.masks_path, "ids"
         return scene.root / scene.masks, scene.mask_kind
 
-    def _fit_cameras(self, views: PosedViews, sizes: Sequence[tuple[int, int]]) -> None:
+    def fit_cameras(self, views: PosedViews, sizes: Sequence[tuple[int, int]]) -> None:
         """Cameras of the size the images will have once loaded: that of the files, divided by the downscale factor."""
         cameras = views.cameras
         camera_sizes = torch.cat([cameras.width, cameras.height], 1).tolist()

@@ -34,7 +34,7 @@ class BeagsDataset(InputDataset):
             )
             resize_cameras(self.cameras, width, height)
         # The data manager crops the cameras when it undistorts; the files keep this size.
-        self._sizes = torch.cat([self.cameras.width, self.cameras.height], 1).tolist()
+        self.file_sizes = torch.cat([self.cameras.width, self.cameras.height], 1).tolist()
 
     def get_numpy_image(self, image_idx: int) -> np.ndarray:
         """The image [H, W, 3] uint8, sRGB, before undistortion."""
@@ -46,7 +46,7 @@ class BeagsDataset(InputDataset):
                 image = image.convert("RGBA")
                 image = Image.alpha_composite(Image.new("RGBA", image.size, (0, 0, 0, 255)), image)
             pixels = np.array(image.convert("RGB"))
-        return resize_area(pixels, *self._sizes[image_idx])
+        return resize_area(pixels, *self.file_sizes[image_idx])
 
     def get_alpha(self, image_idx: int) -> np.ndarray | None:
         """The image's alpha [H, W] uint8, before undistortion; None if it is opaque everywhere."""
@@ -54,14 +54,14 @@ class BeagsDataset(InputDataset):
             if not image.has_transparency_data:
                 return None
             alpha = np.array(image.convert("RGBA").getchannel("A"))
-        return None if (alpha == 255).all() else resize_area(alpha, *self._sizes[image_idx])
+        return None if (alpha == 255).all() else resize_area(alpha, *self.file_sizes[image_idx])
 
     def get_metadata(self, data: dict) -> dict:
         """The class map that belongs to ``data["image_idx"]``."""
         from beags_plugin.masks.classes import read_mask
 
         index = data["image_idx"]
-        width, height = self._sizes[index]
+        width, height = self.file_sizes[index]
         path = self.metadata["class_map_filenames"][index]
         if path is None:
             class_map = np.full((height, width), IGNORE, np.uint16)

@@ -14,8 +14,9 @@ from beags_plugin.plugin.runs import write_text_atomically
 from beags_plugin.rasterizers.drawing import surfel_inputs
 
 if TYPE_CHECKING:
-    from beags_plugin.plugin.datamanager import BeagsDataManager, View
+    from beags_plugin.plugin.datamanager import BeagsDataManager
     from beags_plugin.plugin.model import BeagsModel
+    from beags_plugin.plugin.views import View
 
 CURVE = "held_out.json"
 """File of a run: one record per measurement, see ``HeldOutCurve``."""

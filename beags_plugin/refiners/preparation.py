@@ -162,7 +162,7 @@ def prepare(
             "which needs none."
         )
     surfels = surfels.detach()
-    known = _known_classes(maps, class_names)
+    known = known_classes(maps, class_names)
     stages = Stages(store, code, surfels, list(cameras), settings, type(rasterizer), maps, known.ids, seed)
 
     masks = _consistent_masks(stages, surfels, cameras, maps, known, rasterizer, settings, config, stage)
@@ -264,7 +264,7 @@ def _consistent_masks(
     return masks
 
 
-def _known_classes(labels: Sequence[Tensor | None], class_names: dict[int, str]) -> ClassRanks:
+def known_classes(labels: Sequence[Tensor | None], class_names: dict[int, str]) -> ClassRanks:
     """The named classes and those between them that masks hold; ``UserError`` for ids above the last named one."""
     named = ClassRanks(torch.tensor(sorted(class_names)))
     if named.trivial:

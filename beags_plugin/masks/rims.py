@@ -1,0 +1,35 @@
+"""Outlines of masks moved to edges of the photograph, an optional step for any source."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beags_plugin.rasterizers.interface import IGNORE
+
+EPSILON = 1e-2  # variance of colour (0..1) below which the guide counts as flat
+
+
+def snap_to_edges(class_map: np.ndarray, photo: np.ndarray, radius: int) -> np.ndarray:
+    """[H, W] uint16: the class map with its rims where the photo's edges are, as a guided filter sees them.
+
+    class_map: [H, W] uint16. photo: [H, W, 3] uint8 RGB. radius: pixels of the filter's window, and how far from a
+    rim a label may change. Each class's indicator is filtered with the photo as guide (He et al., "Guided image
+    filtering"); near rims the class of the largest value is taken. IGNORE stays.
+    """
+    import cv2
+
+    ids = [int(i) for i in np.unique(class_map) if i != IGNORE]
+    if radius < 1 or len(ids) < 2:
+        return class_map
+    kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+    guide = np.ascontiguousarray(photo, np.float32) / np.float32(255.0)
+    flat = class_map.astype(np.float32)
+    near = cv2.dilate(flat, kernel) != cv2.erode(flat, kernel)
+    best = np.full(class_map.shape, -np.inf, np.float32)
+    found = class_map.copy()
+    for class_id in ids:
+        indicator = (class_map == class_id).astype(np.float32)
+        value = cv2.ximgproc.guidedFilter(guide, indicator, radius, EPSILON)
+        larger = value > best
+        found[larger], best[larger] = class_id, value[larger]
+    return np.where(near & (class_map != IGNORE), found, class_map)

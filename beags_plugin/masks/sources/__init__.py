@@ -1,0 +1,17 @@
+"""Where masks come from, as registered sources (entry points: ``beags.mask_sources``); nothing of nerfstudio."""
+
+from beags_plugin.registry import Registry
+
+MASK_SOURCES = Registry(
+    "mask source",
+    "beags.mask_sources",
+    {
+        "coco": "beags_plugin.masks.sources.coco:CocoSource",
+        "gaussian-grouping": "beags_plugin.masks.sources.id_images:GaussianGroupingSource",
+        "grabcut": "beags_plugin.masks.sources.grabcut:GrabCutSource",
+        "id-images": "beags_plugin.masks.sources.id_images:IdImagesSource",
+        "langsplat": "beags_plugin.masks.sources.langsplat:LangSplatSource",
+        "object-images": "beags_plugin.masks.sources.object_images:ObjectImagesSource",
+        "sam2": "beags_plugin.masks.sources.sam2:Sam2Source",
+    },
+)

@@ -1,0 +1,135 @@
+"""The interface of mask sources, and what they are given."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Protocol
+
+import numpy as np
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.errors import UserError
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One view: the stem of its image, the file, and its width and height in pixels; trained: not held out."""
+
+    stem: str
+    path: Path
+    width: int
+    height: int
+    trained: bool = True
+
+    def pixels(self) -> np.ndarray:
+        """[H, W, 3] uint8 RGB."""
+        from PIL import Image
+
+        with Image.open(self.path) as image:
+            return np.asarray(image.convert("RGB"))
+
+
+class Geometry(Protocol):
+    """The scene's own shape, from a trained run: of its training views, without lens distortion."""
+
+    @property
+    def stems(self) -> Sequence[str]:
+        """Of the photographs of its views."""
+        ...
+
+    @property
+    def cameras(self) -> Sequence[Camera]:
+        """Without distortion, of the photographs' size."""
+        ...
+
+    def depth(self, view: int) -> Tensor:
+        """[h, w] float32, depth of the surface, 0 where nothing is."""
+        ...
+
+    def to_straight(self, class_map: np.ndarray, view: int) -> np.ndarray:
+        """[h, w] uint16: a class map [H, W] of the photograph without its lens distortion."""
+        ...
+
+    def to_photo(self, class_map: np.ndarray, view: int) -> np.ndarray:
+        """[H, W] uint16: a class map [h, w] with the photograph's lens distortion."""
+        ...
+
+
+@dataclass(frozen=True)
+class SourceScene:
+    """What masks are made for. root: the scene's folder. geometry: None unless a trained run was given."""
+
+    root: Path
+    photos: Sequence[Photo]
+    geometry: Geometry | None = None
+
+    def index_of(self, stem: str, whose: str) -> int:
+        """The place of the view of this stem (or file name); ``whose`` says in the error where it was named."""
+        for index, photo in enumerate(self.photos):
+            if stem in (photo.stem, photo.path.name):
+                return index
+        raise UserError(f"{whose} names the view {stem!r}, but no image of {self.root} is called so: correct it.")
+
+    def below(self, path: Path) -> Path:
+        """The path in the scene's folder, if it is not absolute and exists there; else as it is."""
+        inside = self.root / path
+        return inside if not path.is_absolute() and inside.exists() else path
+
+
+@dataclass(frozen=True)
+class MadeMasks:
+    """Class names by id, and one class map [H, W] uint16 per photo in their order; None: no mask for that view.
+
+    notes: sentences to tell the user, filled while the maps are made.
+    """
+
+    names: Mapping[int, str]
+    maps: Iterator[np.ndarray | None]
+    notes: list[str]
+
+
+class MaskSource(ABC):
+    """Makes the masks of a scene. A source is a frozen dataclass; its own fields are its options.
+
+    needs_run: whether it works only with ``SourceScene.geometry``.
+    """
+
+    needs_run: ClassVar[bool] = False
+
+    @classmethod
+    def unavailable(cls) -> str | None:
+        """None, or one sentence on why it cannot run here."""
+        return None
+
+    @abstractmethod
+    def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
+        """The masks of all photos; raises ``UserError`` for input that cannot be used. progress: (done, total)."""
+
+
+def per_photo(
+    scene: SourceScene, progress: Progress, read: Callable[[Photo], np.ndarray | None]
+) -> Iterator[np.ndarray | None]:
+    """``read`` of each photo, with progress; raises ``UserError`` where a map has another size than its photo."""
+    for index, photo in enumerate(scene.photos):
+        class_map = read(photo)
+        if class_map is not None and class_map.shape != (photo.height, photo.width):
+            raise UserError(
+                f"the masks of {photo.path} are {class_map.shape[1]}x{class_map.shape[0]} pixels but the image is "
+                f"{photo.width}x{photo.height}: make them from the image at its full size."
+            )
+        yield class_map
+        progress(index + 1, len(scene.photos))
+
+
+def stacked(objects: Sequence[tuple[int, np.ndarray]], shape: tuple[int, int]) -> np.ndarray:
+    """[H, W] uint16: the masks [H, W] bool of objects by id in one map; where they overlap, the smaller one is seen."""
+    class_map = np.zeros(shape, np.uint16)
+    for class_id, mask in sorted(objects, key=lambda pair: (-int(pair[1].sum()), pair[0])):
+        class_map[mask] = class_id
+    return class_map

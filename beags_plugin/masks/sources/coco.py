@@ -1,0 +1,102 @@
+"""Source of masks in COCO's JSON: run lengths or polygons."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from beags_plugin.errors import UserError
+from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo, stacked
+
+INSTANCE_KEYS = ("instance_id", "track_id", "object_id")
+
+
+@dataclass(frozen=True)
+class CocoSource(MaskSource):
+    """COCO annotations: ``images``, ``annotations`` with a ``segmentation`` (RLE, compressed or not, or polygons),
+    ``categories``.
+
+    file: the JSON. by: what one object is: "category", or "instance": the annotation's instance_id, track_id or
+    object_id. Where masks overlap, the smaller object is seen.
+    """
+
+    file: Path = Path("annotations.json")
+    by: Literal["category", "instance"] = "category"
+
+    def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
+        path = scene.below(self.file)
+        try:
+            content = json.loads(path.read_text("utf8"))
+            stems = {image["id"]: Path(image["file_name"]).stem for image in content["images"]}
+            categories = {entry["id"]: str(entry["name"]) for entry in content.get("categories", [])}
+            annotations = [(stems[entry["image_id"]], self._key(entry), entry) for entry in content["annotations"]]
+        except OSError as error:
+            raise UserError(f"{path} cannot be read ({error.strerror}): give options file=...") from error
+        except (ValueError, KeyError, TypeError) as error:
+            raise UserError(f"{path} is no COCO JSON with images and annotations: {error!r}.") from error
+        if not {photo.stem for photo in scene.photos} & {stem for stem, _, _ in annotations}:
+            raise UserError(f"{path} annotates no image of {scene.root}: its file_name must be theirs.")
+        keys = sorted({key for _, key, _ in annotations})
+        ids = {key: index for index, key in enumerate(keys, 1)}
+        of_view: dict[str, list[tuple[int, Any]]] = defaultdict(list)
+        for stem, key, entry in annotations:
+            of_view[stem].append((ids[key], entry.get("segmentation")))
+        annotated = set(stems.values())
+
+        def read(photo: Photo) -> np.ndarray | None:
+            if photo.stem not in annotated:
+                return None
+            shape = (photo.height, photo.width)
+            whole: dict[int, np.ndarray] = {}  # an object may be annotated in pieces
+            for class_id, segmentation in of_view[photo.stem]:
+                mask = decoded(segmentation, shape, f"{path}, image {photo.stem}")
+                whole[class_id] = whole.get(class_id, False) | mask
+            return stacked(list(whole.items()), shape)
+
+        names = {0: "background"}
+        for (category, instance), index in ids.items():
+            title = categories.get(category, f"category_{category}")
+            names[index] = title if self.by == "category" else f"{title}_{instance}"
+        return MadeMasks(names, per_photo(scene, progress, read), [])
+
+    def _key(self, entry: dict[str, Any]) -> tuple[int, int]:
+        """What one object is called: (category, instance)."""
+        if self.by == "category":
+            return entry["category_id"], 0
+        for key in INSTANCE_KEYS:
+            if key in entry:
+                return entry.get("category_id", 0), entry[key]
+        raise UserError(f"an annotation has none of {', '.join(INSTANCE_KEYS)}: use options by=category.")
+
+
+def decoded(segmentation: Any, shape: tuple[int, int], where: str) -> np.ndarray:
+    """[H, W] bool of one annotation: {"size", "counts"} or a list of polygons; ``where`` names it in errors."""
+    from pycocotools import mask as coco
+
+    height, width = shape
+    try:
+        if isinstance(segmentation, dict):
+            if list(segmentation["size"]) != [height, width]:
+                raise UserError(
+                    f"{where}: a mask is {segmentation['size'][1]}x{segmentation['size'][0]} pixels but its image is "
+                    f"{width}x{height}: annotate the image at its full size."
+                )
+            counts = segmentation["counts"]
+            if isinstance(counts, list):
+                if sum(counts) != height * width:
+                    raise ValueError(f"the counts sum to {sum(counts)}")
+                runs = coco.frPyObjects(segmentation, height, width)
+            else:
+                runs = {"size": [height, width], "counts": counts.encode() if isinstance(counts, str) else counts}
+        else:
+            runs = coco.merge(coco.frPyObjects(segmentation, height, width))
+        return coco.decode(runs).astype(bool)
+    except UserError:
+        raise
+    except Exception as error:  # the library raises whatever it meets
+        raise UserError(f"{where}: a segmentation is neither RLE nor polygons ({error}): export it again.") from error

@@ -1,0 +1,220 @@
+"""Source that needs no weights: GrabCut from boxes in a few views, carried to the others by the scene's own depth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+
+from beags_plugin.core.class_ranks import ClassRanks
+from beags_plugin.errors import UserError
+from beags_plugin.masks.label_maps import LabelMaps
+from beags_plugin.masks.reprojection import reproject_pairwise
+from beags_plugin.masks.sources.base import Geometry, MadeMasks, MaskSource, Progress, SourceScene, stacked
+from beags_plugin.masks.sources.prompts import Prompt, PromptedObject, read_prompts
+from beags_plugin.rasterizers.interface import IGNORE
+
+_ITERATIONS = 5
+_BAND = 0.012  # of the image diagonal: how far a carried outline may be wrong
+_MARGIN = 0.3  # of an object's box: how much background around it GrabCut sees
+PIECE = 0.1  # share of an object's largest piece that another piece needs: smaller ones are colours found elsewhere
+_POINT = 0.006  # of the image diagonal: radius of a prompted point
+
+
+@dataclass(frozen=True)
+class GrabCutSource(MaskSource):
+    """GrabCut from boxes (and points, if given) in a few views; the other views get what the scene's depth carries
+    to them as a start, and GrabCut draws the outline there.
+
+    prompts: JSON, see ``prompts.read_prompts``. rounds: of carrying; from the second on all views vote, not only the
+    prompted ones. tau: a vote counts if |z - depth| <= tau z.
+    """
+
+    needs_run: ClassVar[bool] = True
+
+    prompts: Path = Path("prompts.json")
+    rounds: int = 2
+    tau: float = 0.02
+
+    def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
+        assert scene.geometry is not None
+        path = scene.below(self.prompts)
+        objects = read_prompts(path)
+        places = [scene.index_of(stem, f"the geometry of {scene.root}") for stem in scene.geometry.stems]
+        drawn = self._prompted(scene, objects, path)
+        if held_out := sorted(scene.photos[view].stem for view in drawn if view not in places):
+            raise UserError(f"{path} has prompts in {held_out[0]}, which is held out: prompt a training view.")
+        names = {0: "background", **{one.class_id: one.name for one in objects}}
+        ids = sorted(one.class_id for one in objects)
+        return MadeMasks(names, self._carried(scene, places, drawn, ids, progress), [])
+
+    def _prompted(self, scene: SourceScene, objects: Sequence[PromptedObject], path: Path) -> dict[int, np.ndarray]:
+        """Place of a photo to its class map, of the prompted views; each must show all objects that are in it."""
+        found: dict[int, list[tuple[int, np.ndarray]]] = {}
+        for one in objects:
+            if not one.prompts:
+                raise UserError(f"{path} gives no prompt for {one.name}: GrabCut needs a box in two or three views.")
+            for stem, prompt in one.prompts.items():
+                view = scene.index_of(stem, str(path))
+                if prompt.box is None:
+                    raise UserError(f"{path} gives no box for {one.name} in {stem}: GrabCut needs one.")
+                mask = cut_by_box(scene.photos[view].pixels(), prompt)
+                found.setdefault(view, []).append((one.class_id, mask))
+        return {
+            view: stacked(masks, (scene.photos[view].height, scene.photos[view].width)) for view, masks in found.items()
+        }
+
+    def _carried(
+        self,
+        scene: SourceScene,
+        places: Sequence[int],
+        drawn: dict[int, np.ndarray],
+        ids: list[int],
+        progress: Progress,
+    ) -> Iterator[np.ndarray | None]:
+        geometry = scene.geometry
+        assert geometry is not None
+        total = len(places) * max(1, self.rounds)
+        maps = dict(drawn)
+        for number in range(max(1, self.rounds)):
+            carried = carry(geometry, [maps.get(view) for view in places], ids, self.tau)
+            for index, (view, (labels, sure)) in enumerate(zip(places, carried, strict=True)):
+                if view not in drawn:
+                    start = geometry.to_photo(np.where(sure, labels, IGNORE).astype(np.uint16), index)
+                    maps[view] = cut_from_labels(scene.photos[view].pixels(), start, ids)
+                progress(number * len(places) + index + 1, total)
+        for view in range(len(scene.photos)):
+            yield maps.get(view)
+
+
+def carry(
+    geometry: Geometry, maps: Sequence[np.ndarray | None], ids: Sequence[int], tau: float
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Of each view of ``geometry`` what the class maps of others (of the photographs; None: none) say there.
+
+    Returns per view labels [h, w] uint16 and [h, w] bool, whether more than half of the votes agree; both without
+    distortion.
+    """
+    known = ClassRanks(torch.tensor([0, *ids]))
+    straight = LabelMaps()
+    for view, class_map in enumerate(maps):
+        ranks = None
+        if class_map is not None:
+            labels = torch.from_numpy(geometry.to_straight(class_map, view).astype(np.int32))
+            ranks = torch.where(labels == IGNORE, labels, known.ranks(labels.masked_fill(labels == IGNORE, 0)))
+        straight.append(ranks)
+    depths = [geometry.depth(view) for view in range(len(maps))]
+    found = []
+    for voted in reproject_pairwise(depths, geometry.cameras, straight, len(known), tau=tau):
+        labels = voted.labels
+        back = known.class_ids(labels.masked_fill(labels == IGNORE, 0)).masked_fill(labels == IGNORE, IGNORE)
+        found.append((back.numpy().astype(np.uint16), (voted.confidence > 0.5).numpy()))
+    return found
+
+
+def cut_by_box(photo: np.ndarray, prompt: Prompt) -> np.ndarray:
+    """[H, W] bool: the object in the prompt's box; photo: [H, W, 3] uint8 RGB."""
+    import cv2
+
+    height, width = photo.shape[:2]
+    assert prompt.box is not None
+    left, top, right, bottom = (round(value) for value in prompt.box)
+    left, top, right, bottom = max(left, 0), max(top, 0), min(right, width), min(bottom, height)
+    if left >= right or top >= bottom:
+        raise UserError(f"the box {list(prompt.box)} lies outside its image of {width}x{height} pixels: correct it.")
+    start = np.full((height, width), cv2.GC_BGD, np.uint8)
+    start[top:bottom, left:right] = cv2.GC_PR_FGD
+    radius = max(2, round(_POINT * np.hypot(height, width)))
+    for (x, y), inside in zip(prompt.points, prompt.inside, strict=True):
+        cv2.circle(start, (int(x), int(y)), radius, cv2.GC_FGD if inside else cv2.GC_BGD, -1)
+    return large_pieces(_cut(photo, start, (left, top, right, bottom)))
+
+
+def cut_from_labels(photo: np.ndarray, labels: np.ndarray, ids: Sequence[int]) -> np.ndarray:
+    """[H, W] uint16 class map: GrabCut per object, started from carried labels [H, W] uint16 (IGNORE: unknown).
+
+    Labels far enough from where they change are kept; between them, and where nothing was carried, colours decide.
+    An object stays within the convex hull of what was carried, and a band about it: where no view voted, as on far
+    walls, colours alone would find it again.
+    """
+    import cv2
+
+    height, width = labels.shape
+    radius = max(2, round(_BAND * np.hypot(height, width)))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    small = np.ones((3, 3), np.uint8)
+    objects = []
+    for class_id in ids:
+        outside = (labels != class_id) & (labels != IGNORE)
+        inside = large_pieces(cv2.morphologyEx((labels == class_id).astype(np.uint8), cv2.MORPH_OPEN, small) > 0)
+        if not inside.any():
+            continue
+        box = _box_around(inside)
+        nearest = _nearer(inside, outside)
+        start = np.where(nearest, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+        start[cv2.erode(inside.astype(np.uint8), disc) > 0] = cv2.GC_FGD
+        start[cv2.erode(outside.astype(np.uint8), disc) > 0] = cv2.GC_BGD
+        start[cv2.dilate(_hull(inside), disc, iterations=3) == 0] = cv2.GC_BGD  # parts that no view has carried
+        objects.append((class_id, large_pieces(_cut(photo, start, box))))
+    return stacked(objects, (height, width))
+
+
+def large_pieces(mask: np.ndarray) -> np.ndarray:
+    """[H, W] bool: the connected pieces of a mask that have at least a tenth of the largest one's pixels."""
+    import cv2
+
+    _, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    kept = 1 + np.flatnonzero(areas >= PIECE * areas.max(initial=0))
+    return np.isin(pieces, kept) & mask
+
+
+def _hull(mask: np.ndarray) -> np.ndarray:
+    """[H, W] uint8: 1 in the convex hull of a mask's pixels."""
+    import cv2
+
+    row, column = np.nonzero(mask)
+    corners = cv2.convexHull(np.stack([column, row], axis=1).astype(np.int32))
+    return cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), corners, 1)
+
+
+def _nearer(inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
+    """[H, W] bool: whether the nearest known pixel is inside."""
+    import cv2
+
+    to_inside, to_outside = (
+        cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) for mask in (inside, outside)
+    )
+    return to_inside <= to_outside
+
+
+def _box_around(mask: np.ndarray) -> tuple[int, int, int, int]:
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
+
+def _cut(photo: np.ndarray, start: np.ndarray, box: tuple[int, int, int, int]) -> np.ndarray:
+    """GrabCut in the box and a margin about it; outside of it nothing is the object."""
+    import cv2
+
+    height, width = start.shape
+    left, top, right, bottom = box
+    more = max(4, round(_MARGIN * max(right - left, bottom - top)))
+    rows = slice(max(top - more, 0), min(bottom + more, height))
+    columns = slice(max(left - more, 0), min(right + more, width))
+    part = np.ascontiguousarray(start[rows, columns])
+    mask = np.zeros((height, width), bool)
+    kinds = np.isin(part, (cv2.GC_FGD, cv2.GC_PR_FGD))
+    if kinds.all() or not kinds.any():  # GrabCut needs both
+        mask[rows, columns] = kinds
+        return mask
+    cv2.setRNGSeed(0)  # its mixture models start from k-means with OpenCV's own generator
+    background, foreground = np.zeros((1, 65)), np.zeros((1, 65))
+    image = np.ascontiguousarray(photo[rows, columns, ::-1])
+    cv2.grabCut(image, part, (0, 0, 1, 1), background, foreground, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
+    mask[rows, columns] = np.isin(part, (cv2.GC_FGD, cv2.GC_PR_FGD))
+    return mask

@@ -1,0 +1,80 @@
+"""Sources of masks that are images of ids already: any folder of them, and that of Gaussian Grouping."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from beags_plugin.data.files import list_images
+from beags_plugin.errors import UserError
+from beags_plugin.masks.classes import read_class_map, read_classes
+from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo
+from beags_plugin.rasterizers.interface import IGNORE
+
+
+@dataclass(frozen=True)
+class IdImagesSource(MaskSource):
+    """Images of ids, called <stem>.png: grey or palette; or of colours, each of which becomes an id.
+
+    folder: with the images. names: JSON {"id": "name"}, or None. colors: take colour images; black is the background,
+    other colours get ids 1, 2, ... in the order in which they first come. ignore_ids: ids that mean "not labelled".
+    least_views: ids in fewer images become background (0: all stay).
+    """
+
+    folder: Path = Path("masks")
+    names: Path | None = None
+    colors: bool = False
+    ignore_ids: tuple[int, ...] = ()
+    least_views: int = 0
+
+    def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
+        folder = scene.below(self.folder)
+        files = {path.stem: path for path in list_images(folder)}
+        if not any(photo.stem in files for photo in scene.photos):
+            raise UserError(f"{folder} holds no image named as one of the scene's: give options folder=...")
+        palette: dict[int, int] = {}
+        views: Counter[int] = Counter()
+        for photo in scene.photos:
+            if photo.stem in files:
+                found = np.unique(self._ids(files[photo.stem], palette))
+                views.update(int(i) for i in found if i not in (0, IGNORE))
+        kept = {i for i, count in views.items() if count >= self.least_views}
+        names = read_classes(None if self.names is None else scene.below(self.names), sorted(kept))
+        notes = [f"{len(views) - len(kept)} ids in fewer than {self.least_views} views became background."]
+
+        def read(photo: Photo) -> np.ndarray | None:
+            if photo.stem not in files:
+                return None
+            ids = self._ids(files[photo.stem], palette)
+            ids[~np.isin(ids, [*kept, 0, IGNORE])] = 0
+            return ids
+
+        return MadeMasks(names, per_photo(scene, progress, read), notes if len(kept) < len(views) else [])
+
+    def _ids(self, path: Path, palette: dict[int, int]) -> np.ndarray:
+        if not self.colors:
+            return read_class_map(path, self.ignore_ids)
+        from PIL import Image
+
+        with Image.open(path) as image:
+            pixels = np.asarray(image.convert("RGB")).astype(np.uint32)
+        packed = pixels[..., 0] << 16 | pixels[..., 1] << 8 | pixels[..., 2]
+        colors, inverse = np.unique(packed, return_inverse=True)
+        for color in colors.tolist():
+            if color and len(palette) >= IGNORE - 1:
+                raise UserError(f"{path} and those before it hold more than {IGNORE - 1} colours: it is no id image.")
+            if color:
+                palette.setdefault(color, len(palette) + 1)
+        ids = np.array([palette.get(color, 0) for color in colors.tolist()], np.uint16)
+        return ids[inverse.reshape(packed.shape)]
+
+
+@dataclass(frozen=True)
+class GaussianGroupingSource(IdImagesSource):
+    """The ``object_mask`` folder that Gaussian Grouping's tracker writes: grey ids, many in few views only."""
+
+    folder: Path = Path("object_mask")
+    least_views: int = 3

@@ -1,0 +1,94 @@
+"""Source of masks as LangSplat's preprocessing leaves them: segments of single views, matched by their features."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from beags_plugin.errors import UserError
+from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo
+from beags_plugin.rasterizers.interface import IGNORE
+
+LEVELS = ("default", "small", "medium", "large")
+
+
+@dataclass(frozen=True)
+class LangSplatSource(MaskSource):
+    """``language_features/<stem>_s.npy`` [4, H, W] (segments of four sizes, -1: none) and ``<stem>_f.npy`` [N, D].
+
+    Segments are numbered in each view anew, so they become one object across views if their features are alike.
+    folder: with the files. level: default, small, medium or large. similarity: least cosine of the angle between a
+    segment's features and the mean of the object's. least_views: objects in fewer views become background.
+    """
+
+    folder: Path = Path("language_features")
+    level: Literal["default", "small", "medium", "large"] = "large"
+    similarity: float = 0.85
+    least_views: int = 3
+
+    def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
+        folder = scene.below(self.folder)
+        having = [photo for photo in scene.photos if (folder / f"{photo.stem}_s.npy").is_file()]
+        if not having:
+            raise UserError(f"{folder} holds no <stem>_s.npy for an image of the scene: give options folder=...")
+        tables = self._objects(having, folder)
+        objects = sorted({int(i) for table in tables.values() for i in table.values()})
+        ids = {i: index for index, i in enumerate(objects, 1)}
+
+        def read(photo: Photo) -> np.ndarray | None:
+            if photo.stem not in tables:
+                return None
+            segments = self._segments(folder, photo.stem)
+            class_map = np.full(segments.shape, 0, np.uint16)
+            class_map[segments < 0] = IGNORE
+            for segment, found in tables[photo.stem].items():
+                class_map[segments == segment] = ids[found]
+            return class_map
+
+        names = {0: "background", **{index: f"object_{index}" for index in ids.values()}}
+        return MadeMasks(names, per_photo(scene, progress, read), [])
+
+    def _segments(self, folder: Path, stem: str) -> np.ndarray:
+        path = folder / f"{stem}_s.npy"
+        maps = np.load(path)
+        if maps.ndim != 3 or len(maps) != len(LEVELS):
+            raise UserError(f"{path} is {list(maps.shape)}, not [4, H, W]: give LangSplat's own files.")
+        return maps[LEVELS.index(self.level)].astype(np.int64)
+
+    def _objects(self, photos: list[Photo], folder: Path) -> dict[str, dict[int, int]]:
+        """Per stem, segment to object, without objects in few views."""
+        means: list[np.ndarray] = []  # sums of unit features
+        views: list[set[str]] = []
+        tables: dict[str, dict[int, int]] = {}
+        for photo in photos:
+            features = self._features(folder, photo.stem)
+            segments = np.unique(self._segments(folder, photo.stem))
+            tables[photo.stem] = {}
+            for segment in segments[segments >= 0].tolist():
+                if segment >= len(features):
+                    raise UserError(f"{folder / photo.stem}_f.npy has no row for segment {segment}: make it again.")
+                own = features[segment]
+                alike = [float(own @ mean) / float(np.linalg.norm(mean)) for mean in means]
+                best = int(np.argmax(alike)) if alike else -1
+                if best < 0 or alike[best] < self.similarity:
+                    best = len(means)
+                    means.append(np.zeros_like(own))
+                    views.append(set())
+                means[best] = means[best] + own
+                views[best].add(photo.stem)
+                tables[photo.stem][segment] = best
+        return {
+            stem: {segment: i for segment, i in table.items() if len(views[i]) >= self.least_views}
+            for stem, table in tables.items()
+        }
+
+    @staticmethod
+    def _features(folder: Path, stem: str) -> np.ndarray:
+        path = folder / f"{stem}_f.npy"
+        if not path.is_file():
+            raise UserError(f"{path} is missing: without features, segments of two views cannot be matched.")
+        features = np.load(path).astype(np.float64)
+        return features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-12)

@@ -1,0 +1,62 @@
+"""Source of masks that are one image per object and view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from beags_plugin.data.files import list_images
+from beags_plugin.errors import UserError
+from beags_plugin.masks.classes import read_binary_mask
+from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo, stacked
+
+
+@dataclass(frozen=True)
+class ObjectImagesSource(MaskSource):
+    """One image per object and view: <folder>/<object>/<stem>.png, or <folder>/<stem>/<object>.png.
+
+    folder: of them. Where masks overlap, the smaller object is seen. A view without any image has no mask.
+    """
+
+    folder: Path = Path("object_masks")
+
+    def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
+        folder = scene.below(self.folder)
+        stems = {photo.stem for photo in scene.photos}
+        found: dict[tuple[str, str], Path] = {}  # (object, stem)
+        for inner in sorted(path for path in folder.glob("*") if path.is_dir()):
+            for path in list_images(inner):
+                if path.stem in stems:
+                    found[inner.name, path.stem] = path
+                elif inner.name in stems:
+                    found[path.stem, inner.name] = path
+        if not found:
+            raise UserError(
+                f"{folder} holds neither <object>/<stem>.png nor <stem>/<object>.png for an image of the scene: "
+                "give options folder=..."
+            )
+        objects = sorted({name for name, _ in found})
+        ids = {name: index for index, name in enumerate(objects, 1)}
+
+        def read(photo: Photo) -> np.ndarray | None:
+            files = [(ids[name], found[name, photo.stem]) for name in objects if (name, photo.stem) in found]
+            return self._stack(files) if files else None
+
+        return MadeMasks(named_objects(objects), per_photo(scene, progress, read), [])
+
+    @staticmethod
+    def _stack(files: Sequence[tuple[int, Path]]) -> np.ndarray:
+        masks = [(class_id, read_binary_mask(path)) for class_id, path in files]
+        sizes = {mask.shape for _, mask in masks}
+        if len(sizes) > 1:
+            raise UserError(f"{files[0][1]} and the other objects' masks of this view differ in size: make them alike.")
+        height, width = sizes.pop()
+        return stacked(masks, (height, width))
+
+
+def named_objects(objects: Sequence[str]) -> dict[int, str]:
+    """Ids 1, 2, ... of objects in their order, and the background."""
+    return {0: "background", **dict(enumerate(objects, 1))}

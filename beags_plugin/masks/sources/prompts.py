@@ -1,0 +1,97 @@
+"""Prompts: where objects are in some views, in a small JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from beags_plugin.errors import UserError
+
+EXAMPLE = '{"objects": [{"name": "cup", "prompts": [{"view": "IMG_1", "box": [10, 20, 90, 80]}]}]}'
+
+
+@dataclass(frozen=True)
+class Prompt:
+    """What shows an object in one view.
+
+    box: (left, top, right, bottom) pixels of the image file, or None. points: (x, y) pixels; inside: of each point
+    whether it is on the object.
+    """
+
+    box: tuple[float, float, float, float] | None = None
+    points: tuple[tuple[float, float], ...] = ()
+    inside: tuple[bool, ...] = ()
+
+
+@dataclass(frozen=True)
+class PromptedObject:
+    """An object: its class id, its prompts by view (stem or file name), and a text for a detector, or None."""
+
+    class_id: int
+    name: str
+    prompts: Mapping[str, Prompt]
+    text: str | None = None
+
+
+def read_prompts(path: Path) -> list[PromptedObject]:
+    """The objects of a prompts JSON; raises ``UserError`` that names file and object.
+
+    {"objects": [{"name": ..., "id": optional, "text": optional, "prompts": [{"view": stem, "box": [left, top, right,
+    bottom], "points": [[x, y], ...], "outside": [[x, y], ...]}, ...]}, ...]}
+    """
+    try:
+        content = json.loads(path.read_text("utf8"))
+    except OSError as error:
+        raise UserError(f"the prompts {path} cannot be read ({error.strerror}): give options prompts=FILE.") from error
+    except ValueError as error:
+        raise UserError(f"the prompts {path} are no JSON ({error}): write e.g. {EXAMPLE}.") from error
+    entries = content.get("objects") if isinstance(content, dict) else None
+    if not isinstance(entries, list) or not entries:
+        raise UserError(f'the prompts {path} have no list "objects": write e.g. {EXAMPLE}.')
+    objects: list[PromptedObject] = []
+    for index, entry in enumerate(entries, 1):
+        try:
+            objects.append(_object(entry, index))
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(
+                f"object {index} of the prompts {path} is wrong ({error}): write e.g. {EXAMPLE}."
+            ) from error
+    for what, values in (("id", [o.class_id for o in objects]), ("name", [o.name for o in objects])):
+        if len(set(values)) < len(values):
+            raise UserError(f"two objects of the prompts {path} have the same {what}: change one of them.")
+    return objects
+
+
+def _object(entry: Any, index: int) -> PromptedObject:
+    name, text = str(entry["name"]), entry.get("text")
+    class_id = int(entry.get("id", index))
+    if not 1 <= class_id < 65535:
+        raise ValueError(f"id {class_id} is not in 1..65534")
+    prompts: dict[str, Prompt] = {}
+    for one in entry.get("prompts", []):
+        if str(one["view"]) in prompts:
+            raise ValueError(f"view {one['view']} comes twice")
+        prompts[str(one["view"])] = _prompt(one)
+    if not prompts and not text:
+        raise ValueError("it has neither prompts nor a text")
+    return PromptedObject(class_id, name, prompts, None if text is None else str(text))
+
+
+def _prompt(entry: Mapping[str, Any]) -> Prompt:
+    inside, outside = (_points(entry.get(key, [])) for key in ("points", "outside"))
+    box = None
+    if (given := entry.get("box")) is not None:
+        left, top, right, bottom = (float(value) for value in given)
+        if not (left < right and top < bottom):
+            raise ValueError(f"the box {given} is not [left, top, right, bottom]")
+        box = (left, top, right, bottom)
+    if box is None and not inside:
+        raise ValueError("a prompt needs a box or points on the object")
+    return Prompt(box, inside + outside, (True,) * len(inside) + (False,) * len(outside))
+
+
+def _points(given: Sequence[Any]) -> tuple[tuple[float, float], ...]:
+    return tuple((float(x), float(y)) for x, y in given)

@@ -1,0 +1,155 @@
+"""``beags masks make``: masks of a scene from a registered source, written as id images."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.data.files import image_size
+from beags_plugin.errors import UserError
+from beags_plugin.masks.classes import write_class_map
+from beags_plugin.masks.pictures import overlay
+from beags_plugin.masks.rims import snap_to_edges
+from beags_plugin.masks.sources import MASK_SOURCES
+from beags_plugin.masks.sources.base import MaskSource, Photo, SourceScene
+from beags_plugin.plugin.dataparser import BeagsDataParser, BeagsDataParserConfig
+from beags_plugin.plugin.evaluate import raster_settings
+from beags_plugin.plugin.extract import read_scene
+from beags_plugin.plugin.reprojected_run import ReprojectionOptions, data_of_run, mask_paths
+from beags_plugin.progress import progress_bar
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.drawing import geometry_inputs, surface_depth
+
+
+class RunGeometry:
+    """The shape that a trained run found, of its training views at the size of the photographs."""
+
+    def __init__(self, config_path: Path) -> None:
+        self.scene = read_scene(config_path)
+        self.manager = data_of_run(self.scene, config_path, ReprojectionOptions())
+        self.views = self.manager.views("train")
+        self.stems = [view.name for view in self.views]
+        self.cameras = [view.camera for view in self.views]
+        self.rasterizer = make_rasterizer(self.scene.config.model_config.rasterizer)
+        self.settings = raster_settings(self.scene)
+
+    @cached_property
+    def _surfels(self):
+        return geometry_inputs(self.scene.surfels())
+
+    def depth(self, view: int) -> Tensor:
+        """[h, w] float32."""
+        kind = self.scene.config.model_config.prepare.depth
+        with torch.no_grad():
+            drawn = self.rasterizer.rasterize(self._surfels, self.cameras[view], self.settings, torch.zeros(3))
+            return surface_depth(drawn, kind)
+
+    def to_straight(self, class_map: np.ndarray, view: int) -> np.ndarray:
+        return self.manager.straight_train_map(class_map, view)
+
+    def to_photo(self, class_map: np.ndarray, view: int) -> np.ndarray:
+        return self.manager.as_in_file(class_map, view)
+
+
+def configured_source(name: str, options: Sequence[str]) -> MaskSource:
+    """A registered source with options "key=value"; raises ``UserError`` for an unknown key or a wrong value."""
+    import tyro
+
+    kind: Any = MASK_SOURCES.get(name)
+    known = [field.name for field in fields(kind)]
+    arguments = []
+    for option in options:
+        key, equals, value = option.partition("=")
+        if key not in known or not equals:
+            raise UserError(f"the mask source {name} has no option {option!r}: give {', '.join(known)} as key=value.")
+        if isinstance(getattr(kind, key, None), bool):
+            if value not in ("true", "false"):
+                raise UserError(f"the option {option!r} must be true or false.")
+            arguments.append(f"--{'' if value == 'true' else 'no-'}{key.replace('_', '-')}")
+        else:
+            arguments += [f"--{key.replace('_', '-')}", *value.split(",")]
+    try:
+        source: MaskSource = tyro.cli(kind, args=arguments, console_outputs=False)
+    except SystemExit:
+        raise UserError(f"the options {' '.join(options)} of the mask source {name} have a wrong value.") from None
+    if reason := source.unavailable():
+        raise UserError(f"the mask source {name} cannot run: {reason}")
+    return source
+
+
+def make_masks(
+    data: BeagsDataParserConfig,
+    source: MaskSource,
+    run: Path | None = None,
+    output: Path | None = None,
+    overwrite: bool = False,
+    snap: int = 0,
+) -> list[str]:
+    """Write the masks of a scene: <output>/masks/<stem>.png, classes.json and made.png, a picture of them.
+
+    data: names the scene. run: config.yml of a run trained on it, for sources that need its depth. output: the scene's
+    own folder if None, where ``beags-data`` looks for them. overwrite: replace masks that are there. snap: radius in
+    pixels of ``rims.snap_to_edges``, 0 leaves rims as they are.
+    Returns lines that tell what was written. Raises ``UserError`` before anything is written, or for bad input.
+    """
+    parser: BeagsDataParser = data.setup()
+    scene, views = parser.posed_views()
+    folder = output or scene.root
+    masks = folder / "masks"
+    if not overwrite and (any(masks.rglob("*.png")) or (folder / "classes.json").exists()):
+        raise UserError(f"{folder} has masks or a classes.json already: add --overwrite, or give another --output.")
+    if source.needs_run and run is None:
+        raise UserError(
+            "this mask source needs the scene's depth: train beags-base, then add --load-config <run>/config.yml."
+        )
+    trained = set(parser.training_views(views))
+    sizes = [image_size(path) for path in views.images]
+    photos = [
+        Photo(path.stem, path, *size, trained=index in trained)
+        for index, (path, size) in enumerate(zip(views.images, sizes, strict=True))
+    ]
+    made_of = SourceScene(scene.root, photos, RunGeometry(run) if run is not None and source.needs_run else None)
+    written, shares, shown = 0, [], []
+    with progress_bar("Making masks") as progress:
+        made = source.make(made_of, progress)
+        for index, (path, class_map) in enumerate(zip(mask_paths(views.images), made.maps, strict=True)):
+            if class_map is None:
+                continue
+            if snap:
+                class_map = snap_to_edges(class_map, photos[index].pixels(), snap)
+            (masks / path).parent.mkdir(parents=True, exist_ok=True)
+            write_class_map(masks / path, class_map)
+            written += 1
+            shares.append(float((class_map != 0).mean()))
+            shown.append((photos[index], masks / path))
+    if not written:
+        raise UserError("the mask source gave no mask for any view: check its options.")
+    names = {str(i): name for i, name in sorted(made.names.items())}
+    (folder / "classes.json").write_text(json.dumps(names, indent=1), "utf8")
+    _picture(folder / "made.png", shown)
+    return [
+        *made.notes,
+        f"{written} masks of {len(photos)} views, {len(names) - 1} objects, which cover {100 * np.mean(shares):.1f} % "
+        f"on average: {masks}",
+        f"names: {folder / 'classes.json'}; look at {folder / 'made.png'}",
+    ]
+
+
+def _picture(path: Path, shown: Sequence[tuple[Photo, Path]], most: int = 24) -> None:
+    from beags_plugin.evaluation.cells import below, cell, wrapped, write_picture
+    from beags_plugin.masks.classes import read_class_map
+
+    step = -(-len(shown) // most)
+    cells = []
+    for photo, mask in shown[::step]:
+        size = (260, max(1, round(260 * photo.height / photo.width)))
+        cells.append([cell(overlay(photo.pixels(), read_class_map(mask)), size, photo.stem)])
+    write_picture(path, below(wrapped(cells, 1100)))

@@ -1,0 +1,191 @@
+"""Masks reprojected with the depth of a trained run: ``beags masks reproject``."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+import torch
+
+from beags_plugin.errors import UserError
+from beags_plugin.masks.classes import write_class_map
+from beags_plugin.masks.label_maps import LabelMaps
+from beags_plugin.masks.pictures import Changed, before_and_after
+from beags_plugin.plugin.evaluate import raster_settings
+from beags_plugin.plugin.extract import read_scene
+from beags_plugin.progress import progress_bar
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.refiners.consistent_masks import reprojected_masks
+from beags_plugin.refiners.preparation import known_classes
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.datamanager import BeagsDataManager
+    from beags_plugin.plugin.dataparser import BeagsDataParserConfig
+    from beags_plugin.plugin.extract import SavedScene
+
+
+@dataclass(frozen=True)
+class ReprojectionOptions:
+    """What may differ from how the run itself prepares masks; None keeps its choice.
+
+    masks: folder of other id images. classes: their classes.json. method, tau, voters, depth: see
+    ``refiners.preparation.PreparationConfig``. run_size: reproject at the size that was trained on, not at that of the
+    photographs.
+    """
+
+    masks: Path | None = None
+    classes: Path | None = None
+    method: str | None = None
+    tau: float | None = None
+    voters: int | None = None
+    depth: str | None = None
+    run_size: bool = False
+
+
+@dataclass(frozen=True)
+class ReprojectedRun:
+    """The masks of V training views before and after, without lens distortion.
+
+    given, voted: class ids; given is None where a view has no mask. confidence: [H, W] uint8, share of the votes
+    times 255. seconds: wall time.
+    """
+
+    scene: SavedScene
+    manager: BeagsDataManager
+    names: list[str]
+    classes: dict[int, str]
+    given: LabelMaps
+    voted: LabelMaps
+    confidence: list[torch.Tensor]
+    seconds: float
+
+    def changed(self, view: int) -> Changed:
+        """One view for a picture."""
+        given = self.given[view]
+        photo = self.manager.views("train")[view].image
+        return Changed(
+            self.names[view],
+            (255.0 * photo + 0.5).to(torch.uint8).numpy(),
+            None if given is None else given.numpy(),
+            self.voted[view].numpy(),
+            self.confidence[view].numpy(),
+        )
+
+
+def reproject_run(config_path: Path, options: ReprojectionOptions) -> ReprojectedRun:
+    """Reproject masks with the depth of a run, trained with or without masks.
+
+    config_path: config.yml of any run. Raises ``UserError`` for a run, data or an option that cannot be used, and if no
+    view has a mask.
+    """
+    scene = read_scene(config_path)
+    manager = data_of_run(scene, config_path, options)
+    own = {"reprojection": options.method, "tau": options.tau, "voters": options.voters, "depth": options.depth}
+    config = replace(scene.config.model_config.prepare, **{k: v for k, v in own.items() if v is not None})
+    if config.reprojection == "none":
+        config = replace(config, reprojection="voxel")
+    config = replace(config, min_confidence=0.0)
+    config.check()
+    start = time.perf_counter()
+    views = manager.views("train")
+    given = LabelMaps(view.stored_labels for view in views)
+    if all(mask is None for mask in given.stored):
+        raise UserError(f"no training view of {scene.config.data_path} has a mask: give --masks-path, or make some.")
+    classes = manager.train_dataset.metadata["classes"]
+    masks = reprojected_masks(
+        scene.surfels().detach(),
+        [view.camera for view in views],
+        given,
+        known_classes(given, classes),
+        make_rasterizer(scene.config.model_config.rasterizer),
+        raster_settings(scene),
+        config,
+        progress_bar,
+    )
+    assert masks.confidence is not None
+    names = [view.name for view in views]
+    seconds = time.perf_counter() - start
+    return ReprojectedRun(scene, manager, names, classes, given, masks.labels, masks.confidence, seconds)
+
+
+def data_of_run(scene: SavedScene, config_path: Path, options: ReprojectionOptions) -> BeagsDataManager:
+    """The data that a run was trained on, at the size and with the masks that ``options`` name."""
+    config = scene.config
+    if not config.data_path.exists():
+        raise UserError(f"{config_path} was trained on {config.data_path}, which is gone: put it back.")
+    parser = cast("BeagsDataParserConfig", replace(config.data_config.dataparser, data=config.data_path))
+    if options.masks is not None:
+        if not options.masks.is_dir():
+            raise UserError(f"the folder of masks {options.masks} does not exist: correct --masks-path.")
+        parser.masks_path = options.masks.absolute()
+        beside = options.masks.absolute().parent / "classes.json"
+        classes = options.classes or (beside if beside.is_file() else None)
+        parser.classes_path = parser.classes_path if classes is None else classes.absolute()
+    data = replace(config.data_config, dataparser=parser)
+    if not options.run_size:
+        parser.downscale_factor, data.camera_res_scale_factor = 1.0, 1.0
+    manager = data.setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
+    return cast("BeagsDataManager", manager)
+
+
+def write_reprojection(found: ReprojectedRun, output: Path, min_confidence: float = 0.0, shown: int = 6) -> list[str]:
+    """Write refined masks, confidence maps, a report and a picture of the views that changed most; what was written.
+
+    Masks are of the size of the photographs, lens distortion included, so that ``beags-data --masks-path`` takes them
+    (at the run's own size if that was asked for). min_confidence: less certain pixels become IGNORE.
+    """
+    import cv2
+
+    changes = []
+    for index, path in enumerate(mask_paths(found.manager.train_dataset.image_filenames)):
+        voted = found.voted[index].numpy().astype(np.uint16)
+        confidence = found.confidence[index].numpy()
+        doubtful = (confidence < 255.0 * min_confidence) if min_confidence > 0 else np.zeros(voted.shape, bool)
+        final = np.where(doubtful, np.uint16(IGNORE), voted)
+        for folder in ("masks", "confidence"):
+            (output / folder / path).parent.mkdir(parents=True, exist_ok=True)
+        write_class_map(output / "masks" / path, found.manager.as_in_file(final, index))
+        cv2.imwrite(str(output / "confidence" / path), confidence)
+        changes.append(_change(found, index, doubtful))
+    (output / "classes.json").write_text(json.dumps({str(i): name for i, name in found.classes.items()}, indent=1))
+    report = {"seconds": found.seconds, "min_confidence": min_confidence, "views": changes}
+    (output / "report.json").write_text(json.dumps(report, indent=1))
+    order = sorted(range(len(changes)), key=lambda index: -changes[index]["changed"])[:shown]
+    before_and_after(output / "before_after.png", [found.changed(index) for index in order])
+    pixels, changed = (sum(view[key] for view in changes) for key in ("labelled", "changed"))
+    filled = sum(mask is None for mask in found.given.stored)
+    return [
+        f"{changed} of {pixels} labelled pixels changed ({100 * changed / max(pixels, 1):.2f} %), "
+        f"{filled} views without a mask got one, in {found.seconds:.1f} s",
+        *(f"{output / name}" for name in ("masks", "confidence", "classes.json", "report.json", "before_after.png")),
+    ]
+
+
+def _change(found: ReprojectedRun, index: int, doubtful: np.ndarray) -> dict[str, object]:
+    given, voted = found.given[index], found.voted[index]
+    known = None if given is None else given != IGNORE
+    confidence = found.confidence[index].float() / 255.0
+    return {
+        "view": found.names[index],
+        "labelled": 0 if known is None else int(known.sum()),
+        "changed": 0 if known is None else int((known & (given != voted)).sum()),
+        "mean_confidence": round(float(confidence.mean()), 4),
+        "doubtful": int(doubtful.sum()),
+    }
+
+
+def mask_paths(images: Sequence[Path]) -> list[Path]:
+    """Where the masks of images go below their folder, so that ``data.files.files_of_views`` finds them again."""
+    stems = Counter(image.stem for image in images)
+    if len(images) == 1 or max(stems.values()) == 1:
+        return [Path(f"{image.stem}.png") for image in images]
+    root = Path(os.path.commonpath([image.parent for image in images]))
+    return [image.relative_to(root).with_suffix(".png") for image in images]

@@ -1,0 +1,88 @@
+"""What checking and snapping masks does: python -m benchmarks.masks swaps|rims SCENE [SCENE ...].
+
+swaps: exchanges ids in some views of scenes with good masks and counts how many of these views the check names, and how
+many others. rims: makes the rims of exact masks ragged, snaps them to edges of the photo, and compares both with the
+exact ones.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+SHARES = (0.02, 0.1, 0.2, 0.3)  # of the views whose ids are exchanged
+SEEDS = 5
+RAGGED = (0.002, 0.004, 0.009)  # of the image diagonal
+RADII = (2, 4, 8)
+MOST_VIEWS = 12
+
+
+def swaps(data: Path) -> None:
+    """Exchange two objects (or the only one and the background) in some views, and look for it."""
+    from beags_plugin.masks.check.consistency import LEAST_POINTS, Agreement
+    from beags_plugin.plugin.masks_check import agreement_of, data_options
+
+    labels, classes = agreement_of(data_options(data))
+    usable = [view for view in range(labels.shape[1]) if (labels[:, view] >= 0).any()]
+    print(f"{data.name}: without an exchange {len(Agreement(labels, classes).renamed())} views named", flush=True)
+    for share in SHARES:
+        planted = found = false = 0
+        for seed in range(SEEDS):
+            generator = np.random.default_rng(seed)
+            changed, table = {}, labels.copy()
+            for view in generator.choice(usable, max(1, round(share * len(usable))), replace=False):
+                column = table[:, view]
+                shown = [c for c in range(1, classes) if (column == c).sum() >= LEAST_POINTS] if classes > 2 else [0, 1]
+                if len(shown) < 2:
+                    continue
+                first, second = (int(c) for c in generator.choice(shown, 2, replace=False))
+                table[:, view] = np.select([column == first, column == second], [second, first], column)
+                changed[int(view)] = {first, second}
+            named: dict[int, set[int]] = {}
+            for renamed in Agreement(table, classes).renamed():
+                named.setdefault(renamed.view, set()).update(renamed.instead)
+            planted += len(changed)
+            found += sum(pair <= named.get(view, set()) for view, pair in changed.items())
+            false += len(named.keys() - changed.keys())
+        print(f"  ids exchanged in {100 * share:.0f} % of the views: {found} of {planted} found, {false} others named")
+
+
+def rims(data: Path) -> None:
+    """IoU and BIoU of ragged and of snapped masks, mean over objects and views."""
+    from beags_plugin.evaluation.metrics import mask_metrics, mean_metrics
+    from beags_plugin.masks.classes import read_class_map
+    from beags_plugin.masks.rims import snap_to_edges
+    from beags_plugin.sample.degrade import rim_amplitude, roughen_rims
+
+    folder = data / "ground_truth/masks" if (data / "ground_truth/masks").is_dir() else data / "masks"
+    photos = {path.stem: path for path in (data / "images").iterdir()}
+    files = sorted(path for path in folder.glob("*.png") if path.stem in photos)
+    files = files[:: -(-len(files) // MOST_VIEWS)]
+    for strength in RAGGED:
+        rows: dict[str, list] = {name: [] for name in ("ragged", *(f"snapped, radius {r}" for r in RADII))}
+        for path in files:
+            exact, photo = read_class_map(path), read_photo(photos[path.stem])
+            ragged = roughen_rims(exact, rim_amplitude(strength, *exact.shape), 0, path.stem)
+            variants = {"ragged": ragged} | {f"snapped, radius {r}": snap_to_edges(ragged, photo, r) for r in RADII}
+            for name, mask in variants.items():
+                ids = [int(i) for i in np.unique(exact) if 0 < i < 65535]
+                rows[name] += [mask_metrics(mask == i, exact == i) for i in ids]
+        print(f"{data.name}: rims moved by up to {strength} of the diagonal, {len(files)} views")
+        for name, found in rows.items():
+            mean = mean_metrics(found)
+            print(f"  {name:20s} IoU {100 * mean.iou:.2f}  BIoU {100 * mean.biou:.2f}", flush=True)
+
+
+def read_photo(path: Path) -> np.ndarray:
+    """[H, W, 3] uint8."""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+if __name__ == "__main__":
+    for scene in sys.argv[2:]:
+        {"swaps": swaps, "rims": rims}[sys.argv[1]](Path(scene).absolute())

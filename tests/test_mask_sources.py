@@ -1,0 +1,328 @@
+"""Mask sources: each file format gives the map that it was written from; bad input is told in one sentence."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from data_folders import HEIGHT, WIDTH, write_image, write_transforms
+from run_folders import write_scene, write_trained
+
+from beags_plugin.cli import main
+from beags_plugin.core.cameras import Camera
+from beags_plugin.errors import UserError
+from beags_plugin.masks.classes import read_class_map
+from beags_plugin.masks.rims import snap_to_edges
+from beags_plugin.masks.sources import MASK_SOURCES
+from beags_plugin.masks.sources.base import MadeMasks, Photo, SourceScene
+from beags_plugin.masks.sources.coco import CocoSource, decoded
+from beags_plugin.masks.sources.grabcut import GrabCutSource, carry, cut_by_box
+from beags_plugin.masks.sources.id_images import GaussianGroupingSource, IdImagesSource
+from beags_plugin.masks.sources.langsplat import LangSplatSource
+from beags_plugin.masks.sources.object_images import ObjectImagesSource
+from beags_plugin.masks.sources.prompts import Prompt, read_prompts
+from beags_plugin.rasterizers.interface import IGNORE
+
+
+def scene_of(root: Path, count: int = 4) -> SourceScene:
+    photos = []
+    for index in range(count):
+        path = root / f"images/v{index}.png"
+        write_image(path, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+        photos.append(Photo(path.stem, path, WIDTH, HEIGHT))
+    return SourceScene(root, photos)
+
+
+def truth(index: int) -> np.ndarray:
+    ids = np.zeros((HEIGHT, WIDTH), np.uint8)
+    ids[2:8, 1 + index : 7 + index], ids[5:11, 10:16] = 1, 2
+    return ids
+
+
+def maps_of(made: MadeMasks) -> list[np.ndarray | None]:
+    return list(made.maps)
+
+
+def make(source, scene) -> tuple[dict[int, str], list[np.ndarray | None]]:
+    made = source.make(scene, lambda done, total: None)
+    return dict(made.names), maps_of(made)
+
+
+def test_every_source_can_be_named_without_its_library():
+    assert set(MASK_SOURCES.names()) >= {
+        "coco", "gaussian-grouping", "grabcut", "id-images", "langsplat", "object-images", "sam2",
+    }  # fmt: skip
+    for name in MASK_SOURCES.names():
+        kind = MASK_SOURCES.get(name)
+        assert kind().unavailable() is None or "pip install" in kind().unavailable()
+
+
+def test_id_images_and_colours_and_rare_ids(tmp_path):
+    scene = scene_of(tmp_path)
+    colors = np.array([(0, 0, 0), (250, 10, 10), (10, 250, 10)], np.uint8)
+    for index in range(3):
+        ids = truth(index)
+        if index == 0:
+            ids[0, 0] = 77
+        write_image(tmp_path / f"masks/v{index}.png", ids)
+        write_image(tmp_path / f"painted/v{index}.png", colors[truth(index)])
+    (tmp_path / "n.json").write_text('{"1": "cup", "2": "box"}')
+    names, maps = make(IdImagesSource(names=Path("n.json")), scene)
+    assert names == {0: "background", 1: "cup", 2: "box", 77: "class_77"} and maps[3] is None
+    assert maps[0] is not None and maps[0][0, 0] == 77
+    names, maps = make(IdImagesSource(least_views=2), scene)
+    assert 77 not in names and all(np.array_equal(maps[i], truth(i)) for i in range(3))
+    names, maps = make(IdImagesSource(folder=Path("painted"), colors=True), scene)
+    assert len(names) == 3
+    for index in range(3):
+        found, exact = maps[index], truth(index)
+        assert found is not None
+        pairs = set(zip(found.ravel().tolist(), exact.ravel().tolist(), strict=True))
+        assert len(pairs) == 3 and (0, 0) in pairs  # one id for each colour, in all views
+    assert {p for i in range(3) for p in zip(maps[i].ravel().tolist(), truth(i).ravel().tolist())} == pairs  # noqa: B905
+    with pytest.raises(UserError, match="holds no image named as one"):
+        make(GaussianGroupingSource(), scene)
+
+
+def test_one_image_per_object_in_either_order(tmp_path):
+    scene = scene_of(tmp_path)
+    for index in range(2):
+        cup = np.uint8(255) * (truth(index) > 0)  # the cup's mask covers the box's: the smaller is seen
+        box = np.uint8(255) * (truth(index) == 2)
+        for first, second, mask in (("cup", f"v{index}", cup), ("box", f"v{index}", box)):
+            write_image(tmp_path / f"a/{first}/{second}.png", mask)
+            write_image(tmp_path / f"b/{second}/{first}.png", mask)
+    for folder in ("a", "b"):
+        names, maps = make(ObjectImagesSource(Path(folder)), scene)
+        assert names == {0: "background", 1: "box", 2: "cup"} and maps[2:] == [None, None]
+        for index in range(2):
+            np.testing.assert_array_equal(maps[index], np.array([0, 2, 1])[truth(index)])
+
+
+def runs(mask: np.ndarray) -> list[int]:
+    """Uncompressed COCO run lengths: column by column, zeros first."""
+    flat = mask.T.ravel().astype(int)
+    edges = np.flatnonzero(np.diff(flat)) + 1
+    lengths = np.diff(np.concatenate([[0], edges, [len(flat)]])).tolist()
+    return lengths if flat[0] == 0 else [0, *lengths]
+
+
+def test_coco_run_lengths_polygons_and_instances(tmp_path):
+    from pycocotools import mask as library
+
+    scene = scene_of(tmp_path)
+    annotations = []
+    for index in range(2):
+        first, second = truth(index) == 1, truth(index) == 2
+        packed = library.encode(np.asfortranarray(second.astype(np.uint8)))
+        for track, counts in ((1, runs(first)), (2, packed["counts"].decode())):
+            segmentation = {"size": [HEIGHT, WIDTH], "counts": counts}
+            annotations.append({"image_id": index, "category_id": 5, "track_id": track, "segmentation": segmentation})
+    content = {
+        "images": [{"id": i, "file_name": f"some/v{i}.png"} for i in range(3)],
+        "categories": [{"id": 5, "name": "thing"}],
+        "annotations": annotations,
+    }
+    (tmp_path / "annotations.json").write_text(json.dumps(content))
+    names, maps = make(CocoSource(by="instance"), scene)
+    assert names == {0: "background", 1: "thing_1", 2: "thing_2"}
+    assert all(np.array_equal(maps[i], truth(i)) for i in range(2))
+    assert maps[2] is not None and not maps[2].any() and maps[3] is None  # no object in v2; v3 is not annotated
+    names, maps = make(CocoSource(), scene)
+    assert names == {0: "background", 1: "thing"} and np.array_equal(maps[0], truth(0) > 0)
+    square = decoded([[2, 3, 8, 3, 8, 9, 2, 9]], (HEIGHT, WIDTH), "x")
+    assert square[3:9, 2:8].all() and square.sum() == 36
+    for wrong, message in (
+        ({"size": [3, 3], "counts": [9]}, "is 3x3 pixels but its image is 20x12"),
+        ({"size": [HEIGHT, WIDTH], "counts": [3]}, "neither RLE nor polygons"),
+        (None, "neither RLE nor polygons"),
+    ):
+        with pytest.raises(UserError, match=message):
+            decoded(wrong, (HEIGHT, WIDTH), "file")
+
+
+def test_langsplat_segments_are_matched_by_features(tmp_path):
+    scene = scene_of(tmp_path)
+    generator = np.random.default_rng(0)
+    features = np.eye(8)[:3]
+    for index in range(3):
+        order = generator.permutation(3)  # segments are numbered anew in each view
+        maps = np.full((4, HEIGHT, WIDTH), -1)
+        for exact in (1, 2):
+            maps[3][truth(index) == exact] = int(np.flatnonzero(order == exact)[0])
+        rows = features[order] + 0.02 * generator.normal(size=(3, 8))
+        (tmp_path / "language_features").mkdir(exist_ok=True)
+        np.save(tmp_path / f"language_features/v{index}_s.npy", maps)
+        np.save(tmp_path / f"language_features/v{index}_f.npy", rows)
+    names, maps = make(LangSplatSource(), scene)
+    assert len(names) == 3 and maps[3] is None
+    pairs = {p for i in range(3) for p in zip(maps[i].ravel().tolist(), truth(i).ravel().tolist(), strict=True)}
+    assert len(pairs) == 3 and (IGNORE, 0) in pairs
+    (tmp_path / "language_features/v1_f.npy").unlink()
+    with pytest.raises(UserError, match="segments of two views cannot be matched"):
+        make(LangSplatSource(), scene)
+
+
+def test_prompts_are_read_and_mistakes_told(tmp_path):
+    path = tmp_path / "prompts.json"
+    entry = {"name": "cup", "id": 4, "text": "a cup", "prompts": [
+        {"view": "v1", "box": [1, 2, 5, 6], "points": [[2, 3]], "outside": [[9, 9], [8, 8]]}]}  # fmt: skip
+    path.write_text(json.dumps({"objects": [entry, {"name": "box", "text": "a box"}]}))
+    cup, box = read_prompts(path)
+    assert (cup.class_id, cup.name, cup.text) == (4, "cup", "a cup") and (box.class_id, box.prompts) == (2, {})
+    assert cup.prompts["v1"] == Prompt((1, 2, 5, 6), ((2, 3), (9, 9), (8, 8)), (True, False, False))
+    for wrong, message in (
+        ({"objects": []}, 'no list "objects"'),
+        ({"objects": [{"prompts": []}]}, "object 1 .* is wrong"),
+        ({"objects": [{"name": "a"}]}, "neither prompts nor a text"),
+        ({"objects": [{"name": "a", "prompts": [{"view": "v", "box": [5, 0, 1, 1]}]}]}, "left, top, right, bottom"),
+        ({"objects": [entry, {**entry, "name": "other"}]}, "the same id"),
+        ({"objects": [{**entry, "id": 70000}]}, "not in 1..65534"),
+    ):
+        path.write_text(json.dumps(wrong))
+        with pytest.raises(UserError, match=message):
+            read_prompts(path)
+
+
+def coloured(width: int = 90, height: int = 70, left: int = 30) -> tuple[np.ndarray, np.ndarray]:
+    """A photo of a red disc on a textured grey ground, and the disc's mask."""
+    generator = np.random.default_rng(left)
+    row, column = np.mgrid[:height, :width] + 0.5
+    disc = (row - 35) ** 2 + (column - left) ** 2 < 15**2
+    photo = np.where(disc[..., None], (190, 50, 40), (110, 120, 115)) + generator.integers(-12, 12, (height, width, 3))
+    return photo.astype(np.uint8), disc
+
+
+def test_grabcut_finds_the_object_in_its_box_and_repeats_itself():
+    photo, disc = coloured()
+    prompt = Prompt((12, 17, 48, 53))
+    found = cut_by_box(photo, prompt)
+    assert (found & disc).sum() / (found | disc).sum() > 0.95
+    np.testing.assert_array_equal(found, cut_by_box(photo, prompt))
+    with pytest.raises(UserError, match="outside its image"):
+        cut_by_box(photo, Prompt((200, 10, 220, 30)))
+
+
+class Wall:
+    """Three cameras side by side before a wall at depth 2: what one sees at x another sees ``shift`` pixels farther."""
+
+    def __init__(self, root: Path, known: int = 3) -> None:
+        self.photos, self.discs = [], []
+        for index in range(3):
+            photo, disc = coloured(left=30 + 10 * index)
+            path = root / f"images/v{index}.png"
+            write_image(path, photo)
+            self.photos.append(Photo(path.stem, path, 90, 70))
+            self.discs.append(disc)
+        self.stems = [photo.stem for photo in self.photos[:known]]
+        K = torch.tensor([[100.0, 0, 45], [0, 100.0, 35], [0, 0, 1]])
+        self.cameras = []
+        for index in range(known):
+            viewmat = torch.eye(4)
+            viewmat[0, 3] = 0.2 * index  # 10 pixels at depth 2
+            self.cameras.append(Camera(viewmat, K, 90, 70))
+
+    def depth(self, view: int) -> torch.Tensor:
+        return torch.full((70, 90), 2.0)
+
+    def to_straight(self, class_map: np.ndarray, view: int) -> np.ndarray:
+        return class_map
+
+    def to_photo(self, class_map: np.ndarray, view: int) -> np.ndarray:
+        return class_map
+
+
+def test_labels_are_carried_by_depth(tmp_path):
+    wall = Wall(tmp_path)
+    given = (7 * wall.discs[0]).astype(np.uint16)
+    for index, (labels, sure) in enumerate(carry(wall, [given, None, None], [7], 0.02)):
+        known = labels != IGNORE
+        np.testing.assert_array_equal((labels == 7)[known], wall.discs[index][known])
+        assert known[:, 10 * index :].all() and not known[:, : 10 * index].any() and sure[known].all()
+
+
+def test_grabcut_fills_the_other_views(tmp_path):
+    wall = Wall(tmp_path)
+    prompts = {"objects": [{"name": "disc", "id": 7, "prompts": [{"view": "v0", "box": [12, 17, 48, 53]}]}]}
+    (tmp_path / "prompts.json").write_text(json.dumps(prompts))
+    names, maps = make(GrabCutSource(), SourceScene(tmp_path, wall.photos, wall))
+    assert names == {0: "background", 7: "disc"}
+    for disc, class_map in zip(wall.discs, maps, strict=True):
+        assert class_map is not None and set(np.unique(class_map)) == {0, 7}
+        found = class_map == 7
+        assert (found & disc).sum() / (found | disc).sum() > 0.95
+    held_out = SourceScene(tmp_path, wall.photos, Wall(tmp_path, known=2))
+    prompts["objects"][0]["prompts"][0]["view"] = "v2"
+    (tmp_path / "prompts.json").write_text(json.dumps(prompts))
+    with pytest.raises(UserError, match="prompts in v2, which is held out"):
+        make(GrabCutSource(), held_out)
+
+
+def test_rims_snap_to_the_edge_of_the_photo():
+    photo, disc = coloured()
+    exact = disc.astype(np.uint16)
+    ragged = exact.copy()
+    row, column = np.mgrid[:70, :90]
+    bumps = (row // 4 + column // 4) % 2 == 0
+    from scipy import ndimage
+
+    ragged[ndimage.binary_dilation(disc, iterations=2) & bumps] = 1
+    ragged[0, 0] = IGNORE
+    snapped = snap_to_edges(ragged, photo, 4)
+    assert snapped[0, 0] == IGNORE
+    snapped[0, 0] = 0
+    assert (snapped != exact).sum() < 0.4 * (ragged != exact).sum()
+    far = ndimage.distance_transform_edt(~(ndimage.binary_dilation(disc, iterations=3) & ~ndimage.binary_erosion(disc)))
+    assert not ((snapped != ragged) & (far > 8))[5:].any()
+    np.testing.assert_array_equal(snap_to_edges(ragged, photo, 0), ragged)
+
+
+def test_the_command_writes_masks_that_training_finds(tmp_path, capsys):
+    from beags_plugin.plugin.dataparser import BeagsDataParserConfig
+
+    write_transforms(tmp_path)
+    for index in range(9):
+        write_image(tmp_path / f"objects/cup/v{index:02d}.png", np.uint8(255) * (truth(0) == 1))
+    arguments = ["masks", "make", "--data", str(tmp_path), "--source", "object-images", "--options", "folder=objects"]
+    main(arguments)
+    out = capsys.readouterr().out
+    assert "9 masks of 9 views, 1 objects" in out and (tmp_path / "made.png").exists()
+    metadata = BeagsDataParserConfig(data=tmp_path).setup().get_dataparser_outputs("train").metadata
+    assert metadata["classes"] == {0: "background", 1: "cup"} and all(metadata["class_map_filenames"])
+    np.testing.assert_array_equal(read_class_map(tmp_path / "masks/v03.png"), truth(0) == 1)
+    for wrong, message in (
+        (arguments, "has masks or a classes.json already"),
+        ([*arguments[:5], "nothing"], "there is no mask source 'nothing'"),
+        ([*arguments[:-1], "color=red"], "has no option 'color=red'"),
+        ([*arguments[:5], "grabcut", "--overwrite"], "needs the scene's depth"),
+    ):
+        with pytest.raises(SystemExit):
+            main(wrong)
+        assert message in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("lens", [{}, {"k1": -0.12, "k2": 0.02}])
+def test_reprojection_of_a_run_writes_masks_of_the_photos_size(tmp_path, lens):
+    data = write_scene(tmp_path / "scene")
+    if lens:
+        meta = json.loads((data / "transforms.json").read_text())
+        (data / "transforms.json").write_text(json.dumps({**meta, **lens}))
+    config = write_trained(tmp_path / "run", data)
+    main(
+        ["masks", "reproject", "--load-config", str(config), "--method", "pairwise", "--output", str(tmp_path / "out")]
+    )
+    masks = sorted((tmp_path / "out/masks").glob("*.png"))
+    assert [path.stem for path in masks] == [f"v{index:02d}" for index in range(1, 8)]
+    assert all(read_class_map(path).shape == (HEIGHT, WIDTH) for path in masks)
+    assert (tmp_path / "out/before_after.png").exists() and (tmp_path / "out/confidence/v01.png").exists()
+    report = json.loads((tmp_path / "out/report.json").read_text())
+    before = read_class_map(data / "masks/v01.png")
+    after = read_class_map(masks[0])
+    if not lens:
+        assert report["views"][0]["changed"] == int((before != after).sum())
+    main(["masks", "check", "--load-config", str(config), "--masks-path", str(tmp_path / "out/masks"),
+          "--output", str(tmp_path / "check")])  # fmt: skip
+    assert (tmp_path / "check/report.json").exists()

@@ -1,0 +1,198 @@
+"""What a check of masks finds: each planted mistake, and nothing in masks without one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from data_folders import look_at, write_image, write_transforms
+
+from beags_plugin.cli import main
+from beags_plugin.masks.check.areas import contradicted
+from beags_plugin.masks.check.consistency import UNSEEN, Agreement, labels_at, ranks_of
+from beags_plugin.masks.check.findings import named, percent
+from beags_plugin.masks.pictures import coverage_picture
+from beags_plugin.rasterizers.interface import IGNORE
+
+VIEWS, SIDE = 12, 48
+BALLS = {1: ((-0.6, 0.0, 0.0), 0.4), 2: ((0.6, 0.1, 0.0), 0.4), 3: ((0.0, 0.7, 0.3), 0.3)}
+FOCAL = 60.0
+
+
+def poses() -> list[np.ndarray]:
+    angles = 2 * np.pi * np.arange(VIEWS) / VIEWS
+    return [look_at((4 * np.cos(a), 4 * np.sin(a), 1.5)) for a in angles]
+
+
+def draw(pose: np.ndarray) -> np.ndarray:
+    """[SIDE, SIDE] uint8 ids of the nearest ball along each pixel's ray."""
+    row, column = np.mgrid[:SIDE, :SIDE] + 0.5
+    local = np.stack([(column - SIDE / 2) / FOCAL, -(row - SIDE / 2) / FOCAL, -np.ones((SIDE, SIDE))], axis=2)
+    rays = local @ pose[:3, :3].T
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    nearest, ids = np.full((SIDE, SIDE), np.inf), np.zeros((SIDE, SIDE), np.uint8)
+    for class_id, (center, radius) in BALLS.items():
+        to = np.asarray(center) - pose[:3, 3]
+        along = rays @ to
+        root = along**2 - to @ to + radius**2
+        hit = np.where(root > 0, along - np.sqrt(np.maximum(root, 0)), np.inf)
+        ids[hit < nearest], nearest = class_id, np.minimum(hit, nearest)
+    return ids
+
+
+def write_balls(root: Path, change=lambda view, ids: ids) -> Path:
+    """A scene of three balls; ``change`` gives the mask of each view, None for no mask."""
+    write_transforms(root, poses=poses(), fl_x=FOCAL, fl_y=FOCAL, cx=SIDE / 2, cy=SIDE / 2, w=SIDE, h=SIDE)
+    meta = json.loads((root / "transforms.json").read_text())
+    (root / "transforms.json").write_text(json.dumps({**meta, "w": SIDE, "h": SIDE, "fl_x": FOCAL, "fl_y": FOCAL}))
+    (root / "classes.json").write_text(json.dumps({"1": "left", "2": "right", "3": "top"}))
+    for view, pose in enumerate(poses()):
+        write_image(root / f"images/v{view:02d}.png", np.full((SIDE, SIDE, 3), 90, np.uint8))
+        if (mask := change(view, draw(pose))) is not None:
+            write_image(root / f"masks/v{view:02d}.png", mask)
+    return root
+
+
+def findings(root: Path, **options) -> dict[str, list]:
+    from beags_plugin.plugin.masks_check import check_scene, data_options
+
+    found: dict[str, list] = {}
+    for finding in check_scene(data_options(root, **options)).findings:
+        found.setdefault(finding.kind, []).append(finding)
+    return found
+
+
+def exchanged(ids: np.ndarray, *order: int) -> np.ndarray:
+    return np.array([0, *order], np.uint8)[ids]
+
+
+def test_good_masks_give_no_finding(tmp_path):
+    assert findings(write_balls(tmp_path)) == {}
+
+
+def test_exchanged_ids_are_found_with_the_view(tmp_path):
+    plan = {3: (2, 1, 3), 6: (3, 1, 2)}
+    found = findings(write_balls(tmp_path, lambda view, ids: exchanged(ids, *plan.get(view, (1, 2, 3)))))
+    assert {finding.views for finding in found["swapped ids"]} == {("v03",), ("v06",)}
+    pair = next(finding for finding in found["swapped ids"] if finding.views == ("v03",))
+    assert "2 (right) instead of 1 (left), 1 (left) instead of 2 (right)" in pair.message
+    pixels = int(np.isin(draw(poses()[3]), (1, 2)).sum())
+    assert f"{pixels} pixels" in pair.cost
+    assert set(found) == {"swapped ids"}
+
+
+def test_an_inverted_mask_and_a_lost_object_are_found(tmp_path):
+    def change(view, ids):
+        one = (ids == 1).astype(np.uint8)
+        return 1 - one if view == 5 else 0 * one if view == 9 else one
+
+    root = write_balls(tmp_path, change)
+    (root / "classes.json").write_text('{"1": "left"}')
+    found = findings(root)
+    assert found["inverted"][0].views == ("v05",) and found["absent"][0].views == ("v09",)
+    assert found["absent"][0].level == "note" and set(found) == {"inverted", "absent"}
+
+
+def test_one_object_under_two_ids_is_found(tmp_path):
+    root = write_balls(tmp_path, lambda view, ids: exchanged(ids, 1 if view < 6 else 4, 2, 3))
+    (root / "classes.json").write_text('{"1": "left", "2": "right", "3": "top", "4": "left again"}')
+    found = findings(root)
+    assert "1 (left) (6 views) and 4 (left again) (6 views)" in found["two ids"][0].message
+
+
+def test_an_id_used_in_a_single_view_is_an_exchange(tmp_path):
+    root = write_balls(tmp_path, lambda view, ids: exchanged(ids, 1, 2, 9 if view == 4 else 3))
+    (root / "classes.json").write_text('{"1": "left", "2": "right", "3": "top", "9": "odd"}')
+    found = findings(root)
+    assert found["swapped ids"][0].views == ("v04",) and "9 (odd) instead of 3 (top)" in found["swapped ids"][0].message
+    assert "id 9 (odd) is in 1 of" in found["few views"][0].message
+
+
+def test_mistakes_in_files_name_file_and_remedy(tmp_path):
+    def change(view, ids):
+        if view == 2:
+            return ids[::2]
+        if view == 3:
+            return np.repeat(ids[..., None], 3, axis=2)
+        return None if view == 4 else exchanged(ids, 1, 2, 255) if view == 5 else exchanged(ids, 1, 2, 0)
+
+    root = write_balls(tmp_path, change)
+    write_image(root / "masks/other.png", np.zeros((4, 4), np.uint8))
+    found = findings(root)
+    assert str(root / "masks/v02.png") in found["size"][0].message and "48x24" in found["size"][0].message
+    assert str(root / "masks/v03.png") in found["type"][0].message and "has colours" in found["type"][0].message
+    assert (
+        "id 255 is in 1 masks" in found["unknown id"][0].message
+        and "--ignore-ids 255" in found["unknown id"][0].message
+    )
+    assert found["missing"][0].views == ("v04",) and "1 of 10" in found["missing"][0].message
+    assert "other.png" in found["unused"][0].message and "3 (top)" in found["unused name"][0].message
+    levels = {kind: found[kind][0].level for kind in ("size", "type", "unknown id", "missing", "unused", "unused name")}
+    assert list(levels.values()) == ["error"] * 3 + ["warning"] * 3
+    ignoring = findings(root, ignore_ids=(255,))
+    assert "unknown id" not in ignoring
+
+
+def test_the_command_writes_its_report_and_ends_with_1_on_errors(tmp_path, capsys):
+    root = write_balls(tmp_path / "scene", lambda view, ids: ids[::2] if view == 2 else ids)
+    with pytest.raises(SystemExit) as ended:
+        main(["masks", "check", "--data", str(root), "--output", str(tmp_path / "out")])
+    assert ended.value.code == 1
+    report = json.loads((tmp_path / "out/report.json").read_text())
+    assert [finding["kind"] for finding in report["findings"]] == ["size"]
+    assert report["coverage"][0]["pixels"]["1"] == int((draw(poses()[0]) == 1).sum())
+    assert (tmp_path / "out/coverage.png").stat().st_size > 5000
+    assert "11 usable masks, 3 objects; 1 errors" in capsys.readouterr().out
+
+
+def test_no_mask_at_all_is_an_error(tmp_path):
+    write_transforms(tmp_path)
+    found = findings(tmp_path)
+    assert found["missing"][0].level == "error" and "beags masks make" in found["missing"][0].message
+
+
+def test_labels_of_points_heed_the_image_and_the_depth():
+    ranks = np.array([[0, 1], [2, UNSEEN]], np.int16)
+    xy = np.array([[0.5, 0.5], [1.5, 0.5], [0.5, 1.5], [1.5, 1.5], [-0.1, 0.5], [0.5, 0.5], [np.nan, 0.5]])
+    z = np.array([1.0, 1.0, 1.0, 1.0, 1.0, -1.0, 1.0])
+    assert labels_at(xy, z, ranks).tolist() == [0, 1, 2, UNSEEN, UNSEEN, UNSEEN, UNSEEN]
+    depth = np.array([[1.01, 1.05], [1.0, 1.0]])
+    assert labels_at(xy, z, ranks, depth, tau=0.02).tolist() == [0, UNSEEN, 2, UNSEEN, UNSEEN, UNSEEN, UNSEEN]
+
+
+def test_confusion_leaves_the_view_itself_out():
+    labels = np.array([[1, 1, 1, 0], [1, 1, 1, 1], [0, 0, 1, 1]], np.int16)
+    agreement = Agreement(labels, 2)
+    # point 0: in view 3 the others say 1; point 2: others of view 0 say 0, 1, 1: 1 wins with 2 of 3
+    assert agreement.confusion[3].tolist() == [[0, 1], [1, 1]]
+    assert agreement.confusion[0].tolist() == [[0, 0], [1, 2]]
+
+
+def test_ranks_of_ids():
+    found = ranks_of(np.array([[0, 7], [9, IGNORE]], np.uint16), [0, 7], IGNORE)
+    assert found.tolist() == [[0, 1], [UNSEEN, UNSEEN]]
+
+
+def test_contradicted_areas_are_more_than_rims():
+    given = np.zeros((100, 100), np.int32)
+    given[20:60, 20:60] = 1
+    voted = given.copy()
+    voted[20:60, 20] = 0  # a rim
+    voted[70:90, 70:95] = 2
+    sure = np.ones((100, 100), np.float32)
+    (area,) = contradicted(given, voted, sure, "v")
+    assert (area.given, area.voted, area.box) == (0, 2, (70, 70, 95, 90)) and 480 < area.pixels <= 500
+    assert contradicted(given, voted, 0.5 * sure, "v") == []
+    assert contradicted(np.full_like(given, IGNORE), voted, sure, "v") == []
+
+
+def test_words():
+    assert named(range(7), 3) == "0, 1, 2 and 4 more" and named(["a", "b"]) == "a, b"
+    assert percent(1, 3) == "33 %" and percent(1, 300) == "0.33 %" and percent(1, 0) == "0 %"
+
+
+def test_coverage_picture_without_any_object(tmp_path):
+    coverage_picture(tmp_path / "c.png", ["a"], [0, 1], {0: "b", 1: "c"}, np.zeros((1, 2)), np.array([False]))
+    assert (tmp_path / "c.png").exists()
