@@ -12,6 +12,7 @@ RASTERIZERS = Registry(
     {
         "torch": "beags_plugin.rasterizers.torch_reference:TorchRasterizer",
         "native": "beags_plugin.rasterizers.native:NativeRasterizer",
+        "cuda": "beags_plugin.rasterizers.cuda:CudaRasterizer",
     },
 )
 _PREFERENCE = ("native", "torch")  # what "auto" tries, best first
