@@ -6,10 +6,8 @@ from dataclasses import fields, replace
 from importlib import import_module
 from types import ModuleType
 
-import torch
 from torch import Tensor
 
-from beags_plugin.core.cameras import Camera
 from beags_plugin.rasterizers.cuda import CudaRasterizer
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, SurfelInputs
 

@@ -13,8 +13,8 @@ def sh_colors(sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_center: Tens
     """Colour of each surfel as seen from ``camera_center``: SH + 0.5, clamped at 0; [N, 3].
 
     sh_dc: [N, 3], band 0. sh_rest: [N, K, 3], the others, K >= (degree + 1)^2 - 1. means: [N, 3] world.
-    camera_center: [3] world, without gradient. degree: 0..3. All float32 or all float64, on the CPU or a GPU (``camera_center`` is quicker on the
-    CPU); differentiable, once, in ``sh_dc``, ``sh_rest`` and ``means``.
+    camera_center: [3] world, without gradient, quicker on the CPU. degree: 0..3. All float32 or all float64, on the
+    CPU or a GPU; differentiable, once, in ``sh_dc``, ``sh_rest`` and ``means``.
     """
     n, dtype = len(sh_dc), sh_dc.dtype
     if not 0 <= degree <= 3:

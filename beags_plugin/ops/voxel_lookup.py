@@ -15,8 +15,8 @@ from beags_plugin.ops import cuda_extension, extension
 class VoxelLookup:
     """The occupied voxels of all classes, and the valid ones (next to an occupied one), as hashed 4 x 4 x 4 bricks.
 
-    Memory is linear in the occupied voxels. Class ids that are no class of the grid have no voxels. Queries are answered
-    where their points lie, on the CPU or a GPU; the tables are made on the CPU and copied to a GPU when it first asks.
+    Memory is linear in the occupied voxels. Class ids that are no class of the grid have no voxels. Queries are
+    answered where their points lie, on the CPU or a GPU; the tables are made on the CPU and copied to a GPU once.
 
     keys: [M] int64, sorted; classes: [M] int32; origin: [3] float64, world; voxel_size: world units; all as in
         ``occupancy.grid.VisibilityGrid``, on any device.

@@ -178,9 +178,7 @@ class CudaRasterizer(KernelRasterizer):
         """See ``Rasterizer.heaviest``."""
         inputs = _detached(inputs.checked())
         indices = torch.empty(camera.height, camera.width, dtype=torch.int32, device=inputs.means.device)
-        self._frame(
-            inputs, camera, settings, lambda frame: frame.native.heaviest(indices, self._stream(inputs.means))
-        )
+        self._frame(inputs, camera, settings, lambda frame: frame.native.heaviest(indices, self._stream(inputs.means)))
         return indices
 
     def _native(self) -> ModuleType:
@@ -243,7 +241,7 @@ class CudaRasterizer(KernelRasterizer):
         pair_start, totals = memory(n + 1, dtype=torch.int64), memory(2, dtype=torch.int64)
         owned = [visible, splats, counts, order, pair_start, totals]
         floats = [getattr(inputs, name) for name in _FLOATS]
-        matrices = (camera.viewmat.tolist(), camera.K.tolist())
+        matrices = (camera.host.viewmat.tolist(), camera.host.K.tolist())
         native = make(
             *floats, inputs.class_ids, *matrices, camera.width, camera.height, settings.near, settings.far, *owned
         )
@@ -264,9 +262,7 @@ class CudaRasterizer(KernelRasterizer):
 
         lasting = [memory(capacity) for _ in range(3)] + [memory(_tiles(camera) + 1)]
         temporary = memory(module.temporary_bytes(capacity), torch.uint8)
-        frame.native.bin(
-            *lasting, temporary, memory(capacity), memory(capacity), cuda_extension.stream(device)
-        )
+        frame.native.bin(*lasting, temporary, memory(capacity), memory(capacity), cuda_extension.stream(device))
         frame.pairs = lasting
         return capacity
 
