@@ -7,8 +7,8 @@ option(BEAGS_CUDA_EMULATION "Build beags_plugin/_cuda_emulation, which runs the 
 set(cuda ${sources}/cuda)
 set(cuda_bindings ${cuda}/module_cuda.cpp ${cuda}/module_cuda_ops.cpp)
 
-if(BEAGS_CUDA_EMULATION)
-  nanobind_add_module(_cuda_emulation NB_STATIC ${cuda}/emulated.cpp ${cuda}/module_emulation.cpp ${cuda_bindings})
+if(BEAGS_CUDA_EMULATION) # in a domain of its own, as its types have the names of those of _native
+  nanobind_add_module(_cuda_emulation NB_STATIC NB_DOMAIN beags_emulation ${cuda}/emulated.cpp ${cuda}/module_emulation.cpp ${cuda_bindings})
   target_compile_definitions(_cuda_emulation PRIVATE BEAGS_CUDA_EMULATION)
   target_compile_options(_cuda_emulation PRIVATE -O1 -ffp-contract=off -Wall -Wextra -Wno-unknown-pragmas)
   install(TARGETS _cuda_emulation LIBRARY DESTINATION beags_plugin)

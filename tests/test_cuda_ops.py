@@ -110,7 +110,7 @@ def loss_and_gradients(surfels, grid, device, **options):
 
 
 @pytest.mark.parametrize("options", [{"samples": 20}, {"samples": 3, "background": False}])
-@pytest.mark.parametrize("stretch", [0.001, 1.0, 1000.0])
+@pytest.mark.parametrize("stretch", [0.001, 1.0, 100.0])
 def test_the_occupancy_loss_is_the_torch_versions(stretch, options, device, torch_version):
     """On dense and hashed tables, for discs of all sizes, some of them broken."""
     surfels, grid = test_occupancy_loss.make_surfels(700), test_occupancy_loss.make_grid(stretch)
