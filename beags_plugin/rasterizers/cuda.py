@@ -134,7 +134,7 @@ class CudaRasterizer(KernelRasterizer):
                 *frame.kept, *found, g_background, records, sums, parts, self._stream(like),
             )  # fmt: skip
         background = g_background.sum(0, dtype=torch.float64).to(like.dtype) if wanted["background"] else None
-        return InputGradients(*found, background)
+        return InputGradients(*found, background)  # type: ignore[call-arg]
 
     @torch.no_grad()
     def class_contributions(
