@@ -102,7 +102,8 @@ def _cuda() -> Check:
     import torch
 
     if torch.cuda.is_available():
-        return Check("CUDA device", True, f"{torch.cuda.get_device_name(0)}; beags has no CUDA rasterizer yet", False)
+        major, minor = torch.cuda.get_device_capability(0)
+        return Check("CUDA device", True, f"{torch.cuda.get_device_name(0)}, sm_{major}{minor}", False)
     return Check("CUDA device", False, "none; not needed: the rasterizers run on the CPU", False)
 
 
@@ -237,9 +238,11 @@ try:
     from beags_plugin.core.cameras import Camera
     from beags_plugin.rasterizers.interface import RasterSettings, SurfelInputs
     K = torch.tensor([[9.0, 0.0, 4.0], [0.0, 9.0, 4.0], [0.0, 0.0, 1.0]])
-    inputs = SurfelInputs(torch.tensor([[0.0, 0.0, 1.0]], requires_grad=True), torch.ones(1, 4),
-                          torch.full((1, 2), -2.0), torch.zeros(1), torch.ones(1, 3))
-    render = rasterizer.rasterize(inputs, Camera(torch.eye(4), K, 8, 8), RasterSettings(0.1, 9.0), torch.zeros(3))
+    values = (torch.tensor([[0.0, 0.0, 1.0]]), torch.ones(1, 4), torch.full((1, 2), -2.0), torch.zeros(1),
+              torch.ones(1, 3), torch.zeros(3))
+    *values, background = (value.to("cuda" if name == "cuda" else "cpu") for value in values)
+    inputs = SurfelInputs(values[0].requires_grad_(), *values[1:])
+    render = rasterizer.rasterize(inputs, Camera(torch.eye(4), K, 8, 8), RasterSettings(0.1, 9.0), background)
     render.color.sum().backward()
     assert render.alpha.max() > 0.1, "it draws nothing"
     native = sys.modules.get("beags_plugin._native") if name == "native" else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -126,6 +126,14 @@ def make_scene(size: Size, seed: int = 0) -> Scene:
         image=uniform(*shape, 3),
         gradients=gradients,
     )
+
+
+def on_device(scene: Scene, device: str) -> Scene:
+    """The same scene, all of it there."""
+    values = {name: value.to(device) for name, value in vars(scene).items() if isinstance(value, Tensor | Camera)}
+    surfels = Surfels(**{name: value.to(device) for name, value in vars(scene.surfels).items()})
+    gradients = {name: value.to(device) for name, value in scene.gradients.items()}
+    return replace(scene, surfels=surfels, gradients=gradients, **values)
 
 
 def classes_at(across: Tensor, down: Tensor) -> Tensor:

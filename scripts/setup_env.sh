@@ -47,10 +47,17 @@ fi
 packages_now="$(printf '%s\n' constraints.txt pyproject.toml | digest)"
 source_now="$(pwd) $({
   printf '%s\n' pyproject.toml CMakeLists.txt
+  printf '%s\n' cmake/cuda.cmake
   find beags_plugin -type f -name '*.[ch]*' ! -name '*.pyc'
 } | digest)"
 packages_before="$(cat "$env/.beags-packages" 2>/dev/null || true)"
 source_before="$(cat "$env/.beags-source" 2>/dev/null || true)"
+
+# The kernels for GPUs are compiled for the GPU that is here; where there is none, once, as PTX, to see that they
+# compile. Their emulation on the CPU is for the tests.
+architectures="${BEAGS_CUDA_ARCHITECTURES:-75-virtual}"
+if [ -z "${BEAGS_CUDA_ARCHITECTURES:-}" ] && nvidia-smi -L >/dev/null 2>&1; then architectures=native; fi
+build=(-C "cmake.define.BEAGS_CUDA_ARCHITECTURES=$architectures" -C cmake.define.BEAGS_CUDA_EMULATION=ON)
 
 pip() { "$env/bin/python" -m pip --disable-pip-version-check "$@"; }
 # guidedFilter, not ximgproc itself: an emptied package leaves an importable shell behind.
@@ -66,7 +73,7 @@ if [ "$packages_now" != "$packages_before" ]; then
   pip install -qq "${pins[@]}" scikit-build-core nanobind ninja 'setuptools<81'
   if ! command -v cmake >/dev/null; then pip install -qq cmake; fi
   # The build tools are in the environment by now, so the build needs no isolated copy of them.
-  pip install -qq --no-build-isolation "${pins[@]}" -e '.[dev]'
+  pip install -qq --no-build-isolation "${build[@]}" "${pins[@]}" -e '.[dev]'
   # nerfstudio brings plain opencv, which shares the folder cv2/ with contrib: the one written last wins.
   if ! contrib_works; then
     pip install -qq "${pins[@]}" --force-reinstall --no-deps "$opencv"
@@ -76,6 +83,6 @@ if [ "$packages_now" != "$packages_before" ]; then
   echo "$source_now" >"$env/.beags-source"
 elif [ "$source_now" != "$source_before" ]; then
   rm -f "$env/.beags-source"
-  pip install -qq --no-deps --no-build-isolation -e .
+  pip install -qq --no-deps --no-build-isolation "${build[@]}" -e .
   echo "$source_now" >"$env/.beags-source"
 fi

@@ -6,6 +6,7 @@ import os
 
 import pytest
 import torch
+from cuda_backends import BACKENDS
 
 from beags_plugin.ops import extension
 from beags_plugin.rasterizers import RASTERIZERS
@@ -17,10 +18,10 @@ def pytest_sessionstart(session):
         pytest.exit(f"BEAGS_REQUIRE_NATIVE is set, but {extension.found()[1]}", returncode=1)
 
 
-@pytest.fixture(params=["torch", "native"])
+@pytest.fixture(params=["torch", "native", *BACKENDS])
 def rasterizer(request):
     """Every backend in turn; one that cannot run here is skipped with its reason."""
-    backend = RASTERIZERS.get(request.param)
+    backend = BACKENDS.get(request.param) or RASTERIZERS.get(request.param)
     if reason := backend.unavailable():
         pytest.skip(f"{request.param}: {reason}")
     return backend()

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from beags_plugin.assignment.sparse_sums import TorchSparseSums, largest_in_rows
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.processes import each_view
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.ops import extension
@@ -61,19 +62,23 @@ def assign_classes(
     # float64: thousands of small weights of many views are added up. A table of all classes would be mostly zeros.
     total = SparseSums() if extension.can_take(surfels.means) else TorchSparseSums(surfels.means.device)
     strongest = torch.zeros_like(surfels.opacity_logits, dtype=torch.float64)
-    for index, (camera, mask) in enumerate(zip(cameras, labels, strict=True)):
+
+    def contributions(index: int) -> tuple[Tensor, Tensor]:
+        camera, mask = cameras[index], labels[index]
         if mask is None:
             mask = torch.full((camera.height, camera.width), IGNORE, dtype=torch.int32, device=surfels.means.device)
         check_class_ids(mask, index, num_classes)
         every = mask.masked_fill(mask == IGNORE, num_classes)  # what is not labelled counts as one more class
         with torch.no_grad():
-            keys, values = rasterizer.contributing_classes(inputs, camera, settings, every, num_classes + 1)
+            return rasterizer.contributing_classes(inputs, camera, settings, every, num_classes + 1)
+
+    if len(cameras) != len(labels):
+        raise ValueError(f"{len(cameras)} cameras and {len(labels)} masks do not belong together")
+    for keys, values in each_view(len(cameras), contributions, progress):
         surfel, class_id = keys // (num_classes + 1), keys % (num_classes + 1)
         strongest = torch.maximum(strongest, torch.zeros_like(strongest).index_add_(0, surfel, values.double()))
         labelled = class_id < num_classes
         total.add((surfel * num_classes + class_id)[labelled], values[labelled])
-        if progress:
-            progress(index + 1, len(cameras))
     class_ids, top, everything = largest_in_rows(*total.found(), len(surfels), num_classes)
     never_seen = everything <= 0
     margin = torch.where(never_seen, 0.0, top / everything.masked_fill(never_seen, 1.0))

@@ -41,9 +41,20 @@ class Camera:
         rows = self.viewmat.tolist()
         return self.viewmat.new_tensor([-sum(rows[k][axis] * rows[k][3] for k in range(3)) for axis in range(3)])
 
+    @property
+    def host(self) -> Camera:
+        """The same camera on the CPU, if this one was made from it by ``to``, else itself.
+
+        Its numbers can be read without waiting for a GPU. Cameras are not changed in place.
+        """
+        return self.__dict__.get("_host", self)
+
     def to(self, *args) -> Camera:
         """As ``Tensor.to``, for both matrices."""
-        return Camera(self.viewmat.to(*args), self.K.to(*args), self.width, self.height)
+        moved = Camera(self.viewmat.to(*args), self.K.to(*args), self.width, self.height)
+        if not moved.viewmat.is_cpu and self.host.viewmat.is_cpu:
+            moved.__dict__["_host"] = self.host
+        return moved
 
 
 def viewmat_from_opengl(camera_to_world: Tensor) -> Tensor:

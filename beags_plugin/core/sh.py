@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from beags_plugin.ops import extension
+from beags_plugin.ops import cuda_extension, extension
 from beags_plugin.ops import sh_colors as compiled
 
 MAX_DEGREE = 3
@@ -62,13 +62,16 @@ def sh_colors(sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_center: Tens
     """Colour of each surfel as seen from ``camera_center``: SH + 0.5, clamped at 0.
 
     sh_dc: [N, 3], band 0. sh_rest: [N, K, 3], the others, K >= (degree + 1)^2 - 1. means: [N, 3] world.
-    camera_center: [3] world. Returns [N, 3]. Computed by the compiled op where it can be.
+    camera_center: [3] world, on any device. Returns [N, 3]. Computed by the compiled op where it can be.
     """
-    if extension.can_take(sh_dc, sh_rest, means, camera_center) and not camera_center.requires_grad:
+    compiles = extension.can_take(sh_dc, sh_rest, means, camera_center)
+    compiles = compiles or cuda_extension.module_for(sh_dc, sh_rest, means) is not None
+    if compiles and not camera_center.requires_grad:
         return compiled.sh_colors(sh_dc, sh_rest, means, camera_center, degree)
     if degree == 0:
         return (_C0 * sh_dc + 0.5).clamp_min(0.0)
-    directions = torch.nn.functional.normalize(means - camera_center, dim=-1)  # eps 1e-12: a surfel at the camera
+    # eps 1e-12: a surfel at the camera
+    directions = torch.nn.functional.normalize(means - camera_center.to(means), dim=-1)
     basis = sh_basis(directions, degree)
     sh = torch.cat([sh_dc[:, None], sh_rest[:, : basis.shape[1] - 1]], dim=1)
     return (torch.einsum("nk,nkc->nc", basis, sh) + 0.5).clamp_min(0.0)

@@ -8,16 +8,19 @@
 
 namespace beags {
 
-// A contiguous torch tensor on the CPU, read through its own methods: a tenth of the time of the DLPack protocol, which
+// Where a tensor lies.
+enum class Memory { kCpu, kCuda };
+
+// A contiguous torch tensor, read through its own methods: a tenth of the time of the DLPack protocol, which
 // counts where a call has tens of tensors and next to nothing to do. It holds no reference: the caller's lasts.
-template <class T>
+template <class T, Memory kMemory = Memory::kCpu>
 class Array {
  public:
   T* data() const { return data_; }  // null for None and where there is no element
   int64_t shape(int axis) const { return shape_[axis]; }
 
  private:
-  friend struct nanobind::detail::type_caster<Array<T>>;
+  friend struct nanobind::detail::type_caster<Array<T, kMemory>>;
   static constexpr int kAxes = 3;
   T* data_ = nullptr;
   int64_t shape_[kAxes] = {};  // of the first axes
@@ -27,7 +30,8 @@ using Ids = Array<const int32_t>;  // of classes
 
 // What is asked of a tensor; made at the first call, kept to the end of the process.
 struct TensorNames {
-  PyObject *tensor, *data_ptr, *dtype, *is_cpu, *is_contiguous, *shape;  // tensor: the class; the others: attributes
+  PyObject *tensor, *data_ptr, *dtype, *is_cpu, *is_cuda, *is_contiguous,
+      *shape;  // tensor: the class; the others: attributes
   PyObject *float32, *float64, *boolean, *uint8, *int32, *int64;
 
   static const TensorNames& get() {
@@ -35,9 +39,9 @@ struct TensorNames {
       const nanobind::module_ torch = nanobind::module_::import_("torch");
       const auto own = [&](const char* name) { return torch.attr(name).inc_ref().ptr(); };
       const auto text = [](const char* name) { return PyUnicode_InternFromString(name); };
-      return TensorNames{own("Tensor"),         text("data_ptr"), text("dtype"),  text("is_cpu"),
-                         text("is_contiguous"), text("shape"),    own("float32"), own("float64"),
-                         own("bool"),           own("uint8"),     own("int32"),   own("int64")};
+      return TensorNames{own("Tensor"),         text("data_ptr"), text("dtype"),  text("is_cpu"), text("is_cuda"),
+                         text("is_contiguous"), text("shape"),    own("float32"), own("float64"), own("bool"),
+                         own("uint8"),          own("int32"),     own("int64")};
     }();
     return names;
   }
@@ -69,12 +73,19 @@ constexpr auto dtype_name() {
 namespace nanobind {
 namespace detail {
 
-// Refuses, with nanobind's TypeError, what is no contiguous CPU tensor of T; None is for the argument to allow.
-template <class T>
-struct type_caster<beags::Array<T>> {
+// Refuses, with nanobind's TypeError, what is no contiguous tensor of T there; None is for the argument to allow. The
+// emulated GPU's memory is the CPU's.
+template <class T, beags::Memory kMemory>
+struct type_caster<beags::Array<T, kMemory>> {
+#if defined(BEAGS_CUDA_EMULATION)
+  static constexpr bool kOnCpu = true;
+#else
+  static constexpr bool kOnCpu = kMemory == beags::Memory::kCpu;
+#endif
+  using Tensor = beags::Array<T, kMemory>;
   using Element = std::remove_const_t<T>;
-  NB_TYPE_CASTER(beags::Array<T>,
-                 const_name("torch.Tensor[") + beags::dtype_name<Element>() + const_name(", contiguous, cpu]"))
+  NB_TYPE_CASTER(Tensor, const_name("torch.Tensor[") + beags::dtype_name<Element>() +
+                             const_name<kOnCpu>(", contiguous, cpu]", ", contiguous, cuda]"))
 
   bool from_python(handle source, uint8_t, cleanup_list*) noexcept {
     value = {};
@@ -84,11 +95,11 @@ struct type_caster<beags::Array<T>> {
       PyObject* tensor = source.ptr();
       if (!PyObject_TypeCheck(tensor, reinterpret_cast<PyTypeObject*>(names.tensor))) return false;
       if (attribute(tensor, names.dtype).ptr() != names.dtype_of<Element>()) return false;
-      if (attribute(tensor, names.is_cpu).ptr() != Py_True) return false;
+      if (attribute(tensor, kOnCpu ? names.is_cpu : names.is_cuda).ptr() != Py_True) return false;
       if (call(tensor, names.is_contiguous).ptr() != Py_True) return false;
       const object shape = attribute(tensor, names.shape);
       const Py_ssize_t axes = PyTuple_Size(shape.ptr());
-      for (Py_ssize_t axis = 0; axis < axes && axis < beags::Array<T>::kAxes; ++axis) {
+      for (Py_ssize_t axis = 0; axis < axes && axis < Tensor::kAxes; ++axis) {
         value.shape_[axis] = PyLong_AsLongLong(PyTuple_GetItem(shape.ptr(), axis));
       }
       value.data_ = static_cast<T*>(PyLong_AsVoidPtr(call(tensor, names.data_ptr).ptr()));

@@ -6,6 +6,7 @@
 #include "binning.h"
 #include "projection.h"
 #include "scratch.h"
+#include "surfel_inputs.h"
 #include "types.h"
 
 namespace beags {
@@ -13,14 +14,6 @@ namespace beags {
 // A team of threads costs more than it brings below about 0.3 ms of work.
 constexpr int64_t kTeamSurfels = 2000;  // projecting one takes a tenth of a microsecond
 constexpr int64_t kTeamPairs = 500;     // drawing one takes most of a microsecond
-
-// N surfels, contiguous, as rasterizers/interface.py's SurfelInputs; class_ids may be null.
-template <class T>
-struct Inputs {
-  int64_t count;
-  const T *means, *quats, *log_scales, *opacity_logits, *colors;
-  const int32_t* class_ids;
-};
 
 // Null: not wanted. The others are zero on entry: surfels that were not drawn are left alone.
 template <class T>

@@ -4,42 +4,24 @@
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
-#include <stdexcept>
 #include <string>
 #include <vector>
 
 #include "arrays.h"
+#if defined(BEAGS_HAS_CUDA)
+#include "cuda/module_cuda.h"
+#endif
 #include "frame.h"
 #include "isa.h"
 #include "module_images.h"
 #include "module_ops.h"
+#include "view.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
 
 namespace beags {
 namespace {
-
-using Matrix = std::vector<std::vector<double>>;  // row by row
-
-View make_view(const Matrix& viewmat, const Matrix& k, int width, int height, double near_plane, double far_plane) {
-  const auto is = [](const Matrix& m, size_t size) {
-    return m.size() == size && std::all_of(m.begin(), m.end(), [&](const auto& row) { return row.size() == size; });
-  };
-  if (!is(viewmat, 4) || !is(k, 3)) throw std::invalid_argument("viewmat must be 4 x 4 and K 3 x 3");
-  View view{};
-  for (int row = 0; row < 3; ++row) {
-    for (int column = 0; column < 3; ++column) view.rotation[3 * row + column] = viewmat[row][column];
-    view.translation[row] = viewmat[row][3];
-    view.kx[row] = k[0][row];
-    view.ky[row] = k[1][row];
-  }
-  view.width = width;
-  view.height = height;
-  view.near_plane = near_plane;
-  view.far_plane = far_plane;
-  return view;
-}
 
 template <class T>
 void bind(nb::module_& m, const char* name) {
@@ -160,4 +142,8 @@ NB_MODULE(_native, m) {
   beags::bind<double>(m, "FrameF64");
   beags::bind_ops(m);
   beags::bind_images(m);
+#if defined(BEAGS_HAS_CUDA)
+  nb::module_ cuda = m.def_submodule("cuda", "The CUDA backend; use it through beags_plugin.rasterizers.cuda.");
+  beags::bind_cuda(cuda);
+#endif
 }

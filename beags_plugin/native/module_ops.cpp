@@ -199,6 +199,18 @@ void bind_ops(nb::module_& m) {
       },
       "keys"_a, "classes"_a, "num_classes"_a, "origin"_a, "voxel_size"_a);
   lookup.def_prop_ro("bytes", &VoxelLookup::bytes);
+  lookup.def("tables", [](const VoxelLookup& self) {  // what ops/voxel_lookup.py copies to a GPU
+    nb::list out;
+    const auto bytes = [](const auto& numbers) {
+      return nb::bytes(reinterpret_cast<const char*>(numbers.data()), numbers.size() * sizeof numbers[0]);
+    };
+    for (const VoxelLookup::Bricks* table : self.stored()) {
+      const std::vector<int> base(table->base, table->base + 3), size(table->size, table->size + 3);
+      out.append(nb::make_tuple(table->num_classes, base, size, bytes(table->dense), bytes(table->slots),
+                                bytes(table->ranges)));
+    }
+    return out;
+  });
   bind_lookup<float>(lookup, "f32");
   bind_lookup<double>(lookup, "f64");
   nb::class_<SparseSums> sums(m, "SparseSums");

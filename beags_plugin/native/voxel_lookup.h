@@ -15,6 +15,20 @@ namespace ops {
 
 class VoxelLookup {
  public:
+  // Storage of one VoxelTable.
+  struct Bricks {
+    std::vector<uint64_t> dense;
+    int32_t base[3], size[3];
+    std::vector<Brick> slots;
+    std::vector<BrickRange> ranges;
+    int32_t num_classes;
+    // bricks: of each class, no two alike.
+    void store(const std::vector<std::vector<Brick>>& bricks);
+    void hash(const std::vector<std::vector<Brick>>& bricks);
+    VoxelTable table() const;
+    int64_t bytes() const;
+  };
+
   // keys: [count], 21 bits for each axis, as VisibilityGrid; classes: [count] in 0 .. num_classes - 1; origin: [3].
   VoxelLookup(const int64_t* keys, const int32_t* classes, int64_t count, int num_classes, const double* origin,
               double voxel_size);
@@ -23,6 +37,10 @@ class VoxelLookup {
   VoxelTable valid() const { return cubes_[0].table(); }
   // The corners (of lowest indices) of cubes of valid voxels, 1, 2 and 3 along each side: one look tells of a cube.
   std::array<VoxelTable, kLargestCube> valid_cubes() const;
+  // All tables: that of the occupied voxels, then those of `valid_cubes`.
+  std::array<const Bricks*, 1 + kLargestCube> stored() const {
+    return {&occupied_, &cubes_[0], &cubes_[1], &cubes_[2]};
+  }
   const double* origin() const { return origin_; }
   double voxel_size() const { return voxel_size_; }
   int64_t bytes() const;
@@ -39,19 +57,6 @@ class VoxelLookup {
                    int threads) const;
 
  private:
-  // Storage of one VoxelTable.
-  struct Bricks {
-    std::vector<uint64_t> dense;
-    int32_t base[3], size[3];
-    std::vector<Brick> slots;
-    std::vector<BrickRange> ranges;
-    int32_t num_classes;
-    // bricks: of each class, no two alike.
-    void store(const std::vector<std::vector<Brick>>& bricks);
-    void hash(const std::vector<std::vector<Brick>>& bricks);
-    VoxelTable table() const;
-    int64_t bytes() const;
-  };
   template <class T>
   void scaled(const T* point, T* voxel) const;
 

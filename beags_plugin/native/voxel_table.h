@@ -1,12 +1,13 @@
 // Sets of voxels, one for each class, as bricks of 4 x 4 x 4 voxels with a bit for each: one read tells about 64
 // voxels. The bricks lie in an array over their bounding box where that is small, else in a hash table, whose memory is
-// linear in the occupied voxels. Plain data and inlined queries, which kernels of every instruction set share: hence
-// the namespace BEAGS_ISA.
+// linear in the occupied voxels. Plain data and inlined queries, which kernels of every instruction set and of GPUs
+// share: hence the namespace BEAGS_ISA.
 #pragma once
 
 #include <math.h>
 #include <stdint.h>
 
+#include "device.h"
 #include "golden.h"
 
 namespace beags {
@@ -41,11 +42,11 @@ struct VoxelTable {
 namespace BEAGS_ISA {
 
 // Brick coordinates in 0 .. 2^20 - 1.
-inline uint64_t brick_key(int64_t x, int64_t y, int64_t z) {
+BEAGS_HD inline uint64_t brick_key(int64_t x, int64_t y, int64_t z) {
   return static_cast<uint64_t>(x) << 40 | static_cast<uint64_t>(y) << 20 | static_cast<uint64_t>(z);
 }
 
-inline uint64_t hashed_bits(const VoxelTable& table, int32_t class_id, int64_t x, int64_t y, int64_t z) {
+BEAGS_HD inline uint64_t hashed_bits(const VoxelTable& table, int32_t class_id, int64_t x, int64_t y, int64_t z) {
   const BrickRange& range = table.classes[class_id];
   const uint64_t key = brick_key(x, y, z);
   for (uint64_t at = key * kGolden >> range.shift;; at = (at + 1) & range.mask) {
@@ -56,12 +57,12 @@ inline uint64_t hashed_bits(const VoxelTable& table, int32_t class_id, int64_t x
 }
 
 // Place of a brick along one axis of the array; `last`: the largest that is allowed.
-inline int64_t dense_place(const VoxelTable& table, int axis, int64_t brick, int64_t last) {
+BEAGS_HD inline int64_t dense_place(const VoxelTable& table, int axis, int64_t brick, int64_t last) {
   const int64_t at = brick - table.base[axis];
   return at < 0 ? 0 : at > last ? last : at;
 }
 
-inline uint64_t brick_bits(const VoxelTable& table, int32_t class_id, int64_t x, int64_t y, int64_t z) {
+BEAGS_HD inline uint64_t brick_bits(const VoxelTable& table, int32_t class_id, int64_t x, int64_t y, int64_t z) {
   if (!table.dense) return hashed_bits(table, class_id, x, y, z);
   const int64_t i = dense_place(table, 0, x, table.size[0] - 1), j = dense_place(table, 1, y, table.size[1] - 1),
                 k = dense_place(table, 2, z, table.size[2] - 1);
@@ -69,18 +70,18 @@ inline uint64_t brick_bits(const VoxelTable& table, int32_t class_id, int64_t x,
 }
 
 // The same four bits in every one of 16 rows; the same 16 bits in every one of 4 slices.
-inline uint64_t in_rows(uint64_t bits) { return bits * 0x1111111111111111u; }
-inline uint64_t in_slices(uint64_t bits) { return bits * 0x0001000100010001u; }
+BEAGS_HD inline uint64_t in_rows(uint64_t bits) { return bits * 0x1111111111111111u; }
+BEAGS_HD inline uint64_t in_slices(uint64_t bits) { return bits * 0x0001000100010001u; }
 
 // Bits of the box of sizes 1..4 whose corner is voxel 0.
-inline uint64_t box_bits(int nx, int ny, int nz) {
+BEAGS_HD inline uint64_t box_bits(int nx, int ny, int nz) {
   const uint64_t row = (1u << nz) - 1, slice = row * 0x1111u & ((uint64_t(1) << 4 * ny) - 1);
   return nx == 4 ? in_slices(slice) : in_slices(slice) & ((uint64_t(1) << 16 * nx) - 1);
 }
 
 // The voxels of the box of sizes n[] in 1..4 whose corner is voxel low[], |low| <= kVoxelHalf + 2: bit 16 x + 4 y + z
 // is the voxel low + (x, y, z). Other bits may be set.
-inline uint64_t voxel_box(const VoxelTable& table, int32_t class_id, const int64_t* low, const int* n) {
+BEAGS_HD inline uint64_t voxel_box(const VoxelTable& table, int32_t class_id, const int64_t* low, const int* n) {
   if (class_id < 0 || class_id >= table.num_classes) return 0;
   int64_t brick[3];
   int place[3];
@@ -129,7 +130,8 @@ constexpr int kWindowVoxels = 4 * kWindow - 3;  // boxes over so many voxels lie
 
 // Copies the bricks that the box of sizes n[] in 1 .. kWindowVoxels from voxel low[] on reaches, and moves low[] to the
 // first voxel of the first one. Returns whether the box wholly lies in the set.
-inline bool fill_window(const VoxelTable& table, int32_t class_id, int64_t* low, const int* n, uint64_t* window) {
+BEAGS_HD inline bool fill_window(const VoxelTable& table, int32_t class_id, int64_t* low, const int* n,
+                                 uint64_t* window) {
   int64_t first[3];
   unsigned reached[3];  // bit 4 b + i: voxel i of brick b
   for (int axis = 0; axis < 3; ++axis) {
@@ -183,7 +185,7 @@ inline bool fill_window(const VoxelTable& table, int32_t class_id, int64_t* low,
 }
 
 // Membership of a voxel, |voxel| <= kVoxelHalf + 2.
-inline bool voxel_bit(const VoxelTable& table, int32_t class_id, const int64_t* voxel) {
+BEAGS_HD inline bool voxel_bit(const VoxelTable& table, int32_t class_id, const int64_t* voxel) {
   if (class_id < 0 || class_id >= table.num_classes) return false;
   int64_t index[3];
   for (int axis = 0; axis < 3; ++axis) index[axis] = voxel[axis] + kVoxelShift;
@@ -193,7 +195,7 @@ inline bool voxel_bit(const VoxelTable& table, int32_t class_id, const int64_t* 
 
 // Membership of the voxel that is given as whole numbers in floating point, which need not be finite.
 template <class T>
-inline bool voxel_member(const VoxelTable& table, int32_t class_id, const T* voxel) {
+BEAGS_HD inline bool voxel_member(const VoxelTable& table, int32_t class_id, const T* voxel) {
   const T limit = static_cast<T>(kVoxelHalf + 1);
   if (!(fabs(voxel[0]) <= limit && fabs(voxel[1]) <= limit && fabs(voxel[2]) <= limit)) return false;
   const int64_t index[3] = {static_cast<int64_t>(voxel[0]), static_cast<int64_t>(voxel[1]),
@@ -204,7 +206,7 @@ inline bool voxel_member(const VoxelTable& table, int32_t class_id, const T* vox
 // The voxels that a box reaches, from floats `low` to `high`. Returns whether they are at most 4 along each axis and
 // near enough to be looked up; else `from` and `n` are not set.
 template <class T>
-inline bool small_box(const T* low, const T* high, int64_t* from, int* n) {
+BEAGS_HD inline bool small_box(const T* low, const T* high, int64_t* from, int* n) {
   const T limit = static_cast<T>(kVoxelHalf + 1);
   for (int axis = 0; axis < 3; ++axis) {
     if (!(high[axis] - low[axis] <= 3 && fabs(low[axis]) <= limit)) return false;  // false for NaN

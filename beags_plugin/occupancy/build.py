@@ -11,6 +11,7 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.lifting import lift
+from beags_plugin.core.processes import each_view
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.occupancy.grid import VisibilityGrid
@@ -59,11 +60,11 @@ def build_visibility_grid(
     Raises ``UserError`` if no pixel of any view reaches an alpha of 0.5.
     """
     settings = replace(settings, geometry=True, distortion=False)
-    views = []
-    for index, camera in enumerate(cameras):
-        views.append(_render(surfels, class_ids, camera, rasterizer, settings, num_classes, depth))
-        if progress:
-            progress(index + 1, len(cameras))
+
+    def render(index: int) -> _View:
+        return _render(surfels, class_ids, cameras[index], rasterizer, settings, num_classes, depth)
+
+    views = list(each_view(len(cameras), render, progress))
     reference, total = _reference_cloud(views, k, seed)
     if total == 0:
         raise UserError("no training view shows anything solid (alpha >= 0.5): train the base for more steps.")

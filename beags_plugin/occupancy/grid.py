@@ -10,7 +10,7 @@ from torch import Tensor
 
 from beags_plugin.core.class_ranks import ClassRanks
 from beags_plugin.errors import UserError
-from beags_plugin.ops import extension
+from beags_plugin.ops import cuda_extension, extension
 from beags_plugin.ops.voxel_lookup import VoxelLookup
 
 DENSE_BYTES = 256 * 2**20  # up to this size, validity is kept as one byte per class and voxel
@@ -79,8 +79,8 @@ class VisibilityGrid:
         )
 
     def lookup(self) -> VoxelLookup | None:
-        """The compiled lookup, made when it is first asked for; None without the extension or off the CPU."""
-        if extension.load() is None or self.keys.device.type != "cpu":
+        """The compiled lookup, made when it is first asked for; None without the extension (for a GPU, with CUDA)."""
+        if extension.load() is None or (not self.keys.is_cpu and cuda_extension.load() is None):
             return None
         if self._lookup is None:
             self._lookup = VoxelLookup(self.keys, self.classes, self.origin, self.voxel_size)
@@ -163,7 +163,8 @@ class VisibilityGrid:
         return cls(size, state["origin"], num_classes, state["keys"], state["classes"], dense_bytes)
 
     def _lookup_for(self, points: Tensor) -> VoxelLookup | None:
-        return self.lookup() if extension.can_take(points) else None
+        compiled = extension.can_take(points) or cuda_extension.module_for(points) is not None
+        return self.lookup() if compiled else None
 
     def _usable(self, points: Tensor) -> tuple[Tensor, Tensor]:
         usable = (_scaled(points, self.origin, self.voxel_size).abs() < _HALF).all(-1)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from beags_plugin.ops import extension
+from beags_plugin.ops import cuda_extension, extension
 from beags_plugin.ops.voxel_lookup import VoxelLookup
 
 
@@ -27,7 +27,7 @@ def occupancy_loss(
     Its memory does not depend on ``samples``.
 
     means [N, 3], quats [N, 4] wxyz, log_scales [N, 2], opacity_logits [N]: as in ``core.surfels.Surfels``; float32 or
-        float64, on the CPU. Surfels with a parameter that is not finite, or with a scale of 0, count as 0.
+        float64, on the CPU or a GPU. Surfels with a parameter that is not finite, or with a scale of 0, count as 0.
     class_ids: [N] int32, phi.
     lookup: of the visibility grid.
     stream: 64 bits that decide the random points: ``occupancy.sampling.sample_stream`` of seed and step.
@@ -42,7 +42,9 @@ def occupancy_loss(
     class_ids = extension.plain("class_ids", class_ids, (n,), torch.int32)
     if samples < 0:
         raise ValueError(f"samples must be 0 or more, not {samples}")
-    fixed = (lookup.ranks(class_ids), lookup.native, stream, samples, background, weight)
+    module = cuda_extension.module_for(*parameters)
+    tables = lookup.native if module is None else lookup.voxels(module, means.device)
+    fixed = (module, lookup.ranks(class_ids), tables, stream, samples, background, weight)
     return _OccupancyLoss.apply(fixed, *parameters)  # type: ignore[return-value]
 
 
@@ -52,14 +54,26 @@ class _OccupancyLoss(torch.autograd.Function):
         plain = [value.detach().contiguous() for value in parameters]
         wanted = any(ctx.needs_input_grad)
         gradients = [torch.empty_like(value) for value in plain] if wanted else [None] * 4
-        compute = extension.function("occupancy_loss", plain[0])
-        *arguments, weight = fixed
-        value, _ = compute(*plain, *arguments, *gradients, extension.threads(), weight)
+        module, *arguments, weight = fixed
         if wanted:
             ctx.save_for_backward(*gradients)
+        if module is not None:
+            return _on_gpu(module, plain, arguments, gradients, weight)
+        compute = extension.function("occupancy_loss", plain[0])
+        value, _ = compute(*plain, *arguments, *gradients, extension.threads(), weight)
         return plain[0].new_full((), value)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *grad_outputs: Tensor):
         return None, *(extension.scaled(gradient, grad_outputs[0]) for gradient in ctx.saved_tensors)
+
+
+def _on_gpu(module, plain: list[Tensor], arguments: list, gradients: list, weight: float) -> Tensor:
+    """The value as a scalar on the GPU, which the host does not wait for; fills ``gradients``."""
+    blocks = -(-len(plain[0]) // module.OCCUPANCY_THREADS)
+    partial = torch.empty(blocks, dtype=torch.float64, device=plain[0].device)
+    value = plain[0].new_empty(1)
+    arguments = [*plain, *arguments, *gradients, partial, value, weight, True]
+    cuda_extension.call(module, "occupancy_loss", plain[0], *arguments)
+    return value[0]

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from beags_plugin.core.class_ranks import ClassRanks
-from beags_plugin.ops import extension
+from beags_plugin.ops import cuda_extension, extension
 
 
 class VoxelLookup:
     """The occupied voxels of all classes, and the valid ones (next to an occupied one), as hashed 4 x 4 x 4 bricks.
 
-    Memory is linear in the occupied voxels. Class ids that are no class of the grid have no voxels.
+    Memory is linear in the occupied voxels. Class ids that are no class of the grid have no voxels. Queries are
+    answered where their points lie, on the CPU or a GPU; the tables are made on the CPU and copied to a GPU once.
 
     keys: [M] int64, sorted; classes: [M] int32; origin: [3] float64, world; voxel_size: world units; all as in
-        ``occupancy.grid.VisibilityGrid``.
+        ``occupancy.grid.VisibilityGrid``, on any device.
     """
 
     def __init__(self, keys: Tensor, classes: Tensor, origin: Tensor, voxel_size: float) -> None:
@@ -28,7 +30,23 @@ class VoxelLookup:
         assert module is not None, "the caller asks extension.load() first"
         self._ranks = ClassRanks(classes)
         ranks, count = self._ranks.ranks(classes), len(self._ranks)
-        self.native: Any = module.VoxelLookup(keys, ranks, count, origin, voxel_size)
+        self.native: Any = module.VoxelLookup(keys.cpu(), ranks.cpu(), count, origin.cpu(), voxel_size)
+        self._place = (origin.tolist(), voxel_size)
+        self._voxels: dict[tuple[str, torch.device], Any] = {}
+
+    def voxels(self, module: ModuleType, device: torch.device) -> Any:
+        """The tables as the CUDA module takes them, in the memory of ``device``."""
+        key = (module.__name__, device)
+        if key not in self._voxels:
+            memory, tables = [], []
+            for classes, base, size, *parts in self.native.tables():
+                there = [
+                    torch.frombuffer(bytearray(part), dtype=torch.uint8).to(device) if part else None for part in parts
+                ]
+                memory.append(there)
+                tables.append(module.VoxelTable(classes, base, size, *there))
+            self._voxels[key] = (module.Voxels(tables, *self._place), memory)
+        return self._voxels[key][0]
 
     def ranks(self, class_ids: Tensor) -> Tensor:
         """The classes as ``native`` numbers them: [N] int32, background 0. class_ids: [N] int32."""
@@ -56,6 +74,11 @@ class VoxelLookup:
         count = len(first)
         arrays = [extension.plain(key, value, (count, 3), first.dtype) for key, value in vectors.items()]
         class_ids = extension.plain("class_ids", class_ids.int(), (count,), torch.int32)
-        out = torch.empty(count, dtype=dtype)
+        out = torch.empty(count, dtype=dtype, device=first.device)
+        module = cuda_extension.module_for(*arrays)
+        if module is not None:
+            voxels = self.voxels(module, first.device)
+            cuda_extension.call(module, name, first, voxels, *arrays, self.ranks(class_ids), out)
+            return out
         extension.function(name, first, self.native)(*arrays, self.ranks(class_ids), out, extension.threads())
         return out

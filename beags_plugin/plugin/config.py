@@ -124,7 +124,7 @@ def base_config() -> BeagsTrainerConfig:
                 "quats": 0.001,
             }.items()
         },
-        # the compiled rasterizer runs on CPUs; the device changes here once there is a CUDA backend to use
+        # the CUDA backend has never run on a GPU; until it has, it must be asked for
         machine=MachineConfig(device_type="cpu"),
         logging=LoggingConfig(steps_per_log=10),
         viewer=ViewerConfig(websocket_host="127.0.0.1", quit_on_train_completion=True),

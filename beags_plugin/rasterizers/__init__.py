@@ -12,13 +12,18 @@ RASTERIZERS = Registry(
     {
         "torch": "beags_plugin.rasterizers.torch_reference:TorchRasterizer",
         "native": "beags_plugin.rasterizers.native:NativeRasterizer",
+        "cuda": "beags_plugin.rasterizers.cuda:CudaRasterizer",
     },
 )
-_PREFERENCE = ("native", "torch")  # what "auto" tries, best first
+_PREFERENCE = ("native", "torch")  # what "auto" tries, best first; on a GPU first "cuda"
 
 
 def make_rasterizer(name: str = "auto") -> Rasterizer:
-    """The backend called ``name``; "auto" takes the best one present. Raises ``UserError`` if it cannot run here."""
+    """The backend called ``name``. Raises ``UserError`` if it cannot run here.
+
+    "auto" takes the best one present; where there is a GPU that the CUDA backend can use, it draws tensors on the GPU
+    with that, and others with the best one for the CPU.
+    """
     if name != "auto":
         backend = RASTERIZERS.get(name)
         if reason := backend.unavailable():
@@ -27,5 +32,10 @@ def make_rasterizer(name: str = "auto") -> Rasterizer:
     for candidate in _PREFERENCE:
         backend = RASTERIZERS.get(candidate)
         if backend.unavailable() is None:
-            return backend()
+            cuda = RASTERIZERS.get("cuda")
+            if cuda.unavailable() is not None:
+                return backend()
+            from beags_plugin.rasterizers.by_device import ByDevice
+
+            return ByDevice(backend(), cuda())
     raise UserError("no rasterizer can run here: reinstall beags.")

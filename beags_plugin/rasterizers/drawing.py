@@ -24,7 +24,7 @@ def surfel_inputs(
     surfels: N surfels. sh_degree: degrees to use, all if None. class_ids: [N] int32, phi, or None.
     """
     degree = surfels.sh_degree if sh_degree is None else sh_degree
-    colors = sh_colors(surfels.sh_dc, surfels.sh_rest, surfels.means, camera.center, degree)
+    colors = sh_colors(surfels.sh_dc, surfels.sh_rest, surfels.means, camera.host.center, degree)
     return SurfelInputs(surfels.means, surfels.quats, surfels.log_scales, surfels.opacity_logits, colors, class_ids)
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.class_ranks import ClassRanks
+from beags_plugin.core.processes import each_view
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.masks.label_maps import LabelMaps
@@ -104,15 +105,14 @@ def render_depths(
     progress: Progress | None = None,
 ) -> list[Tensor]:
     """Per view [H, W], the depth of the surface: see ``rasterizers.drawing.surface_depth``."""
-    depths = []
+
+    def render(index: int) -> Tensor:
+        background = surfels.means.new_zeros(3)
+        drawn = rasterizer.rasterize(geometry_inputs(surfels), cameras[index], settings, background)
+        return surface_depth(drawn, depth)
+
     with torch.no_grad():
-        for index, camera in enumerate(cameras):
-            background = surfels.means.new_zeros(3)
-            drawn = rasterizer.rasterize(geometry_inputs(surfels), camera, settings, background)
-            depths.append(surface_depth(drawn, depth))
-            if progress:
-                progress(index + 1, len(cameras))
-    return depths
+        return list(each_view(len(cameras), render, progress))
 
 
 def _or_ignore(mask: Tensor | None, camera: Camera) -> Tensor:

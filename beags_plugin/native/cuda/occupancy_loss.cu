@@ -1,0 +1,253 @@
+// The occupancy loss (method, section 6; E9): values and closed-form gradients in one pass, whose memory does not
+// depend on the number of samples. A block looks at its Gaussians, passes over those whose disc wholly lies in valid
+// voxels, and gives the others to its first threads, so that warps are full. What is computed is as in
+// ../occupancy_kernel.h.
+#include "ops.h"
+
+namespace beags {
+namespace cuda {
+namespace {
+
+using namespace ops;
+using namespace ops::BEAGS_ISA;
+
+// The SplitMix64 finaliser, as occupancy/sampling.py.
+BEAGS_DEVICE uint64_t mix(uint64_t word) {
+  word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9u;
+  word = (word ^ word >> 27) * 0x94D049BB133111EBu;
+  return word ^ word >> 31;
+}
+
+// Cosine and sine of angle / 2^24 turns.
+BEAGS_DEVICE void cos_sin(uint32_t angle, float& cosine, float& sine) {
+#if defined(BEAGS_CUDA_EMULATION)
+  cosine = static_cast<float>(std::cos(angle * 3.745070282923929e-07));
+  sine = static_cast<float>(std::sin(angle * 3.745070282923929e-07));
+#else
+  sincospif(static_cast<float>(angle) * (1.0f / (1 << 23)), &sine, &cosine);
+#endif
+}
+BEAGS_DEVICE void cos_sin(uint32_t angle, double& cosine, double& sine) {
+  const double x = static_cast<double>(angle) * 3.745070282923929e-07;
+  cosine = cos(x);
+  sine = sin(x);
+}
+
+template <class T>
+BEAGS_DEVICE bool is_finite(T x) {
+  return x - x == T(0);
+}
+
+// A Gaussian's disc.
+template <class T>
+struct Disc {
+  T unit[4], inverse_length;          // the quaternion q / |q|, 1 / |q|
+  T r0[3], r1[3];                     // columns of the rotation
+  T scale[2];                         // world units
+  T center[3], axis_u[3], axis_v[3];  // voxels; s R0 and s R1
+  bool broken;                        // counts as nothing: a number is not finite or a scale is 0
+
+  BEAGS_DEVICE Disc(const OccupancyJob<T>& job, int64_t i) {
+    const T* q = job.quats + 4 * i;
+    inverse_length = T(1) / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+    for (int part = 0; part < 4; ++part) unit[part] = q[part] * inverse_length;
+    const T w = unit[0], x = unit[1], y = unit[2], z = unit[3];
+    r0[0] = 1 - 2 * (y * y + z * z);
+    r0[1] = 2 * (x * y + w * z);
+    r0[2] = 2 * (x * z - w * y);
+    r1[0] = 2 * (x * y - w * z);
+    r1[1] = 1 - 2 * (x * x + z * z);
+    r1[2] = 2 * (y * z + w * x);
+    broken = !is_finite(job.opacity_logits[i]);
+    for (int axis = 0; axis < 2; ++axis) {
+      const T log_scale = job.log_scales[2 * i + axis];
+      scale[axis] = exp(log_scale);
+      broken = broken || !is_finite(log_scale) || !is_finite(T(1) / scale[axis]);
+    }
+    for (int axis = 0; axis < 3; ++axis) {
+      const T mean = job.means[3 * i + axis];
+      axis_u[axis] = scale[0] * r0[axis] / job.voxel_size;
+      axis_v[axis] = scale[1] * r1[axis] / job.voxel_size;
+      center[axis] = (mean - job.origin[axis]) / job.voxel_size;
+      broken = broken || !is_finite(mean) || !is_finite(T(3) * scale[0] * r0[axis] + T(3) * scale[1] * r1[axis]);
+    }
+  }
+
+  // The voxels that it reaches: `size` of them along each axis from `low` on. Returns the largest size; more than
+  // all windows hold where they lie too far off to be looked up.
+  BEAGS_DEVICE int box(int64_t* low, int* size) const {
+    constexpr T kEpsilon = sizeof(T) == 4 ? T(1.1920929e-7) : T(2.220446049250313e-16);
+    constexpr int kFarOff = 1 << 20;
+    int largest = 0;
+    for (int axis = 0; axis < 3; ++axis) {
+      const T u = axis_u[axis], v = axis_v[axis], distance = fabs(center[axis]);
+      // The samples and this box round differently, by a few units in the last place.
+      const T half = T(3) * sqrt(u * u + v * v) * (1 + 16 * kEpsilon) + 16 * kEpsilon * distance;
+      low[axis] = 0;
+      size[axis] = kFarOff;
+      if (distance + half < static_cast<T>(kVoxelHalf)) {
+        low[axis] = static_cast<int64_t>(floor(center[axis] - half));
+        size[axis] = static_cast<int>(static_cast<int64_t>(floor(center[axis] + half)) - low[axis]) + 1;
+      }
+      largest = size[axis] > largest ? size[axis] : largest;
+    }
+    return largest;
+  }
+};
+
+// Whether a disc surely lies in valid voxels.
+BEAGS_DEVICE bool wholly_inside(const VoxelTable* cubes, int32_t class_id, const int64_t* low, const int* size,
+                                int largest) {
+  if (largest <= kLargestCube) {
+    if (voxel_bit(cubes[largest - 1], class_id, low)) return true;
+  }
+  if (largest <= 4) {
+    const uint64_t box = box_bits(size[0], size[1], size[2]);
+    return (voxel_box(cubes[0], class_id, low, size) & box) == box;
+  }
+  if (largest > kWindowVoxels || class_id < 0 || class_id >= cubes->num_classes) return false;
+  int64_t corner[3] = {low[0], low[1], low[2]};
+  uint64_t window[kWindow * kWindow * kWindow];
+  return fill_window(cubes[0], class_id, corner, size, window);
+}
+
+// Draws the samples of one Gaussian, writes its gradients, returns its loss.
+template <class T>
+BEAGS_DEVICE double sample(const OccupancyJob<T>& job, const VoxelTable& valid, int64_t i) {
+  const Disc<T> disc(job, i);
+  const T opacity = T(1) / (T(1) + exp(-job.opacity_logits[i]));
+  const int32_t class_id = job.class_ids[i];
+  const bool known = class_id >= 0 && class_id < valid.num_classes;
+  int64_t low[3];
+  int size[3];
+  const bool near = disc.box(low, size) <= 4;
+  const uint64_t bits = near && known ? voxel_box(valid, class_id, low, size) : 0;
+  uint64_t word = mix(static_cast<uint64_t>(i) * kGolden + job.stream);  // hash of stream and Gaussian
+  T g = 0, gu = 0, gv = 0, guu = 0, gvv = 0, guv = 0;
+  for (int64_t s = 0; s < job.samples; ++s, word += kGolden) {
+    const uint64_t random = mix(word);
+    const T area = static_cast<T>(static_cast<uint32_t>(random >> 40)) * T(1.0 / (1 << 24));  // (r / 3)^2
+    const T radius = T(3) * sqrt(area);  // the area grows with the square of the radius
+    T u, v;
+    cos_sin(static_cast<uint32_t>(random << 32 >> 40), u, v);
+    u *= radius;
+    v *= radius;
+    int64_t index[3];
+    for (int axis = 0; axis < 3; ++axis) {
+      const T at = fused(v, disc.axis_v[axis], fused(u, disc.axis_u[axis], disc.center[axis]));
+      const T limit = static_cast<T>(kVoxelHalf + 4);
+      index[axis] = static_cast<int64_t>(floor(at > limit ? limit : at < -limit ? -limit : at));
+    }
+    bool is_valid = false;
+    if (near) {
+      const int64_t x = index[0] - low[0], y = index[1] - low[1], z = index[2] - low[2];
+      is_valid = bits >> ((x & 3) << 4 | (y & 3) << 2 | (z & 3)) & 1;
+    } else if (known) {
+      for (int axis = 0; axis < 3; ++axis) index[axis] += kVoxelShift;
+      const int place = static_cast<int>((index[0] & 3) << 4 | (index[1] & 3) << 2 | (index[2] & 3));
+      is_valid = brick_bits(valid, class_id, index[0] >> 2, index[1] >> 2, index[2] >> 2) >> place & 1;
+    }
+    if (is_valid) continue;
+    const T weight = exp(T(-4.5) * area), wu = weight * u, wv = weight * v;
+    g += weight;
+    gu += wu;
+    gv += wv;
+    guu = fused(wu, u, guu);
+    gvv = fused(wv, v, gvv);
+    guv = fused(wu, v, guv);
+  }
+  if (job.g_means) {  // see `finish` in ../occupancy_kernel.h
+    const T s_u = disc.scale[0], s_v = disc.scale[1], o = opacity * static_cast<T>(job.factor);
+    const T along_u = o * gu / s_u, along_v = o * gv / s_v;
+    for (int axis = 0; axis < 3; ++axis) job.g_means[3 * i + axis] = along_u * disc.r0[axis] + along_v * disc.r1[axis];
+    const T turn = T(2) * o * guv * (s_u / s_v - s_v / s_u) * disc.inverse_length;
+    job.g_quats[4 * i] = -turn * disc.unit[3];
+    job.g_quats[4 * i + 1] = turn * disc.unit[2];
+    job.g_quats[4 * i + 2] = -turn * disc.unit[1];
+    job.g_quats[4 * i + 3] = turn * disc.unit[0];
+    job.g_log_scales[2 * i] = o * guu;
+    job.g_log_scales[2 * i + 1] = o * gvv;
+    job.g_opacity_logits[i] = o * (T(1) - opacity) * g;
+  }
+  return static_cast<double>(opacity * g) * job.factor;
+}
+
+template <class T>
+__global__ void __launch_bounds__(kOccupancyThreads)
+    occupancy_kernel(OccupancyJob<T> job, Voxels voxels, int64_t count, double* partial) {
+  constexpr int kWarps = kOccupancyThreads / kWarpThreads;
+  __shared__ int active[kOccupancyThreads];
+  __shared__ int found[kWarps];
+  __shared__ double sums[kWarps];
+  const int thread = threadIdx.x, warp = thread / kWarpThreads, lane = thread % kWarpThreads;
+  const int64_t first = static_cast<int64_t>(blockIdx.x) * kOccupancyThreads, i = first + thread;
+  bool wanted = false;
+  if (i < count) {
+    if (job.g_means) {
+      for (int axis = 0; axis < 3; ++axis) job.g_means[3 * i + axis] = 0;
+      for (int part = 0; part < 4; ++part) job.g_quats[4 * i + part] = 0;
+      for (int axis = 0; axis < 2; ++axis) job.g_log_scales[2 * i + axis] = 0;
+      job.g_opacity_logits[i] = 0;
+    }
+    const int32_t class_id = job.class_ids[i];
+    if (job.background || class_id != 0) {
+      const Disc<T> disc(job, i);
+      if (!disc.broken) {
+        int64_t low[3];
+        int size[3];
+        const int largest = disc.box(low, size);
+        wanted = !job.skip || !wholly_inside(voxels.valid, class_id, low, size, largest);
+      }
+    }
+  }
+  const unsigned votes = __ballot_sync(kWholeWarp, wanted);
+  if (lane == 0) found[warp] = __popc(votes);
+  __syncthreads();
+  int place = __popc(votes & ((1u << lane) - 1)), total = 0;
+  for (int w = 0; w < kWarps; ++w) {
+    if (w < warp) place += found[w];
+    total += found[w];
+  }
+  if (wanted) active[place] = thread;
+  __syncthreads();
+  double loss = 0;
+  if (thread < total) loss = sample(job, voxels.valid[0], first + active[thread]);
+  loss = warp_sum(loss);
+  if (lane == 0) sums[warp] = loss;
+  __syncthreads();
+  if (thread == 0) {
+    double sum = 0;
+    for (int w = 0; w < kWarps; ++w) sum += sums[w];
+    partial[blockIdx.x] = sum;
+  }
+}
+
+// One warp adds up all blocks, in a fixed order.
+template <class T>
+__global__ void sum_kernel(int64_t blocks, const double* partial, T* value) {
+  double sum = 0;
+  for (int64_t i = threadIdx.x; i < blocks; i += kWarpThreads) sum += partial[i];
+  sum = warp_sum(sum);
+  if (threadIdx.x == 0) *value = static_cast<T>(sum);
+}
+
+}  // namespace
+
+template <class T>
+void occupancy_loss(const OccupancyJob<T>& job, const Voxels& voxels, int64_t count, double* partial, T* value,
+                    Stream stream) {
+  const int64_t blocks = blocks_for(count, kOccupancyThreads);
+  const auto kernel = occupancy_kernel<T>;
+  BEAGS_LAUNCH(kernel, blocks, kOccupancyThreads, stream, job, voxels, count, partial);
+  const auto sum = sum_kernel<T>;
+  BEAGS_LAUNCH(sum, 1, kWarpThreads, stream, blocks, partial, value);
+}
+
+#define BEAGS_INSTANTIATE(T) \
+  template void occupancy_loss(const OccupancyJob<T>&, const Voxels&, int64_t, double*, T*, Stream);
+BEAGS_INSTANTIATE(float)
+BEAGS_INSTANTIATE(double)
+#undef BEAGS_INSTANTIATE
+
+}  // namespace cuda
+}  // namespace beags

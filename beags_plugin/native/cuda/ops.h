@@ -1,0 +1,44 @@
+// The ops on a GPU. All memory is the caller's (torch's), all work goes to its stream, and nothing waits for the GPU.
+#pragma once
+
+#if !defined(BEAGS_ISA)
+#define BEAGS_ISA device  // of the voxel tables' queries
+#endif
+#include "../op_kernels.h"
+#include "../voxel_table.h"
+#include "platform.h"
+
+namespace beags {
+namespace cuda {
+
+template <class T>
+void sh_colors(const ops::ColorJob<T>& job, int64_t count, Stream stream);
+// Fills the gradients that are not null.
+template <class T>
+void sh_colors_backward(const ops::ColorJob<T>& job, int64_t count, Stream stream);
+
+// The voxel tables of VoxelLookup, in device memory.
+struct Voxels {
+  ops::VoxelTable occupied, valid[ops::kLargestCube];
+  double origin[3], voxel_size;
+};
+
+// See ../voxel_lookup.h.
+template <class T>
+void count_occupied(const Voxels& voxels, int64_t count, const T* points, const int32_t* class_ids, int64_t* out,
+                    Stream stream);
+template <class T>
+void is_valid(const Voxels& voxels, int64_t count, const T* points, const int32_t* class_ids, bool* out, Stream stream);
+template <class T>
+void disc_inside(const Voxels& voxels, int64_t count, const T* means, const T* axes_u, const T* axes_v,
+                 const int32_t* class_ids, bool* out, Stream stream);
+
+// As OccupancyJob; its tables are those of `voxels`.
+constexpr int kOccupancyThreads = 128;
+// partial: [blocks_for(count, kOccupancyThreads)]; value: [1], the loss times `factor`.
+template <class T>
+void occupancy_loss(const ops::OccupancyJob<T>& job, const Voxels& voxels, int64_t count, double* partial, T* value,
+                    Stream stream);
+
+}  // namespace cuda
+}  // namespace beags

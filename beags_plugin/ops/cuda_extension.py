@@ -1,0 +1,68 @@
+"""The CUDA part of the compiled module, if there is one, and what its fronts share."""
+
+from __future__ import annotations
+
+from functools import cache
+from types import ModuleType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from beags_plugin.ops import extension
+
+
+@cache
+def found() -> tuple[ModuleType | None, str | None]:
+    """``beags_plugin._native.cuda``, or one sentence on why it cannot be used here."""
+    module, reason = extension.found()
+    if module is None:
+        return None, reason
+    cuda = getattr(module, "cuda", None)
+    if cuda is None:
+        return None, "beags was built without CUDA; install the CUDA toolkit (nvcc 12 or newer) and reinstall beags."
+    if not torch.cuda.is_available():
+        return None, "torch finds no CUDA device; it needs an NVIDIA GPU, its driver, and a torch built for CUDA."
+    return cuda, None
+
+
+def load() -> ModuleType | None:
+    """The module, or None where CUDA kernels cannot run."""
+    return found()[0]
+
+
+def module_for(*tensors: Tensor) -> ModuleType | None:
+    """The module if it takes these float tensors (on one GPU, all float32 or all float64), else None."""
+    first = tensors[0]
+    if not first.is_cuda or first.dtype not in (torch.float32, torch.float64):
+        return None
+    if any(value.device != first.device or value.dtype != first.dtype for value in tensors):
+        return None
+    return load()
+
+
+def stream(device: torch.device) -> int:
+    """torch's current stream there; 0, the emulation's, for the CPU."""
+    return torch.cuda.current_stream(device).cuda_stream if device.type == "cuda" else 0
+
+
+class on_device:
+    """Makes a GPU the current one, as launches of kernels need it; does nothing for the CPU (the emulation's)."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._guard: Any = torch.cuda.device(device) if device.type == "cuda" else None
+
+    def __enter__(self) -> None:
+        if self._guard is not None:
+            self._guard.__enter__()
+
+    def __exit__(self, *raised: Any) -> None:
+        if self._guard is not None:
+            self._guard.__exit__(*raised)
+
+
+def call(module: ModuleType, name: str, like: Tensor, *arguments: Any) -> Any:
+    """``name`` of the module for the dtype and on the device of ``like``; its last argument is the stream."""
+    suffix = "f32" if like.dtype == torch.float32 else "f64"
+    with on_device(like.device):
+        return getattr(module, f"{name}_{suffix}")(*arguments, stream(like.device))

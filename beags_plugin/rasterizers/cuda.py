@@ -1,0 +1,295 @@
+"""The CUDA rasterizer: checks and allocates here, computes in ``beags_plugin._native.cuda``.
+
+All memory is torch's, all kernels run on torch's current stream. The number of pairs (of a tile and a surfel that
+reaches it) is known on the GPU only, so that their memory is guessed from the drawings before. All kernels of a drawing
+are launched on that guess; then the host waits for the number, which the GPU knew long before the image, and launches
+the last ones again in the rare case that the guess was too small. The GPU never waits for the host.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from types import ModuleType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.errors import UserError
+from beags_plugin.ops import cuda_extension
+from beags_plugin.rasterizers.autograd import (
+    Drawing,
+    Forward,
+    Images,
+    InputGradients,
+    KernelRasterizer,
+    Needed,
+    check_image,
+)
+from beags_plugin.rasterizers.interface import IGNORE, RasterSettings, SurfelInputs
+
+_FLOATS = ("means", "quats", "log_scales", "opacity_logits", "colors")
+_GEOMETRY, _DISTORTION, _BOUNDARY = 1, 2, 4  # Parts of native/types.h
+_TILE = 16
+_SPARE = 1.25  # memory for so many times as many pairs as the largest drawing so far had
+_FADING = 0.98  # of that largest number, a drawing
+_STEP = 1 << 14  # pairs; fewer different sizes leave torch's allocator fewer holes
+UNKNOWN = -1
+"""``num_nonfinite`` of a drawing that is captured into a CUDA graph."""
+
+
+@dataclass
+class _Frame:
+    """Surfels projected and sorted into tiles.
+
+    native: the compiled module's frame, which points into ``owned`` (per surfel) and ``pairs`` (per pair).
+    kept: what the forward keeps for the backward.
+    """
+
+    native: Any
+    visible: Tensor
+    owned: list[Tensor]
+    pairs: list[Tensor] = field(default_factory=list)
+    num_nonfinite: int = 0
+    kept: tuple[Tensor | None, ...] = ()
+
+
+class CudaRasterizer(KernelRasterizer):
+    """Float32 and float64 on one GPU; the same bits in every run (there are no atomic additions of floats).
+
+    In a CUDA graph (``torch.cuda.graph``) nothing is waited for: draw the same scene once before the capture, so that
+    the memory for its pairs is known, and ask ``overflowed`` after replays.
+    """
+
+    def __init__(self) -> None:
+        self._module: ModuleType | None = None
+        self._largest: dict[torch.device, float] = {}
+        self._pinned: dict[torch.device, Tensor] = {}
+        self._captured: list[tuple[Tensor, int]] = []
+
+    @classmethod
+    def unavailable(cls) -> str | None:
+        """See ``Rasterizer.unavailable``."""
+        return cuda_extension.found()[1]
+
+    def overflowed(self) -> bool:
+        """Whether a drawing in a CUDA graph had more pairs than memory in its last replay; its image is then wrong."""
+        return any(int(totals[0]) > capacity for totals, capacity in self._captured)
+
+    def forward_kernel(self, drawing: Drawing) -> Forward:
+        """See ``KernelRasterizer.forward_kernel``."""
+        inputs, camera, settings = drawing.inputs, drawing.camera, drawing.settings
+        geometry, distortion, boundary = settings.geometry, settings.distortion, drawing.target is not None
+        like = inputs.means
+
+        def image(wanted: bool, *channels: int, dtype: torch.dtype | None = None) -> Tensor | None:
+            if not wanted:
+                return None
+            return torch.empty(camera.height, camera.width, *channels, dtype=dtype or like.dtype, device=like.device)
+
+        images = Images(
+            color=image(True, 3),
+            alpha=image(True),
+            depth=image(geometry),
+            median_depth=image(geometry),
+            normal=image(geometry, 3),
+            distortion=image(distortion),
+            boundary=image(boundary),
+        )
+        keep = drawing.differentiable
+        kept = (
+            image(keep),
+            image(keep, dtype=torch.int32),
+            image(keep and geometry),
+            image(keep and geometry, dtype=torch.int32),
+            *(image(keep and distortion) for _ in range(3)),
+        )
+
+        def draw(frame: _Frame) -> None:
+            frame.native.forward(drawing.background, drawing.target, *images, *kept, self._stream(like))
+
+        frame = self._frame(inputs, camera, settings, draw)
+        frame.kept = kept
+        return Forward(images, frame.visible, frame.num_nonfinite, frame)
+
+    def backward_kernel(self, drawing: Drawing, state: Any, gradients: Images, needed: Needed) -> InputGradients:
+        """See ``KernelRasterizer.backward_kernel``."""
+        inputs, camera = drawing.inputs, drawing.camera
+        like, n = inputs.means, len(inputs.means)
+        wanted = dict(zip(Needed._fields, needed, strict=True))
+        shapes = [getattr(inputs, name).shape for name in _FLOATS] + [(n, 2)]
+        names = (*_FLOATS, "screen_shift")
+        found = [like.new_empty(shape) if wanted[name] else None for name, shape in zip(names, shapes, strict=True)]
+        parts = _GEOMETRY * any(g is not None for g in (gradients.depth, gradients.median_depth, gradients.normal))
+        parts |= _DISTORTION * (gradients.distortion is not None) | _BOUNDARY * (gradients.boundary is not None)
+        frame: _Frame = state
+        capacity = len(frame.pairs[0])
+        records = like.new_empty(capacity * frame.native.record_size(parts))
+        sums = torch.empty(n, 20, dtype=torch.float64, device=like.device)
+        g_background = like.new_empty(_tiles(camera), 3)
+        with cuda_extension.on_device(like.device):
+            frame.native.backward(
+                *(getattr(inputs, name) for name in _FLOATS), drawing.background, drawing.target, *gradients,
+                *frame.kept, *found, g_background, records, sums, parts, self._stream(like),
+            )  # fmt: skip
+        background = g_background.sum(0, dtype=torch.float64).to(like.dtype) if wanted["background"] else None
+        return InputGradients(*found, background)  # type: ignore[call-arg]
+
+    @torch.no_grad()
+    def class_contributions(
+        self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, labels: Tensor, num_classes: int
+    ) -> Tensor:
+        """See ``Rasterizer.class_contributions``."""
+        inputs = _detached(inputs.checked())
+        labels = check_image("labels", labels, camera)
+        like = inputs.means
+        sums = torch.zeros(len(like), num_classes, dtype=torch.int64, device=like.device)
+
+        def draw(frame: _Frame) -> None:
+            sums.zero_()
+            frame.native.class_contributions(labels, num_classes, sums, self._stream(like))
+
+        self._frame(inputs, camera, settings, draw)
+        return (sums.double() * self._native().WEIGHT_UNIT).to(like.dtype)
+
+    @torch.no_grad()
+    def class_map(
+        self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
+    ) -> tuple[Tensor, Tensor]:
+        """See ``Rasterizer.class_map``."""
+        inputs = _detached(inputs.checked())
+        ids, like = inputs.class_ids, inputs.means
+        if ids is None:
+            raise ValueError("class_ids must be given for a class map")
+        if ids.numel() and not (int(ids.min()) >= 0 and int(ids.max()) < min(num_classes, IGNORE)):
+            raise ValueError(f"class_ids must lie in 0..{num_classes - 1}, not {int(ids.min())}..{int(ids.max())}")
+        classes = torch.empty(camera.height, camera.width, dtype=torch.int32, device=like.device)
+        share = like.new_empty(camera.height, camera.width)
+
+        def draw(frame: _Frame) -> None:
+            frame.native.class_map(min(num_classes, IGNORE), classes, share, self._stream(like))
+
+        self._frame(inputs, camera, settings, draw)
+        return classes, share
+
+    @torch.no_grad()
+    def heaviest(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
+        """See ``Rasterizer.heaviest``."""
+        inputs = _detached(inputs.checked())
+        indices = torch.empty(camera.height, camera.width, dtype=torch.int32, device=inputs.means.device)
+        self._frame(inputs, camera, settings, lambda frame: frame.native.heaviest(indices, self._stream(inputs.means)))
+        return indices
+
+    def _native(self) -> ModuleType:
+        if self._module is None:
+            module, reason = cuda_extension.found()
+            if module is None:
+                raise UserError(f"the rasterizer 'cuda' cannot run here: {reason}")
+            self._module = module
+        return self._module
+
+    @staticmethod
+    def _stream(like: Tensor) -> int:
+        return cuda_extension.stream(like.device)
+
+    def _frame(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, draw: Any) -> _Frame:
+        """Project, sort into tiles and draw with ``draw(frame)``, which may be called twice."""
+        module, means = self._native(), inputs.means
+        device, n = means.device, len(means)
+        if device.type != ("cpu" if module.EMULATED else "cuda"):
+            raise ValueError(f"the CUDA rasterizer takes tensors on a GPU, not on {device}")
+        if _tiles(camera) > module.MOST_TILES:
+            raise UserError(
+                f"an image of {camera.width} x {camera.height} pixels is too large for the CUDA rasterizer, which "
+                "draws 16 million pixels at most: use smaller images."
+            )
+        with cuda_extension.on_device(device):
+            frame, totals = self._project(module, inputs, camera, settings)
+            capturing = device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+            told = None if capturing else self._send(totals)
+            guess = self._largest.get(device)
+            if guess is None:
+                if told is None:
+                    raise UserError("draw the scene once before it is captured into a CUDA graph.")
+                guess = float(self._receive(told)[0])
+            capacity = self._bin(frame, camera, guess, n)
+            draw(frame)
+            if told is None:
+                self._captured.append((totals, capacity))
+                frame.num_nonfinite = UNKNOWN
+                return frame
+            pairs, frame.num_nonfinite = self._receive(told)
+            self._largest[device] = max(guess * _FADING, float(pairs))
+            if pairs > capacity:
+                self._bin(frame, camera, float(pairs), n)
+                draw(frame)
+        return frame
+
+    def _project(
+        self, module: ModuleType, inputs: SurfelInputs, camera: Camera, settings: RasterSettings
+    ) -> tuple[_Frame, Tensor]:
+        means, n = inputs.means, len(inputs.means)
+        make = module.FrameF32 if means.dtype == torch.float32 else module.FrameF64
+
+        def memory(*shape: int, dtype: torch.dtype = torch.int32) -> Tensor:
+            return torch.empty(*shape, dtype=dtype, device=means.device)
+
+        visible = memory(n, dtype=torch.bool)
+        splats = memory(n * make.splat_bytes, dtype=torch.uint8)
+        counts, order = memory(n), memory(n)
+        pair_start, totals = memory(n + 1, dtype=torch.int64), memory(2, dtype=torch.int64)
+        owned = [visible, splats, counts, order, pair_start, totals]
+        floats = [getattr(inputs, name) for name in _FLOATS]
+        matrices = (camera.host.viewmat.tolist(), camera.host.K.tolist())
+        native = make(
+            *floats, inputs.class_ids, *matrices, camera.width, camera.height, settings.near, settings.far, *owned
+        )
+        low = memory(n) if means.dtype == torch.float64 else None
+        temporary = memory(module.temporary_bytes(n + 1), dtype=torch.uint8)
+        native.project(temporary, memory(n), memory(n), low, memory(n), self._stream(means))
+        return _Frame(native, visible, owned), totals
+
+    def _bin(self, frame: _Frame, camera: Camera, pairs: float, n: int) -> int:
+        """Sort the pairs into tiles; returns for how many there is memory."""
+        capacity = max(int(pairs * _SPARE) // _STEP + 1, 1) * _STEP
+        if capacity > 2**31 - 1 or n > 2**31 - 1:
+            raise UserError("over 1.7 billion pairs of a tile and a surfel: draw fewer surfels or smaller images.")
+        device, module = frame.visible.device, self._native()
+
+        def memory(count: int, dtype: torch.dtype = torch.int32) -> Tensor:
+            return torch.empty(count, dtype=dtype, device=device)
+
+        lasting = [memory(capacity) for _ in range(3)] + [memory(_tiles(camera) + 1)]
+        temporary = memory(module.temporary_bytes(capacity), torch.uint8)
+        frame.native.bin(*lasting, temporary, memory(capacity), memory(capacity), cuda_extension.stream(device))
+        frame.pairs = lasting
+        return capacity
+
+    def _send(self, totals: Tensor) -> tuple[Tensor, Any]:
+        """Start to copy a few numbers to the host."""
+        if not totals.is_cuda:
+            return totals, None
+        device = totals.device
+        if device not in self._pinned:
+            self._pinned[device] = torch.empty(2, dtype=torch.int64, pin_memory=True)
+        self._pinned[device].copy_(totals, non_blocking=True)
+        event = torch.cuda.Event()
+        event.record()
+        return self._pinned[device], event
+
+    @staticmethod
+    def _receive(told: tuple[Tensor, Any]) -> tuple[int, int]:
+        numbers, event = told
+        if event is not None:
+            event.synchronize()
+        pairs, nonfinite = numbers.tolist()
+        return pairs, nonfinite
+
+
+def _tiles(camera: Camera) -> int:
+    return -(-camera.width // _TILE) * -(-camera.height // _TILE)
+
+
+def _detached(inputs: SurfelInputs) -> SurfelInputs:
+    return SurfelInputs(*(getattr(inputs, name).detach() for name in _FLOATS), class_ids=inputs.class_ids)

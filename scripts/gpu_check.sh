@@ -1,0 +1,72 @@
+#!/usr/bin/env bash
+# Everything that needs a GPU, in one command: scripts/gpu_check.sh [--out FOLDER] [build] [tests] [sanitizer] [benchmark]
+# Without names of stages it runs them all. It needs an NVIDIA GPU, nvcc, CMake, a C++ compiler, and a Python (PYTHON,
+# default python3) with torch for CUDA, nanobind, numpy, scipy and pytest; no nerfstudio. It builds in place, for the GPU
+# that is here, and changes nothing outside the repository. A stage that fails does not stop the others; the exit code
+# tells. Logs and cuda.json go to FOLDER (default build/gpu_check).
+set -uo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+python="${PYTHON:-python3}"
+out=build/gpu_check
+if [ "${1:-}" = --out ]; then
+  out="$2"
+  shift 2
+fi
+stages=("$@")
+if [ ${#stages[@]} = 0 ]; then stages=(build tests sanitizer benchmark); fi
+mkdir -p "$out"
+export OMP_WAIT_POLICY=PASSIVE PYTHONPATH="$PWD${PYTHONPATH:+:$PYTHONPATH}" PYTHONUNBUFFERED=1
+
+fail() {
+  echo "gpu_check: $1" >&2
+  exit 1
+}
+command -v nvidia-smi >/dev/null && nvidia-smi -L || fail "there is no NVIDIA GPU, or no driver for it"
+command -v nvcc >/dev/null || fail "there is no nvcc: install the CUDA toolkit"
+"$python" -c 'import torch, sys; sys.exit(not torch.cuda.is_available())' || fail "$python has no torch that sees the GPU"
+
+build() {
+  local architecture
+  architecture="$("$python" -c 'import torch; print("%d%d" % torch.cuda.get_device_capability(0))')"
+  cmake -S . -B build/gpu -DCMAKE_BUILD_TYPE=Release -DPython_EXECUTABLE="$(command -v "$python")" \
+    -Dnanobind_DIR="$("$python" -m nanobind --cmake_dir)" -DBEAGS_CUDA=ON \
+    -DBEAGS_CUDA_ARCHITECTURES="$architecture" -DBEAGS_CUDA_EMULATION=ON &&
+    cmake --build build/gpu -j "$(nproc)" && cp build/gpu/_*.so beags_plugin/ &&
+    "$python" -c 'from beags_plugin.rasterizers.cuda import CudaRasterizer as R; import sys; sys.exit(R.unavailable())'
+}
+
+tests() { # everything that draws or uses an op on the GPU; nothing here imports nerfstudio
+  "$python" -m pytest -q -p no:cacheprovider tests/test_cuda_rasterizer.py tests/test_cuda_ops.py tests/test_cuda_gpu.py \
+    tests/test_rasterizer_reference.py tests/test_rasterizer_robustness.py tests/test_screen_shift.py -k cuda
+}
+
+sanitizer() {
+  command -v compute-sanitizer >/dev/null || {
+    echo "compute-sanitizer is not there: skipped"
+    return 0
+  }
+  local tool
+  for tool in memcheck racecheck synccheck; do
+    echo "compute-sanitizer: $tool"
+    PYTORCH_NO_CUDA_MEMORY_CACHING=1 timeout 240 compute-sanitizer --tool "$tool" --error-exitcode 9 \
+      "$python" -m benchmarks.cuda --smoke || return 1
+  done
+}
+
+benchmark() { "$python" -m benchmarks.cuda --json "$out/cuda.json"; }
+
+failed=()
+for stage in "${stages[@]}"; do
+  case "$stage" in build | tests | sanitizer | benchmark) ;; *) fail "there is no stage $stage" ;; esac
+  echo "== $stage"
+  SECONDS=0
+  if "$stage" >"$out/$stage.log" 2>&1; then word=ok; else
+    word=FAILED
+    failed+=("$stage")
+  fi
+  tail -n 25 "$out/$stage.log"
+  echo "== $stage: $word, $SECONDS s"
+  if [ "$stage $word" = "build FAILED" ]; then break; fi
+done
+if [ ${#failed[@]} -gt 0 ]; then fail "failed: ${failed[*]}"; fi
+echo "gpu_check: all is well"

@@ -1,0 +1,56 @@
+"""The stages before refinement, split over processes: what one process finds, bit for bit."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import preparation_in_processes
+import pytest
+import torch
+import torch.distributed as dist
+
+from beags_plugin.core.processes import each_view
+
+PROGRAM = Path(preparation_in_processes.__file__)
+
+
+def test_alone_views_come_one_after_the_other():
+    calls, told = [], []
+
+    def work(index):
+        calls.append(index)
+        return index * index
+
+    views = each_view(4, work, lambda done, count: told.append((done, count)))
+    assert next(views) == 0 and calls == [0]  # nothing is done before it is asked for
+    assert list(views) == [1, 4, 9]
+    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert list(each_view(0, work)) == []
+
+
+@pytest.mark.skipif(not dist.is_gloo_available(), reason="torch was built without gloo")
+def test_two_processes_find_what_one_finds(tmp_path):
+    root = str(PROGRAM.parents[1])
+
+    def start(rank):
+        command = [sys.executable, str(PROGRAM), str(rank), "2", str(tmp_path / "meeting"), str(tmp_path / str(rank))]
+        return subprocess.Popen(command, cwd=root, env=environment(root))
+
+    running = [start(0), start(1)]
+    try:
+        assert [process.wait(timeout=300) for process in running] == [0, 0]
+    finally:
+        for process in running:
+            process.kill()
+    alone = preparation_in_processes.found()
+    for found in (torch.load(tmp_path / str(rank)) for rank in (0, 1)):
+        assert len(found) == len(alone)
+        assert all(torch.equal(a, b) for a, b in zip(found, alone, strict=True))
+    assert len(alone[-3]) > 10  # voxels
+
+
+def environment(root: str) -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": root, "OMP_NUM_THREADS": "1"}
