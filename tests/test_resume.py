@@ -306,6 +306,22 @@ def test_what_cannot_be_resumed_is_said_in_one_sentence(data, whole, tmp_path, m
     assert checkpoint_of(run)["step"] == LAST
 
 
+def test_a_kill_between_the_last_checkpoint_and_the_report(data, whole, tmp_path, monkeypatch):
+    run = tmp_path / "run"
+
+    def kill(patch):
+        def killed(_):
+            raise Killed
+
+        patch.setattr(BeagsTrainer, "_write_report", killed)
+
+    broken_off(data, run, monkeypatch, kill)
+    assert checkpoint_of(run)["step"] == LAST and not (run / "training.json").exists()
+    resume_to_end(run)
+    assert json.loads((run / "training.json").read_text())["seconds"]["refinement"] > 0
+    assert_same_run(run, whole)
+
+
 def test_a_real_kill(data, whole, tmp_path):
     """SIGKILL from outside while a process trains."""
     run = tmp_path / "run"

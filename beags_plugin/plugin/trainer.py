@@ -91,7 +91,11 @@ class BeagsTrainer(Trainer):
     def train(self) -> None:
         """Train to the end of the schedule, also after a resume (nerfstudio would train that many steps more)."""
         self.config.max_num_iterations = max(self.last_step - self._start_step, 0)
+        self._seconds = _StageSeconds(self._model)
+        self.keep("seconds", self._seconds)
         if self.config.max_num_iterations == 0:
+            if self.loaded_run == self.base_dir.absolute() and not (self.base_dir / REPORT_FILE).exists():
+                return self._write_report()  # killed after its last checkpoint
             _stop(
                 UserError(
                     f"the checkpoint is of a complete run ({self._start_step} steps): nothing is left to train; "
@@ -106,8 +110,6 @@ class BeagsTrainer(Trainer):
         self._set_aside()
         remove_unfinished(self.base_dir)
         (self.base_dir / REPORT_FILE).unlink(missing_ok=True)  # it says that the run is complete
-        self._seconds = _StageSeconds(self._model)
-        self.keep("seconds", self._seconds)
         if self.config.steps_per_held_out > 0:
             datamanager = cast("BeagsDataManager", self.pipeline.datamanager)
             self.curve = HeldOutCurve(
@@ -260,10 +262,12 @@ class BeagsTrainer(Trainer):
         self._interrupts.at_once = True  # a viewer may wait for Ctrl-C
         self.save_checkpoint(self._done)
         self._complete = True
-        report = {"seconds": self._seconds.total(), "peak_memory_mb": peak_memory_mb()}
-        self.base_dir.mkdir(parents=True, exist_ok=True)
-        write_text_atomically(json.dumps(report, indent=2), self.base_dir / REPORT_FILE)
+        self._write_report()
         super()._after_train()
+
+    def _write_report(self) -> None:
+        report = {"seconds": self._seconds.total(), "peak_memory_mb": peak_memory_mb()}
+        write_text_atomically(json.dumps(report, indent=2), self.base_dir / REPORT_FILE)
 
 
 class _StageSeconds:
