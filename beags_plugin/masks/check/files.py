@@ -185,7 +185,7 @@ def _names(files: MaskFiles, coverage: Coverage) -> list[Finding]:
                 f"id {class_id} is in {len(views)} masks, the first {files.masks[views[0]]}, but not in "
                 f"{files.names_file}: name it there or correct the masks{unlabelled}.",
                 f"{STOPS}; the id covers {pixels} pixels ({percent(pixels, coverage.size.sum())})",
-                tuple(files.stems[view] for view in views),
+                tuple(files.stems[int(view)] for view in views),
             )
         )
     absent = [f"{i} ({name})" for i, name in files.names.items() if i != BACKGROUND and i not in coverage.ids]
@@ -219,7 +219,7 @@ def _few_views(files: MaskFiles, coverage: Coverage, few_views: int) -> list[Fin
                 f"id {class_id} ({name}) is in {count} of {int(trained.sum())} training views ({where}), fewer than "
                 f"{few_views}: mask it in more views, or set it to 0 if it is a mistake.",
                 f"its {pixels} pixels can hardly outvote or be outvoted: sides that no mask shows go to other classes",
-                tuple(files.stems[view] for view in np.flatnonzero(present)),
+                tuple(files.stems[int(view)] for view in np.flatnonzero(present)),
             )
         )
     return findings

@@ -76,8 +76,9 @@ class CocoSource(MaskSource):
 
 def decoded(segmentation: Any, shape: tuple[int, int], where: str) -> np.ndarray:
     """[H, W] bool of one annotation: {"size", "counts"} or a list of polygons; ``where`` names it in errors."""
-    from pycocotools import mask as coco
+    from pycocotools import mask
 
+    coco: Any = mask  # its types do not know all that it takes
     height, width = shape
     try:
         if isinstance(segmentation, dict):

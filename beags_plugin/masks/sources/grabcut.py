@@ -130,7 +130,7 @@ def cut_by_box(photo: np.ndarray, prompt: Prompt) -> np.ndarray:
     start[top:bottom, left:right] = cv2.GC_PR_FGD
     radius = max(2, round(_POINT * np.hypot(height, width)))
     for (x, y), inside in zip(prompt.points, prompt.inside, strict=True):
-        cv2.circle(start, (int(x), int(y)), radius, cv2.GC_FGD if inside else cv2.GC_BGD, -1)
+        cv2.circle(start, (int(x), int(y)), radius, (cv2.GC_FGD if inside else cv2.GC_BGD,), -1)
     return large_pieces(_cut(photo, start, (left, top, right, bottom)))
 
 
@@ -179,7 +179,7 @@ def _hull(mask: np.ndarray) -> np.ndarray:
 
     row, column = np.nonzero(mask)
     corners = cv2.convexHull(np.stack([column, row], axis=1).astype(np.int32))
-    return cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), corners, 1)
+    return cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), corners, (1,))
 
 
 def _nearer(inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
