@@ -16,8 +16,8 @@ _TELLING = ("cli.py", "demo.py", "doctor.py", "bench")  # print and draw what th
 def code_digest() -> str:
     """Changes with every file of the package that can change a result, the compiled extension included."""
     digest = hashlib.sha256()
-    for path in sorted([*_PACKAGE.rglob("*.py"), *_PACKAGE.glob("_native*"), *_PACKAGE.glob("native/*")]):
-        if path.relative_to(_PACKAGE).parts[0] not in _TELLING:
+    for path in sorted([*_PACKAGE.rglob("*.py"), *_PACKAGE.glob("_native*"), *_PACKAGE.glob("native/**/*")]):
+        if path.is_file() and path.relative_to(_PACKAGE).parts[0] not in _TELLING:
             digest.update(path.read_bytes())
     digest.update((_PACKAGE / "bench" / "measure.py").read_bytes())
     return digest.hexdigest()
