@@ -116,8 +116,9 @@ class Densifier:
         self.statistics = GradientStatistics(model.num_points)
 
     def state(self) -> dict[str, Any]:
-        """What was gathered since the scene last grew; see ``training_state.Part``."""
-        return {"total": self.statistics.total, "views": self.statistics.views}
+        """What was gathered since the scene last grew, as long as it grows; see ``training_state.Part``."""
+        found = self.statistics if self.model.growing else GradientStatistics(0)
+        return {"total": found.total, "views": found.views}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on gathering."""
