@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -87,3 +88,13 @@ def test_a_failed_base_fails_what_starts_from_it(tmp_path, worker):
     refined = Trial(scene(), "beags-tiny", {"x": 1}, 0, "code", base=base)
     outcome = run_trials([refined], tmp_path, lambda _: 1)[refined.digest]
     assert outcome.failed == "its base failed: k is 0." and len(worker.ran) == 1
+
+
+def test_a_program_that_cannot_start_leaves_its_complaint_in_the_log(tmp_path, monkeypatch):
+    complaint = "import sys; sys.exit('no such preset')"
+    monkeypatch.setattr(runner, "_command", lambda: [sys.executable, "-c", complaint])
+    with runner.Worker() as worker:
+        for trial in ("a", "b"):  # it is started anew for the next one
+            (tmp_path / trial).mkdir()
+            assert worker.run(tmp_path / trial) == 1
+            assert "no such preset" in (tmp_path / trial / "log.txt").read_text()

@@ -9,6 +9,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -83,13 +84,13 @@ class Worker:
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[str] | None = None
+        self._complaints = tempfile.TemporaryFile()  # noqa: SIM115  (what the program itself says; trials have logs)
 
     def run(self, folder: Path) -> int:
         """Run the trial in ``folder``; returns the exit code of its process, negative for a signal."""
         if self._process is None:
-            command = [sys.executable, "-m", "beags_plugin.bench.worker"]
             self._process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+                _command(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._complaints, text=True,
                 env=_environment(),
             )  # fmt: skip
         assert self._process.stdin is not None and self._process.stdout is not None
@@ -99,7 +100,11 @@ class Worker:
         except (OSError, ValueError):  # the program itself is gone
             process, self._process = self._process, None
             process.stdin = None
-            return process.wait()
+            code = process.wait()
+            self._complaints.seek(0)
+            with open(folder / "log.txt", "ab") as log:
+                log.write(self._complaints.read())
+            return code
 
     def __enter__(self) -> Worker:
         return self
@@ -108,6 +113,11 @@ class Worker:
         if self._process is not None:
             self._process.terminate()
             self._process.wait()
+        self._complaints.close()
+
+
+def _command() -> list[str]:
+    return [sys.executable, "-m", "beags_plugin.bench.worker"]
 
 
 def _environment() -> dict[str, str]:
