@@ -22,7 +22,7 @@ from beags_plugin.masks.classes import read_class_map, write_class_map
 from beags_plugin.masks.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.memory import peak_memory_mb
-from beags_plugin.plugin.runs import BASE_SNAPSHOT, PREPARED, STAGES, round_folder, write_run
+from beags_plugin.plugin.runs import BASE_SNAPSHOT, PREPARED, STAGES, round_folder, write_run, write_text_atomically
 from beags_plugin.plugin.scene_edits import edit_scene
 from beags_plugin.progress import progress_bar
 from beags_plugin.refiners import REFINERS
@@ -222,7 +222,7 @@ def save_prepared(prepared: Preparation, names: list[str], folder: Path) -> None
         if prepared.confidence is not None:
             _write_grey(folder / "confidence" / f"{name}.png", prepared.confidence[index])
     report = {"findings": prepared.findings, "seconds": prepared.seconds, "peak_memory_mb": peak_memory_mb()}
-    (folder / "report.json").write_text(json.dumps(report, indent=2))
+    write_text_atomically(json.dumps(report, indent=2), folder / "report.json")
     state = {} if prepared.grid is None else prepared.grid.state_dict()
     write_whole(folder / "grid.pt", lambda file: torch.save(state, file))
 
