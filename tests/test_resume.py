@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -268,6 +269,72 @@ def test_a_new_run_into_the_folder_of_another_is_not_taken_for_it(data, whole, t
     resume_to_end(run)
     assert_same_run(run, whole)
     assert not (run / "replaced_models").exists()
+
+
+def test_a_failed_start_in_the_folder_of_another_run_is_not_mixed_with_it(data, tmp_path, monkeypatch):
+    """Where all checkpoints are kept, too; the former run has come further than the new one."""
+    run = tmp_path / "run"
+    keep_all = {"save_only_latest_checkpoint": False, "steps_per_save": 50, "pipeline.model.refine_steps": 0}
+    run_to_end(short_config(data, run, **{**keep_all, "machine.seed": 7}))
+    assert (run / "training.json").exists()
+    config = short_config(data, run, **keep_all)
+    config.pipeline.model.start_from = tmp_path / "nothing.ply"
+    with pytest.raises(UserError):
+        run_to_end(config)
+    assert not (run / "training.json").exists() and not (run / "nerfstudio_models").exists()
+    assert any((run / "replaced_models").glob("*.ckpt"))
+    broken_off(data, run, monkeypatch, lambda patch: kill_at(patch, 5), **keep_all)
+    resume_to_end(run)
+    assert not (run / "replaced_models").exists()
+
+
+def test_a_run_that_is_training_cannot_be_resumed(whole):
+    from beags_plugin.plugin.run_lock import RunLock
+
+    before = checkpoint_of(whole)["step"]
+    part = whole / ".half.part"
+    part.touch()
+    lock = RunLock(whole)
+    try:
+        with pytest.raises(UserError, match="being trained by another process"):
+            resume_to_end(whole)
+        assert part.exists() and checkpoint_of(whole)["step"] == before
+    finally:
+        lock.release()
+        part.unlink()
+    RunLock(whole).release()
+
+
+def test_ctrl_c_after_the_end_is_quiet(data, tmp_path, monkeypatch, capsys):
+    """As in a viewer that stays open."""
+    from nerfstudio.engine.trainer import Trainer
+
+    run = tmp_path / "run"
+    config = short_config(data, run, **{"pipeline.model.base_steps": 3, "pipeline.model.refine_steps": 0})
+    after = Trainer._after_train
+
+    def waiting(self):
+        after(self)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Trainer, "_after_train", waiting)
+    run_to_end(config)
+    assert (run / "training.json").exists() and "Stopped" not in capsys.readouterr().out
+
+
+def test_ctrl_c_ends_a_training_that_the_viewer_has_paused(data, tmp_path, monkeypatch):
+    run, train = tmp_path / "run", BeagsTrainer.train_iteration
+
+    def iteration(self, step):
+        if step == 4:
+            self.training_state = "paused"
+            threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+        return train(self, step)
+
+    monkeypatch.setattr(BeagsTrainer, "train_iteration", iteration)
+    with pytest.raises(KeyboardInterrupt):
+        run_to_end(short_config(data, run))
+    assert checkpoint_of(run)["step"] == 4
 
 
 def checkpoint_of_folder(folder):
