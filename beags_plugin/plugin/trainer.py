@@ -70,8 +70,9 @@ class BeagsTrainer(Trainer):
                 self._set_aside()  # at once: config.yml is this run's already, and a resume would take both for one run
             if not self._loads():
                 check_start(self.config.model_config)
+            used = any((self.base_dir / self.config.logging.relative_log_dir).glob("events.out.tfevents.*"))
             super().setup(test_mode)
-            if self.loaded_run == self.base_dir.absolute():
+            if used:
                 self._forget_events()
         except UserError as error:
             self._release()
@@ -87,12 +88,16 @@ class BeagsTrainer(Trainer):
             self._lock = None
 
     def _forget_events(self) -> None:
-        """Let tensorboard forget what this run once did after the checkpoint: it does that again."""
+        """Let tensorboard forget what was once done here after the checkpoint, which is done again, or by another run.
+
+        Events at step 0 are forgotten with those of a run that begins; nerfstudio writes the config only later.
+        """
+        own = self.loaded_run == self.base_dir.absolute()
         for each in writer.EVENT_WRITERS:
             if isinstance(each, writer.TensorboardWriter):
                 folder = each.tb_writer.log_dir
                 each.tb_writer.close()
-                each.tb_writer = type(each.tb_writer)(log_dir=folder, purge_step=self._start_step)
+                each.tb_writer = type(each.tb_writer)(log_dir=folder, purge_step=self._start_step if own else 0)
 
     def setup_optimizers(self) -> JointOptimizers:
         """The optimizers that the config lists, one for each group of parameters.
