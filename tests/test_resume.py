@@ -31,6 +31,7 @@ from resumed_runs import (
 from run_folders import write_scene
 
 from beags_plugin.errors import UserError
+from beags_plugin.plugin.extract import read_scene
 from beags_plugin.plugin.trainer import BeagsTrainer
 from beags_plugin.refiners import preparation
 
@@ -214,7 +215,7 @@ def test_refinement_of_a_loaded_base_is_resumed(data, whole, tmp_path, monkeypat
 def test_stages_are_done_again_when_their_inputs_have_changed(data, whole, tmp_path, monkeypatch):
     """A second run into the same folder that differs in k builds its grids anew, and nothing else."""
     run, done = tmp_path / "run", []
-    run_to_end(short_config(data, run))
+    run_to_end(short_config(data, run, keep_stages=True))
     for stage in STAGES:
         module = stage_module(stage)
         compute = getattr(module, stage)
@@ -224,14 +225,22 @@ def test_stages_are_done_again_when_their_inputs_have_changed(data, whole, tmp_p
             return compute(*args, **options)
 
         monkeypatch.setattr(module, stage, counted)
-    run_to_end(short_config(data, run))
+    run_to_end(short_config(data, run, keep_stages=True))
     assert done == []
     assert_same_run(run, whole)
-    run_to_end(short_config(data, run, **{"pipeline.model.prepare.k": 15}))
+    run_to_end(short_config(data, run, keep_stages=True, **{"pipeline.model.prepare.k": 15}))
     assert done[0] == "build_visibility_grid"  # of the first round; the second starts from another scene
     done.clear()
-    run_to_end(short_config(data, run, **{"pipeline.model.prepare.tau": 0.5, "pipeline.model.prepare.k": 15}))
+    run_to_end(
+        short_config(data, run, keep_stages=True, **{"pipeline.model.prepare.tau": 0.5, "pipeline.model.prepare.k": 15})
+    )
     assert done[:5] == ["render_depths", "reprojected_masks", "assign_classes", "split_at_borders", STAGES[-1]]
+    kept = run / "prepared" / "stages"
+    assert sorted(folder.name for folder in kept.iterdir()) == ["round_1", "round_2"]
+    run_to_end(short_config(data, run, keep_stages=True, **{"pipeline.model.refine_rounds": 1}))
+    assert [folder.name for folder in kept.iterdir()] == ["round_1"] and not (run / "prepared" / "round_2").exists()
+    run_to_end(short_config(data, run))
+    assert (run / "prepared" / "masks").is_dir() and not kept.exists()
 
 
 def test_ctrl_c_saves_the_step_and_a_resume_goes_on(data, whole, tmp_path, monkeypatch):
@@ -366,6 +375,8 @@ def test_what_cannot_be_resumed_is_said_in_one_sentence(data, whole, tmp_path, m
     path.write_bytes(content[: len(content) // 2])
     with pytest.raises(UserError, match="is damaged"):
         resume_to_end(run)
+    with pytest.raises(UserError, match="is damaged"):
+        read_scene(run / "config.yml")  # extract, export, render and eval too
     path.write_bytes(content)
     edit_checkpoint(run, lambda content: content.pop("beags"))
     resume_to_end(run)  # of an older version: it goes on all the same

@@ -22,7 +22,14 @@ from beags_plugin.plugin.interrupts import Interrupts
 from beags_plugin.plugin.memory import peak_memory_mb
 from beags_plugin.plugin.optimizers import JointOptimizers
 from beags_plugin.plugin.run_lock import RunLock
-from beags_plugin.plugin.runs import REPORT_FILE, newest_checkpoint, save_atomically, write_text_atomically
+from beags_plugin.plugin.runs import (
+    PREPARED,
+    REPORT_FILE,
+    STAGES,
+    newest_checkpoint,
+    save_atomically,
+    write_text_atomically,
+)
 from beags_plugin.plugin.training_state import STATE, VERSION, GlobalRandom, Part, read_checkpoint, training_state
 from beags_plugin.plugin.warm_start import check_start, start_from_scene
 from beags_plugin.whole_files import remove_unfinished
@@ -309,6 +316,8 @@ class BeagsTrainer(Trainer):
     def _write_report(self) -> None:
         report = {"seconds": self._seconds.total(), "peak_memory_mb": peak_memory_mb()}
         write_text_atomically(json.dumps(report, indent=2), self.base_dir / REPORT_FILE)
+        if not self.config.keep_stages:  # a complete run asks for them no more
+            shutil.rmtree(self.base_dir / PREPARED / STAGES, ignore_errors=True)
 
 
 class _StageSeconds:
