@@ -37,7 +37,7 @@ def _locked(run: Path) -> IO[bytes] | None:
     except ImportError:  # Windows
         return None
     run.mkdir(parents=True, exist_ok=True)
-    file = open(run / LOCK, "ab")
+    file = open(run / LOCK, "ab")  # noqa: SIM115  (open as long as the lock is held)
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
