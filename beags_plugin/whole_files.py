@@ -17,10 +17,20 @@ def write_whole(path: Path, write: Callable[[BinaryIO], Any], beside: Path | Non
     beside: folder of the unfinished file, on the same disk; that of ``path`` if None.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = (beside or path.parent) / f".{path.name}{PART}"
+    part = unfinished(path, beside)
     with open(part, "wb") as file:
         write(file)
-        file.flush()
+    put_in_place(part, path)
+
+
+def unfinished(path: Path, beside: Path | None = None) -> Path:
+    """Where what becomes ``path`` is written first; beside: see ``write_whole``."""
+    return (beside or path.parent) / f".{path.name}{PART}"
+
+
+def put_in_place(part: Path, path: Path) -> None:
+    """Bring a file that has been written safely to disk, and let it take the place of ``path``."""
+    with open(part, "rb+") as file:
         os.fsync(file.fileno())
     os.replace(part, path)
     _sync_folder(path.parent)

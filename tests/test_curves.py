@@ -78,7 +78,8 @@ def test_the_last_iou_is_that_of_the_evaluation(run):
         )
 
 
-def test_a_resumed_run_has_each_step_once(data, tmp_path, monkeypatch):
+@pytest.mark.parametrize("at", [5, 26])  # before the first checkpoint, after it
+def test_a_resumed_run_has_each_step_once(data, tmp_path, monkeypatch, at):
     from beags_plugin.plugin.trainer import BeagsTrainer
 
     run, train = tmp_path / "run", BeagsTrainer.train_iteration
@@ -86,7 +87,7 @@ def test_a_resumed_run_has_each_step_once(data, tmp_path, monkeypatch):
     config.logging.steps_per_log = 1
 
     def iteration(self, step):
-        if step == 26:
+        if step == at:
             raise Killed
         return train(self, step)
 
@@ -96,6 +97,48 @@ def test_a_resumed_run_has_each_step_once(data, tmp_path, monkeypatch):
             run_to_end(config)
     resume_to_end(run)
     assert [event.step for event in events_of(run).Scalars("Train Loss")] == list(range(LAST + 1))
+
+
+@pytest.mark.parametrize("where", ["preparation", 53])
+def test_a_resumed_run_has_the_iou_of_the_whole_one(data, run, tmp_path, monkeypatch, where):
+    from beags_plugin.plugin.trainer import BeagsTrainer
+    from beags_plugin.refiners import preparation
+
+    broken, train = tmp_path / "run", BeagsTrainer.train_iteration
+
+    def killed(*_, **__):
+        raise Killed
+
+    def iteration(self, step):
+        return killed() if step == where else train(self, step)
+
+    with monkeypatch.context() as patch:
+        if where == "preparation":
+            patch.setattr(preparation, "assign_classes", killed)
+        patch.setattr(BeagsTrainer, "train_iteration", iteration)
+        with pytest.raises(Killed):
+            run_to_end(short_config(data, broken, steps_per_objects=5))
+    resume_to_end(broken)
+    whole, resumed = (
+        {(event.step, event.value) for event in events_of(folder).Scalars("Extracted IoU/mean")}
+        for folder in (run, broken)
+    )
+    assert resumed == whole
+
+
+def test_a_bad_held_out_mask_leaves_out_curves_only(data, tmp_path, monkeypatch, capsys):
+    from beags_plugin.errors import UserError
+    from beags_plugin.plugin.evaluation_views import HeldOutViews
+
+    def bad(self, index):
+        raise UserError("the mask view.png has other proportions.")
+
+    monkeypatch.setattr(HeldOutViews, "_view", bad)
+    run_to_end(short_config(data, tmp_path / "run", steps_per_objects=5))
+    assert (tmp_path / "run" / "training.json").exists()
+    assert capsys.readouterr().out.count("has other proportions") == 1
+    tags = events_of(tmp_path / "run").Tags()["scalars"]
+    assert "Extracted IoU/mean" not in tags and "Occupancy violation/cup" in tags
 
 
 def test_wandb_gets_the_same(data, tmp_path, monkeypatch):

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from resumed_runs import (
 from run_folders import write_scene
 
 from beags_plugin.errors import UserError
+from beags_plugin.plugin.extract import read_scene
 from beags_plugin.plugin.trainer import BeagsTrainer
 from beags_plugin.refiners import preparation
 
@@ -213,7 +215,7 @@ def test_refinement_of_a_loaded_base_is_resumed(data, whole, tmp_path, monkeypat
 def test_stages_are_done_again_when_their_inputs_have_changed(data, whole, tmp_path, monkeypatch):
     """A second run into the same folder that differs in k builds its grids anew, and nothing else."""
     run, done = tmp_path / "run", []
-    run_to_end(short_config(data, run))
+    run_to_end(short_config(data, run, keep_stages=True))
     for stage in STAGES:
         module = stage_module(stage)
         compute = getattr(module, stage)
@@ -223,14 +225,22 @@ def test_stages_are_done_again_when_their_inputs_have_changed(data, whole, tmp_p
             return compute(*args, **options)
 
         monkeypatch.setattr(module, stage, counted)
-    run_to_end(short_config(data, run))
+    run_to_end(short_config(data, run, keep_stages=True))
     assert done == []
     assert_same_run(run, whole)
-    run_to_end(short_config(data, run, **{"pipeline.model.prepare.k": 15}))
+    run_to_end(short_config(data, run, keep_stages=True, **{"pipeline.model.prepare.k": 15}))
     assert done[0] == "build_visibility_grid"  # of the first round; the second starts from another scene
     done.clear()
-    run_to_end(short_config(data, run, **{"pipeline.model.prepare.tau": 0.5, "pipeline.model.prepare.k": 15}))
+    run_to_end(
+        short_config(data, run, keep_stages=True, **{"pipeline.model.prepare.tau": 0.5, "pipeline.model.prepare.k": 15})
+    )
     assert done[:5] == ["render_depths", "reprojected_masks", "assign_classes", "split_at_borders", STAGES[-1]]
+    kept = run / "prepared" / "stages"
+    assert sorted(folder.name for folder in kept.iterdir()) == ["round_1", "round_2"]
+    run_to_end(short_config(data, run, keep_stages=True, **{"pipeline.model.refine_rounds": 1}))
+    assert [folder.name for folder in kept.iterdir()] == ["round_1"] and not (run / "prepared" / "round_2").exists()
+    run_to_end(short_config(data, run))
+    assert (run / "prepared" / "masks").is_dir() and not kept.exists()
 
 
 def test_ctrl_c_saves_the_step_and_a_resume_goes_on(data, whole, tmp_path, monkeypatch):
@@ -270,6 +280,72 @@ def test_a_new_run_into_the_folder_of_another_is_not_taken_for_it(data, whole, t
     assert not (run / "replaced_models").exists()
 
 
+def test_a_failed_start_in_the_folder_of_another_run_is_not_mixed_with_it(data, tmp_path, monkeypatch):
+    """Where all checkpoints are kept, too; the former run has come further than the new one."""
+    run = tmp_path / "run"
+    keep_all = {"save_only_latest_checkpoint": False, "steps_per_save": 50, "pipeline.model.refine_steps": 0}
+    run_to_end(short_config(data, run, **{**keep_all, "machine.seed": 7}))
+    assert (run / "training.json").exists()
+    config = short_config(data, run, **keep_all)
+    config.pipeline.model.start_from = tmp_path / "nothing.ply"
+    with pytest.raises(UserError):
+        run_to_end(config)
+    assert not (run / "training.json").exists() and not (run / "nerfstudio_models").exists()
+    assert any((run / "replaced_models").glob("*.ckpt"))
+    broken_off(data, run, monkeypatch, lambda patch: kill_at(patch, 5), **keep_all)
+    resume_to_end(run)
+    assert not (run / "replaced_models").exists()
+
+
+def test_a_run_that_is_training_cannot_be_resumed(whole):
+    from beags_plugin.plugin.run_lock import RunLock
+
+    before = checkpoint_of(whole)["step"]
+    part = whole / ".half.part"
+    part.touch()
+    lock = RunLock(whole)
+    try:
+        with pytest.raises(UserError, match="being trained by another process"):
+            resume_to_end(whole)
+        assert part.exists() and checkpoint_of(whole)["step"] == before
+    finally:
+        lock.release()
+        part.unlink()
+    RunLock(whole).release()
+
+
+def test_ctrl_c_after_the_end_is_quiet(data, tmp_path, monkeypatch, capsys):
+    """As in a viewer that stays open."""
+    from nerfstudio.engine.trainer import Trainer
+
+    run = tmp_path / "run"
+    config = short_config(data, run, **{"pipeline.model.base_steps": 3, "pipeline.model.refine_steps": 0})
+    after = Trainer._after_train
+
+    def waiting(self):
+        after(self)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Trainer, "_after_train", waiting)
+    run_to_end(config)
+    assert (run / "training.json").exists() and "Stopped" not in capsys.readouterr().out
+
+
+def test_ctrl_c_ends_a_training_that_the_viewer_has_paused(data, tmp_path, monkeypatch):
+    run, train = tmp_path / "run", BeagsTrainer.train_iteration
+
+    def iteration(self, step):
+        if step == 4:
+            self.training_state = "paused"
+            threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+        return train(self, step)
+
+    monkeypatch.setattr(BeagsTrainer, "train_iteration", iteration)
+    with pytest.raises(KeyboardInterrupt):
+        run_to_end(short_config(data, run))
+    assert checkpoint_of(run)["step"] == 4
+
+
 def checkpoint_of_folder(folder):
     (path,) = folder.iterdir()
     return torch.load(path, weights_only=True)
@@ -299,6 +375,8 @@ def test_what_cannot_be_resumed_is_said_in_one_sentence(data, whole, tmp_path, m
     path.write_bytes(content[: len(content) // 2])
     with pytest.raises(UserError, match="is damaged"):
         resume_to_end(run)
+    with pytest.raises(UserError, match="is damaged"):
+        read_scene(run / "config.yml")  # extract, export, render and eval too
     path.write_bytes(content)
     edit_checkpoint(run, lambda content: content.pop("beags"))
     resume_to_end(run)  # of an older version: it goes on all the same

@@ -1,13 +1,13 @@
-"""Files that are there whole, or not at all."""
+"""Files that are made for a user: there whole or not at all, or one sentence says why not."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from beags_plugin.errors import UserError
+from beags_plugin.whole_files import put_in_place, unfinished
 
 
 @contextmanager
@@ -18,11 +18,11 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     be written.
     """
     path = Path(path)
-    part = path.with_name(path.name + ".part")
+    part = unfinished(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield part
-        os.replace(part, path)
+        put_in_place(part, path)
     except OSError as error:
         raise UserError(f"{path} cannot be written ({error.strerror}): choose another place.") from error
     finally:

@@ -46,6 +46,10 @@ class BeagsTrainerConfig(TrainerConfig):
     steps_per_held_out: int = 0
     """Measure all held-out views every so many steps, into held_out.json of the run; 0: never."""
 
+    keep_stages: bool = False
+    """Keep the finished stages of the preparation (prepared/stages) when the run is complete, for another run into the
+    same folder, or one that loads this run."""
+
     steps_per_objects: int = 500
     """Once Gaussians have classes: measure extracted masks on four held-out views and draw every object alone, for
     tensorboard or wandb, every so many steps, and first and last; 0: never."""

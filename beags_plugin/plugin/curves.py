@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from nerfstudio.utils import writer
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from beags_plugin.errors import UserError
 from beags_plugin.evaluation.metrics import mask_metrics
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.run_metrics import EvalView, extracted_mask, extracted_truth
@@ -40,6 +42,20 @@ class Curves:
         self.log_every = log_every
         self._all_views = views
         self._views: list[EvalView] | None = None
+        self._measured = False  # objects, at least once
+
+    def state(self) -> dict[str, Any]:
+        """Whether objects have been measured; see ``training_state.Part``."""
+        return {"measured": self._measured}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on with the measurements of the run that gave ``state``."""
+        self._measured = state["measured"]
+
+    def before_step(self, step: int) -> None:
+        """Measure what a run that was broken off in the preparation would have measured after the step before."""
+        if self.every > 0 and step > 0 and not self._measured and bool(self.model.assigned):
+            self._objects(step - 1)
 
     def after_step(self, step: int) -> None:
         """Write what is due after ``step`` (from 0); objects are measured once Gaussians have classes."""
@@ -50,9 +66,9 @@ class Curves:
             writer.put_scalar("Memory (MB)/now", memory_mb(), step)
             writer.put_scalar("Memory (MB)/peak", peak_memory_mb(), step)
             self._boundaries(step)
-        first = bool(model.assigned) and self._views is None
         done = step + 1
-        if self.every > 0 and bool(model.assigned) and (first or done % self.every == 0 or done == self.last):
+        due = self.every > 0 and (not self._measured or done % self.every == 0 or done == self.last)
+        if due and bool(model.assigned):
             self._objects(step)
 
     def _named(self, found: dict[int, float]) -> dict[str, float]:
@@ -70,21 +86,21 @@ class Curves:
     @torch.no_grad()
     def _objects(self, step: int) -> None:
         """Extracted IoU on some held-out views, occupancy violations, pictures of one of the views."""
+        self._measured = True
         model = self.model
         surfels, class_ids = model.surfels().detach(), model.class_ids
         if model.grid is not None:
             found = occupancy_violations(surfels, class_ids, model.grid, model.seed, step)
             for name, share in self._named(found).items():
                 writer.put_scalar(f"Occupancy violation/{name}", share, step)
-        if self._views is None:
-            self._views = spread(self._all_views, VIEWS)
+        views = self._looked_at()
         objects = [index for index in sorted(model.classes)[:MOST_CLASSES] if index != BACKGROUND]
         parts = {index: select_class(surfels, class_ids, index)[0] for index in objects}
         settings = model.settings(geometry=False)
         values: list[float] = []
         for index in objects:
             scores = []
-            for view in self._views:
+            for view in views:
                 if (truth := extracted_truth(view, index)) is not None:
                     mask = extracted_mask(parts[index], view.camera, model.rasterizer, settings, Protocol().threshold)
                     scores.append(mask_metrics(mask, truth[1], truth[2]).iou)
@@ -94,8 +110,19 @@ class Curves:
                 values += scores
         if values:
             writer.put_scalar("Extracted IoU/mean", float(np.mean(values)), step)
-        if self._views:
-            self._pictures(step, self._views[0], parts)
+        if views:
+            self._pictures(step, views[0], parts)
+
+    def _looked_at(self) -> list[EvalView]:
+        """The held-out views, none if they cannot be read: no reason to end a training."""
+        if self._views is None:
+            try:
+                self._views = spread(self._all_views, VIEWS)
+            except UserError as error:
+                message = f"Extracted IoU and pictures are left out of the curves: {error}"
+                CONSOLE.print(message, style="yellow", markup=False, highlight=False, soft_wrap=True)
+                self._views = []
+        return self._views
 
     def _pictures(self, step: int, view: EvalView, parts) -> None:
         model, camera = self.model, view.camera

@@ -18,7 +18,14 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.extraction.ply import write_ply
 from beags_plugin.extraction.select import remove_class, select_class
-from beags_plugin.plugin.runs import EXTRACTION_FILE, TRANSFORM_FILE, newest_checkpoint, write_run
+from beags_plugin.plugin.runs import (
+    EXTRACTION_FILE,
+    TRANSFORM_FILE,
+    newest_checkpoint,
+    write_run,
+    write_text_atomically,
+)
+from beags_plugin.plugin.training_state import read_checkpoint
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
@@ -76,9 +83,9 @@ def load_run_config(config_path: Path) -> BeagsTrainerConfig:
 
 
 def read_scene(config_path: Path) -> SavedScene:
-    """Read a run's newest checkpoint; raises ``UserError`` if the run is incomplete."""
+    """Read a run's newest checkpoint; raises ``UserError`` if the run is incomplete or the file is damaged."""
     config = load_run_config(config_path)
-    checkpoint = torch.load(newest_checkpoint(config.get_checkpoint_dir()), map_location="cpu", weights_only=True)
+    checkpoint = read_checkpoint(newest_checkpoint(config.get_checkpoint_dir()))
     prefix = "_model."
     state = {name[len(prefix) :]: value for name, value in checkpoint["pipeline"].items() if name.startswith(prefix)}
     return SavedScene(config, state, checkpoint["step"], state["_extra_state"]["classes"])
@@ -128,7 +135,7 @@ def extract_objects(
         folder = target / title
         config = write_run(scene.config, folder, _rows(scene.state, index), scene.step)
         origin = {"object": name, "removed": remove, "run": str(config_path.absolute())}
-        (folder / EXTRACTION_FILE).write_text(json.dumps(origin, indent=2), "utf8")
+        write_text_atomically(json.dumps(origin, indent=2), folder / EXTRACTION_FILE)
         ply = folder / f"{title}.ply"
         write_ply(ply, surfels, class_ids[index], transform)
         written.append(Extracted(title, config, ply, len(surfels)))

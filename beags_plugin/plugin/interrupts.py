@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
@@ -15,10 +16,12 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 class Interrupts:
     """Notes the first signal for the training loop to ask about; a second one ends the program at once.
 
-    at_once: whether the first does so too, as where no step is under way that could be finished.
+    at_once: whether the first does so too, as where no step is under way that could be finished. wake: called at the
+    first signal, so that a loop that waits comes to ask.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, wake: Callable[[], None] = lambda: None) -> None:
+        self._wake = wake
         self.asked: int | None = None
         self.at_once = False
         self._former: dict[signal.Signals, Any] = {}
@@ -38,6 +41,7 @@ class Interrupts:
         if again or self.at_once:
             raise KeyboardInterrupt
         CONSOLE.print("Stopping after this step, and saving it. Once more ends at once.", highlight=False)
+        self._wake()
 
     @property
     def exit_code(self) -> int:

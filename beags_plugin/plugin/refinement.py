@@ -22,7 +22,7 @@ from beags_plugin.masks.classes import read_class_map, write_class_map
 from beags_plugin.masks.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.memory import peak_memory_mb
-from beags_plugin.plugin.runs import BASE_SNAPSHOT, PREPARED, STAGES, round_folder, write_run
+from beags_plugin.plugin.runs import BASE_SNAPSHOT, PREPARED, STAGES, round_folder, write_run, write_text_atomically
 from beags_plugin.plugin.scene_edits import edit_scene
 from beags_plugin.progress import progress_bar
 from beags_plugin.refiners import REFINERS
@@ -149,7 +149,14 @@ class RefinementSwitch:
         self._count(prepared.seconds, time.perf_counter() - start, first)
 
     def _stage_store(self) -> StageStore:
-        """Where the stages of this round are kept; those of the run that this one goes on from are looked into too."""
+        """Where the stages of this round are kept; those of the run that this one goes on from are looked into too.
+
+        What an earlier run into the same folder kept of more rounds is removed.
+        """
+        kept, rounds = self.trainer.base_dir / PREPARED / STAGES, self.model.config.refine_rounds
+        for folder in kept.glob("round_*"):
+            if folder.name not in {f"round_{index + 1}" for index in range(rounds)}:
+                shutil.rmtree(folder)
         former = self.trainer.loaded_run
         runs = [self.trainer.base_dir] if former in (None, self.trainer.base_dir) else [self.trainer.base_dir, former]
         own, *others = (run / PREPARED / STAGES / f"round_{self.rounds + 1}" for run in runs)
@@ -183,6 +190,7 @@ class RefinementSwitch:
         folder = round_folder(self.trainer.base_dir, self.rounds - 1)
         former = self.trainer.loaded_run
         if former is not None and former != self.trainer.base_dir:
+            _clear(self.trainer.base_dir / PREPARED)
             for name in (PREPARED, BASE_SNAPSHOT):
                 if (former / name).is_dir():
                     skipped = shutil.ignore_patterns(STAGES)
@@ -211,9 +219,7 @@ def save_prepared(prepared: Preparation, names: list[str], folder: Path) -> None
     """Keep what refinement needs; grid.pt is written last, so its presence says that all is there."""
     (folder / "grid.pt").unlink(missing_ok=True)  # an earlier run's
     if folder.name == PREPARED:
-        for path in folder.glob("*"):
-            if path.name != STAGES:
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        _clear(folder)
     (folder / "masks").mkdir(parents=True, exist_ok=True)
     (folder / "confidence").mkdir(exist_ok=True)
     for index, name in enumerate(names):
@@ -222,9 +228,16 @@ def save_prepared(prepared: Preparation, names: list[str], folder: Path) -> None
         if prepared.confidence is not None:
             _write_grey(folder / "confidence" / f"{name}.png", prepared.confidence[index])
     report = {"findings": prepared.findings, "seconds": prepared.seconds, "peak_memory_mb": peak_memory_mb()}
-    (folder / "report.json").write_text(json.dumps(report, indent=2))
+    write_text_atomically(json.dumps(report, indent=2), folder / "report.json")
     state = {} if prepared.grid is None else prepared.grid.state_dict()
     write_whole(folder / "grid.pt", lambda file: torch.save(state, file))
+
+
+def _clear(folder: Path) -> None:
+    """Remove what another run into the same folder prepared, later rounds too; its stages may serve again."""
+    for path in folder.glob("*"):
+        if path.name != STAGES:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 @contextmanager

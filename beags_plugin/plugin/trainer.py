@@ -21,7 +21,15 @@ from beags_plugin.plugin.held_out import HeldOutCurve
 from beags_plugin.plugin.interrupts import Interrupts
 from beags_plugin.plugin.memory import peak_memory_mb
 from beags_plugin.plugin.optimizers import JointOptimizers
-from beags_plugin.plugin.runs import REPORT_FILE, newest_checkpoint, save_atomically, write_text_atomically
+from beags_plugin.plugin.run_lock import RunLock
+from beags_plugin.plugin.runs import (
+    PREPARED,
+    REPORT_FILE,
+    STAGES,
+    newest_checkpoint,
+    save_atomically,
+    write_text_atomically,
+)
 from beags_plugin.plugin.training_state import STATE, VERSION, GlobalRandom, Part, read_checkpoint, training_state
 from beags_plugin.plugin.warm_start import check_start, start_from_scene
 from beags_plugin.whole_files import remove_unfinished
@@ -50,7 +58,8 @@ class BeagsTrainer(Trainer):
         self.curve: HeldOutCurve | None = None
         self._parts: dict[str, Part] = {}
         self._loaded_states: dict[str, Any] = {}
-        self._interrupts = Interrupts()
+        self._interrupts = Interrupts(self._go_on)
+        self._lock: RunLock | None = None
         self._saved_step: int | None = None
         self._done = 0  # the last step that was trained
         self._complete = False
@@ -63,21 +72,39 @@ class BeagsTrainer(Trainer):
     def setup(self, test_mode: Any = "val") -> None:
         """Load data, build the model, load a checkpoint; a user's mistake ends here, with one sentence."""
         try:
+            if self.local_rank == 0:
+                self._lock = RunLock(self.base_dir)
+                self._set_aside()  # at once: config.yml is this run's already, and a resume would take both for one run
             if not self._loads():
                 check_start(self.config.model_config)
+            used = any((self.base_dir / self.config.logging.relative_log_dir).glob("events.out.tfevents.*"))
             super().setup(test_mode)
-            if self.loaded_run == self.base_dir.absolute():
+            if used:
                 self._forget_events()
         except UserError as error:
+            self._release()
             _stop(error)
+        except BaseException:
+            self._release()
+            raise
+
+    def _release(self) -> None:
+        """Let others train in this run's folder."""
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
 
     def _forget_events(self) -> None:
-        """Let tensorboard forget what this run once did after the checkpoint: it does that again."""
+        """Let tensorboard forget what was once done here after the checkpoint, which is done again, or by another run.
+
+        Events at step 0 are forgotten with those of a run that begins; nerfstudio writes the config only later.
+        """
+        own = self.loaded_run == self.base_dir.absolute()
         for each in writer.EVENT_WRITERS:
             if isinstance(each, writer.TensorboardWriter):
                 folder = each.tb_writer.log_dir
                 each.tb_writer.close()
-                each.tb_writer = type(each.tb_writer)(log_dir=folder, purge_step=self._start_step)
+                each.tb_writer = type(each.tb_writer)(log_dir=folder, purge_step=self._start_step if own else 0)
 
     def setup_optimizers(self) -> JointOptimizers:
         """The optimizers that the config lists, one for each group of parameters.
@@ -90,6 +117,12 @@ class BeagsTrainer(Trainer):
 
     def train(self) -> None:
         """Train to the end of the schedule, also after a resume (nerfstudio would train that many steps more)."""
+        try:
+            self._train()
+        finally:
+            self._release()
+
+    def _train(self) -> None:
         self.config.max_num_iterations = max(self.last_step - self._start_step, 0)
         self._seconds = _StageSeconds(self._model)
         self.keep("seconds", self._seconds)
@@ -107,7 +140,6 @@ class BeagsTrainer(Trainer):
             f"{ESTIMATE_STEPS[1]} of them. {QUICKER}",
             highlight=False,
         )
-        self._set_aside()
         remove_unfinished(self.base_dir)
         (self.base_dir / REPORT_FILE).unlink(missing_ok=True)  # it says that the run is complete
         if self.config.steps_per_held_out > 0:
@@ -124,7 +156,10 @@ class BeagsTrainer(Trainer):
         except UserError as error:
             _stop(error)
         except KeyboardInterrupt as interrupt:
-            CONSOLE.print(f"Stopped. To go on: beags resume {self.base_dir}", highlight=False, soft_wrap=True)
+            if (self.base_dir / REPORT_FILE).exists():  # complete: the signal ended what shows it in the browser
+                return
+            message = f"Stopped. To go on: beags resume {self.base_dir}"
+            CONSOLE.print(message, highlight=False, markup=False, soft_wrap=True)
             raise SystemExit(self._interrupts.exit_code) from interrupt
 
     def train_iteration(self, step: int) -> Any:
@@ -163,6 +198,11 @@ class BeagsTrainer(Trainer):
         """Whether a checkpoint is loaded: what it holds counts, not the scene that its run may have started from."""
         return self.config.load_dir is not None or self.config.load_checkpoint is not None
 
+    def _loads_own(self) -> bool:
+        """Whether this run goes on in its own folder."""
+        loaded = self.config.load_dir or (self.config.load_checkpoint and self.config.load_checkpoint.parent)
+        return loaded is not None and loaded.resolve().parent == self.base_dir.resolve()
+
     def _load_checkpoint(self) -> None:
         path = self._checkpoint_path()
         if path is None:
@@ -180,7 +220,7 @@ class BeagsTrainer(Trainer):
         self.optimizers.load_optimizers(checkpoint["optimizers"])
         self.grad_scaler.load_state_dict(checkpoint["scalers"])
         CONSOLE.print(f"Loaded {path}", highlight=False, markup=False, soft_wrap=True)
-        self.loaded_run = path.absolute().parent.parent
+        self.loaded_run = self.base_dir.absolute() if self._loads_own() else path.absolute().parent.parent
         if self.schedule.base_steps == 0 and int(self._model.refined_steps) == 0:
             self._start_step = 0  # a base that was loaded: refinement counts its own steps, and begins anew
         else:
@@ -215,22 +255,30 @@ class BeagsTrainer(Trainer):
             for old in self.checkpoint_dir.glob("*.ckpt"):
                 if old != path:
                     old.unlink()
-            shutil.rmtree(self.base_dir / REPLACED, ignore_errors=True)
+        shutil.rmtree(self.base_dir / REPLACED, ignore_errors=True)
 
     def _set_aside(self) -> None:
-        """Move away the checkpoints of an earlier run into this folder, which a resume would take for this run's."""
-        if self.loaded_run != self.base_dir.absolute() and self.config.save_only_latest_checkpoint:
-            former = self.base_dir / REPLACED
-            if any(self.checkpoint_dir.glob("*.ckpt")):
-                shutil.rmtree(former, ignore_errors=True)
-                self.checkpoint_dir.rename(former)
-                CONSOLE.print(
-                    f"{self.base_dir} holds an earlier run; its checkpoint is in {REPLACED} until this one saves its "
-                    "first. (beags resume goes on with a run instead.)",
-                    highlight=False, markup=False, soft_wrap=True,
-                )  # fmt: skip
+        """Move away the checkpoints of an earlier run into this folder, and remove its report: a resume would take
+        them for this run's."""
+        if self._loads_own():
+            return
+        (self.base_dir / REPORT_FILE).unlink(missing_ok=True)
+        former = self.base_dir / REPLACED
+        if any(self.checkpoint_dir.glob("*.ckpt")):
+            shutil.rmtree(former, ignore_errors=True)
+            self.checkpoint_dir.rename(former)
+            CONSOLE.print(
+                f"{self.base_dir} holds an earlier run; its checkpoint is in {REPLACED} until this one saves its "
+                "first. (beags resume goes on with a run instead.)",
+                highlight=False, markup=False, soft_wrap=True,
+            )  # fmt: skip
 
     # -- breaks --------------------------------------------------------------------------------------------------------
+
+    def _go_on(self) -> None:
+        """Let a training that the viewer has paused come to its next step, where a signal is heard."""
+        if self.training_state == "paused":
+            self.training_state = "training"
 
     def stop_if_asked(self, step: int) -> None:
         """Before ``step``: save the one before it and end, if a signal asked for that."""
@@ -268,6 +316,8 @@ class BeagsTrainer(Trainer):
     def _write_report(self) -> None:
         report = {"seconds": self._seconds.total(), "peak_memory_mb": peak_memory_mb()}
         write_text_atomically(json.dumps(report, indent=2), self.base_dir / REPORT_FILE)
+        if not self.config.keep_stages:  # a complete run asks for them no more
+            shutil.rmtree(self.base_dir / PREPARED / STAGES, ignore_errors=True)
 
 
 class _StageSeconds:

@@ -40,6 +40,8 @@ def training_callbacks(model: BeagsModel, attributes: TrainingCallbackAttributes
         trainer.keep(name, part)
 
     curves = _curves(model, trainer, datamanager)
+    if curves is not None:
+        trainer.keep("curves", curves)
 
     def before(step: int) -> None:
         trainer.stop_if_asked(step)
@@ -48,6 +50,8 @@ def training_callbacks(model: BeagsModel, attributes: TrainingCallbackAttributes
         model.measuring = every > 0 and step % every == 0  # nerfstudio reads no other step's
         densifier.before_step(step)
         switch.before_step(step)
+        if curves is not None:
+            curves.before_step(step)
         model.clock.start()
         set_learning_rates(model, optimizers, trainer.config.optimizers, step)
 

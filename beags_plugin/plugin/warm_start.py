@@ -18,6 +18,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.extraction.frames import from_input_frame, to_input_frame
 from beags_plugin.importers.base import ImportedScene, find_importer
+from beags_plugin.plugin.runs import write_text_atomically
 from beags_plugin.progress import progress_bar
 from beags_plugin.rasterizers.drawing import surfel_inputs
 
@@ -94,8 +95,7 @@ def start_from_scene(model: BeagsModel, datamanager: BeagsDataManager, run: Path
         CONSOLE.print(f"  {line}", markup=False, highlight=False, soft_wrap=True)
     if fit.poor:
         _say_poor(model, path, fit, candidates, views)
-    run.mkdir(parents=True, exist_ok=True)
-    (run / START_REPORT).write_text(json.dumps(report, indent=2), "utf8")
+    write_text_atomically(json.dumps(report, indent=2), run / START_REPORT)
 
 
 def _frames(wanted: StartFrame) -> Sequence[StartFrame]:
@@ -189,4 +189,4 @@ def _say_poor(
     best = max(tried, key=lambda name: tried[name])
     if tried[best] > fit.psnr + _BETTER_DB:
         sentence += f"; it fits better with --pipeline.model.start-frame {best} ({tried[best]:.1f} dB)"
-    CONSOLE.print(f"[yellow]{sentence}.[/yellow]", highlight=False, soft_wrap=True)
+    CONSOLE.print(f"{sentence}.", style="yellow", markup=False, highlight=False, soft_wrap=True)
