@@ -318,6 +318,11 @@ def test_reprojection_of_a_run_writes_masks_of_the_photos_size(tmp_path, lens):
     assert [path.stem for path in masks] == [f"v{index:02d}" for index in range(1, 8)]
     assert all(read_class_map(path).shape == (HEIGHT, WIDTH) for path in masks)
     assert (tmp_path / "out/before_after.png").exists() and (tmp_path / "out/confidence/v01.png").exists()
+    confidence = [read_class_map(tmp_path / "out/confidence" / path.name) for path in masks]
+    assert all(values.shape == (HEIGHT, WIDTH) and values.max() > 0 for values in confidence)
+    for mask, values in zip(masks, confidence, strict=True):
+        unlabelled = read_class_map(mask) == IGNORE
+        assert not values[unlabelled].any()  # where the straight view does not reach, or nothing voted
     report = json.loads((tmp_path / "out/report.json").read_text())
     before = read_class_map(data / "masks/v01.png")
     after = read_class_map(masks[0])

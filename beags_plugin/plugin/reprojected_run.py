@@ -23,7 +23,7 @@ from beags_plugin.plugin.extract import read_scene
 from beags_plugin.progress import progress_bar
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import IGNORE
-from beags_plugin.refiners.consistent_masks import reprojected_masks
+from beags_plugin.refiners.consistent_masks import render_depths, reprojected_masks
 from beags_plugin.refiners.preparation import known_classes
 
 if TYPE_CHECKING:
@@ -100,16 +100,12 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     if all(mask is None for mask in given.stored):
         raise UserError(f"no training view of {scene.config.data_path} has a mask: give --masks-path, or make some.")
     classes = manager.train_dataset.metadata["classes"]
-    masks = reprojected_masks(
-        scene.surfels().detach(),
-        [view.camera for view in views],
-        given,
-        known_classes(given, classes),
-        make_rasterizer(scene.config.model_config.rasterizer),
-        raster_settings(scene),
-        config,
-        progress_bar,
-    )
+    cameras, rasterizer = [view.camera for view in views], make_rasterizer(scene.config.model_config.rasterizer)
+    with progress_bar("Rendering depth") as progress:
+        surfels = scene.surfels().detach()
+        depths = render_depths(surfels, cameras, rasterizer, raster_settings(scene), config.depth, progress)
+    with progress_bar("Reprojecting masks") as progress:
+        masks = reprojected_masks(depths, cameras, given, known_classes(given, classes), config, progress)
     assert masks.confidence is not None
     names = [view.name for view in views]
     seconds = time.perf_counter() - start
@@ -139,10 +135,10 @@ def data_of_run(scene: SavedScene, config_path: Path, options: ReprojectionOptio
 def write_reprojection(found: ReprojectedRun, output: Path, min_confidence: float = 0.0, shown: int = 6) -> list[str]:
     """Write refined masks, confidence maps, a report and a picture of the views that changed most; what was written.
 
-    Masks are of the size of the photographs, lens distortion included, so that ``beags-data --masks-path`` takes them
+    Masks and confidence are of the size of the photographs, lens distortion included, so that ``beags-data --masks-path`` takes them
     (at the run's own size if that was asked for). min_confidence: less certain pixels become IGNORE.
     """
-    import cv2
+    from PIL import Image
 
     changes = []
     for index, path in enumerate(mask_paths(found.manager.train_dataset.image_filenames)):
@@ -153,7 +149,7 @@ def write_reprojection(found: ReprojectedRun, output: Path, min_confidence: floa
         for folder in ("masks", "confidence"):
             (output / folder / path).parent.mkdir(parents=True, exist_ok=True)
         write_class_map(output / "masks" / path, found.manager.as_in_file(final, index))
-        cv2.imwrite(str(output / "confidence" / path), confidence)
+        Image.fromarray(found.manager.as_in_file(confidence, index, border=0)).save(output / "confidence" / path)
         changes.append(_change(found, index, doubtful))
     (output / "classes.json").write_text(json.dumps({str(i): name for i, name in found.classes.items()}, indent=1))
     report = {"seconds": found.seconds, "min_confidence": min_confidence, "views": changes}

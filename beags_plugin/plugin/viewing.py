@@ -184,7 +184,7 @@ class Viewing:
     ) -> dict[str, Tensor]:
         """Pictures of the training view nearest to ``camera``, as large as fits into the viewer's picture."""
         model, run = self.model, self.run
-        if run is None or run.cameras is None:
+        if run is None:
             notes["view"] = "The training views are being read."
             return {}
         index = nearest_view(camera, run.cameras, float(model.extent))
