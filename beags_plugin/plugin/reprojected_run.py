@@ -135,8 +135,8 @@ def data_of_run(scene: SavedScene, config_path: Path, options: ReprojectionOptio
 def write_reprojection(found: ReprojectedRun, output: Path, min_confidence: float = 0.0, shown: int = 6) -> list[str]:
     """Write refined masks, confidence maps, a report and a picture of the views that changed most; what was written.
 
-    Masks and confidence are of the size of the photographs, lens distortion included, so that ``beags-data --masks-path`` takes them
-    (at the run's own size if that was asked for). min_confidence: less certain pixels become IGNORE.
+    All maps are of the size of the photographs, lens distortion included, so that ``beags-data --masks-path`` takes
+    them (at the run's own size if that was asked for). min_confidence: less certain pixels become IGNORE.
     """
     from PIL import Image
 
