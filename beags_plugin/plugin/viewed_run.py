@@ -27,8 +27,8 @@ _KEPT_MASKS = 8  # of the views that were looked at last
 class ViewedRun:
     """A run on disk with its data manager; what takes time to read is read when ``load_`` is called, by the panel.
 
-    folder: of the run. names: of the training views. cameras: theirs, without lens distortion. grid: the voxel grid of a
-    finished run; None until ``load_grid``.
+    folder: of the run. names: of the training views. cameras: theirs, without lens distortion. grid: the voxel grid
+    of a finished run; None until ``load_grid``.
     """
 
     def __init__(self, folder: Path, datamanager: BeagsDataManager) -> None:
