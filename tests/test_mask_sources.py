@@ -379,9 +379,9 @@ def test_reprojection_of_a_run_writes_masks_of_the_photos_size(tmp_path, lens):
 
 
 def test_the_check_of_a_run_takes_its_options_and_what_replaces_them(tmp_path):
+    from beags_plugin.plugin.extract import read_scene
     from beags_plugin.plugin.masks_check import options_beside
     from beags_plugin.plugin.reprojected_run import ReprojectionOptions, data_of_run
-    from beags_plugin.plugin.extract import read_scene
 
     data = write_scene(tmp_path / "scene")
     config = write_trained(tmp_path / "run", data)

@@ -38,7 +38,7 @@ class ReprojectionOptions:
 
     masks: folder of other id images. classes: their classes.json. method, tau, voters, depth: see
     ``refiners.preparation.PreparationConfig``. run_size: reproject at the size that was trained on, not at that of the
-    photographs.
+    photographs. parser: the options of ``beags-data``, if not the run's own.
     """
 
     masks: Path | None = None
@@ -48,6 +48,7 @@ class ReprojectionOptions:
     voters: int | None = None
     depth: str | None = None
     run_size: bool = False
+    parser: BeagsDataParserConfig | None = None
 
 
 @dataclass(frozen=True)
@@ -115,9 +116,12 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
 def data_of_run(scene: SavedScene, config_path: Path, options: ReprojectionOptions) -> BeagsDataManager:
     """The data that a run was trained on, at the size and with the masks that ``options`` name."""
     config = scene.config
-    if not config.data_path.exists():
-        raise UserError(f"{config_path} was trained on {config.data_path}, which is gone: put it back.")
-    parser = cast("BeagsDataParserConfig", replace(config.data_config.dataparser, data=config.data_path))
+    if options.parser is not None:
+        parser = replace(options.parser)
+    else:
+        parser = cast("BeagsDataParserConfig", replace(config.data_config.dataparser, data=config.data_path))
+    if not parser.data.exists():
+        raise UserError(f"{config_path} was trained on {parser.data}, which is gone: put it back.")
     if options.masks is not None:
         if not options.masks.is_dir():
             raise UserError(f"the folder of masks {options.masks} does not exist: correct --masks-path.")
@@ -125,7 +129,7 @@ def data_of_run(scene: SavedScene, config_path: Path, options: ReprojectionOptio
         beside = options.masks.absolute().parent / "classes.json"
         classes = options.classes or (beside if beside.is_file() else None)
         parser.classes_path = parser.classes_path if classes is None else classes.absolute()
-    data = replace(config.data_config, dataparser=parser)
+    data = replace(config.data_config, dataparser=parser, data=parser.data)
     if not options.run_size:
         parser.downscale_factor, data.camera_res_scale_factor = 1.0, 1.0
     manager = data.setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
