@@ -27,39 +27,34 @@ class Check:
     """Folder of the scene; that of the run if left out."""
     load_config: Path | None = None
     """config.yml of a run trained on the scene (beags-base will do): its depth shows where views disagree."""
-    layout: str = "auto"
-    """How the data set lays out its files (docs/data.md); auto recognises it."""
+    layout: str | None = None
+    """How the data set lays out its files (docs/data.md); as in the run, else auto, which recognises it."""
     images_path: Path | None = None
-    """Folder of the images, if not the layout's own."""
+    """Folder of the images, if not the run's or the layout's own."""
     masks_path: Path | None = None
-    """Folder of the id images, if not the layout's own."""
-    classes_path: Path = Path("classes.json")
-    """File {"id": "name"} of the classes."""
-    ignore_ids: tuple[int, ...] = ()
-    """Ids in the masks that mean "not labelled"."""
+    """Folder of the id images, relative to the scene, if not the run's or the layout's own."""
+    classes_path: Path | None = None
+    """File {"id": "name"} of the classes; as in the run, else classes.json."""
+    ignore_ids: tuple[int, ...] | None = None
+    """Ids in the masks that mean "not labelled", if not the run's own."""
     min_views: int = 3
     """An object in fewer training views is reported."""
     output: Path = Path("outputs/masks_check")
     """Folder for report.json, coverage.png and contradicted.png."""
 
     def run(self) -> None:
-        from beags_plugin.plugin.extract import load_run_config
-        from beags_plugin.plugin.masks_check import check_scene, check_with_run, data_options, write_report
+        from beags_plugin.plugin.masks_check import check_scene, check_with_run, options_beside, write_report
         from beags_plugin.plugin.reprojected_run import ReprojectionOptions, reproject_run
 
         if self.data is None and self.load_config is None:
             raise UserError("no scene is named: give --data its folder, or --load-config a run trained on it.")
-        data = self.data
-        if data is None:
-            assert self.load_config is not None
-            data = load_run_config(self.load_config).data_path
-        masks = None if self.masks_path is None else data / self.masks_path
-        options = (self.layout, self.images_path, masks, self.classes_path, self.ignore_ids)
-        report = check_scene(data_options(data, *options), self.min_views)
+        names = ("layout", "images_path", "masks_path", "classes_path", "ignore_ids")
+        parser = options_beside(self.load_config, self.data, **{name: getattr(self, name) for name in names})
+        report = check_scene(parser, self.min_views)
         run = None
         readable = not any(finding.level == "error" for finding in report.findings)
         if self.load_config is not None and readable:
-            run = reproject_run(self.load_config, ReprojectionOptions(masks=masks, method="voxel", run_size=True))
+            run = reproject_run(self.load_config, ReprojectionOptions(method="voxel", run_size=True, parser=parser))
             report = check_with_run(report, run)
         for finding in report.findings:
             CONSOLE.print(f"{finding.level}: {finding.message}\n    costs: {finding.cost}")

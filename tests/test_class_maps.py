@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from beags_plugin.data.files import image_size
 from beags_plugin.errors import UserError
 from beags_plugin.masks.classes import (
+    check_names,
     colorize,
     read_binary_mask,
     read_class_map,
@@ -166,3 +168,23 @@ def test_colours_are_stable_and_distinct():
     assert np.array_equal(colorize(ids[3:5, 2:4]), colors[3:5, 2:4])
     assert colorize(np.array([[IGNORE]], dtype=np.uint16)).tolist() == [[[128, 128, 128]]]
     assert colorize(np.zeros((0, 4), dtype=np.uint16)).shape == (0, 4, 3)
+
+
+def test_an_image_too_large_to_decode_is_told(tmp_path, monkeypatch):
+    write_class_map(tmp_path / "a.png", np.zeros((20, 20), np.uint8))
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)  # Pillow refuses more than twice as many
+    for read in (read_class_map, image_size):
+        with pytest.raises(UserError, match="a.png cannot be read as an image"):
+            read(tmp_path / "a.png")
+
+
+def test_names_that_could_not_be_read_back_are_refused():
+    check_names({0: "background", 1: "cup", 7: "box"})
+    for wrong, message in (
+        ({1: "background"}, "'background' to two classes"),
+        ({1: "cup", 2: " cup"}, "'cup' to two classes"),
+        ({3: " "}, "the class 3 of the masks has no name"),
+        ({IGNORE: "cup"}, "class id 65535"),
+    ):
+        with pytest.raises(UserError, match=message):
+            check_names(wrong)

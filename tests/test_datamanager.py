@@ -98,7 +98,7 @@ def test_class_map_is_undistorted_like_its_image(tmp_path, model):
 def test_every_label_comes_from_the_pixel_that_the_image_came_from(tmp_path, model):
     write_distorted(tmp_path, model, [])
     rows, columns = np.mgrid[:LARGE_H, :LARGE_W].astype(np.float32)
-    cameras = manager(tmp_path).train_dataset.cameras
+    cameras = manager(tmp_path).train_dataparser_outputs.cameras  # those of the dataset are straightened
     camera, K = cameras[0].reshape(()), cameras[0].get_intrinsics_matrices().numpy()
     ramps = np.stack([columns, rows, columns], axis=2)
     straight = deepcopy(cameras)

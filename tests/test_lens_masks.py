@@ -15,7 +15,6 @@ from beags_plugin.rasterizers.interface import IGNORE
 def test_a_class_map_comes_back_to_its_photo(tmp_path, model):
     write_distorted(tmp_path, model, [])
     data = manager(tmp_path)
-    data.views("train")
     row, column = np.mgrid[:LARGE_H, :LARGE_W]
     given = (1 + row // 20 * 8 + column // 20).astype(np.uint16)  # squares: their borders tell any shift
     back = data.as_in_file(data.straight_train_map(given, 0), 0)
@@ -29,7 +28,7 @@ def test_a_class_map_comes_back_to_its_photo(tmp_path, model):
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
 def test_points_land_where_the_lens_shows_them(tmp_path, model):
     write_distorted(tmp_path, model, [])
-    cameras = manager(tmp_path).train_dataset.cameras  # not straightened before the images load
+    cameras = manager(tmp_path).train_dataparser_outputs.cameras  # those of the dataset are straightened
     rays = [(x, y) for x in (-0.42, 0.0, 0.37) for y in (-0.3, 0.01, 0.21)]
     pose = torch.cat([cameras.camera_to_worlds[0], torch.tensor([[0.0, 0, 0, 1]])]).double().numpy()
     local = np.array([(2 * x, -2 * y, -2.0, 1.0) for x, y in rays])  # depth 2, OpenGL axes

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from data_folders import HEIGHT, WIDTH, write_image, write_transforms
+from PIL import Image
 from run_folders import write_scene, write_trained
 
 from beags_plugin.cli import main
@@ -83,6 +85,14 @@ def test_id_images_and_colours_and_rare_ids(tmp_path):
         pairs = set(zip(found.ravel().tolist(), exact.ravel().tolist(), strict=True))
         assert len(pairs) == 3 and (0, 0) in pairs  # one id for each colour, in all views
     assert {p for i in range(3) for p in zip(maps[i].ravel().tolist(), truth(i).ravel().tolist())} == pairs  # noqa: B905
+    painted = tmp_path / "painted/v1.png"
+    painted.write_bytes(painted.read_bytes()[:60])
+    with pytest.raises(UserError, match="v1.png cannot be read as an image"):
+        make(IdImagesSource(folder=Path("painted"), colors=True), scene)
+    painted.unlink()
+    Image.fromarray(colors[truth(1)]).save(tmp_path / "painted/v1.jpg")
+    with pytest.raises(UserError, match="is a JPEG, which blurs the colours"):
+        make(IdImagesSource(folder=Path("painted"), colors=True), scene)
     with pytest.raises(UserError, match="holds no image named as one"):
         make(GaussianGroupingSource(), scene)
 
@@ -133,6 +143,15 @@ def test_coco_run_lengths_polygons_and_instances(tmp_path):
     assert maps[2] is not None and not maps[2].any() and maps[3] is None  # no object in v2; v3 is not annotated
     names, maps = make(CocoSource(), scene)
     assert names == {0: "background", 1: "thing"} and np.array_equal(maps[0], truth(0) > 0)
+    for entry, track in zip(annotations, (1, "two", 1, "two"), strict=True):
+        entry["track_id"] = track
+    (tmp_path / "annotations.json").write_text(json.dumps(content))
+    names, maps = make(CocoSource(by="instance"), scene)
+    assert names == {0: "background", 1: "thing_1", 2: "thing_two"} and np.array_equal(maps[1], truth(1))
+    annotations[0]["track_id"] = [1]
+    (tmp_path / "annotations.json").write_text(json.dumps(content))
+    with pytest.raises(UserError, match="neither a whole number nor a word"):
+        make(CocoSource(by="instance"), scene)
     square = decoded([[2, 3, 8, 3, 8, 9, 2, 9]], (HEIGHT, WIDTH), "x")
     assert square[3:9, 2:8].all() and square.sum() == 36
     for wrong, message in (
@@ -161,6 +180,9 @@ def test_langsplat_segments_are_matched_by_features(tmp_path):
     assert len(names) == 3 and maps[3] is None
     pairs = {p for i in range(3) for p in zip(maps[i].ravel().tolist(), truth(i).ravel().tolist(), strict=True)}
     assert len(pairs) == 3 and (IGNORE, 0) in pairs
+    (tmp_path / "language_features/v1_f.npy").write_bytes(b"no array")
+    with pytest.raises(UserError, match="v1_f.npy cannot be read as an array"):
+        make(LangSplatSource(), scene)
     (tmp_path / "language_features/v1_f.npy").unlink()
     with pytest.raises(UserError, match="segments of two views cannot be matched"):
         make(LangSplatSource(), scene)
@@ -179,6 +201,9 @@ def test_prompts_are_read_and_mistakes_told(tmp_path):
         ({"objects": [{"prompts": []}]}, "object 1 .* is wrong"),
         ({"objects": [{"name": "a"}]}, "neither prompts nor a text"),
         ({"objects": [{"name": "a", "prompts": [{"view": "v", "box": [5, 0, 1, 1]}]}]}, "left, top, right, bottom"),
+        ({"objects": [{"name": "a", "prompts": [{"view": "v", "box": [0, 0, math.inf, 1]}]}]}, "left, top, right"),
+        ({"objects": [{"name": "a", "prompts": [{"view": "v", "points": [[math.nan, 1]]}]}]}, "the points .* are not"),
+        ({"objects": [{"name": "a", "id": math.inf, "text": "a"}]}, "object 1 .* is wrong"),
         ({"objects": [entry, {**entry, "name": "other"}]}, "the same id"),
         ({"objects": [{**entry, "id": 70000}]}, "not in 1..65534"),
     ):
@@ -217,7 +242,7 @@ class Wall:
             write_image(path, photo)
             self.photos.append(Photo(path.stem, path, 90, 70))
             self.discs.append(disc)
-        self.stems = [photo.stem for photo in self.photos[:known]]
+        self.images = [photo.path for photo in self.photos[:known]]
         K = torch.tensor([[100.0, 0, 45], [0, 100.0, 35], [0, 0, 1]])
         self.cameras = []
         for index in range(known):
@@ -259,6 +284,8 @@ def test_grabcut_fills_the_other_views(tmp_path):
     (tmp_path / "prompts.json").write_text(json.dumps(prompts))
     with pytest.raises(UserError, match="prompts in v2, which is held out"):
         make(GrabCutSource(), held_out)
+    with pytest.raises(UserError, match="was trained on .*elsewhere.*, which is no image of"):
+        make(GrabCutSource(), SourceScene(tmp_path, wall.photos, Wall(tmp_path / "elsewhere")))
 
 
 def test_rims_snap_to_the_edge_of_the_photo():
@@ -293,6 +320,24 @@ def test_the_command_writes_masks_that_training_finds(tmp_path, capsys):
     metadata = BeagsDataParserConfig(data=tmp_path).setup().get_dataparser_outputs("train").metadata
     assert metadata["classes"] == {0: "background", 1: "cup"} and all(metadata["class_map_filenames"])
     np.testing.assert_array_equal(read_class_map(tmp_path / "masks/v03.png"), truth(0) == 1)
+    extra = tmp_path / "objects"
+    for index in range(5, 9):
+        (extra / f"cup/v{index:02d}.png").unlink()
+    write_image(tmp_path / "masks/other/v08.png", truth(0))
+    main([*arguments, "--overwrite"])
+    assert "5 masks of 9 views" in capsys.readouterr().out
+    assert sorted(path.stem for path in (tmp_path / "masks").rglob("*.png")) == [f"v{i:02d}" for i in range(5)]
+    kept = {path: path.read_bytes() for path in (*(tmp_path / "masks").glob("*.png"), tmp_path / "classes.json")}
+    write_image(extra / "cup/v04.png", np.zeros((3, 3), np.uint8))  # found out after those before it are made
+    with pytest.raises(SystemExit):
+        main([*arguments, "--overwrite"])
+    write_image(extra / "cup/v04.png", truth(0))
+    write_image(extra / "background/v03.png", truth(0))
+    with pytest.raises(SystemExit):
+        main([*arguments, "--overwrite"])
+    assert "the name 'background' to two classes" in " ".join(capsys.readouterr().out.split())
+    assert all(path.read_bytes() == content for path, content in kept.items())
+    assert not list(tmp_path.glob(".masks_*"))
     for wrong, message in (
         (arguments, "has masks or a classes.json already"),
         ([*arguments[:5], "nothing"], "there is no mask source 'nothing'"),
@@ -318,6 +363,11 @@ def test_reprojection_of_a_run_writes_masks_of_the_photos_size(tmp_path, lens):
     assert [path.stem for path in masks] == [f"v{index:02d}" for index in range(1, 8)]
     assert all(read_class_map(path).shape == (HEIGHT, WIDTH) for path in masks)
     assert (tmp_path / "out/before_after.png").exists() and (tmp_path / "out/confidence/v01.png").exists()
+    confidence = [read_class_map(tmp_path / "out/confidence" / path.name) for path in masks]
+    assert all(values.shape == (HEIGHT, WIDTH) and values.max() > 0 for values in confidence)
+    for mask, values in zip(masks, confidence, strict=True):
+        unlabelled = read_class_map(mask) == IGNORE
+        assert not values[unlabelled].any()  # where the straight view does not reach, or nothing voted
     report = json.loads((tmp_path / "out/report.json").read_text())
     before = read_class_map(data / "masks/v01.png")
     after = read_class_map(masks[0])
@@ -326,3 +376,22 @@ def test_reprojection_of_a_run_writes_masks_of_the_photos_size(tmp_path, lens):
     main(["masks", "check", "--load-config", str(config), "--masks-path", str(tmp_path / "out/masks"),
           "--output", str(tmp_path / "check")])  # fmt: skip
     assert (tmp_path / "check/report.json").exists()
+
+
+def test_the_check_of_a_run_takes_its_options_and_what_replaces_them(tmp_path):
+    from beags_plugin.plugin.extract import read_scene
+    from beags_plugin.plugin.masks_check import options_beside
+    from beags_plugin.plugin.reprojected_run import ReprojectionOptions, data_of_run
+
+    data = write_scene(tmp_path / "scene")
+    config = write_trained(tmp_path / "run", data)
+    own = options_beside(config, None)
+    assert own.data == data and own.orientation_method == "none"  # as the run was trained
+    (data / "masks").rename(data / "others")
+    parser = options_beside(config, None, masks_path=Path("others"), ignore_ids=(2,), layout=None)
+    assert (parser.layout, parser.orientation_method) == (own.layout, "none")
+    manager = data_of_run(read_scene(config), config, ReprojectionOptions(run_size=True, parser=parser))
+    labels = manager.views("train")[0].labels
+    assert labels is not None and set(labels.unique().tolist()) == {0, 1, IGNORE}
+    main(["masks", "check", "--load-config", str(config), "--masks-path", "others", "--output", str(tmp_path / "out")])
+    assert json.loads((tmp_path / "out/report.json").read_text())["coverage"][0]["pixels"]["2"] == 16

@@ -13,6 +13,7 @@ from beags_plugin.cli import main
 from beags_plugin.masks.check.areas import contradicted
 from beags_plugin.masks.check.consistency import UNSEEN, Agreement, labels_at, ranks_of
 from beags_plugin.masks.check.findings import named, percent
+from beags_plugin.masks.classes import write_class_map
 from beags_plugin.masks.pictures import coverage_picture
 from beags_plugin.rasterizers.interface import IGNORE
 
@@ -145,6 +146,16 @@ def test_the_command_writes_its_report_and_ends_with_1_on_errors(tmp_path, capsy
     assert report["coverage"][0]["pixels"]["1"] == int((draw(poses()[0]) == 1).sum())
     assert (tmp_path / "out/coverage.png").stat().st_size > 5000
     assert "11 usable masks, 3 objects; 1 errors" in capsys.readouterr().out
+
+
+def test_an_image_that_is_no_id_image_is_told_and_not_compared(tmp_path):
+    root = write_balls(tmp_path)
+    (root / "classes.json").unlink()
+    depth = np.arange(draw(poses()[2]).size, dtype=np.uint16).reshape(draw(poses()[2]).shape)
+    write_class_map(root / "masks/v02.png", depth)
+    found = findings(root)
+    assert set(found) == {"no id image"} and found["no id image"][0].level == "error"
+    assert str(root / "masks/v02.png") in found["no id image"][0].message and found["no id image"][0].views == ("v02",)
 
 
 def test_no_mask_at_all_is_an_error(tmp_path):

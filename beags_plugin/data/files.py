@@ -53,7 +53,7 @@ def image_size(path: Path) -> tuple[int, int]:
             return image.size
     except FileNotFoundError:
         raise UserError(f"the image {path} does not exist: restore it, or remove it from the poses.") from None
-    except (UnidentifiedImageError, OSError) as error:
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError) as error:
         raise UserError(f"{path} cannot be read as an image: replace it ({error}).") from error
 
 

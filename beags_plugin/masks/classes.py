@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import colorsys
 import json
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +69,7 @@ def _read_pixels(path: Path | str) -> tuple[str, np.ndarray]:
             form, mode, values = image.format, image.mode, np.asarray(image)
     except FileNotFoundError:
         raise UserError(f"the mask {path} does not exist: check the path.") from None
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
         raise UserError(f"the mask {path} cannot be read as an image ({error}): save it as PNG again.") from None
     if form == "JPEG":
         raise UserError(f"the mask {path} is a JPEG, which blurs class ids: save it as 8-bit or 16-bit grey PNG.")
@@ -93,6 +94,18 @@ def write_class_map(path: Path | str, array: np.ndarray) -> None:
         Image.fromarray(array.astype(np.uint8 if array.max() <= 255 else np.uint16)).save(path, format="PNG")
     except OSError as error:
         raise UserError(f"the class map {path} cannot be written: {error}.") from None
+
+
+def check_names(names: Mapping[int, str]) -> None:
+    """Raise ``UserError`` for names of classes that ``read_classes`` would refuse."""
+    for class_id, name in names.items():
+        if not 0 <= class_id < IGNORE:
+            raise UserError(f"the masks hold the class id {class_id}: only 0..{IGNORE - 1} can be used.")
+        if not name.strip():
+            raise UserError(f"the class {class_id} of the masks has no name: name it.")
+    stripped = Counter(name.strip() for name in ({BACKGROUND: "background"} | dict(names)).values())
+    if repeated := sorted(name for name, uses in stripped.items() if uses > 1):
+        raise UserError(f"the masks give the name {repeated[0]!r} to two classes: rename one of the objects.")
 
 
 def read_classes(path: Path | str | None, ids_present: Iterable[int] | None = None) -> dict[int, str]:

@@ -77,7 +77,10 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
 
     def __init__(self, config: BeagsDataManagerConfig, *args, **kwargs) -> None:
         super().__init__(config, *args, **kwargs)
-        self._distorted: dict[str, Cameras] = {}
+        self._distorted = {"train": deepcopy(self.train_dataset.cameras), "eval": deepcopy(self.eval_dataset.cameras)}
+        straighten(self.train_dataset.cameras)
+        straighten(self.eval_dataset.cameras)
+        self.train_cameras = self.train_dataset.cameras.to(self.device)
         self._replaced = False  # whether the training class maps are no longer those of the files
         self._originals_kept = True
         self._originals: list[Tensor] | None = None  # those of the files, where they are kept beside the ones in use
@@ -85,11 +88,8 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         self._eval_order = random.Random(config.train_cameras_sampling_seed)
 
     def _load_images(self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]) -> Any:
-        """The data of all views, in memory or streamed; the cameras are straightened."""
+        """The data of all views, in memory or streamed."""
         dataset = self._dataset(split)
-        self._distorted[split] = deepcopy(dataset.cameras)
-        straighten(dataset.cameras)
-        self.train_cameras = self.train_dataset.cameras.to(self.device)
         load = partial(self._load_view, split)
         if self.streams(split):
             CONSOLE.print(
@@ -137,46 +137,39 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
             data["alpha"] = torch.from_numpy(undistort_alpha(alpha, *lens))
         return data
 
+    def _straight(self, split: Literal["train", "eval"], class_map: np.ndarray, index: int) -> np.ndarray:
+        """A class map [h, w] of a view, of any size, as it would be had the camera no lens distortion."""
+        return undistort_class_map(class_map, self._distorted[split], self._dataset(split).cameras, index)
+
     def _labels_of_file(self, split: Literal["train", "eval"], index: int) -> Tensor:
         """The labels of a view's mask file in the narrowest type, without its photo."""
-        dataset = self._dataset(split)
-        class_map = dataset.get_metadata({"image_idx": index})["class_map"].numpy()
-        straight = undistort_class_map(class_map, self._distorted[split], dataset.cameras, index)
-        return narrowed(torch.from_numpy(straight.astype(np.int32)))
+        class_map = self._dataset(split).get_metadata({"image_idx": index})["class_map"].numpy()
+        return narrowed(torch.from_numpy(self._straight(split, class_map, index).astype(np.int32)))
 
     def undistort_eval_map(self, class_map: np.ndarray, index: int) -> np.ndarray:
         """A class map [h, w] of an evaluation view, of any size, as it would be had the camera no lens distortion."""
-        assert self.cached_eval is not None  # the cameras are straightened when the images load
-        return undistort_class_map(class_map, self._distorted["eval"], self.eval_dataset.cameras, index)
-
-    def straighten_training_views(self) -> None:
-        """Have the training cameras without lens distortion; opens the images only if there is any to remove."""
-        parameters = self.train_dataset.cameras.distortion_params
-        if "train" not in self._distorted and parameters is not None and bool(parameters.any()):
-            assert self.cached_train is not None  # opening them straightens the cameras
+        return self._straight("eval", class_map, index)
 
     def training_mask(self, index: int) -> np.ndarray | None:
-        """The class map [h, w] uint16 in a training view's mask file, without lens distortion; None without a file.
-
-        Call ``straighten_training_views`` before.
-        """
+        """The class map [h, w] uint16 in a training view's mask file, without lens distortion; None without a file."""
         if self.train_dataset.metadata["class_map_filenames"][index] is None:
             return None
-        ids = self.train_dataset.get_metadata({"image_idx": index})["class_map"].numpy()
-        straight = self.train_dataset.cameras
-        return undistort_class_map(ids, self._distorted.get("train", straight), straight, index)
+        return self._straight(
+            "train", self.train_dataset.get_metadata({"image_idx": index})["class_map"].numpy(), index
+        )
 
     def straight_train_map(self, class_map: np.ndarray, index: int) -> np.ndarray:
         """A class map [h, w] of a training view's file without its lens distortion."""
-        assert self.cached_train is not None  # the cameras are straightened when the images load
-        return undistort_class_map(class_map, self._distorted["train"], self.train_dataset.cameras, index)
+        return self._straight("train", class_map, index)
 
-    def as_in_file(self, class_map: np.ndarray, index: int) -> np.ndarray:
-        """A class map [h', w'] of a training view with the lens distortion of its file, at the size it was read at."""
-        assert self.cached_train is not None  # the cameras are straightened when the images load
+    def as_in_file(self, class_map: np.ndarray, index: int, border: int = IGNORE) -> np.ndarray:
+        """A class map [h', w'] of a training view with the lens distortion of its file, at the size it was read at.
+
+        border: what is where the straight view does not reach.
+        """
         width, height = self.train_dataset.file_sizes[index]
         lens = (self._distorted["train"], self.train_dataset.cameras, index)
-        return redistort_class_map(class_map, *lens, (height, width))
+        return redistort_class_map(class_map, *lens, (height, width), border)
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         camera, data = super().next_train(step)
@@ -191,7 +184,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         index = self.eval_unseen_cameras.pop(self._eval_order.randrange(len(self.eval_unseen_cameras)))
         if not self.eval_unseen_cameras:
             self.eval_unseen_cameras = list(range(len(self.eval_dataset)))
-        data = self.cached_eval[index].copy()  # before the camera: it is straightened then
+        data = self.cached_eval[index].copy()
         data["image"] = data["image"].to(self.device)
         return self.eval_dataset.cameras[index : index + 1].to(self.device), self._on_device(data)
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import fields
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from beags_plugin.data.files import image_size
 from beags_plugin.errors import UserError
-from beags_plugin.masks.classes import write_class_map
+from beags_plugin.masks.classes import check_names, write_class_map
 from beags_plugin.masks.pictures import overlay
 from beags_plugin.masks.rims import snap_to_edges
 from beags_plugin.masks.sources import MASK_SOURCES
@@ -36,7 +37,7 @@ class RunGeometry:
         self.scene = read_scene(config_path)
         self.manager = data_of_run(self.scene, config_path, ReprojectionOptions())
         self.views = self.manager.views("train")
-        self.stems = [view.name for view in self.views]
+        self.images = list(self.manager.train_dataset.image_filenames)
         self.cameras = [view.camera for view in self.views]
         self.rasterizer = make_rasterizer(self.scene.config.model_config.rasterizer)
         self.settings = raster_settings(self.scene)
@@ -95,6 +96,7 @@ def make_masks(
 ) -> list[str]:
     """Write the masks of a scene: <output>/masks/<stem>.png, classes.json and made.png, a picture of them.
 
+    The files take their places once all are made; no old mask of any view stays.
     data: names the scene. run: config.yml of a run trained on it, for sources that need its depth. output: the scene's
     own folder if None, where ``beags-data`` looks for them. overwrite: replace masks that are there. snap: radius in
     pixels of ``rims.snap_to_edges``, 0 leaves rims as they are.
@@ -117,30 +119,44 @@ def make_masks(
         for index, (path, size) in enumerate(zip(views.images, sizes, strict=True))
     ]
     made_of = SourceScene(scene.root, photos, RunGeometry(run) if run is not None and source.needs_run else None)
-    written, shares, shown = 0, [], []
-    with progress_bar("Making masks") as progress:
+    shares, shown = [], []
+    folder.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=".masks_", dir=folder) as temporary, progress_bar("Making masks") as progress:
+        unfinished = Path(temporary)
         made = source.make(made_of, progress)
+        check_names(made.names)
         for index, (path, class_map) in enumerate(zip(mask_paths(views.images), made.maps, strict=True)):
             if class_map is None:
                 continue
             if snap:
                 class_map = snap_to_edges(class_map, photos[index].pixels(), snap)
-            (masks / path).parent.mkdir(parents=True, exist_ok=True)
-            write_class_map(masks / path, class_map)
-            written += 1
+            (unfinished / path).parent.mkdir(parents=True, exist_ok=True)
+            write_class_map(unfinished / path, class_map)
             shares.append(float((class_map != 0).mean()))
             shown.append((photos[index], masks / path))
-    if not written:
-        raise UserError("the mask source gave no mask for any view: check its options.")
+        if not shown:
+            raise UserError("the mask source gave no mask for any view: check its options.")
+        _take_the_place(unfinished, masks, {image.stem for image in views.images})
     names = {str(i): name for i, name in sorted(made.names.items())}
     (folder / "classes.json").write_text(json.dumps(names, indent=1), "utf8")
     _picture(folder / "made.png", shown)
     return [
         *made.notes,
-        f"{written} masks of {len(photos)} views, {len(names) - 1} objects, which cover {100 * np.mean(shares):.1f} % "
-        f"on average: {masks}",
+        f"{len(shown)} masks of {len(photos)} views, {len(names) - 1} objects, which cover {100 * np.mean(shares):.1f} "
+        f"% on average: {masks}",
         f"names: {folder / 'classes.json'}; look at {folder / 'made.png'}",
     ]
+
+
+def _take_the_place(unfinished: Path, masks: Path, stems: set[str]) -> None:
+    """Move the new masks to ``masks``, instead of all that are there for images of these stems."""
+    for old in list(masks.rglob("*.png")):
+        if old.stem in stems:
+            old.unlink()
+    for new in sorted(unfinished.rglob("*.png")):
+        place = masks / new.relative_to(unfinished)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        new.replace(place)
 
 
 def _picture(path: Path, shown: Sequence[tuple[Photo, Path]], most: int = 24) -> None:

@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -16,12 +16,13 @@ from beags_plugin.errors import UserError
 from beags_plugin.masks.check.areas import Area, contradicted
 from beags_plugin.masks.check.consistency import Agreement, labels_at, ranks_of
 from beags_plugin.masks.check.disagreement import views_against_others
-from beags_plugin.masks.check.files import FEW_VIEWS, Coverage, MaskFiles, check_files
+from beags_plugin.masks.check.files import FEW_VIEWS, MOST_IDS, Coverage, MaskFiles, check_files
 from beags_plugin.masks.check.findings import LEVELS, Finding, ordered, percent
 from beags_plugin.masks.classes import read_classes
 from beags_plugin.masks.pictures import contradictions, coverage_picture
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.dataparser import BeagsDataParser, BeagsDataParserConfig
+from beags_plugin.plugin.extract import load_run_config
 from beags_plugin.plugin.lenses import project_through_lens
 from beags_plugin.plugin.poses import PosedViews
 from beags_plugin.plugin.seed_points import random_points, starting_points
@@ -73,7 +74,11 @@ class Report:
 
 
 def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Report:
-    """Check the masks of the scene that ``config`` names; raises ``UserError`` only where poses or photos are bad."""
+    """Check the masks of the scene that ``config`` names, at the size of the photographs.
+
+    Raises ``UserError`` only where poses or photos are bad.
+    """
+    config = replace(config, downscale_factor=1.0)
     if few_views < 1:
         raise UserError(f"min_views is {few_views}: give a number of views, at least 1.")
     scene, views, files = _files(config)
@@ -82,7 +87,17 @@ def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Re
     shown = dict(files.names or {})
     shown = {i: shown.get(i, "background" if i == 0 else f"class_{i}") for i in coverage.ids}
     findings = list(coverage.findings)
-    if coverage.usable.sum() > 3 and len(coverage.ids) > 1:
+    if len(coverage.ids) > MOST_IDS:
+        findings.append(
+            Finding(
+                "note",
+                "not compared",
+                f"the masks hold {len(coverage.ids)} ids, so views are not compared: more than {MOST_IDS} take too "
+                "much memory; drop ids that are in few views.",
+                "ids exchanged between views are not looked for",
+            )
+        )
+    elif coverage.usable.sum() > 3 and len(coverage.ids) > 1:
         points = _points(scene, views, config)
         findings += views_against_others(_agreement(files, coverage, views, points), files.stems, coverage, shown)
     return Report(scene.root, list(files.stems), shown, coverage, ordered(findings))
@@ -192,6 +207,20 @@ def write_report(report: Report, output: Path, run: ReprojectedRun | None = None
         )
         written.append(output / "contradicted.png")
     return written
+
+
+def options_beside(run: Path | None, data: Path | None, **given: Any) -> BeagsDataParserConfig:
+    """The data parser's options of a run, or the usual ones without any, replaced by those given that are not None.
+
+    run: config.yml. data: folder of the scene, that of the run if None.
+    """
+    config = BeagsDataParserConfig()
+    if run is not None:
+        trained = load_run_config(run)
+        config = replace(cast("BeagsDataParserConfig", trained.data_config.dataparser), data=trained.data_path)
+    if data is not None:
+        config = replace(config, data=data)
+    return replace(config, **{name: value for name, value in given.items() if value is not None})
 
 
 def data_options(

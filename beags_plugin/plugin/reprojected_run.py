@@ -23,7 +23,7 @@ from beags_plugin.plugin.extract import read_scene
 from beags_plugin.progress import progress_bar
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import IGNORE
-from beags_plugin.refiners.consistent_masks import reprojected_masks
+from beags_plugin.refiners.consistent_masks import render_depths, reprojected_masks
 from beags_plugin.refiners.preparation import known_classes
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ class ReprojectionOptions:
 
     masks: folder of other id images. classes: their classes.json. method, tau, voters, depth: see
     ``refiners.preparation.PreparationConfig``. run_size: reproject at the size that was trained on, not at that of the
-    photographs.
+    photographs. parser: the options of ``beags-data``, if not the run's own.
     """
 
     masks: Path | None = None
@@ -48,6 +48,7 @@ class ReprojectionOptions:
     voters: int | None = None
     depth: str | None = None
     run_size: bool = False
+    parser: BeagsDataParserConfig | None = None
 
 
 @dataclass(frozen=True)
@@ -100,16 +101,12 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     if all(mask is None for mask in given.stored):
         raise UserError(f"no training view of {scene.config.data_path} has a mask: give --masks-path, or make some.")
     classes = manager.train_dataset.metadata["classes"]
-    masks = reprojected_masks(
-        scene.surfels().detach(),
-        [view.camera for view in views],
-        given,
-        known_classes(given, classes),
-        make_rasterizer(scene.config.model_config.rasterizer),
-        raster_settings(scene),
-        config,
-        progress_bar,
-    )
+    cameras, rasterizer = [view.camera for view in views], make_rasterizer(scene.config.model_config.rasterizer)
+    with progress_bar("Rendering depth") as progress:
+        surfels = scene.surfels().detach()
+        depths = render_depths(surfels, cameras, rasterizer, raster_settings(scene), config.depth, progress)
+    with progress_bar("Reprojecting masks") as progress:
+        masks = reprojected_masks(depths, cameras, given, known_classes(given, classes), config, progress)
     assert masks.confidence is not None
     names = [view.name for view in views]
     seconds = time.perf_counter() - start
@@ -119,9 +116,12 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
 def data_of_run(scene: SavedScene, config_path: Path, options: ReprojectionOptions) -> BeagsDataManager:
     """The data that a run was trained on, at the size and with the masks that ``options`` name."""
     config = scene.config
-    if not config.data_path.exists():
-        raise UserError(f"{config_path} was trained on {config.data_path}, which is gone: put it back.")
-    parser = cast("BeagsDataParserConfig", replace(config.data_config.dataparser, data=config.data_path))
+    if options.parser is not None:
+        parser = replace(options.parser)
+    else:
+        parser = cast("BeagsDataParserConfig", replace(config.data_config.dataparser, data=config.data_path))
+    if not parser.data.exists():
+        raise UserError(f"{config_path} was trained on {parser.data}, which is gone: put it back.")
     if options.masks is not None:
         if not options.masks.is_dir():
             raise UserError(f"the folder of masks {options.masks} does not exist: correct --masks-path.")
@@ -129,7 +129,7 @@ def data_of_run(scene: SavedScene, config_path: Path, options: ReprojectionOptio
         beside = options.masks.absolute().parent / "classes.json"
         classes = options.classes or (beside if beside.is_file() else None)
         parser.classes_path = parser.classes_path if classes is None else classes.absolute()
-    data = replace(config.data_config, dataparser=parser)
+    data = replace(config.data_config, dataparser=parser, data=parser.data)
     if not options.run_size:
         parser.downscale_factor, data.camera_res_scale_factor = 1.0, 1.0
     manager = data.setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
@@ -139,10 +139,10 @@ def data_of_run(scene: SavedScene, config_path: Path, options: ReprojectionOptio
 def write_reprojection(found: ReprojectedRun, output: Path, min_confidence: float = 0.0, shown: int = 6) -> list[str]:
     """Write refined masks, confidence maps, a report and a picture of the views that changed most; what was written.
 
-    Masks are of the size of the photographs, lens distortion included, so that ``beags-data --masks-path`` takes them
-    (at the run's own size if that was asked for). min_confidence: less certain pixels become IGNORE.
+    All maps are of the size of the photographs, lens distortion included, so that ``beags-data --masks-path`` takes
+    them (at the run's own size if that was asked for). min_confidence: less certain pixels become IGNORE.
     """
-    import cv2
+    from PIL import Image
 
     changes = []
     for index, path in enumerate(mask_paths(found.manager.train_dataset.image_filenames)):
@@ -153,7 +153,7 @@ def write_reprojection(found: ReprojectedRun, output: Path, min_confidence: floa
         for folder in ("masks", "confidence"):
             (output / folder / path).parent.mkdir(parents=True, exist_ok=True)
         write_class_map(output / "masks" / path, found.manager.as_in_file(final, index))
-        cv2.imwrite(str(output / "confidence" / path), confidence)
+        Image.fromarray(found.manager.as_in_file(confidence, index, border=0)).save(output / "confidence" / path)
         changes.append(_change(found, index, doubtful))
     (output / "classes.json").write_text(json.dumps({str(i): name for i, name in found.classes.items()}, indent=1))
     report = {"seconds": found.seconds, "min_confidence": min_confidence, "views": changes}

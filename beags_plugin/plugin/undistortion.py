@@ -63,12 +63,17 @@ def undistort_class_map(class_map: np.ndarray, distorted: Cameras, straight: Cam
 
 
 def redistort_class_map(
-    class_map: np.ndarray, distorted: Cameras, straight: Cameras, index: int, shape: tuple[int, int]
+    class_map: np.ndarray,
+    distorted: Cameras,
+    straight: Cameras,
+    index: int,
+    shape: tuple[int, int],
+    border: int = IGNORE,
 ) -> np.ndarray:
     """A class map of the straight view as the photograph's file has it: the inverse of ``undistort_class_map``.
 
     class_map: [h', w'], the whole straight image. shape: (h, w) of the distorted image, at as many pixels per camera
-    pixel. Returns [h, w], the nearest id of each pixel; IGNORE where the straight image does not reach.
+    pixel. Returns [h, w], the nearest value of each pixel; ``border`` where the straight image does not reach.
     """
     if distorted.distortion_params is None or not distorted.distortion_params[index].any():
         return class_map
@@ -87,7 +92,7 @@ def redistort_class_map(
         exact = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-4)
         found = cv2.undistortPointsIter(pixels, K, np.array([k1, k2, p1, p2, k3]), np.eye(3), new_K, exact)
     maps = found.reshape(height, width, 2).astype(np.float32)
-    options = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": (IGNORE,)}
+    options = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": (border,)}
     return cv2.remap(class_map, maps[..., 0], maps[..., 1], cv2.INTER_NEAREST, **options)
 
 

@@ -27,8 +27,8 @@ _KEPT_MASKS = 8  # of the views that were looked at last
 class ViewedRun:
     """A run on disk with its data manager; what takes time to read is read when ``load_`` is called, by the panel.
 
-    folder: of the run. names: of the training views. cameras: theirs, without lens distortion; None until
-    ``load_views``. grid: the voxel grid of a finished run; None until ``load_grid``.
+    folder: of the run. names: of the training views. cameras: theirs, without lens distortion. grid: the voxel grid
+    of a finished run; None until ``load_grid``.
     """
 
     def __init__(self, folder: Path, datamanager: BeagsDataManager) -> None:
@@ -37,7 +37,8 @@ class ViewedRun:
         dataset = datamanager.train_dataset
         self.names = unique_names(dataset.image_filenames)
         self.has_masks = any(path is not None for path in dataset.metadata["class_map_filenames"])
-        self.cameras: list[Camera] | None = None
+        cameras = dataset.cameras
+        self.cameras: list[Camera] = [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))]
         self.grid: VisibilityGrid | None = None
         self._before = lru_cache(_KEPT_MASKS)(datamanager.training_mask)
         self._after = lru_cache(_KEPT_MASKS)(read_class_map)
@@ -52,15 +53,6 @@ class ViewedRun:
     def has_grid(self) -> bool:
         """Whether refinement was prepared with a voxel grid (some refiners need none, and keep an empty file)."""
         return self.prepared is not None and bool(torch.load(self.prepared / "grid.pt", weights_only=True, mmap=True))
-
-    def load_views(self) -> bool:
-        """Make the cameras known; images are only opened if lens distortion has to be removed. Tells if it was due."""
-        if self.cameras is not None:
-            return False
-        self.datamanager.straighten_training_views()
-        cameras = self.datamanager.train_dataset.cameras
-        self.cameras = [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))]
-        return True
 
     def load_grid(self) -> bool:
         """Read the voxel grid; tells whether there was one to read."""

@@ -24,7 +24,7 @@ from nerfstudio.viewer.viewer_elements import (
 from beags_plugin.errors import UserError
 from beags_plugin.export import EXPORTERS
 from beags_plugin.plugin.viewed_run import ViewedRun
-from beags_plugin.plugin.viewing import NO_CLASSES, OF_TRAINING_VIEWS, Viewing
+from beags_plugin.plugin.viewing import NO_CLASSES, Viewing
 from beags_plugin.viewing.legend import LegendRow, escaped, legend, unique_labels
 from beags_plugin.viewing.picking import pick
 
@@ -266,8 +266,6 @@ class ObjectPanel(ViewerElement[None]):
         wanted, run, changed = self._wanted(), self.viewing.run, False
         if run is None:
             return False
-        if wanted & OF_TRAINING_VIEWS:
-            changed |= run.load_views()
         if "occupancy_violation" in wanted:
             if self.viewing.model.grid is None:
                 run.load_grid()

@@ -184,8 +184,8 @@ class Viewing:
     ) -> dict[str, Tensor]:
         """Pictures of the training view nearest to ``camera``, as large as fits into the viewer's picture."""
         model, run = self.model, self.run
-        if run is None or run.cameras is None:
-            notes["view"] = "The training views are being read."
+        if run is None:
+            notes["view"] = "There are no training views: no run is shown."
             return {}
         index = nearest_view(camera, run.cameras, float(model.extent))
         fitted = fitted_camera(run.cameras[index], camera.width, camera.height)

@@ -9,13 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from beags_plugin.data.files import IMAGE_SUFFIXES
+from beags_plugin.data.files import IMAGE_SUFFIXES, image_size
 from beags_plugin.errors import UserError
 from beags_plugin.masks.check.findings import STOPS, Finding, named, percent
 from beags_plugin.masks.classes import BACKGROUND, read_mask
 from beags_plugin.rasterizers.interface import IGNORE
 
 FEW_VIEWS = 3  # an object needs two other views to outvote one
+MOST_IDS = 256  # in one file, or compared between views, which takes memory with their square
 LARGE_IGNORE = 0.2  # share of unlabelled pixels that is worth a word
 
 
@@ -69,15 +70,20 @@ def check_files(
     findings: list[Finding] = []
 
     def look(view: int) -> dict[int, int] | Finding | None:
+        path = files.masks[view]
+        if path is None:
+            return None
         try:
+            size = image_size(path)  # of the header: what is far too large is not decoded
+            if size != tuple(files.sizes[view]):
+                return _wrong_size(files, view, size)
             class_map = files.read(view)
         except UserError as error:
             return Finding("error", "type", str(error), STOPS, (files.stems[view],))
-        if class_map is None:
-            return None
-        if class_map.shape[::-1] != tuple(files.sizes[view]):
-            return _wrong_size(files, view, class_map.shape[::-1])
+        assert class_map is not None
         found = np.bincount(class_map.ravel(), minlength=IGNORE + 1)
+        if np.count_nonzero(found) > MOST_IDS:
+            return _no_id_image(files, view, np.count_nonzero(found))
         return {int(i): int(found[i]) for i in np.flatnonzero(found)}
 
     with ThreadPoolExecutor(max_workers=4) as pool:  # decoding a .png releases the interpreter
@@ -111,6 +117,16 @@ def _wrong_size(files: MaskFiles, view: int, found: tuple[int, ...]) -> Finding:
         f"the mask {files.masks[view]} is {found[0]}x{found[1]} pixels but its image is {width}x{height}: "
         "make it from the image at its full size, or scale it by nearest neighbour.",
         STOPS,
+        (files.stems[view],),
+    )
+
+
+def _no_id_image(files: MaskFiles, view: int, ids: int) -> Finding:
+    return Finding(
+        "error",
+        "no id image",
+        f"the mask {files.masks[view]} holds {ids} different ids: this is no id image (a photo? depth?), replace it.",
+        "training stops, or, without a classes.json, takes every value for an object",
         (files.stems[view],),
     )
 

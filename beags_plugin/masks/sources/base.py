@@ -39,8 +39,8 @@ class Geometry(Protocol):
     """The scene's own shape, from a trained run: of its training views, without lens distortion."""
 
     @property
-    def stems(self) -> Sequence[str]:
-        """Of the photographs of its views."""
+    def images(self) -> Sequence[Path]:
+        """The photographs of its views."""
         ...
 
     @property
@@ -75,6 +75,18 @@ class SourceScene:
             if stem in (photo.stem, photo.path.name):
                 return index
         raise UserError(f"{whose} names the view {stem!r}, but no image of {self.root} is called so: correct it.")
+
+    def places(self) -> list[int]:
+        """Of each view of ``geometry`` its place among the photos; ``UserError`` if it is of another scene."""
+        assert self.geometry is not None
+        known = {photo.path.resolve(): index for index, photo in enumerate(self.photos)}
+        for image in self.geometry.images:
+            if image.resolve() not in known:
+                raise UserError(
+                    f"the run was trained on {image}, which is no image of {self.root}: give --load-config a run that "
+                    "was trained on the same images."
+                )
+        return [known[image.resolve()] for image in self.geometry.images]
 
     def below(self, path: Path) -> Path:
         """The path in the scene's folder, if it is not absolute and exists there; else as it is."""

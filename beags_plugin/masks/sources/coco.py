@@ -12,6 +12,7 @@ import numpy as np
 
 from beags_plugin.errors import UserError
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo, stacked
+from beags_plugin.rasterizers.interface import IGNORE
 
 INSTANCE_KEYS = ("instance_id", "track_id", "object_id")
 
@@ -37,11 +38,14 @@ class CocoSource(MaskSource):
             annotations = [(stems[entry["image_id"]], self._key(entry), entry) for entry in content["annotations"]]
         except OSError as error:
             raise UserError(f"{path} cannot be read ({error.strerror}): give options file=...") from error
-        except (ValueError, KeyError, TypeError) as error:
+        except (AttributeError, ValueError, KeyError, TypeError) as error:
             raise UserError(f"{path} is no COCO JSON with images and annotations: {error!r}.") from error
         if not {photo.stem for photo in scene.photos} & {stem for stem, _, _ in annotations}:
             raise UserError(f"{path} annotates no image of {scene.root}: its file_name must be theirs.")
-        keys = sorted({key for _, key, _ in annotations})
+        # a file may mix numbers and words: numbers come first
+        keys = sorted({key for _, key, _ in annotations}, key=lambda key: [(isinstance(k, str), k) for k in key])
+        if len(keys) > IGNORE - 1:
+            raise UserError(f"{path} has {len(keys)} objects: only {IGNORE - 1} ids can be saved.")
         ids = {key: index for index, key in enumerate(keys, 1)}
         of_view: dict[str, list[tuple[int, Any]]] = defaultdict(list)
         for stem, key, entry in annotations:
@@ -64,14 +68,21 @@ class CocoSource(MaskSource):
             names[index] = title if self.by == "category" else f"{title}_{instance}"
         return MadeMasks(names, per_photo(scene, progress, read), [])
 
-    def _key(self, entry: dict[str, Any]) -> tuple[int, int]:
+    def _key(self, entry: dict[str, Any]) -> tuple[int | str, int | str]:
         """What one object is called: (category, instance)."""
         if self.by == "category":
-            return entry["category_id"], 0
+            return _number_or_word(entry["category_id"]), 0
         for key in INSTANCE_KEYS:
             if key in entry:
-                return entry.get("category_id", 0), entry[key]
+                return _number_or_word(entry.get("category_id", 0)), _number_or_word(entry[key])
         raise UserError(f"an annotation has none of {', '.join(INSTANCE_KEYS)}: use options by=category.")
+
+
+def _number_or_word(value: Any) -> int | str:
+    """An id as JSON may write it; ``ValueError`` for anything else."""
+    if not isinstance(value, (int, str)):
+        raise ValueError(f"the id {value!r} is neither a whole number nor a word")
+    return value
 
 
 def decoded(segmentation: Any, shape: tuple[int, int], where: str) -> np.ndarray:

@@ -44,7 +44,7 @@ class GrabCutSource(MaskSource):
         assert scene.geometry is not None
         path = scene.below(self.prompts)
         objects = read_prompts(path)
-        places = [scene.index_of(stem, f"the geometry of {scene.root}") for stem in scene.geometry.stems]
+        places = scene.places()
         drawn = self._prompted(scene, objects, path)
         if held_out := sorted(scene.photos[view].stem for view in drawn if view not in places):
             raise UserError(f"{path} has prompts in {held_out[0]}, which is held out: prompt a training view.")

@@ -57,10 +57,15 @@ class IdImagesSource(MaskSource):
     def _ids(self, path: Path, palette: dict[int, int]) -> np.ndarray:
         if not self.colors:
             return read_class_map(path, self.ignore_ids)
-        from PIL import Image
+        from PIL import Image, UnidentifiedImageError
 
-        with Image.open(path) as image:
-            pixels = np.asarray(image.convert("RGB")).astype(np.uint32)
+        try:
+            with Image.open(path) as image:
+                form, pixels = image.format, np.asarray(image.convert("RGB")).astype(np.uint32)
+        except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
+            raise UserError(f"the mask {path} cannot be read as an image ({error}): save it as PNG again.") from error
+        if form == "JPEG":
+            raise UserError(f"the mask {path} is a JPEG, which blurs the colours of objects: save it as PNG.")
         packed = pixels[..., 0] << 16 | pixels[..., 1] << 8 | pixels[..., 2]
         colors, inverse = np.unique(packed, return_inverse=True)
         for color in colors.tolist():

@@ -36,6 +36,10 @@ class LangSplatSource(MaskSource):
             raise UserError(f"{folder} holds no <stem>_s.npy for an image of the scene: give options folder=...")
         tables = self._objects(having, folder)
         objects = sorted({int(i) for table in tables.values() for i in table.values()})
+        if len(objects) > IGNORE - 1:
+            raise UserError(
+                f"{folder} gives {len(objects)} objects, only {IGNORE - 1} ids can be saved: lower similarity."
+            )
         ids = {i: index for index, i in enumerate(objects, 1)}
 
         def read(photo: Photo) -> np.ndarray | None:
@@ -53,7 +57,7 @@ class LangSplatSource(MaskSource):
 
     def _segments(self, folder: Path, stem: str) -> np.ndarray:
         path = folder / f"{stem}_s.npy"
-        maps = np.load(path)
+        maps = _array(path)
         if maps.ndim != 3 or len(maps) != len(LEVELS):
             raise UserError(f"{path} is {list(maps.shape)}, not [4, H, W]: give LangSplat's own files.")
         return maps[LEVELS.index(self.level)].astype(np.int64)
@@ -90,5 +94,18 @@ class LangSplatSource(MaskSource):
         path = folder / f"{stem}_f.npy"
         if not path.is_file():
             raise UserError(f"{path} is missing: without features, segments of two views cannot be matched.")
-        features = np.load(path).astype(np.float64)
+        features = _array(path).astype(np.float64)
+        if features.ndim != 2:
+            raise UserError(f"{path} is {list(features.shape)}, not [N, D]: give LangSplat's own files.")
         return features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-12)
+
+
+def _array(path: Path) -> np.ndarray:
+    """A .npy file of numbers."""
+    try:
+        array = np.load(path)
+    except (OSError, ValueError, EOFError) as error:
+        raise UserError(f"{path} cannot be read as an array ({error}): make it again.") from error
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+        raise UserError(f"{path} is no array of numbers: give LangSplat's own files.")
+    return array

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,7 +56,7 @@ def read_prompts(path: Path) -> list[PromptedObject]:
     for index, entry in enumerate(entries, 1):
         try:
             objects.append(_object(entry, index))
-        except (KeyError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
             raise UserError(
                 f"object {index} of the prompts {path} is wrong ({error}): write e.g. {EXAMPLE}."
             ) from error
@@ -85,7 +86,7 @@ def _prompt(entry: Mapping[str, Any]) -> Prompt:
     box = None
     if (given := entry.get("box")) is not None:
         left, top, right, bottom = (float(value) for value in given)
-        if not (left < right and top < bottom):
+        if not (left < right and top < bottom and all(map(math.isfinite, (left, top, right, bottom)))):
             raise ValueError(f"the box {given} is not [left, top, right, bottom]")
         box = (left, top, right, bottom)
     if box is None and not inside:
@@ -94,4 +95,7 @@ def _prompt(entry: Mapping[str, Any]) -> Prompt:
 
 
 def _points(given: Sequence[Any]) -> tuple[tuple[float, float], ...]:
-    return tuple((float(x), float(y)) for x, y in given)
+    points = tuple((float(x), float(y)) for x, y in given)
+    if not all(math.isfinite(value) for point in points for value in point):
+        raise ValueError(f"the points {given} are not [[x, y], ...]")
+    return points
