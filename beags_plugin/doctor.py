@@ -258,8 +258,8 @@ def _try_in_process(name: str) -> Check:
         [sys.executable, "-c", _TRIAL, json.dumps(sys.path), name], capture_output=True, text=True, timeout=120
     )
     if done.returncode < 0:
-        processor = "GPU" if name == "cuda" else "processor"
-        cause = f"it ends with {signal.Signals(-done.returncode).name}, so it is damaged or made for another {processor}"
+        processor, killer = "GPU" if name == "cuda" else "processor", signal.Signals(-done.returncode).name
+        cause = f"it ends with {killer}, so it is damaged or made for another {processor}"
         sentence = f"{cause}: reinstall beags from source; {avoided}"
         return Check(name, False, sentence, repair=_REBUILD)
     lines = done.stdout.strip().splitlines()

@@ -17,7 +17,9 @@ def each_view(
 
     Alone, one after the other, as they are asked for. In a process group of R processes, R views at a time, whose
     results are then exchanged: all processes must ask for all of them, and get the same bits as one process would. The
-    results are pickled; their tensors must lie on the CPU or on the same device in all processes.
+    results are pickled. Their tensors, alone or in tuples, lists and dicts, travel over the CPU: every process gets
+    them where its own ``work`` would have put them, on the CPU or on its own GPU. Other objects must hold no tensors
+    on a GPU.
 
     What ``work`` raises in one process is raised in all.
 
