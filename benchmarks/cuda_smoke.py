@@ -49,21 +49,21 @@ def _results(
     for variant in VARIANTS:
         yield f"drawing {variant}", _drawn(rasterizer, scene, replace(inputs, screen_shift=shift), variant)
     plain = SurfelInputs(**{name: leaf.detach() for name, leaf in leaves.items()}, class_ids=scene.class_ids)
-    what = (plain, scene.camera, scene.settings)
-    yield "contributions", [rasterizer.class_contributions(*what, scene.target, CLASSES)]
-    yield "class map", list(rasterizer.class_map(*what, CLASSES))
-    yield "heaviest", [rasterizer.heaviest(*what)]
-    coefficients = [scene.surfels.sh_dc.to(dtype).requires_grad_(), scene.surfels.sh_rest.to(dtype).requires_grad_()]
+    camera, settings = scene.camera, scene.settings
+    yield "contributions", [rasterizer.class_contributions(plain, camera, settings, scene.target, CLASSES)]
+    yield "class map", list(rasterizer.class_map(plain, camera, settings, CLASSES))
+    yield "heaviest", [rasterizer.heaviest(plain, camera, settings)]
+    dc, rest = (value.to(dtype).requires_grad_() for value in (scene.surfels.sh_dc, scene.surfels.sh_rest))
     for degree in DEGREES:
-        colors = sh_colors(*coefficients, inputs.means, torch.zeros(3, dtype=dtype), degree)
-        yield f"colours of degree {degree}", [colors, *_gradients(colors, [*coefficients, inputs.means])]
-    ids, axes = scene.class_ids, [plain.means.roll(1, 0) - plain.means, plain.means.roll(2, 0) - plain.means]
+        colors = sh_colors(dc, rest, inputs.means, torch.zeros(3, dtype=dtype), degree)
+        yield f"colours of degree {degree}", [colors, *_gradients(colors, [dc, rest, inputs.means])]
+    ids, (axis_u, axis_v) = scene.class_ids, (0.01 * (plain.means.roll(by, 0) - plain.means) for by in (1, 2))
     yield "voxel counts", [grid.count(plain.means, ids), grid.valid(plain.means, ids)]
-    yield "discs inside", [grid.disc_inside(plain.means, *(0.01 * axis for axis in axes), ids)]
+    yield "discs inside", [grid.disc_inside(plain.means, axis_u, axis_v, ids)]
     lookup = grid.lookup()
     assert lookup is not None  # where there is a rasterizer of CUDA, there is the compiled module
-    shape = [leaves[name] for name in LEAVES[:4]]
-    loss = occupancy_loss(*shape, ids, lookup, stream=7, samples=20)
+    shape = [inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits]
+    loss = occupancy_loss(shape[0], shape[1], shape[2], shape[3], ids, lookup, stream=7, samples=20)
     yield "occupancy loss", [loss, *_gradients(loss, shape)]
 
 

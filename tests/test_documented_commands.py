@@ -41,7 +41,6 @@ RUN = {  # command of beags: what is appended to make it quick
     "render": ["--size", "32", "--frames", "3", "--views", "2"],
     "sample": ["--width", "32", "--height", "24", "--views", "3"],
     "masks check": [],
-    "doctor": [],
 }
 PARSERS = {
     "ns-viewer": "nerfstudio.scripts.viewer.run_viewer:RunViewer",
