@@ -59,7 +59,6 @@ def diagnose() -> list[Check]:
         _cpu,
         _cuda,
         *_rasterizers(),
-        _cuda_rasterizer,
         _compiler,
         _pictures,
         _films,
@@ -105,14 +104,6 @@ def _cuda() -> Check:
         major, minor = torch.cuda.get_device_capability(0)
         return Check("CUDA device", True, f"{torch.cuda.get_device_name(0)}, sm_{major}{minor}", False)
     return Check("CUDA device", False, "none; not needed: the rasterizers run on the CPU", False)
-
-
-def _cuda_rasterizer() -> Check:
-    from beags_plugin.rasterizers import RASTERIZERS
-
-    if "cuda" in RASTERIZERS.names():  # from another package: it has a line of its own
-        return Check("CUDA rasterizer", True, "registered", False)
-    return Check("CUDA rasterizer", False, "not built: beags has none yet, so that no command adds it", False)
 
 
 def _cpu() -> Check:
@@ -254,19 +245,27 @@ except UserError as error:
 """
 
 
+_AVOIDED = {  # how to do without a backend that fails
+    "native": "BEAGS_NATIVE=0 in the environment avoids it",
+    "cuda": "training with --machine.device-type cpu, the default, avoids it",
+}
+
+
 def _try_in_process(name: str) -> Check:
     """Draw with the backend in a process of its own, which may die without taking the doctor along."""
+    avoided = _AVOIDED.get(name, "--pipeline.model.rasterizer torch avoids it")
     done = subprocess.run(
         [sys.executable, "-c", _TRIAL, json.dumps(sys.path), name], capture_output=True, text=True, timeout=120
     )
     if done.returncode < 0:
-        cause = f"it ends with {signal.Signals(-done.returncode).name}, so it is damaged or made for another processor"
-        sentence = f"{cause}: reinstall beags from source; BEAGS_NATIVE=0 in the environment avoids it"
+        processor, killer = "GPU" if name == "cuda" else "processor", signal.Signals(-done.returncode).name
+        cause = f"it ends with {killer}, so it is damaged or made for another {processor}"
+        sentence = f"{cause}: reinstall beags from source; {avoided}"
         return Check(name, False, sentence, repair=_REBUILD)
     lines = done.stdout.strip().splitlines()
     if done.returncode != 0 or not lines:
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        sentence = f"it fails when it draws: {last}; BEAGS_NATIVE=0 in the environment avoids it"
+        sentence = f"it fails when it draws: {last}; {avoided}"
         return Check(name, False, sentence, repair=_REBUILD)
     ok, sentence, replaced = json.loads(lines[-1])
     if replaced and name == "native":

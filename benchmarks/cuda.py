@@ -19,12 +19,12 @@ import torch
 from torch import Tensor
 
 from beags_plugin.rasterizers.cuda import CudaRasterizer
-from beags_plugin.rasterizers.interface import RasterSettings, SurfelInputs
+from beags_plugin.rasterizers.interface import SurfelInputs
+from benchmarks.cuda_smoke import LEAVES, smoke
 from benchmarks.machine import commit, describe_machine
-from benchmarks.scenes import Scene, Size, make_scene, on_device, surfel_inputs
+from benchmarks.scenes import Scene, Size, make_scene, on_device
 from benchmarks.training_step import TrainingStep
 
-LEAVES = ("means", "quats", "log_scales", "opacity_logits", "colors")
 COUNTS = (100_000, 1_000_000, 4_000_000)
 IMAGES = ((832, 608), (1280, 800), (1920, 1088))  # 0.5, 1 and 2 megapixels
 LAYERS = 45  # contributing, per pixel: what 50,000 surfels of 17 pixels give 640 x 480
@@ -128,42 +128,50 @@ def copy_rate() -> float:
     return 2 * source.numel() * 4 / milliseconds(lambda: target.copy_(source), 10) / 1e6
 
 
-def step_rows(scene: Scene, repeats: int) -> list[dict[str, Any]]:
-    """A training step without and with the two losses; Z from 1 to 1000."""
-    rows = []
+def step_rows(size: Size, repeats: int) -> list[dict[str, Any]]:
+    """A training step without and with the two losses; Z from 1 to 1000. A row that fails holds the reason."""
+    rows: list[dict[str, Any]] = []
+    scene = on_device(make_scene(size), "cuda")
     for samples in (None, *SAMPLES):
-        step = TrainingStep(scene, samples)
-        row = {"n": scene.size.n, "width": scene.size.width, "height": scene.size.height, "samples": samples}
-        rows.append({**row, "step_ms": milliseconds(step.run, repeats), "peak_mb": peak_mb(step.run)})
-        if samples is not None:
-            rows[-1]["ratio_to_base"] = rows[-1]["step_ms"] / rows[0]["step_ms"]
-        print(rows[-1], flush=True)
+        row: dict[str, Any] = {"n": size.n, "width": size.width, "height": size.height, "samples": samples}
+        try:
+            step = TrainingStep(scene, samples)
+            row = {**row, "step_ms": milliseconds(step.run, repeats), "peak_mb": peak_mb(step.run)}
+            if samples is not None and "step_ms" in rows[0]:
+                row["ratio_to_base"] = row["step_ms"] / rows[0]["step_ms"]
+        except Exception as error:
+            row["failed"] = failure(error)
+        rows.append(row)
+        print(row, flush=True)
     return rows
 
 
-def smoke() -> None:
-    """Every kernel once on a small scene: what a memory checker is run on."""
-    scene = on_device(make_scene(Size(2_000, 130, 100)), "cuda")
-    drawing = Drawing(scene)
-    inputs = replace(surfel_inputs(scene), colors=scene.colors)
-    for settings in (RasterSettings(0.05, 100.0, geometry=False), scene.settings):
-        leaves = SurfelInputs(**drawing.leaves, class_ids=scene.class_ids)
-        drawn = drawing.rasterizer.rasterize(leaves, scene.camera, settings, scene.background, scene.target)
-        images = [image for image in (drawn.color, drawn.alpha, drawn.depth, drawn.normal, drawn.median_depth,
-                                      drawn.distortion, drawn.boundary) if image is not None]  # fmt: skip
-        sum(image.square().sum() for image in images).backward()
-    what = (inputs, scene.camera, scene.settings)
-    contributions = drawing.rasterizer.class_contributions(*what, scene.target, 4)
-    classes, share = drawing.rasterizer.class_map(*what, 4)
-    heaviest = drawing.rasterizer.heaviest(*what)
-    TrainingStep(scene, 20).run()
-    torch.cuda.synchronize()
-    total = contributions.sum() + classes.sum() + share.sum() + heaviest.sum()
-    print("smoke test:", float(total), all(bool(leaf.grad.isfinite().all()) for leaf in drawing.leaves.values()))
+def drawing_rows(size: Size, repeats: int) -> list[dict[str, Any]]:
+    """Both backends on one scene; where one fails (no memory, no compiler for gsplat), the reason stands in its row."""
+    rows: list[dict[str, Any]] = []
+    what = {"n": size.n, "width": size.width, "height": size.height}
+    drawings: list[tuple[str, type[Drawing]]] = [("beags", Drawing)]
+    if gsplat_missing() is None:
+        drawings.append(("gsplat", GsplatDrawing))
+    for name, kind in drawings:
+        try:
+            scene = on_device(make_scene(size), "cuda")
+            rows.append(drawing_row(scene, kind(scene), name, repeats))
+        except Exception as error:  # of another library too: what is measured already must not be lost
+            rows.append({**what, "backend": name, "failed": failure(error)})
+        print(rows[-1], flush=True)
+    torch.cuda.empty_cache()
+    return rows
+
+
+def failure(error: Exception) -> str:
+    """What went wrong, in a line."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run it; exit code 1 without a GPU."""
+    """Run it; exit code 1 without a GPU, where a number is not finite, and where one of our own rows failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="the smallest sizes only")
     parser.add_argument("--smoke", action="store_true", help="run every kernel once, time nothing")
@@ -173,8 +181,10 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"benchmarks.cuda: {reason}", file=sys.stderr)
         return 1
     if chosen.smoke:
-        smoke()
-        return 0
+        wrong = smoke(CudaRasterizer())
+        torch.cuda.synchronize()
+        print("smoke test:", f"not finite: {'; '.join(wrong)}" if wrong else "all is finite")
+        return 1 if wrong else 0
     properties = torch.cuda.get_device_properties(0)
     out: dict[str, Any] = {
         "gpu": properties.name,
@@ -196,20 +206,14 @@ def main(arguments: list[str] | None = None) -> int:
             with open(chosen.json, "w") as file:
                 json.dump(out, file, indent=1)
 
+    size = case(100_000, *IMAGES[0]) if chosen.quick else case(1_000_000, *IMAGES[1])
+    out["steps"] = step_rows(size, repeats)
+    save()
     for count in COUNTS[:1] if chosen.quick else COUNTS:
         for width, height in IMAGES[:1] if chosen.quick else IMAGES:
-            scene = on_device(make_scene(case(count, width, height)), "cuda")
-            drawings: list[tuple[str, type[Drawing]]] = [("beags", Drawing)]
-            if gsplat_missing() is None:
-                drawings.append(("gsplat", GsplatDrawing))
-            for name, kind in drawings:
-                out["rows"].append(drawing_row(scene, kind(scene), name, repeats))
-                print(out["rows"][-1], flush=True)
+            out["rows"] += drawing_rows(case(count, width, height), repeats)
             save()
-    steps = case(100_000, *IMAGES[0]) if chosen.quick else case(1_000_000, *IMAGES[1])
-    out["steps"] = step_rows(on_device(make_scene(steps), "cuda"), repeats)
-    save()
-    return 0
+    return 1 if any("failed" in row and row.get("backend") != "gsplat" for row in out["rows"] + out["steps"]) else 0
 
 
 if __name__ == "__main__":

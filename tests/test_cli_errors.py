@@ -19,6 +19,7 @@ from beags_plugin import cli
 RUN = "{tmp}/run/config.yml"
 PRESETS = "beags, beags-accurate, beags-base, beags-fast, beags-paper, beags-refine, beags-tiny"
 NO_FILE = "{tmp}/absent.yml cannot be read (No such file or directory): name the config.yml of a run."
+NO_DATA = "the data folder {tmp}/nowhere does not exist: give --data the folder that holds the scene."
 SENTENCES = {
     # demo
     "demo --data {tmp}/nowhere": "{tmp}/nowhere is no folder: name one with images, poses and masks.",
@@ -31,6 +32,31 @@ SENTENCES = {
     "sample --output {tmp}/s --width 0": "the sample's width is 0: give at least 16.",
     "sample --output {tmp}/file/s": "{tmp}/file/s cannot be written (File exists): choose another folder.",
     "sample --output {tmp}/lab": "{tmp}/lab exists and is no sample scene: choose another folder or empty it.",
+    # resume
+    "resume {tmp}/absent.yml": NO_FILE,
+    "resume {tmp}/lab": NO_FILE.replace("absent.yml", "lab/config.yml"),
+    "resume {tmp}/notes.yml": "{tmp}/notes.yml is not a run of ns-train beags: name the config.yml of one.",
+    "resume {tmp}/run": "{tmp}/run holds a scene without the state of its training: resume the run that it comes from, "
+    "or refine it: ns-train beags-refine --load-dir {tmp}/run/nerfstudio_models.",
+    # masks
+    "masks check": "no scene is named: give --data its folder, or --load-config a run trained on it.",
+    "masks check --data {tmp}/nowhere": NO_DATA,
+    "masks check --load-config {tmp}/absent.yml": NO_FILE,
+    "masks make --data {tmp}/nowhere --source grabcut": NO_DATA,
+    "masks make --data {tmp}/lab --source magic": "there is no mask source 'magic': choose one of coco, "
+    "gaussian-grouping, grabcut, id-images, langsplat, object-images, sam2.",
+    "masks make --data {tmp}/lab --source grabcut --snap -1": "snap is -1: give a radius in pixels, or 0.",
+    "masks make --data {tmp}/lab --source id-images": "{tmp}/lab has masks or a classes.json already: add --overwrite, "
+    "or give another --output.",
+    "masks make --data {tmp}/lab --source id-images --options colour=red": "the mask source id-images has no option "
+    "'colour=red': give folder, names, colors, ignore_ids, least_views as key=value.",
+    "masks reproject --load-config {tmp}/absent.yml": NO_FILE,
+    f"masks reproject --load-config {RUN} --min-confidence 2": "min_confidence is 2.0: it must be a share of the "
+    "votes, 0 to 1.",
+    f"masks reproject --load-config {RUN} --masks-path {{tmp}}/nowhere": "the folder of masks {tmp}/nowhere does not "
+    "exist: correct --masks-path.",
+    f"masks reproject --load-config {RUN} --method guess": "there is no reprojection 'guess': choose one of none, "
+    "pairwise, voxel.",
     # extract
     "extract --load-config {tmp}/absent.yml": NO_FILE,
     "extract --load-config {tmp}/notes.yml": "{tmp}/notes.yml is not a run of ns-train beags: name the config.yml of "
@@ -111,16 +137,14 @@ def test_a_mistake_is_told_in_this_sentence(folder, monkeypatch, arguments):
 def test_every_subcommand_has_a_sentence():
     import typing
 
-    names = {info.name for one in typing.get_args(cli.Command) for info in typing.get_args(one)[1:]}
-    assert {"demo", "sample", "extract", "export", "render", "eval", "bench", "doctor"} <= names
-    assert {arguments.split()[0] for arguments in SENTENCES} >= {
-        "demo",
-        "sample",
-        "extract",
-        "export",
-        "render",
-        "eval",
-    }
+    from beags_plugin.masks_commands import Action
+
+    def names(union) -> set[str]:
+        return {info.name for one in typing.get_args(union) for info in typing.get_args(one)[1:]}
+
+    words = [arguments.split() for arguments in SENTENCES]
+    assert {first for first, *_ in words} == names(cli.Command)
+    assert {second for first, second, *_ in words if first == "masks"} == names(Action)
 
 
 def test_an_interrupt_is_no_traceback(monkeypatch, capsys):

@@ -140,3 +140,22 @@ def test_the_occupancy_loss_is_the_same_in_every_run(device):
     surfels, grid = test_occupancy_loss.make_surfels(700, torch.float32), test_occupancy_loss.make_grid()
     first, again = (loss_and_gradients(surfels, grid, device) for _ in range(2))
     assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+
+
+def test_the_smoke_test_launches_every_variant_and_finds_what_is_not_finite(device, monkeypatch):
+    from cuda_backends import EmulatedCudaRasterizer
+
+    from beags_plugin.rasterizers.cuda import CudaRasterizer
+    from benchmarks import cuda_smoke
+    from benchmarks.scenes import Size
+
+    rasterizer = CudaRasterizer() if device.type == "cuda" else EmulatedCudaRasterizer()
+    called: set[str] = set()
+    call = cuda_extension.call
+    monkeypatch.setattr(cuda_extension, "call", lambda m, name, *rest: called.add(name) or call(m, name, *rest))
+    assert cuda_smoke.smoke(rasterizer, device.type, Size(60, 24, 20)) == []
+    ops = {"sh_colors", "sh_colors_backward", "occupancy_loss"}
+    assert called == ops | {"count", "valid", "disc_inside"}
+    monkeypatch.setattr(cuda_smoke, "sh_colors", lambda dc, *_: dc * torch.inf)
+    wrong = cuda_smoke.smoke(rasterizer, device.type, Size(60, 24, 20))
+    assert len(wrong) == 2 * 4 and all("colours" in name for name in wrong)

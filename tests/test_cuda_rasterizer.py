@@ -173,6 +173,42 @@ def test_a_drawing_larger_than_the_guess_is_drawn_again(emulated, monkeypatch):
     assert torch.equal(emulated.class_contributions(*what), EmulatedCudaRasterizer().class_contributions(*what))
 
 
+class Guarded:
+    """A frame whose backward is given records with NaN behind them."""
+
+    def __init__(self, native) -> None:
+        self._native = native
+
+    def __getattr__(self, name):
+        return getattr(self._native, name)
+
+    def backward(self, *arguments) -> None:
+        *before, records, sums, parts, stream = arguments
+        guarded = torch.full((8 * len(records),), torch.nan, dtype=records.dtype)[: len(records)]
+        self._native.backward(*before, guarded, sums, parts, stream)
+
+
+def test_the_backward_of_a_drawing_larger_than_its_memory_stays_in_its_memory(emulated, monkeypatch):
+    """As in a CUDA graph, where nothing is drawn again: what comes out is wrong, but of the drawing's own memory."""
+    monkeypatch.setattr("beags_plugin.rasterizers.cuda._STEP", 16)
+    small, large = make_scene(count=2, size=-5.0), make_scene(count=200)
+    small.draw(emulated)
+    told = []
+    monkeypatch.setattr(emulated, "_receive", lambda sent: told.append(int(sent[0][0])) or (0, 0))
+    forward = emulated.forward_kernel
+
+    def guarded(drawing):
+        done = forward(drawing)
+        done.state.native = Guarded(done.state.native)
+        assert told[-1] > 2 * len(done.state.pairs[0])  # pairs that there is no memory for
+        return done
+
+    monkeypatch.setattr(emulated, "forward_kernel", guarded)
+    found = gradients(emulated, large)
+    assert told and all(bool(gradient.isfinite().all()) for gradient in found.values())
+    assert any(float(gradient.abs().max()) > 0.0 for gradient in found.values())
+
+
 def test_images_of_more_tiles_than_a_key_holds_are_refused(emulated):
     scene = make_scene(count=1)
     camera = replace(scene.camera, width=20_000, height=2_000)

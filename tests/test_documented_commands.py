@@ -40,6 +40,7 @@ RUN = {  # command of beags: what is appended to make it quick
     "export": ["--resolution", "24", "--min-views", "1"],
     "render": ["--size", "32", "--frames", "3", "--views", "2"],
     "sample": ["--width", "32", "--height", "24", "--views", "3"],
+    "masks check": [],
 }
 PARSERS = {
     "ns-viewer": "nerfstudio.scripts.viewer.run_viewer:RunViewer",
@@ -113,7 +114,7 @@ def training_config(words: list[str]):
 
 
 def check_beags(words: list[str]) -> None:
-    name = words[0]
+    name = " ".join(words[:2]) if words[0] == "masks" else words[0]
     if name in RUN:
         cli.main([*words, *RUN[name]])
         return

@@ -12,6 +12,7 @@ import pytest
 import torch
 import torch.distributed as dist
 
+from beags_plugin.core import processes
 from beags_plugin.core.processes import each_view
 
 PROGRAM = Path(preparation_in_processes.__file__)
@@ -29,6 +30,21 @@ def test_alone_views_come_one_after_the_other():
     assert list(views) == [1, 4, 9]
     assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert list(each_view(0, work)) == []
+
+
+def test_tensors_of_a_gpu_travel_over_the_cpu():
+    """There is no GPU here: the device "meta" stands for this process's, and a copy on the CPU for what was sent."""
+    values = torch.arange(3.0)
+    result = {"a": [values, 1], "b": (processes._FromGpu(values), "text")}
+    there = processes._unpacked(result, torch.device("meta"))
+    assert there["a"][0] is values and there["a"][1] == 1 and there["b"][1] == "text"
+    assert there["b"][0].is_meta and isinstance(there["b"], tuple)
+    assert processes._gpu_of(there) == torch.device("meta") and processes._gpu_of(result) is None
+    packed = processes._packed((values, None))
+    assert packed[0] is values and packed[1] is None
+    if torch.cuda.is_available():
+        sent = processes._packed([values.cuda()])[0]
+        assert isinstance(sent, processes._FromGpu) and sent.values.is_cpu and torch.equal(sent.values, values)
 
 
 @pytest.mark.skipif(not dist.is_gloo_available(), reason="torch was built without gloo")

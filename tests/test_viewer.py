@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import threading
 import time
 from types import SimpleNamespace
@@ -337,6 +338,22 @@ def test_a_run_in_training_lists_what_will_come(finished):
     window.model.assigned.fill_(True)
     window.panel.follow()
     assert window.look("class_map")["class_map"].sum() > 0.0 and window.panel.object.options[1] == "cup"
+
+
+def test_masks_of_a_former_run_in_the_folder_are_not_shown_while_a_base_is_trained(tmp_path):
+    config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"))
+    prepare(tmp_path / "run", shift=1)
+    window = Stand(config, SimpleNamespace(training_state="training"), lambda model: model.assigned.fill_(False))
+    run = window.model.viewing.run
+    assert run.mask(0, "before", 20, 12) is not None and run.mask(0, "after", 20, 12) is None
+    assert not run.has_grid and not run.load_grid()
+    window.model.viewing.refinement_ready = lambda: True  # as the switch to refinement says once it is done
+    first = run.mask(0, "after", 20, 12)
+    path = tmp_path / "run/prepared/masks" / f"{run.names[0]}.png"
+    write_class_map(path, np.zeros((12, 20), np.uint8))  # prepared again
+    os.utime(path, ns=(1, path.stat().st_mtime_ns + 1))
+    assert set(first.unique().tolist()) == {0, 1, 2} and not run.mask(0, "after", 20, 12).any()
+    assert run.has_grid and run.load_grid()
 
 
 def test_panel_and_legend_do_not_wait_for_a_step_but_the_click_does(window, monkeypatch):

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
+import torch
 import torch.distributed as dist
+from torch import Tensor
 
 Result = TypeVar("Result")
 
@@ -17,7 +20,9 @@ def each_view(
 
     Alone, one after the other, as they are asked for. In a process group of R processes, R views at a time, whose
     results are then exchanged: all processes must ask for all of them, and get the same bits as one process would. The
-    results are pickled; their tensors must lie on the CPU or on the same device in all processes.
+    results are pickled. Their tensors, alone or in tuples, lists and dicts, travel over the CPU: every process gets
+    them where its own ``work`` would have put them, on the CPU or on its own GPU. Other objects must hold no tensors
+    on a GPU.
 
     What ``work`` raises in one process is raised in all.
 
@@ -28,19 +33,20 @@ def each_view(
         for index in range(count):
             yield _told(work(index), progress, index, count)
         return
-    own = dist.get_rank()
+    own, device = dist.get_rank(), None
     for first in range(0, count, processes):
         mine, failure = None, None
         try:
             mine = work(first + own) if first + own < count else None
+            device = device or _gpu_of(mine)
         except Exception as error:  # told to all, who would wait forever
             failure = error
         found: list[Any] = [None] * processes
-        dist.all_gather_object(found, (mine, failure))
+        dist.all_gather_object(found, (_packed(mine), failure))
         for _, problem in found:
             if problem is not None:
                 raise problem
-        results = [result for result, _ in found]
+        results = [mine if rank == own else _unpacked(result, device) for rank, (result, _) in enumerate(found)]
         for index in range(first, min(first + processes, count)):
             yield _told(results[index - first], progress, index, count)
 
@@ -48,4 +54,39 @@ def each_view(
 def _told(result: Result, progress: Callable[[int, int], None] | None, index: int, count: int) -> Result:
     if progress:
         progress(index + 1, count)
+    return result
+
+
+@dataclass(frozen=True)
+class _FromGpu:
+    """A tensor of a GPU while it travels: a copy on the CPU."""
+
+    values: Tensor
+
+
+def _packed(result: Any) -> Any:
+    return _each_tensor(result, Tensor, lambda tensor: tensor if tensor.is_cpu else _FromGpu(tensor.cpu()))
+
+
+def _unpacked(result: Any, device: torch.device | None) -> Any:
+    """device: the GPU of this process; None: torch's current one, for a process that has had no view yet."""
+    return _each_tensor(result, _FromGpu, lambda sent: sent.values.to(device or torch.device("cuda")))
+
+
+def _gpu_of(result: Any) -> torch.device | None:
+    """Where the first tensor lies that is not on the CPU."""
+    devices: list[torch.device] = []
+    _each_tensor(result, Tensor, lambda tensor: devices.append(tensor.device))
+    return next((device for device in devices if device.type != "cpu"), None)
+
+
+def _each_tensor(result: Any, kind: type, change: Callable[[Any], Any]) -> Any:
+    """``result`` with ``change`` of every object of the kind in it, down through tuples, lists and dicts."""
+    if isinstance(result, kind):
+        return change(result)
+    if isinstance(result, dict):
+        return {key: _each_tensor(value, kind, change) for key, value in result.items()}
+    if isinstance(result, (tuple, list)):
+        parts = [_each_tensor(value, kind, change) for value in result]
+        return type(result)(*parts) if hasattr(result, "_fields") else type(result)(parts)
     return result

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,11 +42,17 @@ class ViewedRun:
         self.cameras: list[Camera] = [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))]
         self.grid: VisibilityGrid | None = None
         self._before = lru_cache(_KEPT_MASKS)(datamanager.training_mask)
-        self._after = lru_cache(_KEPT_MASKS)(read_class_map)
+        self.is_prepared: Callable[[], bool] = lambda: True  # asked while the run is trained: see ``prepared``
+        self._after = lru_cache(_KEPT_MASKS)(_read_mask)
 
     @property
     def prepared(self) -> Path | None:
-        """The folder of what refinement was last prepared with: of this run, or of that which it was taken from."""
+        """The folder of what refinement was last prepared with: of this run, or of that which it was taken from.
+
+        While the run is trained, None until its refinement is prepared: a used folder may hold a former run's.
+        """
+        if not self.is_prepared():
+            return None
         folder = last_prepared(preparing_run(self.folder))
         return folder if (folder / "grid.pt").exists() else None
 
@@ -73,5 +80,10 @@ class ViewedRun:
             ids = self._before(view)
         else:
             path = None if self.prepared is None else self.prepared / "masks" / f"{self.names[view]}.png"
-            ids = self._after(path) if path is not None and path.exists() else None
+            ids = self._after(path, path.stat().st_mtime_ns) if path is not None and path.exists() else None
         return None if ids is None else torch.from_numpy(resize_nearest(ids, height, width).astype(np.int32))
+
+
+def _read_mask(path: Path, _changed: int) -> np.ndarray:
+    """_changed: time of the file's last change, so that what is kept in memory is read again after one."""
+    return read_class_map(path)

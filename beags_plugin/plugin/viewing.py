@@ -105,7 +105,8 @@ class Viewing:
 
     choice: what is shown. background: [3], the viewer's. listed: names of ``CHANNELS`` that this run may be asked for;
     the same ones as long as a viewer runs. wanted: gives those that it shows now. crop_box: gives the viewer's.
-    run: what the run has on disk. notes: what is to be said of the pictures of the last drawing.
+    run: what the run has on disk. refinement_ready: whether the training in this process has prepared its refinement,
+    or taken it up. notes: what is to be said of the pictures of the last drawing.
     """
 
     def __init__(self, model: BeagsModel) -> None:
@@ -116,6 +117,7 @@ class Viewing:
         self.wanted: Callable[[], frozenset[str]] = frozenset
         self.crop_box: Callable[[], OrientedBox | None] = lambda: None
         self.run: ViewedRun | None = None
+        self.refinement_ready: Callable[[], bool] = lambda: False
         self.shares: Shares | None = None
         self.notes: dict[str, str] = {}
         self.lock = threading.Lock()
@@ -128,6 +130,8 @@ class Viewing:
         the scene, or draws it for the viewer.
         """
         self.lock = lock or self.lock
+        if training:
+            run.is_prepared = lambda: self.refinement_ready()
         classes = bool(self.model.assigned) or (training and self.model.schedule.refine_steps > 0)
         prepares = training and classes
         available = {

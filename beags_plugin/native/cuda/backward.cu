@@ -219,9 +219,11 @@ __global__ void sum_records_kernel(int64_t count, Bins<T> bins, const T* records
   const int64_t r = (static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x) / kWarpThreads;
   if (r >= count) return;
   const int lane = threadIdx.x % kWarpThreads, number = lane % kSize, which = lane / kSize;
+  // In a CUDA graph, a replay may have more pairs than there is memory for.
+  const int64_t stop = bins.pair_start[r + 1] < bins.capacity ? bins.pair_start[r + 1] : bins.capacity;
   double sum = 0;
   if (which < kTogether) {
-    for (int64_t pair = bins.pair_start[r] + which; pair < bins.pair_start[r + 1]; pair += kTogether) {
+    for (int64_t pair = bins.pair_start[r] + which; pair < stop; pair += kTogether) {
       sum += records[pair * kSize + number];
     }
   }

@@ -1,0 +1,87 @@
+"""Every CUDA kernel once, on a small scene: what a memory checker is run on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.ops.occupancy_loss import occupancy_loss
+from beags_plugin.ops.sh_colors import sh_colors
+from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings, SurfelInputs
+from benchmarks.scenes import CLASSES, Scene, Size, make_scene, on_device
+from benchmarks.training_step import visibility_grid
+
+LEAVES = ("means", "quats", "log_scales", "opacity_logits", "colors")
+SMALL = Size(2_000, 130, 100)
+DEGREES = (0, 1, 2, 3)
+VARIANTS = (  # geometry, distortion, boundary: each has kernels of its own in float32
+    (False, False, False),
+    (False, False, True),
+    (True, False, False),
+    (True, False, True),
+    (True, True, True),
+)
+
+
+def smoke(rasterizer: Rasterizer, device: str = "cuda", size: Size = SMALL) -> list[str]:
+    """The names of the results that are not finite; empty if all is well. float32 and float64, forward and backward."""
+    scene = on_device(make_scene(size), device)
+    grid = visibility_grid(scene)
+    wrong = []
+    for dtype in (torch.float32, torch.float64):
+        for name, values in _results(rasterizer, scene, grid, dtype):
+            if not all(bool(value.isfinite().all()) for value in values):
+                wrong.append(f"{name}, {dtype}")
+    return wrong
+
+
+def _results(
+    rasterizer: Rasterizer, scene: Scene, grid: VisibilityGrid, dtype: torch.dtype
+) -> Iterator[tuple[str, list[Tensor]]]:
+    values = {**vars(scene.surfels), "colors": scene.colors}
+    leaves = {name: values[name].detach().to(dtype).requires_grad_() for name in LEAVES}
+    inputs = SurfelInputs(**leaves, class_ids=scene.class_ids)
+    shift = torch.zeros(len(inputs.means), 2, dtype=dtype, device=inputs.means.device, requires_grad=True)
+    for variant in VARIANTS:
+        yield f"drawing {variant}", _drawn(rasterizer, scene, replace(inputs, screen_shift=shift), variant)
+    plain = SurfelInputs(**{name: leaf.detach() for name, leaf in leaves.items()}, class_ids=scene.class_ids)
+    camera, settings = scene.camera, scene.settings
+    yield "contributions", [rasterizer.class_contributions(plain, camera, settings, scene.target, CLASSES)]
+    yield "class map", list(rasterizer.class_map(plain, camera, settings, CLASSES))
+    yield "heaviest", [rasterizer.heaviest(plain, camera, settings)]
+    dc, rest = (value.to(dtype).requires_grad_() for value in (scene.surfels.sh_dc, scene.surfels.sh_rest))
+    for degree in DEGREES:
+        colors = sh_colors(dc, rest, inputs.means, torch.zeros(3, dtype=dtype), degree)
+        yield f"colours of degree {degree}", [colors, *_gradients(colors, [dc, rest, inputs.means])]
+    ids, (axis_u, axis_v) = scene.class_ids, (0.01 * (plain.means.roll(by, 0) - plain.means) for by in (1, 2))
+    yield "voxel counts", [grid.count(plain.means, ids), grid.valid(plain.means, ids)]
+    yield "discs inside", [grid.disc_inside(plain.means, axis_u, axis_v, ids)]
+    lookup = grid.lookup()
+    assert lookup is not None  # where there is a rasterizer of CUDA, there is the compiled module
+    shape = [inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits]
+    loss = occupancy_loss(shape[0], shape[1], shape[2], shape[3], ids, lookup, stream=7, samples=20)
+    yield "occupancy loss", [loss, *_gradients(loss, shape)]
+
+
+def _drawn(
+    rasterizer: Rasterizer, scene: Scene, inputs: SurfelInputs, variant: tuple[bool, bool, bool]
+) -> list[Tensor]:
+    geometry, distortion, boundary = variant
+    settings = RasterSettings(0.05, 100.0, geometry=geometry, distortion=distortion)
+    background = scene.background.to(inputs.means.dtype)
+    drawn = rasterizer.rasterize(inputs, scene.camera, settings, background, scene.target if boundary else None)
+    found = (
+        drawn.color, drawn.alpha, drawn.depth, drawn.normal, drawn.median_depth, drawn.distortion, drawn.boundary,
+    )  # fmt: skip
+    images = [image for image in found if image is not None]
+    leaves = [getattr(inputs, name) for name in (*LEAVES, "screen_shift")]
+    return [*images, *_gradients(sum(image.square().sum() for image in images), leaves)]  # type: ignore[arg-type]
+
+
+def _gradients(value: Tensor, leaves: list[Tensor]) -> list[Tensor]:
+    found = torch.autograd.grad(value.sum(), leaves, allow_unused=True)
+    return [gradient for gradient in found if gradient is not None]
