@@ -46,7 +46,9 @@ def each_view(
         for _, problem in found:
             if problem is not None:
                 raise problem
-        results = [mine if rank == own else _unpacked(result, device) for rank, (result, _) in enumerate(found)]
+        results: list[Any] = [
+            mine if rank == own else _unpacked(result, device) for rank, (result, _) in enumerate(found)
+        ]
         for index in range(first, min(first + processes, count)):
             yield _told(results[index - first], progress, index, count)
 
