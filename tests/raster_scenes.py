@@ -147,3 +147,18 @@ def error(found: Tensor, expected: Tensor) -> float:
     if expected.numel() == 0:
         return 0.0
     return ((found.double() - expected.double()).abs().max() / expected.double().abs().max().clamp_min(1.0)).item()
+
+
+def poisoned(scene: Scene) -> Scene:
+    """The scene and as many surfels again that draw nothing: too faint to be seen, but for seven that are broken."""
+    n = len(scene.inputs.means)
+    bad = {name: torch.cat([getattr(scene.inputs, name)] * 2) for name in FLOATS}
+    bad["opacity_logits"][n:] = -1e30
+    for i, (name, poison) in enumerate(
+        zip(FLOATS, (torch.nan, torch.inf, -torch.inf, torch.nan, torch.inf), strict=True)
+    ):
+        bad[name][n + i] = poison
+    bad["quats"][n + 5] = 0
+    bad["log_scales"][n + 6] = 1e4
+    bad["opacity_logits"][n : n + 7] += 1e30
+    return replace(scene, inputs=SurfelInputs(**bad, class_ids=torch.cat([scene.inputs.class_ids] * 2)))

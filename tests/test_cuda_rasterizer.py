@@ -7,13 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 from cuda_backends import BACKENDS, EmulatedCudaRasterizer
-from raster_scenes import CLASSES, FLOATS, OUTPUTS, awkward, error, gradients, gradients_by_output, make_scene
+from raster_scenes import CLASSES, FLOATS, OUTPUTS, awkward, error, gradients, gradients_by_output, make_scene, poisoned
 from test_native import ALL_SCENES
 
 from beags_plugin.errors import UserError
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.cuda import CudaRasterizer
-from beags_plugin.rasterizers.interface import IGNORE, SurfelInputs
+from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 
 
@@ -143,22 +143,13 @@ def test_poison_is_dropped_and_counted_without_spreading(cuda):
     scene = awkward()
     clean = scene.draw(cuda)
     n = len(scene.inputs.means)
-    bad = {name: torch.cat([getattr(scene.inputs, name)] * 2) for name in FLOATS}
-    bad["opacity_logits"][n:] = -1e30  # the copies are too faint to be seen, and some of them broken
-    for i, (name, poison) in enumerate(
-        zip(FLOATS, (torch.nan, torch.inf, -torch.inf, torch.nan, torch.inf), strict=True)
-    ):
-        bad[name][n + i] = poison
-    bad["quats"][n + 5] = 0
-    bad["log_scales"][n + 6] = 1e4
-    bad["opacity_logits"][n : n + 7] += 1e30
-    poisoned = replace(scene, inputs=SurfelInputs(**bad, class_ids=torch.cat([scene.inputs.class_ids] * 2)))
-    drawn = poisoned.draw(cuda)
+    broken = poisoned(scene)
+    drawn = broken.draw(cuda)
     assert drawn.num_nonfinite == 7
     assert torch.equal(drawn.visible[:n], clean.visible)
     assert not drawn.visible[n:].any()
     assert all(torch.equal(getattr(drawn, name), getattr(clean, name)) for name in OUTPUTS)
-    assert all(torch.isfinite(g).all() for g in gradients(cuda, poisoned).values())
+    assert all(torch.isfinite(g).all() for g in gradients(cuda, broken).values())
 
 
 def test_a_drawing_larger_than_the_guess_is_drawn_again(emulated, monkeypatch):

@@ -8,7 +8,6 @@ import pytest
 import torch
 from raster_scenes import (
     CLASSES,
-    FLOATS,
     OUTPUTS,
     SCENES,
     awkward,
@@ -16,12 +15,13 @@ from raster_scenes import (
     gradients,
     gradients_by_output,
     make_scene,
+    poisoned,
 )
 
 from beags_plugin.errors import UserError
 from beags_plugin.ops import extension
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.interface import IGNORE, SurfelInputs
+from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.rasterizers.native import NativeRasterizer
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 
@@ -187,23 +187,14 @@ def test_poison_is_dropped_and_counted_without_spreading():
     scene = awkward()
     clean = scene.draw(NativeRasterizer())
     n = len(scene.inputs.means)
-    bad = {name: torch.cat([getattr(scene.inputs, name)] * 2) for name in FLOATS}
-    bad["opacity_logits"][n:] = -1e30  # the copies are too faint to be seen, and some of them broken
-    for i, (name, poison) in enumerate(
-        zip(FLOATS, (torch.nan, torch.inf, -torch.inf, torch.nan, torch.inf), strict=True)
-    ):
-        bad[name][n + i] = poison
-    bad["quats"][n + 5] = 0
-    bad["log_scales"][n + 6] = 1e4
-    bad["opacity_logits"][n : n + 7] += 1e30
-    inputs = SurfelInputs(**bad, class_ids=torch.cat([scene.inputs.class_ids] * 2))
-    render = replace(scene, inputs=inputs).draw(NativeRasterizer())
+    broken = poisoned(scene)
+    render = broken.draw(NativeRasterizer())
     assert render.num_nonfinite == 7
     assert torch.equal(render.visible[:n], clean.visible)
     assert not render.visible[n:].any()
     for name in OUTPUTS:
         assert torch.equal(getattr(render, name), getattr(clean, name))
-    assert all(torch.isfinite(g).all() for g in gradients(NativeRasterizer(), replace(scene, inputs=inputs)).values())
+    assert all(torch.isfinite(g).all() for g in gradients(NativeRasterizer(), broken).values())
 
 
 def test_a_missing_module_is_told_in_a_sentence(monkeypatch):
