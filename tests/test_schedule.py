@@ -172,6 +172,41 @@ def test_official_learning_rates(model):
     )
 
 
+def test_a_short_base_starts_with_larger_rates_and_refinement_does_not(model):
+    from beags_plugin.plugin.config import base_config
+    from beags_plugin.plugin.training import set_learning_rates
+
+    configs = base_config().optimizers
+    optimizers = {name: torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))]) for name in configs}
+    model.schedule = PhaseSchedule(3_000, 200, 30_000)
+
+    def rates(step, power):
+        model.config.base_lr_power = power
+        set_learning_rates(model, optimizers, configs, step)
+        return {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.items()}
+
+    for step, factor in ((0, 10**0.9), (1_500, 10**0.45), (3_000, 1.0), (3_100, 1.0)):  # log-linear in between
+        expected = {name: rate * factor for name, rate in rates(step, 0.0).items()}
+        assert rates(step, 0.9) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("schedule", "factor"),
+    [
+        (PhaseSchedule(7_500, 0, 30_000), 4.0),
+        (PhaseSchedule(7_500, 0, 0), 4.0),  # whatever length the other steps are stated for
+        (PhaseSchedule(100, 0, 30_000), 16.0),  # bounded
+        (PhaseSchedule(30_000, 0, 30_000), 1.0),
+        (PhaseSchedule(60_000, 0, 30_000), 1.0),
+        (PhaseSchedule(0, 3_000, 30_000), 1.0),
+        (PhaseSchedule(3_000, 0, 30_000, warm=True), 1.0),
+    ],
+)
+def test_how_much_larger_the_rates_of_a_base_start(schedule, factor):
+    assert schedule.first_rate_factor(1.0) == factor
+    assert schedule.first_rate_factor(0.0) == 1.0
+
+
 def test_only_steps_of_growth_are_drawn_with_what_growth_looks_at(model):
     from types import SimpleNamespace
 

@@ -105,6 +105,9 @@ class BeagsModelConfig(ModelConfig):
     """Which Gaussians at class borders are split before refinement; none unless rounds is 1 or more."""
     position_lr: tuple[float, float] = (1.6e-4, 1.6e-6)
     """First and last learning rate of the positions, log-linear, times the scene's extent."""
+    base_lr_power: float = 0.0
+    """All learning rates are stated for a base of 30,000 steps. A shorter one starts with (30,000 / base_steps) to this
+    power times as much, and comes down to the stated by its end; 0: no more than stated."""
     refine_position_lr_factor: float = 1.0
     """Factor of the positions' learning rate while refining; 1, as in the paper, is the end of the base schedule."""
     refine_shape_lr_factor: float = 1.0

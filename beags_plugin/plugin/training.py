@@ -90,13 +90,13 @@ def camera_extent(camera_to_worlds: Tensor) -> Tensor:
 
 def set_learning_rates(model: BeagsModel, optimizers: dict, configs: dict, step: int) -> None:
     """Set every group's rate for this step, so that nothing depends on what a checkpoint last held."""
-    first, last = model.config.position_lr
+    progress, refining = model.schedule.progress(step), model.schedule.refining(step)
+    first = model.schedule.first_rate_factor(model.config.base_lr_power)
     for name, optimizer in optimizers.items():
         rate = configs[name]["optimizer"].lr
         if name == "means":
-            rate = log_linear(first, last, model.schedule.progress(step)) * float(model.extent)
-        if model.schedule.refining(step):
-            rate *= refinement_factor(model.config, name)
+            rate = log_linear(*model.config.position_lr, progress) * float(model.extent)
+        rate *= refinement_factor(model.config, name) if refining else log_linear(first, 1.0, progress)
         for group in optimizer.param_groups:
             group["lr"] = rate
 
