@@ -8,10 +8,12 @@ import pytest
 import torch
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.lifting import lift
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.silhouette import SilhouetteLoss
+from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.drawing import surfel_inputs
 from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
@@ -73,6 +75,27 @@ def test_what_lies_behind_another_surface_may_be_covered():
     assert float(everything.value(hidden)) == pytest.approx(float(everything.value(front)), rel=1e-4)
 
 
+def test_surface_that_was_seen_as_the_objects_does_not_count_where_another_object_covers_it():
+    surfels, labels = scene([3.0, 3.0]), columns((1, 8), (2, 6), (0, 10))
+    alone = draw(surfel_inputs(surfels[torch.tensor([0])], CAMERA), CAMERA)
+    size, points = 0.1, lift(alone.depth, CAMERA)
+    seen = (alone.alpha > 0)[:, :12]  # a part of what the second object covers, and none of the rest
+    cloud = points[:, :12][seen]
+    grid = VisibilityGrid.from_points([(cloud, torch.ones(len(cloud)))], size, torch.zeros(3), 3)
+    inputs = replace(inputs_of(surfels, [1, 2], labels), grid=grid)
+    count = grid.count(points.view(-1, 3), torch.ones(SIZE * SIZE, dtype=torch.int32)).view(SIZE, SIZE)
+    free = (labels == 2) & (alone.alpha > 0) & (count >= 3)
+    assert 0 < int(free.sum()) < int(((labels == 2) & (alone.alpha > 0)).sum())
+    class_one = (alone.alpha - (labels == 1).float()).abs()
+    second = draw(surfel_inputs(surfels[torch.tensor([1])], CAMERA), CAMERA).alpha
+    class_two = (second - (labels == 2).float()).abs()  # nothing was seen as the second object's
+    for wanted, expected in ((0, class_one.sum()), (3, class_one[~free].sum())):
+        found = SilhouetteLoss(objects=2, seen=wanted).value(inputs)
+        assert float(found) == pytest.approx(float(expected + class_two.sum()) / SIZE**2, rel=1e-5)
+    with pytest.raises(ValueError, match="grid"):
+        SilhouetteLoss(seen=3).value(replace(inputs, grid=None))
+
+
 def test_gradients_reach_the_shape_and_the_object_alone():
     surfels = scene([3.0, 3.2])
     names = ("means", "quats", "log_scales", "opacity_logits")
@@ -95,6 +118,6 @@ def test_views_that_say_nothing_and_wrong_options():
     surfels = scene([3.0])
     assert float(SilhouetteLoss().value(inputs_of(surfels, [1], None))) == 0.0
     assert float(SilhouetteLoss().value(inputs_of(surfels, [1], columns((0, 12), (IGNORE, 12))))) == 0.0
-    for options, words in (({"objects": 0}, "objects = 0"), ({"tau": -1.0}, "tau = -1")):
+    for options, words in (({"objects": 0}, "objects = 0"), ({"seen": 28}, "seen = 28"), ({"tau": -1.0}, "tau = -1")):
         with pytest.raises(UserError, match=words):
             SilhouetteLoss(**options)

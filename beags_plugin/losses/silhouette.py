@@ -12,6 +12,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from beags_plugin.core.lifting import lift
 from beags_plugin.errors import UserError
 from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.reduction import ordered_sum
@@ -28,6 +29,9 @@ class SilhouetteLoss(Loss):
 
     objects: how many objects of the view are drawn each step, chosen at random and counted in proportion; each costs
         a drawing of its Gaussians.
+    seen: near a contact the surface of what stands below goes on close behind the other object's, too close for tau to
+        tell. Pixels of other objects do not count where so many of the 27 voxels around the drawn surface were seen as
+        this object's (D_occ >= seen, section 5); a plane fills 9 of them. 0: they all count.
     tau: the object is hidden where its depth z and the scene's D have z > (1 + tau) D; as in reprojection (E5).
     """
 
@@ -36,11 +40,14 @@ class SilhouetteLoss(Loss):
     weight: float = 0.5
 
     objects: int = 1
+    seen: int = 0
     tau: float = 0.02
 
     def __post_init__(self) -> None:
         if not (self.objects >= 1 and float(self.objects).is_integer()):
             raise UserError(f"the silhouette loss has objects = {self.objects}: it must be a whole number, 1 or more.")
+        if not (0 <= self.seen <= 27 and float(self.seen).is_integer()):
+            raise UserError(f"the silhouette loss has seen = {self.seen}: it must be a whole number from 0 to 27.")
         if not self.tau >= 0:
             raise UserError(f"the silhouette loss has tau = {self.tau}: it must be 0 or more.")
 
@@ -73,8 +80,21 @@ class SilhouetteLoss(Loss):
         shown = inputs.render.median_depth.detach()
         hidden = (shown > 0) & (depth > (1.0 + self.tau) * shown)
         outside = known & ~inside & ~hidden
+        if self.seen > 0:
+            of_others = outside & (inputs.labels != 0) & (alone.alpha.detach() > 0)
+            outside &= ~self._seen_from_elsewhere(of_others, depth, class_id, inputs)
         wrong = torch.where(inside, 1.0 - alone.alpha, torch.where(outside, alone.alpha, 0.0))
         return ordered_sum(wrong)
+
+    def _seen_from_elsewhere(self, asked: Tensor, depth: Tensor, class_id: int, inputs: LossInputs) -> Tensor:
+        """[H, W] bool: the pixels of ``asked`` [H, W] bool at whose ``depth`` [H, W] some view saw the object."""
+        if inputs.grid is None:
+            raise ValueError("the silhouette loss needs a visibility grid where seen > 0")
+        points = lift(depth, inputs.camera)[asked]
+        ids = torch.full((len(points),), class_id, dtype=torch.int32, device=points.device)
+        found = torch.zeros_like(asked)
+        found[asked] = inputs.grid.count(points, ids) >= self.seen
+        return found
 
 
 def _chosen(count: int, wanted: int, seed: int, step: int) -> list[int]:
