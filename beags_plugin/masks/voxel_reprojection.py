@@ -9,7 +9,7 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.masks.pooled_votes import TorchVotes
-from beags_plugin.masks.reprojection import ReprojectedMask, check_views
+from beags_plugin.masks.reprojection import ReprojectedMask, check_counts, check_view
 from beags_plugin.ops import extension
 from beags_plugin.ops.voxel_votes import VoxelVotes
 from beags_plugin.rasterizers.interface import IGNORE
@@ -35,42 +35,51 @@ def reproject_voxel(
     them two voxels before and two behind its point along its ray too: an error of its own depth then does less harm.
     The confidence is the label's share of the votes in the voxel of the point, or of those read if that has none.
     The points are lifted from what each view sees, so no vote passes through a surface, and ``tau`` is not used.
-    Cost O(V pixels), memory linear in the voxels; neither depends on the number of classes.
+    Cost O(V pixels), memory linear in the voxels; neither depends on the number of classes. Depth and masks are asked
+    for three times, one view at a time: they may lie on disk (``core.filed_tensors``).
     """
-    check_views(depths, cameras, labels, num_classes, tau)
+    check_counts(depths, cameras, labels, tau)
     if not cameras:
         return
-    size, origin = _voxel_size(depths, cameras, labels), _origin(cameras)
-    votes = VoxelVotes(IGNORE) if extension.can_take(*depths) else TorchVotes(IGNORE)
-    views = len(cameras)
-    lifts = [lift.to(depth) for depth, lift in zip(depths, _to_voxels(cameras, origin, size), strict=True)]
+    size, native = _survey(depths, cameras, labels, num_classes)
+    votes = VoxelVotes(IGNORE) if native else TorchVotes(IGNORE)
+    views, lifts = len(cameras), _to_voxels(cameras, _origin(cameras), size)
     for i, (depth, mask) in enumerate(zip(depths, labels, strict=True)):
         if mask is not None:
-            votes.add(depth, lifts[i], mask.int())
+            votes.add(depth, lifts[i].to(depth), mask.int())
         if progress:
             progress(i + 1, 2 * views)
     votes.decide()
     for i, (depth, mask) in enumerate(zip(depths, labels, strict=True)):
         known = torch.full_like(depth, IGNORE, dtype=torch.int32) if mask is None else mask.int()
-        found = ReprojectedMask(*votes.read(depth, lifts[i], known))
+        found = ReprojectedMask(*votes.read(depth, lifts[i].to(depth), known))
         if progress:
             progress(views + i + 1, 2 * views)
         yield found
 
 
-def _voxel_size(depths: Sequence[Tensor], cameras: Sequence[Camera], labels: Sequence[Tensor | None]) -> float:
-    """``VOXEL_PIXELS`` times the median of depth / focal length over the objects' pixels (over all that are drawn, if
-    there are none); world units. Objects, as it is about them that classes meet: what is behind them may be far away.
+def _survey(depths, cameras, labels, num_classes: int) -> tuple[float, bool]:
+    """The size of the voxels, and whether the compiled votes take the depths; raises as ``check_views``.
+
+    The size is ``VOXEL_PIXELS`` times the median of depth / focal length over the objects' pixels (over all that are
+    drawn, if there are none); world units. Objects, as it is about them that classes meet: what is behind them may be
+    far away.
     """
-    pixels = sum(depth.numel() for depth in depths)
-    step = max(1, pixels // _FOOTPRINTS)
-    thinned, labelled = [], []
-    for depth, camera, mask in zip(depths, cameras, labels, strict=True):
+    step = max(1, sum(camera.height * camera.width for camera in cameras) // _FOOTPRINTS)
+    thinned, labelled, native, dtypes = [], [], True, set()
+    for index, (depth, camera, mask) in enumerate(zip(depths, cameras, labels, strict=True)):
+        check_view(index, depth, camera, mask, num_classes)
         focal = (float(camera.K[0, 0]) * float(camera.K[1, 1])) ** 0.5
         thinned.append((depth.reshape(-1)[::step] / focal).double().cpu())
         label = torch.zeros(len(thinned[-1]), dtype=torch.int32) if mask is None else mask.reshape(-1)[::step].cpu()
-        labelled.append(label)
-    footprints, label = torch.cat(thinned), torch.cat(labelled)
+        labelled.append(label.clone())  # not a piece of the view's map, which would stay in memory as a whole
+        dtypes.add(depth.dtype)
+        native = native and len(dtypes) == 1 and extension.can_take(depth)
+    return _voxel_size(torch.cat(thinned), torch.cat(labelled)), native
+
+
+def _voxel_size(footprints: Tensor, label: Tensor) -> float:
+    """footprints: [P] float64, sides of pixels where they lie; label: [P] int32 class ids or IGNORE."""
     drawn = (footprints > 0) & footprints.isfinite()
     for counted in (drawn & (label > 0) & (label != IGNORE), drawn):
         if counted.any():

@@ -24,11 +24,11 @@ from rich.progress import track
 from torch import Tensor
 
 import beags_plugin.plugin.nerfstudio_patches  # noqa: F401  (checkpoints load again)
-from beags_plugin.masks.label_maps import narrowed, widened
+from beags_plugin.masks.label_maps import PackedMap, narrowed, widened
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.dataparser import BeagsDataParserConfig, absolute
 from beags_plugin.plugin.dataset import BeagsDataset
-from beags_plugin.plugin.streaming import Lazy, PackedMap, StreamedViews
+from beags_plugin.plugin.streaming import Lazy, StreamedViews
 from beags_plugin.plugin.undistortion import (
     has_lens,
     redistort_class_map,

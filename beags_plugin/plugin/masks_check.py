@@ -165,7 +165,7 @@ def check_with_run(report: Report, run: ReprojectedRun) -> Report:
     findings = list(report.findings)
     if areas:
         pixels, views = sum(area.pixels for area in areas), {area.view for area in areas}
-        total = sum(mask.numel() for mask in run.given.stored if mask is not None)
+        total = sum(mask.pixels for mask in run.given.stored if mask is not None)
         findings.append(
             Finding(
                 "warning",
