@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beags_plugin.data.files import image_size
+from beags_plugin.data.files import image_size, photo_names
 from beags_plugin.errors import UserError
 from beags_plugin.masks.classes import check_names, write_class_map
 from beags_plugin.masks.pictures import overlay
@@ -115,8 +115,8 @@ def make_masks(
     trained = set(parser.training_views(views))
     sizes = [image_size(path) for path in views.images]
     photos = [
-        Photo(path.stem, path, *size, trained=index in trained)
-        for index, (path, size) in enumerate(zip(views.images, sizes, strict=True))
+        Photo(name, path, *size, trained=index in trained)
+        for index, (name, path, size) in enumerate(zip(photo_names(views.images), views.images, sizes, strict=True))
     ]
     made_of = SourceScene(scene.root, photos, RunGeometry(run) if run is not None and source.needs_run else None)
     shares, shown = [], []
@@ -167,5 +167,5 @@ def _picture(path: Path, shown: Sequence[tuple[Photo, Path]], most: int = 24) ->
     cells = []
     for photo, mask in shown[::step]:
         size = (260, max(1, round(260 * photo.height / photo.width)))
-        cells.append([cell(overlay(photo.pixels(), read_class_map(mask)), size, photo.stem)])
+        cells.append([cell(overlay(photo.pixels(), read_class_map(mask)), size, photo.name)])
     write_picture(path, below(wrapped(cells, 1100)))

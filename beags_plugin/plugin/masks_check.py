@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from beags_plugin.data.files import image_size
+from beags_plugin.data.files import image_size, photo_names
 from beags_plugin.data.scene import Scene
 from beags_plugin.errors import UserError
 from beags_plugin.masks.check.areas import Area, contradicted
@@ -120,7 +120,7 @@ def _files(config: BeagsDataParserConfig) -> tuple[Scene, PosedViews, MaskFiles]
     names_file = scene.root / config.classes_path
     names = read_classes(names_file) if names_file.is_file() else scene.class_names
     files = MaskFiles(
-        [image.stem for image in views.images],
+        photo_names(views.images),
         sizes,
         masks,
         folder,

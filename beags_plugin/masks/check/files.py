@@ -24,9 +24,10 @@ LARGE_IGNORE = 0.2  # share of unlabelled pixels that is worth a word
 class MaskFiles:
     """The views of a scene and the mask of each.
 
-    stems: of the V images; sizes: (width, height) of their files; masks: file or None. folder: where masks are looked
-    for. kind, ignore_ids: see ``masks.classes.read_mask``. trained: whether each view is trained on. names: id to name
-    where the user or the layout gave names, else None; names_file: where they stand.
+    stems: names of the V images (``data.files.photo_names``); sizes: (width, height) of their files; masks: file or
+    None. folder: where masks are looked for. kind, ignore_ids: see ``masks.classes.read_mask``. trained: whether each
+    view is trained on. names: id to name where the user or the layout gave names, else None; names_file: where they
+    stand.
     """
 
     stems: Sequence[str]

@@ -46,7 +46,7 @@ class GrabCutSource(MaskSource):
         objects = read_prompts(path)
         places = scene.places()
         drawn = self._prompted(scene, objects, path)
-        if held_out := sorted(scene.photos[view].stem for view in drawn if view not in places):
+        if held_out := sorted(scene.photos[view].name for view in drawn if view not in places):
             raise UserError(f"{path} has prompts in {held_out[0]}, which is held out: prompt a training view.")
         names = {0: "background", **{one.class_id: one.name for one in objects}}
         ids = sorted(one.class_id for one in objects)
