@@ -8,8 +8,10 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.filed_tensors import filed
 from beags_plugin.masks.pooled_votes import TorchVotes
 from beags_plugin.masks.reprojection import ReprojectedMask, check_counts, check_view
+from beags_plugin.masks.slabs import Slabs, slabs_of
 from beags_plugin.ops import extension
 from beags_plugin.ops.voxel_votes import VoxelVotes
 from beags_plugin.rasterizers.interface import IGNORE
@@ -35,27 +37,78 @@ def reproject_voxel(
     them two voxels before and two behind its point along its ray too: an error of its own depth then does less harm.
     The confidence is the label's share of the votes in the voxel of the point, or of those read if that has none.
     The points are lifted from what each view sees, so no vote passes through a surface, and ``tau`` is not used.
-    Cost O(V pixels), memory linear in the voxels; neither depends on the number of classes. Depth and masks are asked
-    for three times, one view at a time: they may lie on disk (``core.filed_tensors``).
+    Cost O(V pixels), whatever the number of classes. Depth and masks are asked for several times, one view at a time:
+    they may lie on disk (``core.filed_tensors``). Where the voxels would take more than about 0.4 GB, space is cut into
+    slabs (``masks.slabs``) and the views are gone through once more for each; results are the same bits.
     """
     check_counts(depths, cameras, labels, tau)
     if not cameras:
         return
     size, native = _survey(depths, cameras, labels, num_classes)
-    votes = VoxelVotes(IGNORE) if native else TorchVotes(IGNORE)
-    views, lifts = len(cameras), _to_voxels(cameras, _origin(cameras), size)
+    lifts = _to_voxels(cameras, _origin(cameras), size)
+    slabs = slabs_of(depths, cameras, lifts)
+    votes = _Votes(depths, labels, lifts, slabs, native, progress)
+    if len(slabs) == 1:
+        yield from (ReprojectedMask(*pair) for pair in votes.of_slab(0))
+        return
+    pieces = [votes.filed_slab(slab) for slab in range(len(slabs))]
     for i, (depth, mask) in enumerate(zip(depths, labels, strict=True)):
-        if mask is not None:
-            votes.add(depth, lifts[i].to(depth), mask.int())
-        if progress:
-            progress(i + 1, 2 * views)
-    votes.decide()
-    for i, (depth, mask) in enumerate(zip(depths, labels, strict=True)):
-        known = torch.full_like(depth, IGNORE, dtype=torch.int32) if mask is None else mask.int()
-        found = ReprojectedMask(*votes.read(depth, lifts[i].to(depth), known))
-        if progress:
-            progress(views + i + 1, 2 * views)
-        yield found
+        found, confidence = _known(depth, mask), torch.zeros(depth.shape, dtype=torch.float32, device=depth.device)
+        coordinates = slabs.coordinates(depth, lifts[i].to(depth))
+        for slab, piece in enumerate(pieces):
+            inside = slabs.inside(coordinates, slab)
+            found[inside], confidence[inside] = piece[2 * i], piece[2 * i + 1]
+        yield ReprojectedMask(found, confidence)
+
+
+class _Votes:
+    """Votes and their reading, slab by slab."""
+
+    def __init__(self, depths, labels, lifts: Tensor, slabs: Slabs, native: bool, progress) -> None:
+        self.depths, self.labels, self.lifts, self.slabs = depths, labels, lifts, slabs
+        self._native, self._progress = native, progress
+        self._done, self._total = 0, 2 * len(slabs) * len(depths)
+
+    def of_slab(self, slab: int) -> Iterator[tuple[Tensor, Tensor]]:
+        """Per view the labels [H, W] int32 and the confidence [H, W] float32; those of points elsewhere are unchanged,
+        and 0."""
+        votes = VoxelVotes(IGNORE) if self._native else TorchVotes(IGNORE)
+        for i, (depth, mask) in enumerate(zip(self.depths, self.labels, strict=True)):
+            if mask is not None:
+                votes.add(self._only(i, depth, slab, self.slabs.about), self.lifts[i].to(depth), mask.int())
+            self._tick()
+        votes.decide()
+        for i, (depth, mask) in enumerate(zip(self.depths, self.labels, strict=True)):
+            shown = self._only(i, depth, slab, self.slabs.inside)
+            found = votes.read(shown, self.lifts[i].to(depth), _known(depth, mask))
+            self._tick()
+            yield found
+
+    def filed_slab(self, slab: int) -> Sequence[Tensor]:
+        """Per view the labels [P] and the confidence [P] of the points of the slab, in the order of pixels; on disk."""
+
+        def pieces() -> Iterator[Tensor]:
+            for i, values in enumerate(self.of_slab(slab)):
+                depth = self.depths[i]
+                inside = self.slabs.inside(self.slabs.coordinates(depth, self.lifts[i].to(depth)), slab)
+                yield from (value[inside] for value in values)
+
+        return filed(pieces(), self.depths[0].device)
+
+    def _only(self, i: int, depth: Tensor, slab: int, which) -> Tensor:
+        if len(self.slabs) == 1:
+            return depth
+        return torch.where(which(self.slabs.coordinates(depth, self.lifts[i].to(depth)), slab), depth, 0.0)
+
+    def _tick(self) -> None:
+        self._done += 1
+        if self._progress:
+            self._progress(self._done, self._total)
+
+
+def _known(depth: Tensor, mask: Tensor | None) -> Tensor:
+    """[H, W] int32, a copy."""
+    return torch.full_like(depth, IGNORE, dtype=torch.int32) if mask is None else mask.to(torch.int32, copy=True)
 
 
 def _survey(depths, cameras, labels, num_classes: int) -> tuple[float, bool]:
