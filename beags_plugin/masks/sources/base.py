@@ -35,7 +35,7 @@ class Photo:
         from PIL import Image
 
         with Image.open(self.path) as image:
-            return np.asarray(image.convert("RGB"))
+            return np.array(image.convert("RGB"))  # a copy: torch wants memory that can be written to
 
 
 class Geometry(Protocol):
