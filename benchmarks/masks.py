@@ -3,8 +3,8 @@
 A SCENE is a folder, or sample-mild or sample-strong: what `beags sample` writes with such damage, made anew in a
 temporary folder; these two if none is named.
 swaps: exchanges ids in some views of scenes with good masks and counts how many of these views the check names, and how
-many others; a row of a table in Markdown for each scene. rims: makes the rims of exact masks ragged, snaps them to edges of the photo, and compares both with the
-exact ones.
+many others; a row of a table in Markdown for each scene. rims: makes the rims of exact masks ragged, snaps them to
+edges of the photo, and compares both with the exact ones.
 """
 
 from __future__ import annotations
