@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.masks.pooled_votes import LOOKS, lift
+from beags_plugin.masks.pooled_votes import LOOKS
 
 MOST_BRICKS = 1 << 19  # bricks of 4 x 4 x 4 voxels that may be in memory: about 0.4 GB
 _BRICK = 4
@@ -33,9 +33,9 @@ class Slabs:
         return len(self.borders) - 1
 
     def coordinates(self, depth: Tensor, to_voxels: Tensor) -> Tensor:
-        """[H, W] of the points of a view along the axis; NaN where nothing is lifted. See ``ops.voxel_votes``."""
-        points, _, near = lift(depth, to_voxels)
-        return points[..., self.axis].masked_fill(~near, math.nan)
+        """[H, W] of the points of a view along the axis; NaN where nothing is lifted. to_voxels: [13] like ``depth``,
+        see ``ops.voxel_votes``."""
+        return _along(self.axis, depth, to_voxels)
 
     def inside(self, coordinates: Tensor, slab: int) -> Tensor:
         """[H, W] bool: the points of the slab."""
@@ -61,8 +61,7 @@ def slabs_of(depths: Sequence[Tensor], cameras: Sequence[Camera], to_voxels: Ten
         return WHOLE
     found = torch.zeros(0, 3, dtype=torch.int64)
     for depth, own in zip(depths, to_voxels, strict=True):
-        points, _, near = lift(depth, own.to(depth))
-        found = torch.unique(torch.cat([found, _counted(points[near])]), dim=0)
+        found = torch.unique(torch.cat([found, _counted(depth, own.to(depth))]), dim=0)
     count = -(-_PART * len(found) // most)
     if count <= 1:
         return WHOLE
@@ -73,11 +72,22 @@ def slabs_of(depths: Sequence[Tensor], cameras: Sequence[Camera], to_voxels: Ten
     return Slabs(axis, (-math.inf, *map(float, inner), math.inf), _margin(cameras))
 
 
-def _counted(points: Tensor) -> Tensor:
-    """[M, 3] int64, on the CPU: the bricks that hold ``points`` [P, 3], of those that are counted."""
-    bricks = torch.floor(points / _BRICK).int()
-    x, y, z = (bricks[:, axis] * prime for axis, prime in enumerate(_PRIMES))  # int32: wraps around
-    return torch.unique(bricks[((x ^ y ^ z) >> 8) % _PART == 0], dim=0).long().cpu()
+def _along(axis: int, depth: Tensor, to_voxels: Tensor) -> Tensor:
+    height, width = depth.shape
+    x = torch.arange(width, dtype=depth.dtype, device=depth.device) + 0.5
+    y = torch.arange(height, dtype=depth.dtype, device=depth.device)[:, None] + 0.5
+    across, down, rest = to_voxels[3 * axis : 3 * axis + 3]
+    found = (across * x + (down * y + rest)).mul_(depth).add_(to_voxels[9 + axis])
+    return found.masked_fill_(~(depth > 0), math.nan)
+
+
+def _counted(depth: Tensor, to_voxels: Tensor) -> Tensor:
+    """[M, 3] int64, on the CPU: of the bricks that hold the points of a view those that are counted."""
+    along = [_along(axis, depth, to_voxels) for axis in range(3)]
+    bricks = [values.div(_BRICK).floor_().nan_to_num_(0.0, 0.0, 0.0).int() for values in along]
+    x, y, z = (brick * prime for brick, prime in zip(bricks, _PRIMES, strict=True))  # int32: wraps around
+    chosen = (((x ^ y ^ z) >> 8) % _PART == 0) & along[0].isfinite()
+    return torch.unique(torch.stack([brick[chosen] for brick in bricks], dim=1), dim=0).long().cpu()
 
 
 def _margin(cameras: Sequence[Camera]) -> float:

@@ -49,9 +49,9 @@ def reproject_voxel(
     slabs = slabs_of(depths, cameras, lifts)
     votes = _Votes(depths, labels, lifts, slabs, native, progress)
     if len(slabs) == 1:
-        yield from (ReprojectedMask(*pair) for pair in votes.of_slab(0))
+        yield from (ReprojectedMask(labels, confidence) for labels, confidence, _ in votes.of_slab(0))
         return
-    pieces = [votes.filed_slab(slab) for slab in range(len(slabs))]
+    pieces = [filed(votes.pieces_of(slab), depths[0].device) for slab in range(len(slabs))]
     for i, (depth, mask) in enumerate(zip(depths, labels, strict=True)):
         found, confidence = _known(depth, mask), torch.zeros(depth.shape, dtype=torch.float32, device=depth.device)
         coordinates = slabs.coordinates(depth, lifts[i].to(depth))
@@ -69,41 +69,39 @@ class _Votes:
         self._native, self._progress = native, progress
         self._done, self._total = 0, 2 * len(slabs) * len(depths)
 
-    def of_slab(self, slab: int) -> Iterator[tuple[Tensor, Tensor]]:
-        """Per view the labels [H, W] int32 and the confidence [H, W] float32; those of points elsewhere are unchanged,
-        and 0."""
+    def of_slab(self, slab: int) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
+        """Per view the labels [H, W] int32, the confidence [H, W] float32, and which pixels [H, W] bool have their
+        point in the slab (None: all, as there is but one); others keep their label, with confidence 0."""
         votes = VoxelVotes(IGNORE) if self._native else TorchVotes(IGNORE)
         for i, (depth, mask) in enumerate(zip(self.depths, self.labels, strict=True)):
-            if mask is not None:
-                votes.add(self._only(i, depth, slab, self.slabs.about), self.lifts[i].to(depth), mask.int())
+            about = self._of_slab(i, depth, slab, self.slabs.about)
+            if mask is not None and (about is None or bool(about.any())):
+                votes.add(_where(about, depth), self.lifts[i].to(depth), mask.int())
             self._tick()
         votes.decide()
         for i, (depth, mask) in enumerate(zip(self.depths, self.labels, strict=True)):
-            shown = self._only(i, depth, slab, self.slabs.inside)
-            found = votes.read(shown, self.lifts[i].to(depth), _known(depth, mask))
+            inside = self._of_slab(i, depth, slab, self.slabs.inside)
+            yield *votes.read(_where(inside, depth), self.lifts[i].to(depth), _known(depth, mask)), inside
             self._tick()
-            yield found
 
-    def filed_slab(self, slab: int) -> Sequence[Tensor]:
-        """Per view the labels [P] and the confidence [P] of the points of the slab, in the order of pixels; on disk."""
+    def pieces_of(self, slab: int) -> Iterator[Tensor]:
+        """Of each view the labels [P] and the confidence [P] of the points in the slab, in the order of pixels."""
+        for labels, confidence, inside in self.of_slab(slab):
+            yield from (labels[inside], confidence[inside])
 
-        def pieces() -> Iterator[Tensor]:
-            for i, values in enumerate(self.of_slab(slab)):
-                depth = self.depths[i]
-                inside = self.slabs.inside(self.slabs.coordinates(depth, self.lifts[i].to(depth)), slab)
-                yield from (value[inside] for value in values)
-
-        return filed(pieces(), self.depths[0].device)
-
-    def _only(self, i: int, depth: Tensor, slab: int, which) -> Tensor:
+    def _of_slab(self, i: int, depth: Tensor, slab: int, which) -> Tensor | None:
         if len(self.slabs) == 1:
-            return depth
-        return torch.where(which(self.slabs.coordinates(depth, self.lifts[i].to(depth)), slab), depth, 0.0)
+            return None
+        return which(self.slabs.coordinates(depth, self.lifts[i].to(depth)), slab)
 
     def _tick(self) -> None:
         self._done += 1
         if self._progress:
             self._progress(self._done, self._total)
+
+
+def _where(chosen: Tensor | None, depth: Tensor) -> Tensor:
+    return depth if chosen is None else torch.where(chosen, depth, 0.0)
 
 
 def _known(depth: Tensor, mask: Tensor | None) -> Tensor:
