@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -265,7 +266,7 @@ class Wall:
 def test_labels_are_carried_by_depth(tmp_path):
     wall = Wall(tmp_path)
     given = (7 * wall.discs[0]).astype(np.uint16)
-    for index, (labels, sure) in enumerate(carry(wall, [given, None, None], [7], 0.02)):
+    for index, (labels, sure) in enumerate(carry(wall, range(3), [given, None, None], [7], 0.02)):
         known = labels != IGNORE
         np.testing.assert_array_equal((labels == 7)[known], wall.discs[index][known])
         assert known[:, 10 * index :].all() and not known[:, : 10 * index].any() and sure[known].all()
@@ -286,8 +287,28 @@ def test_grabcut_fills_the_other_views(tmp_path):
     (tmp_path / "prompts.json").write_text(json.dumps(prompts))
     with pytest.raises(UserError, match="prompts in v2, which is held out"):
         make(GrabCutSource(), held_out)
+    photos = [replace(photo, trained=index < 2) for index, photo in enumerate(wall.photos)]
+    with pytest.raises(UserError, match="prompts in v2, which is held out"):
+        make(GrabCutSource(), SourceScene(tmp_path, photos, wall))
     with pytest.raises(UserError, match="was trained on .*elsewhere.*, which is no image of"):
         make(GrabCutSource(), SourceScene(tmp_path, wall.photos, Wall(tmp_path / "elsewhere")))
+
+
+def test_held_out_views_get_masks_to_look_at_that_do_not_vote(tmp_path):
+    wall = Wall(tmp_path)
+    prompts = {"objects": [{"name": "disc", "prompts": [{"view": "v0", "box": [12, 17, 48, 53]}]}]}
+    (tmp_path / "prompts.json").write_text(json.dumps(prompts))
+    photos = [replace(photo, trained=index < 2) for index, photo in enumerate(wall.photos)]
+    made = {
+        held_out: GrabCutSource(held_out=held_out).make(SourceScene(tmp_path, photos, wall), lambda *_: None)
+        for held_out in (False, True)
+    }
+    usual, more = (list(made[held_out].maps) for held_out in (False, True))
+    assert made[True].to_look_at == {2} and not made[False].to_look_at
+    assert usual[2] is None and more[2] is not None
+    assert ((more[2] == 1) & wall.discs[2]).sum() / ((more[2] == 1) | wall.discs[2]).sum() > 0.95
+    for a, b in zip(usual[:2], more[:2], strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_rims_snap_to_the_edge_of_the_photo():

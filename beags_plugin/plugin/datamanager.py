@@ -162,13 +162,15 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         """A class map [h, w] of a training view's file without its lens distortion."""
         return self._straight("train", class_map, index)
 
-    def as_in_file(self, class_map: np.ndarray, index: int, border: int = IGNORE) -> np.ndarray:
-        """A class map [h', w'] of a training view with the lens distortion of its file, at the size it was read at.
+    def as_in_file(
+        self, class_map: np.ndarray, index: int, border: int = IGNORE, split: Literal["train", "eval"] = "train"
+    ) -> np.ndarray:
+        """A class map [h', w'] of a view with the lens distortion of its file, at the size it was read at.
 
         border: what is where the straight view does not reach.
         """
-        width, height = self.train_dataset.file_sizes[index]
-        lens = (self._distorted["train"], self.train_dataset.cameras, index)
+        width, height = self._dataset(split).file_sizes[index]
+        lens = (self._distorted[split], self._dataset(split).cameras, index)
         return redistort_class_map(class_map, *lens, (height, width), border)
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:

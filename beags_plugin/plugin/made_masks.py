@@ -8,7 +8,7 @@ from dataclasses import fields
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -31,14 +31,20 @@ from beags_plugin.rasterizers.drawing import geometry_inputs, surface_depth
 
 
 class RunGeometry:
-    """The shape that a trained run found, of its training views at the size of the photographs."""
+    """The shape that a trained run found, at the size of the photographs: of its training views, then of the others."""
 
     def __init__(self, config_path: Path) -> None:
         self.scene = read_scene(config_path)
         self.manager = data_of_run(self.scene, config_path, ReprojectionOptions())
-        self.views = self.manager.views("train")
         self.images = list(self.manager.train_dataset.image_filenames)
-        self.cameras = [view.camera for view in self.views]
+        self.cameras = [view.camera for view in self.manager.views("train")]
+        self._of_split: list[tuple[Literal["train", "eval"], int]] = [("train", i) for i in range(len(self.images))]
+        held_out = zip(self.manager.eval_dataset.image_filenames, self.manager.views("eval"), strict=True)
+        for index, (image, view) in enumerate(held_out):
+            if image not in self.images:  # without held-out views, those that are trained on serve both
+                self._of_split.append(("eval", index))
+                self.images.append(image)
+                self.cameras.append(view.camera)
         self.rasterizer = make_rasterizer(self.scene.config.model_config.rasterizer)
         self.settings = raster_settings(self.scene)
 
@@ -54,10 +60,13 @@ class RunGeometry:
             return surface_depth(drawn, kind)
 
     def to_straight(self, class_map: np.ndarray, view: int) -> np.ndarray:
-        return self.manager.straight_train_map(class_map, view)
+        split, index = self._of_split[view]
+        of_eval, of_train = self.manager.undistort_eval_map, self.manager.straight_train_map
+        return of_eval(class_map, index) if split == "eval" else of_train(class_map, index)
 
     def to_photo(self, class_map: np.ndarray, view: int) -> np.ndarray:
-        return self.manager.as_in_file(class_map, view)
+        split, index = self._of_split[view]
+        return self.manager.as_in_file(class_map, index, split=split)
 
 
 def configured_source(name: str, options: Sequence[str]) -> MaskSource:
@@ -96,7 +105,8 @@ def make_masks(
 ) -> list[str]:
     """Write the masks of a scene: <output>/masks/<stem>.png, classes.json and made.png, a picture of them.
 
-    The files take their places once all are made; no old mask of any view stays.
+    The files take their places once all are made; no old mask of any view stays. Masks that are only to be looked at
+    go to <output>/masks_to_look_at/, which nothing reads.
     data: names the scene. run: config.yml of a run trained on it, for sources that need its depth. output: the scene's
     own folder if None, where ``beags-data`` looks for them. overwrite: replace masks that are there. snap: radius in
     pixels of ``rims.snap_to_edges``, 0 leaves rims as they are.
@@ -130,10 +140,12 @@ def make_masks(
                 continue
             if snap:
                 class_map = snap_to_edges(class_map, photos[index].pixels(), snap)
-            (unfinished / path).parent.mkdir(parents=True, exist_ok=True)
-            write_class_map(unfinished / path, class_map)
+            aside = index in made.to_look_at
+            place = (folder / "masks_to_look_at" if aside else unfinished) / path
+            place.parent.mkdir(parents=True, exist_ok=True)
+            write_class_map(place, class_map)
             shares.append(float((class_map != 0).mean()))
-            shown.append((photos[index], masks / path))
+            shown.append((photos[index], place if aside else masks / path))
         if not shown:
             raise UserError("the mask source gave no mask for any view: check its options.")
         _take_the_place(unfinished, masks, {image.stem for image in views.images})
@@ -144,6 +156,7 @@ def make_masks(
         *made.notes,
         f"{len(shown)} masks of {len(photos)} views, {len(names) - 1} objects, which cover {100 * np.mean(shares):.1f} "
         f"% on average: {masks}",
+        *([f"of held-out views, only to look at: {folder / 'masks_to_look_at'}"] if made.to_look_at else []),
         f"names: {folder / 'classes.json'}; look at {folder / 'made.png'}",
     ]
 

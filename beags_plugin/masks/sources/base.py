@@ -39,7 +39,7 @@ class Photo:
 
 
 class Geometry(Protocol):
-    """The scene's own shape, from a trained run: of its training views, without lens distortion."""
+    """The scene's own shape, from a trained run: of its views, held-out ones included, without lens distortion."""
 
     @property
     def images(self) -> Sequence[Path]:
@@ -106,12 +106,14 @@ class SourceScene:
 class MadeMasks:
     """Class names by id, and one class map [H, W] uint16 per photo in their order; None: no mask for that view.
 
-    notes: sentences to tell the user, filled while the maps are made.
+    notes: sentences to tell the user, filled while the maps are made. to_look_at: places of photos whose maps are
+    neither to be trained on nor to be scored against.
     """
 
     names: Mapping[int, str]
     maps: Iterator[np.ndarray | None]
     notes: list[str]
+    to_look_at: frozenset[int] = frozenset()
 
 
 class MaskSource(ABC):
