@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
+import torch
 from data_folders import look_at, write_image, write_transforms
 
 from beags_plugin.cli import main
@@ -213,6 +216,30 @@ def test_contradicted_areas_are_more_than_rims():
     assert (area.given, area.voted, area.box) == (0, 2, (70, 70, 95, 90)) and 480 < area.pixels <= 500
     assert contradicted(given, voted, 0.5 * sure, "v") == []
     assert contradicted(np.full_like(given, IGNORE), voted, sure, "v") == []
+
+
+def test_areas_that_a_run_contradicts_are_told_with_what_they_cost(tmp_path):
+    from beags_plugin.masks.label_maps import LabelMaps, PackedMaps
+    from beags_plugin.plugin.masks_check import check_scene, check_with_run, data_options
+
+    def change(view, ids):
+        blob = ids.copy()
+        blob[2:12, 2:12] = 2
+        return blob if view == 3 else ids
+
+    root = write_balls(tmp_path, change)
+    report = check_scene(data_options(root))
+    given = LabelMaps(torch.from_numpy(change(view, draw(pose)).astype(np.int32)) for view, pose in enumerate(poses()))
+    voted = LabelMaps(torch.from_numpy(draw(pose).astype(np.int32)) for pose in poses())
+    sure = PackedMaps(torch.full((SIDE, SIDE), 255, dtype=torch.uint8) for _ in poses())
+    run = SimpleNamespace(names=report.stems, given=given, voted=voted, confidence=sure, classes=report.names)
+    found = check_with_run(report, cast(Any, run))
+    (finding,) = [finding for finding in found.findings if finding.kind == "contradicted"]
+    (area,) = found.areas
+    assert (area.view, area.given, area.voted) == ("v03", 2, 0) and finding.views == ("v03",)
+    assert "1 areas in 1 views" in finding.message and f"correct these masks of {root}" in finding.message
+    assert 60 < area.pixels <= 100 and finding.cost.startswith(f"{area.pixels} pixels (0.")
+    assert check_with_run(report, cast(Any, SimpleNamespace(**{**vars(run), "given": voted}))).areas == []
 
 
 def test_words():

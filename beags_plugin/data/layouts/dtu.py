@@ -87,8 +87,8 @@ def read_cameras(
     for image, K, size in zip(images, intrinsics, sizes, strict=True):
         if (np.abs(K[:2, 2] / size - 0.5) > OFF_CENTRE).any():  # the file does not say how large its images were
             raise UserError(
-                f"{file} has the principal point of {image} at {K[0, 2]:.0f}, {K[1, 2]:.0f}, far from the middle of its "
-                f"{size[0]}x{size[1]} pixels: keep the images that the file is of in {image.parent}, and name the "
+                f"{file} has the principal point of {image} at {K[0, 2]:.0f}, {K[1, 2]:.0f}, far from the middle of "
+                f"its {size[0]}x{size[1]} pixels: keep the images that the file is of in {image.parent}, and name the "
                 "folder of smaller copies with --images-path."
             )
     return np.stack(poses), np.stack(intrinsics), sizes
