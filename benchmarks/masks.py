@@ -1,13 +1,18 @@
-"""What checking and snapping masks does: python -m benchmarks.masks swaps|rims SCENE [SCENE ...].
+"""What checking and snapping masks does: python -m benchmarks.masks swaps|rims [SCENE ...].
 
+A SCENE is a folder, or sample-mild or sample-strong: what `beags sample` writes with such damage, made anew in a
+temporary folder; these two if none is named.
 swaps: exchanges ids in some views of scenes with good masks and counts how many of these views the check names, and how
-many others. rims: makes the rims of exact masks ragged, snaps them to edges of the photo, and compares both with the
-exact ones.
+many others; a row of a table in Markdown for each scene. rims: makes the rims of exact masks ragged, snaps them to
+edges of the photo, and compares both with the exact ones.
 """
 
 from __future__ import annotations
 
 import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +22,20 @@ SEEDS = 5
 RAGGED = (0.002, 0.004, 0.009)  # of the image diagonal
 RADII = (2, 4, 8)
 MOST_VIEWS = 12
+SAMPLES = ("sample-mild", "sample-strong")
+
+
+@contextmanager
+def folder_of(scene: str) -> Iterator[Path]:
+    """The folder of a scene; a sample goes again."""
+    if scene not in SAMPLES:
+        yield Path(scene).absolute()
+        return
+    from beags_plugin.demo import make_sample
+
+    with tempfile.TemporaryDirectory() as folder:
+        make_sample(Path(folder) / scene, 0, 256, 192, scene.removeprefix("sample-"), 60)
+        yield Path(folder) / scene
 
 
 def swaps(data: Path) -> None:
@@ -26,9 +45,11 @@ def swaps(data: Path) -> None:
 
     labels, classes = agreement_of(data_options(data))
     usable = [view for view in range(labels.shape[1]) if (labels[:, view] >= 0).any()]
-    print(f"{data.name}: without an exchange {len(Agreement(labels, classes).renamed())} views named", flush=True)
+    cells = [f"{data.name}, {classes - 1} objects, {len(usable)} views"]
+    before = {renamed.view for renamed in Agreement(labels, classes).renamed()}
+    others = set()
     for share in SHARES:
-        planted = found = false = 0
+        planted = found = 0
         for seed in range(SEEDS):
             generator = np.random.default_rng(seed)
             changed, table = {}, labels.copy()
@@ -45,8 +66,9 @@ def swaps(data: Path) -> None:
                 named.setdefault(renamed.view, set()).update(renamed.instead)
             planted += len(changed)
             found += sum(pair <= named.get(view, set()) for view, pair in changed.items())
-            false += len(named.keys() - changed.keys())
-        print(f"  ids exchanged in {100 * share:.0f} % of the views: {found} of {planted} found, {false} others named")
+            others |= named.keys() - changed.keys()
+        cells.append(f"{found} of {planted}")
+    print(f"| {' | '.join(cells)} | {len(before)} | {len(others)} |", flush=True)
 
 
 def rims(data: Path) -> None:
@@ -75,6 +97,18 @@ def rims(data: Path) -> None:
             print(f"  {name:20s} IoU {100 * mean.iou:.2f}  BIoU {100 * mean.biou:.2f}", flush=True)
 
 
+def main(what: str, scenes: Sequence[str]) -> None:
+    """Measure the scenes one after the other."""
+    if what == "swaps":
+        print(
+            f"| scene | {' | '.join(f'{100 * share:g} % of the views' for share in SHARES)} | named before | others |"
+        )
+        print("|---" * (len(SHARES) + 3) + "|")
+    for scene in scenes:
+        with folder_of(scene) as folder:
+            {"swaps": swaps, "rims": rims}[what](folder)
+
+
 def read_photo(path: Path) -> np.ndarray:
     """[H, W, 3] uint8."""
     from PIL import Image
@@ -84,5 +118,4 @@ def read_photo(path: Path) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    for scene in sys.argv[2:]:
-        {"swaps": swaps, "rims": rims}[sys.argv[1]](Path(scene).absolute())
+    main(sys.argv[1], sys.argv[2:] or SAMPLES)

@@ -72,8 +72,9 @@ if [ "$packages_now" != "$packages_before" ]; then
   rm -f "$env/.beags-packages" "$env/.beags-source"
   pip install -qq "${pins[@]}" scikit-build-core nanobind ninja 'setuptools<81'
   if ! command -v cmake >/dev/null; then pip install -qq cmake; fi
+  # sam2 (transformers) is for the tests of its masks; it brings no weights.
   # The build tools are in the environment by now, so the build needs no isolated copy of them.
-  pip install -qq --no-build-isolation "${build[@]}" "${pins[@]}" -e '.[dev]'
+  pip install -qq --no-build-isolation "${build[@]}" "${pins[@]}" -e '.[dev,sam2]'
   # nerfstudio brings plain opencv, which shares the folder cv2/ with contrib: the one written last wins.
   if ! contrib_works; then
     pip install -qq "${pins[@]}" --force-reinstall --no-deps "$opencv"

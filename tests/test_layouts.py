@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -409,6 +410,11 @@ def test_mistakes_are_told_in_one_sentence(tmp_path, mistake):
     check_refused(tmp_path, message, images_path=Path("images_4"))
 
 
+def with_smaller_images(root: Path) -> None:
+    for index, path in enumerate(sorted((root / "image").iterdir())):
+        write_image(path, noise(index, WIDTH // 2, HEIGHT // 2))
+
+
 def without_camera(root: Path) -> None:
     with np.load(root / "cameras_sphere.npz") as cameras:
         kept = {name: cameras[name] for name in cameras.files if name != "world_mat_3"}
@@ -428,6 +434,7 @@ DTU_MISTAKES = {
     "camera gone": (without_camera, "has 8 cameras but there are 9 images"),
     "image gone": (lambda root: (root / "image/000003.png").unlink(), "has 9 cameras but there are 8 images"),
     "mask gone": (lambda root: (root / "mask/003.png").unlink(), "mask holds 8 masks for 9 images"),
+    "smaller images": (with_smaller_images, "far from the middle of its 10x6 pixels: keep the images .* --images-path"),
     "skew": (with_skew, "world_mat_2 in .* is no camera with axes at right angles"),
     "half a file": (lambda root: (root / "cameras_sphere.npz").write_bytes(b"PK\x03\x04"), "cannot be read: restore"),
 }
@@ -446,6 +453,96 @@ def test_a_test_mask_of_no_view_is_told(tmp_path):
     write_image(tmp_path / "test_mask/2/green apple.png", ids())
     with pytest.raises(UserError, match="test_mask/2 is for no test view, of which there are 2"):
         parse(tmp_path)
+
+
+# --- all layouts --------------------------------------------------------------------------------------------------
+
+COLMAP_K = [[FX, 0, CX], [0, FY, CY], [0, 0, 1]]
+POSES_BOUNDS_K = [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
+DTU_K = [[FX, 0, CX + 0.5], [0, FY, CY + 0.5], [0, 0, 1]]  # its pixel centres are whole numbers
+# layout: how its fixture is written, the options to read it with, K and size of the images that are read
+EVERY = {
+    "nerfstudio": (write_transforms, {}, COLMAP_K, 1.0),
+    "colmap": (write_colmap, {}, COLMAP_K, 1.0),
+    "mipnerf360": (write_mipnerf360, {"images_path": Path("images_2")}, COLMAP_K, 0.5),
+    "llff": (write_llff, {"images_path": Path("images_4")}, POSES_BOUNDS_K, 1.0),
+    "lerf-mask": (write_lerf_mask, {}, COLMAP_K, 1.0),
+    "3dovs": (write_3dovs, {}, POSES_BOUNDS_K, 1.0),
+    "spin-nerf": (write_spin_nerf, {}, COLMAP_K, 0.25),
+    "dtu": (write_dtu, {}, DTU_K, 1.0),
+}
+
+
+def every_layout(test):
+    return pytest.mark.parametrize("layout", EVERY)(test)
+
+
+def enlarged(path: Path) -> None:
+    """The image or mask with twice as many pixels along each side."""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        larger = image.resize((2 * image.width, 2 * image.height), Image.Resampling.NEAREST)
+    larger.save(path)
+
+
+@every_layout
+def test_intrinsics_follow_the_size_of_the_images(tmp_path, layout):
+    write, options, K, factor = EVERY[layout]
+    write(tmp_path)
+    before = parse(tmp_path, layout=layout, **options)
+    scale = np.diag([factor, factor, 1.0])
+    np.testing.assert_allclose(camera_from_nerfstudio(before.cameras, 1).K.numpy(), scale @ K, rtol=1e-5)
+    seen = pixel(before, 1, moved(before, POINT))
+    if layout == "dtu":  # its poses do not say how large their images are: larger ones lie in a folder of their own
+        shutil.copytree(tmp_path / "image", tmp_path / "copies")
+        options = {"images_path": Path("copies")}
+    for split in ("train", "test"):
+        outputs = parse(tmp_path, split, layout=layout, **options)
+        for path in (*outputs.image_filenames, *outputs.metadata["class_map_filenames"]):
+            if path is not None:
+                enlarged(path)
+    after = parse(tmp_path, layout=layout, **options)
+    camera = camera_from_nerfstudio(after.cameras, 1)
+    assert (camera.width, camera.height) == (2 * factor * WIDTH, 2 * factor * HEIGHT)
+    np.testing.assert_allclose(camera.K.numpy(), np.diag([2.0, 2.0, 1.0]) @ scale @ K, rtol=1e-5)
+    np.testing.assert_allclose(pixel(after, 1, moved(after, POINT)), 2 * seen, atol=1e-3)
+
+
+@every_layout
+def test_ground_truth_has_a_folder_for_what_is_seen_and_one_for_what_is_hidden(tmp_path, layout):
+    write, options, _, _ = EVERY[layout]
+    write(tmp_path)
+    stem = names(parse(tmp_path, "test", layout=layout, **options))[0]
+    folder = tmp_path / "ground_truth"
+    files = {kind: folder / kind / f"thing/{stem}.png" for kind in ("visible", "silhouettes", "seen")}
+    for path in (*files.values(), folder / f"masks/{stem}.png"):
+        write_image(path, ids(1))
+    truth = parse(tmp_path, "test", layout=layout, **options).metadata["ground_truth"]
+    for kind, path in files.items():
+        assert truth[kind]["thing"][0] == path and not any(truth[kind]["thing"][1:])
+    assert truth["masks"][0] == folder / f"masks/{stem}.png" and not any(truth["masks"][1:])
+    train = parse(tmp_path, layout=layout, **options).metadata["ground_truth"]
+    if set(names(parse(tmp_path, layout=layout, **options))).isdisjoint({stem}):
+        assert not any(any(train[kind]["thing"]) for kind in files)
+
+
+NVOS = {
+    "fern": "IMG_4027", "flower": "IMG_2962", "fortress": "IMG_1800", "horns": "DJI_20200223_163024_597",
+    "leaves": "IMG_2997", "orchids": "IMG_4480", "trex": "DJI_20200223_163619_411",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("scene", NVOS)
+def test_nvos_holds_out_its_view_of_every_llff_scene(tmp_path, scene):
+    """The table of the method, section 9; the view is one that the rule of every 8th would train on."""
+    root = tmp_path / scene
+    stems = [f"AAA_{index}" for index in range(3)] + [NVOS[scene]]  # "AAA" comes first in the order of names
+    for index, stem in enumerate(stems):
+        write_image(root / f"images_4/{stem}.png", noise(index))
+    write_poses_bounds(root, stems, 4)
+    assert title(root) == "LLFF"
+    assert names(parse(root, "test")) == [stems[0], NVOS[scene]] and names(parse(root)) == stems[1:3]
 
 
 # --- real captures ------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from run_folders import write_scene, write_trained
 
 from beags_plugin.cli import main
 from beags_plugin.core.cameras import Camera
+from beags_plugin.data.files import photo_names
 from beags_plugin.errors import UserError
 from beags_plugin.masks.classes import read_class_map
 from beags_plugin.masks.rims import snap_to_edges
@@ -24,6 +26,7 @@ from beags_plugin.masks.sources.coco import CocoSource, decoded
 from beags_plugin.masks.sources.grabcut import GrabCutSource, carry, cut_by_box
 from beags_plugin.masks.sources.id_images import GaussianGroupingSource, IdImagesSource
 from beags_plugin.masks.sources.langsplat import LangSplatSource
+from beags_plugin.masks.sources.matching import PhotoNames
 from beags_plugin.masks.sources.object_images import ObjectImagesSource
 from beags_plugin.masks.sources.prompts import Prompt, read_prompts
 from beags_plugin.rasterizers.interface import IGNORE
@@ -263,7 +266,7 @@ class Wall:
 def test_labels_are_carried_by_depth(tmp_path):
     wall = Wall(tmp_path)
     given = (7 * wall.discs[0]).astype(np.uint16)
-    for index, (labels, sure) in enumerate(carry(wall, [given, None, None], [7], 0.02)):
+    for index, (labels, sure) in enumerate(carry(wall, range(3), [given, None, None], [7], 0.02)):
         known = labels != IGNORE
         np.testing.assert_array_equal((labels == 7)[known], wall.discs[index][known])
         assert known[:, 10 * index :].all() and not known[:, : 10 * index].any() and sure[known].all()
@@ -284,8 +287,28 @@ def test_grabcut_fills_the_other_views(tmp_path):
     (tmp_path / "prompts.json").write_text(json.dumps(prompts))
     with pytest.raises(UserError, match="prompts in v2, which is held out"):
         make(GrabCutSource(), held_out)
+    photos = [replace(photo, trained=index < 2) for index, photo in enumerate(wall.photos)]
+    with pytest.raises(UserError, match="prompts in v2, which is held out"):
+        make(GrabCutSource(), SourceScene(tmp_path, photos, wall))
     with pytest.raises(UserError, match="was trained on .*elsewhere.*, which is no image of"):
         make(GrabCutSource(), SourceScene(tmp_path, wall.photos, Wall(tmp_path / "elsewhere")))
+
+
+def test_held_out_views_get_masks_to_look_at_that_do_not_vote(tmp_path):
+    wall = Wall(tmp_path)
+    prompts = {"objects": [{"name": "disc", "prompts": [{"view": "v0", "box": [12, 17, 48, 53]}]}]}
+    (tmp_path / "prompts.json").write_text(json.dumps(prompts))
+    photos = [replace(photo, trained=index < 2) for index, photo in enumerate(wall.photos)]
+    made = {
+        held_out: GrabCutSource(held_out=held_out).make(SourceScene(tmp_path, photos, wall), lambda *_: None)
+        for held_out in (False, True)
+    }
+    usual, more = (list(made[held_out].maps) for held_out in (False, True))
+    assert made[True].to_look_at == {2} and not made[False].to_look_at
+    assert usual[2] is None and more[2] is not None
+    assert ((more[2] == 1) & wall.discs[2]).sum() / ((more[2] == 1) | wall.discs[2]).sum() > 0.95
+    for a, b in zip(usual[:2], more[:2], strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_rims_snap_to_the_edge_of_the_photo():
@@ -395,3 +418,89 @@ def test_the_check_of_a_run_takes_its_options_and_what_replaces_them(tmp_path):
     assert labels is not None and set(labels.unique().tolist()) == {0, 1, IGNORE}
     main(["masks", "check", "--load-config", str(config), "--masks-path", "others", "--output", str(tmp_path / "out")])
     assert json.loads((tmp_path / "out/report.json").read_text())["coverage"][0]["pixels"]["2"] == 16
+
+
+def scene_of_folders(root: Path, names=("left/v0", "left/v1", "right/v0", "right/v2")) -> SourceScene:
+    """Photos of two cameras; v0 is the stem of two."""
+    photos = []
+    for name in names:
+        path = root / f"images/{name}.png"
+        write_image(path, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+        photos.append(Photo(name, path, WIDTH, HEIGHT))
+    return SourceScene(root, photos)
+
+
+def mask_at(path: Path, value: int) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.full((HEIGHT, WIDTH), value, np.uint8)).save(path)
+
+
+def values_of(maps) -> list[int | None]:
+    return [None if class_map is None else int(class_map.max()) for class_map in maps]
+
+
+def test_names_of_photos_and_what_other_names_mean():
+    assert photo_names([Path("/a/images/l/1.jpg"), Path("/a/images/r/1.jpg")]) == ["l/1", "r/1"]
+    assert photo_names([Path("/a/images/1.jpg"), Path("/a/images/x.y.png")]) == ["1", "x.y"]
+    names = PhotoNames(["left/v0", "left/v1", "right/v0", "x.y"])
+    assert (
+        names.candidates("left/v0") == names.candidates("left\\v0.JPG") == names.candidates("images/left/v0.jpg") == [0]
+    )
+    assert names.candidates("v0") == names.candidates("v0.png") == names.candidates("elsewhere/v0.png") == [0, 2]
+    assert names.candidates("v1") == names.candidates("elsewhere/v1") == [1]
+    assert names.candidates("x.y") == names.candidates("images/x.y.png") == [3] and names.candidates("w") == []
+    assert names.candidates("t/v0") == [0, 2]  # "t/v0" ends "left/v0" as text, but is no part of its path
+    assert names.find("right/v0", "it") == 2 and names.find("w", "it") is None
+    with pytest.raises(UserError, match="it names the view 'v0', which could be left/v0 or right/v0: give more of"):
+        names.find("v0", "it")
+
+
+def test_masks_of_equal_stems_are_told_apart_by_their_folders(tmp_path):
+    scene = scene_of_folders(tmp_path)
+    for value, name in enumerate(("left/v0", "v1", "right/v0"), 1):  # v1 is the stem of one photo only
+        mask_at(tmp_path / f"masks/{name}.png", value)
+    assert values_of(make(IdImagesSource(), scene)[1]) == [1, 2, 3, None]
+    (tmp_path / "masks/right/v0.png").rename(tmp_path / "masks/v0.png")
+    with pytest.raises(
+        UserError, match=r"masks/v0.png could belong to left/v0 or right/v0: give it the path .* as left/v0\."
+    ):
+        make(IdImagesSource(), scene)
+    mask_at(tmp_path / "masks/right/v0.png", 4)  # now both photos have their own: v0.png is nobody's
+    assert values_of(make(IdImagesSource(), scene)[1]) == [1, 2, 4, None]
+    mask_at(tmp_path / "masks/a/v2.png", 5)
+    mask_at(tmp_path / "masks/b/v2.png", 6)
+    with pytest.raises(UserError, match="a/v2.png and .*b/v2.png could both belong to right/v2: remove one of them"):
+        make(IdImagesSource(), scene)
+
+
+def test_objects_and_coco_and_features_are_matched_by_folders_too(tmp_path):
+    scene = scene_of_folders(tmp_path)
+    for way, pattern in (("first", "cup/{}.png"), ("last", "{}/cup.png")):
+        for value, name in ((0, "left/v0"), (255, "right/v0")):
+            mask_at(tmp_path / way / pattern.format(name), value)
+        assert values_of(make(ObjectImagesSource(Path(way)), scene)[1]) == [0, None, 1, None]
+    images = [{"id": i, "file_name": f"{name}.jpg"} for i, name in enumerate(("left/v0", "images/right/v0", "v2"))]
+    box = [[2, 2, 9, 2, 9, 9, 2, 9]]
+    annotations = [{"image_id": i, "category_id": 1 + i, "segmentation": box} for i in range(3)]
+    (tmp_path / "annotations.json").write_text(json.dumps({"images": images, "annotations": annotations}))
+    assert values_of(make(CocoSource(), scene)[1]) == [1, None, 2, 3]
+    images[0]["file_name"] = "v0.jpg"
+    (tmp_path / "annotations.json").write_text(json.dumps({"images": images, "annotations": annotations}))
+    with pytest.raises(UserError, match="the image v0.jpg of .*annotations.json could belong to left/v0 or right/v0"):
+        make(CocoSource(), scene)
+    for segment, name in ((0, "left/v0"), (-1, "right/v0")):
+        path = tmp_path / f"language_features/{name}_s.npy"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, np.full((4, HEIGHT, WIDTH), segment))
+        np.save(path.with_name("v0_f.npy"), np.ones((1, 3)))
+    maps = make(LangSplatSource(least_views=1), scene)[1]
+    assert values_of(maps) == [1, None, IGNORE, None]
+
+
+def test_prompts_name_views_by_folders(tmp_path):
+    scene = scene_of_folders(tmp_path)
+    assert scene.index_of("right/v0.png", "prompts.json") == 2 and scene.index_of("v2", "prompts.json") == 3
+    with pytest.raises(UserError, match="prompts.json names the view 'v0', which could be left/v0 or right/v0"):
+        scene.index_of("v0", "prompts.json")
+    with pytest.raises(UserError, match="prompts.json names the view 'v9', but no image of"):
+        scene.index_of("v9", "prompts.json")

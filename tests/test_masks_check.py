@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
+import torch
 from data_folders import look_at, write_image, write_transforms
 
 from beags_plugin.cli import main
@@ -79,6 +82,7 @@ def test_exchanged_ids_are_found_with_the_view(tmp_path):
     assert {finding.views for finding in found["swapped ids"]} == {("v03",), ("v06",)}
     pair = next(finding for finding in found["swapped ids"] if finding.views == ("v03",))
     assert "2 (right) instead of 1 (left), 1 (left) instead of 2 (right)" in pair.message
+    assert f"1 masks ({tmp_path / 'masks/v03.png'})" in pair.message
     pixels = int(np.isin(draw(poses()[3]), (1, 2)).sum())
     assert f"{pixels} pixels" in pair.cost
     assert set(found) == {"swapped ids"}
@@ -94,6 +98,8 @@ def test_an_inverted_mask_and_a_lost_object_are_found(tmp_path):
     found = findings(root)
     assert found["inverted"][0].views == ("v05",) and found["absent"][0].views == ("v09",)
     assert found["absent"][0].level == "note" and set(found) == {"inverted", "absent"}
+    assert str(root / "masks/v05.png") in found["inverted"][0].message
+    assert str(root / "masks/v09.png") in found["absent"][0].message
 
 
 def test_one_object_under_two_ids_is_found(tmp_path):
@@ -101,6 +107,7 @@ def test_one_object_under_two_ids_is_found(tmp_path):
     (root / "classes.json").write_text('{"1": "left", "2": "right", "3": "top", "4": "left again"}')
     found = findings(root)
     assert "1 (left) (6 views) and 4 (left again) (6 views)" in found["two ids"][0].message
+    assert str(root / "masks") in found["two ids"][0].message
 
 
 def test_an_id_used_in_a_single_view_is_an_exchange(tmp_path):
@@ -109,6 +116,7 @@ def test_an_id_used_in_a_single_view_is_an_exchange(tmp_path):
     found = findings(root)
     assert found["swapped ids"][0].views == ("v04",) and "9 (odd) instead of 3 (top)" in found["swapped ids"][0].message
     assert "id 9 (odd) is in 1 of" in found["few views"][0].message
+    assert str(root / "masks/v04.png") in found["few views"][0].message
 
 
 def test_mistakes_in_files_name_file_and_remedy(tmp_path):
@@ -146,6 +154,17 @@ def test_the_command_writes_its_report_and_ends_with_1_on_errors(tmp_path, capsy
     assert report["coverage"][0]["pixels"]["1"] == int((draw(poses()[0]) == 1).sum())
     assert (tmp_path / "out/coverage.png").stat().st_size > 5000
     assert "11 usable masks, 3 objects; 1 errors" in capsys.readouterr().out
+
+
+def test_unlabelled_masks_are_named(tmp_path):
+    def change(view, ids):
+        return np.full_like(ids, 255) if view in (2, 7, 10) else ids
+
+    root = write_balls(tmp_path, change)
+    (note,) = findings(root, ignore_ids=(255,))["unlabelled"]
+    assert f"most in {root / 'masks/v02.png'}, v07.png, v10.png: fine" in note.message and note.message.startswith(
+        "25 %"
+    )
 
 
 def test_an_image_that_is_no_id_image_is_told_and_not_compared(tmp_path):
@@ -197,6 +216,30 @@ def test_contradicted_areas_are_more_than_rims():
     assert (area.given, area.voted, area.box) == (0, 2, (70, 70, 95, 90)) and 480 < area.pixels <= 500
     assert contradicted(given, voted, 0.5 * sure, "v") == []
     assert contradicted(np.full_like(given, IGNORE), voted, sure, "v") == []
+
+
+def test_areas_that_a_run_contradicts_are_told_with_what_they_cost(tmp_path):
+    from beags_plugin.masks.label_maps import LabelMaps, PackedMaps
+    from beags_plugin.plugin.masks_check import check_scene, check_with_run, data_options
+
+    def change(view, ids):
+        blob = ids.copy()
+        blob[2:12, 2:12] = 2
+        return blob if view == 3 else ids
+
+    root = write_balls(tmp_path, change)
+    report = check_scene(data_options(root))
+    given = LabelMaps(torch.from_numpy(change(view, draw(pose)).astype(np.int32)) for view, pose in enumerate(poses()))
+    voted = LabelMaps(torch.from_numpy(draw(pose).astype(np.int32)) for pose in poses())
+    sure = PackedMaps(torch.full((SIDE, SIDE), 255, dtype=torch.uint8) for _ in poses())
+    run = SimpleNamespace(names=report.stems, given=given, voted=voted, confidence=sure, classes=report.names)
+    found = check_with_run(report, cast(Any, run))
+    (finding,) = [finding for finding in found.findings if finding.kind == "contradicted"]
+    (area,) = found.areas
+    assert (area.view, area.given, area.voted) == ("v03", 2, 0) and finding.views == ("v03",)
+    assert "1 areas in 1 views" in finding.message and f"correct these masks of {root}" in finding.message
+    assert 60 < area.pixels <= 100 and finding.cost.startswith(f"{area.pixels} pixels (0.")
+    assert check_with_run(report, cast(Any, SimpleNamespace(**{**vars(run), "given": voted}))).areas == []
 
 
 def test_words():

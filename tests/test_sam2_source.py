@@ -88,7 +88,7 @@ def photos(tmp_path):
     return found
 
 
-def test_the_predictor_tracks_both_ways_and_forgets(sam2, photos):
+def test_the_predictor_tracks_both_ways(sam2, photos):
     predictor = Sam2Predictor(*load(str(sam2), "Sam2VideoModel", local=True), photos)
     prompts = {2: Prompt(box=(10, 8, 24, 22)), 3: Prompt(points=((18.0, 15.0), (2.0, 2.0)), inside=(True, False))}
     up = list(predictor.track(prompts, [2, 3, 4]))
@@ -99,6 +99,24 @@ def test_the_predictor_tracks_both_ways_and_forgets(sam2, photos):
     np.testing.assert_array_equal(up[0][1], down[0][1])  # calls know nothing of each other
     other = next(iter(predictor.track({2: Prompt(box=(0, 0, 5, 5))}, [2, 3])))[1]
     assert np.abs(other - up[0][1]).max() > 0  # the prompt matters
+
+
+def test_the_predictor_forgets_what_the_model_no_longer_looks_at(sam2, photos, monkeypatch):
+    from beags_plugin.masks.sources import sam2 as module
+
+    held, forget = [], module._forget
+
+    def observed(session, frame, kept):
+        forget(session, frame, kept)
+        outputs = next(iter(session.output_dict_per_obj.values()))
+        held.append((sorted(outputs["cond_frame_outputs"]), sorted(outputs["non_cond_frame_outputs"])))
+        assert len(session.processed_frames.keys()) <= 1
+
+    monkeypatch.setattr(module, "KEPT_FRAMES", 1)
+    monkeypatch.setattr(module, "_forget", observed)
+    predictor = Sam2Predictor(*load(str(sam2), "Sam2VideoModel", local=True), photos)
+    list(predictor.track({0: Prompt(box=(10, 8, 24, 22))}, range(FRAMES)))
+    assert held == [([0], []), ([0], [1]), ([0], [1, 2]), ([0], [2, 3]), ([0], [3, 4])]
 
 
 def test_the_predictor_agrees_with_a_whole_video_in_memory(sam2, photos):

@@ -10,7 +10,8 @@ import torch
 from data_folders import HEIGHT, WIDTH, write_image, write_transforms
 from test_datamanager import manager, write_distorted
 
-from beags_plugin.plugin.streaming import Lazy, PackedMap, StreamedViews
+from beags_plugin.masks.label_maps import PackedMap, widened
+from beags_plugin.plugin.streaming import Lazy, StreamedViews
 from beags_plugin.rasterizers.interface import IGNORE
 
 
@@ -112,8 +113,6 @@ def test_a_failure_while_loading_ahead_is_raised_where_the_view_is_asked_for():
 def test_packed_maps_are_small_and_give_every_id_back(ids):
     labels = torch.tensor(ids, dtype=torch.int32).repeat_interleave(40_000).reshape(-1, 200)
     packed = PackedMap(labels)
-    from beags_plugin.masks.label_maps import widened
-
     assert torch.equal(widened(packed.unpacked()), labels) and len(packed.packed) < 0.02 * labels.numel()
 
 

@@ -53,6 +53,11 @@ def each_view(
             yield _told(results[index - first], progress, index, count)
 
 
+def is_first() -> bool:
+    """Whether this process is the only one, or the first of its group."""
+    return not (dist.is_available() and dist.is_initialized()) or dist.get_rank() == 0
+
+
 def _told(result: Result, progress: Callable[[int, int], None] | None, index: int, count: int) -> Result:
     if progress:
         progress(index + 1, count)

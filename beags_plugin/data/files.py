@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -57,17 +58,32 @@ def image_size(path: Path) -> tuple[int, int]:
         raise UserError(f"{path} cannot be read as an image: replace it ({error}).") from error
 
 
+def photo_names(images: Sequence[Path]) -> list[str]:
+    """Of each image its path below their common folder, without suffix: "v1", or "left/v1" where there are folders."""
+    if not images:
+        return []
+    root = Path(os.path.commonpath([image.parent for image in images]))
+    return [image.relative_to(root).with_suffix("").as_posix() for image in images]
+
+
 def existing_images(named: Sequence[Path], folder: Path, in_order: bool) -> list[Path]:
     """The files for the images that a COLMAP model names, smaller copies of which may have other names.
 
-    A name that does not exist stands for the file of the same stem in ``folder``. If ``in_order`` and not one image is
-    found so, the files in ``folder`` stand for the images in the order of their names, if there are as many.
+    A name that does not exist stands for the file in ``folder`` of the same path but for the suffix, else of the same
+    stem, if no other image has it. If ``in_order`` and not one image is found so, the files in ``folder`` stand for the
+    images in the order of their names, if there are as many.
     """
     files = list_images(folder)
     if all(path.exists() for path in named):
         return list(named)
     by_stem = {path.stem: path for path in files}
-    found = [path if path.exists() else by_stem.get(path.stem, path) for path in named]
+    stems = Counter(path.stem for path in named)
+
+    def file_for(path: Path) -> Path:
+        alike = {other.stem: other for other in list_images(path.parent)}
+        return alike.get(path.stem) or (by_stem.get(path.stem, path) if stems[path.stem] == 1 else path)
+
+    found = [path if path.exists() else file_for(path) for path in named]
     if in_order and len(files) == len(named) and not any(path.exists() for path in found):
         order = sorted(range(len(named)), key=lambda index: named[index].as_posix())
         found = list(named)

@@ -22,7 +22,7 @@ class TorchVotes:
         self._pending: list[tuple[Tensor, Tensor]] = []
 
     def add(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> None:
-        points, _, near = _lift(depth, to_voxels)
+        points, _, near = lift(depth, to_voxels)
         votes = near & (labels != self._ignore)
         self._pending.append((_keys(torch.floor(points[votes]).long()), labels[votes]))
 
@@ -44,7 +44,7 @@ class TorchVotes:
         self._leaders[voxel[leads]] = self._pairs[leads] % self._classes
 
     def read(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-        points, steps, near = _lift(depth, to_voxels)
+        points, steps, near = lift(depth, to_voxels)
         voted = labels.clone()
         confidence = torch.zeros(depth.shape, dtype=torch.float32, device=depth.device)
         if len(self._voxels):
@@ -120,7 +120,7 @@ class TorchVotes:
         return torch.where(leaders == 1, winner.int(), labels), share
 
 
-def _lift(depth: Tensor, to_voxels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def lift(depth: Tensor, to_voxels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Points [H, W, 3] in voxels, steps along their rays [H, W, 3], and which of them [H, W] count."""
     height, width = depth.shape
     x = torch.arange(width, dtype=depth.dtype, device=depth.device) + 0.5

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.errors import UserError
-from beags_plugin.masks.label_maps import LabelMaps
+from beags_plugin.masks.label_maps import LabelMaps, widened
 from beags_plugin.ops import extension
 from beags_plugin.ops.reprojection_votes import reprojection_votes
 from beags_plugin.rasterizers.interface import IGNORE
@@ -48,13 +48,15 @@ def reproject_pairwise(
     tau: a vote counts only if its point is visible, |z - D_i| <= tau z; ``inf`` counts all (the paper's literal text).
     IGNORE pixels and pixels without depth do not vote; a view votes in itself too. A tie or no vote keeps the original
     label; a view without a mask counts as all IGNORE, so there it leaves IGNORE (an ambiguous pixel is better left
-    unlabelled than guessed). Cost O(V^2 pixels), memory O(pixels of one view x classes).
+    unlabelled than guessed). Cost O(V^2 pixels). Depth and masks of all V views are held in memory (5 bytes a pixel),
+    beside O(pixels of one view x classes).
     Yields the views in their order; none is kept here.
     Raises ``UserError`` for a mask of the wrong size or with ids out of range.
     """
     check_views(depths, cameras, labels, num_classes, tau)
     if not cameras:
         return
+    depths = list(depths)  # every view is projected into every other
     maps, held = _PixelMaps(cameras), _held(labels)
     i = 0
     while i < len(cameras):
@@ -79,9 +81,8 @@ def _held(labels: Sequence[Tensor | None]) -> list[Tensor | None]:
     """The maps in the types that the compiled op reads: int32, or uint8 as ``label_maps.narrowed`` gives it."""
     if not isinstance(labels, LabelMaps):
         return list(labels)
-    return [
-        mask if mask is None or mask.dtype == torch.uint8 else labels[index] for index, mask in enumerate(labels.stored)
-    ]
+    narrow = (labels.narrow(index) for index in range(len(labels)))
+    return [mask if mask is None or mask.dtype == torch.uint8 else widened(mask) for mask in narrow]
 
 
 def _by_torch(depths, cameras, labels, num_classes: int, tau: float, i: int, maps: _PixelMaps) -> ReprojectedMask:
@@ -96,27 +97,37 @@ def _by_torch(depths, cameras, labels, num_classes: int, tau: float, i: int, map
 
 def check_views(depths, cameras, labels, num_classes: int, tau: float) -> None:
     """Raise ``UserError`` for masks of the wrong size or with ids out of range, ``ValueError`` for other misfits."""
+    check_counts(depths, cameras, labels, tau)
+    for index, (depth, camera, mask) in enumerate(zip(depths, cameras, labels, strict=True)):
+        check_view(index, depth, camera, mask, num_classes)
+
+
+def check_counts(depths, cameras, labels, tau: float) -> None:
+    """What ``check_views`` asks before it looks at a view."""
     if not len(depths) == len(cameras) == len(labels):
         raise ValueError(f"{len(depths)} depths, {len(cameras)} cameras and {len(labels)} masks do not belong together")
     if not tau >= 0:
         raise UserError(f"tau is {tau}: it must be 0 or more (inf counts every vote).")
-    for index, (depth, camera, mask) in enumerate(zip(depths, cameras, labels, strict=True)):
-        size = (camera.height, camera.width)
-        if tuple(depth.shape) != size:
-            raise ValueError(f"depth {index} must be {list(size)}, not {list(depth.shape)}")
-        if mask is None:
-            continue
-        if tuple(mask.shape) != size:
-            raise UserError(
-                f"the mask of view {index} is {mask.shape[1]} x {mask.shape[0]} pixels but its image is "
-                f"{camera.width} x {camera.height}: give both the same size."
-            )
-        low, high = (int(value) for value in torch.where(mask == IGNORE, 0, mask).aminmax())
-        if low < 0 or high >= num_classes:
-            raise UserError(
-                f"the mask of view {index} holds class ids {low}..{high}, but only "
-                f"0..{num_classes - 1} are known: name all classes."
-            )
+
+
+def check_view(index: int, depth: Tensor, camera: Camera, mask: Tensor | None, num_classes: int) -> None:
+    """What ``check_views`` asks of one view."""
+    size = (camera.height, camera.width)
+    if tuple(depth.shape) != size:
+        raise ValueError(f"depth {index} must be {list(size)}, not {list(depth.shape)}")
+    if mask is None:
+        return
+    if tuple(mask.shape) != size:
+        raise UserError(
+            f"the mask of view {index} is {mask.shape[1]} x {mask.shape[0]} pixels but its image is "
+            f"{camera.width} x {camera.height}: give both the same size."
+        )
+    low, high = (int(value) for value in torch.where(mask == IGNORE, 0, mask).aminmax())
+    if low < 0 or high >= num_classes:
+        raise UserError(
+            f"the mask of view {index} holds class ids {low}..{high}, but only "
+            f"0..{num_classes - 1} are known: name all classes."
+        )
 
 
 class _PixelMaps:

@@ -8,8 +8,10 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.filed_tensors import filed
 from beags_plugin.masks.pooled_votes import TorchVotes
-from beags_plugin.masks.reprojection import ReprojectedMask, check_views
+from beags_plugin.masks.reprojection import ReprojectedMask, check_counts, check_view
+from beags_plugin.masks.slabs import Slabs, slabs_of
 from beags_plugin.ops import extension
 from beags_plugin.ops.voxel_votes import VoxelVotes
 from beags_plugin.rasterizers.interface import IGNORE
@@ -35,42 +37,100 @@ def reproject_voxel(
     them two voxels before and two behind its point along its ray too: an error of its own depth then does less harm.
     The confidence is the label's share of the votes in the voxel of the point, or of those read if that has none.
     The points are lifted from what each view sees, so no vote passes through a surface, and ``tau`` is not used.
-    Cost O(V pixels), memory linear in the voxels; neither depends on the number of classes.
+    Cost O(V pixels), whatever the number of classes. Depth and masks are asked for several times, one view at a time:
+    they may lie on disk (``core.filed_tensors``). Where the voxels would take more than about 0.4 GB, space is cut into
+    slabs (``masks.slabs``) and the views are gone through once more for each; results are the same bits.
     """
-    check_views(depths, cameras, labels, num_classes, tau)
+    check_counts(depths, cameras, labels, tau)
     if not cameras:
         return
-    size, origin = _voxel_size(depths, cameras, labels), _origin(cameras)
-    votes = VoxelVotes(IGNORE) if extension.can_take(*depths) else TorchVotes(IGNORE)
-    views = len(cameras)
-    lifts = [lift.to(depth) for depth, lift in zip(depths, _to_voxels(cameras, origin, size), strict=True)]
+    size, native = _survey(depths, cameras, labels, num_classes)
+    lifts = _to_voxels(cameras, _origin(cameras), size)
+    slabs = slabs_of(depths, cameras, lifts)
+    votes = _Votes(depths, labels, lifts, slabs, native, progress)
+    if len(slabs) == 1:
+        yield from (ReprojectedMask(labels, confidence) for labels, confidence, _ in votes.of_slab(0))
+        return
+    pieces = [filed(votes.pieces_of(slab), depths[0].device) for slab in range(len(slabs))]
     for i, (depth, mask) in enumerate(zip(depths, labels, strict=True)):
-        if mask is not None:
-            votes.add(depth, lifts[i], mask.int())
-        if progress:
-            progress(i + 1, 2 * views)
-    votes.decide()
-    for i, (depth, mask) in enumerate(zip(depths, labels, strict=True)):
-        known = torch.full_like(depth, IGNORE, dtype=torch.int32) if mask is None else mask.int()
-        found = ReprojectedMask(*votes.read(depth, lifts[i], known))
-        if progress:
-            progress(views + i + 1, 2 * views)
-        yield found
+        found, confidence = _known(depth, mask), torch.zeros(depth.shape, dtype=torch.float32, device=depth.device)
+        coordinates = slabs.coordinates(depth, lifts[i].to(depth))
+        for slab, piece in enumerate(pieces):
+            inside = slabs.inside(coordinates, slab)
+            found[inside], confidence[inside] = piece[2 * i], piece[2 * i + 1]
+        yield ReprojectedMask(found, confidence)
 
 
-def _voxel_size(depths: Sequence[Tensor], cameras: Sequence[Camera], labels: Sequence[Tensor | None]) -> float:
-    """``VOXEL_PIXELS`` times the median of depth / focal length over the objects' pixels (over all that are drawn, if
-    there are none); world units. Objects, as it is about them that classes meet: what is behind them may be far away.
+class _Votes:
+    """Votes and their reading, slab by slab."""
+
+    def __init__(self, depths, labels, lifts: Tensor, slabs: Slabs, native: bool, progress) -> None:
+        self.depths, self.labels, self.lifts, self.slabs = depths, labels, lifts, slabs
+        self._native, self._progress = native, progress
+        self._done, self._total = 0, 2 * len(slabs) * len(depths)
+
+    def of_slab(self, slab: int) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
+        """Per view the labels [H, W] int32, the confidence [H, W] float32, and which pixels [H, W] bool have their
+        point in the slab (None: all, as there is but one); others keep their label, with confidence 0."""
+        votes = VoxelVotes(IGNORE) if self._native else TorchVotes(IGNORE)
+        for i, (depth, mask) in enumerate(zip(self.depths, self.labels, strict=True)):
+            about = self._of_slab(i, depth, slab, self.slabs.about)
+            if mask is not None and (about is None or bool(about.any())):
+                votes.add(_where(about, depth), self.lifts[i].to(depth), mask.int())
+            self._tick()
+        votes.decide()
+        for i, (depth, mask) in enumerate(zip(self.depths, self.labels, strict=True)):
+            inside = self._of_slab(i, depth, slab, self.slabs.inside)
+            yield *votes.read(_where(inside, depth), self.lifts[i].to(depth), _known(depth, mask)), inside
+            self._tick()
+
+    def pieces_of(self, slab: int) -> Iterator[Tensor]:
+        """Of each view the labels [P] and the confidence [P] of the points in the slab, in the order of pixels."""
+        for labels, confidence, inside in self.of_slab(slab):
+            yield from (labels[inside], confidence[inside])
+
+    def _of_slab(self, i: int, depth: Tensor, slab: int, which) -> Tensor | None:
+        if len(self.slabs) == 1:
+            return None
+        return which(self.slabs.coordinates(depth, self.lifts[i].to(depth)), slab)
+
+    def _tick(self) -> None:
+        self._done += 1
+        if self._progress:
+            self._progress(self._done, self._total)
+
+
+def _where(chosen: Tensor | None, depth: Tensor) -> Tensor:
+    return depth if chosen is None else torch.where(chosen, depth, 0.0)
+
+
+def _known(depth: Tensor, mask: Tensor | None) -> Tensor:
+    """[H, W] int32, a copy."""
+    return torch.full_like(depth, IGNORE, dtype=torch.int32) if mask is None else mask.to(torch.int32, copy=True)
+
+
+def _survey(depths, cameras, labels, num_classes: int) -> tuple[float, bool]:
+    """The size of the voxels, and whether the compiled votes take the depths; raises as ``check_views``.
+
+    The size is ``VOXEL_PIXELS`` times the median of depth / focal length over the objects' pixels (over all that are
+    drawn, if there are none); world units. Objects, as it is about them that classes meet: what is behind them may be
+    far away.
     """
-    pixels = sum(depth.numel() for depth in depths)
-    step = max(1, pixels // _FOOTPRINTS)
-    thinned, labelled = [], []
-    for depth, camera, mask in zip(depths, cameras, labels, strict=True):
+    step = max(1, sum(camera.height * camera.width for camera in cameras) // _FOOTPRINTS)
+    thinned, labelled, native, dtypes = [], [], True, set()
+    for index, (depth, camera, mask) in enumerate(zip(depths, cameras, labels, strict=True)):
+        check_view(index, depth, camera, mask, num_classes)
         focal = (float(camera.K[0, 0]) * float(camera.K[1, 1])) ** 0.5
         thinned.append((depth.reshape(-1)[::step] / focal).double().cpu())
         label = torch.zeros(len(thinned[-1]), dtype=torch.int32) if mask is None else mask.reshape(-1)[::step].cpu()
-        labelled.append(label)
-    footprints, label = torch.cat(thinned), torch.cat(labelled)
+        labelled.append(label.clone())  # not a piece of the view's map, which would stay in memory as a whole
+        dtypes.add(depth.dtype)
+        native = native and len(dtypes) == 1 and extension.can_take(depth)
+    return _voxel_size(torch.cat(thinned), torch.cat(labelled)), native
+
+
+def _voxel_size(footprints: Tensor, label: Tensor) -> float:
+    """footprints: [P] float64, sides of pixels where they lie; label: [P] int32 class ids or IGNORE."""
     drawn = (footprints > 0) & footprints.isfinite()
     for counted in (drawn & (label > 0) & (label != IGNORE), drawn):
         if counted.any():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.filed_tensors import filed
 from beags_plugin.core.lifting import lift
 from beags_plugin.core.processes import each_view
 from beags_plugin.core.surfels import Surfels
@@ -38,6 +39,24 @@ class _View:
         return lift(depth, self.camera)[self.solid]
 
 
+class _Views:
+    """What all views show, on disk; each is read anew whenever they are gone through."""
+
+    def __init__(self, views: Iterable[_View], cameras: Sequence[Camera], device: torch.device) -> None:
+        self._cameras = cameras
+        self.counts: list[int] = []  # of the points of each view
+        self._tensors = filed(self._flat(views), device)
+
+    def _flat(self, views: Iterable[_View]) -> Iterator[Tensor]:
+        for view in views:
+            self.counts.append(len(view.depth))
+            yield from (view.solid, view.depth, view.class_id)
+
+    def __iter__(self) -> Iterator[_View]:
+        for index, camera in enumerate(self._cameras):
+            yield _View(camera, *self._tensors[3 * index : 3 * index + 3])
+
+
 def build_visibility_grid(
     surfels: Surfels,
     class_ids: Tensor,
@@ -55,8 +74,8 @@ def build_visibility_grid(
     surfels: N surfels. class_ids: [N] int32, phi, below ``num_classes``.
     k: sets the voxel size (E8); seed: of the points that measure it.
     depth: which depth is lifted: see ``surface_depth``.
-    Keeps whether a pixel is solid, and its depth and class if so, of all views (6 bytes for up to 256 class ids), and
-    lifts them view by view.
+    Whether a pixel is solid, and its depth and class if so, goes to a temporary file (6 bytes for up to 256 class ids),
+    which is read twice, view by view: memory grows with the voxels, and with the points that measure their size.
     Raises ``UserError`` if no pixel of any view reaches an alpha of 0.5.
     """
     settings = replace(settings, geometry=True, distortion=False)
@@ -64,7 +83,7 @@ def build_visibility_grid(
     def render(index: int) -> _View:
         return _render(surfels, class_ids, cameras[index], rasterizer, settings, num_classes, depth)
 
-    views = list(each_view(len(cameras), render, progress))
+    views = _Views(each_view(len(cameras), render, progress), cameras, surfels.means.device)
     reference, total = _reference_cloud(views, k, seed)
     if total == 0:
         raise UserError("no training view shows anything solid (alpha >= 0.5): train the base for more steps.")
@@ -84,21 +103,18 @@ def _render(surfels, class_ids, camera, rasterizer, settings, num_classes: int, 
     return _View(camera, solid, surface[solid], classes[solid].to(small))
 
 
-def _reference_cloud(views: Sequence[_View], k: int, seed: int) -> tuple[np.ndarray, int]:
+def _reference_cloud(views: _Views, k: int, seed: int) -> tuple[np.ndarray, int]:
     """The thinned cloud of all classes [R, 3], and how many points there are in all."""
-    counts = [len(view.depth) for view in views]
-    chosen = reference_indices(sum(counts), k, seed)
-    pieces = [_piece(view, chosen, first, count) for view, first, count in _spans(views, counts)]
-    return np.concatenate([np.zeros((0, 3), dtype=np.float32), *pieces]), sum(counts)
+    total = sum(views.counts)
+    chosen = reference_indices(total, k, seed)
+    pieces, first = [np.zeros((0, 3), dtype=np.float32)], 0
+    for view in views:
+        pieces.append(_piece(view, chosen, first))
+        first += len(view.depth)
+    return np.concatenate(pieces), total
 
 
-def _spans(views: Sequence[_View], counts: Sequence[int]) -> Iterator[tuple[_View, int, int]]:
-    first = 0
-    for view, count in zip(views, counts, strict=True):
-        yield view, first, count
-        first += count
-
-
-def _piece(view: _View, chosen: np.ndarray, first: int, count: int) -> np.ndarray:
-    start, stop = np.searchsorted(chosen, [first, first + count])
+def _piece(view: _View, chosen: np.ndarray, first: int) -> np.ndarray:
+    """The chosen points of a view whose points are number ``first`` and following."""
+    start, stop = np.searchsorted(chosen, [first, first + len(view.depth)])
     return view.points()[torch.from_numpy(chosen[start:stop] - first).to(view.depth.device)].cpu().numpy()

@@ -24,11 +24,11 @@ from rich.progress import track
 from torch import Tensor
 
 import beags_plugin.plugin.nerfstudio_patches  # noqa: F401  (checkpoints load again)
-from beags_plugin.masks.label_maps import narrowed, widened
+from beags_plugin.masks.label_maps import PackedMap, narrowed, widened
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.dataparser import BeagsDataParserConfig, absolute
 from beags_plugin.plugin.dataset import BeagsDataset
-from beags_plugin.plugin.streaming import Lazy, PackedMap, StreamedViews
+from beags_plugin.plugin.streaming import Lazy, StreamedViews
 from beags_plugin.plugin.undistortion import (
     has_lens,
     redistort_class_map,
@@ -162,13 +162,15 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         """A class map [h, w] of a training view's file without its lens distortion."""
         return self._straight("train", class_map, index)
 
-    def as_in_file(self, class_map: np.ndarray, index: int, border: int = IGNORE) -> np.ndarray:
-        """A class map [h', w'] of a training view with the lens distortion of its file, at the size it was read at.
+    def as_in_file(
+        self, class_map: np.ndarray, index: int, border: int = IGNORE, split: Literal["train", "eval"] = "train"
+    ) -> np.ndarray:
+        """A class map [h', w'] of a view with the lens distortion of its file, at the size it was read at.
 
         border: what is where the straight view does not reach.
         """
-        width, height = self.train_dataset.file_sizes[index]
-        lens = (self._distorted["train"], self.train_dataset.cameras, index)
+        width, height = self._dataset(split).file_sizes[index]
+        lens = (self._distorted[split], self._dataset(split).cameras, index)
         return redistort_class_map(class_map, *lens, (height, width), border)
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:

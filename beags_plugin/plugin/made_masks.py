@@ -8,13 +8,13 @@ from dataclasses import fields
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from beags_plugin.data.files import image_size
+from beags_plugin.data.files import image_size, photo_names
 from beags_plugin.errors import UserError
 from beags_plugin.masks.classes import check_names, write_class_map
 from beags_plugin.masks.pictures import overlay
@@ -31,14 +31,20 @@ from beags_plugin.rasterizers.drawing import geometry_inputs, surface_depth
 
 
 class RunGeometry:
-    """The shape that a trained run found, of its training views at the size of the photographs."""
+    """The shape that a trained run found, at the size of the photographs: of its training views, then of the others."""
 
     def __init__(self, config_path: Path) -> None:
         self.scene = read_scene(config_path)
         self.manager = data_of_run(self.scene, config_path, ReprojectionOptions())
-        self.views = self.manager.views("train")
         self.images = list(self.manager.train_dataset.image_filenames)
-        self.cameras = [view.camera for view in self.views]
+        self.cameras = [view.camera for view in self.manager.views("train")]
+        self._of_split: list[tuple[Literal["train", "eval"], int]] = [("train", i) for i in range(len(self.images))]
+        held_out = zip(self.manager.eval_dataset.image_filenames, self.manager.views("eval"), strict=True)
+        for index, (image, view) in enumerate(held_out):
+            if image not in self.images:  # without held-out views, those that are trained on serve both
+                self._of_split.append(("eval", index))
+                self.images.append(image)
+                self.cameras.append(view.camera)
         self.rasterizer = make_rasterizer(self.scene.config.model_config.rasterizer)
         self.settings = raster_settings(self.scene)
 
@@ -54,10 +60,13 @@ class RunGeometry:
             return surface_depth(drawn, kind)
 
     def to_straight(self, class_map: np.ndarray, view: int) -> np.ndarray:
-        return self.manager.straight_train_map(class_map, view)
+        split, index = self._of_split[view]
+        of_eval, of_train = self.manager.undistort_eval_map, self.manager.straight_train_map
+        return of_eval(class_map, index) if split == "eval" else of_train(class_map, index)
 
     def to_photo(self, class_map: np.ndarray, view: int) -> np.ndarray:
-        return self.manager.as_in_file(class_map, view)
+        split, index = self._of_split[view]
+        return self.manager.as_in_file(class_map, index, split=split)
 
 
 def configured_source(name: str, options: Sequence[str]) -> MaskSource:
@@ -96,7 +105,8 @@ def make_masks(
 ) -> list[str]:
     """Write the masks of a scene: <output>/masks/<stem>.png, classes.json and made.png, a picture of them.
 
-    The files take their places once all are made; no old mask of any view stays.
+    The files take their places once all are made; no old mask of any view stays. Masks that are only to be looked at
+    go to <output>/masks_to_look_at/, which nothing reads.
     data: names the scene. run: config.yml of a run trained on it, for sources that need its depth. output: the scene's
     own folder if None, where ``beags-data`` looks for them. overwrite: replace masks that are there. snap: radius in
     pixels of ``rims.snap_to_edges``, 0 leaves rims as they are.
@@ -115,8 +125,8 @@ def make_masks(
     trained = set(parser.training_views(views))
     sizes = [image_size(path) for path in views.images]
     photos = [
-        Photo(path.stem, path, *size, trained=index in trained)
-        for index, (path, size) in enumerate(zip(views.images, sizes, strict=True))
+        Photo(name, path, *size, trained=index in trained)
+        for index, (name, path, size) in enumerate(zip(photo_names(views.images), views.images, sizes, strict=True))
     ]
     made_of = SourceScene(scene.root, photos, RunGeometry(run) if run is not None and source.needs_run else None)
     shares, shown = [], []
@@ -130,10 +140,12 @@ def make_masks(
                 continue
             if snap:
                 class_map = snap_to_edges(class_map, photos[index].pixels(), snap)
-            (unfinished / path).parent.mkdir(parents=True, exist_ok=True)
-            write_class_map(unfinished / path, class_map)
+            aside = index in made.to_look_at
+            place = (folder / "masks_to_look_at" if aside else unfinished) / path
+            place.parent.mkdir(parents=True, exist_ok=True)
+            write_class_map(place, class_map)
             shares.append(float((class_map != 0).mean()))
-            shown.append((photos[index], masks / path))
+            shown.append((photos[index], place if aside else masks / path))
         if not shown:
             raise UserError("the mask source gave no mask for any view: check its options.")
         _take_the_place(unfinished, masks, {image.stem for image in views.images})
@@ -144,6 +156,7 @@ def make_masks(
         *made.notes,
         f"{len(shown)} masks of {len(photos)} views, {len(names) - 1} objects, which cover {100 * np.mean(shares):.1f} "
         f"% on average: {masks}",
+        *([f"of held-out views, only to look at: {folder / 'masks_to_look_at'}"] if made.to_look_at else []),
         f"names: {folder / 'classes.json'}; look at {folder / 'made.png'}",
     ]
 
@@ -167,5 +180,5 @@ def _picture(path: Path, shown: Sequence[tuple[Photo, Path]], most: int = 24) ->
     cells = []
     for photo, mask in shown[::step]:
         size = (260, max(1, round(260 * photo.height / photo.width)))
-        cells.append([cell(overlay(photo.pixels(), read_class_map(mask)), size, photo.stem)])
+        cells.append([cell(overlay(photo.pixels(), read_class_map(mask)), size, photo.name)])
     write_picture(path, below(wrapped(cells, 1100)))

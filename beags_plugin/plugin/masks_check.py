@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from beags_plugin.data.files import image_size
+from beags_plugin.data.files import image_size, photo_names
 from beags_plugin.data.scene import Scene
 from beags_plugin.errors import UserError
 from beags_plugin.masks.check.areas import Area, contradicted
@@ -99,7 +99,7 @@ def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Re
         )
     elif coverage.usable.sum() > 3 and len(coverage.ids) > 1:
         points = _points(scene, views, config)
-        findings += views_against_others(_agreement(files, coverage, views, points), files.stems, coverage, shown)
+        findings += views_against_others(_agreement(files, coverage, views, points), files, coverage, shown)
     return Report(scene.root, list(files.stems), shown, coverage, ordered(findings))
 
 
@@ -120,7 +120,7 @@ def _files(config: BeagsDataParserConfig) -> tuple[Scene, PosedViews, MaskFiles]
     names_file = scene.root / config.classes_path
     names = read_classes(names_file) if names_file.is_file() else scene.class_names
     files = MaskFiles(
-        [image.stem for image in views.images],
+        photo_names(views.images),
         sizes,
         masks,
         folder,
@@ -165,14 +165,14 @@ def check_with_run(report: Report, run: ReprojectedRun) -> Report:
     findings = list(report.findings)
     if areas:
         pixels, views = sum(area.pixels for area in areas), {area.view for area in areas}
-        total = sum(mask.numel() for mask in run.given.stored if mask is not None)
+        total = sum(mask.pixels for mask in run.given.stored if mask is not None)
         findings.append(
             Finding(
                 "warning",
                 "contradicted",
                 f"{len(areas)} areas in {len(views)} views are contradicted by the other views, the largest: "
-                f"{'; '.join(area.told(run.classes) for area in areas[:3])}: correct these masks, or leave it to "
-                "reprojection.",
+                f"{'; '.join(area.told(run.classes) for area in areas[:3])}: correct these masks of {report.data}, or "
+                "leave it to reprojection.",
                 f"{pixels} pixels ({percent(pixels, total)} of the masks) go to another class in reprojection; "
                 "with --pipeline.model.prepare.reprojection none they pull Gaussians to the wrong class",
                 tuple(sorted(views)),

@@ -20,7 +20,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from beags_plugin.data.files import existing_images
+from beags_plugin.data.files import existing_images, photo_names
 from beags_plugin.data.layouts.colmap import points_file
 from beags_plugin.data.scene import ColmapModel, Poses, PoseTable, TransformsFile
 from beags_plugin.errors import UserError
@@ -46,9 +46,9 @@ class Normalization:
 class PosedViews:
     """All views of a scene, sorted by name, before they are split.
 
-    stems: of each view that of its file, and the one that the poses give it. members: split name to indices of its
-    views, where the poses name splits themselves; else None. outputs: of nerfstudio's parser, for the scene box, the
-    transform and the seed points.
+    stems: of each view that of its file, the one that the poses give it, and its path below the folder of all files.
+    members: split name to indices of its views, where the poses name splits themselves; else None. outputs: of
+    nerfstudio's parser, for the scene box, the transform and the seed points.
     """
 
     images: list[Path]
@@ -89,7 +89,8 @@ def read_poses(poses: Poses, root: Path, normalization: Normalization) -> PosedV
             for split, part in zip(named, parts, strict=True)
         }
     images = [path.absolute() for path in _files(named_as, poses)]
-    stems = [{name.stem, image.stem} for name, image in zip(named_as, images, strict=True)]
+    names = zip(named_as, images, photo_names(images), strict=True)
+    stems = [{name.stem, image.stem, whole} for name, image, whole in names]
     return PosedViews(images, stems, cameras, members, parts[0])
 
 

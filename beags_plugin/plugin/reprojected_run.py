@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import torch
 
+from beags_plugin.core.filed_tensors import filed
 from beags_plugin.errors import UserError
 from beags_plugin.masks.classes import write_class_map
-from beags_plugin.masks.label_maps import LabelMaps
+from beags_plugin.masks.label_maps import LabelMaps, PackedMaps
 from beags_plugin.masks.pictures import Changed, before_and_after
 from beags_plugin.plugin.evaluate import raster_settings
 from beags_plugin.plugin.extract import read_scene
@@ -65,7 +66,7 @@ class ReprojectedRun:
     classes: dict[int, str]
     given: LabelMaps
     voted: LabelMaps
-    confidence: list[torch.Tensor]
+    confidence: PackedMaps
     seconds: float
 
     def changed(self, view: int) -> Changed:
@@ -104,7 +105,8 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     cameras, rasterizer = [view.camera for view in views], make_rasterizer(scene.config.model_config.rasterizer)
     with progress_bar("Rendering depth") as progress:
         surfels = scene.surfels().detach()
-        depths = render_depths(surfels, cameras, rasterizer, raster_settings(scene), config.depth, progress)
+        drawn = render_depths(surfels, cameras, rasterizer, raster_settings(scene), config.depth, progress)
+        depths = filed(drawn, surfels.means.device)
     with progress_bar("Reprojecting masks") as progress:
         masks = reprojected_masks(depths, cameras, given, known_classes(given, classes), config, progress)
     assert masks.confidence is not None

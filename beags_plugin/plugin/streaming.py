@@ -2,33 +2,13 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
-import numpy as np
-import torch
-from torch import Tensor
-
-from beags_plugin.masks.label_maps import narrowed
+from beags_plugin.masks.label_maps import PackedMap
 
 Load = Callable[[int], dict[str, Any]]
-
-
-class PackedMap:
-    """A class map [H, W] in the narrowest type and compressed: some kilobytes for a photo."""
-
-    def __init__(self, labels: Tensor) -> None:
-        narrow = narrowed(labels.detach().cpu())
-        array = narrow.contiguous().numpy()
-        self.shape, self.dtype = array.shape, array.dtype
-        self.packed = zlib.compress(array.tobytes(), level=1)
-
-    def unpacked(self) -> Tensor:
-        """[H, W], as ``label_maps.narrowed`` gave it."""
-        array = np.frombuffer(bytearray(zlib.decompress(self.packed)), self.dtype)
-        return torch.from_numpy(array.reshape(self.shape))
 
 
 class StreamedViews(Sequence[dict[str, Any]]):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from beags_plugin.core.class_ranks import ClassRanks
 from beags_plugin.core.processes import each_view
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.masks import REPROJECTIONS
-from beags_plugin.masks.label_maps import LabelMaps
+from beags_plugin.masks.label_maps import LabelMaps, PackedMaps
 from beags_plugin.rasterizers.drawing import geometry_inputs, surface_depth
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
 from beags_plugin.refiners.base import Progress
@@ -29,11 +29,12 @@ class ConsistentMasks:
 
     ranked: ranks of the classes, for the stages. labels: class ids, for the losses; the same maps where ids are ranks.
     confidence: per view [H, W] uint8, the winner's share of the votes in steps of 1/255; None: nothing was reprojected.
+    All are held compressed.
     """
 
     ranked: LabelMaps
     labels: LabelMaps
-    confidence: list[Tensor] | None
+    confidence: PackedMaps | None
 
 
 def masks_as_they_are(labels: LabelMaps, cameras: Sequence[Camera], known: ClassRanks) -> ConsistentMasks:
@@ -43,7 +44,7 @@ def masks_as_they_are(labels: LabelMaps, cameras: Sequence[Camera], known: Class
 
 
 def reprojected_masks(
-    depths: list[Tensor],
+    depths: Sequence[Tensor],
     cameras: Sequence[Camera],
     labels: LabelMaps,
     known: ClassRanks,
@@ -52,12 +53,12 @@ def reprojected_masks(
 ) -> ConsistentMasks:
     """The masks of all views, voted by those that vote.
 
-    depths: per view [H, W], of the surface. config: a ``preparation.PreparationConfig``. Of what the votes give, one
-    view is held at a time.
+    depths: per view [H, W], of the surface; they may lie on disk. config: a ``preparation.PreparationConfig``. Of what
+    the votes give, one view is held at a time.
     """
     given = translated(labels, known, known.ranks)
     votes = votes_of(given, config.voters)
-    ranked, consistent, confidence = LabelMaps(), LabelMaps(), []
+    ranked, consistent, confidence = LabelMaps(), LabelMaps(), PackedMaps()
     reproject = REPROJECTIONS.get(config.reprojection)
     found = reproject(depths, cameras, votes, len(known), tau=config.tau, progress=progress)
     for index, mask in enumerate(found):
@@ -103,16 +104,16 @@ def render_depths(
     settings: RasterSettings,
     depth: str,
     progress: Progress | None = None,
-) -> list[Tensor]:
-    """Per view [H, W], the depth of the surface: see ``rasterizers.drawing.surface_depth``."""
+) -> Iterator[Tensor]:
+    """Per view [H, W], the depth of the surface, drawn when it is asked for: see ``drawing.surface_depth``."""
 
+    @torch.no_grad()
     def render(index: int) -> Tensor:
         background = surfels.means.new_zeros(3)
         drawn = rasterizer.rasterize(geometry_inputs(surfels), cameras[index], settings, background)
         return surface_depth(drawn, depth)
 
-    with torch.no_grad():
-        return list(each_view(len(cameras), render, progress))
+    return each_view(len(cameras), render, progress)
 
 
 def _or_ignore(mask: Tensor | None, camera: Camera) -> Tensor:

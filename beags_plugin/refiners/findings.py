@@ -13,10 +13,12 @@ from beags_plugin.refiners.base import EditedScene
 
 def reprojection_finding(before: Sequence[Tensor | None], after: Sequence[Tensor]) -> str:
     """How much reprojection changed."""
-    known = [(old, new) for old, new in zip(before, after, strict=True) if old is not None]
-    changed = sum(int((old != new).sum()) for old, new in known)
-    pixels = sum(old.numel() for old, _ in known)
-    filled = len(before) - len(known)
+    changed = pixels = filled = 0
+    for old, new in zip(before, after, strict=True):  # they are held compressed: one view at a time
+        if old is None:
+            filled += 1
+        else:
+            changed, pixels = changed + int((old != new).sum()), pixels + old.numel()
     return (
         f"reprojection: {changed} of {pixels} labelled pixels changed ({100 * changed / max(pixels, 1):.2f} %), "
         f"{filled} views without a mask got one"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 
@@ -17,7 +17,7 @@ from beags_plugin.core.densification import Densified
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.masks import REPROJECTIONS
-from beags_plugin.masks.label_maps import LabelMaps
+from beags_plugin.masks.label_maps import LabelMaps, PackedMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.rasterizers.drawing import check_surface_depth
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
@@ -38,7 +38,7 @@ from beags_plugin.refiners.findings import (
     reprojection_finding,
     split_finding,
 )
-from beags_plugin.refiners.stage_forms import ASSIGNMENT, BANDS, DEPTHS, EDITED, GRID, MASKS
+from beags_plugin.refiners.stage_forms import ASSIGNMENT, BANDS, EDITED, GRID, MASKS
 from beags_plugin.refiners.stages import Stages, StageStore
 
 LEAST_K = 10  # nearer neighbours tell the noise of the depth rather than the distance of points
@@ -108,9 +108,9 @@ class PreparationConfig:
 class Preparation:
     """What the stages made.
 
-    labels: per training view [H, W] int32, M'; held in the narrowest type.
-    confidence: per training view [H, W] uint8, share of the winning votes times 255; None where nothing was
-        reprojected.
+    labels: per training view [H, W] int32, M'; held in the narrowest type, compressed.
+    confidence: per training view [H, W] uint8, share of the winning votes times 255, held compressed; None where
+        nothing was reprojected.
     assignment: the class of every surfel and its margin.
     edited: the scene and the classes that refinement starts from, where surfels were removed or split; None where it
         starts from the base.
@@ -120,7 +120,7 @@ class Preparation:
     """
 
     labels: LabelMaps
-    confidence: list[Tensor] | None
+    confidence: PackedMaps | None
     assignment: Assignment
     grid: VisibilityGrid | None
     edited: EditedScene | None = None
@@ -148,11 +148,13 @@ def prepare(
 
     surfels: the trained base, N surfels.
     cameras: V training views; labels: per view [H, W] int32 class ids or IGNORE, None where there is no mask; held in
-        the narrowest type, as ``LabelMaps`` already are.
+        the narrowest type and compressed, as ``LabelMaps`` already are.
     class_names: id to name, background (0) included; ids may lie far apart: the stages work on their ranks.
     background_voxels: whether a loss will ask the grid about the background; if none will, those voxels are not kept.
     store: where finished stages are kept, and taken from if nothing that they depend on has changed; code: a digest of
         the program, on which all of them depend.
+    What is as large as the photos lies in temporary files: memory grows with the views by compressed masks, and by
+    what the voxels of the scene take. "pairwise" alone reads depth and masks of all views into memory.
     Raises ``UserError`` if no view has a mask or no mask names an object.
     """
     maps = labels if isinstance(labels, LabelMaps) else LabelMaps(labels)
@@ -249,12 +251,12 @@ def _consistent_masks(
     depth_key = stages.key("depth", config.depth)
     key = stages.key("reprojection", *options, reproject)
 
-    def rendered() -> list[Tensor]:
+    def rendered() -> Iterator[Tensor]:
         with stage("Rendering depth") as progress:
-            return render_depths(surfels, cameras, rasterizer, settings, config.depth, progress)
+            yield from render_depths(surfels, cameras, rasterizer, settings, config.depth, progress)
 
     def reprojected() -> ConsistentMasks:
-        depths = stages.run("depth", depth_key, rendered, DEPTHS)
+        depths = stages.run_filed("depth", depth_key, rendered, surfels.means.device)
         with stage("Reprojecting masks") as progress:
             return reprojected_masks(depths, cameras, maps, known, config, progress)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from beags_plugin.assignment.assignment import Assignment
 from beags_plugin.core.densification import Densified
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.masks.label_maps import LabelMaps
+from beags_plugin.masks.label_maps import LabelMaps, PackedMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.refiners.base import EditedScene
 from beags_plugin.refiners.consistent_masks import ConsistentMasks
@@ -37,7 +37,8 @@ def _expanded(data: Tensor) -> Tensor:
 
 
 def _pack_maps(maps: LabelMaps) -> list[Tensor]:
-    return [_compressed(image) for image in maps.stored if image is not None]  # every view has one by now
+    images = (maps.narrow(index) for index in range(len(maps)))
+    return [_compressed(image) for image in images if image is not None]  # every view has one by now
 
 
 def _unpack_maps(packed: list[Tensor]) -> LabelMaps:
@@ -56,7 +57,8 @@ def _pack_masks(masks: ConsistentMasks) -> dict[str, Any]:
 def _unpack_masks(packed: dict[str, Any]) -> ConsistentMasks:
     ranked, confidence = _unpack_maps(packed["ranked"]), packed["confidence"]
     labels = ranked if packed["labels"] is None else _unpack_maps(packed["labels"])
-    return ConsistentMasks(ranked, labels, None if confidence is None else [_expanded(data) for data in confidence])
+    shares = None if confidence is None else PackedMaps(_expanded(data) for data in confidence)
+    return ConsistentMasks(ranked, labels, shares)
 
 
 def _pack_edited(scene: EditedScene) -> dict[str, Any]:
@@ -83,8 +85,6 @@ def _unpack_bands(packed: dict[str, Any]) -> tuple[Surfels | None, float]:
     return None if packed["surfels"] is None else Surfels(**packed["surfels"]), packed["change"]
 
 
-DEPTHS: Form[list[Tensor]] = Form(list, list)
-"""[H, W] of every view."""
 MASKS = Form(_pack_masks, _unpack_masks)
 ASSIGNMENT = Form(_tensors, lambda packed: Assignment(**packed))
 EDITED = Form(_pack_edited, _unpack_edited)

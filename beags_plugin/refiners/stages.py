@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import torch
+from torch import Tensor
 
+from beags_plugin.core.filed_tensors import FiledTensors, filed, write_tensors
+from beags_plugin.core.processes import is_first
 from beags_plugin.digests import input_digest
 from beags_plugin.whole_files import write_whole
 
-FORMAT = 1
+FORMAT = 2
 """Of the files below; another number makes every stage be done again."""
 
 T = TypeVar("T")
@@ -20,6 +24,8 @@ T = TypeVar("T")
 
 class StageStore:
     """Results of stages: files ``<name>-<digest>.pt`` in ``folder``, one for each name; whole ones only.
+
+    Tensors too large for memory lie in ``<name>-<digest>.npz``.
 
     former: folders of runs that this one goes on from, looked into too, but not written to.
     """
@@ -43,18 +49,37 @@ class StageStore:
         """Keep the stage's content (tensors and plain values) in place of what was there of it."""
         path = _file(self.folder, name, digest)
         write_whole(path, lambda file: torch.save(content, file))
-        for other in self.folder.glob(f"{name}-*.pt"):
-            if other != path:
-                other.unlink()
+        self._remove_but(path, name)
+
+    def kept_tensors(self, name: str, digest: str, device: torch.device | str) -> FiledTensors | None:
+        """What was kept of the stage by ``keep_tensors``; None if it is not there or cannot be read."""
+        for folder in (self.folder, *self.former):
+            with suppress(OSError, ValueError):
+                return FiledTensors(_file(folder, name, digest, ".npz"), device)
+        return None
+
+    def keep_tensors(
+        self, name: str, digest: str, tensors: Iterable[Tensor], device: torch.device | str
+    ) -> FiledTensors:
+        """Keep tensors, one by one as they come, in place of what was there of the stage; read them from there."""
+        path = _file(self.folder, name, digest, ".npz")
+        write_whole(path, lambda file: write_tensors(file, tensors))
+        self._remove_but(path, name)
+        return FiledTensors(path, device)
 
     def drop(self, name: str) -> None:
         """Forget the stage."""
-        for path in self.folder.glob(f"{name}-*.pt"):
-            path.unlink()
+        self._remove_but(None, name)
+
+    def _remove_but(self, kept: Path | None, name: str) -> None:
+        for suffix in (".pt", ".npz"):
+            for other in self.folder.glob(f"{name}-*{suffix}"):
+                if other != kept:
+                    other.unlink()
 
 
-def _file(folder: Path, name: str, digest: str) -> Path:
-    return folder / f"{name}-{digest[:24]}.pt"
+def _file(folder: Path, name: str, digest: str, suffix: str = ".pt") -> Path:
+    return folder / f"{name}-{digest[:24]}{suffix}"
 
 
 class Form(Generic[T]):
@@ -101,6 +126,29 @@ class Stages:
             self._aside += time.perf_counter() - start
         return found
 
+    def run_filed(
+        self, name: str, key: str, compute: Callable[[], Iterable[Tensor]], device: torch.device | str
+    ) -> Sequence[Tensor]:
+        """The stage's tensors, which never are in memory together: in the store, or without one in a temporary file.
+
+        compute: gives them one by one. device: where those that are asked for are put.
+        """
+        start = time.perf_counter()
+
+        def timed() -> Iterator[Tensor]:
+            yield from compute()
+            self.seconds[name] = time.perf_counter() - start
+            yield torch.tensor(self.seconds[name], dtype=torch.float64)  # the last one: what the stage took
+
+        if self.store is not None and (kept := self.store.kept_tensors(name, key, device)) is not None:
+            self._reused.add(name)
+            self.seconds[name] = float(kept[-1])
+            self._aside += time.perf_counter() - start - self.seconds[name]
+            return _AllButLast(kept)
+        if self.store is None or not is_first():  # of several processes, one writes to the run's folder
+            return _AllButLast(filed(timed(), device))
+        return _AllButLast(self.store.keep_tensors(name, key, timed(), device))
+
     def drop(self, name: str) -> None:
         """Forget a stage that nothing asks for again; its seconds are part of another's."""
         self.seconds.pop(name, None)
@@ -110,3 +158,17 @@ class Stages:
     def found(self, name: str, finding: str) -> None:
         """Note a line for a reader."""
         self.findings.append(f"{finding} (kept from before)" if name in self._reused else finding)
+
+
+class _AllButLast(Sequence[Tensor]):
+    """A sequence without its last item, which is not copied."""
+
+    def __init__(self, whole: Sequence[Tensor]) -> None:
+        self._whole = whole
+
+    def __len__(self) -> int:
+        return len(self._whole) - 1
+
+    def __getitem__(self, index: int | slice) -> Any:
+        chosen = range(len(self))[index]
+        return self._whole[chosen] if isinstance(chosen, int) else [self._whole[each] for each in chosen]

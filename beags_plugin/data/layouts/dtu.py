@@ -16,6 +16,7 @@ from beags_plugin.errors import UserError
 FILE = "cameras_sphere.npz"
 IMAGES = ("image", "images")
 LARGEST_SKEW = 1.0  # pixels; the rasterizers know none
+OFF_CENTRE = 0.2  # of the image's sides: the principal point of no camera lies farther from the middle
 
 
 class Dtu(Layout):
@@ -83,6 +84,13 @@ def read_cameras(
         intrinsics.append(K)
         poses.append(np.concatenate([rotation.T * [1.0, -1.0, -1.0], center[:, None]], axis=1))
     sizes = np.array([image_size(image) for image in images], np.int64)
+    for image, K, size in zip(images, intrinsics, sizes, strict=True):
+        if (np.abs(K[:2, 2] / size - 0.5) > OFF_CENTRE).any():  # the file does not say how large its images were
+            raise UserError(
+                f"{file} has the principal point of {image} at {K[0, 2]:.0f}, {K[1, 2]:.0f}, far from the middle of "
+                f"its {size[0]}x{size[1]} pixels: keep the images that the file is of in {image.parent}, and name the "
+                "folder of smaller copies with --images-path."
+            )
     return np.stack(poses), np.stack(intrinsics), sizes
 
 

@@ -7,23 +7,23 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from beags_plugin.masks.check.consistency import Agreement
-from beags_plugin.masks.check.files import Coverage
-from beags_plugin.masks.check.findings import Finding, named, percent
+from beags_plugin.masks.check.files import Coverage, MaskFiles
+from beags_plugin.masks.check.findings import Finding, percent
 
 
 def views_against_others(
-    agreement: Agreement, stems: Sequence[str], coverage: Coverage, names: Mapping[int, str]
+    agreement: Agreement, files: MaskFiles, coverage: Coverage, names: Mapping[int, str]
 ) -> list[Finding]:
     """The findings of ``agreement`` in words; its ranks are places in ``coverage.ids``."""
     titles = [f"{i} ({names[i]})" for i in coverage.ids]
     return [
-        *_renamed(agreement, stems, coverage, titles),
-        *_twins(agreement, coverage, titles),
-        *_lost(agreement, stems, coverage, titles),
+        *_renamed(agreement, files, coverage, titles),
+        *_twins(agreement, files, coverage, titles),
+        *_lost(agreement, files, coverage, titles),
     ]
 
 
-def _renamed(agreement: Agreement, stems: Sequence[str], coverage: Coverage, titles: Sequence[str]) -> list[Finding]:
+def _renamed(agreement: Agreement, files: MaskFiles, coverage: Coverage, titles: Sequence[str]) -> list[Finding]:
     groups: dict[tuple[tuple[int, int], ...], list[int]] = {}
     for found in agreement.renamed():
         groups.setdefault(tuple(sorted(found.instead.items())), []).append(found.view)
@@ -37,17 +37,17 @@ def _renamed(agreement: Agreement, stems: Sequence[str], coverage: Coverage, tit
             Finding(
                 "warning",
                 "inverted" if inverted else "swapped ids",
-                f"{len(views)} views ({named([stems[view] for view in views])}) say {says}, against the other views: "
+                f"{len(views)} masks ({files.paths(views)}) say {says}, against the other views: "
                 + ("invert these masks." if inverted else "give these objects the ids of the other views."),
                 f"{wrong} pixels ({percent(wrong, all_of)} of these ids) vote for the wrong object; reprojection "
                 "outvotes single views, but not many",
-                tuple(stems[view] for view in views),
+                tuple(files.stems[view] for view in views),
             )
         )
     return findings
 
 
-def _twins(agreement: Agreement, coverage: Coverage, titles: Sequence[str]) -> list[Finding]:
+def _twins(agreement: Agreement, files: MaskFiles, coverage: Coverage, titles: Sequence[str]) -> list[Finding]:
     findings = []
     for twins in agreement.twins(coverage.pixels > 0):
         both = [int((coverage.pixels[:, rank] > 0).sum()) for rank in (twins.first, twins.second)]
@@ -56,7 +56,7 @@ def _twins(agreement: Agreement, coverage: Coverage, titles: Sequence[str]) -> l
                 "warning",
                 "two ids",
                 f"ids {titles[twins.first]} ({both[0]} views) and {titles[twins.second]} ({both[1]} views) are never "
-                "in one view but in the same place: if they are one object, give it one id.",
+                f"in one mask of {files.folder} but in the same place: if they are one object, give it one id.",
                 f"each id has {percent(min(both), sum(both))} to {percent(max(both), sum(both))} of the object's "
                 "views: its Gaussians go to the one or the other, and neither is extracted whole",
             )
@@ -64,7 +64,7 @@ def _twins(agreement: Agreement, coverage: Coverage, titles: Sequence[str]) -> l
     return findings
 
 
-def _lost(agreement: Agreement, stems: Sequence[str], coverage: Coverage, titles: Sequence[str]) -> list[Finding]:
+def _lost(agreement: Agreement, files: MaskFiles, coverage: Coverage, titles: Sequence[str]) -> list[Finding]:
     groups: dict[int, list[int]] = {}
     for found in agreement.lost():
         groups.setdefault(found.class_rank, []).append(found.view)
@@ -76,11 +76,11 @@ def _lost(agreement: Agreement, stems: Sequence[str], coverage: Coverage, titles
             Finding(
                 "note",
                 "absent",
-                f"{titles[rank]} is absent from {len(views)} views ({named([stems[view] for view in views])}), though "
+                f"{titles[rank]} is absent from {len(views)} masks ({files.paths(views)}), though "
                 "it lies in their image: fine if something hides it, else mask it there.",
                 f"if it shows, about {len(views) * usual} pixels vote for the background "
                 f"({percent(len(views), int((areas > 0).sum()) + len(views))} of its views)",
-                tuple(stems[view] for view in views),
+                tuple(files.stems[view] for view in views),
             )
         )
     return findings

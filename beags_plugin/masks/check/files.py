@@ -24,9 +24,10 @@ LARGE_IGNORE = 0.2  # share of unlabelled pixels that is worth a word
 class MaskFiles:
     """The views of a scene and the mask of each.
 
-    stems: of the V images; sizes: (width, height) of their files; masks: file or None. folder: where masks are looked
-    for. kind, ignore_ids: see ``masks.classes.read_mask``. trained: whether each view is trained on. names: id to name
-    where the user or the layout gave names, else None; names_file: where they stand.
+    stems: names of the V images (``data.files.photo_names``); sizes: (width, height) of their files; masks: file or
+    None. folder: where masks are looked for. kind, ignore_ids: see ``masks.classes.read_mask``. trained: whether each
+    view is trained on. names: id to name where the user or the layout gave names, else None; names_file: where they
+    stand.
     """
 
     stems: Sequence[str]
@@ -43,6 +44,16 @@ class MaskFiles:
         """[H, W] uint16 class ids or IGNORE of a view; None without a mask; ``UserError`` if it cannot be read."""
         path = self.masks[view]
         return None if path is None else read_mask(path, self.kind, self.ignore_ids)
+
+    def paths(self, views: Sequence[int]) -> str:
+        """The masks of some views for a message: the first by its path, others by what follows the folder."""
+        found = [path for view in views if (path := self.masks[view]) is not None]
+        return named(
+            [
+                path.relative_to(self.folder) if i and path.is_relative_to(self.folder) else path
+                for i, path in enumerate(found)
+            ]
+        )
 
 
 @dataclass
@@ -227,7 +238,7 @@ def _few_views(files: MaskFiles, coverage: Coverage, few_views: int) -> list[Fin
             continue
         name = (files.names or {}).get(class_id, f"class_{class_id}")
         pixels = int(coverage.pixels[present, column].sum())
-        where = named([files.stems[view] for view in np.flatnonzero(present)]) or "only held-out views"
+        where = files.paths([int(view) for view in np.flatnonzero(present)]) or "only held-out views"
         findings.append(
             Finding(
                 "warning",
@@ -245,13 +256,13 @@ def _unlabelled(files: MaskFiles, coverage: Coverage) -> list[Finding]:
     total, ignored = int(coverage.size.sum()), int(coverage.ignored.sum())
     if not total or ignored / total < LARGE_IGNORE:
         return []
-    most = [files.stems[view] for view in np.argsort(-coverage.ignored, kind="stable")]
+    most = [int(view) for view in np.argsort(-coverage.ignored, kind="stable") if coverage.ignored[view]]
     return [
         Finding(
             "note",
             "unlabelled",
-            f"{percent(ignored, total)} of the masks' pixels are unlabelled, most in {named(most, 3)}: fine if nobody "
-            "knows what is there, else label them (background is 0).",
+            f"{percent(ignored, total)} of the masks' pixels are unlabelled, most in {files.paths(most[:3])}: fine if "
+            "nobody knows what is there, else label them (background is 0).",
             f"{ignored} pixels do not vote, and boundary and silhouette loss do not look at them",
         )
     ]

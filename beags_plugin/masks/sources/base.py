@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, Protocol
 
@@ -13,15 +14,17 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.errors import UserError
+from beags_plugin.masks.sources.matching import PhotoNames
 
 Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
 class Photo:
-    """One view: the stem of its image, the file, and its width and height in pixels; trained: not held out."""
+    """One view: its name (see ``data.files.photo_names``), the file, and its width and height in pixels; trained: not
+    held out."""
 
-    stem: str
+    name: str
     path: Path
     width: int
     height: int
@@ -32,11 +35,11 @@ class Photo:
         from PIL import Image
 
         with Image.open(self.path) as image:
-            return np.asarray(image.convert("RGB"))
+            return np.array(image.convert("RGB"))  # a copy: torch wants memory that can be written to
 
 
 class Geometry(Protocol):
-    """The scene's own shape, from a trained run: of its training views, without lens distortion."""
+    """The scene's own shape, from a trained run: of its views, held-out ones included, without lens distortion."""
 
     @property
     def images(self) -> Sequence[Path]:
@@ -69,12 +72,17 @@ class SourceScene:
     photos: Sequence[Photo]
     geometry: Geometry | None = None
 
-    def index_of(self, stem: str, whose: str) -> int:
-        """The place of the view of this stem (or file name); ``whose`` says in the error where it was named."""
-        for index, photo in enumerate(self.photos):
-            if stem in (photo.stem, photo.path.name):
-                return index
-        raise UserError(f"{whose} names the view {stem!r}, but no image of {self.root} is called so: correct it.")
+    @cached_property
+    def names(self) -> PhotoNames:
+        """What the photos are called."""
+        return PhotoNames([photo.name for photo in self.photos])
+
+    def index_of(self, name: str, whose: str) -> int:
+        """The place of the view that ``name`` means; ``whose`` says in the error where it was named."""
+        found = self.names.find(name, whose)
+        if found is None:
+            raise UserError(f"{whose} names the view {name!r}, but no image of {self.root} is called so: correct it.")
+        return found
 
     def places(self) -> list[int]:
         """Of each view of ``geometry`` its place among the photos; ``UserError`` if it is of another scene."""
@@ -98,12 +106,14 @@ class SourceScene:
 class MadeMasks:
     """Class names by id, and one class map [H, W] uint16 per photo in their order; None: no mask for that view.
 
-    notes: sentences to tell the user, filled while the maps are made.
+    notes: sentences to tell the user, filled while the maps are made. to_look_at: places of photos whose maps are
+    neither to be trained on nor to be scored against.
     """
 
     names: Mapping[int, str]
     maps: Iterator[np.ndarray | None]
     notes: list[str]
+    to_look_at: frozenset[int] = frozenset()
 
 
 class MaskSource(ABC):

@@ -33,14 +33,17 @@ class CocoSource(MaskSource):
         path = scene.below(self.file)
         try:
             content = json.loads(path.read_text("utf8"))
-            stems = {image["id"]: Path(image["file_name"]).stem for image in content["images"]}
+            views = {image["id"]: str(image["file_name"]) for image in content["images"]}
             categories = {entry["id"]: str(entry["name"]) for entry in content.get("categories", [])}
-            annotations = [(stems[entry["image_id"]], self._key(entry), entry) for entry in content["annotations"]]
+            annotations = [(views[entry["image_id"]], self._key(entry), entry) for entry in content["annotations"]]
         except OSError as error:
             raise UserError(f"{path} cannot be read ({error.strerror}): give options file=...") from error
         except (AttributeError, ValueError, KeyError, TypeError) as error:
             raise UserError(f"{path} is no COCO JSON with images and annotations: {error!r}.") from error
-        if not {photo.stem for photo in scene.photos} & {stem for stem, _, _ in annotations}:
+        meant = scene.names.assigned(
+            {name: name for name in views.values()}, lambda name: f"the image {name} of {path}"
+        )
+        if not set(meant.values()) & {view for view, _, _ in annotations}:
             raise UserError(f"{path} annotates no image of {scene.root}: its file_name must be theirs.")
         # a file may mix numbers and words: numbers come first
         keys = sorted({key for _, key, _ in annotations}, key=lambda key: [(isinstance(k, str), k) for k in key])
@@ -48,17 +51,17 @@ class CocoSource(MaskSource):
             raise UserError(f"{path} has {len(keys)} objects: only {IGNORE - 1} ids can be saved.")
         ids = {key: index for index, key in enumerate(keys, 1)}
         of_view: dict[str, list[tuple[int, Any]]] = defaultdict(list)
-        for stem, key, entry in annotations:
-            of_view[stem].append((ids[key], entry.get("segmentation")))
-        annotated = set(stems.values())
+        for view, key, entry in annotations:
+            of_view[view].append((ids[key], entry.get("segmentation")))
+        annotated = {scene.photos[index].name: view for index, view in meant.items()}
 
         def read(photo: Photo) -> np.ndarray | None:
-            if photo.stem not in annotated:
+            if photo.name not in annotated:
                 return None
             shape = (photo.height, photo.width)
             whole: dict[int, np.ndarray] = {}  # an object may be annotated in pieces
-            for class_id, segmentation in of_view[photo.stem]:
-                mask = decoded(segmentation, shape, f"{path}, image {photo.stem}")
+            for class_id, segmentation in of_view[annotated[photo.name]]:
+                mask = decoded(segmentation, shape, f"{path}, image {photo.name}")
                 whole[class_id] = whole.get(class_id, False) | mask
             return stacked(list(whole.items()), shape)
 

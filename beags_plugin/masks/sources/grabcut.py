@@ -31,7 +31,8 @@ class GrabCutSource(MaskSource):
     to them as a start, and GrabCut draws the outline there.
 
     prompts: JSON, see ``prompts.read_prompts``. rounds: of carrying; from the second on all views vote, not only the
-    prompted ones. tau: a vote counts if |z - depth| <= tau z.
+    prompted ones. tau: a vote counts if |z - depth| <= tau z. held_out: masks of held-out views too, drawn in the last
+    round, which never vote: to look at, as nothing that a program drew is a truth to score against.
     """
 
     needs_run: ClassVar[bool] = True
@@ -39,18 +40,21 @@ class GrabCutSource(MaskSource):
     prompts: Path = Path("prompts.json")
     rounds: int = 2
     tau: float = 0.02
+    held_out: bool = False
 
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
         assert scene.geometry is not None
         path = scene.below(self.prompts)
         objects = read_prompts(path)
         places = scene.places()
+        trained = {view for view in places if scene.photos[view].trained}
         drawn = self._prompted(scene, objects, path)
-        if held_out := sorted(scene.photos[view].stem for view in drawn if view not in places):
+        if held_out := sorted(scene.photos[view].name for view in drawn if view not in trained):
             raise UserError(f"{path} has prompts in {held_out[0]}, which is held out: prompt a training view.")
         names = {0: "background", **{one.class_id: one.name for one in objects}}
         ids = sorted(one.class_id for one in objects)
-        return MadeMasks(names, self._carried(scene, places, drawn, ids, progress), [])
+        maps = self._carried(scene, places, trained, drawn, ids, progress)
+        return MadeMasks(names, maps, [], frozenset(places) - trained if self.held_out else frozenset())
 
     def _prompted(self, scene: SourceScene, objects: Sequence[PromptedObject], path: Path) -> dict[int, np.ndarray]:
         """Place of a photo to its class map, of the prompted views; each must show all objects that are in it."""
@@ -72,44 +76,51 @@ class GrabCutSource(MaskSource):
         self,
         scene: SourceScene,
         places: Sequence[int],
+        trained: set[int],
         drawn: dict[int, np.ndarray],
         ids: list[int],
         progress: Progress,
     ) -> Iterator[np.ndarray | None]:
         geometry = scene.geometry
         assert geometry is not None
-        total = len(places) * max(1, self.rounds)
-        maps = dict(drawn)
-        for number in range(max(1, self.rounds)):
-            carried = carry(geometry, [maps.get(view) for view in places], ids, self.tau)
-            for index, (view, (labels, sure)) in enumerate(zip(places, carried, strict=True)):
+        rounds, maps, done = max(1, self.rounds), dict(drawn), 0
+        own = [index for index, view in enumerate(places) if view in trained]
+        others = [index for index, view in enumerate(places) if self.held_out and view not in trained]
+        total = len(own) * rounds + len(others)
+        for number in range(rounds):
+            chosen = own + others if number == rounds - 1 else own
+            carried = carry(geometry, chosen, [maps.get(places[index]) for index in chosen], ids, self.tau)
+            for index, (labels, sure) in zip(chosen, carried, strict=True):
+                view = places[index]
                 if view not in drawn:
                     start = geometry.to_photo(np.where(sure, labels, IGNORE).astype(np.uint16), index)
                     maps[view] = cut_from_labels(scene.photos[view].pixels(), start, ids)
-                progress(number * len(places) + index + 1, total)
+                progress(done := done + 1, total)
         for view in range(len(scene.photos)):
             yield maps.get(view)
 
 
 def carry(
-    geometry: Geometry, maps: Sequence[np.ndarray | None], ids: Sequence[int], tau: float
+    geometry: Geometry, views: Sequence[int], maps: Sequence[np.ndarray | None], ids: Sequence[int], tau: float
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Of each view of ``geometry`` what the class maps of others (of the photographs; None: none) say there.
+    """Of each of some views of ``geometry`` what the class maps of the others say there.
 
+    maps: of ``views``, as their photographs; None: none.
     Returns per view labels [h, w] uint16 and [h, w] bool, whether more than half of the votes agree; both without
     distortion.
     """
     known = ClassRanks(torch.tensor([0, *ids]))
     straight = LabelMaps()
-    for view, class_map in enumerate(maps):
+    for view, class_map in zip(views, maps, strict=True):
         ranks = None
         if class_map is not None:
             labels = torch.from_numpy(geometry.to_straight(class_map, view).astype(np.int32))
             ranks = torch.where(labels == IGNORE, labels, known.ranks(labels.masked_fill(labels == IGNORE, 0)))
         straight.append(ranks)
-    depths = [geometry.depth(view) for view in range(len(maps))]
+    depths = [geometry.depth(view) for view in views]
+    cameras = [geometry.cameras[view] for view in views]
     found = []
-    for voted in reproject_pairwise(depths, geometry.cameras, straight, len(known), tau=tau):
+    for voted in reproject_pairwise(depths, cameras, straight, len(known), tau=tau):
         labels = voted.labels
         back = known.class_ids(labels.masked_fill(labels == IGNORE, 0)).masked_fill(labels == IGNORE, IGNORE)
         found.append((back.numpy().astype(np.uint16), (voted.confidence > 0.5).numpy()))

@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from beags_plugin.data.files import list_images
 from beags_plugin.errors import UserError
 from beags_plugin.masks.classes import read_class_map, read_classes
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo
+from beags_plugin.masks.sources.matching import files_by_name
 from beags_plugin.rasterizers.interface import IGNORE
 
 
 @dataclass(frozen=True)
 class IdImagesSource(MaskSource):
-    """Images of ids, called <stem>.png: grey or palette; or of colours, each of which becomes an id.
+    """Images of ids, called as the photos, with their folders: grey or palette; or of colours, each an id.
 
     folder: with the images. names: JSON {"id": "name"}, or None. colors: take colour images; black is the background,
     other colours get ids 1, 2, ... in the order in which they first come. ignore_ids: ids that mean "not labelled".
@@ -32,23 +32,24 @@ class IdImagesSource(MaskSource):
 
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
         folder = scene.below(self.folder)
-        files = {path.stem: path for path in list_images(folder)}
-        if not any(photo.stem in files for photo in scene.photos):
+        of_photo = scene.names.assigned(files_by_name(folder), str)
+        files = {scene.photos[index].name: path for index, path in of_photo.items()}
+        if not files:
             raise UserError(f"{folder} holds no image named as one of the scene's: give options folder=...")
         palette: dict[int, int] = {}
         views: Counter[int] = Counter()
         for photo in scene.photos:
-            if photo.stem in files:
-                found = np.unique(self._ids(files[photo.stem], palette))
+            if photo.name in files:
+                found = np.unique(self._ids(files[photo.name], palette))
                 views.update(int(i) for i in found if i not in (0, IGNORE))
         kept = {i for i, count in views.items() if count >= self.least_views}
         names = read_classes(None if self.names is None else scene.below(self.names), sorted(kept))
         notes = [f"{len(views) - len(kept)} ids in fewer than {self.least_views} views became background."]
 
         def read(photo: Photo) -> np.ndarray | None:
-            if photo.stem not in files:
+            if photo.name not in files:
                 return None
-            ids = self._ids(files[photo.stem], palette)
+            ids = self._ids(files[photo.name], palette)
             ids[~np.isin(ids, [*kept, 0, IGNORE])] = 0
             return ids
 

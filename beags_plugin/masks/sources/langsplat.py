@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -10,6 +11,7 @@ import numpy as np
 
 from beags_plugin.errors import UserError
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo
+from beags_plugin.masks.sources.matching import files_by_name
 from beags_plugin.rasterizers.interface import IGNORE
 
 LEVELS = ("default", "small", "medium", "large")
@@ -31,10 +33,11 @@ class LangSplatSource(MaskSource):
 
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
         folder = scene.below(self.folder)
-        having = [photo for photo in scene.photos if (folder / f"{photo.stem}_s.npy").is_file()]
-        if not having:
+        files = scene.names.assigned(files_by_name(folder, ("_s.npy",)), str)
+        segments_of = {scene.photos[index].name: path for index, path in files.items()}
+        if not segments_of:
             raise UserError(f"{folder} holds no <stem>_s.npy for an image of the scene: give options folder=...")
-        tables = self._objects(having, folder)
+        tables = self._objects(segments_of)
         objects = sorted({int(i) for table in tables.values() for i in table.values()})
         if len(objects) > IGNORE - 1:
             raise UserError(
@@ -43,37 +46,37 @@ class LangSplatSource(MaskSource):
         ids = {i: index for index, i in enumerate(objects, 1)}
 
         def read(photo: Photo) -> np.ndarray | None:
-            if photo.stem not in tables:
+            if photo.name not in tables:
                 return None
-            segments = self._segments(folder, photo.stem)
+            segments = self._segments(segments_of[photo.name])
             class_map = np.full(segments.shape, 0, np.uint16)
             class_map[segments < 0] = IGNORE
-            for segment, found in tables[photo.stem].items():
+            for segment, found in tables[photo.name].items():
                 class_map[segments == segment] = ids[found]
             return class_map
 
         names = {0: "background", **{index: f"object_{index}" for index in ids.values()}}
         return MadeMasks(names, per_photo(scene, progress, read), [])
 
-    def _segments(self, folder: Path, stem: str) -> np.ndarray:
-        path = folder / f"{stem}_s.npy"
+    def _segments(self, path: Path) -> np.ndarray:
         maps = _array(path)
         if maps.ndim != 3 or len(maps) != len(LEVELS):
             raise UserError(f"{path} is {list(maps.shape)}, not [4, H, W]: give LangSplat's own files.")
         return maps[LEVELS.index(self.level)].astype(np.int64)
 
-    def _objects(self, photos: list[Photo], folder: Path) -> dict[str, dict[int, int]]:
-        """Per stem, segment to object, without objects in few views."""
+    def _objects(self, files: Mapping[str, Path]) -> dict[str, dict[int, int]]:
+        """Per photo's name, segment to object, without objects in few views. files: of the segments, by that name."""
         means: list[np.ndarray] = []  # sums of unit features
         views: list[set[str]] = []
         tables: dict[str, dict[int, int]] = {}
-        for photo in photos:
-            features = self._features(folder, photo.stem)
-            segments = np.unique(self._segments(folder, photo.stem))
-            tables[photo.stem] = {}
+        for name, path in files.items():
+            file = path.with_name(path.name[: -len("_s.npy")] + "_f.npy")
+            features = self._features(file)
+            segments = np.unique(self._segments(path))
+            tables[name] = {}
             for segment in segments[segments >= 0].tolist():
                 if segment >= len(features):
-                    raise UserError(f"{folder / photo.stem}_f.npy has no row for segment {segment}: make it again.")
+                    raise UserError(f"{file} has no row for segment {segment}: make it again.")
                 own = features[segment]
                 alike = [float(own @ mean) / float(np.linalg.norm(mean)) for mean in means]
                 best = int(np.argmax(alike)) if alike else -1
@@ -82,16 +85,15 @@ class LangSplatSource(MaskSource):
                     means.append(np.zeros_like(own))
                     views.append(set())
                 means[best] = means[best] + own
-                views[best].add(photo.stem)
-                tables[photo.stem][segment] = best
+                views[best].add(name)
+                tables[name][segment] = best
         return {
-            stem: {segment: i for segment, i in table.items() if len(views[i]) >= self.least_views}
-            for stem, table in tables.items()
+            name: {segment: i for segment, i in table.items() if len(views[i]) >= self.least_views}
+            for name, table in tables.items()
         }
 
     @staticmethod
-    def _features(folder: Path, stem: str) -> np.ndarray:
-        path = folder / f"{stem}_f.npy"
+    def _features(path: Path) -> np.ndarray:
         if not path.is_file():
             raise UserError(f"{path} is missing: without features, segments of two views cannot be matched.")
         features = _array(path).astype(np.float64)

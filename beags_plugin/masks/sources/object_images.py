@@ -8,16 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
-from beags_plugin.data.files import list_images
 from beags_plugin.errors import UserError
 from beags_plugin.masks.classes import read_binary_mask
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo, stacked
+from beags_plugin.masks.sources.matching import files_by_name
 
 
 @dataclass(frozen=True)
 class ObjectImagesSource(MaskSource):
     """One image per object and view: <folder>/<object>/<stem>.png, or <folder>/<stem>/<object>.png.
 
+    Views are called as the photos, with the folders that these are in, if there are any.
     folder: of them. Where masks overlap, the smaller object is seen. A view without any image has no mask.
     """
 
@@ -25,14 +26,7 @@ class ObjectImagesSource(MaskSource):
 
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
         folder = scene.below(self.folder)
-        stems = {photo.stem for photo in scene.photos}
-        found: dict[tuple[str, str], Path] = {}  # (object, stem)
-        for inner in sorted(path for path in folder.glob("*") if path.is_dir()):
-            for path in list_images(inner):
-                if path.stem in stems:
-                    found[inner.name, path.stem] = path
-                elif inner.name in stems:
-                    found[path.stem, inner.name] = path
+        found = self._found(scene, folder)
         if not found:
             raise UserError(
                 f"{folder} holds neither <object>/<stem>.png nor <stem>/<object>.png for an image of the scene: "
@@ -42,10 +36,27 @@ class ObjectImagesSource(MaskSource):
         ids = {name: index for index, name in enumerate(objects, 1)}
 
         def read(photo: Photo) -> np.ndarray | None:
-            files = [(ids[name], found[name, photo.stem]) for name in objects if (name, photo.stem) in found]
+            files = [(ids[name], found[name, photo.name]) for name in objects if (name, photo.name) in found]
             return self._stack(files) if files else None
 
         return MadeMasks(named_objects(objects), per_photo(scene, progress, read), [])
+
+    @staticmethod
+    def _found(scene: SourceScene, folder: Path) -> dict[tuple[str, str], Path]:
+        """(object, name of a photo) to the file: the object is the first part of a path, or else the last."""
+        named: dict[str, dict[str, Path]] = {}  # object, then view
+        for name, path in files_by_name(folder).items():
+            first, _, rest = name.partition("/")
+            view, _, last = name.rpartition("/")
+            if rest and scene.names.candidates(rest):
+                named.setdefault(first, {})[rest] = path
+            elif view and scene.names.candidates(view):
+                named.setdefault(last, {})[view] = path
+        return {
+            (each, scene.photos[index].name): path
+            for each, files in named.items()
+            for index, path in scene.names.assigned(files, str).items()
+        }
 
     @staticmethod
     def _stack(files: Sequence[tuple[int, Path]]) -> np.ndarray:

@@ -29,7 +29,7 @@ class Prompt:
 
 @dataclass(frozen=True)
 class PromptedObject:
-    """An object: its class id, its prompts by view (stem or file name), and a text for a detector, or None."""
+    """An object: its class id, its prompts by view (``matching.PhotoNames``), and a text for a detector, or None."""
 
     class_id: int
     name: str
@@ -40,7 +40,7 @@ class PromptedObject:
 def read_prompts(path: Path) -> list[PromptedObject]:
     """The objects of a prompts JSON; raises ``UserError`` that names file and object.
 
-    {"objects": [{"name": ..., "id": optional, "text": optional, "prompts": [{"view": stem, "box": [left, top, right,
+    {"objects": [{"name": ..., "id": optional, "text": optional, "prompts": [{"view": name, "box": [left, top, right,
     bottom], "points": [[x, y], ...], "outside": [[x, y], ...]}, ...]}, ...]}
     """
     try:

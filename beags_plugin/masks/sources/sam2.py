@@ -65,8 +65,8 @@ class Sam2Source(MaskSource):
         def maps() -> Iterator[np.ndarray]:
             with TemporaryDirectory(prefix="beags-sam2-") as folder:
                 best = BestLabels(Path(folder))
-                stems = [photo.stem for photo in scene.photos]
-                notes.extend(retrieve(objects, frame_of, stems, predictor, detector, best, options, progress))
+                names = [photo.name for photo in scene.photos]
+                notes.extend(retrieve(objects, frame_of, names, predictor, detector, best, options, progress))
                 for frame, photo in enumerate(scene.photos):
                     yield best.class_map(frame, (photo.height, photo.width))
 

@@ -83,7 +83,7 @@ class BestLabels:
 def retrieve(
     objects: Sequence[PromptedObject],
     frame_of: Mapping[str, int],
-    stems: Sequence[str],
+    names: Sequence[str],
     predictor: VideoPredictor,
     detector: Detector | None,
     best: BestLabels,
@@ -92,7 +92,7 @@ def retrieve(
 ) -> list[str]:
     """Track every object through all frames, then again through the runs of frames where it was lost.
 
-    frame_of: view of a prompt to its frame. stems: of all frames. detector: needed where an object has a text alone.
+    frame_of: view of a prompt to its frame. names: of all frames. detector: needed where an object has a text alone.
     Stage 1 starts at the first prompted frame (or the best detection) and goes both ways. In stage 2 the detector is
     asked, more strictly, in each run where the object came back empty; where it finds the object, tracking starts
     there and stays in the run, both ways.
@@ -100,19 +100,19 @@ def retrieve(
     """
     notes: list[str] = []
     for index, one in enumerate(objects):
-        tracked = _Tracking(one, len(stems), predictor, detector, best, options)
+        tracked = _Tracking(one, len(names), predictor, detector, best, options)
         prompts = {frame_of[view]: prompt for view, prompt in one.prompts.items()}
         if not prompts:
-            found = tracked.detected(range(len(stems)), options.threshold)
+            found = tracked.detected(range(len(names)), options.threshold)
             if found is None:
                 raise UserError(
                     f"{one.text!r} ({one.name}) is found in no view with a score of {options.threshold} or more: give "
                     "it a box, another text, or a lower threshold."
                 )
             prompts = dict([found])
-        tracked.both_ways(prompts, 0, len(stems) - 1)
+        tracked.both_ways(prompts, 0, len(names) - 1)
         tracked.second_stage()
-        lost = [f"{stems[run[0]]} to {stems[run[-1]]}" for run in runs_of(~tracked.seen)]
+        lost = [f"{names[run[0]]} to {names[run[-1]]}" for run in runs_of(~tracked.seen)]
         if lost:
             notes.append(
                 f"{one.name} is empty from {'; '.join(lost[:5])}{' and in other runs' if len(lost) > 5 else ''}: if it "

@@ -1,0 +1,102 @@
+"""Space cut into slabs that are voted on one after the other, so that few voxels are in memory at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.masks.pooled_votes import LOOKS
+
+MOST_BRICKS = 1 << 19  # bricks of 4 x 4 x 4 voxels that may be in memory: about 0.4 GB
+_BRICK = 4
+_PART = 64  # one brick of so many is counted
+_PRIMES = (73856093, 19349663, 83492791)
+
+
+@dataclass(frozen=True)
+class Slabs:
+    """Slab s holds the points whose coordinate along ``axis`` is in borders[s] .. borders[s + 1], in voxels.
+
+    borders: the first is -inf, the last inf. margin: what is read about a point lies within so many voxels of it.
+    """
+
+    axis: int
+    borders: tuple[float, ...]
+    margin: float
+
+    def __len__(self) -> int:
+        return len(self.borders) - 1
+
+    def coordinates(self, depth: Tensor, to_voxels: Tensor) -> Tensor:
+        """[H, W] of the points of a view along the axis; NaN where nothing is lifted. to_voxels: [13] like ``depth``,
+        see ``ops.voxel_votes``."""
+        return _along(self.axis, depth, to_voxels)
+
+    def inside(self, coordinates: Tensor, slab: int) -> Tensor:
+        """[H, W] bool: the points of the slab."""
+        return (coordinates >= self.borders[slab]) & (coordinates < self.borders[slab + 1])
+
+    def about(self, coordinates: Tensor, slab: int) -> Tensor:
+        """[H, W] bool: the points whose votes matter to those of the slab."""
+        first, last = self.borders[slab] - self.margin, self.borders[slab + 1] + self.margin
+        return (coordinates >= first) & (coordinates < last)
+
+
+WHOLE = Slabs(0, (-math.inf, math.inf), 0.0)
+
+
+def slabs_of(depths: Sequence[Tensor], cameras: Sequence[Camera], to_voxels: Tensor, most: int | None = None) -> Slabs:
+    """As many slabs as keep about ``most`` (``MOST_BRICKS``) bricks of voxels in each, along the longest axis.
+
+    depths: V x [H, W], asked for once, one view at a time. to_voxels: [V, 13] float64, see ``ops.voxel_votes``.
+    Bricks are counted by those whose hash is a multiple of 64, so that memory is that of a 64th of them.
+    """
+    most = MOST_BRICKS if most is None else most
+    if sum(camera.height * camera.width for camera in cameras) <= most:
+        return WHOLE
+    found = torch.zeros(0, 3, dtype=torch.int64)
+    for depth, own in zip(depths, to_voxels, strict=True):
+        found = torch.unique(torch.cat([found, _counted(depth, own.to(depth))]), dim=0)
+    count = -(-_PART * len(found) // most)
+    if count <= 1:
+        return WHOLE
+    middle = torch.quantile(found.double(), torch.tensor([0.05, 0.95], dtype=torch.float64), dim=0)
+    axis = int((middle[1] - middle[0]).argmax())
+    along = found[:, axis].sort().values
+    inner = sorted({int(along[len(along) * s // count]) * _BRICK for s in range(1, count)})
+    return Slabs(axis, (-math.inf, *map(float, inner), math.inf), _margin(cameras))
+
+
+def _along(axis: int, depth: Tensor, to_voxels: Tensor) -> Tensor:
+    height, width = depth.shape
+    x = torch.arange(width, dtype=depth.dtype, device=depth.device) + 0.5
+    y = torch.arange(height, dtype=depth.dtype, device=depth.device)[:, None] + 0.5
+    across, down, rest = to_voxels[3 * axis : 3 * axis + 3]
+    found = (across * x + (down * y + rest)).mul_(depth).add_(to_voxels[9 + axis])
+    return found.masked_fill_(~(depth > 0), math.nan)
+
+
+def _counted(depth: Tensor, to_voxels: Tensor) -> Tensor:
+    """[M, 3] int64, on the CPU: of the bricks that hold the points of a view those that are counted."""
+    along = [_along(axis, depth, to_voxels) for axis in range(3)]
+    bricks = [values.div(_BRICK).floor_().nan_to_num_(0.0, 0.0, 0.0).int() for values in along]
+    x, y, z = (brick * prime for brick, prime in zip(bricks, _PRIMES, strict=True))  # int32: wraps around
+    chosen = (((x ^ y ^ z) >> 8) % _PART == 0) & along[0].isfinite()
+    return torch.unique(torch.stack([brick[chosen] for brick in bricks], dim=1), dim=0).long().cpu()
+
+
+def _margin(cameras: Sequence[Camera]) -> float:
+    """How many voxels from a point its votes are read: steps along the ray are longest in the corners of images."""
+    longest = 1.0
+    for camera in cameras:
+        corners = [(x, y, 1.0) for x in (0, camera.width) for y in (0, camera.height)]
+        middle = (camera.width / 2, camera.height / 2, 1.0)
+        pixels = torch.tensor([*corners, middle], dtype=torch.float64)
+        rays = (pixels @ torch.linalg.inv(camera.K.cpu().double()).T).norm(dim=1)
+        longest = max(longest, float(rays.max() / rays[-1]))
+    return math.ceil(max(abs(step) for step in LOOKS) * longest) + 3.0

@@ -1,0 +1,183 @@
+"""Tensors in files, and stages of a preparation that never have all views in memory."""
+
+from __future__ import annotations
+
+import errno
+import gc
+import weakref
+
+import pytest
+import torch
+from raster_scenes import CLASSES, make_scene
+
+from beags_plugin.core import filed_tensors
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.filed_tensors import FiledTensors, filed, write_tensors
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.errors import UserError
+from beags_plugin.masks import REPROJECTIONS
+from beags_plugin.masks.label_maps import LabelMaps, PackedMaps
+from beags_plugin.masks.reprojection import check_views
+from beags_plugin.masks.voxel_reprojection import reproject_voxel
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.drawing import draw_class_map
+from beags_plugin.refiners import REFINERS, consistent_masks
+from beags_plugin.refiners.preparation import PreparationConfig, prepare
+from beags_plugin.refiners.stages import Stages, StageStore
+
+VALUES = [
+    torch.tensor([[1.5, -0.0], [float("nan"), float("inf")]]),
+    torch.arange(6, dtype=torch.float64).reshape(2, 3).T,
+    torch.tensor([True, False]),
+    torch.zeros(0, dtype=torch.int16),
+    torch.tensor(7, dtype=torch.int32),
+]
+
+
+def same_bits(a, b):
+    return a.dtype == b.dtype and a.shape == b.shape and a.numpy().tobytes() == b.numpy().tobytes()
+
+
+@pytest.mark.parametrize("in_folder", [True, False])
+def test_tensors_come_back_bit_for_bit(tmp_path, in_folder):
+    if in_folder:
+        with open(tmp_path / "some.npz", "wb") as file:
+            write_tensors(file, iter(VALUES))
+        found = FiledTensors(tmp_path / "some.npz")
+    else:
+        found = filed(iter(VALUES))
+    assert len(found) == 5 and all(same_bits(a, b) for a, b in zip(found, VALUES, strict=True))
+    assert same_bits(found[-1], VALUES[-1]) and [value.shape for value in found[1:3]] == [(3, 2), (2,)]
+    with pytest.raises(IndexError):
+        found[5]
+    found[0].fill_(3)
+    assert same_bits(found[0], VALUES[0])
+
+
+def test_tensors_are_written_as_they_come_and_not_kept():
+    alive: list[weakref.ref] = []
+
+    def views():
+        for index in range(5):
+            gc.collect()
+            assert sum(ref() is not None for ref in alive) <= 1
+            values = torch.full((3,), float(index))
+            alive.append(weakref.ref(values))
+            yield values
+
+    assert [float(value[0]) for value in filed(views())] == [0, 1, 2, 3, 4]
+
+
+def test_a_file_that_is_not_whole_is_refused(tmp_path):
+    path = tmp_path / "some.npz"
+    with open(path, "wb") as file:
+        write_tensors(file, VALUES)
+    path.write_bytes(path.read_bytes()[:-30])
+    with pytest.raises(ValueError):
+        FiledTensors(path)
+
+
+def test_a_full_disk_is_told(monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(filed_tensors, "write_tensors", full)
+    with pytest.raises(UserError, match="is full: free some space there, or name another folder with TMPDIR"):
+        filed(VALUES)
+
+
+def test_a_filed_stage_is_reused_and_forgotten(tmp_path):
+    calls = []
+
+    def compute():
+        calls.append(1)
+        yield from VALUES
+
+    for folder in (tmp_path, tmp_path, None):
+        stages = Stages(None if folder is None else StageStore(folder), "inputs")
+        found = stages.run_filed("depth", stages.key("depth", 1), compute, "cpu")
+        assert len(found) == 5 and all(same_bits(a, b) for a, b in zip(found, VALUES, strict=True))
+        assert stages.seconds["depth"] >= 0 and found[-1].shape == () and len(found[3:]) == 2
+    assert len(calls) == 2 and len(list(tmp_path.iterdir())) == 1
+    next(tmp_path.iterdir()).write_bytes(b"half")  # damaged: made again
+    stages = Stages(StageStore(tmp_path), "inputs")
+    stages.run_filed("depth", stages.key("depth", 1), compute, "cpu")
+    assert len(calls) == 3
+    stages.run_filed("depth", stages.key("depth", 2), compute, "cpu")
+    assert len(calls) == 4 and len(list(tmp_path.iterdir())) == 1
+    stages.drop("depth")
+    assert not list(tmp_path.iterdir())
+
+
+class Counting:
+    """Views of which no more than a few may be held at a time."""
+
+    def __init__(self, make, count):
+        self.make, self.count, self.alive, self.most = make, count, [], 0
+
+    def __len__(self):
+        return self.count
+
+    def __getitem__(self, index):
+        if index >= self.count:
+            raise IndexError
+        made = self.make(index)
+        self.alive = [ref for ref in self.alive if ref() is not None] + [weakref.ref(made)]
+        self.most = max(self.most, len(self.alive))
+        return made
+
+
+def views_of_a_scene(views=9):
+    scene = make_scene(count=80, size=-1.0, opacity=2.0).to(torch.float32)
+    s = scene.inputs
+    surfels = Surfels.of(s.means, s.quats, s.log_scales, s.opacity_logits, torch.zeros(len(s.means), 1, 3))
+    cameras = []
+    for view in range(views):
+        viewmat = scene.camera.viewmat.clone()
+        viewmat[0, 3] += 0.1 * view
+        cameras.append(Camera(viewmat, scene.camera.K, scene.camera.width, scene.camera.height))
+    rasterizer = make_rasterizer("auto")
+    masks = [draw_class_map(rasterizer, surfels, s.class_ids, camera, scene.settings)[0] for camera in cameras]
+    masks[3] = None
+    return surfels, cameras, masks, rasterizer, scene.settings
+
+
+@pytest.mark.usefixtures("ops")
+def test_the_voxel_form_holds_one_view_at_a_time():
+    surfels, cameras, masks, rasterizer, settings = views_of_a_scene()
+    depths = list(consistent_masks.render_depths(surfels, cameras, rasterizer, settings, "median"))
+    expected = list(reproject_voxel(depths, cameras, masks, CLASSES))
+    lazy = Counting(lambda index: depths[index].clone(), len(depths))
+    maps = Counting(lambda index: masks[index % 3].clone(), 9)
+    found = [(each.labels, each.confidence) for each in reproject_voxel(lazy, cameras, masks, CLASSES)]
+    assert lazy.most <= 3  # a loop over a zip holds the last one until it has the next
+    assert all(
+        torch.equal(a, b.labels) and torch.equal(c, b.confidence) for (a, c), b in zip(found, expected, strict=True)
+    )
+    list(reproject_voxel(depths[:3] * 3, cameras[:3] * 3, maps, CLASSES))
+    assert maps.most <= 3
+
+
+def test_what_is_prepared_from_files_is_what_is_prepared_from_memory(monkeypatch, tmp_path):
+    surfels, cameras, masks, rasterizer, settings = views_of_a_scene()
+    names = {index: str(index) for index in range(CLASSES)}
+
+    def prepared(name, store=None):
+        config = PreparationConfig(reprojection=name, k=20)
+        refiner = REFINERS.get("bea")()
+        found = prepare(surfels, cameras, masks, names, rasterizer, settings, refiner, config, store=store)
+        assert isinstance(found.labels, LabelMaps) and isinstance(found.confidence, PackedMaps)
+        return [*found.labels, *found.confidence, found.assignment.margin, found.grid.keys, found.grid.classes]
+
+    for name in ("voxel", "pairwise"):
+        depths = list(consistent_masks.render_depths(surfels, cameras, rasterizer, settings, "median"))
+        check_views(depths, cameras, masks, CLASSES, 0.02)
+        direct = [each.labels for each in REPROJECTIONS.get(name)(depths, cameras, masks, CLASSES)]
+        found = prepared(name)
+        assert all(torch.equal(a, b) for a, b in zip(direct, found[: len(cameras)], strict=True))
+        for store in (StageStore(tmp_path / name), StageStore(tmp_path / name)):  # made, then taken from there
+            again = prepared(name, store)
+            assert all(torch.equal(a, b) for a, b in zip(found, again, strict=True))
+        assert sorted(path.name.split("-")[0] for path in (tmp_path / name).iterdir()) == [
+            "assignment", "reprojection", "voxel grids",
+        ]  # fmt: skip
