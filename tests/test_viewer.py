@@ -28,6 +28,7 @@ from beags_plugin.extraction.ply import read_ply
 from beags_plugin.masks.classes import colorize, write_class_map
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.extract import extract_objects
+from beags_plugin.plugin.schedule import PhaseSchedule
 from beags_plugin.plugin.viewed_run import ViewedRun
 from beags_plugin.plugin.viewing import CHANNELS
 from beags_plugin.viewing.choice import Choice
@@ -35,10 +36,10 @@ from beags_plugin.viewing.choice import Choice
 ALWAYS = {"rgb", "depth", "normal", "accumulation"}
 
 
-def prepare(run, shift: int = 0) -> None:
+def prepare(run, shift: int = 0, later: str = "") -> None:
     """Masks after reprojection, those of the data moved down by ``shift`` rows, and a grid in which all that is left
-    of the middle is valid for the cup, as refinement would keep them."""
-    folder = run / "prepared"
+    of the middle is valid for the cup, as refinement would keep them. later: folder of a later round."""
+    folder = run / "prepared" / later
     (folder / "masks").mkdir(parents=True)
     ids = np.zeros((12, 20), np.uint8)
     ids[4:9, 4:9], ids[4:8, 11:15] = 1, 2
@@ -286,6 +287,8 @@ def test_an_export_says_in_the_panel_how_it_ended(window, monkeypatch):
     monkeypatch.setattr(panel, "export_now", lambda: 1 / 0)
     panel.start_export()
     assert said(panel, "Not exported (ZeroDivisionError")
+    panel._exported(3, 9)
+    assert said(panel, "Exporting: 3 of 9 views")
     gate = threading.Event()
     monkeypatch.setattr(panel, "export_now", gate.wait)
     panel.start_export()
@@ -347,13 +350,39 @@ def test_masks_of_a_former_run_in_the_folder_are_not_shown_while_a_base_is_train
     run = window.model.viewing.run
     assert run.mask(0, "before", 20, 12) is not None and run.mask(0, "after", 20, 12) is None
     assert not run.has_grid and not run.load_grid()
-    window.model.viewing.refinement_ready = lambda: True  # as the switch to refinement says once it is done
+    window.model.viewing.rounds = lambda: 1  # as the switch to refinement says once it is done
     first = run.mask(0, "after", 20, 12)
     path = tmp_path / "run/prepared/masks" / f"{run.names[0]}.png"
     write_class_map(path, np.zeros((12, 20), np.uint8))  # prepared again
     os.utime(path, ns=(1, path.stat().st_mtime_ns + 1))
     assert set(first.unique().tolist()) == {0, 1, 2} and not run.mask(0, "after", 20, 12).any()
     assert run.has_grid and run.load_grid()
+
+
+def test_a_base_opened_again_shows_no_masks_of_a_former_run_in_its_folder(tmp_path):
+    config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"), assigned=False)
+    prepare(tmp_path / "run", shift=1)
+    window = Stand(config)
+    run = window.model.viewing.run
+    assert run.mask(0, "after", 20, 12) is None and not run.has_grid and not run.load_grid()
+    assert set(window.look()) == ALWAYS | {"mask_before"}
+
+
+@pytest.mark.parametrize(("done", "masks"), [(0, 0), (1, 0), (3, 0), (4, 2), (6, 2)])
+def test_only_rounds_that_the_scene_has_been_through_are_shown(tmp_path, done, masks):
+    """Three rounds of nine steps are prepared before steps 0, 3 and 6; this run has come to step 6, and a former run
+    in its folder had another round."""
+    config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"))
+    for folder, shift in (("", 0), ("round_2", 2), ("round_3", 3)):
+        prepare(tmp_path / "run", shift, folder)
+
+    def change(model):
+        model.config.refine_rounds, model.schedule = 3, PhaseSchedule(10, 9)
+        model.refined_steps.fill_(done)
+
+    run = Stand(config, change=change).model.viewing.run
+    before, after = (run.mask(0, kind, 20, 12) for kind in ("before", "after"))
+    assert torch.equal(before.roll(masks, 0), after)
 
 
 def test_panel_and_legend_do_not_wait_for_a_step_but_the_click_does(window, monkeypatch):

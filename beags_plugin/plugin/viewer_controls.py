@@ -222,8 +222,11 @@ class ObjectPanel(ViewerElement[None]):
         with torch.no_grad():
             return export_shown(
                 config_path, scene.surfels, scene.class_ids, f"shown_{self.title()}", self.format.value,
-                viewing.model.settings(),
+                viewing.model.settings(), self._exported,
             )  # fmt: skip
+
+    def _exported(self, done: int, total: int) -> None:
+        self.notes = {**self.notes, "export": f"Exporting: {done} of {total} views are drawn."}
 
     def title(self) -> str:
         """What is shown, in a few words for a file's name."""
