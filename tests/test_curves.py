@@ -184,6 +184,22 @@ def test_occupancy_violations_are_the_share_of_matter_outside():
         assert found[index] == pytest.approx(expected, abs=0.02)
 
 
+@pytest.mark.parametrize("background", [True, False])
+def test_the_sums_are_those_of_the_loss(background):
+    """With the same seed and step, opacity times what lies outside, over all points, is the loss."""
+    from beags_plugin.losses.base import LossInputs
+    from beags_plugin.losses.occupancy import OccupancyLoss
+    from beags_plugin.occupancy.violation import disc_sums
+
+    surfels, ids = discs()
+    grid = VisibilityGrid.from_points([(surfels.means[ids != 2], ids[ids != 2])], 0.05, torch.zeros(3), 3)
+    sums = disc_sums(surfels, ids, grid, 7, background, seed=3, step=4)
+    value = (torch.sigmoid(surfels.opacity_logits) * sums.wrong).sum() / (7 * len(ids))
+    loss = OccupancyLoss(samples=7, background=background)
+    inputs = LossInputs(4, 3, surfels, None, None, None, class_ids=ids, grid=grid)
+    assert float(value) == pytest.approx(float(loss.value(inputs)), rel=1e-5) and float(value) > 0.01
+
+
 def test_the_clock_adds_up_parts_and_divides_by_steps(monkeypatch):
     now = iter([0.0, 1.0, 1.5, 4.0, 10.0, 11.0, 12.0])
     monkeypatch.setattr("time.perf_counter", lambda: next(now))
