@@ -101,7 +101,8 @@ def differences(a, b, where="") -> list[str]:
 
 def assert_same_run(one: Path, other: Path):
     """Both ended with the same checkpoint, bit for bit, the same curve and the same masks."""
-    assert differences(without_clocks(checkpoint_of(one)), without_clocks(checkpoint_of(other))) == []
+    found = differences(without_clocks(checkpoint_of(one)), without_clocks(checkpoint_of(other)))
+    assert not found, found
     curves = [without_clocks(json.loads((run / "held_out.json").read_text())) for run in (one, other)]
     assert curves[0] == curves[1] and len(curves[0]) >= 5
     for folder in ("prepared/masks", "prepared/round_2/masks"):

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from run_folders import CLASSES, write_scene, write_trained
+from run_folders import CLASSES, write_prepared, write_scene, write_trained
 
 pytest.importorskip("nerfstudio")
 
@@ -26,7 +26,6 @@ from beags_plugin.core.cameras import Camera, viewmat_from_opengl
 from beags_plugin.errors import UserError
 from beags_plugin.extraction.ply import read_ply
 from beags_plugin.masks.classes import colorize, write_class_map
-from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.extract import extract_objects
 from beags_plugin.plugin.schedule import PhaseSchedule
 from beags_plugin.plugin.viewed_run import ViewedRun
@@ -36,29 +35,12 @@ from beags_plugin.viewing.choice import Choice
 ALWAYS = {"rgb", "depth", "normal", "accumulation"}
 
 
-def prepare(run, shift: int = 0, later: str = "") -> None:
-    """Masks after reprojection, those of the data moved down by ``shift`` rows, and a grid in which all that is left
-    of the middle is valid for the cup, as refinement would keep them. later: folder of a later round."""
-    folder = run / "prepared" / later
-    (folder / "masks").mkdir(parents=True)
-    ids = np.zeros((12, 20), np.uint8)
-    ids[4:9, 4:9], ids[4:8, 11:15] = 1, 2
-    for index in range(9):
-        write_class_map(folder / f"masks/v{index:02d}.png", np.roll(np.roll(ids, index % 3, axis=1), shift, axis=0))
-    points = torch.cartesian_prod(*(torch.arange(-2.0, 2.0, 0.25) for _ in range(3)))
-    cup = points[points[:, 0] < -0.75]  # valid is one voxel more
-    grid = VisibilityGrid.from_points(
-        [(cup, torch.ones(len(cup), dtype=torch.int64))], 0.25, torch.zeros(3, dtype=torch.float64), 3
-    )
-    torch.save(grid.state_dict(), folder / "grid.pt")
-
-
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """config.yml of a run that was prepared."""
     root = tmp_path_factory.mktemp("viewer")
     config = write_trained(root / "run", write_scene(root / "lab"))
-    prepare(root / "run", shift=1)
+    write_prepared(root / "run", shift=1)
     return config
 
 
@@ -345,7 +327,7 @@ def test_a_run_in_training_lists_what_will_come(finished):
 
 def test_masks_of_a_former_run_in_the_folder_are_not_shown_while_a_base_is_trained(tmp_path):
     config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"))
-    prepare(tmp_path / "run", shift=1)
+    write_prepared(tmp_path / "run", shift=1)
     window = Stand(config, SimpleNamespace(training_state="training"), lambda model: model.assigned.fill_(False))
     run = window.model.viewing.run
     assert run.mask(0, "before", 20, 12) is not None and run.mask(0, "after", 20, 12) is None
@@ -361,7 +343,7 @@ def test_masks_of_a_former_run_in_the_folder_are_not_shown_while_a_base_is_train
 
 def test_a_base_opened_again_shows_no_masks_of_a_former_run_in_its_folder(tmp_path):
     config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"), assigned=False)
-    prepare(tmp_path / "run", shift=1)
+    write_prepared(tmp_path / "run", shift=1)
     window = Stand(config)
     run = window.model.viewing.run
     assert run.mask(0, "after", 20, 12) is None and not run.has_grid and not run.load_grid()
@@ -374,7 +356,7 @@ def test_only_rounds_that_the_scene_has_been_through_are_shown(tmp_path, done, m
     in its folder had another round."""
     config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"))
     for folder, shift in (("", 0), ("round_2", 2), ("round_3", 3)):
-        prepare(tmp_path / "run", shift, folder)
+        write_prepared(tmp_path / "run", shift, folder)
 
     def change(model):
         model.config.refine_rounds, model.schedule = 3, PhaseSchedule(10, 9)
