@@ -245,36 +245,36 @@ def test_buttons_and_sliders_change_what_is_shown(window):
 def test_the_export_holds_what_is_shown_in_full(window, finished):
     panel, ids = window.panel, window.model.class_ids
     panel.choose(Choice(rest=0.5).isolate(1))
-    first, second = panel.export_now(), panel.export_now()
+    first, second = panel.files.write(), panel.files.write()
     assert first == finished.parent / "exports/shown_cup.ply" and second.name == "shown_cup_2.ply"
     surfels, classes = read_ply(first)
     assert len(surfels) == int((ids == 1).sum()) and set(classes.tolist()) == {1}
     torch.testing.assert_close(surfels.opacity_logits, window.model.surfels().opacity_logits[ids == 1].detach())
     panel.choose(Choice().remove(1))
-    assert panel.export_now().name == "shown_without_cup.ply"
+    assert panel.files.write().name == "shown_without_cup.ply"
     panel.choose(Choice())
-    assert panel.export_now().name == "shown_scene.ply"
+    assert panel.files.write().name == "shown_scene.ply"
 
 
 def test_an_export_says_in_the_panel_how_it_ended(window, monkeypatch):
     panel = window.panel
     panel.choose(Choice(min_opacity=1.0))
-    panel.start_export()
+    panel.files.start()
     assert said(panel, "Not exported: nothing is shown")
     panel.choose(Choice())
-    panel.start_export()
+    panel.files.start()
     assert "shown_scene" in said(panel, "Exported to")
     panel.follow()
     assert "shown" in panel._status.content
-    monkeypatch.setattr(panel, "export_now", lambda: 1 / 0)
-    panel.start_export()
+    monkeypatch.setattr(panel.files, "write", lambda: 1 / 0)
+    panel.files.start()
     assert said(panel, "Not exported (ZeroDivisionError")
-    panel._exported(3, 9)
+    panel.files.say_views(3, 9)
     assert said(panel, "Exporting: 3 of 9 views")
     gate = threading.Event()
-    monkeypatch.setattr(panel, "export_now", gate.wait)
-    panel.start_export()
-    panel.start_export()
+    monkeypatch.setattr(panel.files, "write", gate.wait)
+    panel.files.start()
+    panel.files.start()
     assert said(panel, "The former export")
     gate.set()
 
@@ -308,7 +308,7 @@ def test_odd_names_and_classes_that_come_later(window):
         assert window.look(name)["rgb"].isfinite().all()
     assert "no classes yet" in window.model.viewing.notes.get("classes", "no classes yet")
     assert len(model.viewing.shown().surfels) == model.num_points
-    assert panel.export_now().exists()
+    assert panel.files.write().exists()
     model.assigned.fill_(True)
     model.set_extra_state(classes)
     panel.follow()
@@ -388,7 +388,7 @@ def test_an_extracted_run_shows_its_object_and_the_masks_of_the_run_it_is_from(f
     window.look("occupancy_violation")
     window.panel.follow()
     assert window.look("occupancy_violation")["occupancy_violation"].sum() > 0
-    assert window.panel.export_now() == extracted.config.parent / "exports/shown_scene.ply"
+    assert window.panel.files.write() == extracted.config.parent / "exports/shown_scene.ply"
 
 
 def test_an_extracted_run_whose_origin_is_gone_lists_less(finished, tmp_path):
@@ -410,4 +410,4 @@ def test_a_base_without_masks_lists_what_it_has(tmp_path):
 def test_without_a_viewer_there_is_no_export(finished):
     _, pipeline, _, _ = eval_setup(finished, test_mode="test")
     with pytest.raises(UserError, match="beags export"):
-        pipeline.model.viewer_panel.export_now()
+        pipeline.model.viewer_panel.files.write()

@@ -91,18 +91,23 @@ def differing(one: np.ndarray, other: np.ndarray) -> float:
     return float((np.abs(one - other).max(axis=2) > 40).mean())
 
 
+def varied(pixels: np.ndarray) -> float:
+    """How much a picture varies over its pixels; 0 for one colour."""
+    return float(pixels.reshape(-1, 3).std(axis=0).max())
+
+
 def painted(pixels: np.ndarray, name: str) -> float:
     """Share of the pixels that have the colour of a class."""
     return float((np.abs(pixels - np.array(COLORS[name])).max(axis=2) < 30).mean())
 
 
 def awaited(page: Page, true) -> np.ndarray:
-    """The picture, once it is as asked for."""
-    found: list[np.ndarray] = []
+    """The picture, once it is as asked for and stays so: coarse ones come before it."""
+    found = [picture(page)]
 
     def holds() -> bool:
         found.append(picture(page))
-        return true(found[-1])
+        return differing(*found[-2:]) == 0.0 and true(found[-1])
 
     page.wait(holds, 120)
     return found[-1]
@@ -115,7 +120,7 @@ def test_every_output_is_a_picture_of_its_own(page):
         page.choose("Output type", output)
         seen[output] = awaited(
             page,
-            lambda now: now.std() > 2 and all(differing(now, other) > 0.002 for other in seen.values()),
+            lambda now: varied(now) > 2 and all(differing(now, other) > 0.002 for other in seen.values()),
         )
     assert painted(seen["class_map"], "cup") > 0.01 < painted(seen["class_map"], "box")
     assert painted(seen["mask_before"], "cup") > 0.01 < painted(seen["mask_after"], "cup")
@@ -146,9 +151,9 @@ def test_objects_are_isolated_hidden_faded_and_removed(page):
 def test_the_sliders_fade_and_thin_out(page):
     """The discs have an opacity of 0.95."""
     page.choose("Output type", "accumulation")
-    whole = awaited(page, lambda now: now.std() > 2)
+    whole = awaited(page, lambda now: varied(now) > 2)
     page.slide("Least opacity", 0.97)
-    awaited(page, lambda now: now.std() < 1)
+    awaited(page, lambda now: varied(now) < 1)
     page.slide("Least opacity", 0.9)
     awaited(page, lambda now: differing(now, whole) < 0.002)
     page.choose("Object", "box")

@@ -55,4 +55,5 @@ def test_a_training_that_is_watched_ends_as_it_does_unwatched(tmp_path, monkeypa
     assert not client.is_alive() and not client.errors
     assert last == {"picture": True, "alive": [True]}
     assert sum(client.pictures.values()) >= 3 and client.seen["rgb"].std() > 0
-    assert_same_run(tmp_path / "watched", tmp_path / "unwatched")
+    # websockets draw from Python's own generator, the training from none but its own
+    assert_same_run(tmp_path / "watched", tmp_path / "unwatched", but_for="/beags/parts/random/python")

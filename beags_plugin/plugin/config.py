@@ -18,7 +18,8 @@ from beags_plugin.plugin import nerfstudio_patches  # noqa: F401  (lets torch lo
 from beags_plugin.plugin.datamanager import BeagsDataManagerConfig
 from beags_plugin.plugin.dataparser import BeagsDataParserConfig
 from beags_plugin.plugin.interrupts import stop
-from beags_plugin.plugin.model import BeagsModelConfig, LossSpec
+from beags_plugin.plugin.loss_spec import LossSpec
+from beags_plugin.plugin.model import BeagsModelConfig
 from beags_plugin.plugin.run_lock import lock_ahead, run_lock
 from beags_plugin.plugin.runs import CONFIG_FILE, write_text_atomically
 from beags_plugin.plugin.trainer import BeagsTrainer

@@ -16,8 +16,8 @@ from beags_plugin.evaluation.metrics import resize_nearest
 from beags_plugin.masks.classes import read_class_map
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
-from beags_plugin.plugin.datamanager import unique_names
 from beags_plugin.plugin.runs import preparing_run, round_folder
+from beags_plugin.plugin.views import unique_names
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.datamanager import BeagsDataManager
