@@ -228,7 +228,8 @@ class Doctor:
     """File for the same."""
 
     def run(self) -> None:
-        from beags_plugin.doctor import diagnose, print_report
+        from beags_plugin.doctor.check import print_report
+        from beags_plugin.doctor.diagnosis import diagnose
 
         checks = diagnose()
         write_json(self.json, [check.to_json() for check in checks])

@@ -16,7 +16,9 @@ from rich.console import Console
 
 from beags_plugin.digests import code_digest, folder_digest, value_digest
 from beags_plugin.errors import UserError
+from beags_plugin.plugin.run_lock import RunLock
 from beags_plugin.progress import progress_bar
+from beags_plugin.whole_files import write_whole
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.model import BeagsModelConfig
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 QUICK_PIXELS = 50_000  # a folder of the user's is scaled down to at most so many pixels a view, to end in minutes
 STAMP = "trained.json"  # beside the run: what it was made from
+STARTED = "started"  # in there, as long as that is not done
 SHEET_VIEWS = 3  # held-out views in the picture
 
 
@@ -55,14 +58,19 @@ def run_demo(
         downscale = downscale or quick_downscale(data)
     run = output / "run"
     request = {"preset": preset, "downscale": downscale, "inputs": _digest(data, preset)}
-    if fresh or not _trained(output, request):
-        _clear(output)
-        output.mkdir(parents=True, exist_ok=True)
-        (output / STAMP).write_text("{}")  # the run that follows is the demo's, also if it is broken off
-        train(data, run, preset, downscale)
-        (output / STAMP).write_text(json.dumps(request))
-    else:
+    if not fresh and _trained(output, request):
         CONSOLE.print(f"Trained before: {run} (add --fresh to train again).")
+    else:
+        if run.is_dir():
+            RunLock(run).release()  # says so if the same demo is being trained
+        if not fresh and _broken_off(output, request):
+            resume(run)
+        else:
+            _clear(output)
+            output.mkdir(parents=True, exist_ok=True)
+            write_stamp(output, {STARTED: request})
+            train(data, run, preset, downscale)
+        write_stamp(output, request)
     measure(run, output, seconds)
 
 
@@ -121,12 +129,28 @@ def _digest(data: Path, preset: str) -> str:
     return value_digest([folder_digest(data), code_digest(), (preset_folder() / f"{preset}.toml").read_text("utf8")])
 
 
-def _trained(output: Path, request: dict[str, Any]) -> bool:
+def write_stamp(output: Path, content: dict[str, Any]) -> None:
+    """Say what the run in ``output`` was made from, or, under ``STARTED``, is being made from."""
+    write_whole(output / STAMP, lambda file: file.write(json.dumps(content).encode()))
+
+
+def _read_stamp(output: Path) -> dict[str, Any]:
     try:
         former = json.loads((output / STAMP).read_text())
     except (OSError, ValueError):
-        return False
-    return former == request and (output / "run" / "training.json").exists()
+        return {}
+    return former if isinstance(former, dict) else {}
+
+
+def _trained(output: Path, request: dict[str, Any]) -> bool:
+    """Whether the same was trained before, to its end."""
+    former = _read_stamp(output)
+    return request in (former, former.get(STARTED)) and (output / "run" / "training.json").exists()
+
+
+def _broken_off(output: Path, request: dict[str, Any]) -> bool:
+    """Whether the same was being trained, and can go on."""
+    return _read_stamp(output).get(STARTED) == request and (output / "run" / "config.yml").exists()
 
 
 def _clear(output: Path) -> None:
@@ -144,6 +168,16 @@ def train(data: Path, run: Path, preset: str, downscale: float) -> None:
         "--vis", "tensorboard", "beags-data", "--downscale-factor", str(downscale),
     ]  # fmt: skip
     CONSOLE.print("$ " + " ".join(command))
+    _finish(command)
+
+
+def resume(run: Path) -> None:
+    """Go on with a training that was broken off, in a process of its own."""
+    CONSOLE.print(f"Going on with the training that was broken off (add --fresh to start anew).\n$ beags resume {run}")
+    _finish([sys.executable, "-m", "beags_plugin.cli", "resume", str(run)])
+
+
+def _finish(command: list[str]) -> None:
     code = subprocess.run(command).returncode
     if code != 0:
         raise UserError(f"training ended with exit code {code}; what it printed above says why.")

@@ -24,6 +24,12 @@ def chromium() -> str | None:
     return shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
+def _labelled(label: str) -> str:
+    """JavaScript for the control that a label belongs to."""
+    labels = "[...document.querySelectorAll('label')]"
+    return f"document.getElementById({labels}.find(l => l.innerText.trim() == {json.dumps(label)}).htmlFor)"
+
+
 class Page:
     """One page at ``url``; a context manager that ends the browser."""
 
@@ -104,15 +110,6 @@ class Page:
             self._send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
             time.sleep(0.05)
 
-    def click_on(self, selector: str) -> None:
-        """Click on the middle of what a JavaScript expression gives, an element, once scrolled into view."""
-        box = self.evaluate(
-            f"(() => {{ const e = {selector}; e.scrollIntoView({{block: 'center'}});"
-            " const b = e.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; })()"
-        )
-        time.sleep(0.2)
-        self.click(*box)
-
     def press(self, label: str) -> None:
         """Press the button of that name; not with the mouse: the panel may still be moving."""
         self.evaluate(
@@ -121,16 +118,26 @@ class Page:
 
     def choose(self, label: str, option: str) -> None:
         """Choose an option of the drop-down list called ``label``."""
-        labelled = f"[...document.querySelectorAll('label')].find(l => l.innerText.trim() == {json.dumps(label)})"
-        self.click_on(f"document.getElementById({labelled}.htmlFor)")
-        time.sleep(0.5)
+        self.evaluate(f"{_labelled(label)}.click()")  # not with the mouse: the panel may still be moving
         listed = (
             "[...document.querySelectorAll('[role=option]')]"
             f".find(o => o.innerText.trim() == {json.dumps(option)} && o.offsetParent)"
         )
         self.wait(lambda: self.evaluate(f"!!{listed}"))
-        self.evaluate(f"{listed}.click()")  # not with the mouse: the list may still be moving
-        time.sleep(0.5)
+        self.evaluate(f"{listed}.click()")
+        self.wait(lambda: self.chosen(label) == option)
+
+    def chosen(self, label: str) -> str:
+        """What the drop-down list called ``label`` shows."""
+        return self.evaluate(f"{_labelled(label)}.value")
+
+    def slide(self, label: str, value: float) -> None:
+        """Write into the number field beside the slider called ``label``."""
+        self.evaluate(
+            f"(() => {{ const e = {_labelled(label)}.parentElement.querySelector('input[type=text]');"
+            " Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value')"
+            f".set.call(e, '{value}'); e.dispatchEvent(new Event('input', {{bubbles: true}})); }})()"
+        )
 
     def picture(self) -> bytes:
         """The page as a PNG file's content."""

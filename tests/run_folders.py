@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -50,9 +51,12 @@ def write_scene(root: Path, masks: bool = True, truth_factor: int = 1) -> Path:
 
 
 def write_trained(
-    folder: Path, data: Path, assigned: bool = True, base: bool = True, background: str = "black"
+    folder: Path, data: Path, assigned: bool = True, base: bool = True, background: str = "black", scale: float = 1.0
 ) -> Path:
-    """config.yml of a run, with its base if asked for, that holds ``discs``; before refinement the cup is off."""
+    """config.yml of a run, with its base if asked for, that holds ``discs``; before refinement the cup is off.
+
+    scale: of the world, with its cameras.
+    """
     from beags_plugin.plugin.config import base_config
     from beags_plugin.plugin.runs import write_run
 
@@ -60,25 +64,46 @@ def write_trained(
     config.run_dir = folder
     parser = config.data_config.dataparser
     parser.data, parser.orientation_method, parser.center_method = data, "none", "none"
-    parser.auto_scale_poses = False
+    parser.auto_scale_poses, parser.scale_factor = False, scale
     config.model_config.background_color = background
     if assigned and base:
-        write_run(config, folder / "base", _state(*discs(shift=0.15)), 99)
-    return write_run(config, folder, _state(*discs(), assigned=assigned), 199)
+        write_run(config, folder / "base", _state(*discs(shift=0.15), scale=scale), 99)
+    return write_run(config, folder, _state(*discs(), assigned=assigned, scale=scale), 199)
 
 
-def _state(surfels: Surfels, class_ids: torch.Tensor, assigned: bool = True) -> dict:
+def _state(surfels: Surfels, class_ids: torch.Tensor, assigned: bool = True, scale: float = 1.0) -> dict:
     return {
-        "gauss_params.means": surfels.means,
+        "gauss_params.means": scale * surfels.means,
         "gauss_params.quats": surfels.quats,
-        "gauss_params.scales": surfels.log_scales,
+        "gauss_params.scales": surfels.log_scales + math.log(scale),
         "gauss_params.opacities": surfels.opacity_logits[:, None],
         "gauss_params.features_dc": surfels.sh_dc,
         "gauss_params.features_rest": surfels.sh_rest,
         "class_ids": class_ids,
         "class_margin": torch.ones(len(class_ids)),
         "assigned": torch.tensor(assigned),
-        "extent": torch.tensor(3.0),
+        "extent": torch.tensor(3.0 * scale),
         "refined_steps": torch.tensor(0),
         "_extra_state": {"classes": CLASSES if assigned else {0: "background"}},
     }
+
+
+def write_prepared(run: Path, shift: int = 0, later: str = "", scale: float = 1.0) -> None:
+    """Masks after reprojection, those of the data moved down by ``shift`` rows, and a grid in which all that is left
+    of the middle is valid for the cup, as refinement would keep them. later: folder of a later round;
+    scale: of the world."""
+    from beags_plugin.masks.classes import write_class_map
+    from beags_plugin.occupancy.grid import VisibilityGrid
+
+    folder = run / "prepared" / later
+    (folder / "masks").mkdir(parents=True)
+    ids = np.zeros((12, 20), np.uint8)
+    ids[4:9, 4:9], ids[4:8, 11:15] = 1, 2
+    for index in range(9):
+        write_class_map(folder / f"masks/v{index:02d}.png", np.roll(np.roll(ids, index % 3, axis=1), shift, axis=0))
+    points = torch.cartesian_prod(*(torch.arange(-2.0, 2.0, 0.25) for _ in range(3)))
+    cup = points[points[:, 0] < -0.75]  # valid is one voxel more
+    grid = VisibilityGrid.from_points(
+        [(scale * cup, torch.ones(len(cup), dtype=torch.int64))], 0.25 * scale, torch.zeros(3, dtype=torch.float64), 3
+    )
+    torch.save(grid.state_dict(), folder / "grid.pt")

@@ -121,11 +121,11 @@ def folder(tmp_path_factory):
 
 @pytest.mark.parametrize("arguments", SENTENCES)
 def test_a_mistake_is_told_in_this_sentence(folder, monkeypatch, arguments):
-    from beags_plugin import doctor
+    from beags_plugin.doctor import diagnosis
 
     out = io.StringIO()
     monkeypatch.setattr(cli, "CONSOLE", Console(file=out, soft_wrap=True, highlight=False))
-    monkeypatch.setattr(doctor, "diagnose", lambda: [])
+    monkeypatch.setattr(diagnosis, "diagnose", lambda: [])
     monkeypatch.chdir(folder)
     with pytest.raises(SystemExit) as end:
         cli.main(arguments.replace("{tmp}", str(folder)).split())

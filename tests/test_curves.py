@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -141,18 +143,52 @@ def test_a_bad_held_out_mask_leaves_out_curves_only(data, tmp_path, monkeypatch,
     assert "Extracted IoU/mean" not in tags and "Occupancy violation/cup" in tags
 
 
-def test_wandb_gets_the_same(data, tmp_path, monkeypatch):
-    """What nerfstudio's writer hands to wandb; no server, no process of wandb's."""
-    wandb = pytest.importorskip("wandb")
-    from nerfstudio.utils import writer
+def wandb_history(folder):
+    """What wandb wrote to its own file in ``folder``, without a server: step to values by name."""
+    from wandb.proto import wandb_internal_pb2
+    from wandb.sdk.internal.datastore import DataStore
 
-    got: dict[int, dict] = {}
-    monkeypatch.setattr(writer.WandbWriter, "__init__", lambda self, **_: None)
-    monkeypatch.setattr(writer.WandbWriter, "write_config", lambda *_, **__: None)
-    monkeypatch.setattr(wandb, "log", lambda values, step: got.setdefault(step, {}).update(values))
-    run_to_end(short_config(data, tmp_path / "run", vis="wandb", steps_per_objects=5))
-    assert {"Extracted IoU/mean", "Occupancy violation/cup", "Scene/class map", "Objects/box"} <= set(got[LAST])
-    assert {"Train Loss Dict/photometric", "Boundary error/background"} <= set(got[50])
+    (file,) = folder.rglob("*.wandb")
+    store, history = DataStore(), {}
+    store.open_for_scan(str(file))
+    while (data := store.scan_data()) is not None:
+        record = wandb_internal_pb2.Record()
+        record.ParseFromString(data)
+        if record.WhichOneof("record_type") == "history":
+            items = record.history.item
+            values = {"/".join(item.nested_key) or item.key: json.loads(item.value_json) for item in items}
+            history[values["_step"]] = values
+    return history
+
+
+def test_wandb_gets_the_same(data, run, tmp_path, monkeypatch):
+    """Its real client, offline: each value of tensorboard's, at its step; pictures as files."""
+    wandb = pytest.importorskip("wandb")
+    for name, value in {"MODE": "offline", "SILENT": "true", "DIR": str(tmp_path)}.items():
+        monkeypatch.setenv(f"WANDB_{name}", value)
+    config = short_config(data, tmp_path / "run", vis="wandb", steps_per_objects=5)
+    config.logging.steps_per_log = 3
+    run_to_end(config)
+    wandb.finish()
+    history, events = wandb_history(tmp_path), events_of(run)
+    clocks = (
+        "Seconds",
+        "Memory",
+        "GPU Memory",
+        "Train Iter",
+        "Train Total",
+        "ETA",
+        "Train Rays",
+        "Test Rays",
+        "Vis Rays",
+    )
+    tags = [tag for tag in events.Tags()["scalars"] if not tag.startswith(clocks)]
+    values = [(tag, event) for tag in tags for event in events.Scalars(tag)]
+    for tag, event in values:
+        assert history[event.step][tag] == pytest.approx(event.value, rel=1e-5), (tag, event.step)
+    assert len(values) > 100 and {"Extracted IoU/mean", "Memory (MB)/now"} <= set(history[LAST])
+    picture = tmp_path.rglob(history[LAST]["Objects/cup"]["path"])
+    assert len(list(picture)) == 1
 
 
 def test_boundary_errors_are_means_over_the_pixels_of_a_class():
@@ -182,6 +218,22 @@ def test_occupancy_violations_are_the_share_of_matter_outside():
         expected = float(weight[ids == index][~inside[ids == index]].sum() / weight[ids == index].sum())
         assert 0.05 < expected < 0.95
         assert found[index] == pytest.approx(expected, abs=0.02)
+
+
+@pytest.mark.parametrize("background", [True, False])
+def test_the_sums_are_those_of_the_loss(background):
+    """With the same seed and step, opacity times what lies outside, over all points, is the loss."""
+    from beags_plugin.losses.base import LossInputs
+    from beags_plugin.losses.occupancy import OccupancyLoss
+    from beags_plugin.occupancy.violation import disc_sums
+
+    surfels, ids = discs()
+    grid = VisibilityGrid.from_points([(surfels.means[ids != 2], ids[ids != 2])], 0.05, torch.zeros(3), 3)
+    sums = disc_sums(surfels, ids, grid, 7, background, seed=3, step=4)
+    value = (torch.sigmoid(surfels.opacity_logits) * sums.wrong).sum() / (7 * len(ids))
+    loss = OccupancyLoss(samples=7, background=background)
+    inputs = LossInputs(4, 3, surfels, None, None, None, class_ids=ids, grid=grid)
+    assert float(value) == pytest.approx(float(loss.value(inputs)), rel=1e-5) and float(value) > 0.01
 
 
 def test_the_clock_adds_up_parts_and_divides_by_steps(monkeypatch):

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import subprocess
 import sys
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from data_folders import write_image
+from run_folders import write_scene
 
 from beags_plugin.demo import STAMP, _clear, _trained, check_preset, quick_downscale
 from beags_plugin.errors import UserError
@@ -72,6 +76,58 @@ def test_a_damaged_stamp_means_not_trained(tmp_path):
     assert not _trained(tmp_path, {"preset": "beags-tiny"})
     (tmp_path / STAMP).write_text(json.dumps({"preset": "beags-tiny"}))
     assert _trained(tmp_path, {"preset": "beags-tiny"})
+
+
+def test_a_demo_that_was_killed_goes_on(tmp_path, monkeypatch):
+    """Killed in the training, it resumes; after the training, it measures; with another request, it starts anew."""
+    from beags_plugin import demo
+
+    data, output = write_scene(tmp_path / "data"), tmp_path / "out"
+    run, commands, measured = output / "run", [], []
+
+    def process(command):
+        commands.append(command[3] if "beags_plugin.cli" in command else Path(command[0]).name)
+        run.mkdir(exist_ok=True)
+        (run / "config.yml").touch()
+        if len(commands) == 2:
+            raise KeyboardInterrupt
+        if len(commands) > 2:
+            (run / "training.json").write_text("{}")
+        return SimpleNamespace(returncode=9 if len(commands) == 1 else 0)
+
+    def measure(*_):
+        measured.append(len(commands))
+        if len(measured) == 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(demo.subprocess, "run", process)
+    monkeypatch.setattr(demo, "measure", measure)
+
+    def again(downscale=None, fresh=False):
+        with contextlib.suppress(KeyboardInterrupt, UserError):
+            demo.run_demo(data, output, "beags-tiny", downscale, 0, fresh)
+        return commands[-1], len(commands)
+
+    assert again() == ("ns-train", 1)  # which fails
+    assert again() == ("resume", 2)  # which is killed
+    assert again() == ("resume", 3) and measured == [3]  # then the demo is killed
+    assert again() == ("resume", 3) and measured == [3, 3]
+    assert again(downscale=2.0) == ("ns-train", 4)
+    assert again(fresh=True) == ("ns-train", 5) and again() == ("ns-train", 5)
+
+
+def test_a_demo_that_is_under_way_is_left_alone(tmp_path, monkeypatch):
+    from beags_plugin import demo
+    from beags_plugin.plugin.run_lock import RunLock
+
+    data, run = write_scene(tmp_path / "data"), tmp_path / "out/run"
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / STAMP).write_text("{}")
+    lock = RunLock(run)
+    with pytest.raises(UserError, match="being trained by another process"):
+        demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, True)
+    assert run.is_dir()
+    lock.release()
 
 
 def test_brackets_in_a_path_are_no_markup(tmp_path):

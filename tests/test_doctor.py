@@ -8,13 +8,14 @@ import sys
 import pytest
 from rich.console import Console
 
-from beags_plugin import doctor
+from beags_plugin.doctor import backends, building, diagnosis
+from beags_plugin.doctor.check import Check, print_report
 from beags_plugin.rasterizers import RASTERIZERS
 
 
 @pytest.fixture(scope="module")
-def checks() -> dict[str, doctor.Check]:
-    return {check.name: check for check in doctor.diagnose()}
+def checks() -> dict[str, Check]:
+    return {check.name: check for check in diagnosis.diagnose()}
 
 
 def test_everything_is_looked_at(checks):
@@ -33,56 +34,56 @@ def test_what_the_tests_use_is_there(checks):
 @pytest.mark.parametrize("module", ["torch", "nerfstudio", "cv2", "open3d"])
 def test_a_missing_package_is_a_finding(monkeypatch, module):
     monkeypatch.setitem(sys.modules, module, None)  # what makes an import fail
-    check = {"torch": doctor._torch, "nerfstudio": doctor._nerfstudio, "cv2": doctor._opencv, "open3d": doctor._open3d}
-    found = doctor._safely(check[module])
+    name = {"cv2": "opencv"}.get(module, module)
+    found = diagnosis._safely(getattr(diagnosis, f"_{name}"))
     assert not found.ok and module in found.sentence
-    assert found.repair.startswith("pip install") and {"cv2": "opencv"}.get(module, module) in found.repair
+    assert found.repair.startswith("pip install") and name in found.repair
 
 
 def test_opencv_without_contrib_is_told_from_opencv_with_it(monkeypatch):
     cv2 = pytest.importorskip("cv2")
     monkeypatch.setattr(cv2, "ximgproc", type(sys)("cv2.ximgproc"))  # an empty shell, as plain opencv leaves it
-    found = doctor._opencv()
+    found = diagnosis._opencv()
     assert not found.ok and "guidedFilter" in found.sentence
     assert found.repair == "pip install --force-reinstall --no-deps opencv-contrib-python-headless==4.10.0.84"
 
 
 def test_a_check_that_breaks_in_any_way_is_reported():
-    def broken() -> doctor.Check:
+    def broken() -> Check:
         raise SystemExit("a library that\ngives up")
 
-    found = doctor._safely(broken)
+    found = diagnosis._safely(broken)
     assert not found.ok and found.sentence == "cannot be used: SystemExit: a library that"
 
 
 def test_no_programs_on_the_path(monkeypatch):
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CXX", raising=False)
-    for check in (doctor._compiler(), doctor._ffmpeg()):
+    for check in (building.compiler(), diagnosis._ffmpeg()):
         assert not check.ok and not check.required and "install" in check.sentence
         assert check.repair in ("apt install g++", "apt install ffmpeg", "xcode-select --install")
 
 
 def test_a_backend_that_kills_its_process_is_a_finding(monkeypatch):
-    monkeypatch.setattr(doctor, "_TRIAL", "import os, signal; os.kill(os.getpid(), signal.SIGILL)")
-    found = doctor._rasterizer("native")
+    monkeypatch.setattr(backends, "TRIAL", "import os, signal; os.kill(os.getpid(), signal.SIGILL)")
+    found = backends.rasterizer("native")
     assert not found.ok and not found.required and found.name == "rasterizer native"
     assert "SIGILL" in found.sentence and "reinstall beags from source" in found.sentence
     assert found.repair == "pip install --force-reinstall --no-deps ."
-    monkeypatch.setattr(doctor, "_TRIAL", "raise ValueError('odd')")
-    odd = doctor._rasterizer("native").sentence
+    monkeypatch.setattr(backends, "TRIAL", "raise ValueError('odd')")
+    odd = backends.rasterizer("native").sentence
     assert "it fails when it draws: ValueError: odd" in odd and "BEAGS_NATIVE=0" in odd
-    odd = doctor._rasterizer("cuda").sentence
+    odd = backends.rasterizer("cuda").sentence
     assert "ValueError: odd" in odd and "--machine.device-type cpu" in odd and "BEAGS_NATIVE" not in odd
 
 
 def test_an_absent_extension_says_what_to_install_and_what_draws_instead(monkeypatch):
     hidden = "import sys; sys.modules['beags_plugin._native'] = None\n"  # what makes an import fail
-    monkeypatch.setattr(doctor, "_TRIAL", hidden + doctor._TRIAL)
-    found = doctor._rasterizer("native")
+    monkeypatch.setattr(backends, "TRIAL", hidden + backends.TRIAL)
+    found = backends.rasterizer("native")
     assert not found.ok and not found.required and "\n" not in found.sentence
     assert "install a C++ compiler and reinstall beags; until then the torch reference draws" in found.sentence
-    assert found.repair and doctor._rasterizer("torch").ok
+    assert found.repair and backends.rasterizer("torch").ok
 
 
 def test_missing_codecs_and_presets_are_findings(monkeypatch):
@@ -94,13 +95,13 @@ def test_missing_codecs_and_presets_are_findings(monkeypatch):
     monkeypatch.setattr(video, "encoder", lambda: None)
     monkeypatch.setattr(metadata, "entry_points", lambda group: [])
     monkeypatch.setattr(GlbExporter, "unavailable", classmethod(lambda cls: "Open3D cannot be loaded."))
-    films, presets, formats = doctor._films(), doctor._presets(), doctor._formats()
+    films, presets, formats = diagnosis._films(), diagnosis._presets(), diagnosis._formats()
     assert not films.ok and not films.required and "pip install" in films.repair
     assert not presets.ok and presets.required and presets.repair == "pip install -c constraints.txt -e ."
     assert not formats.ok and formats.sentence == "obj, ply, ply-2dgs, spz; not glb: Open3D cannot be loaded."
     cv2 = pytest.importorskip("cv2")
     monkeypatch.setattr(cv2, "imencode", lambda suffix, image: (False, None))
-    assert not doctor._pictures().ok and "opencv" in doctor._pictures().repair
+    assert not diagnosis._pictures().ok and "opencv" in diagnosis._pictures().repair
 
 
 def test_the_native_rasterizer_is_tried_with_its_kernels(checks):
@@ -130,30 +131,30 @@ def _compiler_that(folder, script: str) -> str:
 )
 def test_the_compiler_is_tried(monkeypatch, tmp_path, script, ok, words):
     monkeypatch.setenv("CXX", _compiler_that(tmp_path, script) + " -O2")
-    found = doctor._compiler()
+    found = building.compiler()
     assert found.ok == ok and not found.required and words in found.sentence
 
 
 def test_a_compiler_that_is_named_but_not_there(monkeypatch):
     monkeypatch.setenv("CXX", "/nonexistent/c++ -O2")
-    found = doctor._compiler()
+    found = building.compiler()
     assert not found.ok and "CXX names /nonexistent/c++" in found.sentence and "install" in found.sentence
 
 
 def test_long_sentences_are_folded_not_cut():
     out = io.StringIO()
-    doctor.print_report([doctor.Check("a", True, "x" * 200)], Console(file=out, width=60))
+    print_report([Check("a", True, "x" * 200)], Console(file=out, width=60))
     assert out.getvalue().count("x") == 200
 
 
 def test_the_report_tells_missing_from_absent():
     out = io.StringIO()
     found = [
-        doctor.Check("a", True, "fine"),
-        doctor.Check("b", False, "[gone]"),
-        doctor.Check("c", False, "optional", required=False, repair="apt install c"),
+        Check("a", True, "fine"),
+        Check("b", False, "[gone]"),
+        Check("c", False, "optional", required=False, repair="apt install c"),
     ]
-    doctor.print_report(found, Console(file=out, width=80))
+    print_report(found, Console(file=out, width=80))
     lines = [line.split() for line in out.getvalue().splitlines()]
     assert lines == [
         ["ok", "a", "fine"],

@@ -25,8 +25,9 @@ from beags_plugin.evaluation.contact_sheet import (
 )
 from beags_plugin.evaluation.metrics import MaskMetrics
 from beags_plugin.evaluation.protocol import Protocol
+from beags_plugin.evaluation.records import EvalView, ObjectMetrics, SceneMetrics
 from beags_plugin.evaluation.report import RunMetrics
-from beags_plugin.evaluation.run_metrics import EvalView, ObjectMetrics, SceneMetrics, evaluate_scene
+from beags_plugin.evaluation.run_metrics import evaluate_scene
 from beags_plugin.evaluation.table import print_run, summary_json
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterOutputs, RasterSettings
 

@@ -26,6 +26,7 @@ from beags_plugin.export.frames import Frame, bounding_box
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.ply import read_ply
 from beags_plugin.extraction.select import select_class
+from beags_plugin.plugin.export import export_run
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.drawing import surfel_inputs
 from beags_plugin.rasterizers.interface import RasterSettings
@@ -211,6 +212,19 @@ def test_meshes_of_a_run_lie_where_its_discs_are(trained, tmp_path, monkeypatch)
     assert all("is seen in 3 training views" in one["left_out"][0]["reason"] for one in manifest["objects"])
     with pytest.raises(SystemExit):  # named alone it is a mistake
         main([*arguments, str(tmp_path / "none"), "--object", "cup"])
+
+
+def test_the_progress_of_meshes_counts_their_views(trained, tmp_path):
+    """Seven training views: a mesh takes 8 steps, the same mesh in another file 8 at once, a splat file 1."""
+    pytest.importorskip("open3d")
+    told: list[tuple[int, int]] = []
+    export_run(
+        trained, ["cup", "box"], formats=("ply", "glb", "obj"), output=tmp_path,
+        options={name: {"resolution": 16} for name in ("glb", "obj")}, progress=lambda *steps: told.append(steps),
+    )  # fmt: skip
+    assert {total for _, total in told} == {2 * (1 + 8 + 8)}
+    done = [step for step, _ in told]
+    assert done == [0, *range(1, 10), 17, 18, *range(19, 27), 34]
 
 
 def test_meshes_need_the_data(tmp_path, capsys):

@@ -71,7 +71,7 @@ def test_a_run_is_refused_at_its_start_only_if_it_refines(refine_steps):
 
 def test_a_loss_with_a_wrong_option_is_refused_where_it_is_built():
     pytest.importorskip("nerfstudio")
-    from beags_plugin.plugin.model import LossSpec
+    from beags_plugin.plugin.loss_spec import LossSpec
     from beags_plugin.plugin.schedule import PhaseSchedule
 
     with pytest.raises(UserError, match="samples = 0"):

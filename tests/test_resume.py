@@ -314,6 +314,40 @@ def test_a_run_that_is_training_cannot_be_resumed(whole):
     RunLock(whole).release()
 
 
+def contents(folder):
+    return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.rglob("*") if path.is_file()}
+
+
+def test_ns_train_into_the_folder_of_a_run_that_is_training_changes_nothing_there(data, whole):
+    """config.yml is the first that ns-train writes."""
+    import fcntl
+
+    from beags_plugin.plugin.run_lock import LOCK
+
+    before = contents(whole)
+    with open(whole / LOCK, "ab") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # as another process would
+        with pytest.raises(UserError, match="being trained by another process"):
+            run_to_end(short_config(data, whole, steps_per_save=99))
+    assert contents(whole) == before
+
+
+@pytest.mark.parametrize("devices", [1, 2])
+def test_the_lock_is_held_from_the_first_file_on(data, tmp_path, devices):
+    """Two that start at once: one is refused; where each device has a process of its own, only while it is written."""
+    from beags_plugin.plugin.run_lock import RunLock, run_lock
+
+    config = short_config(data, tmp_path / "run")
+    config.machine.num_devices = devices
+    config.save_config()
+    config.save_config()  # not refused by itself
+    if devices == 1:
+        with pytest.raises(UserError, match="being trained by another process"):
+            RunLock(tmp_path / "run")
+        run_lock(tmp_path / "run").release()  # as the trainer takes it over
+    RunLock(tmp_path / "run").release()
+
+
 def test_ctrl_c_after_the_end_is_quiet(data, tmp_path, monkeypatch, capsys):
     """As in a viewer that stays open."""
     from nerfstudio.engine.trainer import Trainer

@@ -117,7 +117,7 @@ def test_stated_steps_are_scaled_with_the_length_of_the_base():
 
 
 def test_losses_start_at_their_share_of_the_base():
-    from beags_plugin.plugin.model import LossSpec
+    from beags_plugin.plugin.loss_spec import LossSpec
 
     short = PhaseSchedule(3_000, 300, 30_000)
     assert LossSpec(start=7_000).build("normal", short).start == 700

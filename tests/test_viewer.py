@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from run_folders import CLASSES, write_scene, write_trained
+from run_folders import CLASSES, write_prepared, write_scene, write_trained
 
 pytest.importorskip("nerfstudio")
 
@@ -26,8 +26,8 @@ from beags_plugin.core.cameras import Camera, viewmat_from_opengl
 from beags_plugin.errors import UserError
 from beags_plugin.extraction.ply import read_ply
 from beags_plugin.masks.classes import colorize, write_class_map
-from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.extract import extract_objects
+from beags_plugin.plugin.schedule import PhaseSchedule
 from beags_plugin.plugin.viewed_run import ViewedRun
 from beags_plugin.plugin.viewing import CHANNELS
 from beags_plugin.viewing.choice import Choice
@@ -35,29 +35,12 @@ from beags_plugin.viewing.choice import Choice
 ALWAYS = {"rgb", "depth", "normal", "accumulation"}
 
 
-def prepare(run, shift: int = 0) -> None:
-    """Masks after reprojection, those of the data moved down by ``shift`` rows, and a grid in which all that is left
-    of the middle is valid for the cup, as refinement would keep them."""
-    folder = run / "prepared"
-    (folder / "masks").mkdir(parents=True)
-    ids = np.zeros((12, 20), np.uint8)
-    ids[4:9, 4:9], ids[4:8, 11:15] = 1, 2
-    for index in range(9):
-        write_class_map(folder / f"masks/v{index:02d}.png", np.roll(np.roll(ids, index % 3, axis=1), shift, axis=0))
-    points = torch.cartesian_prod(*(torch.arange(-2.0, 2.0, 0.25) for _ in range(3)))
-    cup = points[points[:, 0] < -0.75]  # valid is one voxel more
-    grid = VisibilityGrid.from_points(
-        [(cup, torch.ones(len(cup), dtype=torch.int64))], 0.25, torch.zeros(3, dtype=torch.float64), 3
-    )
-    torch.save(grid.state_dict(), folder / "grid.pt")
-
-
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """config.yml of a run that was prepared."""
     root = tmp_path_factory.mktemp("viewer")
     config = write_trained(root / "run", write_scene(root / "lab"))
-    prepare(root / "run", shift=1)
+    write_prepared(root / "run", shift=1)
     return config
 
 
@@ -262,34 +245,36 @@ def test_buttons_and_sliders_change_what_is_shown(window):
 def test_the_export_holds_what_is_shown_in_full(window, finished):
     panel, ids = window.panel, window.model.class_ids
     panel.choose(Choice(rest=0.5).isolate(1))
-    first, second = panel.export_now(), panel.export_now()
+    first, second = panel.files.write(), panel.files.write()
     assert first == finished.parent / "exports/shown_cup.ply" and second.name == "shown_cup_2.ply"
     surfels, classes = read_ply(first)
     assert len(surfels) == int((ids == 1).sum()) and set(classes.tolist()) == {1}
     torch.testing.assert_close(surfels.opacity_logits, window.model.surfels().opacity_logits[ids == 1].detach())
     panel.choose(Choice().remove(1))
-    assert panel.export_now().name == "shown_without_cup.ply"
+    assert panel.files.write().name == "shown_without_cup.ply"
     panel.choose(Choice())
-    assert panel.export_now().name == "shown_scene.ply"
+    assert panel.files.write().name == "shown_scene.ply"
 
 
 def test_an_export_says_in_the_panel_how_it_ended(window, monkeypatch):
     panel = window.panel
     panel.choose(Choice(min_opacity=1.0))
-    panel.start_export()
+    panel.files.start()
     assert said(panel, "Not exported: nothing is shown")
     panel.choose(Choice())
-    panel.start_export()
+    panel.files.start()
     assert "shown_scene" in said(panel, "Exported to")
     panel.follow()
     assert "shown" in panel._status.content
-    monkeypatch.setattr(panel, "export_now", lambda: 1 / 0)
-    panel.start_export()
+    monkeypatch.setattr(panel.files, "write", lambda: 1 / 0)
+    panel.files.start()
     assert said(panel, "Not exported (ZeroDivisionError")
+    panel.files.say_views(3, 9)
+    assert said(panel, "Exporting: 3 of 9 views")
     gate = threading.Event()
-    monkeypatch.setattr(panel, "export_now", gate.wait)
-    panel.start_export()
-    panel.start_export()
+    monkeypatch.setattr(panel.files, "write", gate.wait)
+    panel.files.start()
+    panel.files.start()
     assert said(panel, "The former export")
     gate.set()
 
@@ -323,7 +308,7 @@ def test_odd_names_and_classes_that_come_later(window):
         assert window.look(name)["rgb"].isfinite().all()
     assert "no classes yet" in window.model.viewing.notes.get("classes", "no classes yet")
     assert len(model.viewing.shown().surfels) == model.num_points
-    assert panel.export_now().exists()
+    assert panel.files.write().exists()
     model.assigned.fill_(True)
     model.set_extra_state(classes)
     panel.follow()
@@ -342,18 +327,44 @@ def test_a_run_in_training_lists_what_will_come(finished):
 
 def test_masks_of_a_former_run_in_the_folder_are_not_shown_while_a_base_is_trained(tmp_path):
     config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"))
-    prepare(tmp_path / "run", shift=1)
+    write_prepared(tmp_path / "run", shift=1)
     window = Stand(config, SimpleNamespace(training_state="training"), lambda model: model.assigned.fill_(False))
     run = window.model.viewing.run
     assert run.mask(0, "before", 20, 12) is not None and run.mask(0, "after", 20, 12) is None
     assert not run.has_grid and not run.load_grid()
-    window.model.viewing.refinement_ready = lambda: True  # as the switch to refinement says once it is done
+    window.model.viewing.rounds = lambda: 1  # as the switch to refinement says once it is done
     first = run.mask(0, "after", 20, 12)
     path = tmp_path / "run/prepared/masks" / f"{run.names[0]}.png"
     write_class_map(path, np.zeros((12, 20), np.uint8))  # prepared again
     os.utime(path, ns=(1, path.stat().st_mtime_ns + 1))
     assert set(first.unique().tolist()) == {0, 1, 2} and not run.mask(0, "after", 20, 12).any()
     assert run.has_grid and run.load_grid()
+
+
+def test_a_base_opened_again_shows_no_masks_of_a_former_run_in_its_folder(tmp_path):
+    config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"), assigned=False)
+    write_prepared(tmp_path / "run", shift=1)
+    window = Stand(config)
+    run = window.model.viewing.run
+    assert run.mask(0, "after", 20, 12) is None and not run.has_grid and not run.load_grid()
+    assert set(window.look()) == ALWAYS | {"mask_before"}
+
+
+@pytest.mark.parametrize(("done", "masks"), [(0, 0), (1, 0), (3, 0), (4, 2), (6, 2)])
+def test_only_rounds_that_the_scene_has_been_through_are_shown(tmp_path, done, masks):
+    """Three rounds of nine steps are prepared before steps 0, 3 and 6; this run has come to step 6, and a former run
+    in its folder had another round."""
+    config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"))
+    for folder, shift in (("", 0), ("round_2", 2), ("round_3", 3)):
+        write_prepared(tmp_path / "run", shift, folder)
+
+    def change(model):
+        model.config.refine_rounds, model.schedule = 3, PhaseSchedule(10, 9)
+        model.refined_steps.fill_(done)
+
+    run = Stand(config, change=change).model.viewing.run
+    before, after = (run.mask(0, kind, 20, 12) for kind in ("before", "after"))
+    assert torch.equal(before.roll(masks, 0), after)
 
 
 def test_panel_and_legend_do_not_wait_for_a_step_but_the_click_does(window, monkeypatch):
@@ -377,7 +388,7 @@ def test_an_extracted_run_shows_its_object_and_the_masks_of_the_run_it_is_from(f
     window.look("occupancy_violation")
     window.panel.follow()
     assert window.look("occupancy_violation")["occupancy_violation"].sum() > 0
-    assert window.panel.export_now() == extracted.config.parent / "exports/shown_scene.ply"
+    assert window.panel.files.write() == extracted.config.parent / "exports/shown_scene.ply"
 
 
 def test_an_extracted_run_whose_origin_is_gone_lists_less(finished, tmp_path):
@@ -399,4 +410,4 @@ def test_a_base_without_masks_lists_what_it_has(tmp_path):
 def test_without_a_viewer_there_is_no_export(finished):
     _, pipeline, _, _ = eval_setup(finished, test_mode="test")
     with pytest.raises(UserError, match="beags export"):
-        pipeline.model.viewer_panel.export_now()
+        pipeline.model.viewer_panel.files.write()

@@ -9,8 +9,8 @@ from typing import Any
 
 from beags_plugin.bench.experiment import Experiment, Variant
 from beags_plugin.evaluation.metrics import METRICS
+from beags_plugin.evaluation.records import KINDS
 from beags_plugin.evaluation.report import STAGES as MOMENTS
-from beags_plugin.evaluation.run_metrics import KINDS
 
 STAGES = ("base training", "reprojection", "assignment", "voxel grids", "refinement")
 MEAN = "mean"  # in the column "object": over all masks of the scene

@@ -14,7 +14,8 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.cells import Square, below, cell, crop, square_around, wrapped, write_picture
 from beags_plugin.evaluation.metrics import resize_nearest
-from beags_plugin.evaluation.run_metrics import EvalView, extracted_truth
+from beags_plugin.evaluation.records import EvalView
+from beags_plugin.evaluation.run_metrics import extracted_truth
 from beags_plugin.extraction.select import select_class
 from beags_plugin.masks.classes import colorize
 from beags_plugin.rasterizers.drawing import surfel_inputs

@@ -9,7 +9,8 @@ from typing import Any, Literal
 
 from beags_plugin.evaluation.metrics import METRICS, MaskMetrics, mean, mean_metrics
 from beags_plugin.evaluation.protocol import Protocol
-from beags_plugin.evaluation.run_metrics import KINDS, Kind, ObjectMetrics, SceneMetrics, pooled_average
+from beags_plugin.evaluation.records import KINDS, Kind, ObjectMetrics, SceneMetrics
+from beags_plugin.evaluation.run_metrics import pooled_average
 
 Stage = Literal["before", "after"]
 STAGES: tuple[Stage, ...] = ("before", "after")

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from beags_plugin.evaluation.metrics import METRICS
 from beags_plugin.evaluation.protocol import Protocol
+from beags_plugin.evaluation.records import KINDS, ObjectMetrics
 from beags_plugin.evaluation.report import DataSetMetrics, RunMetrics, Stage
-from beags_plugin.evaluation.run_metrics import KINDS, ObjectMetrics
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType

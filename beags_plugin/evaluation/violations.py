@@ -6,10 +6,9 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.class_ranks import ClassRanks
-from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels, opacities
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.occupancy.sampling import disc_points, sample_words
+from beags_plugin.occupancy.violation import disc_sums
 from beags_plugin.rasterizers.interface import IGNORE
 
 
@@ -38,21 +37,10 @@ def occupancy_violations(
     surfels: N surfels. class_ids: [N] int32, phi. seed, step: decide the points, uniform in the discs of radius 3, as
     the loss draws them. Returns class id to 0..1, of the classes that have Gaussians.
     """
-    surfels = surfels.detach()
-    rotation = rotation_from_quat(surfels.quats)
-    axes = surfels.log_scales.exp()[:, None, :] * rotation[..., :2]  # [N, 3, 2]
-    opacity = opacities(surfels.opacity_logits)
-    gaussians = torch.arange(len(surfels), device=class_ids.device)
-    matter = torch.zeros(len(surfels), dtype=torch.float64, device=class_ids.device)
-    outside = torch.zeros_like(matter)
-    for sample in range(samples):  # one at a time: memory does not grow with their number
-        numbers = torch.tensor([sample], device=class_ids.device)
-        u, v = (value[0] for value in disc_points(sample_words(seed, step, gaussians, numbers), surfels.means.dtype))
-        points = surfels.means + u[:, None] * axes[..., 0] + v[:, None] * axes[..., 1]
-        weight = (opacity * torch.exp(-0.5 * (u * u + v * v))).double()
-        weight = torch.where(torch.isfinite(weight), weight, 0.0)
-        matter += weight
-        outside += weight.masked_fill(grid.valid(points, class_ids), 0.0)
+    sums = disc_sums(surfels, class_ids, grid, samples, seed=seed, step=step)
+    opacity = opacities(surfels.opacity_logits.detach()).double()
+    opacity = torch.where(torch.isfinite(opacity), opacity, 0.0)
+    matter, outside = opacity * sums.whole, opacity * sums.wrong
     ranks = ClassRanks(class_ids)
     places = ranks.ranks(class_ids).long()
     total = torch.bincount(places, weights=matter, minlength=len(ranks)).tolist()

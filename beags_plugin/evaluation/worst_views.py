@@ -14,8 +14,9 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.cells import GAP, Square, below, beside, cell, crop, printable, square_around
 from beags_plugin.evaluation.metrics import MaskMetrics, compared_masks
 from beags_plugin.evaluation.protocol import Protocol
+from beags_plugin.evaluation.records import KINDS, EvalView, Kind, MaskRecord
 from beags_plugin.evaluation.report import RunMetrics, Stage
-from beags_plugin.evaluation.run_metrics import KINDS, EvalView, Kind, MaskDrawing, MaskRecord
+from beags_plugin.evaluation.run_metrics import MaskDrawing
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 
 RIGHT, MISSED, WRONG, LEFT_OUT = 1, 2, 3, 4  # of an error map; 0 is right too: outside of both masks

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -36,6 +36,7 @@ class Piece:
     name: as the user calls it. surfels: N surfels. class_ids: [N] int32, phi.
     views: of the training photos; None unless an exporter ``needs_views``.
     shared: what exporters of one piece keep for each other, such as the mesh that two file types hold.
+    drew: is told, by an exporter that ``needs_views``, how many of them it has drawn so far.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Piece:
     class_ids: Tensor
     views: Viewpoints | None = None
     shared: dict[Any, Any] = field(default_factory=dict)
+    drew: Callable[[int], None] = lambda done: None
 
 
 class Exporter(ABC):

@@ -6,7 +6,7 @@ The fusing is Open3D's (``VoxelBlockGrid``); what is here chooses the voxels and
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,23 +66,31 @@ def _grid_mb(sides: Tensor, voxel: float, truncation: float) -> float:
 
 @torch.no_grad()
 def fuse(
-    surfels: Surfels, views: Viewpoints, resolution: int, truncation: float, memory_mb: float, min_views: int
+    surfels: Surfels,
+    views: Viewpoints,
+    resolution: int,
+    truncation: float,
+    memory_mb: float,
+    min_views: int,
+    drew: Callable[[int], None] = lambda done: None,
 ) -> Mesh:
     """The surface that at least ``min_views`` of the views show of an object drawn alone.
 
     surfels: N surfels, in the frame of the views. resolution: voxels along the longest side of their box; the drawings
     are close-ups of the box, ``PIXELS_PER_VOXEL`` times as many pixels long. truncation: voxels on either side of the
-    surface that a view changes. memory_mb: bound of the grid, 10^6 bytes. Returns a mesh, maybe of no face, vertices
-    and faces in an order that does not depend on the number of threads.
+    surface that a view changes. memory_mb: bound of the grid, 10^6 bytes. drew: is told after each view how many are
+    done. Returns a mesh, maybe of no face, its vertices and faces in an order that does not depend on the number of
+    threads.
     """
     low, high = bounding_box(surfels)
     voxel = voxel_size(low, high, resolution, truncation, memory_mb)
     grid = _new_grid()
-    for camera in views.cameras:
+    for done, camera in enumerate(views.cameras, start=1):
         close = close_up(camera, low, high, views.settings.near, PIXELS_PER_VOXEL * resolution)
         depth, color = _draw(surfels, close, views, low - truncation * voxel, high + truncation * voxel)
         if bool((depth > 0).any()):
             _integrate(grid, depth / voxel, color, _in_voxels(close, low, voxel), truncation)
+        drew(done)
     weight = min(min_views, len(views.cameras)) - 0.5
     mesh = grid.extract_triangle_mesh(weight_threshold=weight)
     if "positions" not in mesh.vertex or not len(mesh.vertex.positions):

@@ -45,7 +45,8 @@ class MeshExporter(MeshOptions, Exporter):
     def _mesh(self, piece: Piece) -> Mesh:
         if piece.views is None:
             raise ValueError("a mesh needs the views of the training photos")
-        fused = fuse(piece.surfels, piece.views, self.resolution, self.truncation, self.memory_mb, self.min_views)
+        options = self.resolution, self.truncation, self.memory_mb, self.min_views
+        fused = fuse(piece.surfels, piece.views, *options, piece.drew)
         return without_small_parts(fused, self.smallest_part)
 
     @staticmethod

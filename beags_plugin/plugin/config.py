@@ -13,10 +13,14 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 
+from beags_plugin.errors import UserError
 from beags_plugin.plugin import nerfstudio_patches  # noqa: F401  (lets torch load nerfstudio's own checkpoints)
 from beags_plugin.plugin.datamanager import BeagsDataManagerConfig
 from beags_plugin.plugin.dataparser import BeagsDataParserConfig
-from beags_plugin.plugin.model import BeagsModelConfig, LossSpec
+from beags_plugin.plugin.interrupts import stop
+from beags_plugin.plugin.loss_spec import LossSpec
+from beags_plugin.plugin.model import BeagsModelConfig
+from beags_plugin.plugin.run_lock import lock_ahead, run_lock
 from beags_plugin.plugin.runs import CONFIG_FILE, write_text_atomically
 from beags_plugin.plugin.trainer import BeagsTrainer
 
@@ -74,7 +78,17 @@ class BeagsTrainerConfig(TrainerConfig):
         return self.run_dir if self.run_dir is not None else super().get_base_dir()
 
     def save_config(self) -> None:
-        """Save config.yml with absolute paths, so that every command finds the run from any folder."""
+        """Save config.yml with absolute paths, so that every command finds the run from any folder.
+
+        It is the first that ns-train writes: ends the program, with one sentence, if another one trains in the folder.
+        """
+        try:
+            self._lock_and_save()
+        except UserError as error:
+            stop(error)
+
+    def _lock_and_save(self) -> None:
+        lock_ahead(self.get_base_dir())
         self.output_dir = Path(self.output_dir).absolute()
         for name in ("run_dir", "load_dir", "load_checkpoint"):
             if (path := getattr(self, name)) is not None:
@@ -85,6 +99,8 @@ class BeagsTrainerConfig(TrainerConfig):
         if (start := self.model_config.start_from) is not None:
             self.model_config.start_from = Path(start).absolute()
         write_text_atomically(yaml.dump(self), self.get_base_dir() / CONFIG_FILE)
+        if self.machine.num_devices * self.machine.num_machines > 1:  # the training is in processes of its own
+            run_lock(self.get_base_dir()).release()
 
 
 def base_config() -> BeagsTrainerConfig:

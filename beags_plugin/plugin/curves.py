@@ -14,7 +14,8 @@ from torch import Tensor
 from beags_plugin.errors import UserError
 from beags_plugin.evaluation.metrics import mask_metrics
 from beags_plugin.evaluation.protocol import Protocol
-from beags_plugin.evaluation.run_metrics import EvalView, extracted_mask, extracted_truth
+from beags_plugin.evaluation.records import EvalView
+from beags_plugin.evaluation.run_metrics import extracted_mask, extracted_truth
 from beags_plugin.evaluation.violations import boundary_errors, occupancy_violations
 from beags_plugin.extraction.select import select_class
 from beags_plugin.masks.classes import BACKGROUND, colorize

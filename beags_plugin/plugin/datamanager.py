@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import os
 import random
-from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain, count
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -37,7 +34,7 @@ from beags_plugin.plugin.undistortion import (
     undistort_class_map,
     undistort_image,
 )
-from beags_plugin.plugin.views import View
+from beags_plugin.plugin.views import View, unique_names
 from beags_plugin.rasterizers.interface import IGNORE
 
 OWN_KEYS = ("class_map", "alpha")
@@ -299,22 +296,3 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         """The view's data for use: class map and alpha on the device, the class map as int32."""
         moved = {key: value.to(self.device) if key in OWN_KEYS else value for key, value in data.items()}
         return {**moved, "class_map": widened(moved["class_map"])}
-
-
-def unique_names(files: Sequence[Path]) -> list[str]:
-    """For each file its stem; stems that several share get their folders before them, and a number if need be."""
-    parts = [Path(file).with_suffix("").parts for file in files]
-    depth = 1
-    while len({path[-depth:] for path in parts}) < len(set(parts)):
-        depth += 1
-    stems = Counter(path[-1] for path in parts)
-    taken = {stem for stem, uses in stems.items() if uses == 1}
-    names = []
-    for path in parts:
-        name = path[-1]
-        if stems[name] > 1:
-            whole = "_".join(path[-depth:])
-            name = next(n for n in chain([whole], (f"{whole}_{i}" for i in count(2))) if n not in taken)
-            taken.add(name)
-        names.append(name)
-    return names

@@ -12,8 +12,9 @@ from torch import Tensor
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.evaluation.protocol import Protocol
+from beags_plugin.evaluation.records import SceneMetrics
 from beags_plugin.evaluation.report import RunMetrics, Stage
-from beags_plugin.evaluation.run_metrics import SceneMetrics, evaluate_scene
+from beags_plugin.evaluation.run_metrics import evaluate_scene
 from beags_plugin.evaluation.worst_views import By, WorstMask, draw_worst
 from beags_plugin.plugin.evaluation_views import HeldOutViews
 from beags_plugin.plugin.extract import SavedScene, read_scene

@@ -14,7 +14,7 @@ from beags_plugin.data.files import image_size
 from beags_plugin.data.ground_truth import GroundTruth
 from beags_plugin.errors import UserError
 from beags_plugin.evaluation.metrics import resize_nearest
-from beags_plugin.evaluation.run_metrics import EvalView
+from beags_plugin.evaluation.records import EvalView
 from beags_plugin.masks.classes import read_binary_mask, read_mask
 from beags_plugin.plugin.model import fixed_background
 from beags_plugin.rasterizers.interface import IGNORE

@@ -103,7 +103,8 @@ def export_run(
     the emptied background, and a manifest. whole: the whole scene too, in one file; alone it needs no classes.
     formats: names of exporters. placement: "world", the frame of the input poses (the run's own if it has not kept how
     that was normalised), or "object", the same centred on each object. output: folder; ``exports/`` in the run by
-    default. options: format to its exporter's options. progress: is told (done, total) files.
+    default. options: format to its exporter's options. progress: is told (done, total) files, and
+    views drawn for the meshes among them.
     Raises ``UserError`` for a mistake, before anything is written.
     """
     from beags_plugin.plugin.evaluate import raster_settings
@@ -137,17 +138,34 @@ def export_run(
     pieces: list[tuple[str, int | None, str]] = [(name, present[name], titles[present[name]]) for name in names]
     if whole:
         pieces.append((WHOLE, None, "whole_scene"))
-    exported, total = [], len(pieces) * len(exporters)
-    for number, (name, class_id, title) in enumerate(pieces):
-        if progress:
-            progress(number * len(exporters), total)
-        exported.append(job.export(name, class_id, folder / title))
-    if progress:
-        progress(total, total)
+    steps = _Steps(job.steps(), len(pieces), progress or (lambda done, total: None))
+    exported = [job.export(name, class_id, folder / title, steps) for name, class_id, title in pieces]
     if everything:
         world = "run" if transform is None else "input"
         _write_manifest(folder, {"run": str(config_path.absolute()), "frame": placement, "world": world}, exported)
     return exported
+
+
+class _Steps:
+    """Tells the progress of an export: a step for each file, and before it one for each view that it draws.
+
+    of_a_piece: steps of each exporter's file.
+    """
+
+    def __init__(self, of_a_piece: Sequence[int], pieces: int, tell: Progress) -> None:
+        self._of_files = of_a_piece * pieces
+        self._file = 0
+        self._tell = tell
+        self.drew(0)
+
+    def drew(self, views: int) -> None:
+        """Some of the present file's views are drawn."""
+        self._tell(sum(self._of_files[: self._file]) + views, sum(self._of_files))
+
+    def wrote(self) -> None:
+        """The present file is done, whatever it took."""
+        self._file += 1
+        self.drew(0)
 
 
 @dataclass(frozen=True)
@@ -165,7 +183,12 @@ class _Job:
     views: Viewpoints | None
     tolerant: bool
 
-    def export(self, name: str, class_id: int | None, stem: Path) -> Exported:
+    def steps(self) -> list[int]:
+        """Of each file of a piece: see ``_Steps``."""
+        views = 0 if self.views is None else len(self.views.cameras)
+        return [1 + (views if exporter.needs_views else 0) for exporter in self.exporters.values()]
+
+    def export(self, name: str, class_id: int | None, stem: Path, steps: _Steps) -> Exported:
         """All files of one class (None: of the whole scene), called ``stem`` and their suffixes."""
         class_ids = self.scene.state["class_ids"]
         chosen = self.scene.surfels()
@@ -176,11 +199,11 @@ class _Job:
         center = (low + high) / 2 if self.centred else torch.zeros(3, dtype=torch.float64)
         frame = self.world.centred(center)
         views = None if self.views is None else frame.views(self.views)
-        piece = Piece(name, frame.surfels(chosen), class_ids, views)
-        files = [
-            self._write(label, exporter, stem.with_name(f"{stem.name}.{exporter.suffix}"), piece)
-            for label, exporter in self.exporters.items()
-        ]
+        piece = Piece(name, frame.surfels(chosen), class_ids, views, drew=steps.drew)
+        files = []
+        for label, exporter in self.exporters.items():
+            files.append(self._write(label, exporter, stem.with_name(f"{stem.name}.{exporter.suffix}"), piece))
+            steps.wrote()
         low, high = low - center, high - center
         return Exported(
             name, class_id, len(chosen), center.tolist(), low.tolist(), high.tolist(), frame.to_run(), files
@@ -196,13 +219,19 @@ class _Job:
 
 
 def export_shown(
-    config_path: Path, surfels: Surfels, class_ids: Tensor, title: str, format_name: str, settings: RasterSettings
+    config_path: Path,
+    surfels: Surfels,
+    class_ids: Tensor,
+    title: str,
+    format_name: str,
+    settings: RasterSettings,
+    progress: Progress = lambda done, total: None,
 ) -> Path:
     """Write surfels that a viewer shows into ``exports/`` of the run, without replacing a file; returns its path.
 
     config_path: config.yml of the run. surfels: M of its frame; class_ids: [M] int32. title: what the file is called,
-    before the suffix. settings: depth range of the scene. Raises ``UserError`` if nothing is shown, for an unknown
-    format, or a file that cannot be written.
+    before the suffix. settings: depth range of the scene. progress: is told (done, total) views that a mesh is made of.
+    Raises ``UserError`` if nothing is shown, for an unknown format, or a file that cannot be written.
     """
     exporter = make_exporter(format_name)
     if len(surfels) == 0:
@@ -213,7 +242,10 @@ def export_shown(
     if exporter.needs_views:
         views = frame.views(training_viewpoints(load_run_config(config_path), settings, config_path))
     path = _free_path(config_path.parent / "exports", title, exporter.suffix)
-    exporter.write(path, Piece(title, frame.surfels(surfels), class_ids, views))
+    total = 0 if views is None else len(views.cameras)
+    exporter.write(
+        path, Piece(title, frame.surfels(surfels), class_ids, views, drew=lambda done: progress(done, total))
+    )
     return path
 
 

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM during training: the step is finished and saved before the program ends."""
+"""What ends a training before its time: Ctrl-C and SIGTERM, after the step is finished and saved; a user's mistake."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import signal
 import threading
 from collections.abc import Callable
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
+
+from beags_plugin.errors import UserError
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -47,3 +50,9 @@ class Interrupts:
     def exit_code(self) -> int:
         """What a shell expects of a program that a signal ended."""
         return 128 + (self.asked or signal.SIGINT)
+
+
+def stop(error: UserError) -> NoReturn:
+    """End the program with the sentence of a user's mistake, and exit code 2."""
+    CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}", highlight=False, soft_wrap=True)
+    raise SystemExit(2) from error  # the cause is for callers from Python

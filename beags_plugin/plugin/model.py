@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -12,19 +11,18 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.models.base_model import Model, ModelConfig
-from nerfstudio.models.splatfacto import SplatfactoModel
-from torch import Tensor, nn
+from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import DensifyConfig, initial_surfels
-from beags_plugin.core.surfels import Surfels
-from beags_plugin.losses import LOSSES
 from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.photometric import ssim
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
+from beags_plugin.plugin.loss_spec import LossSpec
 from beags_plugin.plugin.schedule import PhaseSchedule
 from beags_plugin.plugin.step_clock import StepClock
+from beags_plugin.plugin.surfel_model import SurfelModel
 from beags_plugin.plugin.training import training_callbacks
 from beags_plugin.plugin.viewer_controls import ObjectPanel, ViewerLink
 from beags_plugin.plugin.viewing import Viewing, asked_by_viewer, scene_outputs
@@ -33,32 +31,6 @@ from beags_plugin.rasterizers.drawing import surfel_inputs
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings, SurfelInputs
 from beags_plugin.refiners.border_split import BorderSplitConfig
 from beags_plugin.refiners.preparation import PreparationConfig
-
-PARAMETER_GROUPS = ("means", "features_dc", "features_rest", "opacities", "scales", "quats")
-FLATNESS = 1e-3  # exported third scale, relative to the smaller of the two: flat, yet no viewer divides by 0
-
-
-@dataclass
-class LossSpec:
-    """One term of the training loss, as a config lists it."""
-
-    weight: float = 1.0
-    """Factor in the sum; 0 switches the term off."""
-    phase: Literal["base", "refine", "both"] = "both"
-    """Where the term may act."""
-    start: int = 0
-    """First step of the term: of the run, stated for a base of schedule_steps; or, for phase "refine", of the
-    refinement, as it is."""
-    options: dict[str, bool | int | float] = field(default_factory=dict)
-    """Options of the loss itself, e.g. ssim_weight or samples."""
-
-    def build(self, name: str, schedule: PhaseSchedule) -> Loss:
-        """The loss, with its steps made absolute."""
-        first = schedule.base_steps + self.start if self.phase == "refine" else schedule.scaled(self.start)
-        if self.phase != "refine" and (schedule.base_steps == 0 or schedule.warm):
-            first = 0  # the base was trained elsewhere: its terms have long started
-        last = schedule.base_steps if self.phase == "base" else None
-        return LOSSES.get(name)(weight=self.weight, start=first, stop=last, **self.options)
 
 
 @dataclass
@@ -141,17 +113,11 @@ def fixed_background(config: BeagsModelConfig) -> Tensor:
     return torch.full((3,), 1.0 if config.background_color == "white" else 0.0)
 
 
-class BeagsModel(SplatfactoModel):
-    """A scene of surfels with classes.
-
-    It derives from nerfstudio's ``SplatfactoModel`` because ns-export and the viewer ask for that type, but shares
-    none of its training: parameters, rendering, losses and callbacks are all its own.
-    """
+class BeagsModel(SurfelModel):
+    """A scene of surfels with classes that is drawn, scored and trained by the losses of its config."""
 
     config: BeagsModelConfig
-    # buffers, for type checkers; the surfels are N
-    class_ids: Tensor  # [N] int32
-    class_margin: Tensor  # [N] float32
+    # buffers, for type checkers
     assigned: Tensor  # [] bool
     extent: Tensor  # [] float32, world units
     refined_steps: Tensor  # [] int64, refinement steps that the scene has been through
@@ -164,19 +130,7 @@ class BeagsModel(SplatfactoModel):
             raise ValueError("the data supplies no seed points; use the data parser beags-data, which always does")
         generator = torch.Generator().manual_seed(torch.initial_seed() % 2**63)
         points, colors = (values.detach().cpu().float() for values in self.seed_points)
-        surfels = initial_surfels(points, colors / 255.0, self.config.sh_degree, generator)
-        self.gauss_params = nn.ParameterDict(
-            {
-                "means": nn.Parameter(surfels.means),
-                "features_dc": nn.Parameter(surfels.sh_dc),
-                "features_rest": nn.Parameter(surfels.sh_rest),
-                "opacities": nn.Parameter(surfels.opacity_logits[:, None].contiguous()),
-                "scales": nn.Parameter(surfels.log_scales),
-                "quats": nn.Parameter(surfels.quats),
-            }
-        )
-        self.register_buffer("class_ids", torch.zeros(len(surfels), dtype=torch.int32))
-        self.register_buffer("class_margin", torch.zeros(len(surfels)))
+        self.hold(initial_surfels(points, colors / 255.0, self.config.sh_degree, generator))
         self.register_buffer("assigned", torch.tensor(False))
         self.register_buffer("extent", torch.tensor(1.0))
         self.register_buffer("refined_steps", torch.tensor(0))
@@ -206,71 +160,9 @@ class BeagsModel(SplatfactoModel):
         self.viewer_panel = ObjectPanel(self.viewing)  # nerfstudio finds both by being public attributes
         self.viewer_link = ViewerLink(self.viewer_panel)
 
-    # -- the scene ---------------------------------------------------------------------------------------------------
-
-    @property
-    def scales(self) -> Tensor:
-        """[N, 3] logs of the scales as exporters want them: the third is thin; the parameter itself has two."""
-        flat = self.gauss_params["scales"]
-        thin = flat.min(dim=-1, keepdim=True).values + torch.log(flat.new_tensor(FLATNESS))
-        return torch.cat([flat, thin], dim=-1)
-
-    def surfels(self) -> Surfels:
-        """The scene, sharing storage (and gradients) with the parameters."""
-        return Surfels(
-            means=self.gauss_params["means"],
-            quats=self.gauss_params["quats"],
-            log_scales=self.gauss_params["scales"],
-            opacity_logits=self.gauss_params["opacities"].view(-1),
-            sh_dc=self.gauss_params["features_dc"],
-            sh_rest=self.gauss_params["features_rest"],
-        )
-
-    def replace_surfels(self, surfels: Surfels) -> None:
-        """Put new parameters in place of all, of any number and degree; classes are reset.
-
-        New ones, since autograd still knows the size of those that the last step's graph holds.
-        """
-        values = {
-            "means": surfels.means,
-            "features_dc": surfels.sh_dc,
-            "features_rest": surfels.sh_rest,
-            "opacities": surfels.opacity_logits[:, None],
-            "scales": surfels.log_scales,
-            "quats": surfels.quats,
-        }
-        self.config.sh_degree = surfels.sh_degree
-        for name, value in values.items():
-            self.gauss_params[name] = nn.Parameter(value.detach().to(self.device).contiguous())
-        self.class_ids = torch.zeros(len(surfels), dtype=torch.int32, device=self.device)
-        self.class_margin = torch.zeros(len(surfels), device=self.device)
-
-    def load_state_dict(self, state: Mapping[str, Any], **kwargs) -> Any:
-        """Load a checkpoint of any number of surfels; parameters are resized in place (optimizers hold them)."""
-        count = state["gauss_params.means"].shape[0]
-        # colours are shown as they were trained, whatever degree this config asks for
-        self.config.sh_degree = round((state["gauss_params.features_rest"].shape[1] + 1) ** 0.5) - 1
-        for name, parameter in self.gauss_params.items():
-            parameter.data = torch.zeros_like(state[f"gauss_params.{name}"], device=self.device)
-        self.class_ids = torch.zeros(count, dtype=torch.int32, device=self.device)
-        self.class_margin = torch.zeros(count, device=self.device)
-        return nn.Module.load_state_dict(self, state, **kwargs)  # type: ignore[arg-type]
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """What a checkpoint keeps besides tensors: the class names."""
-        return {"classes": dict(self.classes)}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Take the class names of a checkpoint."""
-        self.classes = {int(index): str(name) for index, name in state["classes"].items()}
-
     def update_to_step(self, step: int) -> None:
         """Called with a checkpoint's step before it is loaded."""
         self.step = step
-
-    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """One optimizer group per kind of parameter."""
-        return {name: [self.gauss_params[name]] for name in PARAMETER_GROUPS}
 
     # -- rendering ---------------------------------------------------------------------------------------------------
 

@@ -105,9 +105,7 @@ class RefinementSwitch:
             self._switching = False
 
     def _round_starts(self) -> list[int]:
-        """The refinement steps before which masks, classes and grids are made, the first of them 0."""
-        steps, rounds = self.model.schedule.refine_steps, self.model.config.refine_rounds
-        return [steps * index // rounds for index in range(rounds)]
+        return self.model.schedule.round_starts(self.model.config.refine_rounds)
 
     def _prepare(self, step: int) -> None:
         """Prepare a round from the scene as it is and the masks as the data has them. step: the last one done."""

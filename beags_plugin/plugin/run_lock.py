@@ -20,6 +20,8 @@ class RunLock:
 
     def __init__(self, run: Path) -> None:
         self._file = _locked(run)
+        self._run = run.absolute()
+        _held.add(self._run)
 
     def release(self) -> None:
         """Let others train there."""
@@ -29,6 +31,25 @@ class RunLock:
             fcntl.flock(self._file, fcntl.LOCK_UN)  # also where a forked process still has the file open
             self._file.close()
             self._file = None
+        _held.discard(self._run)
+
+
+_held: set[Path] = set()  # by this process
+_ahead: dict[Path, RunLock] = {}
+
+
+def lock_ahead(run: Path) -> None:
+    """Hold ``run`` for a training of this process, which may have yet to begin: see ``run_lock``.
+
+    Raises ``UserError`` if another process holds it.
+    """
+    if run.absolute() not in _held:
+        _ahead[run.absolute()] = RunLock(run)
+
+
+def run_lock(run: Path) -> RunLock:
+    """The lock of ``run``, which this process may hold ahead of its training. Raises ``UserError``."""
+    return _ahead.pop(run.absolute(), None) or RunLock(run)
 
 
 def _locked(run: Path) -> IO[bytes] | None:

@@ -42,6 +42,10 @@ class PhaseSchedule:
         """Whether ``step`` belongs to refinement."""
         return step >= self.base_steps
 
+    def round_starts(self, rounds: int) -> list[int]:
+        """The steps of refinement before which masks, classes and grids are made, the first of them 0."""
+        return [self.refine_steps * index // rounds for index in range(rounds)]
+
     def progress(self, step: int) -> float:
         """Position in the base's learning-rate schedule, 0..1; refinement runs from 0.9 to 1 again, polish from 0.5."""
         if not self.refining(step):

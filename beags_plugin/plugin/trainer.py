@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
-from rich.markup import escape
 
 from beags_plugin.errors import UserError
 from beags_plugin.plugin.held_out import HeldOutCurve
-from beags_plugin.plugin.interrupts import Interrupts
+from beags_plugin.plugin.interrupts import Interrupts, stop
 from beags_plugin.plugin.memory import peak_memory_mb
 from beags_plugin.plugin.optimizers import JointOptimizers
-from beags_plugin.plugin.run_lock import RunLock
+from beags_plugin.plugin.run_lock import RunLock, run_lock
+from beags_plugin.plugin.run_seconds import Estimate, StageSeconds
 from beags_plugin.plugin.runs import (
     PREPARED,
     REPORT_FILE,
@@ -40,9 +39,6 @@ if TYPE_CHECKING:
     from beags_plugin.plugin.model import BeagsModel
 
 REPLACED = "replaced_models"  # checkpoints of an earlier run into the same folder, until the new one has its own
-QUICKER = "Quicker: ns-train beags-tiny, or end the command with: beags-data --downscale-factor 2."
-LONG_RUN_SECONDS = 20 * 60  # a run that is expected to take longer says which preset is quicker
-ESTIMATE_STEPS = (20, 120)  # the estimate is the mean step between these: after warm-up, soon enough to matter
 
 
 class BeagsTrainer(Trainer):
@@ -73,7 +69,7 @@ class BeagsTrainer(Trainer):
         """Load data, build the model, load a checkpoint; a user's mistake ends here, with one sentence."""
         try:
             if self.local_rank == 0:
-                self._lock = RunLock(self.base_dir)
+                self._lock = run_lock(self.base_dir)
                 self._set_aside()  # at once: config.yml is this run's already, and a resume would take both for one run
             if not self._loads():
                 check_start(self.config.model_config)
@@ -83,7 +79,7 @@ class BeagsTrainer(Trainer):
                 self._forget_events()
         except UserError as error:
             self._release()
-            _stop(error)
+            stop(error)
         except BaseException:
             self._release()
             raise
@@ -124,22 +120,18 @@ class BeagsTrainer(Trainer):
 
     def _train(self) -> None:
         self.config.max_num_iterations = max(self.last_step - self._start_step, 0)
-        self._seconds = _StageSeconds(self._model)
+        self._seconds = StageSeconds(self._model)
         self.keep("seconds", self._seconds)
         if self.config.max_num_iterations == 0:
             if self.loaded_run == self.base_dir.absolute() and not (self.base_dir / REPORT_FILE).exists():
                 return self._write_report()  # killed after its last checkpoint
-            _stop(
+            stop(
                 UserError(
                     f"the checkpoint is of a complete run ({self._start_step} steps): nothing is left to train; "
                     "to refine again, load <run>/base/nerfstudio_models with beags-refine."
                 )
             )
-        CONSOLE.print(
-            f"{self.config.method_name}: {self.config.max_num_iterations} steps; how long they take is said after "
-            f"{ESTIMATE_STEPS[1]} of them. {QUICKER}",
-            highlight=False,
-        )
+        self._estimate = Estimate(self.config.method_name, self.config.max_num_iterations)
         remove_unfinished(self.base_dir)
         (self.base_dir / REPORT_FILE).unlink(missing_ok=True)  # it says that the run is complete
         if self.config.steps_per_held_out > 0:
@@ -154,7 +146,7 @@ class BeagsTrainer(Trainer):
             with self._interrupts:
                 super().train()
         except UserError as error:
-            _stop(error)
+            stop(error)
         except KeyboardInterrupt as interrupt:
             if (self.base_dir / REPORT_FILE).exists():  # complete: the signal ended what shows it in the browser
                 return
@@ -164,27 +156,13 @@ class BeagsTrainer(Trainer):
 
     def train_iteration(self, step: int) -> Any:
         """One step; after some of them, says how long the run will take, or measures the held-out views."""
-        done = step - self._start_step
-        if done == ESTIMATE_STEPS[0]:
-            self._estimate_from = time.perf_counter()
-        if done == ESTIMATE_STEPS[1]:
-            self._say_duration((time.perf_counter() - self._estimate_from) / (ESTIMATE_STEPS[1] - ESTIMATE_STEPS[0]))
+        self._estimate.before_step(step - self._start_step)
         found = super().train_iteration(step)
         self._done = step
         if self.curve is not None:
             self.curve.after_step(step)  # before the scene grows, from which it needs some steps to recover
             self._model.clock.skip()
         return found
-
-    def _say_duration(self, seconds_per_step: float) -> None:
-        left = (self.last_step - self._start_step) * seconds_per_step
-        message = (
-            f"About {_duration(left)} for {self.last_step - self._start_step} steps at the present speed "
-            f"({1000 * seconds_per_step:.0f} ms a step; it slows down as Gaussians are added)."
-        )
-        if left > LONG_RUN_SECONDS:
-            message += f" {QUICKER}"
-        CONSOLE.print(message, highlight=False)
 
     # -- checkpoints -------------------------------------------------------------------------------------------------
 
@@ -318,40 +296,3 @@ class BeagsTrainer(Trainer):
         write_text_atomically(json.dumps(report, indent=2), self.base_dir / REPORT_FILE)
         if not self.config.keep_stages:  # a complete run asks for them no more
             shutil.rmtree(self.base_dir / PREPARED / STAGES, ignore_errors=True)
-
-
-class _StageSeconds:
-    """Wall time of base training, each preparation stage and refinement; a run that was broken off counts on."""
-
-    def __init__(self, model: BeagsModel) -> None:
-        self.model = model
-        self._started = time.perf_counter()
-        self._former: dict[str, float] = {}
-
-    def total(self) -> dict[str, float]:
-        """Seconds by name."""
-        model, now = self.model, time.perf_counter()
-        refining = now - model.refining_since if model.refining_since > 0 else 0.0
-        base = now - self._started - model.preparing_seconds - refining
-        own = {"base training": base, **model.prepared_seconds, "refinement": refining}
-        names = [name for name in {**self._former, **own} if name != "refinement"]
-        return {name: self._former.get(name, 0.0) + own.get(name, 0.0) for name in [*names, "refinement"]}
-
-    def state(self) -> dict[str, Any]:
-        """See ``training_state.Part``."""
-        return self.total()
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """See ``training_state.Part``."""
-        self._former = dict(state)
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
-def _stop(error: UserError) -> NoReturn:
-    CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}", highlight=False, soft_wrap=True)
-    raise SystemExit(2) from error  # the cause is for callers from Python

@@ -36,7 +36,7 @@ def training_callbacks(model: BeagsModel, attributes: TrainingCallbackAttributes
     switch = RefinementSwitch(model, trainer, datamanager)
     switch.check_options()
     switch.check_masks()
-    model.viewing.refinement_ready = lambda: switch.ready
+    model.viewing.rounds = lambda: switch.rounds if switch.ready else 0
     for name, part in {"views": datamanager, "densification": densifier, "refinement": switch}.items():
         trainer.keep(name, part)
 

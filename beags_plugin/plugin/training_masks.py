@@ -10,8 +10,8 @@ import numpy as np
 
 from beags_plugin.evaluation.metrics import resize_nearest
 from beags_plugin.masks.classes import read_class_map, read_mask
-from beags_plugin.plugin.datamanager import unique_names
 from beags_plugin.plugin.runs import last_prepared
+from beags_plugin.plugin.views import unique_names
 
 if TYPE_CHECKING:
     import numpy.typing as npt

@@ -16,8 +16,8 @@ from beags_plugin.evaluation.metrics import resize_nearest
 from beags_plugin.masks.classes import read_class_map
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
-from beags_plugin.plugin.datamanager import unique_names
-from beags_plugin.plugin.runs import last_prepared, preparing_run
+from beags_plugin.plugin.runs import preparing_run, round_folder
+from beags_plugin.plugin.views import unique_names
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.datamanager import BeagsDataManager
@@ -42,18 +42,20 @@ class ViewedRun:
         self.cameras: list[Camera] = [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))]
         self.grid: VisibilityGrid | None = None
         self._before = lru_cache(_KEPT_MASKS)(datamanager.training_mask)
-        self.is_prepared: Callable[[], bool] = lambda: True  # asked while the run is trained: see ``prepared``
+        self.rounds: Callable[[], int] = lambda: 1  # see ``prepared``
         self._after = lru_cache(_KEPT_MASKS)(_read_mask)
 
     @property
     def prepared(self) -> Path | None:
-        """The folder of what refinement was last prepared with: of this run, or of that which it was taken from.
+        """The folder of what refinement was prepared with: of this run, or of that which it was taken from.
 
-        While the run is trained, None until its refinement is prepared: a used folder may hold a former run's.
+        None while the scene that is shown has been through no preparation; else that of the last round that it has been
+        through: a folder that is used again may hold those of a former run.
         """
-        if not self.is_prepared():
+        rounds = self.rounds()
+        if rounds == 0:
             return None
-        folder = last_prepared(preparing_run(self.folder))
+        folder = round_folder(preparing_run(self.folder), rounds - 1)
         return folder if (folder / "grid.pt").exists() else None
 
     @property

@@ -21,9 +21,9 @@ from nerfstudio.viewer.viewer_elements import (
     ViewerSlider,
 )
 
-from beags_plugin.errors import UserError
 from beags_plugin.export import EXPORTERS
 from beags_plugin.plugin.viewed_run import ViewedRun
+from beags_plugin.plugin.viewer_export import ShownFiles
 from beags_plugin.plugin.viewing import NO_CLASSES, Viewing
 from beags_plugin.viewing.legend import LegendRow, escaped, legend, unique_labels
 from beags_plugin.viewing.picking import pick
@@ -70,7 +70,6 @@ class ObjectPanel(ViewerElement[None]):
         self._status: Any = None
         self._counted: tuple | None = None
         self._said = ["", ""]
-        self._exporting = threading.Lock()
         self.object = ViewerDropdown("Object", NONE, [NONE], hint="Also chosen by a click on the picture")
         # two rows: four buttons in one are cut off
         self.look = ViewerButtonGroup("Look at it", "Isolate", ["Isolate", "Show"], cb_hook=self._act)
@@ -85,9 +84,10 @@ class ObjectPanel(ViewerElement[None]):
             hint="Weaker Gaussians are left out",
         )  # fmt: skip
         self.clicks = ViewerCheckbox("Click picks an object", True, cb_hook=lambda box: self._listen(box.value))
+        self.files = ShownFiles(viewing, self.title, lambda: self.format.value, lambda said: self.note("export", said))
         formats = EXPORTERS.names()
         self.format = ViewerDropdown("Format", "ply" if "ply" in formats else formats[0], formats)
-        self.export = ViewerButton("Export what is shown", lambda _: self.start_export())
+        self.export = ViewerButton("Export what is shown", lambda _: self.files.start())
 
     # -- nerfstudio's side -------------------------------------------------------------------------------------------
 
@@ -152,7 +152,7 @@ class ObjectPanel(ViewerElement[None]):
         """Do to the chosen object what a button says: "Isolate", "Show", "Hide" or "Remove"."""
         class_id = self.labels.get(self.object.value)
         if class_id is None:
-            self.notes = {**self.notes, "object": f"Nothing to choose: {NO_CLASSES}"}
+            self.note("object", f"Nothing to choose: {NO_CLASSES}")
             return
         choice = self.viewing.choice
         change = {"Isolate": choice.isolate, "Hide": choice.hide, "Remove": choice.remove, "Show": choice.show}
@@ -163,7 +163,7 @@ class ObjectPanel(ViewerElement[None]):
 
     def clicked(self, click: ViewerClick) -> None:
         """Choose the object under the cursor."""
-        self.notes = {**self.notes, "object": self._pick(click)}
+        self.note("object", self._pick(click))
 
     def _pick(self, click: ViewerClick) -> str:
         viewing, model = self.viewing, self.viewing.model
@@ -189,42 +189,6 @@ class ObjectPanel(ViewerElement[None]):
         what = "background, no object" if found.class_id == 0 else label
         return f"Picked: {what} (Gaussian {index}, {margin:.0%} of its weight)."
 
-    # -- export ------------------------------------------------------------------------------------------------------
-
-    def start_export(self) -> None:
-        """Write what is shown, in a thread of its own."""
-        if not self._exporting.acquire(blocking=False):
-            self.notes = {**self.notes, "export": "The former export is still being written."}
-            return
-        self.notes = {**self.notes, "export": "Exporting ..."}
-        threading.Thread(target=self._export_and_say, name="beags export", daemon=True).start()
-
-    def _export_and_say(self) -> None:
-        try:
-            said = f"Exported to {self.export_now()}"
-        except UserError as error:
-            said = f"Not exported: {error}"
-        except Exception as error:  # a thread has nobody else to tell
-            said = f"Not exported ({type(error).__name__}: {error})."
-        finally:
-            self._exporting.release()
-        self.notes = {**self.notes, "export": said}
-
-    def export_now(self) -> Path:
-        """Write what is shown in full, inside the crop box; returns the file. Raises ``UserError``."""
-        from beags_plugin.plugin.export import export_shown
-
-        viewing = self.viewing
-        if viewing.run is None:
-            raise UserError("no viewer shows this scene: use beags export.")
-        scene = viewing.copy(rest=False)
-        config_path = viewing.run.folder / "config.yml"
-        with torch.no_grad():
-            return export_shown(
-                config_path, scene.surfels, scene.class_ids, f"shown_{self.title()}", self.format.value,
-                viewing.model.settings(),
-            )  # fmt: skip
-
     def title(self) -> str:
         """What is shown, in a few words for a file's name."""
         names = {class_id: label for label, class_id in self.labels.items()}
@@ -242,7 +206,7 @@ class ObjectPanel(ViewerElement[None]):
             try:
                 self.follow()
             except Exception as error:  # the panel must not stay behind for good
-                self.notes = {**self.notes, "panel": f"{type(error).__name__}: {error}"}
+                self.note("panel", f"{type(error).__name__}: {error}")
 
     def follow(self) -> None:
         """Bring the panel up to date, and read or compute what the viewer is to show; redraws when that is there."""
@@ -292,6 +256,10 @@ class ObjectPanel(ViewerElement[None]):
         self.object.set_options(options)
         if former not in options:
             self.object.value = next((label for label in options if self.labels.get(label)), options[0])  # an object
+
+    def note(self, about: str, said: str) -> None:
+        """Say something below the controls, in place of what was said last about the same."""
+        self.notes = {**self.notes, about: said}
 
     def _say(self) -> None:
         """Write legend and notes, if they have changed."""

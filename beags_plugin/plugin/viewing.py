@@ -83,6 +83,14 @@ def class_outputs(model: BeagsModel, scene: Shown, camera: Camera) -> dict[str, 
     return {"class_map": class_picture(classes), "class_confidence": share[..., None].float()}
 
 
+def rounds_of(model: BeagsModel) -> int:
+    """How often refinement was prepared for a scene that is not being trained: what a checkpoint says of it."""
+    if not bool(model.assigned):
+        return 0
+    starts, done = model.schedule.round_starts(max(model.config.refine_rounds, 1)), int(model.refined_steps)
+    return max(1, sum(start < done for start in starts))
+
+
 def within(model: BeagsModel, box: OrientedBox | None) -> Tensor | None:
     """[N] bool, the surfels in nerfstudio's crop box; None without one."""
     return None if box is None else box.within(model.means).reshape(-1)
@@ -105,8 +113,8 @@ class Viewing:
 
     choice: what is shown. background: [3], the viewer's. listed: names of ``CHANNELS`` that this run may be asked for;
     the same ones as long as a viewer runs. wanted: gives those that it shows now. crop_box: gives the viewer's.
-    run: what the run has on disk. refinement_ready: whether the training in this process has prepared its refinement,
-    or taken it up. notes: what is to be said of the pictures of the last drawing.
+    run: what the run has on disk. rounds: how often refinement has been prepared for the scene as it now is; a training
+    in this process says it for itself. notes: what is to be said of the pictures of the last drawing.
     """
 
     def __init__(self, model: BeagsModel) -> None:
@@ -117,7 +125,7 @@ class Viewing:
         self.wanted: Callable[[], frozenset[str]] = frozenset
         self.crop_box: Callable[[], OrientedBox | None] = lambda: None
         self.run: ViewedRun | None = None
-        self.refinement_ready: Callable[[], bool] = lambda: False
+        self.rounds: Callable[[], int] = lambda: rounds_of(model)
         self.shares: Shares | None = None
         self.notes: dict[str, str] = {}
         self.lock = threading.Lock()
@@ -130,8 +138,7 @@ class Viewing:
         the scene, or draws it for the viewer.
         """
         self.lock = lock or self.lock
-        if training:
-            run.is_prepared = lambda: self.refinement_ready()
+        run.rounds = lambda: self.rounds()
         classes = bool(self.model.assigned) or (training and self.model.schedule.refine_steps > 0)
         prepares = training and classes
         available = {

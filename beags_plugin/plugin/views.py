@@ -1,9 +1,12 @@
-"""One view of a scene as the data manager gives it."""
+"""One view of a scene as the data manager gives it, and what views are called."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import chain, count
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -65,3 +68,22 @@ class View:
         """The image [H, W, 3] with ``background`` [3] behind what is transparent."""
         alpha = self.alpha
         return self.image if alpha is None else self.image + (1.0 - alpha)[..., None] * background
+
+
+def unique_names(files: Sequence[Path]) -> list[str]:
+    """For each file its stem; stems that several share get their folders before them, and a number if need be."""
+    parts = [Path(file).with_suffix("").parts for file in files]
+    depth = 1
+    while len({path[-depth:] for path in parts}) < len(set(parts)):
+        depth += 1
+    stems = Counter(path[-1] for path in parts)
+    taken = {stem for stem, uses in stems.items() if uses == 1}
+    names = []
+    for path in parts:
+        name = path[-1]
+        if stems[name] > 1:
+            whole = "_".join(path[-depth:])
+            name = next(n for n in chain([whole], (f"{whole}_{i}" for i in count(2))) if n not in taken)
+            taken.add(name)
+        names.append(name)
+    return names
