@@ -81,7 +81,7 @@ class SilhouetteLoss(Loss):
         hidden = (shown > 0) & (depth > (1.0 + self.tau) * shown)
         outside = known & ~inside & ~hidden
         if self.seen > 0:
-            of_others = outside & (inputs.labels != 0) & (alone.alpha.detach() > 0)
+            of_others = outside & (inputs.labels != 0) & (alone.alpha.detach() > 0) & (depth > shown)
             outside &= ~self._seen_from_elsewhere(of_others, depth, class_id, inputs)
         wrong = torch.where(inside, 1.0 - alone.alpha, torch.where(outside, alone.alpha, 0.0))
         return ordered_sum(wrong)
