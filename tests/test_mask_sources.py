@@ -504,3 +504,50 @@ def test_prompts_name_views_by_folders(tmp_path):
         scene.index_of("v0", "prompts.json")
     with pytest.raises(UserError, match="prompts.json names the view 'v9', but no image of"):
         scene.index_of("v9", "prompts.json")
+
+
+def test_the_command_and_training_agree_on_photos_of_equal_stems(tmp_path, capsys):
+    from beags_plugin.plugin.dataparser import BeagsDataParserConfig
+
+    write_transforms(tmp_path, count=4)
+    meta = json.loads((tmp_path / "transforms.json").read_text())
+    for frame in meta["frames"]:
+        old = tmp_path / frame["file_path"]
+        camera, number = ("left", "right")[int(old.stem[1:]) % 2], int(old.stem[1:]) // 2
+        frame["file_path"] = f"images/{camera}/v{number}.png"
+        (tmp_path / f"images/{camera}").mkdir(exist_ok=True)
+        old.rename(tmp_path / frame["file_path"])
+        mask_at(tmp_path / f"made/{camera}/v{number}.png", 1 + number + 2 * (camera == "right"))
+    (tmp_path / "transforms.json").write_text(json.dumps(meta))
+    arguments = ["masks", "make", "--data", str(tmp_path), "--source", "id-images", "--options", "folder=made"]
+    main(arguments)
+    assert "4 masks of 4 views, 4 objects" in capsys.readouterr().out
+    expected = {"left/v0": 1, "left/v1": 2, "right/v0": 3, "right/v1": 4}
+    outputs = BeagsDataParserConfig(data=tmp_path, eval_interval=0).setup().get_dataparser_outputs("train")
+    found = {
+        path.relative_to(tmp_path / "images").with_suffix("").as_posix(): int(read_class_map(mask).max())
+        for path, mask in zip(outputs.image_filenames, outputs.metadata["class_map_filenames"], strict=True)
+    }
+    assert found == expected
+    held_out = BeagsDataParserConfig(data=tmp_path, eval_interval=0, held_out=("right/v0",)).setup()
+    (test,) = held_out.get_dataparser_outputs("test").image_filenames
+    assert test == tmp_path / "images/right/v0.png"
+    (tmp_path / "made/left/v0.png").rename(tmp_path / "made/v0.png")
+    with pytest.raises(SystemExit) as ended:
+        main([*arguments, "--overwrite"])
+    assert ended.value.code == 2
+    assert "made/v0.png could belong to left/v0 or right/v0" in " ".join(capsys.readouterr().out.split())
+
+
+def test_the_geometry_of_a_run_has_its_held_out_views_too(tmp_path):
+    from beags_plugin.plugin.made_masks import RunGeometry
+
+    data = write_scene(tmp_path / "scene")
+    geometry = RunGeometry(write_trained(tmp_path / "run", data))
+    assert [path.stem for path in geometry.images] == [f"v{index:02d}" for index in (*range(1, 8), 0, 8)]
+    ids = truth(0)
+    for view in (0, 7, 8):
+        camera = geometry.cameras[view]
+        assert tuple(geometry.depth(view).shape) == (camera.height, camera.width)
+        straight = geometry.to_straight(ids.astype(np.uint16), view)
+        np.testing.assert_array_equal(geometry.to_photo(straight, view), ids)  # this scene has no lens distortion
