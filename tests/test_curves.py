@@ -179,7 +179,7 @@ def test_wandb_gets_the_same(data, run, tmp_path, monkeypatch):
         assert history[event.step][tag] == pytest.approx(event.value, rel=1e-5), (tag, event.step)
     assert len(values) > 100 and "Extracted IoU/mean" in history[LAST]
     assert any({"Memory (MB)/now", "Seconds per step/drawing"} <= set(each) for each in history.values())
-    picture = tmp_path.rglob(history[LAST]["Objects/cup"]["path"])
+    picture = tmp_path.rglob(history[LAST]["Objects/cup/path"])
     assert len(list(picture)) == 1
 
 
