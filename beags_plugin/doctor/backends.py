@@ -51,7 +51,7 @@ name = sys.argv[2]
 reason = None
 try:
     reason = RASTERIZERS.get(name).unavailable()
-    rasterizer = makerasterizer(name)
+    rasterizer = make_rasterizer(name)
     import torch
     from beags_plugin.core.cameras import Camera
     from beags_plugin.rasterizers.interface import RasterSettings, SurfelInputs

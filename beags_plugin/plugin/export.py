@@ -153,7 +153,7 @@ class _Steps:
     """
 
     def __init__(self, of_a_piece: Sequence[int], pieces: int, tell: Progress) -> None:
-        self._of_files = of_a_piece * pieces
+        self._of_files = list(of_a_piece) * pieces
         self._file = 0
         self._tell = tell
         self.drew(0)
