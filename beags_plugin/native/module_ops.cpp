@@ -9,6 +9,7 @@
 
 #include "arrays.h"
 #include "occupancy_loss.h"
+#include "op_jobs.h"
 #include "reprojection_votes.h"
 #include "sh_colors.h"
 #include "sparse_sums.h"
@@ -99,24 +100,10 @@ void bind_functions(nb::module_& m, const char* suffix) {
            Out g_opacity_logits, int threads, double weight, bool skip) {
           const auto cubes = lookup.valid_cubes();
           const int64_t count = rows(class_ids);
-          OccupancyJob<T> job{};
-          job.means = means.data();
-          job.quats = quats.data();
-          job.log_scales = log_scales.data();
-          job.opacity_logits = opacity_logits.data();
-          job.class_ids = class_ids.data();
+          OccupancyJob<T> job = occupancy_job<T>(means, quats, log_scales, opacity_logits, class_ids, lookup.origin(),
+                                                 lookup.voxel_size(), stream, samples, background, g_means, g_quats,
+                                                 g_log_scales, g_opacity_logits, weight, skip);
           job.valid = cubes.data();
-          for (int axis = 0; axis < 3; ++axis) job.origin[axis] = static_cast<T>(lookup.origin()[axis]);
-          job.voxel_size = static_cast<T>(lookup.voxel_size());
-          job.stream = stream;
-          job.skip = skip;
-          job.samples = samples;
-          job.background = background;
-          job.factor = weight / (count && samples ? static_cast<double>(count) * static_cast<double>(samples) : 1.0);
-          job.g_means = g_means.data();
-          job.g_quats = g_quats.data();
-          job.g_log_scales = g_log_scales.data();
-          job.g_opacity_logits = g_opacity_logits.data();
           OccupancyResult result;
           {
             nb::gil_scoped_release release;
@@ -130,15 +117,8 @@ void bind_functions(nb::module_& m, const char* suffix) {
   m.def(("sh_colors_" + end).c_str(),
         [](In sh_dc, In sh_rest, In means, const std::vector<double>& center, int degree, Out colors,
            Array<uint8_t> clamped, int threads) {
-          ColorJob<T> job{};
-          job.degree = degree;
-          job.num_rest = static_cast<int>(sh_rest.shape(1));
-          for (int axis = 0; axis < 3; ++axis) job.center[axis] = static_cast<T>(center[axis]);
-          job.dc = sh_dc.data();
-          job.rest = sh_rest.data();
-          job.means = means.data();
+          ColorJob<T> job = color_job<T>(sh_dc, sh_rest, means, center, degree, clamped);
           job.colors = colors.data();
-          job.clamped = clamped.data();
           nb::gil_scoped_release release;
           sh_colors(job, means.shape(0), threads);
         },
@@ -146,18 +126,8 @@ void bind_functions(nb::module_& m, const char* suffix) {
   m.def(("sh_colors_backward_" + end).c_str(),
         [](In sh_dc, In sh_rest, In means, const std::vector<double>& center, int degree, Array<uint8_t> clamped,
            In g_colors, Out g_dc, Out g_rest, Out g_means, int threads) {
-          ColorJob<T> job{};
-          job.degree = degree;
-          job.num_rest = static_cast<int>(sh_rest.shape(1));
-          for (int axis = 0; axis < 3; ++axis) job.center[axis] = static_cast<T>(center[axis]);
-          job.dc = sh_dc.data();
-          job.rest = sh_rest.data();
-          job.means = means.data();
-          job.clamped = clamped.data();
-          job.g_colors = g_colors.data();
-          job.g_dc = g_dc.data();
-          job.g_rest = g_rest.data();
-          job.g_means = g_means.data();
+          ColorJob<T> job = color_job<T>(sh_dc, sh_rest, means, center, degree, clamped);
+          add_gradients(job, g_colors, g_dc, g_rest, g_means);
           nb::gil_scoped_release release;
           sh_colors_backward(job, means.shape(0), threads);
         },

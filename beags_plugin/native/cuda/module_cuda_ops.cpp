@@ -7,6 +7,7 @@
 #include <string>
 
 #include "../arrays.h"
+#include "../op_jobs.h"
 #include "ops.h"
 
 namespace nb = nanobind;
@@ -16,7 +17,10 @@ namespace beags {
 namespace {
 
 using namespace cuda;
+using ops::add_gradients;
+using ops::color_job;
 using ops::ColorJob;
+using ops::occupancy_job;
 using ops::OccupancyJob;
 using ops::VoxelTable;
 
@@ -63,23 +67,9 @@ void bind(nb::module_& m, const char* suffix) {
            uint64_t stream_of_numbers, int64_t samples, bool background, Out g_means, Out g_quats, Out g_log_scales,
            Out g_opacity_logits, Device<double> partial, Out value, double weight, bool skip, uintptr_t stream) {
           const int64_t count = class_ids.shape(0);
-          OccupancyJob<T> job{};
-          job.means = means.data();
-          job.quats = quats.data();
-          job.log_scales = log_scales.data();
-          job.opacity_logits = opacity_logits.data();
-          job.class_ids = class_ids.data();
-          for (int axis = 0; axis < 3; ++axis) job.origin[axis] = static_cast<T>(voxels.origin[axis]);
-          job.voxel_size = static_cast<T>(voxels.voxel_size);
-          job.stream = stream_of_numbers;
-          job.skip = skip;
-          job.samples = samples;
-          job.background = background;
-          job.factor = weight / (count && samples ? static_cast<double>(count) * static_cast<double>(samples) : 1.0);
-          job.g_means = g_means.data();
-          job.g_quats = g_quats.data();
-          job.g_log_scales = g_log_scales.data();
-          job.g_opacity_logits = g_opacity_logits.data();
+          const OccupancyJob<T> job = occupancy_job<T>(
+              means, quats, log_scales, opacity_logits, class_ids, voxels.origin, voxels.voxel_size, stream_of_numbers,
+              samples, background, g_means, g_quats, g_log_scales, g_opacity_logits, weight, skip);
           occupancy_loss(job, voxels, count, partial.data(), value.data(), stream_of(stream));
         },
         "means"_a, "quats"_a, "log_scales"_a, "opacity_logits"_a, "class_ids"_a, "voxels"_a, "numbers"_a, "samples"_a,
@@ -88,33 +78,16 @@ void bind(nb::module_& m, const char* suffix) {
   m.def(("sh_colors_" + end).c_str(),
         [](In sh_dc, In sh_rest, In means, const std::vector<double>& center, int degree, Out colors,
            Device<uint8_t> clamped, uintptr_t stream) {
-          ColorJob<T> job{};
-          job.degree = degree;
-          job.num_rest = static_cast<int>(sh_rest.shape(1));
-          for (int axis = 0; axis < 3; ++axis) job.center[axis] = static_cast<T>(center.at(axis));
-          job.dc = sh_dc.data();
-          job.rest = sh_rest.data();
-          job.means = means.data();
+          ColorJob<T> job = color_job<T>(sh_dc, sh_rest, means, center, degree, clamped);
           job.colors = colors.data();
-          job.clamped = clamped.data();
           sh_colors(job, means.shape(0), stream_of(stream));
         },
         "sh_dc"_a, "sh_rest"_a, "means"_a, "center"_a, "degree"_a, "colors"_a, "clamped"_a, "stream"_a);
   m.def(("sh_colors_backward_" + end).c_str(),
         [](In sh_dc, In sh_rest, In means, const std::vector<double>& center, int degree, Device<uint8_t> clamped,
            In g_colors, Out g_dc, Out g_rest, Out g_means, uintptr_t stream) {
-          ColorJob<T> job{};
-          job.degree = degree;
-          job.num_rest = static_cast<int>(sh_rest.shape(1));
-          for (int axis = 0; axis < 3; ++axis) job.center[axis] = static_cast<T>(center.at(axis));
-          job.dc = sh_dc.data();
-          job.rest = sh_rest.data();
-          job.means = means.data();
-          job.clamped = clamped.data();
-          job.g_colors = g_colors.data();
-          job.g_dc = g_dc.data();
-          job.g_rest = g_rest.data();
-          job.g_means = g_means.data();
+          ColorJob<T> job = color_job<T>(sh_dc, sh_rest, means, center, degree, clamped);
+          add_gradients(job, g_colors, g_dc, g_rest, g_means);
           sh_colors_backward(job, means.shape(0), stream_of(stream));
         },
         "sh_dc"_a, "sh_rest"_a, "means"_a, "center"_a, "degree"_a, "clamped"_a, "g_colors"_a, "g_dc"_a.none(),
