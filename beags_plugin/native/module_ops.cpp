@@ -61,16 +61,6 @@ void bind_lookup(nb::class_<VoxelLookup>& lookup, const char* suffix) {
              "means"_a, "axes_u"_a, "axes_v"_a, "class_ids"_a, "out"_a, "threads"_a);
 }
 
-// to_voxels: [13], a row by row, b, the side of a voxel.
-template <class T>
-LiftedView<T> lifted_view(const Array<const T>& depth, const Array<const T>& to_voxels) {
-  const int height = static_cast<int>(depth.shape(0)), width = static_cast<int>(depth.shape(1));
-  LiftedView<T> view{height, width, depth.data(), {}, {}, to_voxels.data()[12]};
-  std::copy_n(to_voxels.data(), 9, view.a);
-  std::copy_n(to_voxels.data() + 9, 3, view.b);
-  return view;
-}
-
 template <class T>
 void bind_votes(nb::class_<VoxelVotes>& votes, const char* suffix) {
   using In = Array<const T>;
@@ -78,13 +68,13 @@ void bind_votes(nb::class_<VoxelVotes>& votes, const char* suffix) {
   votes.def(("add_" + end).c_str(),
             [](VoxelVotes& self, In depth, In to_voxels, Ids labels, int32_t ignore) {
               nb::gil_scoped_release release;
-              self.add(lifted_view<T>(depth, to_voxels), labels.data(), ignore);
+              self.add(lifted_view(depth, to_voxels), labels.data(), ignore);
             },
             "depth"_a, "to_voxels"_a, "labels"_a, "ignore"_a);
   votes.def(("read_" + end).c_str(),
             [](const VoxelVotes& self, In depth, In to_voxels, Array<int32_t> labels, Array<float> confidence) {
               nb::gil_scoped_release release;
-              self.read(lifted_view<T>(depth, to_voxels), labels.data(), confidence.data());
+              self.read(lifted_view(depth, to_voxels), labels.data(), confidence.data());
             },
             "depth"_a, "to_voxels"_a, "labels"_a, "confidence"_a);
 }
@@ -138,17 +128,8 @@ void bind_functions(nb::module_& m, const char* suffix) {
            const std::vector<std::optional<Array<const uint8_t>>>& short_labels, int first, const In& maps,
            const std::vector<Array<int32_t>>& voted, const std::vector<Array<float>>& confidence, int num_classes,
            double tau, int threads) {
-          std::vector<VotingView<T>> views;
-          for (size_t v = 0; v < depths.size(); ++v) {
-            views.push_back({static_cast<int>(depths[v].shape(0)), static_cast<int>(depths[v].shape(1)),
-                             depths[v].data(), labels[v] ? labels[v]->data() : nullptr,
-                             short_labels[v] ? short_labels[v]->data() : nullptr});
-          }
-          std::vector<VotedView<T>> targets;
-          for (size_t t = 0; t < voted.size(); ++t) {
-            targets.push_back({first + static_cast<int>(t), maps.data() + 12 * views.size() * t, voted[t].data(),
-                               confidence[t].data()});
-          }
+          const auto views = voting_views(depths, labels, short_labels);
+          const auto targets = voted_views(first, maps, views.size(), voted, confidence);
           nb::gil_scoped_release release;
           reprojection_votes(views, targets, num_classes, tau, threads);
         },

@@ -1,10 +1,15 @@
 // Jobs of the ops from the arrays that Python hands over: the same for CPUs and for GPUs.
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
+#include <optional>
+#include <vector>
 
 #include "arrays.h"
+#include "lifted_view.h"
 #include "op_kernels.h"
+#include "reprojection_votes.h"
 
 namespace beags {
 namespace ops {
@@ -62,6 +67,42 @@ void add_gradients(ColorJob<T>& job, const Array<const T, kMemory>& g_colors, co
   job.g_dc = g_dc.data();
   job.g_rest = g_rest.data();
   job.g_means = g_means.data();
+}
+
+// to_voxels: [13], a row by row, b, the side of a voxel.
+template <class T, Memory kMemory>
+LiftedView<T> lifted_view(const Array<const T, kMemory>& depth, const Array<const T>& to_voxels) {
+  const int height = static_cast<int>(depth.shape(0)), width = static_cast<int>(depth.shape(1));
+  LiftedView<T> view{height, width, depth.data(), {}, {}, to_voxels.data()[12]};
+  std::copy_n(to_voxels.data(), 9, view.a);
+  std::copy_n(to_voxels.data() + 9, 3, view.b);
+  return view;
+}
+
+// The views of the pairwise votes; a view without labels of either type does not vote.
+template <class T, Memory kMemory>
+std::vector<VotingView<T>> voting_views(const std::vector<Array<const T, kMemory>>& depths,
+                                        const std::vector<std::optional<Array<const int32_t, kMemory>>>& labels,
+                                        const std::vector<std::optional<Array<const uint8_t, kMemory>>>& short_labels) {
+  std::vector<VotingView<T>> views;
+  for (size_t v = 0; v < depths.size(); ++v) {
+    views.push_back({static_cast<int>(depths[v].shape(0)), static_cast<int>(depths[v].shape(1)), depths[v].data(),
+                     labels[v] ? labels[v]->data() : nullptr, short_labels[v] ? short_labels[v]->data() : nullptr});
+  }
+  return views;
+}
+
+// The views first, first + 1, .. as targets. maps: [targets, views, 12].
+template <class T, Memory kMemory>
+std::vector<VotedView<T>> voted_views(int first, const Array<const T>& maps, size_t views,
+                                      const std::vector<Array<int32_t, kMemory>>& voted,
+                                      const std::vector<Array<float, kMemory>>& confidence) {
+  std::vector<VotedView<T>> targets;
+  for (size_t t = 0; t < voted.size(); ++t) {
+    targets.push_back(
+        {first + static_cast<int>(t), maps.data() + 12 * views * t, voted[t].data(), confidence[t].data()});
+  }
+  return targets;
 }
 
 }  // namespace ops

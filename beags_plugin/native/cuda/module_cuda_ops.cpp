@@ -1,6 +1,7 @@
 // The ops of the CUDA backend as Python sees them. Arguments are checked once, in beags_plugin/ops.
 #include "module_cuda_ops.h"
 
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
@@ -9,6 +10,7 @@
 #include "../arrays.h"
 #include "../op_jobs.h"
 #include "ops.h"
+#include "voxel_tally.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -94,6 +96,65 @@ void bind(nb::module_& m, const char* suffix) {
         "g_rest"_a.none(), "g_means"_a.none(), "stream"_a);
 }
 
+template <class T>
+void bind_votes(nb::module_& m, const char* suffix) {
+  using In = Device<const T>;
+  const std::string end(suffix);
+  m.def(("reprojection_votes_" + end).c_str(),
+        [](const std::vector<In>& depths, const std::vector<std::optional<DeviceIds>>& labels,
+           const std::vector<std::optional<Device<const uint8_t>>>& short_labels, int first, Array<const T> maps,
+           const std::vector<Device<int32_t>>& voted, const std::vector<Device<float>>& confidence, int num_classes,
+           double tau, Device<int32_t> counters, uintptr_t stream) {
+          const auto views = ops::voting_views(depths, labels, short_labels);
+          const auto targets = ops::voted_views(first, maps, views.size(), voted, confidence);
+          reprojection_votes(views, targets, num_classes, tau, reinterpret_cast<uint32_t*>(counters.data()),
+                             stream_of(stream));
+        },
+        "depths"_a, "labels"_a, "short_labels"_a, "first"_a, "maps"_a, "voted"_a, "confidence"_a, "num_classes"_a,
+        "tau"_a, "counters"_a, "stream"_a);
+  m.def(("vote_pixels_" + end).c_str(), [](const VoxelTally& tally, In depth, Array<const T> to_voxels,
+                                           DeviceIds labels, int32_t ignore, uintptr_t stream) {
+    vote_pixels(tally, ops::lifted_view(depth, to_voxels), labels.data(), ignore, stream_of(stream));
+  });
+  m.def(("vote_points_" + end).c_str(), [](const VoxelTally& tally, In points, DeviceIds class_ids,
+                                           const std::vector<double>& origin, double size, uintptr_t stream) {
+    VoxelFrame<T> frame{{}, static_cast<T>(size)};
+    for (int axis = 0; axis < 3; ++axis) frame.origin[axis] = static_cast<T>(origin.at(axis));
+    vote_points(tally, points.data(), class_ids.data(), class_ids.shape(0), frame, stream_of(stream));
+  });
+  m.def(("read_votes_" + end).c_str(), [](const VoxelTally& tally, In depth, Array<const T> to_voxels,
+                                          Device<int32_t> labels, Device<float> confidence, uintptr_t stream) {
+    read_votes(tally, ops::lifted_view(depth, to_voxels), labels.data(), confidence.data(), stream_of(stream));
+  });
+}
+
+void bind_tally(nb::module_& m) {
+  using Longs = Device<int64_t>;
+  using Ints = Device<int32_t>;
+  const auto counts = [](const Ints& ints) { return reinterpret_cast<uint32_t*>(ints.data()); };
+  const auto keys_of = [](const Longs& longs) { return reinterpret_cast<uint64_t*>(longs.data()); };
+  nb::class_<VoxelTally>(m, "VoxelTally")
+      .def(
+          "__init__",
+          [=](VoxelTally* self, Longs keys, Ints labels, Ints votes, Ints further, Longs more_keys, Ints more_votes,
+              Ints more_next, Ints used, Ints leaders, Ints totals) {
+            new (self) VoxelTally{keys.shape(0),    more_keys.shape(0), keys_of(keys),      labels.data(),
+                                  counts(votes),    further.data(),     keys_of(more_keys), counts(more_votes),
+                                  more_next.data(), used.data(),        leaders.data(),     counts(totals)};
+          },
+          "keys"_a, "labels"_a, "votes"_a, "further"_a, "more_keys"_a, "more_votes"_a, "more_next"_a, "used"_a,
+          "leaders"_a.none(), "totals"_a.none());
+  m.def("move_votes", [](const VoxelTally& from, const VoxelTally& to, uintptr_t stream) {
+    move_votes(from, to, stream_of(stream));
+  });
+  m.def("decide_votes", [](const VoxelTally& tally, uintptr_t stream) { decide(tally, stream_of(stream)); });
+  m.def("hash_bricks", [](Ints ranks, Longs bricks, Longs classes, Longs slots, uintptr_t stream) {
+    hash_bricks(ranks.shape(0), ranks.data(), reinterpret_cast<const ops::Brick*>(bricks.data()),
+                reinterpret_cast<const ops::BrickRange*>(classes.data()), reinterpret_cast<ops::Brick*>(slots.data()),
+                stream_of(stream));
+  });
+}
+
 }  // namespace
 
 void bind_cuda_ops(nb::module_& m) {
@@ -119,6 +180,9 @@ void bind_cuda_ops(nb::module_& m) {
   m.attr("OCCUPANCY_THREADS") = kOccupancyThreads;
   bind<float>(m, "f32");
   bind<double>(m, "f64");
+  bind_votes<float>(m, "f32");
+  bind_votes<double>(m, "f64");
+  bind_tally(m);
 }
 
 }  // namespace beags
