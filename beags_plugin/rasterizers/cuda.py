@@ -77,6 +77,10 @@ class CudaRasterizer(KernelRasterizer):
         """Whether a drawing in a CUDA graph had more pairs than memory in its last replay; its image is then wrong."""
         return any(int(totals[0]) > capacity for totals, capacity in self._captured)
 
+    def pairs(self) -> int:
+        """How many pairs of a tile and a surfel the largest drawing of late had, on any GPU; 0 before the first."""
+        return int(max(self._largest.values(), default=0))
+
     def forward_kernel(self, drawing: Drawing) -> Forward:
         """See ``KernelRasterizer.forward_kernel``."""
         inputs, camera, settings = drawing.inputs, drawing.camera, drawing.settings
