@@ -59,7 +59,7 @@ def test_both_reprojections_are_the_cpus(method, dtype, device, cpu_version):
 def test_pairwise_votes_with_maps_of_bytes_are_the_cpus(tau, device, cpu_version):
     depths, cameras, labels, num_classes = larger_scene()
     scene = (depths, cameras, LabelMaps(labels), num_classes)
-    assert all(mask is None or mask.dtype == torch.uint8 for mask in scene[2].stored)
+    assert {None if m is None else m.dtype for m in map(scene[2].narrow, range(5))} == {None, torch.uint8}
     found = reprojected(reproject_pairwise, scene, device, tau=tau)
     assert same(found, cpu_version(lambda: list(reproject_pairwise(*scene, tau=tau))))
 

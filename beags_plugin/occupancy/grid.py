@@ -86,6 +86,13 @@ class VisibilityGrid:
             self.voxel_size, self.origin, self.num_classes, self.keys[kept], self.classes[kept], self._dense_bytes
         )
 
+    def to(self, device: torch.device | str) -> VisibilityGrid:
+        """The grid there; itself if it lies there already."""
+        if self.keys.device == torch.device(device):
+            return self
+        parts = (self.keys.to(device), self.classes.to(device))
+        return VisibilityGrid(self.voxel_size, self.origin.to(device), self.num_classes, *parts, self._dense_bytes)
+
     def lookup(self) -> VoxelLookup | None:
         """The compiled lookup, made when it is first asked for; None without the extension (for a GPU, with CUDA)."""
         if extension.load() is None or (not self.keys.is_cpu and cuda_extension.load() is None):
