@@ -69,8 +69,9 @@ def inputs(surfels: Surfels) -> LossInputs:
     image = (HEIGHT, WIDTH)
     render = RasterOutputs(
         color=rand(*image, 3, requires_grad=True), alpha=rand(*image), depth=rand(*image, requires_grad=True),
-        median_depth=rand(*image), normal=rand(*image, 3, requires_grad=True), distortion=rand(*image, requires_grad=True),
-        boundary=rand(*image, requires_grad=True), visible=rand(N) > 0.5, num_nonfinite=0,
+        median_depth=rand(*image), normal=rand(*image, 3, requires_grad=True),
+        distortion=rand(*image, requires_grad=True), boundary=rand(*image, requires_grad=True),
+        visible=rand(N) > 0.5, num_nonfinite=0,
     )  # fmt: skip
     class_ids = torch.zeros(N, dtype=torch.int32, device="cuda")
     ranks = ClassRanks.__new__(ClassRanks)

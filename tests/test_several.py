@@ -22,6 +22,7 @@ from beags_plugin.plugin.presets import preset_config, preset_names
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.by_device import ByDevice
 from beags_plugin.rasterizers.cuda import CudaRasterizer
+from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 from beags_plugin.sample.writer import SampleConfig, write_sample
 
 
@@ -53,6 +54,12 @@ def test_presets_train_on_a_gpu_where_its_kernels_can_run(two_gpus):
 def test_presets_train_on_the_cpu_elsewhere(no_gpu):
     assert {device_of(name) for name in preset_names()} == {"cpu"}
     assert not isinstance(make_rasterizer("auto"), ByDevice)
+
+
+def test_a_gpu_without_our_kernels_is_drawn_on_by_torch(no_gpu, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    rasterizer = make_rasterizer("auto")
+    assert isinstance(rasterizer, ByDevice) and isinstance(rasterizer.gpu, TorchRasterizer)
 
 
 def test_devices_that_are_there_are_accepted(two_gpus):
