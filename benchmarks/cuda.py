@@ -1,8 +1,9 @@
-"""Times the CUDA backend on a GPU, beside gsplat's 2DGS where it is installed, and prints a table.
+"""Times the CUDA backend on a GPU, beside gsplat's 2DGS where it is installed.
 
-    python -m benchmarks.cuda [--quick | --smoke] [--json FILE]
+    python -m benchmarks.cuda [--quick | --smoke] [--json FILE] [--seconds 500] [--gsplat-seconds 150]
 
-Figures are medians of CUDA events around whole calls, after warming up. See docs/cuda.md.
+Figures are medians of CUDA events around whole calls, after warming up. What does not fit into --seconds is left out
+and named. See docs/cuda.md.
 """
 
 from __future__ import annotations
@@ -10,7 +11,9 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
+import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -30,6 +33,11 @@ IMAGES = ((832, 608), (1280, 800), (1920, 1088))  # 0.5, 1 and 2 megapixels
 LAYERS = 45  # contributing, per pixel: what 50,000 surfels of 17 pixels give 640 x 480
 SAMPLES = (1, 10, 20, 50, 100, 1000)  # Z
 LEAST_WIDTH = 3.0  # pixels
+DEVICE = "cuda"
+PARAMETER_BYTES = 52  # of a surfel: mean, quaternion, two scales, opacity, colour, as float32
+PIXEL_BYTES = 36  # of a pixel: colour, alpha, two depths, normal
+# of a pair: what is written once and read once at least; keys and places before and after the sort, and the record
+PAIR_BYTES = 2 * (2 * 8 + 4 + 80)
 
 
 def case(count: int, width: int, height: int) -> Size:
@@ -62,6 +70,11 @@ def peak_mb(call: Callable[[], Any]) -> float:
     return (torch.cuda.max_memory_allocated() - before) / 2**20
 
 
+def make_cuda() -> CudaRasterizer:
+    """The backend that is measured."""
+    return CudaRasterizer()
+
+
 class Drawing:
     """Forward and backward of one backend over one scene, towards all parameters and colours."""
 
@@ -70,7 +83,7 @@ class Drawing:
         values = {**vars(scene.surfels), "colors": scene.colors}
         self.leaves = {name: values[name].detach().clone().requires_grad_() for name in LEAVES}
         self.settings = replace(scene.settings, distortion=False)
-        self.rasterizer = CudaRasterizer()
+        self.rasterizer = make_cuda()
 
     def images(self) -> dict[str, Tensor]:
         """What both backends draw: colour, alpha, normal, expected and median depth."""
@@ -108,22 +121,53 @@ def drawing_row(scene: Scene, drawing: Drawing, name: str, repeats: int) -> dict
         forward = milliseconds(drawing.images, repeats)
     both = milliseconds(drawing.both, repeats)
     size = scene.size
-    row = {"n": size.n, "width": size.width, "height": size.height, "backend": name, "forward_ms": forward}
-    return {**row, "both_ms": both, "peak_mb": peak_mb(drawing.both)}
+    row = {**size_of(size), "backend": name, "forward_ms": forward, "both_ms": both, "peak_mb": peak_mb(drawing.both)}
+    if name == "beags":
+        row["pairs"] = drawing.rasterizer.pairs()
+        row["least_mb"] = least_bytes(size, drawing.rasterizer.pairs()) / 2**20
+    return row
 
 
-def gsplat_missing() -> str | None:
-    """None if gsplat's CUDA kernels can be used, else why not."""
+def size_of(size: Size) -> dict[str, Any]:
+    """What names a row."""
+    return {"n": size.n, "width": size.width, "height": size.height}
+
+
+def least_bytes(size: Size, pairs: int) -> int:
+    """What forward and backward must move at the very least, were nothing read twice: parameters read twice, their
+    gradients written once, images written and their gradients read, and what each pair of a tile and a surfel needs."""
+    return 3 * PARAMETER_BYTES * size.n + 2 * PIXEL_BYTES * size.width * size.height + PAIR_BYTES * pairs
+
+
+def against_the_copy_rate(rows: list[dict[str, Any]], rate: float) -> None:
+    """Into each of our rows: how long ``least_mb`` takes at the rate of a copy (GB/s), as a share of what it took."""
+    for row in rows:
+        if "least_mb" in row:
+            row["least_ms"] = row["least_mb"] * 2**20 / (rate * 1e6)
+            row["share_of_copy_rate"] = row["least_ms"] / row["both_ms"]
+
+
+PROBE = "from gsplat.rendering import rasterization_2dgs; from gsplat.cuda._backend import _C; assert _C is not None"
+
+
+def gsplat_missing(seconds: float) -> str | None:
+    """None if gsplat's CUDA kernels can be used, else why not. It compiles them when it is first imported, which may
+    take many minutes: it is given so many seconds, in a process of its own."""
+    if seconds <= 0:
+        return "left out: --gsplat-seconds is 0"
     try:
-        from gsplat.rendering import rasterization_2dgs  # noqa: F401
-    except Exception as error:
-        return f"gsplat is not there ({error})"
-    return None
+        done = subprocess.run([sys.executable, "-c", PROBE], capture_output=True, text=True, timeout=seconds)
+    except subprocess.TimeoutExpired:
+        return f"gsplat did not compile its kernels within {seconds:.0f} s"
+    if done.returncode == 0:
+        return None
+    lines = done.stderr.strip().splitlines()
+    return f"gsplat cannot be used: {lines[-1] if lines else f'exit code {done.returncode}'}"
 
 
 def copy_rate() -> float:
     """GB/s of a large copy on the device, bytes read and written: the ceiling of what only moves memory."""
-    source = torch.rand(1 << 28, device="cuda")
+    source = torch.rand(1 << 28, device=DEVICE)
     target = torch.empty_like(source)
     return 2 * source.numel() * 4 / milliseconds(lambda: target.copy_(source), 10) / 1e6
 
@@ -131,14 +175,16 @@ def copy_rate() -> float:
 def step_rows(size: Size, repeats: int) -> list[dict[str, Any]]:
     """A training step without and with the two losses; Z from 1 to 1000. A row that fails holds the reason."""
     rows: list[dict[str, Any]] = []
-    scene = on_device(make_scene(size), "cuda")
+    scene: Scene | None = None
     for samples in (None, *SAMPLES):
-        row: dict[str, Any] = {"n": size.n, "width": size.width, "height": size.height, "samples": samples}
+        row: dict[str, Any] = {**size_of(size), "samples": samples}
         try:
+            scene = scene or on_device(make_scene(size), DEVICE)
             step = TrainingStep(scene, samples)
             row = {**row, "step_ms": milliseconds(step.run, repeats), "peak_mb": peak_mb(step.run)}
             if samples is not None and "step_ms" in rows[0]:
                 row["ratio_to_base"] = row["step_ms"] / rows[0]["step_ms"]
+                row["extra_ms"] = row["step_ms"] - rows[0]["step_ms"]
         except Exception as error:
             row["failed"] = failure(error)
         rows.append(row)
@@ -146,21 +192,18 @@ def step_rows(size: Size, repeats: int) -> list[dict[str, Any]]:
     return rows
 
 
-def drawing_rows(size: Size, repeats: int) -> list[dict[str, Any]]:
-    """Both backends on one scene; where one fails (no memory, no compiler for gsplat), the reason stands in its row."""
+def drawing_rows(size: Size, repeats: int, gsplat: bool) -> list[dict[str, Any]]:
+    """Both backends on one scene; where one fails (no memory, say), the reason stands in its row."""
     rows: list[dict[str, Any]] = []
-    what = {"n": size.n, "width": size.width, "height": size.height}
-    drawings: list[tuple[str, type[Drawing]]] = [("beags", Drawing)]
-    if gsplat_missing() is None:
-        drawings.append(("gsplat", GsplatDrawing))
-    for name, kind in drawings:
+    scene: Scene | None = None
+    for name, kind in (("beags", Drawing), ("gsplat", GsplatDrawing))[: 2 if gsplat else 1]:
         try:
-            scene = on_device(make_scene(size), "cuda")
+            scene = scene or on_device(make_scene(size), DEVICE)
             rows.append(drawing_row(scene, kind(scene), name, repeats))
         except Exception as error:  # of another library too: what is measured already must not be lost
-            rows.append({**what, "backend": name, "failed": failure(error)})
+            rows.append({**size_of(size), "backend": name, "failed": failure(error)})
         print(rows[-1], flush=True)
-    torch.cuda.empty_cache()
+        torch.cuda.empty_cache()
     return rows
 
 
@@ -175,8 +218,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="the smallest sizes only")
     parser.add_argument("--smoke", action="store_true", help="run every kernel once, time nothing")
-    parser.add_argument("--json", help="file to write")
-    chosen = parser.parse_args(arguments)
+    parser.add_argument("--json", help="file to write, again after every row")
+    parser.add_argument("--seconds", type=float, default=500.0, help="begin nothing new after so long")
+    parser.add_argument("--gsplat-seconds", type=float, default=150.0, help="for gsplat to compile; 0 leaves it out")
+    chosen, began = parser.parse_args(arguments), time.monotonic()
     if reason := CudaRasterizer.unavailable():
         print(f"benchmarks.cuda: {reason}", file=sys.stderr)
         return 1
@@ -185,35 +230,72 @@ def main(arguments: list[str] | None = None) -> int:
         torch.cuda.synchronize()
         print("smoke test:", f"not finite: {'; '.join(wrong)}" if wrong else "all is finite")
         return 1 if wrong else 0
+    return measure(describe_gpu(), chosen, began + chosen.seconds)
+
+
+def describe_gpu() -> dict[str, Any]:
+    """What was measured, on what."""
     properties = torch.cuda.get_device_properties(0)
-    out: dict[str, Any] = {
+    names = ("multi_processor_count", "total_memory", "L2_cache_size", "clock_rate", "memory_clock_rate")
+    return {
         "gpu": properties.name,
-        "multiprocessors": properties.multi_processor_count,
+        "capability": f"{properties.major}.{properties.minor}",
+        **{name: getattr(properties, name) for name in names if hasattr(properties, name)},
         "machine": describe_machine(),
         "commit": commit(),
         "torch": torch.__version__,
         "cuda": torch.version.cuda,
-        "gsplat": gsplat_missing() or "used",
-        "copy_gb_per_s": copy_rate(),
-        "rows": [],
-        "steps": [],
     }
-    print({name: value for name, value in out.items() if name not in ("rows", "steps")}, flush=True)
+
+
+def measure(machine: dict[str, Any], chosen: argparse.Namespace, end: float) -> int:
+    """All rows that can be begun before ``end`` (of ``time.monotonic``); the exit code."""
+    missing = gsplat_missing(chosen.gsplat_seconds)
+    out: dict[str, Any] = {**machine, "gsplat": missing or "used", "copy_gb_per_s": copy_rate(), "left_out": []}
+    print(out, flush=True)
+    out.update(rows=[], steps=[])
     repeats = 5 if chosen.quick else 20
 
     def save() -> None:
+        against_the_copy_rate(out["rows"], out["copy_gb_per_s"])
         if chosen.json:
             with open(chosen.json, "w") as file:
                 json.dump(out, file, indent=1)
 
-    size = case(100_000, *IMAGES[0]) if chosen.quick else case(1_000_000, *IMAGES[1])
-    out["steps"] = step_rows(size, repeats)
+    out["steps"] = step_rows(case(100_000, *IMAGES[0]) if chosen.quick else case(1_000_000, *IMAGES[1]), repeats)
     save()
-    for count in COUNTS[:1] if chosen.quick else COUNTS:
-        for width, height in IMAGES[:1] if chosen.quick else IMAGES:
-            out["rows"] += drawing_rows(case(count, width, height), repeats)
-            save()
+    sizes = [case(count, *image) for count in COUNTS for image in IMAGES]
+    for size in sizes[:1] if chosen.quick else sizes:
+        if time.monotonic() > end:
+            out["left_out"].append(size_of(size))
+            continue
+        out["rows"] += drawing_rows(size, repeats, gsplat=missing is None)
+        save()
+    save()
+    print(table(out), flush=True)
     return 1 if any("failed" in row and row.get("backend") != "gsplat" for row in out["rows"] + out["steps"]) else 0
+
+
+def table(out: dict[str, Any]) -> str:
+    """The rows for a reader."""
+    lines = [f"{out.get('gpu')}, a copy moves {out['copy_gb_per_s']:.0f} GB/s, gsplat: {out['gsplat']}"]
+    lines.append("surfels    image        backend  forward   both ms   MB   of copy rate")
+    for row in out["rows"]:
+        name = f"{row['n']:<10} {row['width']}x{row['height']:<7} {row['backend']:<8}"
+        if "failed" in row:
+            lines.append(f"{name} failed: {row['failed']}")
+            continue
+        share = f"{100 * row['share_of_copy_rate']:.0f} %" if "share_of_copy_rate" in row else ""
+        lines.append(f"{name} {row['forward_ms']:7.2f} {row['both_ms']:9.2f} {row['peak_mb']:6.0f}  {share}")
+    lines.append("step       Z        ms     MB   times the base step")
+    for row in out["steps"]:
+        name = f"{row['n']:<10} {row['samples'] or 'base'!s:<5}"
+        if "failed" in row:
+            lines.append(f"{name} failed: {row['failed']}")
+            continue
+        lines.append(f"{name} {row['step_ms']:7.2f} {row['peak_mb']:6.0f}  {row.get('ratio_to_base', 1.0):.3f}")
+    lines += [f"left out, no time: {size}" for size in out["left_out"]]
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

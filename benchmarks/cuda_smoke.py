@@ -8,6 +8,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from beags_plugin.masks.reprojection import reproject_pairwise
+from beags_plugin.masks.voxel_reprojection import reproject_voxel
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.ops.occupancy_loss import occupancy_loss
 from beags_plugin.ops.sh_colors import sh_colors
@@ -65,6 +67,18 @@ def _results(
     shape = [inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits]
     loss = occupancy_loss(shape[0], shape[1], shape[2], shape[3], ids, lookup, stream=7, samples=20)
     yield "occupancy loss", [loss, *_gradients(loss, shape)]
+    yield "reprojection", list(_reprojected(rasterizer, scene, plain))
+
+
+def _reprojected(rasterizer: Rasterizer, scene: Scene, inputs: SurfelInputs) -> Iterator[Tensor]:
+    """Confidences of both kinds, from two views with different depths and masks."""
+    settings, background = replace(scene.settings, geometry=True), scene.background.to(inputs.means.dtype)
+    drawn = rasterizer.rasterize(inputs, scene.camera, settings, background)
+    depths = [image for image in (drawn.depth, drawn.median_depth) if image is not None]
+    masks = [scene.target, scene.target.flip(0).contiguous()]
+    for reproject in (reproject_pairwise, reproject_voxel):
+        for voted in reproject(depths, [scene.camera] * 2, masks, CLASSES):
+            yield voted.confidence
 
 
 def _drawn(

@@ -1,8 +1,10 @@
 #!/usr/bin/env bash
 # Everything that needs a GPU: scripts/gpu_check.sh [--out FOLDER] [build] [tests] [memcheck] [racecheck] [synccheck] [benchmark]
-# Without names of stages it runs them all; where a command may only run for a few minutes, name one stage a call. It
-# needs an NVIDIA GPU, nvcc, CMake, a C++ compiler, and a Python (PYTHON, default python3) with torch for CUDA, nanobind,
-# numpy, scipy and pytest; no nerfstudio. It builds in place, for the GPU that is here, and changes nothing outside the
+# Without names of stages it runs them all; where a command may only run for a few minutes, name one stage a call (and
+# build in each call, if the machine is a fresh one every time). It needs an NVIDIA GPU, nvcc, CMake, a C++ compiler, and
+# a Python (PYTHON, default python3) with torch for CUDA, nanobind, numpy, scipy and pytest; no nerfstudio. Where gsplat
+# is installed, its kernels may take GSPLAT_SECONDS (150) to compile, else it is left out. The benchmark begins nothing
+# new after BENCHMARK_SECONDS (500). It builds in place, for the GPU that is here, and changes nothing outside the
 # repository. A stage that fails does not stop the others, except that nothing runs after a build that failed; the exit
 # code tells. Logs and cuda.json go to FOLDER (default build/gpu_check).
 set -uo pipefail
@@ -26,7 +28,12 @@ for stage in "${stages[@]}"; do
   case "$stage" in build | tests | memcheck | racecheck | synccheck | benchmark) ;; *) fail "there is no stage $stage" ;; esac
 done
 command -v nvidia-smi >/dev/null && nvidia-smi -L || fail "there is no NVIDIA GPU, or no driver for it"
+export PATH="$PATH:/usr/local/cuda/bin"
 command -v nvcc >/dev/null || fail "there is no nvcc: install the CUDA toolkit"
+for tool in cmake c++; do command -v "$tool" >/dev/null || fail "there is no $tool: install it"; done
+for package in torch nanobind numpy scipy pytest; do
+  "$python" -c "import $package" 2>/dev/null || fail "$python has no $package: pip install $package"
+done
 "$python" -c 'import torch, sys; sys.exit(not torch.cuda.is_available())' || fail "$python has no torch that sees the GPU"
 
 build() {
@@ -40,7 +47,7 @@ build() {
 }
 
 tests() { # everything that draws or uses an op on the GPU; nothing here imports nerfstudio
-  "$python" -m pytest -q -p no:cacheprovider tests/test_cuda_rasterizer.py tests/test_cuda_ops.py tests/test_cuda_gpu.py \
+  "$python" -m pytest -q -p no:cacheprovider tests/test_cuda_rasterizer.py tests/test_cuda_ops.py tests/test_cuda_votes.py tests/test_cuda_gpu.py \
     tests/test_rasterizer_reference.py tests/test_rasterizer_robustness.py tests/test_screen_shift.py \
     -k "cuda and not emulated"
 }
@@ -57,12 +64,18 @@ memcheck() { sanitized memcheck; }
 racecheck() { sanitized racecheck; }
 synccheck() { sanitized synccheck; }
 
-benchmark() { "$python" -m benchmarks.cuda --json "$out/cuda.json"; }
+benchmark() {
+  "$python" -m benchmarks.cuda --json "$out/cuda.json" --seconds "${BENCHMARK_SECONDS:-500}" \
+    --gsplat-seconds "${GSPLAT_SECONDS:-150}"
+}
 
 failed=()
 for stage in "${stages[@]}"; do
   echo "== $stage"
   SECONDS=0
+  if [ "$stage" != build ] && ! ls beags_plugin/_native*.so >/dev/null 2>&1; then
+    fail "there is no beags_plugin/_native*.so here: name the stage build first"
+  fi
   "$stage" >"$out/$stage.log" 2>&1
   code=$?
   word=ok
@@ -73,7 +86,10 @@ for stage in "${stages[@]}"; do
   fi
   tail -n 25 "$out/$stage.log"
   echo "== $stage: $word, $SECONDS s"
-  if [ "$stage" = build ] && [ "$code" != 0 ]; then break; fi
+  if [ "$stage" = build ] && [ "$code" != 0 ]; then
+    echo "gpu_check: without a build nothing else can run; the compiler's words are in $out/build.log" >&2
+    break
+  fi
 done
 if [ ${#failed[@]} -gt 0 ]; then fail "failed: ${failed[*]}"; fi
 echo "gpu_check: all is well"

@@ -6,8 +6,11 @@ from dataclasses import fields, replace
 from importlib import import_module
 from types import ModuleType
 
+import pytest
+import torch
 from torch import Tensor
 
+from beags_plugin.ops import cuda_extension
 from beags_plugin.rasterizers.cuda import CudaRasterizer
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, SurfelInputs
 
@@ -18,6 +21,23 @@ def emulation() -> ModuleType | None:
         return import_module("beags_plugin._cuda_emulation")
     except ImportError:
         return None
+
+
+def cuda_device(request, monkeypatch) -> torch.device:
+    """A fixture's body: where the CUDA ops take their tensors from; a GPU, or for the emulation the CPU.
+
+    ``request.param``: "cuda" or "cuda emulated".
+    """
+    if request.param == "cuda":
+        if reason := cuda_extension.found()[1]:
+            pytest.skip(reason)
+        return torch.device("cuda")
+    module = emulation()
+    if module is None:
+        pytest.skip("beags_plugin._cuda_emulation was not built (BEAGS_CUDA_EMULATION=ON)")
+    monkeypatch.setattr(cuda_extension, "module_for", lambda *tensors: module)
+    monkeypatch.setattr(cuda_extension, "load", lambda: module)
+    return torch.device("cpu")
 
 
 class EmulatedCudaRasterizer(CudaRasterizer):

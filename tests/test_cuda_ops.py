@@ -7,7 +7,7 @@ import test_occupancy_loss
 import test_sh_colors
 import test_voxel_lookup
 import torch
-from cuda_backends import emulation
+from cuda_backends import cuda_device
 
 from beags_plugin.core import sh
 from beags_plugin.losses.base import LossInputs
@@ -16,6 +16,7 @@ from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.ops import cuda_extension, extension
 
 pytestmark = pytest.mark.skipif(extension.load() is None, reason="beags_plugin._native was not built")
+device = pytest.fixture(params=["cuda", "cuda emulated"])(cuda_device)
 
 
 @pytest.fixture
@@ -29,21 +30,6 @@ def torch_version(monkeypatch):
             return call()
 
     return compute
-
-
-@pytest.fixture(params=["cuda", "cuda emulated"])
-def device(request, monkeypatch):
-    """Where the CUDA ops take their tensors from: a GPU, or for the emulation the CPU."""
-    if request.param == "cuda":
-        if reason := cuda_extension.found()[1]:
-            pytest.skip(reason)
-        return torch.device("cuda")
-    module = emulation()
-    if module is None:
-        pytest.skip("beags_plugin._cuda_emulation was not built (BEAGS_CUDA_EMULATION=ON)")
-    monkeypatch.setattr(cuda_extension, "module_for", lambda *tensors: module)
-    monkeypatch.setattr(cuda_extension, "load", lambda: module)
-    return torch.device("cpu")
 
 
 def moved(grid: VisibilityGrid, device: torch.device) -> VisibilityGrid:
@@ -154,8 +140,8 @@ def test_the_smoke_test_launches_every_variant_and_finds_what_is_not_finite(devi
     call = cuda_extension.call
     monkeypatch.setattr(cuda_extension, "call", lambda m, name, *rest: called.add(name) or call(m, name, *rest))
     assert cuda_smoke.smoke(rasterizer, device.type, Size(60, 24, 20)) == []
-    ops = {"sh_colors", "sh_colors_backward", "occupancy_loss"}
-    assert called == ops | {"count", "valid", "disc_inside"}
+    ops = {"sh_colors", "sh_colors_backward", "occupancy_loss", "count", "valid", "disc_inside"}
+    assert called == ops | {"vote_points", "vote_pixels", "read_votes", "reprojection_votes"}
     monkeypatch.setattr(cuda_smoke, "sh_colors", lambda dc, *_: dc * torch.inf)
     wrong = cuda_smoke.smoke(rasterizer, device.type, Size(60, 24, 20))
     assert len(wrong) == 2 * 4 and all("colours" in name for name in wrong)

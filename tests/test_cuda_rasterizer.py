@@ -212,3 +212,11 @@ def test_without_cuda_the_reason_is_told():
         pytest.skip("there is a GPU here")
     with pytest.raises(UserError, match="'cuda' cannot run here"):
         make_rasterizer("cuda")
+
+
+def test_memory_for_pairs_comes_in_few_sizes():
+    from beags_plugin.rasterizers.cuda import _capacity
+
+    for pairs in (0, 1, 5_000, 100_000, 3_000_000, 60_000_000):
+        assert 1.25 * pairs < _capacity(pairs) <= 1.25 * 1.125 * pairs + (1 << 14)
+    assert len({_capacity(pairs) for pairs in range(1_000_000, 2_000_000, 1_000)}) <= 9

@@ -18,6 +18,8 @@ from beags_plugin.ops.sparse_sums import SparseSums
 from beags_plugin.rasterizers.drawing import geometry_inputs
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
 
+_UNITS = float(1 << 38)  # of a pixel, in the sums of contributions on a GPU, which come in such units
+
 
 @dataclass(frozen=True)
 class Assignment:
@@ -76,13 +78,24 @@ def assign_classes(
         raise ValueError(f"{len(cameras)} cameras and {len(labels)} masks do not belong together")
     for keys, values in each_view(len(cameras), contributions, progress):
         surfel, class_id = keys // (num_classes + 1), keys % (num_classes + 1)
-        strongest = torch.maximum(strongest, torch.zeros_like(strongest).index_add_(0, surfel, values.double()))
+        strongest = torch.maximum(strongest, _added_up(surfel, values, len(strongest)))
         labelled = class_id < num_classes
         total.add((surfel * num_classes + class_id)[labelled], values[labelled])
     class_ids, top, everything = largest_in_rows(*total.found(), len(surfels), num_classes)
     never_seen = everything <= 0
     margin = torch.where(never_seen, 0.0, top / everything.masked_fill(never_seen, 1.0))
     return Assignment(class_ids.int(), margin.float(), never_seen, strongest.float())
+
+
+def _added_up(surfel: Tensor, values: Tensor, count: int) -> Tensor:
+    """[count] float64, the sum of each surfel's values.
+
+    A GPU adds in any order: there, in whole numbers, whose sums have none.
+    """
+    if values.is_cuda:
+        zeros = torch.zeros(count, dtype=torch.int64, device=values.device)
+        return zeros.index_add_(0, surfel, (values.double() * _UNITS).round().long()).double() / _UNITS
+    return torch.zeros(count, dtype=torch.float64).index_add_(0, surfel, values.double())
 
 
 def check_class_ids(mask: Tensor, index: int, num_classes: int) -> None:

@@ -105,9 +105,9 @@ class Densified:
 class GradientStatistics:
     """Mean screen gradient of N surfels over the views that saw them."""
 
-    def __init__(self, count: int) -> None:
-        self.total = torch.zeros(count)
-        self.views = torch.zeros(count)
+    def __init__(self, count: int, device: torch.device | str = "cpu") -> None:
+        self.total = torch.zeros(count, device=device)
+        self.views = torch.zeros(count, device=device)
 
     def add(self, gradient: Tensor, visible: Tensor) -> None:
         """Add one view: gradient [N], counted where visible [N] bool."""
@@ -152,7 +152,7 @@ def densify(
 
     # a clone is the copy; a split replaces the surfel by two, so it leaves the kept ones
     source = torch.cat([kept, clones, splits, splits])
-    fresh = torch.zeros(source.shape[0], dtype=torch.bool)
+    fresh = torch.zeros_like(source, dtype=torch.bool)
     fresh[kept.shape[0] :] = True
     grown = surfels[source]
     halves = slice(kept.shape[0] + clones.shape[0], None)

@@ -1,8 +1,12 @@
-"""Work on views, split over the processes of ``torch.distributed`` where there are several."""
+"""Work on views, split over the processes of ``torch.distributed`` where there are several, and what they agree on.
+
+What the functions here are given must be of the same kind in all processes, and all must call them. Alone, they do
+nothing.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -11,6 +15,62 @@ import torch.distributed as dist
 from torch import Tensor
 
 Result = TypeVar("Result")
+
+
+def size() -> int:
+    """How many processes there are."""
+    return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
+
+
+def rank() -> int:
+    """The number of this one, from 0."""
+    return dist.get_rank() if size() > 1 else 0
+
+
+def add_up(tensors: Iterable[Tensor]) -> None:
+    """Put the sum over all processes into each tensor, the same bits in all of them."""
+    if size() > 1:
+        for tensor in tensors:
+            dist.all_reduce(tensor, group=_group(tensor.device))
+
+
+def average(tensors: Iterable[Tensor]) -> None:
+    """Put the mean over all processes into each float tensor, the same bits in all of them."""
+    if size() > 1:
+        tensors = list(tensors)
+        add_up(tensors)
+        for tensor in tensors:
+            tensor /= size()
+
+
+def take_from_first(tensors: Iterable[Tensor]) -> None:
+    """Put what the first process has into each tensor."""
+    if size() > 1:
+        for tensor in tensors:
+            dist.broadcast(tensor, src=0, group=_group(tensor.device))
+
+
+def in_any(yes: bool) -> bool:
+    """Whether it is so in any process; the host waits for all hosts, not for a GPU."""
+    if size() > 1:
+        flag = torch.tensor(int(yes))
+        dist.all_reduce(flag, op=dist.ReduceOp.MAX, group=_group(flag.device))
+        return bool(flag)
+    return yes
+
+
+_host_groups: dict[Any, Any] = {}
+
+
+def _group(device: torch.device) -> Any:
+    """What exchanges tensors there: GPUs may talk through NCCL, which knows none on a CPU."""
+    if device.type != "cpu" or dist.get_backend() != "nccl":
+        return None
+    world = dist.group.WORLD
+    if world not in _host_groups:
+        _host_groups.clear()
+        _host_groups[world] = dist.new_group(backend="gloo")
+    return _host_groups[world]
 
 
 def each_view(
@@ -28,7 +88,7 @@ def each_view(
 
     progress: called with how many are done and ``count``.
     """
-    processes = dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
+    processes = size()
     if processes == 1:
         for index in range(count):
             yield _told(work(index), progress, index, count)
@@ -42,7 +102,7 @@ def each_view(
         except Exception as error:  # told to all, who would wait forever
             failure = error
         found: list[Any] = [None] * processes
-        dist.all_gather_object(found, (_packed(mine), failure))
+        dist.all_gather_object(found, (_packed(mine), failure), group=_group(torch.device("cpu")))
         for _, problem in found:
             if problem is not None:
                 raise problem

@@ -74,7 +74,7 @@ except UserError as error:
 
 _AVOIDED = {  # how to do without a backend that fails
     "native": "BEAGS_NATIVE=0 in the environment avoids it",
-    "cuda": "training with --machine.device-type cpu, the default, avoids it",
+    "cuda": "training with --machine.device-type cpu avoids it",
 }
 
 

@@ -25,5 +25,6 @@ class BoundaryLoss(Loss):
             return inputs.render.color.new_zeros(())
         if inputs.render.boundary is None:
             raise ValueError("the boundary loss needs a render with a target")
-        labelled = int((inputs.labels - IGNORE).count_nonzero())  # a third of the time of comparing and summing
-        return ordered_sum(inputs.render.boundary) / max(labelled, 1)  # B is 0 at IGNORE
+        labelled = (inputs.labels - IGNORE).count_nonzero()  # a third of the time of comparing and summing
+        # As a tensor: of a GPU's, the host would have to wait for the number.
+        return ordered_sum(inputs.render.boundary) / labelled.clamp(min=1)  # B is 0 at IGNORE

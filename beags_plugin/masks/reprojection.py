@@ -12,7 +12,7 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.errors import UserError
 from beags_plugin.masks.label_maps import LabelMaps, widened
-from beags_plugin.ops import extension
+from beags_plugin.ops import cuda_extension, extension
 from beags_plugin.ops.reprojection_votes import reprojection_votes
 from beags_plugin.rasterizers.interface import IGNORE
 
@@ -58,15 +58,16 @@ def reproject_pairwise(
         return
     depths = list(depths)  # every view is projected into every other
     maps, held = _PixelMaps(cameras), _held(labels)
+    compiled = extension.can_take(*depths) or cuda_extension.module_for(*depths) is not None
     i = 0
     while i < len(cameras):
         size = max(camera.height * camera.width for camera in cameras) * num_classes
-        if extension.can_take(*depths) and size <= _DENSE_COUNTERS:
+        if compiled and size <= _DENSE_COUNTERS:
             # as many views at a time as there are threads, each with its own counters
             batch = range(i, min(i + max(1, min(extension.threads(), 2 * _DENSE_COUNTERS // size)), len(cameras)))
             towards = torch.stack([torch.cat([A.flatten(1), b], dim=1) for A, b in map(maps.towards, batch)])
             own = [labels[view] for view in batch]
-            found = reprojection_votes(depths, held, own, towards.to(depths[0]), i, num_classes, tau, IGNORE)
+            found = reprojection_votes(depths, held, own, towards.to(depths[0].dtype), i, num_classes, tau, IGNORE)
             results = [ReprojectedMask(*pair) for pair in zip(*found, strict=True)]
         else:
             results = [_by_torch(depths, cameras, labels, num_classes, tau, i, maps)]

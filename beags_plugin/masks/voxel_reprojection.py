@@ -12,8 +12,7 @@ from beags_plugin.core.filed_tensors import filed
 from beags_plugin.masks.pooled_votes import TorchVotes
 from beags_plugin.masks.reprojection import ReprojectedMask, check_counts, check_view
 from beags_plugin.masks.slabs import Slabs, slabs_of
-from beags_plugin.ops import extension
-from beags_plugin.ops.voxel_votes import VoxelVotes
+from beags_plugin.ops.voxel_votes import votes_for
 from beags_plugin.rasterizers.interface import IGNORE
 
 VOXEL_PIXELS = 1.5  # side of a voxel, in pixels seen at the objects' median depth
@@ -44,10 +43,10 @@ def reproject_voxel(
     check_counts(depths, cameras, labels, tau)
     if not cameras:
         return
-    size, native = _survey(depths, cameras, labels, num_classes)
+    size, alike = _survey(depths, cameras, labels, num_classes)
     lifts = _to_voxels(cameras, _origin(cameras), size)
     slabs = slabs_of(depths, cameras, lifts)
-    votes = _Votes(depths, labels, lifts, slabs, native, progress)
+    votes = _Votes(depths, labels, lifts, slabs, alike, progress)
     if len(slabs) == 1:
         yield from (ReprojectedMask(labels, confidence) for labels, confidence, _ in votes.of_slab(0))
         return
@@ -64,15 +63,16 @@ def reproject_voxel(
 class _Votes:
     """Votes and their reading, slab by slab."""
 
-    def __init__(self, depths, labels, lifts: Tensor, slabs: Slabs, native: bool, progress) -> None:
+    def __init__(self, depths, labels, lifts: Tensor, slabs: Slabs, alike: bool, progress) -> None:
         self.depths, self.labels, self.lifts, self.slabs = depths, labels, lifts, slabs
-        self._native, self._progress = native, progress
+        self._alike, self._progress = alike, progress
         self._done, self._total = 0, 2 * len(slabs) * len(depths)
 
     def of_slab(self, slab: int) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
         """Per view the labels [H, W] int32, the confidence [H, W] float32, and which pixels [H, W] bool have their
         point in the slab (None: all, as there is but one); others keep their label, with confidence 0."""
-        votes = VoxelVotes(IGNORE) if self._native else TorchVotes(IGNORE)
+        compiled = votes_for(self.depths[:1], IGNORE) if self._alike else None
+        votes = compiled or TorchVotes(IGNORE)
         for i, (depth, mask) in enumerate(zip(self.depths, self.labels, strict=True)):
             about = self._of_slab(i, depth, slab, self.slabs.about)
             if mask is not None and (about is None or bool(about.any())):
@@ -110,23 +110,22 @@ def _known(depth: Tensor, mask: Tensor | None) -> Tensor:
 
 
 def _survey(depths, cameras, labels, num_classes: int) -> tuple[float, bool]:
-    """The size of the voxels, and whether the compiled votes take the depths; raises as ``check_views``.
+    """The size of the voxels, and whether all depths are of one type and place; raises as ``check_views``.
 
     The size is ``VOXEL_PIXELS`` times the median of depth / focal length over the objects' pixels (over all that are
     drawn, if there are none); world units. Objects, as it is about them that classes meet: what is behind them may be
     far away.
     """
     step = max(1, sum(camera.height * camera.width for camera in cameras) // _FOOTPRINTS)
-    thinned, labelled, native, dtypes = [], [], True, set()
+    thinned, labelled, kinds = [], [], set()
     for index, (depth, camera, mask) in enumerate(zip(depths, cameras, labels, strict=True)):
         check_view(index, depth, camera, mask, num_classes)
         focal = (float(camera.K[0, 0]) * float(camera.K[1, 1])) ** 0.5
         thinned.append((depth.reshape(-1)[::step] / focal).double().cpu())
         label = torch.zeros(len(thinned[-1]), dtype=torch.int32) if mask is None else mask.reshape(-1)[::step].cpu()
         labelled.append(label.clone())  # not a piece of the view's map, which would stay in memory as a whole
-        dtypes.add(depth.dtype)
-        native = native and len(dtypes) == 1 and extension.can_take(depth)
-    return _voxel_size(torch.cat(thinned), torch.cat(labelled)), native
+        kinds.add((depth.dtype, depth.device))
+    return _voxel_size(torch.cat(thinned), torch.cat(labelled)), len(kinds) == 1
 
 
 def _voxel_size(footprints: Tensor, label: Tensor) -> float:

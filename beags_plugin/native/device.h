@@ -3,6 +3,8 @@
 
 #if defined(__CUDACC__)
 #define BEAGS_HD __host__ __device__
+#define BEAGS_HD_INLINE __host__ __device__ __forceinline__
 #else
 #define BEAGS_HD
+#define BEAGS_HD_INLINE inline __attribute__((always_inline))
 #endif

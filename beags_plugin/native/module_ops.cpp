@@ -9,6 +9,7 @@
 
 #include "arrays.h"
 #include "occupancy_loss.h"
+#include "op_jobs.h"
 #include "reprojection_votes.h"
 #include "sh_colors.h"
 #include "sparse_sums.h"
@@ -60,16 +61,6 @@ void bind_lookup(nb::class_<VoxelLookup>& lookup, const char* suffix) {
              "means"_a, "axes_u"_a, "axes_v"_a, "class_ids"_a, "out"_a, "threads"_a);
 }
 
-// to_voxels: [13], a row by row, b, the side of a voxel.
-template <class T>
-LiftedView<T> lifted_view(const Array<const T>& depth, const Array<const T>& to_voxels) {
-  const int height = static_cast<int>(depth.shape(0)), width = static_cast<int>(depth.shape(1));
-  LiftedView<T> view{height, width, depth.data(), {}, {}, to_voxels.data()[12]};
-  std::copy_n(to_voxels.data(), 9, view.a);
-  std::copy_n(to_voxels.data() + 9, 3, view.b);
-  return view;
-}
-
 template <class T>
 void bind_votes(nb::class_<VoxelVotes>& votes, const char* suffix) {
   using In = Array<const T>;
@@ -77,13 +68,13 @@ void bind_votes(nb::class_<VoxelVotes>& votes, const char* suffix) {
   votes.def(("add_" + end).c_str(),
             [](VoxelVotes& self, In depth, In to_voxels, Ids labels, int32_t ignore) {
               nb::gil_scoped_release release;
-              self.add(lifted_view<T>(depth, to_voxels), labels.data(), ignore);
+              self.add(lifted_view(depth, to_voxels), labels.data(), ignore);
             },
             "depth"_a, "to_voxels"_a, "labels"_a, "ignore"_a);
   votes.def(("read_" + end).c_str(),
             [](const VoxelVotes& self, In depth, In to_voxels, Array<int32_t> labels, Array<float> confidence) {
               nb::gil_scoped_release release;
-              self.read(lifted_view<T>(depth, to_voxels), labels.data(), confidence.data());
+              self.read(lifted_view(depth, to_voxels), labels.data(), confidence.data());
             },
             "depth"_a, "to_voxels"_a, "labels"_a, "confidence"_a);
 }
@@ -99,24 +90,10 @@ void bind_functions(nb::module_& m, const char* suffix) {
            Out g_opacity_logits, int threads, double weight, bool skip) {
           const auto cubes = lookup.valid_cubes();
           const int64_t count = rows(class_ids);
-          OccupancyJob<T> job{};
-          job.means = means.data();
-          job.quats = quats.data();
-          job.log_scales = log_scales.data();
-          job.opacity_logits = opacity_logits.data();
-          job.class_ids = class_ids.data();
+          OccupancyJob<T> job = occupancy_job<T>(means, quats, log_scales, opacity_logits, class_ids, lookup.origin(),
+                                                 lookup.voxel_size(), stream, samples, background, g_means, g_quats,
+                                                 g_log_scales, g_opacity_logits, weight, skip);
           job.valid = cubes.data();
-          for (int axis = 0; axis < 3; ++axis) job.origin[axis] = static_cast<T>(lookup.origin()[axis]);
-          job.voxel_size = static_cast<T>(lookup.voxel_size());
-          job.stream = stream;
-          job.skip = skip;
-          job.samples = samples;
-          job.background = background;
-          job.factor = weight / (count && samples ? static_cast<double>(count) * static_cast<double>(samples) : 1.0);
-          job.g_means = g_means.data();
-          job.g_quats = g_quats.data();
-          job.g_log_scales = g_log_scales.data();
-          job.g_opacity_logits = g_opacity_logits.data();
           OccupancyResult result;
           {
             nb::gil_scoped_release release;
@@ -130,15 +107,8 @@ void bind_functions(nb::module_& m, const char* suffix) {
   m.def(("sh_colors_" + end).c_str(),
         [](In sh_dc, In sh_rest, In means, const std::vector<double>& center, int degree, Out colors,
            Array<uint8_t> clamped, int threads) {
-          ColorJob<T> job{};
-          job.degree = degree;
-          job.num_rest = static_cast<int>(sh_rest.shape(1));
-          for (int axis = 0; axis < 3; ++axis) job.center[axis] = static_cast<T>(center[axis]);
-          job.dc = sh_dc.data();
-          job.rest = sh_rest.data();
-          job.means = means.data();
+          ColorJob<T> job = color_job<T>(sh_dc, sh_rest, means, center, degree, clamped);
           job.colors = colors.data();
-          job.clamped = clamped.data();
           nb::gil_scoped_release release;
           sh_colors(job, means.shape(0), threads);
         },
@@ -146,18 +116,8 @@ void bind_functions(nb::module_& m, const char* suffix) {
   m.def(("sh_colors_backward_" + end).c_str(),
         [](In sh_dc, In sh_rest, In means, const std::vector<double>& center, int degree, Array<uint8_t> clamped,
            In g_colors, Out g_dc, Out g_rest, Out g_means, int threads) {
-          ColorJob<T> job{};
-          job.degree = degree;
-          job.num_rest = static_cast<int>(sh_rest.shape(1));
-          for (int axis = 0; axis < 3; ++axis) job.center[axis] = static_cast<T>(center[axis]);
-          job.dc = sh_dc.data();
-          job.rest = sh_rest.data();
-          job.means = means.data();
-          job.clamped = clamped.data();
-          job.g_colors = g_colors.data();
-          job.g_dc = g_dc.data();
-          job.g_rest = g_rest.data();
-          job.g_means = g_means.data();
+          ColorJob<T> job = color_job<T>(sh_dc, sh_rest, means, center, degree, clamped);
+          add_gradients(job, g_colors, g_dc, g_rest, g_means);
           nb::gil_scoped_release release;
           sh_colors_backward(job, means.shape(0), threads);
         },
@@ -168,17 +128,8 @@ void bind_functions(nb::module_& m, const char* suffix) {
            const std::vector<std::optional<Array<const uint8_t>>>& short_labels, int first, const In& maps,
            const std::vector<Array<int32_t>>& voted, const std::vector<Array<float>>& confidence, int num_classes,
            double tau, int threads) {
-          std::vector<VotingView<T>> views;
-          for (size_t v = 0; v < depths.size(); ++v) {
-            views.push_back({static_cast<int>(depths[v].shape(0)), static_cast<int>(depths[v].shape(1)),
-                             depths[v].data(), labels[v] ? labels[v]->data() : nullptr,
-                             short_labels[v] ? short_labels[v]->data() : nullptr});
-          }
-          std::vector<VotedView<T>> targets;
-          for (size_t t = 0; t < voted.size(); ++t) {
-            targets.push_back({first + static_cast<int>(t), maps.data() + 12 * views.size() * t, voted[t].data(),
-                               confidence[t].data()});
-          }
+          const auto views = voting_views(depths, labels, short_labels);
+          const auto targets = voted_views(first, maps, views.size(), voted, confidence);
           nb::gil_scoped_release release;
           reprojection_votes(views, targets, num_classes, tau, threads);
         },

@@ -1,17 +1,10 @@
 #include <algorithm>
-#include <cmath>
 
 #include "voxel_space.h"
 #include "voxel_votes.h"
 
 namespace beags {
 namespace ops {
-namespace {
-
-constexpr int32_t kParts = 64;  // of a voxel, in interpolation weights
-constexpr int kLook = 2;        // voxels before and behind a point along its ray, where votes disagree
-
-}  // namespace
 
 // Reads the pixels of one tile after the other.
 class VoxelVotes::Reader {
@@ -92,7 +85,7 @@ class VoxelVotes::Reader {
       return share_in(at.voxels[cell], at.pairs, at.label);
     }
     const bool voted = at.voted >> cell & 1;
-    Place place = about(query.point);
+    NearVoxels place = about(query.point);
     gather(place);
     const int32_t leader = agreed(place);
     if (leader >= 0 && voted) {
@@ -114,10 +107,6 @@ class VoxelVotes::Reader {
     return voted ? share_in(at.voxels[cell], at.pairs, *label) : share;
   }
 
-  // The eight voxels about a point: from `corner` on; `fraction` of kParts from the middle of the first to the second.
-  struct Place {
-    int32_t corner[3], fraction[3];
-  };
   struct Kept {
     uint64_t key = ~uint64_t(0);
     const Brick* brick = nullptr;
@@ -127,21 +116,9 @@ class VoxelVotes::Reader {
     uint64_t votes;
   };
 
-  template <class T>
-  static Place about(const T* point) {
-    Place place;
-    for (int a = 0; a < 3; ++a) {
-      const T at = point[a] - T(0.5);
-      const int32_t whole = floor_of(at);
-      place.corner[a] = whole + kHalf;
-      place.fraction[a] = static_cast<int32_t>((at - static_cast<T>(whole)) * T(kParts));
-    }
-    return place;
-  }
-
   // The bricks of the eight voxels: one to eight of them. `bricks_` has them by bits 4, 2, 1 for one step along x, y,
   // z; the others of it are not asked for.
-  void gather(const Place& place) {
+  void gather(const NearVoxels& place) {
     int32_t near[3], end[3];
     for (int a = 0; a < 3; ++a) {
       near[a] = place.corner[a] >> 2;
@@ -167,7 +144,7 @@ class VoxelVotes::Reader {
 
   // do_voxel(brick, voxel, weight) for those of the eight voxels of gathered bricks that have votes.
   template <class DoVoxel>
-  void each_voxel(const Place& place, DoVoxel do_voxel) const {
+  void each_voxel(const NearVoxels& place, DoVoxel do_voxel) const {
     int brick[3][2], cell[3][2];
     uint32_t weight[3][2];
     for (int a = 0; a < 3; ++a) {
@@ -187,7 +164,7 @@ class VoxelVotes::Reader {
   }
 
   // The class with more than half of the votes of each of the eight voxels that has any, or kMany or kNobody.
-  int32_t agreed(const Place& place) const {
+  int32_t agreed(const NearVoxels& place) const {
     int32_t least = INT32_MAX, most = kNobody;
     each_voxel(place, [&](const Brick&, const Voxel& voxel, uint32_t) {
       least = std::min(least, voxel.label);
@@ -197,7 +174,7 @@ class VoxelVotes::Reader {
   }
 
   // Adds the votes of the eight voxels, interpolated.
-  void count(const Place& place) {
+  void count(const NearVoxels& place) {
     each_voxel(place, [&](const Brick& at, const Voxel& voxel, uint64_t weight) {
       if (!(voxel.votes & kSeveral)) return add(voxel.label, weight * voxel.votes);
       const Pair* pair = at.pairs + (voxel.votes & ~kSeveral);

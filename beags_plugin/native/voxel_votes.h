@@ -5,16 +5,10 @@
 #include <memory>
 #include <vector>
 
+#include "lifted_view.h"
+
 namespace beags {
 namespace ops {
-
-// A pixel (x, y) at depth d lies at d a (x, y, 1) + b, in voxels. depth: [height, width]. voxel: its side, as a depth.
-template <class T>
-struct LiftedView {
-  int height, width;
-  const T* depth;
-  T a[9], b[3], voxel;
-};
 
 class VoxelVotes {
  public:

@@ -12,6 +12,7 @@ from beags_plugin.core.class_ranks import ClassRanks
 from beags_plugin.errors import UserError
 from beags_plugin.ops import cuda_extension, extension
 from beags_plugin.ops.voxel_lookup import VoxelLookup
+from beags_plugin.ops.voxel_tally import VoxelTally
 
 DENSE_BYTES = 256 * 2**20  # up to this size, validity is kept as one byte per class and voxel
 _BOX = 4  # voxels along each side of the largest box that ``disc_inside`` looks at
@@ -57,6 +58,13 @@ class VisibilityGrid:
         Raises ``UserError`` if the cloud spans more than 2^21 voxels along an axis.
         """
         origin = origin.to(torch.float64)
+        clouds = iter(clouds)
+        first = next(clouds, None)
+        if first is not None:
+            clouds = itertools.chain([first], clouds)
+            if (module := cuda_extension.module_for(first[0])) is not None:
+                found = _tallied(VoxelTally(module, first[0].device), clouds, origin, voxel_size)
+                return cls(voxel_size, origin, num_classes, *found, dense_bytes)
         keys = torch.zeros(0, dtype=torch.int64, device=origin.device)
         classes = torch.zeros(0, dtype=torch.int32, device=origin.device)
         for points, class_ids in clouds:
@@ -77,6 +85,13 @@ class VisibilityGrid:
         return VisibilityGrid(
             self.voxel_size, self.origin, self.num_classes, self.keys[kept], self.classes[kept], self._dense_bytes
         )
+
+    def to(self, device: torch.device | str) -> VisibilityGrid:
+        """The grid there; itself if it lies there already."""
+        if self.keys.device == torch.device(device):
+            return self
+        parts = (self.keys.to(device), self.classes.to(device))
+        return VisibilityGrid(self.voxel_size, self.origin.to(device), self.num_classes, *parts, self._dense_bytes)
 
     def lookup(self) -> VoxelLookup | None:
         """The compiled lookup, made when it is first asked for; None without the extension (for a GPU, with CUDA)."""
@@ -228,11 +243,24 @@ def _scaled(points: Tensor, origin: Tensor, size: float) -> Tensor:
 def _voxels(points: Tensor, origin: Tensor, size: float) -> Tensor:
     scaled = _scaled(points, origin, size)
     if not bool((scaled.abs() < _HALF).all()):
-        raise UserError(
-            f"points of the views lie more than {_HALF} voxels of size {size:.4g} apart or are not finite: "
-            "raise k to get larger voxels, or train the base longer."
-        )
+        raise _too_far(size)
     return scaled.long()
+
+
+def _too_far(size: float) -> UserError:
+    return UserError(
+        f"points of the views lie more than {_HALF} voxels of size {size:.4g} apart or are not finite: "
+        "raise k to get larger voxels, or train the base longer."
+    )
+
+
+def _tallied(tally: VoxelTally, clouds: Iterable[tuple[Tensor, Tensor]], origin: Tensor, size: float):
+    """Keys and classes of the voxels of one class alone, counted on a GPU."""
+    for points, class_ids in clouds:
+        tally.add_points(points, class_ids.int(), origin, size)
+    if not tally.all_near():
+        raise _too_far(size)
+    return tally.pure()
 
 
 def _pack(voxels: Tensor) -> Tensor:

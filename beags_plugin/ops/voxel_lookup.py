@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.class_ranks import ClassRanks
-from beags_plugin.ops import cuda_extension, extension
+from beags_plugin.ops import cuda_extension, extension, voxel_bricks
 
 
 class VoxelLookup:
     """The occupied voxels of all classes, and the valid ones (next to an occupied one), as hashed 4 x 4 x 4 bricks.
 
     Memory is linear in the occupied voxels. Class ids that are no class of the grid have no voxels. Queries are
-    answered where their points lie, on the CPU or a GPU; the tables are made on the CPU and copied to a GPU once.
+    answered where their points lie, on the CPU or a GPU, from tables that are made there when they are first needed.
 
     keys: [M] int64, sorted; classes: [M] int32; origin: [3] float64, world; voxel_size: world units; all as in
         ``occupancy.grid.VisibilityGrid``, on any device.
@@ -29,24 +29,42 @@ class VoxelLookup:
         module = extension.load()
         assert module is not None, "the caller asks extension.load() first"
         self._ranks = ClassRanks(classes)
-        ranks, count = self._ranks.ranks(classes), len(self._ranks)
-        self.native: Any = module.VoxelLookup(keys.cpu(), ranks.cpu(), count, origin.cpu(), voxel_size)
+        self._occupied = (keys, self._ranks.ranks(classes), len(self._ranks))
         self._place = (origin.tolist(), voxel_size)
+        self._native: Any = None
         self._voxels: dict[tuple[str, torch.device], Any] = {}
+
+    @property
+    def native(self) -> Any:
+        """The tables as the CPU's module holds them."""
+        if self._native is None:
+            module = extension.load()
+            assert module is not None, "the caller asks extension.load() first"
+            keys, ranks, count = self._occupied
+            origin = torch.tensor(self._place[0], dtype=torch.float64)
+            self._native = module.VoxelLookup(keys.cpu(), ranks.cpu(), count, origin, self._place[1])
+        return self._native
 
     def voxels(self, module: ModuleType, device: torch.device) -> Any:
         """The tables as the CUDA module takes them, in the memory of ``device``."""
         key = (module.__name__, device)
         if key not in self._voxels:
-            memory, tables = [], []
-            for classes, base, size, *parts in self.native.tables():
-                there = [
-                    torch.frombuffer(bytearray(part), dtype=torch.uint8).to(device) if part else None for part in parts
-                ]
-                memory.append(there)
-                tables.append(module.VoxelTable(classes, base, size, *there))
+            keys, ranks, count = self._occupied
+            made = voxel_bricks.tables(module, keys.to(device), ranks.to(device), count)
+            tables, memory = made or self._copied(module, device)
             self._voxels[key] = (module.Voxels(tables, *self._place), memory)
         return self._voxels[key][0]
+
+    def _copied(self, module: ModuleType, device: torch.device) -> tuple[list[Any], list[Any]]:
+        """The CPU's tables there, for voxels too far apart to be numbered."""
+        memory, tables = [], []
+        for classes, base, size, *parts in self.native.tables():
+            there = [
+                torch.frombuffer(bytearray(part), dtype=torch.uint8).to(device) if part else None for part in parts
+            ]
+            memory.append(there)
+            tables.append(module.VoxelTable(classes, base, size, *there))
+        return tables, memory
 
     def ranks(self, class_ids: Tensor) -> Tensor:
         """The classes as ``native`` numbers them: [N] int32, background 0. class_ids: [N] int32."""
@@ -54,7 +72,7 @@ class VoxelLookup:
 
     @property
     def bytes(self) -> int:
-        """Memory of the tables."""
+        """Memory of the CPU's tables."""
         return self.native.bytes
 
     def count(self, points: Tensor, class_ids: Tensor) -> Tensor:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from beags_plugin.ops import extension
+from beags_plugin.ops import cuda_extension, extension
+from beags_plugin.ops.voxel_tally import VoxelTally
 
 
 class VoxelVotes:
@@ -49,6 +52,36 @@ class VoxelVotes:
         confidence = torch.empty(tuple(depth.shape), dtype=torch.float32)
         extension.function("read", depth, self._native)(depth, to_voxels, labels, confidence)
         return labels, confidence
+
+
+class CudaVoxelVotes:
+    """``VoxelVotes`` on a GPU, with the same results: its arguments and results lie there, but for ``to_voxels``."""
+
+    def __init__(self, ignore: int, module: ModuleType, device: torch.device) -> None:
+        self._tally, self._ignore = VoxelTally(module, device), ignore
+
+    def add(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> None:
+        """See ``VoxelVotes.add``."""
+        depth, to_voxels = _view(depth, to_voxels)
+        labels = extension.plain("labels", labels, tuple(depth.shape), torch.int32)
+        self._tally.add_pixels(depth, to_voxels.cpu(), labels, self._ignore)
+
+    def decide(self) -> None:
+        """See ``VoxelVotes.decide``."""
+        self._tally.decide()
+
+    def read(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+        """See ``VoxelVotes.read``."""
+        depth, to_voxels = _view(depth, to_voxels)
+        labels = extension.plain("labels", labels, tuple(depth.shape), torch.int32).clone()
+        return labels, self._tally.read(depth, to_voxels.cpu(), labels)
+
+
+def votes_for(depths: Sequence[Tensor], ignore: int) -> VoxelVotes | CudaVoxelVotes | None:
+    """What counts the votes of pixels with these depths, compiled for where they lie; None: nothing was."""
+    if (module := cuda_extension.module_for(*depths)) is not None:
+        return CudaVoxelVotes(ignore, module, depths[0].device)
+    return VoxelVotes(ignore) if extension.can_take(*depths) else None
 
 
 def _view(depth: Tensor, to_voxels: Tensor) -> tuple[Tensor, Tensor]:

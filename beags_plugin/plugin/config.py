@@ -20,8 +20,10 @@ from beags_plugin.plugin.dataparser import BeagsDataParserConfig
 from beags_plugin.plugin.interrupts import stop
 from beags_plugin.plugin.loss_spec import LossSpec
 from beags_plugin.plugin.model import BeagsModelConfig
+from beags_plugin.plugin.pipeline import BeagsPipeline
 from beags_plugin.plugin.run_lock import lock_ahead, run_lock
 from beags_plugin.plugin.runs import CONFIG_FILE, write_text_atomically
+from beags_plugin.plugin.several import check_machine, default_device
 from beags_plugin.plugin.trainer import BeagsTrainer
 
 
@@ -77,6 +79,14 @@ class BeagsTrainerConfig(TrainerConfig):
         """Folder of the run."""
         return self.run_dir if self.run_dir is not None else super().get_base_dir()
 
+    def set_timestamp(self) -> None:
+        """See ``ExperimentConfig.set_timestamp``: the first that nerfstudio does with the config of a new run."""
+        try:
+            check_machine(self.machine)
+        except UserError as error:
+            stop(error)
+        super().set_timestamp()
+
     def save_config(self) -> None:
         """Save config.yml with absolute paths, so that every command finds the run from any folder.
 
@@ -115,6 +125,7 @@ def base_config() -> BeagsTrainerConfig:
         steps_per_eval_all_images=0,
         steps_per_save=2000,
         pipeline=VanillaPipelineConfig(
+            _target=BeagsPipeline,
             datamanager=BeagsDataManagerConfig(
                 dataparser=BeagsDataParserConfig(),
                 cache_images="gpu",  # nerfstudio's word for "on the model's device"; "cpu" would pin memory
@@ -144,8 +155,7 @@ def base_config() -> BeagsTrainerConfig:
                 "quats": 0.001,
             }.items()
         },
-        # the CUDA backend has never run on a GPU; until it has, it must be asked for
-        machine=MachineConfig(device_type="cpu"),
+        machine=MachineConfig(device_type=default_device()),  # type: ignore[arg-type]
         logging=LoggingConfig(steps_per_log=10),
         viewer=ViewerConfig(websocket_host="127.0.0.1", quit_on_train_completion=True),
         vis="viewer+tensorboard",

@@ -55,7 +55,9 @@ class Curves:
 
     def before_step(self, step: int) -> None:
         """Measure what a run that was broken off in the preparation would have measured after the step before."""
-        if self.every > 0 and step > 0 and not self._measured and bool(self.model.assigned):
+        model = self.model  # whose `assigned` may lie on a GPU: it is not asked before it may be True
+        asked = self.every > 0 and step > 0 and not self._measured and model.schedule.refining(step)
+        if asked and bool(model.assigned):
             self._objects(step - 1)
 
     def after_step(self, step: int) -> None:
@@ -69,7 +71,7 @@ class Curves:
             self._boundaries(step)
         done = step + 1
         due = self.every > 0 and (not self._measured or done % self.every == 0 or done == self.last)
-        if due and bool(model.assigned):
+        if due and model.schedule.refining(done) and bool(model.assigned):
             self._objects(step)
 
     def _named(self, found: dict[int, float]) -> dict[str, float]:

@@ -21,6 +21,8 @@ from rich.progress import track
 from torch import Tensor
 
 import beags_plugin.plugin.nerfstudio_patches  # noqa: F401  (checkpoints load again)
+from beags_plugin.core import processes
+from beags_plugin.core.cameras import Camera
 from beags_plugin.masks.label_maps import PackedMap, narrowed, widened
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.dataparser import BeagsDataParserConfig, absolute
@@ -78,6 +80,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         straighten(self.train_dataset.cameras)
         straighten(self.eval_dataset.cameras)
         self.train_cameras = self.train_dataset.cameras.to(self.device)
+        self._cameras: dict[int, Camera] = {}
         self._replaced = False  # whether the training class maps are no longer those of the files
         self._originals_kept = True
         self._originals: list[Tensor] | None = None  # those of the files, where they are kept beside the ones in use
@@ -171,13 +174,30 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         return redistort_class_map(class_map, *lens, (height, width), border)
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:
+        own = processes.rank()  # each process draws a view of its own, from an order that all have
+        self._pass_over(own)
         camera, data = super().next_train(step)
+        self._pass_over(processes.size() - own - 1)
         if isinstance(self.cached_train, StreamedViews):
             self.cached_train.expect(self.train_unseen_cameras)
         data = self._on_device(data)
         # the boundary is computed inside the rasterizer, which sees the camera only: the mask travels with it
-        camera.metadata = {**(camera.metadata or {}), "class_map": data["class_map"]}
+        metadata = camera.metadata or {}
+        camera.metadata = {**metadata, "class_map": data["class_map"], "camera": self._camera(metadata["cam_idx"])}
         return camera, data
+
+    def _camera(self, index: int) -> Camera:
+        """A training view's camera on the device, which knows its numbers on the host: a step need not fetch them."""
+        if index not in self._cameras:
+            self._cameras[index] = camera_from_nerfstudio(self.train_dataset.cameras, index).to(self.device)
+        return self._cameras[index]
+
+    def _pass_over(self, count: int) -> None:
+        """Leave out training views, which other processes draw."""
+        for _ in range(count):
+            self.train_unseen_cameras.pop(0)
+            if not self.train_unseen_cameras:
+                self.train_unseen_cameras = self.sample_train_cameras()
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict]:
         index = self.eval_unseen_cameras.pop(self._eval_order.randrange(len(self.eval_unseen_cameras)))

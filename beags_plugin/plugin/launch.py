@@ -31,8 +31,11 @@ def resume(run: Path) -> None:
     """
     from nerfstudio.scripts.train import launch, train_loop
 
+    from beags_plugin.plugin.several import check_machine
+
     config = resumed_config(run)
     machine = config.machine
+    check_machine(machine)
     _complete(
         lambda: launch(
             main_func=train_loop,

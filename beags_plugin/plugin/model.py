@@ -143,6 +143,7 @@ class BeagsModel(SurfelModel):
             if spec.weight != 0.0 and (spec.phase != "refine" or self.schedule.refine_steps > 0)
         }
         self.rasterizer: Rasterizer = make_rasterizer(self.config.rasterizer)
+        self._known_extent: tuple[Tensor, int, float] | None = None
         self.grid: VisibilityGrid | None = None
         self.step = 0
         self.seed = 0
@@ -164,11 +165,18 @@ class BeagsModel(SurfelModel):
         """Called with a checkpoint's step before it is loaded."""
         self.step = step
 
+    def extent_on_host(self) -> float:
+        """``extent``, world units, fetched from a GPU once only, lest every step wait for it."""
+        known = self._known_extent
+        if known is None or known[0] is not self.extent or known[1] != self.extent._version:
+            self._known_extent = known = (self.extent, self.extent._version, float(self.extent))
+        return known[2]
+
     # -- rendering ---------------------------------------------------------------------------------------------------
 
     def settings(self, geometry: bool = True, distortion: bool = False) -> RasterSettings:
         """Depth range of the scene and what to compute."""
-        extent = float(self.extent)
+        extent = self.extent_on_host()
         return RasterSettings(self.config.near * extent, self.config.far * extent, geometry, distortion)
 
     def active_sh_degree(self) -> int:
@@ -194,7 +202,8 @@ class BeagsModel(SurfelModel):
 
     def _training_outputs(self, cameras: Cameras) -> dict[str, Any]:
         self.clock.mark("data")
-        camera = camera_from_nerfstudio(cameras, 0).to(self.device)
+        known = (cameras.metadata or {}).get("camera")  # whose numbers the host has too
+        camera = known or camera_from_nerfstudio(cameras, 0).to(self.device)
         needs = frozenset().union(*(loss.needs for loss in self.active_losses().values()))
         target = (cameras.metadata or {}).get("class_map") if "boundary" in needs else None
         background = self._training_background()

@@ -8,6 +8,7 @@ from nerfstudio.engine.optimizers import Optimizers
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from beags_plugin.core.adam import clear_gradients, step_all
+from beags_plugin.plugin.several import average_gradients
 from beags_plugin.plugin.step_clock import StepClock
 
 
@@ -25,6 +26,9 @@ class JointOptimizers(Optimizers):
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
         """See ``Optimizers.optimizer_scaler_step_some``; scaled or clipped gradients go nerfstudio's way."""
         self.clock.mark("backward")
+        groups = [group for name in param_groups for group in self.optimizers[name].param_groups]
+        # not `self.parameters`: those are the ones that training began with
+        average_gradients(value for group in groups for value in group["params"])
         if grad_scaler.is_enabled():
             super().optimizer_scaler_step_some(grad_scaler, param_groups)
         else:

@@ -6,7 +6,7 @@ import json
 import shutil
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.assignment.assignment import Assignment
+from beags_plugin.core import processes
 from beags_plugin.digests import code_digest
 from beags_plugin.errors import UserError
 from beags_plugin.masks.classes import read_class_map, write_class_map
@@ -46,6 +47,7 @@ class RefinementSwitch:
         self.ready = False
         self._switching = False  # in the middle of the last base step, before nerfstudio evaluates and saves it
         self._evaluation_due = False
+        self._done: int | None = None  # refined_steps, which lies on the GPU, as the host knows it
         self.rounds = 0  # prepared so far, in this process and those that it goes on from
 
     @property
@@ -85,7 +87,7 @@ class RefinementSwitch:
         model = self.model
         if not self.wanted or not model.schedule.refining(step):
             return
-        done = int(model.refined_steps)
+        done = self._done = int(model.refined_steps) if self._done is None else self._done
         if not self.ready:
             self.rounds = max(self.rounds, sum(start < done for start in self._round_starts()))
             if self.rounds > 0:
@@ -96,6 +98,7 @@ class RefinementSwitch:
             self.trainer.eval_iteration(step - 1)
             self._evaluation_due = False
         model.refined_steps += 1
+        self._done += 1
 
     def after_step(self, step: int) -> None:
         """Switch right after the last base step, so that a run that ends there has its classes too."""
@@ -127,7 +130,7 @@ class RefinementSwitch:
                     model.config.split,
                     background_voxels=self._background_voxels(),
                     seed=model.seed,
-                    stage=progress_bar,
+                    stage=progress_bar if processes.rank() == 0 else lambda name: nullcontext(),
                     store=self._stage_store(),
                     code=code_digest(),
                 )
@@ -146,11 +149,14 @@ class RefinementSwitch:
             self._start(prepared.grid, prepared.labels)
         self._count(prepared.seconds, time.perf_counter() - start, first)
 
-    def _stage_store(self) -> StageStore:
+    def _stage_store(self) -> StageStore | None:
         """Where the stages of this round are kept; those of the run that this one goes on from are looked into too.
 
-        What an earlier run into the same folder kept of more rounds is removed.
+        None for several processes, which must all do a stage or none. What an earlier run into the same folder kept of
+        more rounds is removed.
         """
+        if processes.size() > 1:
+            return None
         kept, rounds = self.trainer.base_dir / PREPARED / STAGES, self.model.config.refine_rounds
         for folder in kept.glob("round_*"):
             if folder.name not in {f"round_{index + 1}" for index in range(rounds)}:
@@ -179,7 +185,7 @@ class RefinementSwitch:
     def _start(self, grid: VisibilityGrid | None, labels: LabelMaps) -> None:
         more_rounds = self.rounds < self.model.config.refine_rounds  # which need the masks as the data has them
         self.datamanager.replace_class_maps(labels, keep=more_rounds)
-        self.model.grid = grid
+        self.model.grid = None if grid is None else grid.to(self.model.device)
         self.model.frozen = not self.refiner.trains
         self.ready = True
 

@@ -14,6 +14,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from beags_plugin.core import processes
 from beags_plugin.errors import UserError
 from beags_plugin.plugin.held_out import HeldOutCurve
 from beags_plugin.plugin.interrupts import Interrupts, stop
@@ -29,6 +30,7 @@ from beags_plugin.plugin.runs import (
     save_atomically,
     write_text_atomically,
 )
+from beags_plugin.plugin.several import Rank, check_machine
 from beags_plugin.plugin.training_state import STATE, VERSION, GlobalRandom, Part, read_checkpoint, training_state
 from beags_plugin.plugin.warm_start import check_start, start_from_scene
 from beags_plugin.whole_files import remove_unfinished
@@ -59,6 +61,7 @@ class BeagsTrainer(Trainer):
         self._saved_step: int | None = None
         self._done = 0  # the last step that was trained
         self._complete = False
+        self._rank = Rank(config, local_rank)
         super().__init__(config, local_rank, world_size)
 
     @property
@@ -68,13 +71,15 @@ class BeagsTrainer(Trainer):
     def setup(self, test_mode: Any = "val") -> None:
         """Load data, build the model, load a checkpoint; a user's mistake ends here, with one sentence."""
         try:
-            if self.local_rank == 0:
+            check_machine(self.config.machine)
+            if processes.rank() == 0:
                 self._lock = run_lock(self.base_dir)
                 self._set_aside()  # at once: config.yml is this run's already, and a resume would take both for one run
             if not self._loads():
                 check_start(self.config.model_config)
             used = any((self.base_dir / self.config.logging.relative_log_dir).glob("events.out.tfevents.*"))
             super().setup(test_mode)
+            self._rank.start_alike(self._model)
             if used:
                 self._forget_events()
         except UserError as error:
@@ -86,6 +91,7 @@ class BeagsTrainer(Trainer):
 
     def _release(self) -> None:
         """Let others train in this run's folder."""
+        self._rank.end()
         if self._lock is not None:
             self._lock.release()
             self._lock = None
@@ -260,7 +266,7 @@ class BeagsTrainer(Trainer):
 
     def stop_if_asked(self, step: int) -> None:
         """Before ``step``: save the one before it and end, if a signal asked for that."""
-        if self._interrupts.asked is not None:
+        if processes.in_any(self._interrupts.asked is not None):
             if step > self._start_step:
                 self._save_once(step - 1)
             raise KeyboardInterrupt

@@ -8,6 +8,7 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from torch import Tensor
 
+from beags_plugin.core import processes
 from beags_plugin.core.densification import GradientStatistics, densify, length_units, reset_opacity
 from beags_plugin.plugin.refinement import RefinementSwitch
 from beags_plugin.plugin.scene_edits import edit_scene, move_adam_state
@@ -95,7 +96,7 @@ def set_learning_rates(model: BeagsModel, optimizers: dict, configs: dict, step:
     for name, optimizer in optimizers.items():
         rate = configs[name]["optimizer"].lr
         if name == "means":
-            rate = log_linear(*model.config.position_lr, progress) * float(model.extent)
+            rate = log_linear(*model.config.position_lr, progress) * model.extent_on_host()
         rate *= refinement_factor(model.config, name) if refining else log_linear(first, 1.0, progress)
         for group in optimizer.param_groups:
             group["lr"] = rate
@@ -118,7 +119,7 @@ class Densifier:
         self.camera_centers = camera_centers
         self.config = model.config.densify.scaled(model.schedule.scale).bounded(pixels)
         self.optimizers = optimizers
-        self.statistics = GradientStatistics(model.num_points)
+        self.statistics = GradientStatistics(model.num_points, model.device)
 
     def state(self) -> dict[str, Any]:
         """What was gathered since the scene last grew, as long as it grows; see ``training_state.Part``."""
@@ -126,9 +127,10 @@ class Densifier:
         return {"total": found.total, "views": found.views}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on gathering."""
-        if len(state["total"]) == self.model.num_points:
-            self.statistics.total, self.statistics.views = state["total"].clone(), state["views"].clone()
+        """Go on gathering, in the first process alone: what the others had gathered is not in a checkpoint."""
+        if processes.rank() == 0 and len(state["total"]) == self.model.num_points:
+            kept = self.statistics
+            kept.total, kept.views = state["total"].clone().to(kept.total), state["views"].clone().to(kept.views)
 
     def before_step(self, step: int) -> None:
         """Let the step be drawn with what is gathered, as long as the scene still grows; a trained one does not."""
@@ -153,10 +155,11 @@ class Densifier:
         # drawn from (seed, step), so that a resumed run draws what the uninterrupted one did
         generator = torch.Generator().manual_seed(model.seed * 1_000_003 + step)
         surfels = model.surfels().detach()
+        processes.add_up([self.statistics.total, self.statistics.views])
         units = length_units(surfels.means, self.camera_centers, float(model.extent), self.config)
         edited = densify(surfels, self.statistics.mean(), units, self.config, step, generator)
         edit_scene(model, self.optimizers, edited)
-        self.statistics = GradientStatistics(model.num_points)
+        self.statistics = GradientStatistics(model.num_points, model.device)
         model.drawn = None
 
     def _reset_opacity(self) -> None:

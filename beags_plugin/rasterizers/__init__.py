@@ -21,8 +21,9 @@ _PREFERENCE = ("native", "torch")  # what "auto" tries, best first; on a GPU fir
 def make_rasterizer(name: str = "auto") -> Rasterizer:
     """The backend called ``name``. Raises ``UserError`` if it cannot run here.
 
-    "auto" takes the best one present; where there is a GPU that the CUDA backend can use, it draws tensors on the GPU
-    with that, and others with the best one for the CPU.
+    "auto" takes the best one present; where there is a GPU, it draws tensors that lie there with the CUDA backend, or
+    where that cannot run with the torch one (nerfstudio's commands load a run onto any GPU), and others with the best
+    one for the CPU.
     """
     if name != "auto":
         backend = RASTERIZERS.get(name)
@@ -32,10 +33,14 @@ def make_rasterizer(name: str = "auto") -> Rasterizer:
     for candidate in _PREFERENCE:
         backend = RASTERIZERS.get(candidate)
         if backend.unavailable() is None:
-            cuda = RASTERIZERS.get("cuda")
-            if cuda.unavailable() is not None:
-                return backend()
+            on_gpu = RASTERIZERS.get("cuda")
+            if on_gpu.unavailable() is not None:
+                import torch
+
+                if not torch.cuda.is_available():
+                    return backend()
+                on_gpu = RASTERIZERS.get("torch")
             from beags_plugin.rasterizers.by_device import ByDevice
 
-            return ByDevice(backend(), cuda())
+            return ByDevice(backend(), on_gpu())
     raise UserError("no rasterizer can run here: reinstall beags.")

@@ -9,6 +9,7 @@ the last ones again in the rare case that the guess was too small. The GPU never
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from threading import get_ident
 from types import ModuleType
 from typing import Any
 
@@ -34,7 +35,7 @@ _GEOMETRY, _DISTORTION, _BOUNDARY = 1, 2, 4  # Parts of native/types.h
 _TILE = 16
 _SPARE = 1.25  # memory for so many times as many pairs as the largest drawing so far had
 _FADING = 0.98  # of that largest number, a drawing
-_STEP = 1 << 14  # pairs; fewer different sizes leave torch's allocator fewer holes
+_STEP = 1 << 14  # pairs, or an eighth of the power of two below: few different sizes leave torch's allocator no holes
 UNKNOWN = -1
 """``num_nonfinite`` of a drawing that is captured into a CUDA graph."""
 
@@ -65,7 +66,7 @@ class CudaRasterizer(KernelRasterizer):
     def __init__(self) -> None:
         self._module: ModuleType | None = None
         self._largest: dict[torch.device, float] = {}
-        self._pinned: dict[torch.device, Tensor] = {}
+        self._pinned: dict[tuple[torch.device, int], Tensor] = {}
         self._captured: list[tuple[Tensor, int]] = []
 
     @classmethod
@@ -76,6 +77,10 @@ class CudaRasterizer(KernelRasterizer):
     def overflowed(self) -> bool:
         """Whether a drawing in a CUDA graph had more pairs than memory in its last replay; its image is then wrong."""
         return any(int(totals[0]) > capacity for totals, capacity in self._captured)
+
+    def pairs(self) -> int:
+        """How many pairs of a tile and a surfel the largest drawing of late had, on any GPU; 0 before the first."""
+        return int(max(self._largest.values(), default=0))
 
     def forward_kernel(self, drawing: Drawing) -> Forward:
         """See ``KernelRasterizer.forward_kernel``."""
@@ -252,7 +257,7 @@ class CudaRasterizer(KernelRasterizer):
 
     def _bin(self, frame: _Frame, camera: Camera, pairs: float, n: int) -> int:
         """Sort the pairs into tiles; returns for how many there is memory."""
-        capacity = max(int(pairs * _SPARE) // _STEP + 1, 1) * _STEP
+        capacity = _capacity(pairs)
         if capacity > 2**31 - 1 or n > 2**31 - 1:
             raise UserError("over 1.7 billion pairs of a tile and a surfel: draw fewer surfels or smaller images.")
         device, module = frame.visible.device, self._native()
@@ -270,13 +275,13 @@ class CudaRasterizer(KernelRasterizer):
         """Start to copy a few numbers to the host."""
         if not totals.is_cuda:
             return totals, None
-        device = totals.device
-        if device not in self._pinned:
-            self._pinned[device] = torch.empty(2, dtype=torch.int64, pin_memory=True)
-        self._pinned[device].copy_(totals, non_blocking=True)
+        place = (totals.device, get_ident())  # a viewer's thread may draw at the same time
+        if place not in self._pinned:
+            self._pinned[place] = torch.empty(2, dtype=torch.int64, pin_memory=True)
+        self._pinned[place].copy_(totals, non_blocking=True)
         event = torch.cuda.Event()
         event.record()
-        return self._pinned[device], event
+        return self._pinned[place], event
 
     @staticmethod
     def _receive(told: tuple[Tensor, Any]) -> tuple[int, int]:
@@ -285,6 +290,13 @@ class CudaRasterizer(KernelRasterizer):
             event.synchronize()
         pairs, nonfinite = numbers.tolist()
         return pairs, nonfinite
+
+
+def _capacity(pairs: float) -> int:
+    """For how many pairs there shall be memory, where so many are expected."""
+    wanted = int(pairs * _SPARE)
+    step = max(1 << max(wanted.bit_length() - 4, 0), _STEP)
+    return (wanted // step + 1) * step
 
 
 def _tiles(camera: Camera) -> int:

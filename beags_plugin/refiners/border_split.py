@@ -104,7 +104,7 @@ def _share_of_class(surfels, cameras, bands, rasterizer, settings, tick) -> Tens
     """[N] share of each surfel's contributions that falls on pixels of value 1; 0 where there are none."""
     inputs = geometry_inputs(surfels)
     settings = replace(settings, geometry=False, distortion=False)
-    total = torch.zeros(len(surfels), 2, dtype=torch.float64)
+    total = torch.zeros(len(surfels), 2, dtype=torch.float64, device=surfels.means.device)
     for camera, band in zip(cameras, bands, strict=True):
         total += rasterizer.class_contributions(inputs, camera, settings, band, 2).double()
         tick()

@@ -117,4 +117,5 @@ def render_depths(
 
 
 def _or_ignore(mask: Tensor | None, camera: Camera) -> Tensor:
-    return mask if mask is not None else torch.full((camera.height, camera.width), IGNORE, dtype=torch.int32)
+    size, device = (camera.height, camera.width), camera.viewmat.device
+    return mask if mask is not None else torch.full(size, IGNORE, dtype=torch.int32, device=device)

@@ -165,7 +165,8 @@ def prepare(
         )
     surfels = surfels.detach()
     known = known_classes(maps, class_names)
-    stages = Stages(store, code, surfels, list(cameras), settings, type(rasterizer), maps, known.ids, seed)
+    inputs = (code, surfels, list(cameras), settings, type(rasterizer), maps, known.ids, seed)
+    stages = Stages(store, *inputs, device=surfels.means.device)
 
     masks = _consistent_masks(stages, surfels, cameras, maps, known, rasterizer, settings, config, stage)
     ranked = masks.ranked

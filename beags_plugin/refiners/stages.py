@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
+from copy import copy
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -14,6 +16,8 @@ from torch import Tensor
 from beags_plugin.core.filed_tensors import FiledTensors, filed, write_tensors
 from beags_plugin.core.processes import is_first
 from beags_plugin.digests import input_digest
+from beags_plugin.masks.label_maps import LabelMaps, PackedMap, PackedMaps
+from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.whole_files import write_whole
 
 FORMAT = 2
@@ -90,14 +94,36 @@ class Form(Generic[T]):
         self.unpack = unpack
 
 
+def moved(value: Any, device: torch.device) -> Any:
+    """A stage's result with all its tensors there; packed ones come from the CPU."""
+    if device.type == "cpu":
+        return value
+    if isinstance(value, (Tensor, VisibilityGrid)):
+        return value.to(device)
+    if isinstance(value, (PackedMap, LabelMaps, PackedMaps)):
+        elsewhere = copy(value)
+        if isinstance(elsewhere, PackedMap):
+            elsewhere.device = device
+        else:
+            elsewhere.stored = moved(elsewhere.stored, device)
+        return elsewhere
+    if isinstance(value, (list, tuple)):
+        return type(value)(moved(part, device) for part in value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{field.name: moved(getattr(value, field.name), device) for field in fields(value)})
+    return value
+
+
 class Stages:
     """The stages of one preparation, in order: each depends on its own inputs and on all that came before.
 
     inputs: what every stage depends on; see ``digests.input_digest``. store: where to keep them; None keeps nothing.
+    device: where results are computed, and brought to when they were kept.
     """
 
-    def __init__(self, store: StageStore | None, *inputs: Any) -> None:
+    def __init__(self, store: StageStore | None, *inputs: Any, device: torch.device | str = "cpu") -> None:
         self.store = store
+        self.device = torch.device(device)
         self.findings: list[str] = []
         self.seconds: dict[str, float] = {}
         self._digest = "" if store is None else input_digest(FORMAT, *inputs)
@@ -117,7 +143,7 @@ class Stages:
             self._reused.add(name)
             self.seconds[name] = kept["seconds"]
             self._aside += time.perf_counter() - start - kept["seconds"]
-            return form.unpack(kept["content"])
+            return moved(form.unpack(kept["content"]), self.device)
         found = compute()
         self.seconds[name] = time.perf_counter() - start - (self._aside - aside)
         if self.store is not None:

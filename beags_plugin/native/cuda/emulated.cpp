@@ -8,5 +8,7 @@
 #include "primitives.cu"
 #include "products.cu"
 #include "project.cu"
+#include "reprojection_votes.cu"
 #include "sh_colors.cu"
 #include "voxel_lookup.cu"
+#include "voxel_tally.cu"

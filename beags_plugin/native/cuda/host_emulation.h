@@ -266,6 +266,18 @@ V atomicOr(V* at, V value) {
   return before;
 }
 template <class V>
+V atomicCAS(V* at, V expected, V value) {
+  const V before = *at;
+  if (before == expected) *at = value;
+  return before;
+}
+template <class V>
+V atomicExch(V* at, V value) {
+  const V before = *at;
+  *at = value;
+  return before;
+}
+template <class V>
 V atomicMax(V* at, V value) {
   const V before = *at;
   if (value > before) *at = value;

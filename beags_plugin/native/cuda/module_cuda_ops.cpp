@@ -1,13 +1,16 @@
 // The ops of the CUDA backend as Python sees them. Arguments are checked once, in beags_plugin/ops.
 #include "module_cuda_ops.h"
 
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
 #include <string>
 
 #include "../arrays.h"
+#include "../op_jobs.h"
 #include "ops.h"
+#include "voxel_tally.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -16,7 +19,10 @@ namespace beags {
 namespace {
 
 using namespace cuda;
+using ops::add_gradients;
+using ops::color_job;
 using ops::ColorJob;
+using ops::occupancy_job;
 using ops::OccupancyJob;
 using ops::VoxelTable;
 
@@ -63,23 +69,9 @@ void bind(nb::module_& m, const char* suffix) {
            uint64_t stream_of_numbers, int64_t samples, bool background, Out g_means, Out g_quats, Out g_log_scales,
            Out g_opacity_logits, Device<double> partial, Out value, double weight, bool skip, uintptr_t stream) {
           const int64_t count = class_ids.shape(0);
-          OccupancyJob<T> job{};
-          job.means = means.data();
-          job.quats = quats.data();
-          job.log_scales = log_scales.data();
-          job.opacity_logits = opacity_logits.data();
-          job.class_ids = class_ids.data();
-          for (int axis = 0; axis < 3; ++axis) job.origin[axis] = static_cast<T>(voxels.origin[axis]);
-          job.voxel_size = static_cast<T>(voxels.voxel_size);
-          job.stream = stream_of_numbers;
-          job.skip = skip;
-          job.samples = samples;
-          job.background = background;
-          job.factor = weight / (count && samples ? static_cast<double>(count) * static_cast<double>(samples) : 1.0);
-          job.g_means = g_means.data();
-          job.g_quats = g_quats.data();
-          job.g_log_scales = g_log_scales.data();
-          job.g_opacity_logits = g_opacity_logits.data();
+          const OccupancyJob<T> job = occupancy_job<T>(
+              means, quats, log_scales, opacity_logits, class_ids, voxels.origin, voxels.voxel_size, stream_of_numbers,
+              samples, background, g_means, g_quats, g_log_scales, g_opacity_logits, weight, skip);
           occupancy_loss(job, voxels, count, partial.data(), value.data(), stream_of(stream));
         },
         "means"_a, "quats"_a, "log_scales"_a, "opacity_logits"_a, "class_ids"_a, "voxels"_a, "numbers"_a, "samples"_a,
@@ -88,37 +80,79 @@ void bind(nb::module_& m, const char* suffix) {
   m.def(("sh_colors_" + end).c_str(),
         [](In sh_dc, In sh_rest, In means, const std::vector<double>& center, int degree, Out colors,
            Device<uint8_t> clamped, uintptr_t stream) {
-          ColorJob<T> job{};
-          job.degree = degree;
-          job.num_rest = static_cast<int>(sh_rest.shape(1));
-          for (int axis = 0; axis < 3; ++axis) job.center[axis] = static_cast<T>(center.at(axis));
-          job.dc = sh_dc.data();
-          job.rest = sh_rest.data();
-          job.means = means.data();
+          ColorJob<T> job = color_job<T>(sh_dc, sh_rest, means, center, degree, clamped);
           job.colors = colors.data();
-          job.clamped = clamped.data();
           sh_colors(job, means.shape(0), stream_of(stream));
         },
         "sh_dc"_a, "sh_rest"_a, "means"_a, "center"_a, "degree"_a, "colors"_a, "clamped"_a, "stream"_a);
   m.def(("sh_colors_backward_" + end).c_str(),
         [](In sh_dc, In sh_rest, In means, const std::vector<double>& center, int degree, Device<uint8_t> clamped,
            In g_colors, Out g_dc, Out g_rest, Out g_means, uintptr_t stream) {
-          ColorJob<T> job{};
-          job.degree = degree;
-          job.num_rest = static_cast<int>(sh_rest.shape(1));
-          for (int axis = 0; axis < 3; ++axis) job.center[axis] = static_cast<T>(center.at(axis));
-          job.dc = sh_dc.data();
-          job.rest = sh_rest.data();
-          job.means = means.data();
-          job.clamped = clamped.data();
-          job.g_colors = g_colors.data();
-          job.g_dc = g_dc.data();
-          job.g_rest = g_rest.data();
-          job.g_means = g_means.data();
+          ColorJob<T> job = color_job<T>(sh_dc, sh_rest, means, center, degree, clamped);
+          add_gradients(job, g_colors, g_dc, g_rest, g_means);
           sh_colors_backward(job, means.shape(0), stream_of(stream));
         },
         "sh_dc"_a, "sh_rest"_a, "means"_a, "center"_a, "degree"_a, "clamped"_a, "g_colors"_a, "g_dc"_a.none(),
         "g_rest"_a.none(), "g_means"_a.none(), "stream"_a);
+}
+
+template <class T>
+void bind_votes(nb::module_& m, const char* suffix) {
+  using In = Device<const T>;
+  const std::string end(suffix);
+  m.def(("reprojection_votes_" + end).c_str(),
+        [](const std::vector<In>& depths, const std::vector<std::optional<DeviceIds>>& labels,
+           const std::vector<std::optional<Device<const uint8_t>>>& short_labels, int first, Array<const T> maps,
+           const std::vector<Device<int32_t>>& voted, const std::vector<Device<float>>& confidence, int num_classes,
+           double tau, Device<int32_t> counters, uintptr_t stream) {
+          const auto views = ops::voting_views(depths, labels, short_labels);
+          const auto targets = ops::voted_views(first, maps, views.size(), voted, confidence);
+          reprojection_votes(views, targets, num_classes, tau, reinterpret_cast<uint32_t*>(counters.data()),
+                             stream_of(stream));
+        },
+        "depths"_a, "labels"_a, "short_labels"_a, "first"_a, "maps"_a, "voted"_a, "confidence"_a, "num_classes"_a,
+        "tau"_a, "counters"_a, "stream"_a);
+  m.def(("vote_pixels_" + end).c_str(), [](const VoxelTally& tally, In depth, Array<const T> to_voxels,
+                                           DeviceIds labels, int32_t ignore, uintptr_t stream) {
+    vote_pixels(tally, ops::lifted_view(depth, to_voxels), labels.data(), ignore, stream_of(stream));
+  });
+  m.def(("vote_points_" + end).c_str(), [](const VoxelTally& tally, In points, DeviceIds class_ids,
+                                           const std::vector<double>& origin, double size, uintptr_t stream) {
+    VoxelFrame<T> frame{{}, static_cast<T>(size)};
+    for (int axis = 0; axis < 3; ++axis) frame.origin[axis] = static_cast<T>(origin.at(axis));
+    vote_points(tally, points.data(), class_ids.data(), class_ids.shape(0), frame, stream_of(stream));
+  });
+  m.def(("read_votes_" + end).c_str(), [](const VoxelTally& tally, In depth, Array<const T> to_voxels,
+                                          Device<int32_t> labels, Device<float> confidence, uintptr_t stream) {
+    read_votes(tally, ops::lifted_view(depth, to_voxels), labels.data(), confidence.data(), stream_of(stream));
+  });
+}
+
+void bind_tally(nb::module_& m) {
+  using Longs = Device<int64_t>;
+  using Ints = Device<int32_t>;
+  const auto counts = [](const Ints& ints) { return reinterpret_cast<uint32_t*>(ints.data()); };
+  const auto keys_of = [](const Longs& longs) { return reinterpret_cast<uint64_t*>(longs.data()); };
+  nb::class_<VoxelTally>(m, "VoxelTally")
+      .def(
+          "__init__",
+          [=](VoxelTally* self, Longs keys, Ints labels, Ints votes, Ints further, Longs more_keys, Ints more_votes,
+              Ints more_next, Ints used, Ints leaders, Ints totals) {
+            new (self) VoxelTally{keys.shape(0),    more_keys.shape(0), keys_of(keys),      labels.data(),
+                                  counts(votes),    further.data(),     keys_of(more_keys), counts(more_votes),
+                                  more_next.data(), used.data(),        leaders.data(),     counts(totals)};
+          },
+          "keys"_a, "labels"_a, "votes"_a, "further"_a, "more_keys"_a, "more_votes"_a, "more_next"_a, "used"_a,
+          "leaders"_a.none(), "totals"_a.none());
+  m.def("move_votes", [](const VoxelTally& from, const VoxelTally& to, uintptr_t stream) {
+    move_votes(from, to, stream_of(stream));
+  });
+  m.def("decide_votes", [](const VoxelTally& tally, uintptr_t stream) { decide(tally, stream_of(stream)); });
+  m.def("hash_bricks", [](Ints ranks, Longs bricks, Longs classes, Longs slots, uintptr_t stream) {
+    hash_bricks(ranks.shape(0), ranks.data(), reinterpret_cast<const ops::Brick*>(bricks.data()),
+                reinterpret_cast<const ops::BrickRange*>(classes.data()), reinterpret_cast<ops::Brick*>(slots.data()),
+                stream_of(stream));
+  });
 }
 
 }  // namespace
@@ -146,6 +180,9 @@ void bind_cuda_ops(nb::module_& m) {
   m.attr("OCCUPANCY_THREADS") = kOccupancyThreads;
   bind<float>(m, "f32");
   bind<double>(m, "f64");
+  bind_votes<float>(m, "f32");
+  bind_votes<double>(m, "f64");
+  bind_tally(m);
 }
 
 }  // namespace beags

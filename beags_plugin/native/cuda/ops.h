@@ -2,9 +2,11 @@
 #pragma once
 
 #if !defined(BEAGS_ISA)
-#define BEAGS_ISA device  // of the voxel tables' queries
+#define BEAGS_ISA device  // of what is shared with the CPU
 #endif
 #include "../op_kernels.h"
+#include "../pairwise_votes.h"
+#include "../reprojection_votes.h"
 #include "../voxel_table.h"
 #include "platform.h"
 
@@ -32,6 +34,15 @@ void is_valid(const Voxels& voxels, int64_t count, const T* points, const int32_
 template <class T>
 void disc_inside(const Voxels& voxels, int64_t count, const T* means, const T* axes_u, const T* axes_v,
                  const int32_t* class_ids, bool* out, Stream stream);
+
+// Puts bricks, each class's all different, into the empty slots of a hash table. ranks: [count], the class of each.
+void hash_bricks(int64_t count, const int32_t* ranks, const ops::Brick* bricks, const ops::BrickRange* classes,
+                 ops::Brick* slots, Stream stream);
+
+// votes: counters for the largest target's pixels times num_classes. See ../reprojection_votes.h.
+template <class T>
+void reprojection_votes(const std::vector<ops::VotingView<T>>& views, const std::vector<ops::VotedView<T>>& targets,
+                        int num_classes, double tau, uint32_t* votes, Stream stream);
 
 // As OccupancyJob; its tables are those of `voxels`.
 constexpr int kOccupancyThreads = 128;

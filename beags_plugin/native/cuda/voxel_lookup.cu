@@ -41,6 +41,21 @@ __global__ void valid_kernel(Voxels voxels, int64_t count, const T* points, cons
   out[i] = voxel_member(voxels.valid[0], class_ids[i], voxel);
 }
 
+__global__ void hash_kernel(int64_t count, const int32_t* ranks, const Brick* bricks, const BrickRange* classes,
+                            Brick* slots) {
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i >= count) return;
+  const BrickRange range = classes[ranks[i]];
+  const Brick brick = bricks[i];
+  for (uint64_t at = brick.key * kGolden >> range.shift;; at = (at + 1) & range.mask) {
+    Brick& slot = slots[range.first + at];
+    const unsigned long long empty = kNoBrick, key = brick.key;
+    if (atomicCAS(reinterpret_cast<unsigned long long*>(&slot.key), empty, key) != empty) continue;
+    slot.bits = brick.bits;
+    return;
+  }
+}
+
 template <class T>
 __global__ void disc_inside_kernel(Voxels voxels, int64_t count, const T* means, const T* axes_u, const T* axes_v,
                                    const int32_t* class_ids, bool* out) {
@@ -88,6 +103,11 @@ void disc_inside(const Voxels& voxels, int64_t count, const T* means, const T* a
                  const int32_t* class_ids, bool* out, Stream stream) {
   const auto kernel = disc_inside_kernel<T>;
   BEAGS_LAUNCH(kernel, blocks_for(count), kBlockThreads, stream, voxels, count, means, axes_u, axes_v, class_ids, out);
+}
+
+void hash_bricks(int64_t count, const int32_t* ranks, const Brick* bricks, const BrickRange* classes, Brick* slots,
+                 Stream stream) {
+  BEAGS_LAUNCH(hash_kernel, blocks_for(count), kBlockThreads, stream, count, ranks, bricks, classes, slots);
 }
 
 #define BEAGS_INSTANTIATE(T)                                                                        \

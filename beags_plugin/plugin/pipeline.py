@@ -1,0 +1,18 @@
+"""nerfstudio's pipeline, also in one of several processes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline
+
+
+class BeagsPipeline(VanillaPipeline):
+    """``VanillaPipeline`` without torch's ``DistributedDataParallel``, which keeps to the parameters it was made with.
+
+    Ours change in number as the scene grows: ``optimizers.JointOptimizers`` averages their gradients, and ``several``
+    does the rest.
+    """
+
+    def __init__(self, *args: Any, world_size: int = 1, local_rank: int = 0, **kwargs: Any) -> None:
+        super().__init__(*args, world_size=1, local_rank=local_rank, **kwargs)

@@ -1,0 +1,118 @@
+"""A training step on a GPU's tensors that have no data: no number of theirs is fetched, no devices are mixed."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from beags_plugin.core.adam import clear_gradients, step_all
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.class_ranks import ClassRanks
+from beags_plugin.core.densification import GradientStatistics
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.losses.base import LossInputs
+from beags_plugin.losses.boundary import BoundaryLoss
+from beags_plugin.losses.distortion import DistortionLoss
+from beags_plugin.losses.normal import NormalConsistencyLoss
+from beags_plugin.losses.occupancy import OccupancyLoss
+from beags_plugin.losses.opacity import OpacityLoss
+from beags_plugin.losses.photometric import PhotometricLoss
+from beags_plugin.ops import cuda_extension
+from beags_plugin.rasterizers.interface import RasterOutputs
+
+N, HEIGHT, WIDTH = 50, 40, 60
+LOSSES = [
+    PhotometricLoss(),
+    NormalConsistencyLoss(),
+    BoundaryLoss(),
+    OccupancyLoss(samples=20),
+    DistortionLoss(weight=1.0),
+    OpacityLoss(weight=1.0),
+]
+
+
+class Fetches(TorchDispatchMode):
+    """Notes what copies from a GPU to the CPU. (Numbers asked of a tensor without data raise by themselves.)"""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        out = function(*args, **(kwargs or {}))
+        devices = {value.device.type for value in args if isinstance(value, torch.Tensor)}
+        if isinstance(out, torch.Tensor) and out.device.type == "cpu" and "cuda" in devices:
+            self.found.append(str(function))
+        return out
+
+
+@pytest.fixture
+def gpu(monkeypatch):
+    """Tensors on a GPU that is not there, and kernels that do nothing."""
+    module = SimpleNamespace(OCCUPANCY_THREADS=128)
+    on_gpu = lambda *tensors: module if tensors[0].device.type == "cuda" else None  # noqa: E731
+    monkeypatch.setattr(cuda_extension, "module_for", on_gpu)
+    monkeypatch.setattr(cuda_extension, "call", lambda *_: None)
+    with FakeTensorMode(), Fetches() as fetches:
+        yield fetches
+
+
+def rand(*shape: int, **options) -> torch.Tensor:
+    return torch.rand(*shape, device="cuda", **options)
+
+
+def inputs(surfels: Surfels) -> LossInputs:
+    image = (HEIGHT, WIDTH)
+    render = RasterOutputs(
+        color=rand(*image, 3, requires_grad=True), alpha=rand(*image), depth=rand(*image, requires_grad=True),
+        median_depth=rand(*image), normal=rand(*image, 3, requires_grad=True),
+        distortion=rand(*image, requires_grad=True), boundary=rand(*image, requires_grad=True),
+        visible=rand(N) > 0.5, num_nonfinite=0,
+    )  # fmt: skip
+    class_ids = torch.zeros(N, dtype=torch.int32, device="cuda")
+    ranks = ClassRanks.__new__(ClassRanks)
+    ranks._table = torch.zeros(9, dtype=torch.int32, device="cuda")
+    lookup = SimpleNamespace(voxels=lambda *_: None, ranks=ranks.ranks, native=None)
+    return LossInputs(
+        step=20_000, seed=1, surfels=surfels, camera=Camera(rand(4, 4), rand(3, 3), WIDTH, HEIGHT), render=render,
+        image=rand(*image, 3), labels=torch.zeros(image, dtype=torch.int32, device="cuda"), class_ids=class_ids,
+        grid=SimpleNamespace(lookup=lambda: lookup),
+    )  # fmt: skip
+
+
+def parameters() -> list[torch.Tensor]:
+    shapes = ((N, 3), (N, 4), (N, 2), (N,), (N, 3), (N, 15, 3))
+    return [rand(*shape).requires_grad_() for shape in shapes]
+
+
+@pytest.mark.parametrize("loss", LOSSES, ids=lambda loss: type(loss).__name__)
+def test_a_loss_waits_for_nothing(loss, gpu):
+    """The forward; autograd's own way back needs a device, and asks for no numbers."""
+    value = loss.weighted(inputs(Surfels(*parameters())))
+    assert value.device.type == "cuda" and value.shape == () and value.requires_grad
+    assert gpu.found == []
+
+
+def test_growth_and_adam_wait_for_nothing(gpu):
+    leaves = parameters()
+    surfels = Surfels(*leaves)
+    optimizers = [torch.optim.Adam([leaf], lr=0.1, fused=True) for leaf in leaves]
+    statistics = GradientStatistics(N, "cuda")
+    clear_gradients(optimizers)
+    for leaf in leaves:
+        leaf.grad = torch.ones_like(leaf)
+    statistics.add(surfels.means.grad.norm(dim=-1), rand(N) > 0.5)
+    assert statistics.mean().device.type == "cuda"
+    step_all(optimizers)
+    assert gpu.found == []
+
+
+def test_what_fetches_is_noticed(gpu):
+    with pytest.raises(Exception, match="item|local_scalar"):
+        float(rand(3).sum())
+    rand(3).cpu()
+    assert len(gpu.found) == 1

@@ -1,0 +1,74 @@
+"""A training in two processes on the CPU, started by nerfstudio's own launcher: for test_several.py.
+
+nerfstudio's worker asks torch for two GPUs before it does anything. A process that it starts imports this module first,
+which says yes, and only until the training begins.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+from pathlib import Path
+
+import torch
+
+_TRUE = (torch.cuda.is_available, torch.cuda.device_count)
+if multiprocessing.current_process().name != "MainProcess":
+    torch.cuda.is_available, torch.cuda.device_count = lambda: True, lambda: 2
+
+
+def worker(local_rank: int, world_size: int, config, global_rank: int = 0) -> None:
+    """What ``train_loop`` of nerfstudio does, and then: what this process has."""
+    torch.cuda.is_available, torch.cuda.device_count = _TRUE
+    torch.set_num_threads(1)
+    from nerfstudio.scripts.train import train_loop
+
+    from beags_plugin.plugin import trainer
+
+    out, run = Path(config.run_dir).parent, config.run_dir
+    counts, views = [], []
+    iteration = trainer.BeagsTrainer.train_iteration
+
+    def noted(self, step):
+        found = iteration(self, step)
+        counts.append(self._model.num_points)
+        views.append(int(self._model.drawn.camera.viewmat.sum() * 1e6))
+        return found
+
+    trainer.BeagsTrainer.train_iteration = noted
+    ended, after = {}, trainer.BeagsTrainer._after_train
+
+    def end(self):
+        state = self.pipeline.state_dict()
+        tensors = {name: value for name, value in state.items() if isinstance(value, torch.Tensor)}
+        ended.update({name: hashlib.sha256(value.numpy().tobytes()).hexdigest() for name, value in tensors.items()})
+        ended["adam"] = hashlib.sha256(
+            b"".join(
+                state["exp_avg"].numpy().tobytes()
+                for optimizer in self.optimizers.optimizers.values()
+                for state in optimizer.state.values()
+            )
+        ).hexdigest()
+        ended["folder"] = str(self.base_dir)
+        after(self)
+
+    trainer.BeagsTrainer._after_train = end
+    train_loop(local_rank, world_size, config, global_rank)
+    found = {"end": ended, "counts": counts, "views": views, "own": str(run)}
+    (out / f"rank{global_rank}.json").write_text(json.dumps(found))
+
+
+def train_in_two(data: Path, out: Path) -> None:
+    """Train ``out``/run on ``data``; what process i has at its end is in ``out``/rank<i>.json."""
+    from nerfstudio.scripts.train import launch
+    from resumed_runs import short_config
+
+    from beags_plugin.plugin.run_lock import run_lock
+
+    config = short_config(data, out / "run")
+    config.pipeline.datamanager.data = data  # as nerfstudio's own main
+    config.set_timestamp()
+    config.save_config()
+    run_lock(config.get_base_dir()).release()  # for the processes, as with --machine.num-devices 2
+    launch(main_func=worker, num_devices_per_machine=2, device_type="cpu", config=config)
