@@ -30,8 +30,9 @@ class SilhouetteLoss(Loss):
     objects: how many objects of the view are drawn each step, chosen at random and counted in proportion; each costs
         a drawing of its Gaussians.
     seen: near a contact the surface of what stands below goes on close behind the other object's, too close for tau to
-        tell. Pixels of other objects do not count where so many of the 27 voxels around the drawn surface were seen as
-        this object's (D_occ >= seen, section 5); a plane fills 9 of them. 0: they all count.
+        tell. Pixels of other objects do not count where the drawn surface lies behind what the scene shows, and so many
+        of the 27 voxels around it were seen as this object's (D_occ >= seen, section 5); a plane fills 9 of them. 0:
+        they all count.
     tau: the object is hidden where its depth z and the scene's D have z > (1 + tau) D; as in reprojection (E5).
     """
 
