@@ -18,9 +18,13 @@ def write_whole(path: Path, write: Callable[[BinaryIO], Any], beside: Path | Non
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     part = unfinished(path, beside)
-    with open(part, "wb") as file:
-        write(file)
-    put_in_place(part, path)
+    try:
+        with open(part, "wb") as file:
+            write(file)
+        put_in_place(part, path)
+    except BaseException:
+        part.unlink(missing_ok=True)  # it may be what fills the disk
+        raise
 
 
 def unfinished(path: Path, beside: Path | None = None) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import gc
+import io
 import weakref
 
 import pytest
@@ -24,6 +25,7 @@ from beags_plugin.rasterizers.drawing import draw_class_map
 from beags_plugin.refiners import REFINERS, consistent_masks
 from beags_plugin.refiners.preparation import PreparationConfig, prepare
 from beags_plugin.refiners.stages import Stages, StageStore
+from beags_plugin.whole_files import write_whole
 
 VALUES = [
     torch.tensor([[1.5, -0.0], [float("nan"), float("inf")]]),
@@ -84,6 +86,35 @@ def test_a_full_disk_is_told(monkeypatch):
     monkeypatch.setattr(filed_tensors, "write_tensors", full)
     with pytest.raises(UserError, match="is full: free some space there, or name another folder with TMPDIR"):
         filed(VALUES)
+
+
+class _FullDisk(io.RawIOBase):
+    """Every byte that is really written fails, when the buffer is flushed and when the file is closed."""
+
+    def writable(self):
+        return True
+
+    def write(self, data):
+        raise OSError(errno.ENOSPC, "no space left on device")
+
+
+def test_a_full_disk_is_told_also_where_closing_fails_again(monkeypatch):
+    monkeypatch.setattr(filed_tensors.tempfile, "TemporaryFile", lambda **_: io.BufferedWriter(_FullDisk()))
+    with pytest.raises(UserError, match="is full: free some space there"):
+        filed([torch.zeros(10)])
+
+
+def test_what_could_not_be_written_leaves_nothing_behind(tmp_path):
+    path = tmp_path / "some.npz"
+    write_whole(path, lambda file: file.write(b"former"))
+
+    def breaks(file):
+        file.write(b"half")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_whole(path, breaks)
+    assert [other.name for other in tmp_path.iterdir()] == ["some.npz"] and path.read_bytes() == b"former"
 
 
 def test_a_filed_stage_is_reused_and_forgotten(tmp_path):

@@ -7,6 +7,7 @@ import tempfile
 import weakref
 import zipfile
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -66,7 +67,8 @@ def filed(tensors: Iterable[Tensor], device: torch.device | str = "cpu") -> File
         write_tensors(file, tensors)
         file.flush()
     except OSError as error:
-        file.close()
+        with suppress(OSError):  # it writes what it still holds, which fails again
+            file.close()
         if error.errno != errno.ENOSPC:
             raise
         folder = tempfile.gettempdir()

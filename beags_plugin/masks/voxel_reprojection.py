@@ -71,7 +71,7 @@ class _Votes:
     def of_slab(self, slab: int) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
         """Per view the labels [H, W] int32, the confidence [H, W] float32, and which pixels [H, W] bool have their
         point in the slab (None: all, as there is but one); others keep their label, with confidence 0."""
-        compiled = votes_for(self.depths[:1], IGNORE) if self._alike else None
+        compiled = votes_for([self.depths[0]], IGNORE) if self._alike else None
         votes = compiled or TorchVotes(IGNORE)
         for i, (depth, mask) in enumerate(zip(self.depths, self.labels, strict=True)):
             about = self._of_slab(i, depth, slab, self.slabs.about)

@@ -131,13 +131,15 @@ class BeagsTrainer(Trainer):
         if self.config.max_num_iterations == 0:
             if self.loaded_run == self.base_dir.absolute() and not (self.base_dir / REPORT_FILE).exists():
                 return self._write_report()  # killed after its last checkpoint
+            if processes.rank() > 0:
+                return None  # the first process writes the report, or says what is wrong
             stop(
                 UserError(
                     f"the checkpoint is of a complete run ({self._start_step} steps): nothing is left to train; "
                     "to refine again, load <run>/base/nerfstudio_models with beags-refine."
                 )
             )
-        self._estimate = Estimate(self.config.method_name, self.config.max_num_iterations)
+        self._estimate = Estimate(str(self.config.method_name), self.config.max_num_iterations)
         remove_unfinished(self.base_dir)
         (self.base_dir / REPORT_FILE).unlink(missing_ok=True)  # it says that the run is complete
         if self.config.steps_per_held_out > 0:

@@ -58,7 +58,7 @@ class StageStore:
     def kept_tensors(self, name: str, digest: str, device: torch.device | str) -> FiledTensors | None:
         """What was kept of the stage by ``keep_tensors``; None if it is not there or cannot be read."""
         for folder in (self.folder, *self.former):
-            with suppress(OSError, ValueError):
+            with suppress(OSError, ValueError, EOFError):  # an empty file ends early
                 return FiledTensors(_file(folder, name, digest, ".npz"), device)
         return None
 
