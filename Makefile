@@ -1,4 +1,4 @@
-# make setup | test | demo [DATA=folder] | lint | format | clean
+# make setup | test | demo [DATA=folder] | fuzz [COUNT=scenes] [SEED=first] | lint | format | clean
 # BEAGS_VENV names the environment; clones may share one. PYTHON names the interpreter that makes it.
 BEAGS_VENV ?= .venv
 BIN := $(BEAGS_VENV)/bin
@@ -7,7 +7,7 @@ CXX_FILES = $(shell git ls-files --cached --others --exclude-standard '*.cpp' '*
 # With passive waiting, idle OpenMP threads leave the cores to torch's other threads.
 export OMP_WAIT_POLICY = PASSIVE
 
-.PHONY: help setup test demo lint format clean
+.PHONY: help setup test demo fuzz lint format clean
 
 help:
 	@sed -n '1,2p' Makefile
@@ -21,6 +21,9 @@ test: setup
 
 demo: setup
 	"$(BIN)/beags" demo $(if $(DATA),--data "$(DATA)")
+
+fuzz: setup
+	"$(BIN)/python" scripts/fuzz.py --count "$(or $(COUNT),1000)" --seed "$(or $(SEED),0)"
 
 lint: setup
 	"$(BIN)/ruff" check .

@@ -99,6 +99,10 @@ def test_drawing_blocks_again_to_save_memory_changes_no_bit():
         ("opacity_logits", -100.0, 0),
         ("opacity_logits", math.nan, 1),
         ("quats", 0.0, 1),
+        ("quats", 1e-20, 1),  # its gradient would overflow float32
+        ("quats", 1e-9, 0),
+        ("quats", 1e9, 0),
+        ("quats", 1e20, 1),
         ("means", 1e-40, 0),
         ("means", math.inf, 1),
     ],

@@ -5,6 +5,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+LONGEST_QUAT = 1e12
+"""Quaternions longer than this, or shorter than one part of it, count as broken wherever surfels are used: their gradient
+is the rotation's divided by the length, and in float32 it would overflow."""
+
+
+def usable_quats(quats: Tensor) -> Tensor:
+    """[...] bool: which of quats [..., 4] have a length that can be divided by; NaN has none. No gradient."""
+    length = quats.detach().double().norm(dim=-1)
+    return (length >= 1.0 / LONGEST_QUAT) & (length <= LONGEST_QUAT)
+
 
 def rotation_from_quat(quats: Tensor) -> Tensor:
     """Rotation matrices of quaternions, which are normalised here (so the gradient includes it, once).

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from beags_plugin.core.rotations import rotation_from_quat
+from beags_plugin.core.rotations import rotation_from_quat, usable_quats
 from beags_plugin.core.surfels import opacities as opacities_of
 from beags_plugin.errors import UserError
 from beags_plugin.losses.base import Loss, LossInputs
@@ -89,7 +89,7 @@ def _outside(means, quats, log_scales, opacity_logits, class_ids: Tensor, grid: 
     half_axes = RADIUS * scales[:, None, :] * rotation_from_quat(quats)[..., :2]  # [N, 3, 2]
     inside = grid.disc_inside(means, half_axes[..., 0], half_axes[..., 1], class_ids)
     finite = means.isfinite().all(1) & half_axes.isfinite().all(2).all(1) & opacity_logits.isfinite()
-    finite &= (1.0 / scales).isfinite().all(1)
+    finite &= (1.0 / scales).isfinite().all(1) & usable_quats(quats)
     return torch.nonzero(finite & ~inside)[:, 0]
 
 

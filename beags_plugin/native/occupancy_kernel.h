@@ -6,6 +6,7 @@
 #include "counter.h"
 #include "lanes.h"
 #include "op_kernels.h"
+#include "quaternion.h"
 #include "voxel_table.h"
 
 namespace beags {
@@ -119,10 +120,12 @@ struct Discs {
     }
   }
 
-  // NaN for those that count as nothing: a number is not finite or a scale is 0.
+  // NaN for those that count as nothing: a number is not finite, a scale is 0 or a quaternion cannot be used.
   BEAGS_OPS_INLINE R nan_if_broken(const Parameters<T>& raw) const {
-    const R one = R{} + T(1);
-    R sum = nan_unless_finite(raw.logit);
+    const R zero = {}, one = zero + T(1), infinite = zero + static_cast<T>(INFINITY);
+    const R long_enough = select(inverse_length <= zero + static_cast<T>(kLongestQuat), zero, infinite);
+    const R short_enough = select(inverse_length >= zero + static_cast<T>(1 / kLongestQuat), zero, infinite);
+    R sum = nan_unless_finite(raw.logit) + nan_unless_finite(long_enough) + nan_unless_finite(short_enough);
     for (int axis = 0; axis < 2; ++axis) {
       sum += nan_unless_finite(raw.log_scale[axis]) + nan_unless_finite(one / scale[axis]);
     }

@@ -6,6 +6,7 @@
 #include <cmath>
 
 #include "device.h"
+#include "quaternion.h"
 #include "types.h"
 
 namespace beags {
@@ -119,7 +120,8 @@ BEAGS_HD inline bool is_plain(const View& view, const Splat<double>& s) {
 BEAGS_HD inline Fate project(const View& view, const SurfelParameters& s, Splat<double>& splat) {
   Placement at;
   place(view, s, at);
-  if (!finite(at.unit[0], s.scale[0], s.scale[1], at.z)) return Fate::kNonFinite;  // quaternion 0, or an overflow
+  if (!usable_quaternion(at.inverse_length)) return Fate::kNonFinite;
+  if (!finite(at.unit[0], s.scale[0], s.scale[1], at.z)) return Fate::kNonFinite;  // an overflow
   if (at.z <= view.near_plane || s.log2_opacity < kLog2MinAlpha) return Fate::kCulled;
   splat.log2_opacity = s.log2_opacity;
   splat.cx = at.cx;

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.rotations import rotation_from_quat
+from beags_plugin.core.rotations import rotation_from_quat, usable_quats
 from beags_plugin.rasterizers.interface import MAX_ALPHA, MIN_ALPHA, RasterSettings, SurfelInputs
 
 
@@ -48,10 +48,10 @@ class Hits:
 
 
 def finite_surfels(inputs: SurfelInputs) -> Tensor:
-    """[N] bool: all parameters are finite and the quaternion has a length."""
+    """[N] bool: all parameters are finite and the quaternion has a length that can be divided by."""
     floats = (inputs.means, inputs.quats, inputs.log_scales, inputs.colors, inputs.opacity_logits[:, None])
     finite = torch.stack([torch.isfinite(value.detach()).all(dim=-1) for value in floats]).all(dim=0)
-    return finite & (inputs.quats.detach().norm(dim=-1) > 0)
+    return finite & usable_quats(inputs.quats)
 
 
 def project(inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> ProjectedSurfels:

@@ -2,6 +2,7 @@
 // depend on the number of samples. A block looks at its Gaussians, passes over those whose disc wholly lies in valid
 // voxels, and gives the others to its first threads, so that warps are full. What is computed is as in
 // ../occupancy_kernel.h.
+#include "../quaternion.h"
 #include "ops.h"
 
 namespace beags {
@@ -45,7 +46,7 @@ struct Disc {
   T r0[3], r1[3];                     // columns of the rotation
   T scale[2];                         // world units
   T center[3], axis_u[3], axis_v[3];  // voxels; s R0 and s R1
-  bool broken;                        // counts as nothing: a number is not finite or a scale is 0
+  bool broken;  // counts as nothing: a number is not finite, a scale is 0 or the quaternion cannot be used
 
   BEAGS_DEVICE Disc(const OccupancyJob<T>& job, int64_t i) {
     const T* q = job.quats + 4 * i;
@@ -58,7 +59,7 @@ struct Disc {
     r1[0] = 2 * (x * y - w * z);
     r1[1] = 1 - 2 * (x * x + z * z);
     r1[2] = 2 * (y * z + w * x);
-    broken = !is_finite(job.opacity_logits[i]);
+    broken = !is_finite(job.opacity_logits[i]) || !usable_quaternion(inverse_length);
     for (int axis = 0; axis < 2; ++axis) {
       const T log_scale = job.log_scales[2 * i + axis];
       scale[axis] = exp(log_scale);
