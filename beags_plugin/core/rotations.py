@@ -6,8 +6,10 @@ import torch
 from torch import Tensor
 
 LONGEST_QUAT = 1e12
-"""Quaternions longer than this, or shorter than one part of it, count as broken wherever surfels are used: their gradient
-is the rotation's divided by the length, and in float32 it would overflow."""
+"""Quaternions longer than this, or shorter than one part of it, count as broken wherever surfels are used.
+
+Their gradient is the rotation's divided by the length, and would overflow in float32.
+"""
 
 
 def usable_quats(quats: Tensor) -> Tensor:
