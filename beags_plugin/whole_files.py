@@ -22,7 +22,7 @@ def write_whole(path: Path, write: Callable[[BinaryIO], Any], beside: Path | Non
         with open(part, "wb") as file:
             write(file)
         put_in_place(part, path)
-    except BaseException:
+    except (Exception, KeyboardInterrupt):
         part.unlink(missing_ok=True)  # it may be what fills the disk
         raise
 
