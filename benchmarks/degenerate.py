@@ -40,13 +40,8 @@ class Scene:
 
     def to(self, dtype: torch.dtype) -> Scene:
         """The same scene in another precision, in which a number may become 0 or infinite."""
-        floats = {name: getattr(self.inputs, name).to(dtype) for name in FLOATS}
-        return replace(
-            self,
-            inputs=replace(self.inputs, **floats),
-            camera=self.camera.to(dtype),
-            background=self.background.to(dtype),
-        )
+        camera, background = self.camera.to(dtype), self.background.to(dtype)
+        return replace(self, inputs=self.inputs.to(dtype), camera=camera, background=background)
 
 
 def degenerate_scene(seed: int) -> Scene:

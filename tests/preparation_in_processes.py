@@ -9,32 +9,19 @@ import sys
 
 import torch
 import torch.distributed as dist
-from raster_scenes import CLASSES, make_scene
+from labelled_views import labelled_views
+from raster_scenes import CLASSES
 
-from beags_plugin.core.cameras import Camera
-from beags_plugin.core.surfels import Surfels
-from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.drawing import draw_class_map
 from beags_plugin.refiners import REFINERS
 from beags_plugin.refiners.preparation import PreparationConfig, prepare
 
 
 def found() -> list[torch.Tensor]:
     """Labels, confidence, classes, margins and voxels of five views."""
-    scene = make_scene(count=80, size=-1.0, opacity=2.0).to(torch.float32)
-    s = scene.inputs
-    surfels = Surfels.of(s.means, s.quats, s.log_scales, s.opacity_logits, torch.zeros(len(s.means), 1, 3))
-    cameras = []
-    for view in range(5):
-        viewmat = scene.camera.viewmat.clone()
-        viewmat[0, 3] += 0.15 * view
-        cameras.append(Camera(viewmat, scene.camera.K, scene.camera.width, scene.camera.height))
-    rasterizer = make_rasterizer("auto")
-    masks = [draw_class_map(rasterizer, surfels, s.class_ids, camera, scene.settings)[0] for camera in cameras]
-    masks[3] = None
+    surfels, cameras, masks, rasterizer, settings = labelled_views(5, 0.15)
     names = {index: str(index) for index in range(CLASSES)}
     prepared = prepare(
-        surfels, cameras, masks, names, rasterizer, scene.settings, REFINERS.get("bea")(), PreparationConfig(k=20)
+        surfels, cameras, masks, names, rasterizer, settings, REFINERS.get("bea")(), PreparationConfig(k=20)
     )
     assigned, grid = prepared.assignment, prepared.grid
     return [

@@ -26,13 +26,8 @@ class Scene:
 
     def to(self, dtype: torch.dtype) -> Scene:
         """The same scene in another precision."""
-        floats = {name: getattr(self.inputs, name).to(dtype) for name in FLOATS}
-        return replace(
-            self,
-            inputs=replace(self.inputs, **floats),
-            camera=self.camera.to(dtype),
-            background=self.background.to(dtype),
-        )
+        camera, background = self.camera.to(dtype), self.background.to(dtype)
+        return replace(self, inputs=self.inputs.to(dtype), camera=camera, background=background)
 
     def draw(self, rasterizer, **changes):
         """Draw, with some of the inputs replaced (``background`` among them)."""

@@ -9,19 +9,16 @@ import weakref
 
 import pytest
 import torch
-from raster_scenes import CLASSES, make_scene
+from labelled_views import labelled_views
+from raster_scenes import CLASSES
 
 from beags_plugin.core import filed_tensors
-from beags_plugin.core.cameras import Camera
 from beags_plugin.core.filed_tensors import FiledTensors, filed, write_tensors
-from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.masks.label_maps import LabelMaps, PackedMaps
 from beags_plugin.masks.reprojection import check_views
 from beags_plugin.masks.voxel_reprojection import reproject_voxel
-from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.drawing import draw_class_map
 from beags_plugin.refiners import REFINERS, consistent_masks
 from beags_plugin.refiners.preparation import PreparationConfig, prepare
 from beags_plugin.refiners.stages import Stages, StageStore
@@ -158,24 +155,9 @@ class Counting:
         return made
 
 
-def views_of_a_scene(views=9):
-    scene = make_scene(count=80, size=-1.0, opacity=2.0).to(torch.float32)
-    s = scene.inputs
-    surfels = Surfels.of(s.means, s.quats, s.log_scales, s.opacity_logits, torch.zeros(len(s.means), 1, 3))
-    cameras = []
-    for view in range(views):
-        viewmat = scene.camera.viewmat.clone()
-        viewmat[0, 3] += 0.1 * view
-        cameras.append(Camera(viewmat, scene.camera.K, scene.camera.width, scene.camera.height))
-    rasterizer = make_rasterizer("auto")
-    masks = [draw_class_map(rasterizer, surfels, s.class_ids, camera, scene.settings)[0] for camera in cameras]
-    masks[3] = None
-    return surfels, cameras, masks, rasterizer, scene.settings
-
-
 @pytest.mark.usefixtures("ops")
 def test_the_voxel_form_holds_one_view_at_a_time():
-    surfels, cameras, masks, rasterizer, settings = views_of_a_scene()
+    surfels, cameras, masks, rasterizer, settings = labelled_views(9, 0.1)
     depths = list(consistent_masks.render_depths(surfels, cameras, rasterizer, settings, "median"))
     expected = list(reproject_voxel(depths, cameras, masks, CLASSES))
     lazy = Counting(lambda index: depths[index].clone(), len(depths))
@@ -190,7 +172,7 @@ def test_the_voxel_form_holds_one_view_at_a_time():
 
 
 def test_what_is_prepared_from_files_is_what_is_prepared_from_memory(monkeypatch, tmp_path):
-    surfels, cameras, masks, rasterizer, settings = views_of_a_scene()
+    surfels, cameras, masks, rasterizer, settings = labelled_views(9, 0.1)
     names = {index: str(index) for index in range(CLASSES)}
 
     def prepared(name, store=None):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -51,6 +51,12 @@ class SurfelInputs:
     colors: Tensor
     class_ids: Tensor | None = None
     screen_shift: Tensor | None = None
+
+    def to(self, dtype: torch.dtype) -> SurfelInputs:
+        """The same with all floats in another precision."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        changed = {name: value.to(dtype) for name, value in values.items() if name != "class_ids" and value is not None}
+        return replace(self, **changed)
 
     def checked(self) -> SurfelInputs:
         """Itself, contiguous, after checking shapes and dtypes by name; raises ``ValueError``."""
