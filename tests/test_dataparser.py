@@ -383,6 +383,22 @@ MISTAKES = {
         ],
         "the poses in .* cannot be read",
     ),
+    "two images of one name": (
+        lambda root: [
+            Image.fromarray(noise(3)).save(root / "images/v01.jpg"),
+            edit(root, lambda meta: meta["frames"][0].update(file_path="images/v01.jpg")),
+        ],
+        "v01.jpg and .*v01.png are both called v01, by which their masks are found: rename one of them, in the poses",
+    ),
+    "two copies of one image": (
+        lambda root: [
+            (root / "transforms.json").unlink(),
+            write_colmap(root, names=["v00.png", "v01.png", "v02.png"]),
+            (root / "images/v01.png").rename(root / "images/v01.bmp"),
+            (root / "images/v02.png").rename(root / "images/v01.webp"),
+        ],
+        r"v01.png does not exist, and .*v01.bmp or .*v01.webp could stand for it: remove one of them",
+    ),
 }
 
 

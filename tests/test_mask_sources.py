@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from beags_plugin.errors import UserError
 from beags_plugin.masks.classes import read_class_map
 from beags_plugin.masks.rims import snap_to_edges
 from beags_plugin.masks.sources import MASK_SOURCES
-from beags_plugin.masks.sources.base import MadeMasks, Photo, SourceScene
+from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene
 from beags_plugin.masks.sources.coco import CocoSource, decoded
 from beags_plugin.masks.sources.grabcut import GrabCutSource, carry, cut_by_box
 from beags_plugin.masks.sources.id_images import GaussianGroupingSource, IdImagesSource
@@ -29,6 +29,8 @@ from beags_plugin.masks.sources.langsplat import LangSplatSource
 from beags_plugin.masks.sources.matching import PhotoNames
 from beags_plugin.masks.sources.object_images import ObjectImagesSource
 from beags_plugin.masks.sources.prompts import Prompt, read_prompts
+from beags_plugin.plugin.dataparser import BeagsDataParserConfig
+from beags_plugin.plugin.made_masks import make_masks
 from beags_plugin.rasterizers.interface import IGNORE
 
 
@@ -331,8 +333,6 @@ def test_rims_snap_to_the_edge_of_the_photo():
 
 
 def test_the_command_writes_masks_that_training_finds(tmp_path, capsys):
-    from beags_plugin.plugin.dataparser import BeagsDataParserConfig
-
     write_transforms(tmp_path)
     for index in range(9):
         write_image(tmp_path / f"objects/cup/v{index:02d}.png", np.uint8(255) * (truth(0) == 1))
@@ -370,6 +370,44 @@ def test_the_command_writes_masks_that_training_finds(tmp_path, capsys):
         with pytest.raises(SystemExit):
             main(wrong)
         assert message in " ".join(capsys.readouterr().out.split())
+
+
+@dataclass(frozen=True)
+class Scripted(MaskSource):
+    """Masks of all views, those of ``aside`` only to look at; breaks off before the view ``breaks``."""
+
+    aside: tuple[int, ...] = ()
+    breaks: int = 99
+
+    def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
+        def maps():
+            for index in range(len(scene.photos)):
+                if index == self.breaks:
+                    raise UserError("broken off")
+                yield truth(0).astype(np.uint16)
+
+        return MadeMasks({0: "background", 1: "cup", 2: "box"}, maps(), [], frozenset(self.aside))
+
+
+def test_masks_to_look_at_are_guarded_and_whole_as_the_others(tmp_path):
+    write_transforms(tmp_path)
+    data = BeagsDataParserConfig(data=tmp_path)
+    lines = " ".join(make_masks(data, Scripted(aside=(0, 8))))
+    assert "7 masks of 9 views, 2 objects" in lines and "2 masks of held-out views, only to look at" in lines
+    aside = tmp_path / "masks_to_look_at"
+    assert sorted(path.name for path in aside.iterdir()) == ["v00.png", "v08.png"]
+    for path in (*(tmp_path / "masks").iterdir(), tmp_path / "classes.json"):
+        path.unlink()
+    with pytest.raises(UserError, match=r"already \(masks_to_look_at/v0[08].png\): add --overwrite"):
+        make_masks(data, Scripted())
+    kept = {path: path.read_bytes() for path in aside.iterdir()}
+    with pytest.raises(UserError, match="broken off"):
+        make_masks(data, Scripted(aside=(0, 1), breaks=4), overwrite=True)
+    assert {path: path.read_bytes() for path in aside.iterdir()} == kept and not list((tmp_path / "masks").iterdir())
+    make_masks(data, Scripted(), overwrite=True)
+    assert not list(aside.iterdir()) and len(list((tmp_path / "masks").iterdir())) == 9  # none of a former run stays
+    with pytest.raises(UserError, match="gave no mask"):
+        make_masks(data, Scripted(aside=tuple(range(9))), overwrite=True)
 
 
 @pytest.mark.parametrize("lens", [{}, {"k1": -0.12, "k2": 0.02}])
@@ -446,13 +484,17 @@ def test_names_of_photos_and_what_other_names_mean():
     assert (
         names.candidates("left/v0") == names.candidates("left\\v0.JPG") == names.candidates("images/left/v0.jpg") == [0]
     )
-    assert names.candidates("v0") == names.candidates("v0.png") == names.candidates("elsewhere/v0.png") == [0, 2]
-    assert names.candidates("v1") == names.candidates("elsewhere/v1") == [1]
+    assert names.candidates("v0") == names.candidates("v0.png") == [0, 2] and names.candidates("v1") == [1]
+    assert names.candidates("elsewhere/v0.png") == names.candidates("right/v1") == []  # another folder, another photo
+    assert names.in_other_folders("elsewhere/v0.png") == [0, 2] and names.in_other_folders("right/v1.jpg") == [1]
+    assert names.in_other_folders("v0") == names.in_other_folders("right/v0") == names.in_other_folders("w") == []
     assert names.candidates("x.y") == names.candidates("images/x.y.png") == [3] and names.candidates("w") == []
-    assert names.candidates("t/v0") == [0, 2]  # "t/v0" ends "left/v0" as text, but is no part of its path
+    assert names.candidates("t/v0") == []  # "t/v0" ends "left/v0" as text, but is no part of its path
     assert names.find("right/v0", "it") == 2 and names.find("w", "it") is None
     with pytest.raises(UserError, match="it names the view 'v0', which could be left/v0 or right/v0: give more of"):
         names.find("v0", "it")
+    with pytest.raises(UserError, match="it names the view 'right/v1', but the photo of that name is left/v1: correct"):
+        names.find("right/v1", "it")
 
 
 def test_masks_of_equal_stems_are_told_apart_by_their_folders(tmp_path):
@@ -467,10 +509,46 @@ def test_masks_of_equal_stems_are_told_apart_by_their_folders(tmp_path):
         make(IdImagesSource(), scene)
     mask_at(tmp_path / "masks/right/v0.png", 4)  # now both photos have their own: v0.png is nobody's
     assert values_of(make(IdImagesSource(), scene)[1]) == [1, 2, 4, None]
-    mask_at(tmp_path / "masks/a/v2.png", 5)
-    mask_at(tmp_path / "masks/b/v2.png", 6)
-    with pytest.raises(UserError, match="a/v2.png and .*b/v2.png could both belong to right/v2: remove one of them"):
+    mask_at(tmp_path / "masks/v2.png", 5)
+    mask_at(tmp_path / "masks/of/right/v2.png", 6)
+    with pytest.raises(UserError, match="of/right/v2.png and .*/v2.png could both belong to right/v2: remove one of"):
         make(IdImagesSource(), scene)
+
+
+def test_a_folder_that_contradicts_the_photos_is_told(tmp_path):
+    scene = scene_of_folders(tmp_path)
+    mask_at(tmp_path / "masks/left/v1.png", 1)
+    mask_at(tmp_path / "masks/left/v2.png", 2)  # v2 is a photo of the right camera only
+    for source, folder, name in (
+        (IdImagesSource(), "masks", "left/v2.png"),
+        (ObjectImagesSource(Path("first")), "first", "cup/left/v2.png"),
+        (ObjectImagesSource(Path("last")), "last", "left/v2/cup.png"),
+    ):
+        mask_at(tmp_path / folder / name, 2)
+        with pytest.raises(UserError, match=f"{folder}/{name} has the name of right/v2 but not the folder: give it"):
+            make(source, scene)
+    mask_at(tmp_path / "masks/right/v2.png", 3)  # the photo has its own mask: the other one is nobody's
+    assert values_of(make(IdImagesSource(), scene)[1]) == [None, 1, None, 3]
+    mask_at(tmp_path / "numbered/right/v0/v1.png", 255)  # an object may be called as a photo elsewhere
+    names, maps = make(ObjectImagesSource(Path("numbered")), scene)
+    assert names == {0: "background", 1: "v1"} and values_of(maps) == [None, None, 1, None]
+
+
+def test_two_files_of_one_name_are_told(tmp_path):
+    scene = scene_of(tmp_path)
+    for index in range(4):
+        mask_at(tmp_path / f"masks/v{index}.png", 1)
+    mask_at(tmp_path / "masks/v1.bmp", 2)
+    with pytest.raises(UserError, match="masks/v1.bmp and .*masks/v1.png are two files for v1: remove one of them"):
+        make(IdImagesSource(), scene)
+    images = [{"id": i, "file_name": name} for i, name in enumerate(("v1.jpg", "v1.png"))]
+    annotations = [{"image_id": i, "category_id": 1, "segmentation": [[2, 2, 9, 2, 9, 9]]} for i in range(2)]
+    (tmp_path / "annotations.json").write_text(json.dumps({"images": images, "annotations": annotations}))
+    with pytest.raises(UserError, match="v1.jpg of .* and the image v1.png of .* could both belong to v1: remove one"):
+        make(CocoSource(), scene)
+    pair = [Path("/a/v1.jpg"), Path("/a/v1.png")]
+    with pytest.raises(UserError, match="/a/v1.jpg and /a/v1.png are both called v1, .*: rename one of them"):
+        photo_names(pair)
 
 
 def test_objects_and_coco_and_features_are_matched_by_folders_too(tmp_path):
@@ -507,8 +585,6 @@ def test_prompts_name_views_by_folders(tmp_path):
 
 
 def test_the_command_and_training_agree_on_photos_of_equal_stems(tmp_path, capsys):
-    from beags_plugin.plugin.dataparser import BeagsDataParserConfig
-
     write_transforms(tmp_path, count=4)
     meta = json.loads((tmp_path / "transforms.json").read_text())
     for frame in meta["frames"]:

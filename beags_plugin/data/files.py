@@ -59,11 +59,24 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def photo_names(images: Sequence[Path]) -> list[str]:
-    """Of each image its path below their common folder, without suffix: "v1", or "left/v1" where there are folders."""
+    """Of each image its path below their common folder, without suffix: "v1", or "left/v1" where there are folders.
+
+    Raises ``UserError`` if two images have one name: masks are found by it, and held-out views named.
+    """
     if not images:
         return []
     root = Path(os.path.commonpath([image.parent for image in images]))
-    return [image.relative_to(root).with_suffix("").as_posix() for image in images]
+    named: dict[str, Path] = {}
+    for image in images:
+        name = image.relative_to(root).with_suffix("").as_posix()
+        if (other := named.setdefault(name, image)) is not image:
+            raise UserError(
+                f"the poses name {image} twice: keep one of them."
+                if other == image
+                else f"the images {other} and {image} are both called {name}, by which their masks are found: rename "
+                "one of them, in the poses too."
+            )
+    return list(named)
 
 
 def existing_images(named: Sequence[Path], folder: Path, in_order: bool) -> list[Path]:
@@ -71,17 +84,22 @@ def existing_images(named: Sequence[Path], folder: Path, in_order: bool) -> list
 
     A name that does not exist stands for the file in ``folder`` of the same path but for the suffix, else of the same
     stem, if no other image has it. If ``in_order`` and not one image is found so, the files in ``folder`` stand for the
-    images in the order of their names, if there are as many.
+    images in the order of their names, if there are as many. Raises ``UserError`` where a name may stand for two files.
     """
     files = list_images(folder)
     if all(path.exists() for path in named):
         return list(named)
-    by_stem = {path.stem: path for path in files}
     stems = Counter(path.stem for path in named)
 
     def file_for(path: Path) -> Path:
-        alike = {other.stem: other for other in list_images(path.parent)}
-        return alike.get(path.stem) or (by_stem.get(path.stem, path) if stems[path.stem] == 1 else path)
+        alike = [other for other in list_images(path.parent) if other.stem == path.stem]
+        if not alike and stems[path.stem] == 1:
+            alike = [other for other in files if other.stem == path.stem]
+        if len(alike) > 1:
+            raise UserError(
+                f"{path} does not exist, and {alike[0]} or {alike[1]} could stand for it: remove one of them."
+            )
+        return alike[0] if alike else path
 
     found = [path if path.exists() else file_for(path) for path in named]
     if in_order and len(files) == len(named) and not any(path.exists() for path in found):

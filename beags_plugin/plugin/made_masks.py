@@ -28,6 +28,7 @@ from beags_plugin.plugin.reprojected_run import ReprojectionOptions, data_of_run
 from beags_plugin.progress import progress_bar
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.drawing import geometry_inputs, surface_depth
+from beags_plugin.whole_files import write_whole
 
 
 class RunGeometry:
@@ -106,7 +107,7 @@ def make_masks(
     """Write the masks of a scene: <output>/masks/<stem>.png, classes.json and made.png, a picture of them.
 
     The files take their places once all are made; no old mask of any view stays. Masks that are only to be looked at
-    go to <output>/masks_to_look_at/, which nothing reads.
+    go to <output>/masks_to_look_at/, which nothing reads; all else that is said of masks holds for them too.
     data: names the scene. run: config.yml of a run trained on it, for sources that need its depth. output: the scene's
     own folder if None, where ``beags-data`` looks for them. overwrite: replace masks that are there. snap: radius in
     pixels of ``rims.snap_to_edges``, 0 leaves rims as they are.
@@ -115,9 +116,13 @@ def make_masks(
     parser: BeagsDataParser = data.setup()
     scene, views = parser.posed_views()
     folder = output or scene.root
-    masks = folder / "masks"
-    if not overwrite and (any(masks.rglob("*.png")) or (folder / "classes.json").exists()):
-        raise UserError(f"{folder} has masks or a classes.json already: add --overwrite, or give another --output.")
+    masks, look_at, classes = folder / "masks", folder / "masks_to_look_at", folder / "classes.json"
+    there = [*masks.rglob("*.png"), *look_at.rglob("*.png"), *([classes] if classes.exists() else [])]
+    if there and not overwrite:
+        raise UserError(
+            f"{folder} has masks or a classes.json already ({there[0].relative_to(folder)}): add --overwrite, or give "
+            "another --output."
+        )
     if source.needs_run and run is None:
         raise UserError(
             "this mask source needs the scene's depth: train beags-base, then add --load-config <run>/config.yml."
@@ -129,10 +134,11 @@ def make_masks(
         for index, (name, path, size) in enumerate(zip(photo_names(views.images), views.images, sizes, strict=True))
     ]
     made_of = SourceScene(scene.root, photos, RunGeometry(run) if run is not None and source.needs_run else None)
-    shares, shown = [], []
+    shares: list[float] = []
+    shown: list[tuple[Photo, Path]] = []
     folder.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=".masks_", dir=folder) as temporary, progress_bar("Making masks") as progress:
-        unfinished = Path(temporary)
+        unfinished = {place: Path(temporary) / place.name for place in (masks, look_at)}
         made = source.make(made_of, progress)
         check_names(made.names)
         for index, (path, class_map) in enumerate(zip(mask_paths(views.images), made.maps, strict=True)):
@@ -140,24 +146,27 @@ def make_masks(
                 continue
             if snap:
                 class_map = snap_to_edges(class_map, photos[index].pixels(), snap)
-            aside = index in made.to_look_at
-            place = (folder / "masks_to_look_at" if aside else unfinished) / path
-            place.parent.mkdir(parents=True, exist_ok=True)
-            write_class_map(place, class_map)
-            shares.append(float((class_map != 0).mean()))
-            shown.append((photos[index], place if aside else masks / path))
-        if not shown:
+            place = look_at if index in made.to_look_at else masks
+            file = unfinished[place] / path
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_class_map(file, class_map)
+            if place is masks:
+                shares.append(float((class_map != 0).mean()))
+            shown.append((photos[index], place / path))
+        if not shares:
             raise UserError("the mask source gave no mask for any view: check its options.")
-        _take_the_place(unfinished, masks, {image.stem for image in views.images})
+        for place, new in unfinished.items():
+            _take_the_place(new, place, {image.stem for image in views.images})
     names = {str(i): name for i, name in sorted(made.names.items())}
-    (folder / "classes.json").write_text(json.dumps(names, indent=1), "utf8")
+    write_whole(classes, lambda file: file.write(json.dumps(names, indent=1).encode("utf8")))
     _picture(folder / "made.png", shown)
+    aside = len(shown) - len(shares)
     return [
         *made.notes,
-        f"{len(shown)} masks of {len(photos)} views, {len(names) - 1} objects, which cover {100 * np.mean(shares):.1f} "
-        f"% on average: {masks}",
-        *([f"of held-out views, only to look at: {folder / 'masks_to_look_at'}"] if made.to_look_at else []),
-        f"names: {folder / 'classes.json'}; look at {folder / 'made.png'}",
+        f"{len(shares)} masks of {len(photos)} views, {len(names) - 1} objects, which cover "
+        f"{100 * np.mean(shares):.1f} % on average: {masks}",
+        *([f"{aside} masks of held-out views, only to look at: {look_at}"] if aside else []),
+        f"names: {classes}; look at {folder / 'made.png'}",
     ]
 
 

@@ -48,10 +48,11 @@ class ObjectImagesSource(MaskSource):
         for name, path in files_by_name(folder).items():
             first, _, rest = name.partition("/")
             view, _, last = name.rpartition("/")
-            if rest and scene.names.candidates(rest):
-                named.setdefault(first, {})[rest] = path
-            elif view and scene.names.candidates(view):
-                named.setdefault(last, {})[view] = path
+            ways = [(first, rest), (last, view)]  # of reading the path: object and view
+            meant = [way for way in ways if scene.names.candidates(way[1])]
+            meant += [way for way in ways if scene.names.in_other_folders(way[1])]  # ``assigned`` tells the mistake
+            for each, of_view in meant[:1]:
+                named.setdefault(each, {})[of_view] = path
         return {
             (each, scene.photos[index].name): path
             for each, files in named.items()
