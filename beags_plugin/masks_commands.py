@@ -78,7 +78,8 @@ class Reproject:
     classes_path: Path | None = None
     """File {"id": "name"} for them; classes.json beside the folder if there is one."""
     method: str | None = None
-    """pairwise (exact), voxel (quick) or your own; as the run is configured if left out."""
+    """pairwise (exact), voxel (quick), auto (the one that fits the views) or your own; as the run is configured
+    if left out."""
     tau: float | None = None
     """pairwise: a vote counts if |z - depth| <= tau z; inf counts all."""
     voters: int | None = None

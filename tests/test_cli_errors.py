@@ -55,8 +55,8 @@ SENTENCES = {
     "votes, 0 to 1.",
     f"masks reproject --load-config {RUN} --masks-path {{tmp}}/nowhere": "the folder of masks {tmp}/nowhere does not "
     "exist: correct --masks-path.",
-    f"masks reproject --load-config {RUN} --method guess": "there is no reprojection 'guess': choose one of none, "
-    "pairwise, voxel.",
+    f"masks reproject --load-config {RUN} --method guess": "there is no reprojection 'guess': choose one of auto, "
+    "none, pairwise, voxel.",
     # extract
     "extract --load-config {tmp}/absent.yml": NO_FILE,
     "extract --load-config {tmp}/notes.yml": "{tmp}/notes.yml is not a run of ns-train beags: name the config.yml of "

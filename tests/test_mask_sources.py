@@ -411,15 +411,15 @@ def test_masks_to_look_at_are_guarded_and_whole_as_the_others(tmp_path):
 
 
 @pytest.mark.parametrize("lens", [{}, {"k1": -0.12, "k2": 0.02}])
-def test_reprojection_of_a_run_writes_masks_of_the_photos_size(tmp_path, lens):
+def test_reprojection_of_a_run_writes_masks_of_the_photos_size(tmp_path, lens, capsys):
     data = write_scene(tmp_path / "scene")
     if lens:
         meta = json.loads((data / "transforms.json").read_text())
         (data / "transforms.json").write_text(json.dumps({**meta, **lens}))
     config = write_trained(tmp_path / "run", data)
-    main(
-        ["masks", "reproject", "--load-config", str(config), "--method", "pairwise", "--output", str(tmp_path / "out")]
-    )
+    method, output = ("auto" if lens else "pairwise"), str(tmp_path / "out")
+    main(["masks", "reproject", "--load-config", str(config), "--method", method, "--output", output])
+    assert ("reprojection pairwise: 7 views have" in " ".join(capsys.readouterr().out.split())) == (method == "auto")
     masks = sorted((tmp_path / "out/masks").glob("*.png"))
     assert [path.stem for path in masks] == [f"v{index:02d}" for index in range(1, 8)]
     assert all(read_class_map(path).shape == (HEIGHT, WIDTH) for path in masks)
@@ -430,6 +430,7 @@ def test_reprojection_of_a_run_writes_masks_of_the_photos_size(tmp_path, lens):
         unlabelled = read_class_map(mask) == IGNORE
         assert not values[unlabelled].any()  # where the straight view does not reach, or nothing voted
     report = json.loads((tmp_path / "out/report.json").read_text())
+    assert report["method"] == "pairwise"
     before = read_class_map(data / "masks/v01.png")
     after = read_class_map(masks[0])
     if not lens:

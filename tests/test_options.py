@@ -14,7 +14,7 @@ from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.refiners.preparation import PreparationConfig
 
 WRONG = [
-    ({"reprojection": "pairs"}, "there is no reprojection 'pairs': choose one of none, pairwise, voxel."),
+    ({"reprojection": "pairs"}, "there is no reprojection 'pairs': choose one of auto, none, pairwise, voxel."),
     ({"depth": "mean"}, "there is no surface depth 'mean': choose one of median, expected."),
     ({"tau": -0.1}, "tau is -0.1: it must be 0 or more (inf counts every vote)."),
     ({"tau": math.nan}, "tau is nan: it must be 0 or more (inf counts every vote)."),
@@ -29,7 +29,7 @@ def test_wrong_options_of_the_preparation(options, sentence):
     assert str(error.value) == sentence
 
 
-@pytest.mark.parametrize("reprojection", ["none", "pairwise", "voxel"])
+@pytest.mark.parametrize("reprojection", ["auto", "none", "pairwise", "voxel"])
 @pytest.mark.parametrize("tau", [0.0, math.inf])
 def test_options_at_their_limits_are_taken(reprojection, tau):
     PreparationConfig(reprojection=reprojection, tau=tau, depth="expected", k=1).check()  # raises nothing

@@ -6,14 +6,20 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from labelled_views import labelled_views
+from raster_scenes import CLASSES
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
+from beags_plugin.masks.label_maps import LabelMaps
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
+from beags_plugin.refiners import consistent_masks
+from beags_plugin.refiners.consistent_masks import chosen_reprojection
 from beags_plugin.refiners.none import NoRefiner
 from beags_plugin.refiners.preparation import PreparationConfig, prepare
+from beags_plugin.refiners.stages import StageStore
 
 SIZE = 12
 CAMERA = Camera(torch.eye(4), torch.tensor([[10.0, 0.0, 6.0], [0.0, 10.0, 6.0], [0.0, 0.0, 1.0]]), SIZE, SIZE)
@@ -53,6 +59,56 @@ def test_without_a_decision_every_view_keeps_its_own():
 def test_doubtful_pixels_may_be_left_out():
     assert prepared([1, 2, 2, 1, 2], min_confidence=0.5) == [[2]] * 5  # 3 of 5 votes
     assert prepared([1, 2, 2, 1, 2], min_confidence=0.7) == [[IGNORE]] * 5
+
+
+@pytest.mark.parametrize(
+    ("views", "side", "masks", "voters", "expected"),
+    [
+        (60, (750, 1000), 60, 0, "pairwise"),
+        (300, (750, 1000), 300, 0, "voxel"),  # 225 million pixels
+        (130, (750, 1000), 130, 0, "voxel"),  # 97.5 million pixels, but 12.7 billion pairs
+        (130, (750, 1000), 100, 0, "pairwise"),  # 9.75 billion: views without a mask do not vote
+        (130, (750, 1000), 130, 100, "pairwise"),
+        (500, (192, 256), 500, 0, "voxel"),  # 24.6 million pixels, 12.3 billion pairs
+        (400, (192, 256), 400, 0, "pairwise"),
+        (2, (10_000, 5_000), 1, 0, "pairwise"),  # 100 million pixels
+        (2, (10_000, 5_001), 1, 0, "voxel"),
+    ],
+)
+def test_auto_is_pairwise_where_its_time_and_memory_are_small(views, side, masks, voters, expected):
+    cameras = [SimpleNamespace(height=side[0], width=side[1])] * views
+    labels = LabelMaps(torch.zeros(2, 2, dtype=torch.int32) if view < masks else None for view in range(views))
+    name, why = chosen_reprojection("auto", voters, cameras, labels)
+    pixels, pairs = views * side[0] * side[1] / 1e6, (voters or masks) * views * side[0] * side[1] / 1e9
+    assert name == expected and why is not None and "\n" not in why
+    assert f"reprojection {expected}: {views} views have {pixels:.3g} million pixels, {pairs:.3g} billion pairs" in why
+    for stated in ("pairwise", "voxel", "of another package"):
+        assert chosen_reprojection(stated, voters, cameras, labels) == (stated, None)
+
+
+def test_what_auto_chose_is_what_the_stages_are_kept_for(tmp_path, monkeypatch):
+    surfels, cameras, masks, rasterizer, settings = labelled_views(5, 0.1)
+    names = {index: str(index) for index in range(CLASSES)}
+
+    def of(name):
+        config = PreparationConfig(reprojection=name, k=20)
+        refiner, store = NoRefiner(), StageStore(tmp_path)
+        return prepare(surfels, cameras, masks, names, rasterizer, settings, refiner, config, store=store)
+
+    stated = {name: of(name) for name in ("voxel", "pairwise")}
+    few = of("auto")
+    assert any(line.startswith("reprojection pairwise: 5 views") for line in few.findings)
+    assert any("labelled pixels changed" in line and "kept from before" in line for line in few.findings)
+    monkeypatch.setattr(consistent_masks, "PAIRWISE_PIXELS", 1)
+    many = of("auto")
+    assert any(line.startswith("reprojection voxel: 5 views") for line in many.findings)
+    assert not any("labelled pixels changed" in line and "kept from before" in line for line in many.findings)
+    assert any("labelled pixels changed" in line and "kept from before" in line for line in of("voxel").findings)
+    assert not any(line.startswith("reprojection voxel") for line in stated["voxel"].findings)
+    for found, name in ((few, "pairwise"), (many, "voxel")):
+        assert all(torch.equal(a, b) for a, b in zip(found.labels, stated[name].labels, strict=True))
+        assert all(torch.equal(a, b) for a, b in zip(found.confidence, stated[name].confidence, strict=True))
+    assert not all(torch.equal(a, b) for a, b in zip(few.confidence, many.confidence, strict=True))
 
 
 def test_wrong_options_are_refused():

@@ -24,7 +24,7 @@ from beags_plugin.plugin.extract import read_scene
 from beags_plugin.progress import progress_bar
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import IGNORE
-from beags_plugin.refiners.consistent_masks import render_depths, reprojected_masks
+from beags_plugin.refiners.consistent_masks import chosen_reprojection, render_depths, reprojected_masks
 from beags_plugin.refiners.preparation import known_classes
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class ReprojectedRun:
     """The masks of V training views before and after, without lens distortion.
 
     given, voted: class ids; given is None where a view has no mask. confidence: [H, W] uint8, share of the votes
-    times 255. seconds: wall time.
+    times 255. seconds: wall time. method: the reprojection; why: a line on why it was chosen, if it was not given.
     """
 
     scene: SavedScene
@@ -68,6 +68,8 @@ class ReprojectedRun:
     voted: LabelMaps
     confidence: PackedMaps
     seconds: float
+    method: str
+    why: str | None
 
     def changed(self, view: int) -> Changed:
         """One view for a picture."""
@@ -103,6 +105,8 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
         raise UserError(f"no training view of {scene.config.data_path} has a mask: give --masks-path, or make some.")
     classes = manager.train_dataset.metadata["classes"]
     cameras, rasterizer = [view.camera for view in views], make_rasterizer(scene.config.model_config.rasterizer)
+    method, why = chosen_reprojection(config.reprojection, config.voters, cameras, given)
+    config = replace(config, reprojection=method)
     with progress_bar("Rendering depth") as progress:
         surfels = scene.surfels().detach()
         drawn = render_depths(surfels, cameras, rasterizer, raster_settings(scene), config.depth, progress)
@@ -112,7 +116,7 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     assert masks.confidence is not None
     names = [view.name for view in views]
     seconds = time.perf_counter() - start
-    return ReprojectedRun(scene, manager, names, classes, given, masks.labels, masks.confidence, seconds)
+    return ReprojectedRun(scene, manager, names, classes, given, masks.labels, masks.confidence, seconds, method, why)
 
 
 def data_of_run(scene: SavedScene, config_path: Path, options: ReprojectionOptions) -> BeagsDataManager:
@@ -158,13 +162,14 @@ def write_reprojection(found: ReprojectedRun, output: Path, min_confidence: floa
         Image.fromarray(found.manager.as_in_file(confidence, index, border=0)).save(output / "confidence" / path)
         changes.append(_change(found, index, doubtful))
     (output / "classes.json").write_text(json.dumps({str(i): name for i, name in found.classes.items()}, indent=1))
-    report = {"seconds": found.seconds, "min_confidence": min_confidence, "views": changes}
+    report = {"method": found.method, "seconds": found.seconds, "min_confidence": min_confidence, "views": changes}
     (output / "report.json").write_text(json.dumps(report, indent=1))
     order = sorted(range(len(changes)), key=lambda index: -changes[index]["changed"])[:shown]
     before_and_after(output / "before_after.png", [found.changed(index) for index in order])
     pixels, changed = (sum(view[key] for view in changes) for key in ("labelled", "changed"))
     filled = sum(mask is None for mask in found.given.stored)
     return [
+        *([found.why] if found.why else []),
         f"{changed} of {pixels} labelled pixels changed ({100 * changed / max(pixels, 1):.2f} %), "
         f"{filled} views without a mask got one, in {found.seconds:.1f} s",
         *(f"{output / name}" for name in ("masks", "confidence", "classes.json", "report.json", "before_after.png")),

@@ -19,6 +19,12 @@ from beags_plugin.rasterizers.drawing import geometry_inputs, surface_depth
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
 from beags_plugin.refiners.base import Progress
 
+AUTO = "auto"
+PAIRWISE_PIXELS = 100_000_000
+"""Up to so many pixels in all views "auto" is pairwise, which holds 5 bytes for each: 0.5 GB."""
+PAIRWISE_PAIRS = 10_000_000_000
+"""Up to so many pairs of a voting pixel and a view "auto" is pairwise: 7 to 9 ns each on one core, 80 s."""
+
 Stage = Callable[[str], AbstractContextManager[Progress | None]]
 """Opens a named stage and gives its progress callback; a command line draws a bar with it."""
 
@@ -37,6 +43,25 @@ class ConsistentMasks:
     confidence: PackedMaps | None
 
 
+def chosen_reprojection(name: str, voters: int, cameras: Sequence[Camera], labels: LabelMaps) -> tuple[str, str | None]:
+    """The reprojection that ``name`` means for these views, and where that was chosen here, why: a line for a reader.
+
+    "auto" is pairwise, which is a little more exact, where its memory (pixels) and its time (pairs) are small; else
+    voxel, which grows with neither. Any other name means itself.
+    """
+    if name != AUTO:
+        return name, None
+    sizes = [camera.height * camera.width for camera in cameras]
+    voting = [size for size, mask in zip(sizes, votes_of(labels, voters).stored, strict=True) if mask is not None]
+    pixels, pairs = sum(sizes), sum(voting) * len(cameras)
+    few = pixels <= PAIRWISE_PIXELS and pairs <= PAIRWISE_PAIRS
+    return "pairwise" if few else "voxel", (
+        f"reprojection {'pairwise' if few else 'voxel'}: {len(cameras)} views have {pixels / 1e6:.3g} million pixels, "
+        f"{pairs / 1e9:.3g} billion pairs of a pixel and a view; pairwise is taken up to {PAIRWISE_PIXELS / 1e6:g} "
+        f"million and {PAIRWISE_PAIRS / 1e9:g} billion"
+    )
+
+
 def masks_as_they_are(labels: LabelMaps, cameras: Sequence[Camera], known: ClassRanks) -> ConsistentMasks:
     """The masks without reprojection; a view that has none is all IGNORE."""
     whole = LabelMaps(_or_ignore(mask, camera) for mask, camera in zip(labels, cameras, strict=True))
@@ -53,8 +78,8 @@ def reprojected_masks(
 ) -> ConsistentMasks:
     """The masks of all views, voted by those that vote.
 
-    depths: per view [H, W], of the surface; they may lie on disk. config: a ``preparation.PreparationConfig``. Of what
-    the votes give, one view is held at a time.
+    depths: per view [H, W], of the surface; they may lie on disk. config: a ``preparation.PreparationConfig`` whose
+    reprojection is a registered one. Of what the votes give, one view is held at a time.
     """
     given = translated(labels, known, known.ranks)
     votes = votes_of(given, config.voters)

@@ -24,8 +24,10 @@ from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSetting
 from beags_plugin.refiners.base import AssignedScene, EditedScene, Refiner
 from beags_plugin.refiners.border_split import BorderSplitConfig, split_at_borders
 from beags_plugin.refiners.consistent_masks import (
+    AUTO,
     ConsistentMasks,
     Stage,
+    chosen_reprojection,
     masks_as_they_are,
     render_depths,
     reprojected_masks,
@@ -48,8 +50,9 @@ LEAST_K = 10  # nearer neighbours tell the noise of the depth rather than the di
 class PreparationConfig:
     """Options of the stages between base training and refinement.
 
-    reprojection: how masks are made consistent: "pairwise", "voxel" or another name of ``masks.REPROJECTIONS``; "none"
-        keeps them.
+    reprojection: how masks are made consistent: "pairwise", "voxel" or another name of ``masks.REPROJECTIONS``; "auto"
+        chooses of these two by the number of views and pixels (``consistent_masks.chosen_reprojection``); "none" keeps
+        the masks.
     voters: how many views vote, evenly spread among those with a mask; 0: all of them. Every view is voted on.
     min_confidence: reprojected pixels whose winner has a smaller share of the votes are IGNORE to the losses.
     tau: pairwise: a vote counts if its point is visible: |z - D| <= tau z; infinity counts every vote (E5).
@@ -63,7 +66,7 @@ class PreparationConfig:
         refinement: no view tells what they should be. 0, as in the paper, keeps all.
     """
 
-    reprojection: str = "pairwise"
+    reprojection: str = AUTO
     voters: int = 0
     min_confidence: float = 0.0
     tau: float = 0.02
@@ -75,10 +78,10 @@ class PreparationConfig:
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that no stage can work with: hours before the stages would say so."""
-        choices = ["none", *REPROJECTIONS.names()]
+        choices = [AUTO, "none", *REPROJECTIONS.names()]
         if self.reprojection not in choices:
             raise UserError(f"there is no reprojection {self.reprojection!r}: choose one of {', '.join(choices)}.")
-        if self.reprojection != "none":
+        if self.reprojection not in (AUTO, "none"):
             REPROJECTIONS.get(self.reprojection)  # one of another package may not load
         if self.voters < 0:
             raise UserError(f"voters is {self.voters}: it must be a number of views, or 0 for all of them.")
@@ -247,7 +250,9 @@ def _consistent_masks(
         stages.key("reprojection", "none")
         stages.found("reprojection", "reprojection: off, masks used as they are")
         return masks
-    reproject = REPROJECTIONS.get(config.reprojection)
+    method, why = chosen_reprojection(config.reprojection, config.voters, cameras, maps)
+    config = replace(config, reprojection=method)  # stages depend on what is really done
+    reproject = REPROJECTIONS.get(method)
     options = (config.reprojection, config.voters, config.min_confidence, config.tau)
     depth_key = stages.key("depth", config.depth)
     key = stages.key("reprojection", *options, reproject)
@@ -263,6 +268,8 @@ def _consistent_masks(
 
     masks = stages.run("reprojection", key, reprojected, MASKS)
     stages.drop("depth")  # as large as all photos in float, and quickly drawn
+    if why is not None:
+        stages.findings.append(why)
     stages.found("reprojection", reprojection_finding(maps, masks.labels))
     return masks
 
