@@ -62,6 +62,7 @@ def run_demo(
         CONSOLE.print(f"Trained before: {run} (add --fresh to train again).")
     else:
         if run.is_dir():
+            _check_own(output)  # before anything is written there
             RunLock(run).release()  # says so if the same demo is being trained
         if not fresh and _broken_off(output, request):
             resume(run)
@@ -153,12 +154,17 @@ def _broken_off(output: Path, request: dict[str, Any]) -> bool:
     return _read_stamp(output).get(STARTED) == request and (output / "run" / "config.yml").exists()
 
 
-def _clear(output: Path) -> None:
-    """Remove the demo's own former run; raises ``UserError`` if ``run`` is something else's."""
+def _check_own(output: Path) -> None:
+    """Raise ``UserError`` if ``run`` is there and something else's."""
     run = output / "run"
     if run.exists() and not (output / STAMP).exists():
         raise UserError(f"{run} is not the demo's: choose another --output, or move it away.")
-    shutil.rmtree(run, ignore_errors=True)
+
+
+def _clear(output: Path) -> None:
+    """Remove the demo's own former run; raises ``UserError`` if ``run`` is something else's."""
+    _check_own(output)
+    shutil.rmtree(output / "run", ignore_errors=True)
 
 
 def train(data: Path, run: Path, preset: str, downscale: float) -> None:
@@ -193,10 +199,10 @@ def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
     with _Timer(seconds, "evaluation"), progress_bar("Evaluating") as progress:
         evaluated = EvaluatedRun(run / "config.yml")
         metrics = evaluated.metrics(progress=progress)
-    with _Timer(seconds, "extraction"):
-        extracted = extract_objects(run / "config.yml")
+    with _Timer(seconds, "extraction"), progress_bar("Extracting") as progress:
+        extracted = extract_objects(run / "config.yml", progress=progress)
     picture = output / "contact_sheet.png"
-    with _Timer(seconds, "picture"):
+    with _Timer(seconds, "picture"), progress_bar("Drawing the picture") as progress:
         views, classes = evaluated.views, evaluated.classes
         shown = views[:: max(1, len(views) // SHEET_VIEWS)][:SHEET_VIEWS]
         objects = [index for index in classes if index != 0]
@@ -204,7 +210,7 @@ def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
         assert base.class_ids is not None and refined.class_ids is not None
         scenes = ((base.surfels(), base.class_ids), (refined.surfels(), refined.class_ids))
         drawing = (evaluated.rasterizer, evaluated.settings)
-        scenery = {"novel": novel_camera(views), "background": views.background}
+        scenery = {"novel": novel_camera(views), "background": views.background, "progress": progress}
         rows = draw_rows(shown, *scenes, objects, *drawing, **scenery)
         write_contact_sheet(picture, rows, classes)
     training = json.loads((run / "training.json").read_text())

@@ -64,7 +64,8 @@ def run_evaluation(configs: Sequence[Path], data_set_name: str, protocol: Protoc
         with progress_bar(f"Evaluating {name}") as progress:
             metrics = evaluated.metrics(protocol, progress)
         if outputs.picture is not None:
-            worst += evaluated.worst(metrics, outputs.worst)
+            with progress_bar("Drawing worst masks") as progress:
+                worst += evaluated.worst(metrics, outputs.worst, progress=progress)
         runs.append(metrics)
         CONSOLE.print(render_run(metrics))
     found = data_set(data_set_name, runs)

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from time import monotonic
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+A_MOMENT = 2.0  # seconds
+
 
 @contextmanager
-def progress_bar(name: str) -> Iterator[Callable[[int, int], None]]:
-    """Draw a bar called ``name``; the callback that it yields takes (done, total)."""
+def progress_bar(name: str, passing: bool = False) -> Iterator[Callable[[int, int], None]]:
+    """Draw a bar called ``name``; the callback that it yields takes (done, total).
+
+    passing: for what happens often, and mostly takes no time: draw it only after a moment, and remove it at the end.
+    """
     columns = (
         TextColumn("  {task.description:<22}"),
         BarColumn(),
@@ -18,10 +24,20 @@ def progress_bar(name: str) -> Iterator[Callable[[int, int], None]]:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns) as progress:
-        task = progress.add_task(name, total=None)
-        try:
-            yield lambda done, total: progress.update(task, completed=done, total=total)
-        except BaseException:
-            progress.live.transient = True  # what stopped it says more than half a bar
-            raise
+    progress = Progress(*columns, transient=passing)
+    task, began = progress.add_task(name, total=None), monotonic()
+
+    def update(done: int, total: int) -> None:
+        progress.update(task, completed=done, total=total)
+        if passing and monotonic() - began > A_MOMENT:
+            progress.start()  # nothing, if it is drawn already
+
+    if not passing:
+        progress.start()
+    try:
+        yield update
+    except BaseException:
+        progress.live.transient = True  # what stopped it says more than half a bar
+        raise
+    finally:
+        progress.stop()

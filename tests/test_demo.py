@@ -14,6 +14,7 @@ import pytest
 from data_folders import write_image
 from run_folders import write_scene
 
+from beags_plugin import demo
 from beags_plugin.demo import STAMP, _clear, _trained, check_preset, quick_downscale
 from beags_plugin.errors import UserError
 from beags_plugin.plugin.config import base_config
@@ -68,6 +69,18 @@ def test_a_run_that_is_not_the_demos_is_kept(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_nothing_is_written_into_a_folder_that_is_not_the_demos(tmp_path):
+    data, run = write_scene(tmp_path / "data"), tmp_path / "out/run"
+    run.mkdir(parents=True)
+    (run / "notes.txt").write_text("mine")
+    for fresh in (False, True):
+        with pytest.raises(UserError, match="out/run is not the demo's"):
+            demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, fresh)
+    assert sorted(path.relative_to(tmp_path).as_posix() for path in (tmp_path / "out").rglob("*")) == [
+        "out/run", "out/run/notes.txt",
+    ]  # fmt: skip
+
+
 def test_a_damaged_stamp_means_not_trained(tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run/training.json").write_text("{}")
@@ -80,8 +93,6 @@ def test_a_damaged_stamp_means_not_trained(tmp_path):
 
 def test_a_demo_that_was_killed_goes_on(tmp_path, monkeypatch):
     """Killed in the training, it resumes; after the training, it measures; with another request, it starts anew."""
-    from beags_plugin import demo
-
     data, output = write_scene(tmp_path / "data"), tmp_path / "out"
     run, commands, measured = output / "run", [], []
 
@@ -117,7 +128,6 @@ def test_a_demo_that_was_killed_goes_on(tmp_path, monkeypatch):
 
 
 def test_a_demo_that_is_under_way_is_left_alone(tmp_path, monkeypatch):
-    from beags_plugin import demo
     from beags_plugin.plugin.run_lock import RunLock
 
     data, run = write_scene(tmp_path / "data"), tmp_path / "out/run"

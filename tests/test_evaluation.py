@@ -272,7 +272,10 @@ def test_the_sheet_shows_objects_before_and_after(tmp_path):
     before, after = scene([CUP, BOX, FLOOR]), scene([CUP, BOX, FLOOR], grey=0.6)
     ids = torch.tensor([1, 2, 0], dtype=torch.int32)
     views = [EvalView(camera(s), torch.rand(SIZE, SIZE, 3), truth(), name=f"view {s}") for s in (0.0, 1.0)]
-    rows = draw_rows(views, (before, ids), (after, ids), [1, 2], Squares(), SETTINGS)
+    told: list[tuple[int, int]] = []
+    progress = lambda done, total: told.append((done, total))  # noqa: E731
+    rows = draw_rows(views, (before, ids), (after, ids), [1, 2], Squares(), SETTINGS, progress=progress)
+    assert told == [(1, 3), (2, 3), (3, 3)]
     assert [row.name for row in rows] == ["view 0.0", "view 1.0", "novel view"]
     assert np.array_equal(rows[0].after[1][..., 3] == 255, square_mask(*CUP).numpy())
     assert (rows[0].before[1][12, 8, :3] == 76).all() and (rows[0].after[1][12, 8, :3] == 153).all()

@@ -82,7 +82,10 @@ def test_the_worst_come_first():
 
 def test_the_drawn_errors_are_those_of_the_figures():
     run, scenes, views = evaluated()
-    found = draw_worst(run, scenes, views, Squares(), SETTINGS, count=1)
+    told: list[tuple[int, int]] = []
+    progress = lambda done, total: told.append((done, total))  # noqa: E731
+    found = draw_worst(run, scenes, views, Squares(), SETTINGS, count=1, progress=progress)
+    assert told == [(1, 2), (2, 2)]
     assert [mask.kind for mask in found] == ["extracted", "rendered"]
     worst = found[0]  # the second view, whose truth is the shifted cup
     assert worst.title == "lab, second: cup"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -55,12 +55,13 @@ def draw_rows(
     *,
     novel: Camera | None = None,
     background: Tensor | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> list[SheetRow]:
     """Draw the views and one novel view.
 
     before, after: the surfels with assignment alone and after refinement, each with phi, [N] int32.
     objects: ids to show alone. novel: its camera; ``novel_camera`` of the views if None. background: [3], black if
-    None.
+    None. progress: is told (done, total) views.
     No gradients.
     """
     novel = novel or novel_camera(views)
@@ -86,6 +87,8 @@ def draw_rows(
                 focus={c: resize_nearest(t[1].cpu().numpy(), *size) for c, t in truths.items() if t is not None},
             )
             rows.append(row)
+            if progress is not None:
+                progress(len(rows), len(views))
     return rows
 
 

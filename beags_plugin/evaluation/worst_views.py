@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -91,29 +91,32 @@ def draw_worst(
     settings: RasterSettings,
     count: int = 6,
     by: By = "iou",
+    progress: Callable[[int, int], None] | None = None,
 ) -> list[WorstMask]:
     """Draw again the ``count`` worst masks of each kind.
 
     run: the figures of these scenes and views. scenes: stage to the surfels and their classes [N] int32. by: the
-    figure that says what is worst. No gradients.
+    figure that says what is worst. progress: is told (done, total) masks. No gradients.
     """
     names = run.names()
     found = []
+    chosen = [(kind, index) for kind in KINDS for index in worst_records(run, kind, count, by)]
     with torch.no_grad():
-        for kind in KINDS:
-            for index in worst_records(run, kind, count, by):
-                record = run.after.masks[index]
-                view = views[record.view]
-                errors: dict[Stage, np.ndarray] = {}
-                for stage, (surfels, class_ids) in scenes.items():
-                    drawing = MaskDrawing(surfels.detach(), class_ids, view, rasterizer, settings, run.protocol)
-                    errors[stage] = _errors(drawing, record, run.protocol)
-                metrics: dict[Stage, MaskMetrics] = {}
-                for stage, scene in run.stages().items():
-                    metrics[stage] = scene.masks[index].metrics
-                photo = _photo(view, errors["after"].shape)
-                title = f"{run.scene}, {view.name}: {names[record.class_id]}"
-                found.append(WorstMask(title, kind, photo, errors, metrics))
+        for kind, index in chosen:
+            record = run.after.masks[index]
+            view = views[record.view]
+            errors: dict[Stage, np.ndarray] = {}
+            for stage, (surfels, class_ids) in scenes.items():
+                drawing = MaskDrawing(surfels.detach(), class_ids, view, rasterizer, settings, run.protocol)
+                errors[stage] = _errors(drawing, record, run.protocol)
+            metrics: dict[Stage, MaskMetrics] = {}
+            for stage, scene in run.stages().items():
+                metrics[stage] = scene.masks[index].metrics
+            photo = _photo(view, errors["after"].shape)
+            title = f"{run.scene}, {view.name}: {names[record.class_id]}"
+            found.append(WorstMask(title, kind, photo, errors, metrics))
+            if progress is not None:
+                progress(len(found), len(chosen))
     return found
 
 

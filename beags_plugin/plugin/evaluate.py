@@ -101,13 +101,15 @@ class EvaluatedRun:
             notes=tuple(self._notes(found["after"])),
         )
 
-    def worst(self, metrics: RunMetrics, count: int, by: By = "iou") -> list[WorstMask]:
-        """The ``count`` worst masks of each kind, drawn; metrics: what ``metrics`` gave."""
+    def worst(
+        self, metrics: RunMetrics, count: int, by: By = "iou", progress: Progress | None = None
+    ) -> list[WorstMask]:
+        """The ``count`` worst masks of each kind, drawn; metrics: what ``metrics`` gave; progress: (done, total)."""
         scenes: dict[Stage, tuple[Surfels, Tensor]] = {}
         for stage, scene in self.stages.items():
             if scene.class_ids is not None:
                 scenes[stage] = (scene.surfels(), scene.class_ids)
-        return draw_worst(metrics, scenes, self.views, self.rasterizer, self.settings, count, by)
+        return draw_worst(metrics, scenes, self.views, self.rasterizer, self.settings, count, by, progress)
 
     def _notes(self, after: SceneMetrics) -> Iterator[str]:
         if not self.stages["after"].assigned:

@@ -1,0 +1,38 @@
+"""Bars: drawn where something lasts, and not where it is over before one could read them."""
+
+from __future__ import annotations
+
+import pytest
+
+from beags_plugin import progress
+from beags_plugin.progress import progress_bar
+
+
+def clock(monkeypatch, seconds_per_call: float) -> None:
+    calls = iter(range(10**6))
+    monkeypatch.setattr(progress, "monotonic", lambda: seconds_per_call * next(calls))
+
+
+def test_a_bar_says_what_is_done(capsys):
+    with progress_bar("Counting sheep") as told:
+        told(3, 7)
+    assert "Counting sheep" in (said := capsys.readouterr().out) and "3/7" in said
+
+
+@pytest.mark.parametrize(("seconds", "drawn"), [(0.4, False), (3.0, True)])
+def test_a_passing_bar_is_drawn_only_after_a_moment(capsys, monkeypatch, seconds, drawn):
+    clock(monkeypatch, seconds)
+    started = []
+    monkeypatch.setattr(progress.Progress, "start", lambda self: started.append(self.live.transient))
+    with progress_bar("Counting sheep", passing=True) as told:
+        for done in range(1, 5):
+            told(done, 4)
+    assert started == [True] * 4 * drawn  # and is removed at the end
+    assert "Counting" not in capsys.readouterr().out
+
+
+def test_errors_come_through_and_leave_no_bar(capsys):
+    for passing in (False, True):
+        with pytest.raises(ValueError, match="wolf"), progress_bar("Counting sheep", passing) as told:
+            told(1, 2)
+            raise ValueError("wolf")
