@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import threading
 import time
 from types import SimpleNamespace
@@ -389,6 +390,44 @@ def test_an_extracted_run_shows_its_object_and_the_masks_of_the_run_it_is_from(f
     window.panel.follow()
     assert window.look("occupancy_violation")["occupancy_violation"].sum() > 0
     assert window.panel.files.write() == extracted.config.parent / "exports/shown_scene.ply"
+
+
+@pytest.mark.parametrize("changed", ["a mask", "the grid"])
+def test_an_extracted_run_whose_origin_was_trained_again_shows_none_of_its_masks(tmp_path, changed):
+    run = tmp_path / "run"
+    config = write_trained(run, write_scene(tmp_path / "lab"))
+    write_prepared(run, shift=1)
+    (extracted,) = extract_objects(config, ["cup"], output=tmp_path / "out")
+    (of_extracted,) = extract_objects(extracted.config, ["cup"], output=tmp_path / "twice")
+    for each in (extracted, of_extracted):
+        assert Stand(each.config).panel.notes == {}
+    open_now = Stand(extracted.config).model.viewing.run
+    shutil.rmtree(run / "prepared")
+    write_prepared(run, shift=1, **({"scale": 2.0} if changed == "the grid" else {}))
+    if changed == "a mask":
+        write_class_map(run / "prepared/masks/v03.png", np.zeros((12, 20), np.uint8))
+    os.utime(run / "prepared/grid.pt", ns=(1, 1))  # another file, even where the clock is coarse
+    assert open_now.prepared is None and open_now.mask(0, "after", 20, 12) is None
+    for each in (extracted, of_extracted):
+        window = Stand(each.config)
+        assert set(window.look("rgb")) == ALWAYS | {"class_map", "class_confidence", "boundary_error", "mask_before"}
+        assert window.panel.notes["run"] == (
+            f"No masks after reprojection and no voxel grid: {run} has been trained again since this was extracted "
+            "from it. Extract it again."
+        )
+    origin = Stand(config)  # the run itself shows what it has
+    assert origin.panel.notes == {} and {"mask_after", "occupancy_violation"} <= set(origin.look())
+    (again,) = extract_objects(config, ["cup"], output=tmp_path / "out")
+    assert Stand(again.config).panel.notes == {}
+
+
+def test_an_extract_that_does_not_say_what_it_was_prepared_with_shows_what_is_there(finished, tmp_path):
+    (extracted,) = extract_objects(finished, ["cup"], output=tmp_path / "out")
+    origin = extracted.config.parent / "extraction.json"
+    content = json.loads(origin.read_text())
+    assert len(content.pop("prepared")) == 1
+    origin.write_text(json.dumps(content))
+    assert {"mask_after", "occupancy_violation"} <= set(Stand(extracted.config).look())
 
 
 def test_an_extracted_run_whose_origin_is_gone_lists_less(finished, tmp_path):

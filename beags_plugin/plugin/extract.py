@@ -22,6 +22,7 @@ from beags_plugin.plugin.runs import (
     EXTRACTION_FILE,
     TRANSFORM_FILE,
     newest_checkpoint,
+    prepared_digests,
     write_run,
     write_text_atomically,
 )
@@ -127,6 +128,7 @@ def extract_objects(
         target.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"{target} cannot be written ({error.strerror}): choose another place.") from error
+    prepared = prepared_digests(run)  # tells whether the run was trained again later
     written = []
     for name in names:
         surfels, index = select(scene.surfels(), class_ids, ids[name])
@@ -134,7 +136,7 @@ def extract_objects(
         title = f"without_{title}" if remove else title
         folder = target / title
         config = write_run(scene.config, folder, _rows(scene.state, index), scene.step)
-        origin = {"object": name, "removed": remove, "run": str(config_path.absolute())}
+        origin = {"object": name, "removed": remove, "run": str(config_path.absolute()), "prepared": prepared}
         write_text_atomically(json.dumps(origin, indent=2), folder / EXTRACTION_FILE)
         ply = folder / f"{title}.ply"
         write_ply(ply, surfels, class_ids[index], transform)

@@ -12,6 +12,7 @@ import torch
 import yaml
 from torch import Tensor
 
+from beags_plugin.digests import content_digest
 from beags_plugin.errors import UserError
 from beags_plugin.whole_files import write_whole
 
@@ -85,6 +86,27 @@ def preparing_run(run: Path) -> Path:
     if origin.exists():
         return preparing_run(Path(json.loads(origin.read_text("utf8"))["run"]).parent)
     return run.parent if run.name == BASE_SNAPSHOT and (run.parent / PREPARED).is_dir() else run
+
+
+def prepared_digests(run: Path) -> list[str] | None:
+    """Of each round that refinement was prepared for, for what ``run`` holds, a digest of its masks and grid.
+
+    Of an extract they are those of the time when it was made; None for one that has not kept them.
+    """
+    origin = run / EXTRACTION_FILE
+    if origin.exists():
+        return json.loads(origin.read_text("utf8")).get("prepared")
+    digests = []
+    while (digest := round_digest(round_folder(preparing_run(run), len(digests)))) is not None:
+        digests.append(digest)
+    return digests
+
+
+def round_digest(folder: Path) -> str | None:
+    """Of the masks and the grid that lie in the folder of a round; None if none was prepared there."""
+    if not (folder / "grid.pt").exists():
+        return None
+    return content_digest([folder / "grid.pt", *sorted((folder / "masks").glob("*.png"))])
 
 
 def last_prepared(run: Path) -> Path:

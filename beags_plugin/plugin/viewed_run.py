@@ -16,7 +16,7 @@ from beags_plugin.evaluation.metrics import resize_nearest
 from beags_plugin.masks.classes import read_class_map
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
-from beags_plugin.plugin.runs import preparing_run, round_folder
+from beags_plugin.plugin.runs import EXTRACTION_FILE, prepared_digests, preparing_run, round_digest, round_folder
 from beags_plugin.plugin.views import unique_names
 
 if TYPE_CHECKING:
@@ -44,19 +44,48 @@ class ViewedRun:
         self._before = lru_cache(_KEPT_MASKS)(datamanager.training_mask)
         self.rounds: Callable[[], int] = lambda: 1  # see ``prepared``
         self._after = lru_cache(_KEPT_MASKS)(_read_mask)
+        self._kept = prepared_digests(folder) if (folder / EXTRACTION_FILE).exists() else None
+        self._digest = lru_cache(1)(lambda folder, _changed: round_digest(folder))
 
     @property
     def prepared(self) -> Path | None:
         """The folder of what refinement was prepared with: of this run, or of that which it was taken from.
 
         None while the scene that is shown has been through no preparation; else that of the last round that it has been
-        through: a folder that is used again may hold those of a former run.
+        through: a folder that is used again may hold those of a former run, and the run that this is an extract of may
+        have been prepared again.
         """
+        folder = self._round()
+        return None if folder is None or self._replaced(folder) else folder
+
+    @property
+    def note(self) -> str | None:
+        """A sentence for the user where what lies on disk is no longer what this scene was prepared with."""
+        folder = self._round()
+        if folder is None or not self._replaced(folder):
+            return None
+        return (
+            f"No masks after reprojection and no voxel grid: {preparing_run(self.folder)} has been trained again since "
+            "this was extracted from it. Extract it again."
+        )
+
+    def _round(self) -> Path | None:
+        """The folder of the round, if something is there."""
         rounds = self.rounds()
         if rounds == 0:
             return None
         folder = round_folder(preparing_run(self.folder), rounds - 1)
         return folder if (folder / "grid.pt").exists() else None
+
+    def _replaced(self, folder: Path) -> bool:
+        """Whether the round's folder holds something else than when this run was extracted, as far as that is known."""
+        if self._kept is None:
+            return False
+        try:
+            now = self._digest(folder, (folder / "grid.pt").stat().st_mtime_ns)
+        except OSError:  # it is being replaced
+            return True
+        return now != dict(enumerate(self._kept)).get(self.rounds() - 1)
 
     @property
     def has_grid(self) -> bool:

@@ -120,6 +120,8 @@ class ObjectPanel(ViewerElement[None]):
         run = ViewedRun(Path(viewer.log_filename).parent.absolute(), viewer.pipeline.datamanager)  # type: ignore[arg-type]
         self.viewing.attach(run, viewer.trainer is not None, viewer.train_lock)
         self.viewing.wanted, self.viewing.crop_box = self._wanted, self._crop_box
+        if run.note is not None:
+            self.note("run", run.note)
         self._listen(self.clicks.value)
         threading.Thread(target=self._follow, name="beags panel", daemon=True).start()
 
