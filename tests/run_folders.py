@@ -50,6 +50,33 @@ def write_scene(root: Path, masks: bool = True, truth_factor: int = 1) -> Path:
     return root
 
 
+def write_drawn_scene(root: Path, factor: int = 4) -> Surfels:
+    """Nine photos and masks of the discs, which fit: drawn ``factor`` times as large as other scenes; the discs."""
+    from data_folders import CX, CY, FX, FY, ring
+
+    from beags_plugin.core.cameras import Camera, viewmat_from_opengl
+    from beags_plugin.rasterizers import make_rasterizer
+    from beags_plugin.rasterizers.drawing import draw_class_map, surfel_inputs
+    from beags_plugin.rasterizers.interface import RasterSettings
+
+    surfels, class_ids = discs()
+    rasterizer, settings = make_rasterizer("auto"), RasterSettings(0.03, 300.0)
+    write_scene(root)
+    meta = json.loads((root / "transforms.json").read_text())
+    meta |= {name: factor * meta[name] for name in ("fl_x", "fl_y", "cx", "cy", "w", "h")}
+    (root / "transforms.json").write_text(json.dumps(meta))
+    K = torch.tensor([[FX, 0, CX], [0, FY, CY], [0, 0, 1 / factor]]) * factor
+    for index, pose in enumerate(ring(9)):
+        viewmat = viewmat_from_opengl(torch.from_numpy(pose)).float()
+        camera = Camera(viewmat, K, factor * WIDTH, factor * HEIGHT)
+        image = rasterizer.rasterize(surfel_inputs(surfels, camera), camera, settings, torch.zeros(3)).color
+        write_image(root / f"images/v{index:02d}.png", (255 * image.clamp(0, 1)).round().to(torch.uint8).numpy())
+        labels, _ = draw_class_map(rasterizer, surfels, class_ids, camera, settings)
+        labels[labels > max(CLASSES)] = 0  # nothing drawn
+        write_image(root / f"masks/v{index:02d}.png", labels.to(torch.uint8).numpy())
+    return surfels
+
+
 def write_trained(
     folder: Path, data: Path, assigned: bool = True, base: bool = True, background: str = "black", scale: float = 1.0
 ) -> Path:

@@ -2,32 +2,18 @@
 
 from __future__ import annotations
 
-import os
-import socket
-import subprocess
-import sys
-import time
-from io import BytesIO
-from pathlib import Path
-
 import numpy as np
 import pytest
-from PIL import Image
 from run_folders import CLASSES, write_prepared, write_scene, write_trained
 
 pytest.importorskip("nerfstudio")
 
 from browser import Page, chromium
+from viewer_pages import COLORS, HEIGHT, WIDTH, awaited, differing, painted, varied, viewed
 
 from beags_plugin.extraction.ply import read_ply
-from beags_plugin.masks.classes import colorize
 
 pytestmark = pytest.mark.skipif(chromium() is None, reason="there is no chromium (Debian: apt-get install chromium)")
-ENTRY = "from nerfstudio.scripts.viewer.run_viewer import entrypoint; entrypoint()"  # what ns-viewer runs
-
-
-WIDTH, HEIGHT = 640, 400
-COLORS = {name: colorize(np.array([[index]]))[0, 0].astype(int) for index, name in CLASSES.items()}
 OUTPUTS = (
     "rgb", "depth", "normal", "accumulation", "class_map", "class_confidence", "boundary_error", "occupancy_violation",
     "mask_before", "mask_after",
@@ -36,31 +22,15 @@ OUTPUTS = (
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
-    """The config.yml of a run, the address of its viewer, and the file that the viewer prints to.
+    """The config.yml of a run, and the address of its viewer.
 
     The scene is so small that all of it is seen from where the viewer's camera is at first.
     """
     root = tmp_path_factory.mktemp("served")
     config = write_trained(root / "run", write_scene(root / "lab"), scale=0.1)
     write_prepared(root / "run", shift=1, scale=0.1)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    log = root / "log.txt"
-    options = ("--load-config", config, "--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", port)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path[1:]])}
-    with open(log, "wb") as out:
-        process = subprocess.Popen(
-            [sys.executable, "-c", ENTRY, *map(str, options)], stdout=out, stderr=subprocess.STDOUT, env=environment
-        )
-    end = time.monotonic() + 500
-    while "disabled local writer" not in log.read_text():  # the last that it prints
-        assert process.poll() is None and time.monotonic() < end, log.read_text()[-3000:]
-        time.sleep(0.5)
-    yield config, f"http://127.0.0.1:{port}", log
-    process.terminate()
-    process.wait()
-    assert "Traceback" not in log.read_text()
+    with viewed(config, root / "log.txt") as address:
+        yield config, address
 
 
 @pytest.fixture(scope="module")
@@ -78,39 +48,6 @@ def page(opened):
     for label in ("Rest", "Least opacity"):
         opened.slide(label, 0)
     return opened
-
-
-def picture(page: Page) -> np.ndarray:
-    """What is left of the panel and below the title, without the cross of axes in the corner; [H, W, 3] int."""
-    pixels = np.asarray(Image.open(BytesIO(page.picture())).convert("RGB"))
-    return pixels[60:340, :310].astype(int)
-
-
-def differing(one: np.ndarray, other: np.ndarray) -> float:
-    """Share of the pixels that differ by more than what JPEG does to them."""
-    return float((np.abs(one - other).max(axis=2) > 40).mean())
-
-
-def varied(pixels: np.ndarray) -> float:
-    """How much a picture varies over its pixels; 0 for one colour."""
-    return float(pixels.reshape(-1, 3).std(axis=0).max())
-
-
-def painted(pixels: np.ndarray, name: str) -> float:
-    """Share of the pixels that have the colour of a class."""
-    return float((np.abs(pixels - np.array(COLORS[name])).max(axis=2) < 30).mean())
-
-
-def awaited(page: Page, true) -> np.ndarray:
-    """The picture, once it is as asked for and stays so: coarse ones come before it."""
-    found = [picture(page)]
-
-    def holds() -> bool:
-        found.append(picture(page))
-        return differing(*found[-2:]) == 0.0 and true(found[-1])
-
-    page.wait(holds, 120)
-    return found[-1]
 
 
 def test_every_output_is_a_picture_of_its_own(page):

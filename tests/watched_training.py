@@ -1,0 +1,39 @@
+"""ns-train as it is, but that either phase waits before its last step until somebody has seen it.
+
+python watched_training.py FOLDER ARGUMENTS OF NS-TRAIN: the phase "base" or "refine" goes on once the file of that name
+is in FOLDER. Pictures are drawn meanwhile, as between any two steps.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+from nerfstudio.scripts.train import entrypoint
+
+from beags_plugin.plugin.trainer import BeagsTrainer
+
+
+def main() -> None:
+    """Run ns-train."""
+    seen = Path(sys.argv.pop(1))
+    iteration = BeagsTrainer.train_iteration
+
+    def waiting(self, step: int):
+        phase = {self.schedule.base_steps - 1: "base", self.last_step - 1: "refine"}.get(step)
+        if phase is not None:
+            self.train_lock.release()
+            try:
+                while not (seen / phase).exists():
+                    time.sleep(0.05)
+            finally:
+                self.train_lock.acquire()
+        return iteration(self, step)
+
+    BeagsTrainer.train_iteration = waiting
+    entrypoint()
+
+
+if __name__ == "__main__":
+    main()
