@@ -1,0 +1,140 @@
+"""LLFF: scaled images, poses and points of either file, and the views that NVOS holds out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from data_folders import CX, CY, FX, FY, HEIGHT, WIDTH, noise, write_colmap, write_image
+from layout_folders import FOCAL, opencv_matrices, write_copies, write_llff, write_poses_bounds
+from parsed_views import AS_GIVEN, POINT, moved, names, parse, pixel, real, title
+
+from beags_plugin.plugin.cameras import camera_from_nerfstudio
+
+
+def test_llff_scales_the_intrinsics_to_the_images_and_turns_the_axes(tmp_path):
+    root = tmp_path / "fern"
+    stems = write_llff(root)
+    assert title(root) == "LLFF"
+    outputs = parse(root, images_path=Path("images_4"), eval_interval=0, **AS_GIVEN)
+    assert outputs.image_filenames[0] == root / "images_4/image000.png"
+    for index, matrix in enumerate(opencv_matrices(len(stems))):
+        if index != 1:
+            x, y, z = (matrix @ [*POINT, 1.0])[:3]
+            expected = [WIDTH / 2 + FOCAL * x / z, HEIGHT / 2 + FOCAL * y / z]
+            np.testing.assert_allclose(pixel(outputs, index - (index > 1), POINT), expected, atol=1e-4)
+    normalised = parse(root, images_path=Path("images_4"), eval_interval=0)
+    expected = pixel(outputs, 0, POINT)
+    np.testing.assert_allclose(pixel(normalised, 0, moved(normalised, POINT)), expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("known_by", ["images", "names", "copies"])
+def test_llff_holds_out_the_view_that_nvos_scores(tmp_path, known_by, capsys):
+    root = tmp_path / "fern"
+    stems = write_llff(root, originals=known_by == "images")
+    if known_by == "names":
+        (root / "original_names.txt").write_text("image001.png IMG_4026.JPG\nimage003.png IMG_4027.JPG\n")
+    target = {"images": ["image001"], "names": ["image003"], "copies": []}[known_by]
+    outputs = parse(root, "test", images_path=Path("images_4"))
+    assert names(outputs) == sorted(["image000", "image008", *target])
+    assert set(names(parse(root, images_path=Path("images_4")))) == set(stems) - set(names(outputs))
+    said = " ".join(capsys.readouterr().out.split())
+    assert ("holds out IMG_4027, which no image here is called" in said) == (not target)
+    assert not target or f"({2 + len(target)} held out, {target[0]} by protocol)" in said
+
+
+def test_llff_with_colmap_pairs_renamed_copies_in_order(tmp_path):
+    root = tmp_path / "fern"
+    originals = [f"IMG_{4026 + index}.JPG" for index in range(10)]
+    points = np.array([[0.1, 0.2, 0.3], [0.0, 0.1, -0.2]])
+    write_colmap(root, names=originals, points=points)
+    write_copies(root, [f"image{index:03d}.png" for index in range(10)], 2)
+    for name in originals:
+        (root / "images" / name).unlink()
+    np.save(root / "poses_bounds.npy", np.zeros((10, 17)))  # COLMAP comes first: it knows the lens
+    outputs = parse(root, "test")
+    assert names(outputs) == ["image000", "image001", "image008"]
+    K = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
+    x, y, w = K @ (opencv_matrices(10)[8] @ [*POINT, 1.0])[:3]
+    np.testing.assert_allclose(pixel(outputs, 2, moved(outputs, POINT)), [x / w / 2, y / w / 2], atol=1e-3)
+    np.testing.assert_allclose(outputs.metadata["points3D_xyz"][1], moved(outputs, points[1]), atol=1e-5)
+
+
+@pytest.mark.parametrize("same_frame", [True, False])
+def test_llff_takes_colmap_points_only_where_the_poses_look(tmp_path, same_frame):
+    write_llff(tmp_path)
+    other = tmp_path / "other"
+    points = np.random.default_rng(0).uniform(-0.3, 0.3, (40, 3))
+    write_colmap(other, points=points if same_frame else points + 40.0)
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    (other / "sparse/0/points3D.bin").rename(tmp_path / "sparse/0/points3D.bin")
+    outputs = parse(tmp_path, images_path=Path("images_4"), num_random_points=300)
+    assert outputs.metadata["points3D_random"] != same_frame
+    assert len(outputs.metadata["points3D_xyz"]) == (40 if same_frame else 300)
+    if same_frame:
+        np.testing.assert_allclose(outputs.metadata["points3D_xyz"][7], moved(outputs, points[7]), atol=1e-5)
+
+
+def test_llff_draws_points_between_the_bounds(tmp_path):
+    stems = write_llff(tmp_path)
+    write_poses_bounds(tmp_path, stems, 4, bounds=(2.5, 3.5))
+    outputs = parse(tmp_path, images_path=Path("images_4"), num_random_points=400, **AS_GIVEN)
+    points = outputs.metadata["points3D_xyz"].double().numpy()
+    depths = np.stack([points @ m[2, :3] + m[2, 3] for m in opencv_matrices(10)])
+    assert points.shape == (400, 3) and ((depths > 2.5 - 1e-4) & (depths < 3.5 + 1e-4)).any(axis=0).all()
+
+
+def test_llff_knows_the_lens_from_the_camera_file(tmp_path):
+    write_llff(tmp_path)
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    cameras = tmp_path / "sparse/0/cameras.txt"
+    cameras.write_text(f"1 SIMPLE_RADIAL {4 * WIDTH} {4 * HEIGHT} {4 * FOCAL} {2 * WIDTH} {2 * HEIGHT} 0.02\n")
+    parameters = parse(tmp_path, images_path=Path("images_4")).cameras.distortion_params
+    torch.testing.assert_close(parameters, torch.tensor([0.02, 0, 0, 0, 0, 0]).expand(8, 6))
+    cameras.write_text(f"1 SIMPLE_RADIAL {WIDTH} {HEIGHT} {FOCAL} {WIDTH / 2} {HEIGHT / 2} 0.02\n")  # another camera
+    assert not parse(tmp_path, images_path=Path("images_4")).cameras.distortion_params.any()
+
+
+NVOS = {
+    "fern": "IMG_4027", "flower": "IMG_2962", "fortress": "IMG_1800", "horns": "DJI_20200223_163024_597",
+    "leaves": "IMG_2997", "orchids": "IMG_4480", "trex": "DJI_20200223_163619_411",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("scene", NVOS)
+def test_nvos_holds_out_its_view_of_every_llff_scene(tmp_path, scene):
+    """The table of the method, section 9; the view is one that the rule of every 8th would train on."""
+    root = tmp_path / scene
+    stems = [f"AAA_{index}" for index in range(3)] + [NVOS[scene]]  # "AAA" comes first in the order of names
+    for index, stem in enumerate(stems):
+        write_image(root / f"images_4/{stem}.png", noise(index))
+    write_poses_bounds(root, stems, 4)
+    assert title(root) == "LLFF"
+    assert names(parse(root, "test")) == [stems[0], NVOS[scene]] and names(parse(root)) == stems[1:3]
+
+
+def test_fern_points_have_the_colours_of_the_images():
+    """Poses, scaled intrinsics, lens and seed points agree: points meet their colours; mirrored they do not."""
+    from PIL import Image
+
+    root = real("fern")
+    outputs, test = parse(root), parse(root, "test")
+    assert title(root) == "LLFF" and len(names(outputs)) == 16
+    assert names(test) == ["image000", "image001", "image008", "image016"]  # IMG_4027 is image001
+    assert len(outputs.metadata["points3D_xyz"]) == 10091 and not outputs.metadata["points3D_random"]
+    assert outputs.cameras.distortion_params[0, 0] == pytest.approx(0.01975, abs=1e-5)
+    points = outputs.metadata["points3D_xyz"].double().numpy()
+    colors = outputs.metadata["points3D_rgb"].double().numpy()
+    camera = camera_from_nerfstudio(outputs.cameras, 5)
+    x, y, z = (points @ camera.rotation.double().numpy().T + camera.translation.double().numpy()).T
+    x, y = x / z, y / z
+    lens = 1.0 + float(outputs.cameras.distortion_params[5, 0]) * (x * x + y * y)
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    columns, rows = np.floor(fx * x * lens + cx).astype(int), np.floor(fy * y * lens + cy).astype(int)
+    inside = (z > 0) & (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
+    image = np.asarray(Image.open(outputs.image_filenames[5]).convert("RGB")).astype(float)
+    error = np.abs(image[rows[inside], columns[inside]] - colors[inside]).mean(axis=1)
+    mirrored = np.abs(image[rows[inside], camera.width - 1 - columns[inside]] - colors[inside]).mean(axis=1)
+    assert inside.mean() > 0.5 and np.median(error) < 0.5 * np.median(mirrored)

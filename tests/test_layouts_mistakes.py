@@ -1,0 +1,81 @@
+"""What is wrong with the files of a layout is told in one sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from data_folders import HEIGHT, WIDTH, noise, write_image
+from layout_folders import ids, write_dtu, write_lerf_mask, write_llff
+from parsed_views import parse
+
+from beags_plugin.errors import UserError
+
+MISTAKES = {
+    "poses": (lambda root: np.save(root / "poses_bounds.npy", np.ones((10, 15))), "no finite .views, 17. numbers"),
+    "text": (lambda root: (root / "poses_bounds.npy").write_text("x"), r"poses_bounds\.npy cannot be read"),
+    "empty": (lambda root: (root / "poses_bounds.npy").write_bytes(b""), r"poses_bounds\.npy cannot be read"),
+    "image gone": (lambda root: (root / "images_4/image003.png").unlink(), "has 10 poses but .*images_4 9 images"),
+    "no images": (lambda root: [p.unlink() for p in (root / "images_4").iterdir()], "images_4 holds no images"),
+}
+
+
+def check_refused(folder: Path, message: str, **options: Any) -> None:
+    with pytest.raises(UserError, match=message) as raised:
+        parse(folder, **options)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistakes_are_told_in_one_sentence(tmp_path, mistake):
+    write_llff(tmp_path)
+    make, message = MISTAKES[mistake]
+    make(tmp_path)
+    check_refused(tmp_path, message, images_path=Path("images_4"))
+
+
+def with_smaller_images(root: Path) -> None:
+    for index, path in enumerate(sorted((root / "image").iterdir())):
+        write_image(path, noise(index, WIDTH // 2, HEIGHT // 2))
+
+
+def without_camera(root: Path) -> None:
+    with np.load(root / "cameras_sphere.npz") as cameras:
+        kept = {name: cameras[name] for name in cameras.files if name != "world_mat_3"}
+    np.savez(root / "cameras_sphere.npz", **kept)
+
+
+def with_skew(root: Path) -> None:
+    with np.load(root / "cameras_sphere.npz") as cameras:
+        entries = dict(cameras)
+    entries["world_mat_2"] = (
+        np.array([[1.0, 0.4, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ entries["world_mat_2"]
+    )
+    np.savez(root / "cameras_sphere.npz", **entries)
+
+
+DTU_MISTAKES = {
+    "camera gone": (without_camera, "has 8 cameras but there are 9 images"),
+    "image gone": (lambda root: (root / "image/000003.png").unlink(), "has 9 cameras but there are 8 images"),
+    "mask gone": (lambda root: (root / "mask/003.png").unlink(), "mask holds 8 masks for 9 images"),
+    "smaller images": (with_smaller_images, "far from the middle of its 10x6 pixels: keep the images .* --images-path"),
+    "skew": (with_skew, "world_mat_2 in .* is no camera with axes at right angles"),
+    "half a file": (lambda root: (root / "cameras_sphere.npz").write_bytes(b"PK\x03\x04"), "cannot be read: restore"),
+}
+
+
+@pytest.mark.parametrize("mistake", DTU_MISTAKES)
+def test_mistakes_in_dtu_are_told_in_one_sentence(tmp_path, mistake):
+    write_dtu(tmp_path)
+    make, message = DTU_MISTAKES[mistake]
+    make(tmp_path)
+    check_refused(tmp_path, message)
+
+
+def test_a_test_mask_of_no_view_is_told(tmp_path):
+    write_lerf_mask(tmp_path)
+    write_image(tmp_path / "test_mask/2/green apple.png", ids())
+    with pytest.raises(UserError, match="test_mask/2 is for no test view, of which there are 2"):
+        parse(tmp_path)

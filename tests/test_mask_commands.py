@@ -1,0 +1,162 @@
+"""beags masks make, reproject and check: what they write, guard and say."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from data_folders import HEIGHT, WIDTH, write_image, write_transforms
+from run_folders import write_scene, write_trained
+from source_scenes import truth
+
+from beags_plugin.cli import main
+from beags_plugin.errors import UserError
+from beags_plugin.masks.classes import read_class_map
+from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Progress, SourceScene
+from beags_plugin.plugin.dataparser import BeagsDataParserConfig
+from beags_plugin.plugin.made_masks import make_masks
+from beags_plugin.rasterizers.interface import IGNORE
+
+
+def test_the_command_writes_masks_that_training_finds(tmp_path, capsys):
+    write_transforms(tmp_path)
+    for index in range(9):
+        write_image(tmp_path / f"objects/cup/v{index:02d}.png", np.uint8(255) * (truth(0) == 1))
+    arguments = ["masks", "make", "--data", str(tmp_path), "--source", "object-images", "--options", "folder=objects"]
+    main(arguments)
+    out = capsys.readouterr().out
+    assert "9 masks of 9 views, 1 objects" in out and (tmp_path / "made.png").exists()
+    metadata = BeagsDataParserConfig(data=tmp_path).setup().get_dataparser_outputs("train").metadata
+    assert metadata["classes"] == {0: "background", 1: "cup"} and all(metadata["class_map_filenames"])
+    np.testing.assert_array_equal(read_class_map(tmp_path / "masks/v03.png"), truth(0) == 1)
+    extra = tmp_path / "objects"
+    for index in range(5, 9):
+        (extra / f"cup/v{index:02d}.png").unlink()
+    write_image(tmp_path / "masks/other/v08.png", truth(0))
+    main([*arguments, "--overwrite"])
+    assert "5 masks of 9 views" in capsys.readouterr().out
+    assert sorted(path.stem for path in (tmp_path / "masks").rglob("*.png")) == [f"v{i:02d}" for i in range(5)]
+    kept = {path: path.read_bytes() for path in (*(tmp_path / "masks").glob("*.png"), tmp_path / "classes.json")}
+    write_image(extra / "cup/v04.png", np.zeros((3, 3), np.uint8))  # found out after those before it are made
+    with pytest.raises(SystemExit):
+        main([*arguments, "--overwrite"])
+    write_image(extra / "cup/v04.png", truth(0))
+    write_image(extra / "background/v03.png", truth(0))
+    with pytest.raises(SystemExit):
+        main([*arguments, "--overwrite"])
+    assert "the name 'background' to two classes" in " ".join(capsys.readouterr().out.split())
+    assert all(path.read_bytes() == content for path, content in kept.items())
+    assert not list(tmp_path.glob(".masks_*"))
+    for wrong, message in (
+        (arguments, "has masks or a classes.json already"),
+        ([*arguments[:5], "nothing"], "there is no mask source 'nothing'"),
+        ([*arguments[:-1], "color=red"], "has no option 'color=red'"),
+        ([*arguments[:5], "grabcut", "--overwrite"], "needs the scene's depth"),
+    ):
+        with pytest.raises(SystemExit):
+            main(wrong)
+        assert message in " ".join(capsys.readouterr().out.split())
+
+
+@dataclass(frozen=True)
+class Scripted(MaskSource):
+    """Masks of all views, those of ``aside`` only to look at; breaks off before the view ``breaks``."""
+
+    aside: tuple[int, ...] = ()
+    breaks: int = 99
+
+    def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
+        def maps():
+            for index in range(len(scene.photos)):
+                if index == self.breaks:
+                    raise UserError("broken off")
+                yield truth(0).astype(np.uint16)
+
+        return MadeMasks({0: "background", 1: "cup", 2: "box"}, maps(), [], frozenset(self.aside))
+
+
+def test_masks_to_look_at_are_guarded_and_whole_as_the_others(tmp_path):
+    write_transforms(tmp_path)
+    data = BeagsDataParserConfig(data=tmp_path)
+    lines = " ".join(make_masks(data, Scripted(aside=(0, 8))))
+    assert "7 masks of 9 views, 2 objects" in lines and "2 masks of held-out views, only to look at" in lines
+    aside = tmp_path / "masks_to_look_at"
+    assert sorted(path.name for path in aside.iterdir()) == ["v00.png", "v08.png"]
+    for path in (*(tmp_path / "masks").iterdir(), tmp_path / "classes.json"):
+        path.unlink()
+    with pytest.raises(UserError, match=r"already \(masks_to_look_at/v0[08].png\): add --overwrite"):
+        make_masks(data, Scripted())
+    kept = {path: path.read_bytes() for path in aside.iterdir()}
+    with pytest.raises(UserError, match="broken off"):
+        make_masks(data, Scripted(aside=(0, 1), breaks=4), overwrite=True)
+    assert {path: path.read_bytes() for path in aside.iterdir()} == kept and not list((tmp_path / "masks").iterdir())
+    make_masks(data, Scripted(), overwrite=True)
+    assert not list(aside.iterdir()) and len(list((tmp_path / "masks").iterdir())) == 9  # none of a former run stays
+    with pytest.raises(UserError, match="gave no mask"):
+        make_masks(data, Scripted(aside=tuple(range(9))), overwrite=True)
+
+
+@pytest.mark.parametrize("lens", [{}, {"k1": -0.12, "k2": 0.02}])
+def test_reprojection_of_a_run_writes_masks_of_the_photos_size(tmp_path, lens, capsys):
+    data = write_scene(tmp_path / "scene")
+    if lens:
+        meta = json.loads((data / "transforms.json").read_text())
+        (data / "transforms.json").write_text(json.dumps({**meta, **lens}))
+    config = write_trained(tmp_path / "run", data)
+    method, output = ("auto" if lens else "pairwise"), str(tmp_path / "out")
+    main(["masks", "reproject", "--load-config", str(config), "--method", method, "--output", output])
+    assert ("reprojection pairwise: 7 views have" in " ".join(capsys.readouterr().out.split())) == (method == "auto")
+    masks = sorted((tmp_path / "out/masks").glob("*.png"))
+    assert [path.stem for path in masks] == [f"v{index:02d}" for index in range(1, 8)]
+    assert all(read_class_map(path).shape == (HEIGHT, WIDTH) for path in masks)
+    assert (tmp_path / "out/before_after.png").exists() and (tmp_path / "out/confidence/v01.png").exists()
+    confidence = [read_class_map(tmp_path / "out/confidence" / path.name) for path in masks]
+    assert all(values.shape == (HEIGHT, WIDTH) and values.max() > 0 for values in confidence)
+    for mask, values in zip(masks, confidence, strict=True):
+        unlabelled = read_class_map(mask) == IGNORE
+        assert not values[unlabelled].any()  # where the straight view does not reach, or nothing voted
+    report = json.loads((tmp_path / "out/report.json").read_text())
+    assert report["method"] == "pairwise"
+    before = read_class_map(data / "masks/v01.png")
+    after = read_class_map(masks[0])
+    if not lens:
+        assert report["views"][0]["changed"] == int((before != after).sum())
+    main(["masks", "check", "--load-config", str(config), "--masks-path", str(tmp_path / "out/masks"),
+          "--output", str(tmp_path / "check")])  # fmt: skip
+    assert (tmp_path / "check/report.json").exists()
+
+
+def test_the_check_of_a_run_takes_its_options_and_what_replaces_them(tmp_path):
+    from beags_plugin.plugin.extract import read_scene
+    from beags_plugin.plugin.masks_check import options_beside
+    from beags_plugin.plugin.reprojected_run import ReprojectionOptions, data_of_run
+
+    data = write_scene(tmp_path / "scene")
+    config = write_trained(tmp_path / "run", data)
+    own = options_beside(config, None)
+    assert own.data == data and own.orientation_method == "none"  # as the run was trained
+    (data / "masks").rename(data / "others")
+    parser = options_beside(config, None, masks_path=Path("others"), ignore_ids=(2,), layout=None)
+    assert (parser.layout, parser.orientation_method) == (own.layout, "none")
+    manager = data_of_run(read_scene(config), config, ReprojectionOptions(run_size=True, parser=parser))
+    labels = manager.views("train")[0].labels
+    assert labels is not None and set(labels.unique().tolist()) == {0, 1, IGNORE}
+    main(["masks", "check", "--load-config", str(config), "--masks-path", "others", "--output", str(tmp_path / "out")])
+    assert json.loads((tmp_path / "out/report.json").read_text())["coverage"][0]["pixels"]["2"] == 16
+
+
+def test_the_geometry_of_a_run_has_its_held_out_views_too(tmp_path):
+    from beags_plugin.plugin.made_masks import RunGeometry
+
+    data = write_scene(tmp_path / "scene")
+    geometry = RunGeometry(write_trained(tmp_path / "run", data))
+    assert [path.stem for path in geometry.images] == [f"v{index:02d}" for index in (*range(1, 8), 0, 8)]
+    ids = truth(0)
+    for view in (0, 7, 8):
+        camera = geometry.cameras[view]
+        assert tuple(geometry.depth(view).shape) == (camera.height, camera.width)
+        straight = geometry.to_straight(ids.astype(np.uint16), view)
+        np.testing.assert_array_equal(geometry.to_photo(straight, view), ids)  # this scene has no lens distortion
