@@ -87,6 +87,10 @@ def test_two_files_of_one_name_are_told(tmp_path):
     mask_at(tmp_path / "masks/v1.bmp", 2)
     with pytest.raises(UserError, match="masks/v1.bmp and .*masks/v1.png are two files for v1: remove one of them"):
         make(IdImagesSource(), scene)
+    for name in ("cup/v1", "v1/cup"):
+        mask_at(tmp_path / f"objects/{name}.png", 255)
+    with pytest.raises(UserError, match="cup/v1.png and .*v1/cup.png are both cup in v1: remove one of them"):
+        make(ObjectImagesSource(Path("objects")), scene)
     images = [{"id": i, "file_name": name} for i, name in enumerate(("v1.jpg", "v1.png"))]
     annotations = [{"image_id": i, "category_id": 1, "segmentation": [[2, 2, 9, 2, 9, 9]]} for i in range(2)]
     (tmp_path / "annotations.json").write_text(json.dumps({"images": images, "annotations": annotations}))

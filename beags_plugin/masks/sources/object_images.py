@@ -52,7 +52,8 @@ class ObjectImagesSource(MaskSource):
             meant = [way for way in ways if scene.names.candidates(way[1])]
             meant += [way for way in ways if scene.names.in_other_folders(way[1])]  # ``assigned`` tells the mistake
             for each, of_view in meant[:1]:
-                named.setdefault(each, {})[of_view] = path
+                if (other := named.setdefault(each, {}).setdefault(of_view, path)) is not path:
+                    raise UserError(f"{other} and {path} are both {each} in {of_view}: remove one of them.")
         return {
             (each, scene.photos[index].name): path
             for each, files in named.items()
