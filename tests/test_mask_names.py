@@ -99,6 +99,8 @@ def test_two_files_of_one_name_are_told(tmp_path):
     pair = [Path("/a/v1.jpg"), Path("/a/v1.png")]
     with pytest.raises(UserError, match="/a/v1.jpg and /a/v1.png are both called v1, .*: rename one of them"):
         photo_names(pair)
+    with pytest.raises(UserError, match="the poses name /a/v1.jpg twice: keep one of them"):
+        photo_names([pair[0], pair[0]])
 
 
 def test_objects_and_coco_and_features_are_matched_by_folders_too(tmp_path):

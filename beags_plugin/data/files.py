@@ -69,13 +69,14 @@ def photo_names(images: Sequence[Path]) -> list[str]:
     named: dict[str, Path] = {}
     for image in images:
         name = image.relative_to(root).with_suffix("").as_posix()
-        if (other := named.setdefault(name, image)) is not image:
+        if (other := named.get(name)) is not None:
             raise UserError(
                 f"the poses name {image} twice: keep one of them."
                 if other == image
                 else f"the images {other} and {image} are both called {name}, by which their masks are found: rename "
                 "one of them, in the poses too."
             )
+        named[name] = image
     return list(named)
 
 
