@@ -46,8 +46,8 @@ SENTENCES = {
     "masks make --data {tmp}/lab --source magic": "there is no mask source 'magic': choose one of coco, "
     "gaussian-grouping, grabcut, id-images, langsplat, object-images, sam2.",
     "masks make --data {tmp}/lab --source grabcut --snap -1": "snap is -1: give a radius in pixels, or 0.",
-    "masks make --data {tmp}/lab --source id-images": "{tmp}/lab has masks or a classes.json already: add --overwrite, "
-    "or give another --output.",
+    "masks make --data {tmp}/lab --source id-images": "{tmp}/lab has masks or a classes.json already "
+    "(classes.json): add --overwrite, or give another --output.",
     "masks make --data {tmp}/lab --source id-images --options colour=red": "the mask source id-images has no option "
     "'colour=red': give folder, names, colors, ignore_ids, least_views as key=value.",
     "masks reproject --load-config {tmp}/absent.yml": NO_FILE,

@@ -120,8 +120,8 @@ def make_masks(
     there = [*masks.rglob("*.png"), *look_at.rglob("*.png"), *([classes] if classes.exists() else [])]
     if there and not overwrite:
         raise UserError(
-            f"{folder} has masks or a classes.json already ({there[0].relative_to(folder)}): add --overwrite, or give "
-            "another --output."
+            f"{folder} has masks or a classes.json already ({min(there).relative_to(folder)}): add --overwrite, or "
+            "give another --output."
         )
     if source.needs_run and run is None:
         raise UserError(
