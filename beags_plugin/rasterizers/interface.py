@@ -95,7 +95,7 @@ class RasterOutputs:
     distortion: [H, W] sum_{j<i} w_i w_j (m_i - m_j)^2, or None.
     boundary: [H, W] B(u) = sum_i w_i [phi_i != M'(u)], 0 at IGNORE (E7), or None without a target.
     visible: [N] bool, survived culling and reaches at least one tile; what densification counts as seen.
-    num_nonfinite: number of surfels dropped because a parameter is NaN or infinite, or beyond what can be computed with.
+    num_nonfinite: number of surfels dropped: a parameter is not finite, or the surfel is too large or too far.
     """
 
     color: Tensor

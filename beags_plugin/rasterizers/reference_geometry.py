@@ -49,7 +49,7 @@ class Hits:
 
 
 def finite_surfels(inputs: SurfelInputs) -> Tensor:
-    """[N] bool: all parameters are finite, the quaternion can be divided by its length and the disc is not too large."""
+    """[N] bool: all parameters are finite, the quaternion can be divided by its length, the disc is not too large."""
     floats = (inputs.means, inputs.quats, inputs.log_scales, inputs.colors, inputs.opacity_logits[:, None])
     finite = torch.stack([torch.isfinite(value.detach()).all(dim=-1) for value in floats]).all(dim=0)
     return finite & usable_quats(inputs.quats) & (inputs.log_scales <= math.log(LARGEST)).all(dim=-1)
