@@ -222,7 +222,19 @@ class Bench:
 
 @dataclass
 class Doctor:
-    """Say what this installation can do, what is missing, and the one command that repairs each."""
+    """Say what this installation can do, what is missing, and the one command that repairs each.
+
+    With --data: how much memory and disk a training on it will take, and whether they are there.
+    """
+
+    data: Path | None = None
+    """Folder of a scene (or a transforms .json)."""
+
+    preset: str = "beags"
+    """Preset that it would be trained with."""
+
+    downscale_factor: float = 1.0
+    """Divide the images' width and height by this."""
 
     json: Path | None = None
     """File for the same."""
@@ -232,6 +244,10 @@ class Doctor:
         from beags_plugin.doctor.diagnosis import diagnose
 
         checks = diagnose()
+        if self.data is not None:
+            from beags_plugin.plugin.forecast import checks_of_run
+
+            checks += checks_of_run(self.data, self.preset, self.downscale_factor)
         write_json(self.json, [check.to_json() for check in checks])
         print_report(checks)
 

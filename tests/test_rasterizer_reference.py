@@ -232,6 +232,21 @@ def test_nonfinite_surfels_are_dropped_and_counted(rasterizer):
     assert all(torch.isfinite(value.grad).all() and not value.grad[:3].any() for value in leaves.values())
 
 
+def test_surfels_too_large_or_too_far_for_float32_are_dropped_and_counted(rasterizer):
+    scene = make_scene().to(torch.float32)
+    clean = scene.draw(rasterizer, **{n: getattr(scene.inputs, n)[2:] for n in (*FLOATS, "class_ids")})
+    leaves = {name: getattr(scene.inputs, name).clone() for name in FLOATS}
+    ahead = scene.camera.rotation[2]
+    leaves["means"][0], leaves["log_scales"][1, 1] = 1e20 * ahead, 80.0
+    leaves = {name: value.requires_grad_() for name, value in leaves.items()}
+    drawn = scene.draw(rasterizer, **leaves)
+    assert drawn.num_nonfinite == 2 and clean.num_nonfinite == 0 and not drawn.visible[:2].any()
+    for name in OUTPUTS:
+        torch.testing.assert_close(getattr(drawn, name), getattr(clean, name), rtol=1e-5, atol=1e-6)
+    (drawn.color.sum() + drawn.depth.sum()).backward()
+    assert all(torch.isfinite(value.grad).all() and not value.grad[:2].any() for value in leaves.values())
+
+
 def test_nothing_to_draw_gives_the_background_with_finite_gradients(rasterizer):
     scene = SCENES["empty"]()
     background = scene.background.clone().requires_grad_()

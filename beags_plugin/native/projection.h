@@ -122,6 +122,7 @@ BEAGS_HD inline Fate project(const View& view, const SurfelParameters& s, Splat<
   place(view, s, at);
   if (!usable_quaternion(at.inverse_length)) return Fate::kNonFinite;
   if (!finite(at.unit[0], s.scale[0], s.scale[1], at.z)) return Fate::kNonFinite;  // an overflow
+  if (at.z > kLargest || s.scale[0] > kLargest || s.scale[1] > kLargest) return Fate::kNonFinite;
   if (at.z <= view.near_plane || s.log2_opacity < kLog2MinAlpha) return Fate::kCulled;
   splat.log2_opacity = s.log2_opacity;
   splat.cx = at.cx;

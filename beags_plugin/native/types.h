@@ -11,6 +11,7 @@ constexpr int kTilePixels = kTile * kTile;
 constexpr int kGroupPixels = kGroup * kGroup;
 constexpr int tiles_along(int pixels) { return (pixels + kTile - 1) / kTile; }
 constexpr double kLog2MinAlpha = -7.994353436858858;  // log2(1 / 255); this and the next two: rasterizers/interface.py
+constexpr double kLargest = 1e18;  // world units: larger surfels, and those further off in depth, count as broken
 constexpr double kMaxAlpha = 0.99;
 constexpr double kMinTransmittance = 1e-4;
 constexpr double kLn2 = 0.6931471805599453;

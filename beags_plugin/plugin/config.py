@@ -56,6 +56,9 @@ class BeagsTrainerConfig(TrainerConfig):
     """Keep the finished stages of the preparation (prepared/stages) when the run is complete, for another run into the
     same folder, or one that loads this run."""
 
+    check_memory: bool = True
+    """Stop before a run that memory or disk cannot hold, and save and stop when memory runs out (on a CPU)."""
+
     steps_per_objects: int = 500
     """Once Gaussians have classes: measure extracted masks on four held-out views and draw every object alone, for
     tensorboard or wandb, every so many steps, and first and last; 0: never."""

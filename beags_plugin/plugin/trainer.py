@@ -16,9 +16,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.core import processes
 from beags_plugin.errors import UserError
+from beags_plugin.plugin.forecast import MemoryWatch, check_memory, forecast, is_out_of_memory
 from beags_plugin.plugin.held_out import HeldOutCurve
 from beags_plugin.plugin.interrupts import Interrupts, stop
-from beags_plugin.plugin.memory import peak_memory_mb
+from beags_plugin.plugin.memory import memory_mb, peak_memory_mb
 from beags_plugin.plugin.optimizers import JointOptimizers
 from beags_plugin.plugin.run_lock import RunLock, run_lock
 from beags_plugin.plugin.run_seconds import Estimate, StageSeconds
@@ -59,6 +60,7 @@ class BeagsTrainer(Trainer):
         self._interrupts = Interrupts(self._go_on)
         self._lock: RunLock | None = None
         self._saved_step: int | None = None
+        self._watch = MemoryWatch(config.machine.device_type)
         self._done = 0  # the last step that was trained
         self._complete = False
         self._rank = Rank(config, local_rank)
@@ -80,6 +82,7 @@ class BeagsTrainer(Trainer):
             used = any((self.base_dir / self.config.logging.relative_log_dir).glob("events.out.tfevents.*"))
             super().setup(test_mode)
             self._rank.start_alike(self._model)
+            self._check_memory()
             if used:
                 self._forget_events()
         except UserError as error:
@@ -88,6 +91,15 @@ class BeagsTrainer(Trainer):
         except BaseException:
             self._release()
             raise
+
+    def _check_memory(self) -> None:
+        """Stop where the run would not fit the machine, hours before it would be ended without a word."""
+        if not self.config.check_memory or processes.rank() > 0:
+            return
+        datamanager = cast("BeagsDataManager", self.pipeline.datamanager)
+        sizes = datamanager.train_dataset.file_sizes, datamanager.eval_dataset.file_sizes
+        points, program = self._model.num_points, memory_mb()
+        check_memory(forecast(self.config, *sizes, seeds=points, device=self.device, program=program))
 
     def _release(self) -> None:
         """Let others train in this run's folder."""
@@ -155,6 +167,16 @@ class BeagsTrainer(Trainer):
                 super().train()
         except UserError as error:
             stop(error)
+        except (MemoryError, RuntimeError) as error:
+            if not is_out_of_memory(error):
+                raise
+            stop(
+                UserError(
+                    f"memory ran out after step {self._done} ({str(error).splitlines()[0]}): the last checkpoint is "
+                    f"whole. Close other programs and go on with beags resume {self.base_dir}, or begin anew with "
+                    "smaller photos or fewer Gaussians."
+                )
+            )
         except KeyboardInterrupt as interrupt:
             if (self.base_dir / REPORT_FILE).exists():  # complete: the signal ended what shows it in the browser
                 return
@@ -167,6 +189,12 @@ class BeagsTrainer(Trainer):
         self._estimate.before_step(step - self._start_step)
         found = super().train_iteration(step)
         self._done = step
+        if self.config.check_memory and (short := self._watch.short_of(step)) is not None:
+            self._save_once(step)
+            raise UserError(
+                f"{short}: saved and stopped after step {step}. Close other programs and go on with beags resume "
+                f"{self.base_dir}, or bound the Gaussians of a new run (--pipeline.model.densify.max-surfels)."
+            )
         if self.curve is not None:
             self.curve.after_step(step)  # before the scene grows, from which it needs some steps to recover
             self._model.clock.skip()

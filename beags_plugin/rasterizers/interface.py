@@ -12,6 +12,7 @@ from beags_plugin.core.cameras import Camera
 
 IGNORE = 65535  # class id of an unlabelled pixel: it neither votes nor is penalised
 MIN_ALPHA = 1.0 / 255.0  # weaker contributions are skipped: they are invisible in 8 bits
+LARGEST = 1e18  # world units: surfels larger, or further off in depth, count as broken; their squares overflow float32
 MAX_ALPHA = 0.99  # keeps 1 - alpha, a divisor in the backward, away from 0
 MIN_TRANSMITTANCE = 1e-4  # compositing stops before the surfel that would take T below this
 
@@ -94,7 +95,7 @@ class RasterOutputs:
     distortion: [H, W] sum_{j<i} w_i w_j (m_i - m_j)^2, or None.
     boundary: [H, W] B(u) = sum_i w_i [phi_i != M'(u)], 0 at IGNORE (E7), or None without a target.
     visible: [N] bool, survived culling and reaches at least one tile; what densification counts as seen.
-    num_nonfinite: number of surfels dropped because a parameter is NaN or infinite.
+    num_nonfinite: number of surfels dropped: a parameter is not finite, or the surfel is too large or too far.
     """
 
     color: Tensor

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.rotations import rotation_from_quat, usable_quats
-from beags_plugin.rasterizers.interface import MAX_ALPHA, MIN_ALPHA, RasterSettings, SurfelInputs
+from beags_plugin.rasterizers.interface import LARGEST, MAX_ALPHA, MIN_ALPHA, RasterSettings, SurfelInputs
 
 
 @dataclass(frozen=True)
@@ -48,17 +49,17 @@ class Hits:
 
 
 def finite_surfels(inputs: SurfelInputs) -> Tensor:
-    """[N] bool: all parameters are finite and the quaternion has a length that can be divided by."""
+    """[N] bool: all parameters are finite, the quaternion can be divided by its length, the disc is not too large."""
     floats = (inputs.means, inputs.quats, inputs.log_scales, inputs.colors, inputs.opacity_logits[:, None])
     finite = torch.stack([torch.isfinite(value.detach()).all(dim=-1) for value in floats]).all(dim=0)
-    return finite & usable_quats(inputs.quats)
+    return finite & usable_quats(inputs.quats) & (inputs.log_scales <= math.log(LARGEST)).all(dim=-1)
 
 
 def project(inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> ProjectedSurfels:
     """Cull, project and sort N surfels; differentiable."""
     with torch.no_grad():
-        finite = finite_surfels(inputs)
         depth = inputs.means @ camera.rotation[2] + camera.translation[2]
+        finite = finite_surfels(inputs) & (depth <= LARGEST)
         opacity = torch.sigmoid(inputs.opacity_logits)
         index = (finite & (depth > settings.near) & (opacity >= MIN_ALPHA)).nonzero()[:, 0]
         index = index[depth[index].argsort(stable=True)]  # by centre depth, ties by index

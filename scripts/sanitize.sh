@@ -1,0 +1,46 @@
+#!/usr/bin/env bash
+# The extension's tests on builds with GCC's sanitizers: scripts/sanitize.sh [address] [thread]
+# address finds bad memory accesses and undefined behaviour, in the emulation of the CUDA kernels too; thread finds data
+# races between the CPU's threads. Needs the environment of `make setup` (BEAGS_VENV, default .venv) and GCC 10 or
+# later. Works on a copy under build/sanitize; the exit code tells whether a test failed or a sanitizer spoke up.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+root="$PWD"
+case "${BEAGS_VENV:=.venv}" in /*) ;; *) BEAGS_VENV="$root/$BEAGS_VENV" ;; esac
+export PATH="$BEAGS_VENV/bin:$PATH" PYTHONDONTWRITEBYTECODE=1
+tests=(tests/test_{native,native_arguments,native_isa,native_work,rasterizer_reference,rasterizer_robustness,invariances,fuzz}.py
+  tests/test_{image_ops,occupancy_loss,ops_everywhere,reprojection_votes,sh_colors,sparse_sums,voxel_grid,voxel_lookup,class_maps}.py)
+emulated=(tests/test_cuda_{rasterizer,ops,votes}.py)
+
+run() { # kind, options of CMake, tests...
+  local kind="$1" emulation="$2" folder="$root/build/sanitize/$1"
+  shift 2
+  mkdir -p "$folder/tree"
+  git ls-files -z --cached --others --exclude-standard | xargs -0 cp --parents -t "$folder/tree"
+  cmake -S . -B "$folder/cmake" -G Ninja -DCMAKE_BUILD_TYPE=None -DBEAGS_SANITIZE="$kind" -DBEAGS_CUDA=OFF \
+    -DBEAGS_CUDA_EMULATION="$emulation" -DPython_EXECUTABLE="$(command -v python)" \
+    -Dnanobind_DIR="$(python -m nanobind --cmake_dir)" >"$folder/cmake.log"
+  cmake --build "$folder/cmake"
+  cp "$folder"/cmake/_*.so "$folder/tree/beags_plugin/"
+  # The sanitizer's runtime comes first; libstdc++ with it, whose exceptions it wraps.
+  local runtime
+  runtime="$(cc -print-file-name="lib${kind/address/asan}.so")"
+  runtime="${runtime/thread/tsan}"
+  (cd "$folder/tree" && BEAGS_REQUIRE_NATIVE=1 LD_PRELOAD="$runtime $(c++ -print-file-name=libstdc++.so.6)" \
+    ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
+    TSAN_OPTIONS="suppressions=$root/tests/native/tsan.supp exitcode=66" \
+    python -m pytest -q -p no:cacheprovider "$@")
+}
+
+for kind in "${@:-address thread}"; do
+  for one in $kind; do
+    case "$one" in
+    address) run address ON "${tests[@]}" "${emulated[@]}" ;;
+    thread) OMP_NUM_THREADS=4 run thread OFF "${tests[@]}" -k "not torch and not cuda" ;;
+    *)
+      echo "sanitize: there is no sanitizer $one: address or thread" >&2
+      exit 2
+      ;;
+    esac
+  done
+done
