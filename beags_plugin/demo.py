@@ -67,7 +67,6 @@ def run_demo(
             resume(run)
         else:
             _clear(output)
-            output.mkdir(parents=True, exist_ok=True)
             write_stamp(output, {STARTED: request})
             train(data, run, preset, downscale)
         write_stamp(output, request)
@@ -210,7 +209,8 @@ def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
     training = json.loads((run / "training.json").read_text())
     stages = {"sample": seconds.pop("sample", 0.0), **training["seconds"], **seconds}
     memory = training["peak_memory_mb"]
-    (output / "summary.json").write_text(json.dumps(summary_json(metrics, stages, memory), indent=2))
+    summary = json.dumps(summary_json(metrics, stages, memory), indent=2)
+    write_whole(output / "summary.json", lambda file: file.write(summary.encode()))
     print_run(metrics, stages, memory, CONSOLE)
     CONSOLE.print(f"objects: {', '.join(str(item.ply) for item in extracted)}")
     CONSOLE.print(f"figures: {output / 'summary.json'}")

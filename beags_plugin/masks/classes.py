@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beags_plugin.errors import UserError
+from beags_plugin.errors import UserError, writing
 from beags_plugin.rasterizers.interface import IGNORE
 
 BACKGROUND = 0
@@ -90,10 +90,8 @@ def write_class_map(path: Path | str, array: np.ndarray) -> None:
         raise UserError(
             f"the class map for {path} holds ids {array.min()}..{array.max()}: only 0..{IGNORE} can be saved."
         )
-    try:
+    with writing(path, "the class map "):
         Image.fromarray(array.astype(np.uint8 if array.max() <= 255 else np.uint16)).save(path, format="PNG")
-    except OSError as error:
-        raise UserError(f"the class map {path} cannot be written: {error}.") from None
 
 
 def check_names(names: Mapping[int, str]) -> None:

@@ -15,7 +15,7 @@ import yaml
 from torch import Tensor
 
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
+from beags_plugin.errors import UserError, writing
 from beags_plugin.extraction.ply import write_ply
 from beags_plugin.extraction.select import remove_class, select_class
 from beags_plugin.plugin.runs import (
@@ -123,10 +123,8 @@ def extract_objects(
     transform = read_transform(run)
     select = remove_class if remove else select_class
     folders, target = folder_names(scene.classes), output or run / "extracted"
-    try:
+    with writing(target):
         target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{target} cannot be written ({error.strerror}): choose another place.") from error
     written = []
     for name in names:
         surfels, index = select(scene.surfels(), class_ids, ids[name])

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.data.files import image_size, photo_names
-from beags_plugin.errors import UserError
+from beags_plugin.errors import UserError, writing
 from beags_plugin.masks.classes import check_names, write_class_map
 from beags_plugin.masks.pictures import overlay
 from beags_plugin.masks.rims import snap_to_edges
@@ -28,6 +28,7 @@ from beags_plugin.plugin.reprojected_run import ReprojectionOptions, data_of_run
 from beags_plugin.progress import progress_bar
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.drawing import geometry_inputs, surface_depth
+from beags_plugin.whole_files import write_whole
 
 
 class RunGeometry:
@@ -130,8 +131,9 @@ def make_masks(
     ]
     made_of = SourceScene(scene.root, photos, RunGeometry(run) if run is not None and source.needs_run else None)
     shares, shown = [], []
-    folder.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=".masks_", dir=folder) as temporary, progress_bar("Making masks") as progress:
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    with writing(folder), TemporaryDirectory(prefix=".masks_", dir=folder) as temporary, progress_bar("Making masks") as progress:
         unfinished = Path(temporary)
         made = source.make(made_of, progress)
         check_names(made.names)
@@ -150,7 +152,7 @@ def make_masks(
             raise UserError("the mask source gave no mask for any view: check its options.")
         _take_the_place(unfinished, masks, {image.stem for image in views.images})
     names = {str(i): name for i, name in sorted(made.names.items())}
-    (folder / "classes.json").write_text(json.dumps(names, indent=1), "utf8")
+    write_whole(folder / "classes.json", lambda file: file.write(json.dumps(names, indent=1).encode()))
     _picture(folder / "made.png", shown)
     return [
         *made.notes,

@@ -18,7 +18,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from beags_plugin.assignment.assignment import Assignment
 from beags_plugin.core import processes
 from beags_plugin.digests import code_digest
-from beags_plugin.errors import UserError
+from beags_plugin.errors import UserError, writing
 from beags_plugin.masks.classes import read_class_map, write_class_map
 from beags_plugin.masks.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
@@ -221,11 +221,12 @@ class RefinementSwitch:
 
 def save_prepared(prepared: Preparation, names: list[str], folder: Path) -> None:
     """Keep what refinement needs; grid.pt is written last, so its presence says that all is there."""
-    (folder / "grid.pt").unlink(missing_ok=True)  # an earlier run's
-    if folder.name == PREPARED:
-        _clear(folder)
-    (folder / "masks").mkdir(parents=True, exist_ok=True)
-    (folder / "confidence").mkdir(exist_ok=True)
+    with writing(folder):
+        (folder / "grid.pt").unlink(missing_ok=True)  # an earlier run's
+        if folder.name == PREPARED:
+            _clear(folder)
+        (folder / "masks").mkdir(parents=True, exist_ok=True)
+        (folder / "confidence").mkdir(exist_ok=True)
     for index, name in enumerate(names):
         labels = prepared.labels[index]
         write_class_map(folder / "masks" / f"{name}.png", labels.cpu().numpy().astype(np.uint16))
@@ -255,6 +256,7 @@ def released(lock: Lock) -> Iterator[None]:
 
 
 def _write_grey(path: Path, values: torch.Tensor) -> None:
-    import cv2
+    from PIL import Image
 
-    cv2.imwrite(str(path), values.cpu().numpy())
+    with writing(path):  # cv2 would say nothing of a full disk
+        Image.fromarray(values.cpu().numpy()).save(path)

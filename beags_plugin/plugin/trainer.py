@@ -15,7 +15,7 @@ from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.core import processes
-from beags_plugin.errors import UserError
+from beags_plugin.errors import UserError, refused, unwritable
 from beags_plugin.plugin.held_out import HeldOutCurve
 from beags_plugin.plugin.interrupts import Interrupts, stop
 from beags_plugin.plugin.memory import peak_memory_mb
@@ -85,9 +85,16 @@ class BeagsTrainer(Trainer):
         except UserError as error:
             self._release()
             stop(error)
+        except OSError as error:
+            self._release()
+            stop(self._told(error))
         except BaseException:
             self._release()
             raise
+
+    def _told(self, error: OSError) -> UserError:
+        """What the system refused where nothing else has told it, as to nerfstudio's own writers."""
+        return refused(error) or unwritable(self.base_dir, error)
 
     def _release(self) -> None:
         """Let others train in this run's folder."""
@@ -155,6 +162,8 @@ class BeagsTrainer(Trainer):
                 super().train()
         except UserError as error:
             stop(error)
+        except OSError as error:
+            stop(self._told(error))
         except KeyboardInterrupt as interrupt:
             if (self.base_dir / REPORT_FILE).exists():  # complete: the signal ended what shows it in the browser
                 return

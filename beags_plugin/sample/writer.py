@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from beags_plugin.errors import UserError
+from beags_plugin.errors import UserError, unwritable, writing
 from beags_plugin.sample.arrangement import make_still
 from beags_plugin.sample.degrade import Degradation, degrade_mask, dropped_views, resolve_degradation
 from beags_plugin.sample.lighting import Light
@@ -103,13 +103,14 @@ def write_sample(
         target.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(prefix=f".{target.name}.partial-", dir=target.parent))
     except OSError as error:
-        raise UserError(f"{target} cannot be written ({error.strerror}): choose another folder.") from error
+        raise unwritable(target, error) from error
     try:
         built = partial / "new"
-        _build(built, config, progress)
-        if old:
-            target.rename(partial / "old")
-        built.rename(target)
+        with writing(target):
+            _build(built, config, progress)
+            if old:
+                target.rename(partial / "old")
+            built.rename(target)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return target
