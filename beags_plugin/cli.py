@@ -263,7 +263,8 @@ Command = (
 
 def say(error: UserError) -> NoReturn:
     """Print a user's mistake and end with exit code 2."""
-    CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}")
+    if not error.told:
+        CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}")
     sys.exit(2)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import shutil
 import subprocess
 import sys
@@ -44,6 +45,8 @@ def run_demo(
 ) -> None:
     """Do the whole job in ``output`` and print the table; see ``cli.Demo`` for the arguments."""
     check_preset(preset)
+    if downscale is not None and not 1.0 <= downscale < math.inf:
+        raise UserError(f"downscale is {downscale}: give 1 (full size) or more.")
     seconds: dict[str, float] = {}
     if data is None:
         output = output or Path("outputs/demo")

@@ -15,11 +15,15 @@ class UserError(Exception):
     """A mistake in the input, told in one sentence: which file or value, what is wrong, what to do.
 
     Command lines print the sentence alone, without a traceback, and end with exit code 2.
+
+    told: whether it has been printed already, by the trainer for the command that started it.
     """
+
+    told = False
 
 
 def system_error(error: BaseException) -> OSError | None:
-    """What the operating system refused, if that is why ``error`` was raised; torch hides it behind errors of its own."""
+    """What the operating system refused, if that is why ``error`` was raised: torch hides it behind its own errors."""
     seen: set[int] = set()
     at: BaseException | None = error
     while at is not None and id(at) not in seen:

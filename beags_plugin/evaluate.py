@@ -87,7 +87,7 @@ def scene_names(configs: Sequence[Path]) -> list[str]:
     Raises ``UserError`` for a file that is no run's config, and for a run given twice.
     """
     from beags_plugin.plugin.evaluate import scene_name
-    from beags_plugin.plugin.extract import load_run_config
+    from beags_plugin.plugin.run_config import load_run_config
 
     if not configs:
         raise UserError("no run is named: give --load-config the config.yml of at least one.")

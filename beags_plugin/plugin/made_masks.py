@@ -133,7 +133,11 @@ def make_masks(
     shares, shown = [], []
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    with writing(folder), TemporaryDirectory(prefix=".masks_", dir=folder) as temporary, progress_bar("Making masks") as progress:
+    with (
+        writing(folder),
+        TemporaryDirectory(prefix=".masks_", dir=folder) as temporary,
+        progress_bar("Making masks") as progress,
+    ):
         unfinished = Path(temporary)
         made = source.make(made_of, progress)
         check_names(made.names)

@@ -22,9 +22,9 @@ from beags_plugin.masks.classes import read_classes
 from beags_plugin.masks.pictures import contradictions, coverage_picture
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.dataparser import BeagsDataParser, BeagsDataParserConfig
-from beags_plugin.plugin.extract import load_run_config
 from beags_plugin.plugin.lenses import project_through_lens
 from beags_plugin.plugin.poses import PosedViews
+from beags_plugin.plugin.run_config import load_run_config
 from beags_plugin.plugin.seed_points import random_points, starting_points
 from beags_plugin.progress import progress_bar
 from beags_plugin.rasterizers.interface import IGNORE

@@ -23,6 +23,7 @@ from beags_plugin.sample.views import Picture, View, make_views, render_view
 
 VERSION = 8
 """Raise it whenever the same config would give other files: older samples are then rebuilt."""
+LARGEST_SIDE = 8192  # pixels
 POINT_NOISE = 0.03
 """World units, two to three pixels at 256 x 192: as a hand-held capture gives."""
 SAMPLE_FILE = "sample.json"
@@ -53,6 +54,9 @@ class SampleConfig:
         for name, low in least.items():
             if getattr(self, name) < low:
                 raise UserError(f"the sample's {name} is {getattr(self, name)}: give at least {low}.")
+        for name in ("width", "height"):
+            if getattr(self, name) > LARGEST_SIDE:
+                raise UserError(f"the sample's {name} is {getattr(self, name)}: give at most {LARGEST_SIDE}.")
         resolve_degradation(self.degradation)
 
     def as_dict(self) -> dict[str, Any]:

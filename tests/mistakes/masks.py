@@ -204,7 +204,6 @@ mistake("mask sources", "LangSplat: segments of wrong shape")(made("langsplat", 
 mistake("mask sources", "LangSplat: segments without features")(
     made("langsplat", langsplat(np.full((4, HEIGHT, WIDTH), 5), np.ones((1, 3))))
 )
-mistake("mask sources", "SAM2 without the extra or weights")(made("sam2", options="prompts=prompts.json"))
 
 
 def prompts(content: Any) -> Callable[[Path], Any]:
@@ -216,13 +215,50 @@ def boxed(box: list[Any], view: str = "v01") -> dict[str, Any]:
     return {"name": "cup", "prompts": [{"view": view, "box": box}]}
 
 
-mistake("mask sources", "GrabCut: no prompts")(made("grabcut"))
-mistake("mask sources", "GrabCut: a box outside of the picture")(made("grabcut", prompts(boxed([100, 100, 200, 200]))))
-mistake("mask sources", "GrabCut: a box turned around")(made("grabcut", prompts(boxed([8, 8, 2, 2]))))
-mistake("mask sources", "GrabCut: a box of words")(made("grabcut", prompts(boxed(["a", 1, 2, 3]))))
-mistake("mask sources", "GrabCut: a view that does not exist")(made("grabcut", prompts(boxed([2, 2, 8, 8], "v99"))))
-mistake("mask sources", "GrabCut: prompts broken")(made("grabcut", prompts("{")))
-mistake("mask sources", "GrabCut: prompts nested 100,000 deep")(made("grabcut", prompts("[" * 100_000)))
+def grabcut(prepare: Callable[[Path], Any] = lambda data: None) -> Callable[[Place], Any]:
+    """A mistake in the prompts of GrabCut, which asks a run for its depth."""
+
+    def make(at: Place):
+        prepare(at.data)
+        words = "--source grabcut --overwrite --options prompts=prompts.json --load-config {run}"
+        return at.beags("masks make --data", at.data, words)
+
+    return make
+
+
+mistake("mask sources", "GrabCut: no prompts")(grabcut())
+mistake("mask sources", "GrabCut: a box outside of the picture")(grabcut(prompts(boxed([100, 100, 200, 200]))))
+mistake("mask sources", "GrabCut: a box turned around")(grabcut(prompts(boxed([8, 8, 2, 2]))))
+mistake("mask sources", "GrabCut: a box of words")(grabcut(prompts(boxed(["a", 1, 2, 3]))))
+mistake("mask sources", "GrabCut: a view that does not exist")(grabcut(prompts(boxed([2, 2, 8, 8], "v99"))))
+mistake("mask sources", "GrabCut: prompts broken")(grabcut(prompts("{")))
+mistake("mask sources", "GrabCut: prompts nested 100,000 deep")(grabcut(prompts("[" * 100_000)))
+
+
+@mistake("mask sources", "SAM2 without weights")
+def _(at: Place):
+    import sys
+    from types import SimpleNamespace
+
+    from beags_plugin.masks.sources import sam2
+
+    def absent(name, **_):
+        raise OSError(f"{name} is not a local folder and is not a valid model identifier")
+
+    prompts(boxed([2, 2, 8, 8]))(at.data)
+    library = SimpleNamespace(Sam2VideoModel=SimpleNamespace(from_pretrained=absent))  # which is installed on demand
+    at.patch.setitem(sys.modules, "transformers", library)
+    at.patch.setattr(sam2.Sam2Source, "unavailable", classmethod(lambda cls: None))
+    words = "--source sam2 --overwrite --options prompts=prompts.json model=nowhere"
+    return at.beags("masks make --data", at.data, words)
+
+
+@mistake("mask sources", "SAM2 without its extra")
+def _(at: Place):
+    from beags_plugin.masks.sources import sam2
+
+    at.patch.setattr(sam2, "find_spec", lambda name: None)
+    return at.beags("masks make --data", at.data, "--source sam2 --overwrite")
 
 
 @mistake("mask sources", "depth of a run without the run")

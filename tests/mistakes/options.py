@@ -57,7 +57,7 @@ mistake("options", "classes in a file that does not exist")(trained("beags-data"
 mistake("options", "a device that is not there")(trained("--machine.device-type", "cuda"))
 mistake("options", "several processes on a CPU")(trained("--machine.num-devices", "2"))
 mistake("options", "no process")(trained("--machine.num-devices", "0"))
-mistake("options", "a learning rate that is not a number")(model("position-lr", "nan nan"))
+mistake("options", "a learning rate that is not a number")(trained("--pipeline.model.position-lr", "nan", "nan"))
 
 
 def loss(name: str, **values: Any) -> Callable[[Place], Any]:
@@ -89,9 +89,7 @@ mistake("options", "samples that are negative")(loss("occupancy", options={"samp
 def _(at: Place):
     from beags_plugin.ops import extension
 
-    reason = (
-        "the compiled module was not built: install a C++17 compiler, then pip install --force-reinstall --no-deps ."
-    )
+    reason = "the compiled module was not built: install a C++17 compiler, then run make clean setup."
     at.patch.setattr(extension, "load", lambda: None)
     at.patch.setattr(extension, "found", lambda: (None, reason))
     return at.train("--pipeline.model.rasterizer", "native")

@@ -36,7 +36,8 @@ def _(at: Place):
     (at.data / "prompts.json").write_text(
         '{"objects": [{"name": "cup", "prompts": [{"view": "v02", "box": [2, 2, 8, 8]}]}]}'
     )
-    return at.beags("masks make --data", at.data, "--source grabcut --overwrite --options prompts=prompts.json")
+    words = "--source grabcut --overwrite --options prompts=prompts.json --load-config {run}"
+    return at.beags("masks make --data", at.data, words)
 
 
 @mistake("photos", "no bytes")

@@ -151,9 +151,9 @@ mistake("poses", "seed points not numbers")(
 )
 
 
-def colmap(damage: Callable[[Path], Any]) -> Callable[[Place], Any]:
+def colmap(damage: Callable[[Path], Any], text: bool = False) -> Callable[[Place], Any]:
     def make(at: Place):
-        write_colmap(at.root / "colmap", points=np.zeros((20, 3)))
+        write_colmap(at.root / "colmap", points=np.zeros((20, 3)), text=text)
         damage(at.root / "colmap/sparse/0")
         return at.train(data=at.root / "colmap")
 
@@ -169,12 +169,20 @@ def giant(name: str) -> Callable[[Path], Any]:
     return lambda model: (model / name).write_bytes(struct.pack("<Q", 1 << 60) + (model / name).read_bytes()[8:])
 
 
+def tracks(model: Path) -> None:
+    """The first image promises 2^60 points."""
+    content = bytearray((model / "images.bin").read_bytes())
+    content[8 + 64 + 8 : 8 + 64 + 16] = struct.pack("<Q", 1 << 60)  # after the count, its pose, and v08.png
+    (model / "images.bin").write_bytes(content)
+
+
+mistake("poses", "COLMAP's images.bin promises 2^60 points of an image")(colmap(tracks))
 for _name in ("images.bin", "cameras.bin", "points3D.bin"):
     mistake("poses", f"COLMAP's {_name} cut off")(colmap(cut(_name)))
     mistake("poses", f"COLMAP's {_name} promises 2^60")(colmap(giant(_name)))
 mistake("poses", "COLMAP's images.bin missing")(colmap(lambda model: (model / "images.bin").unlink()))
 mistake("poses", "COLMAP's images.txt with words")(
-    colmap(lambda model: [(model / "images.bin").unlink(), (model / "images.txt").write_text("1 a b c\n\n")])
+    colmap(lambda model: (model / "images.txt").write_text("1 a b c d e f g 1 v00.png\n\n"), text=True)
 )
 
 
@@ -187,7 +195,7 @@ def llff(rows: np.ndarray | bytes) -> Callable[[Place], Any]:
             (folder / "poses_bounds.npy").write_bytes(rows)
         else:
             np.save(folder / "poses_bounds.npy", rows)
-        return at.train(data=folder)
+        return at.train(data=folder, preset="beags-base")
 
     return make
 
@@ -241,7 +249,7 @@ def dtu_cameras() -> dict[str, Any]:
     return {f"world_mat_{index}": K @ np.linalg.inv(pose @ flip) for index, pose in enumerate(ring(9))}
 
 
-mistake("poses", "cameras_sphere.npz lacks a key")(dtu({**dtu_cameras(), "world_mat_9": 1, "world_mat_3": [1.0]}))
+mistake("poses", "cameras_sphere.npz lacks a key")(dtu({**dtu_cameras(), "world_mat_3": [1.0]}))
 mistake("poses", "cameras_sphere.npz of fewer cameras")(
     dtu({name: value for name, value in dtu_cameras().items() if name != "world_mat_8"})
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -62,13 +63,13 @@ mistake("configs", "a class that has been renamed")(
 mistake("configs", "a module that has been renamed")(
     config(lambda text: text.replace("plugin.model.", "plugin.scene."))
 )
-mistake("configs", "a key that is missing")(
-    config(lambda text: "".join(line for line in text.splitlines(True) if "pipeline:" not in line))
+mistake("configs", "a key that is missing")(config(lambda text: text.replace("    densify:", "    densifying:")))
+mistake("configs", "a part of another kind")(
+    config(
+        lambda text: re.sub(r"\n    prepare: !!python/object:\S+", "\n    prepare: !!python/object:os.environ", text)
+    )
 )
-mistake("configs", "a field that has been removed")(
-    config(lambda text: "\n".join(line for line in text.splitlines() if not line.startswith("relative_model_dir")))
-)
-mistake("configs", "a field that is unknown")(config(lambda text: text + "colour: red\n"))
+mistake("configs", "a word for a number")(config(lambda text: text.replace("    near: 0.01", "    near: close")))
 mistake("configs", "YAML broken")(config(lambda text: text[: len(text) // 2] + "\n\t{"))
 mistake("configs", "cut off")(config(lambda text: text[: len(text) // 2]))
 mistake("configs", "empty")(config(lambda text: ""))
@@ -193,12 +194,6 @@ def _(at: Place):
     return at.beags("export --load-config {run} --object box")
 
 
-@mistake("runs", "extraction.json of an extracted run is broken")
-def _(at: Place):
-    (at.run / "extraction.json").write_text("{")
-    return at.beags("eval --load-config {run}")
-
-
 @mistake("runs", "the transform of a run is broken")
 def _(at: Place):
     (at.run / "dataparser_transforms.json").write_text('{"transform": "x"}')
@@ -263,7 +258,7 @@ mistake("resuming", "an optimizer is missing")(
     resumed(lambda at, run: content(lambda found: found["optimizers"].pop("means"))(at.checkpoint))
 )
 mistake("resuming", "a tensor is missing")(
-    resumed(lambda at, run: content(lambda found: found["pipeline"].pop(NAMES))(at.checkpoint))
+    resumed(lambda at, run: content(lambda found: [found["pipeline"].pop(NAMES)].clear())(at.checkpoint))
 )
 mistake("resuming", "a photo has gone since")(
     resumed(lambda at, run: at.edit_poses(lambda meta: meta.update(frames=meta["frames"][2:])))
@@ -288,12 +283,9 @@ mistake("resuming", "a prepared mask is of another size")(
 @mistake("resuming", "a finished run")
 def _(at: Place):
     run = broken_off(at)
-    import yaml
-
     text = (run / "config.yml").read_text("utf8")
     (run / "config.yml").write_text(text.replace("refine_steps: 8", "refine_steps: 3"), "utf8")
     (run / "training.json").write_text("{}")
-    assert yaml
     return at.beags("resume", run)
 
 
