@@ -220,8 +220,8 @@ class BeagsDataParser(DataParser):
         size = downscaled_size(actual, self.config.downscale_factor)
         if int(size.min()) < LEAST_PIXELS <= int(actual.min()):
             raise UserError(
-                f"downscale_factor is {self.config.downscale_factor:g}, which leaves {int(size.min())} pixels of a side "
-                f"of {views.images[0]}: give less, so that {LEAST_PIXELS} or more are left."
+                f"downscale_factor is {self.config.downscale_factor:g}, which leaves {int(size.min())} pixels of "
+                f"a side of {views.images[0]}: give less, so that {LEAST_PIXELS} or more are left."
             )
         resize_cameras(cameras, size[:, :1], size[:, 1:])
 

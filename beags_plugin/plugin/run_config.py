@@ -37,10 +37,13 @@ class Refused(yaml.constructor.ConstructorError):
 @lru_cache(None)
 def known_packages() -> frozenset[str]:
     """Packages whose classes configs may name: ours, nerfstudio, and those that entry points register with either."""
-    points = [point for point in entry_points() if point.group in _GROUPS or point.group.startswith("beags.")]
-    return frozenset(
-        {"beags_plugin", "nerfstudio", *(point.value.partition(".")[0].partition(":")[0] for point in points)}
-    )
+    groups = [group for group in entry_points().groups if group in _GROUPS or group.startswith("beags.")]
+    values = [point.value for group in groups for point in entry_points(group=group)]
+    return frozenset({"beags_plugin", "nerfstudio", *(_package(value.partition(":")[0]) for value in values)})
+
+
+def _package(module: str) -> str:
+    return module.partition(".")[0]
 
 
 class RunConfigLoader(yaml.UnsafeLoader):
@@ -64,7 +67,7 @@ class RunConfigLoader(yaml.UnsafeLoader):
             raise Refused(None, None, f"it names {name}, which this version does not have", mark) from None
         if not isinstance(found, type) and name not in _FUNCTIONS:
             raise Refused(None, None, f"it names {name}, which is no class", mark)
-        own = str(getattr(found, "__module__", "")).partition(".")[0]
+        own = _package(str(getattr(found, "__module__", "")))
         if own not in known_packages() | {"torch", "pathlib"}:  # what a known module has imported from elsewhere
             raise Refused(None, None, f"it names {name}, which no run of beags needs", mark)
         return found

@@ -15,7 +15,7 @@ _WIDTHS = {"means": (3,), "quats": (4,), "scales": (2,), "opacities": (1,), "fea
 
 
 def check_state(state: Mapping[str, Any], path: Path) -> None:
-    """Raise ``UserError`` unless ``state`` is that of a ``BeagsModel``: one scene with its classes. path: where from."""
+    """Raise ``UserError`` unless ``state`` is that of a ``BeagsModel`` with classes. path: where it is from."""
     if wrong := _wrong(state):
         raise UserError(f"the checkpoint {path} holds no scene of beags ({wrong}): name another, or train again.")
 
