@@ -51,10 +51,14 @@ class FiledTensors(Sequence[Tensor]):
 
     def _read(self, index: int) -> Tensor:
         member = f"{index}.npy"
-        with self._held.open(member) as file:
-            check_header(file, self._held.getinfo(member).file_size)
-        with self._held.open(member) as file:
-            return torch.from_numpy(np.lib.format.read_array(file, allow_pickle=False)).to(self.device)
+        try:
+            with self._held.open(member) as file:
+                check_header(file, self._held.getinfo(member).file_size)
+            with self._held.open(member) as file:
+                return torch.from_numpy(np.lib.format.read_array(file, allow_pickle=False)).to(self.device)
+        # what zipfile raises for members that are damaged, and torch for numbers that it does not know
+        except (zipfile.BadZipFile, NotImplementedError, RuntimeError, KeyError, TypeError, EOFError) as error:
+            raise ValueError(f"tensor {index} cannot be read: {error}") from None
 
 
 def write_tensors(file: BinaryIO, tensors: Iterable[Tensor]) -> None:

@@ -223,6 +223,10 @@ class RefinementSwitch:
 
 def _prepared_labels(path: Path, camera: Camera) -> torch.Tensor:
     """[H, W] int32 of the mask that refinement was prepared with for a view of this camera."""
+    if not path.is_file():
+        raise UserError(
+            f"the prepared mask {path} is missing: restore it, or refine again from base/nerfstudio_models."
+        )
     labels = torch.from_numpy(read_class_map(path).astype(np.int32))
     if labels.shape != (camera.height, camera.width):
         raise UserError(

@@ -217,6 +217,7 @@ class BeagsTrainer(Trainer):
             return super()._load_checkpoint()
         checkpoint = read_checkpoint(path)
         states = training_state(checkpoint, path)
+        named = dict(self._model.classes)  # by the data
         self._start_step = checkpoint["step"] + 1
         check_state(_of_model(checkpoint["pipeline"]), path)
         try:
@@ -225,6 +226,11 @@ class BeagsTrainer(Trainer):
             self.grad_scaler.load_state_dict(checkpoint["scalers"])
         except (RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
             raise _misfit(path, error) from error
+        if self._loads_own() and self._model.classes != named:
+            raise UserError(
+                f"the classes of {self.config.data_path} are not those with which training began "
+                f"({', '.join(self._model.classes.values())}): restore classes.json and the masks, or train again."
+            )
         CONSOLE.print(f"Loaded {path}", highlight=False, markup=False, soft_wrap=True)
         self.loaded_run = self.base_dir.absolute() if self._loads_own() else path.absolute().parent.parent
         if self.schedule.base_steps == 0 and int(self._model.refined_steps) == 0:

@@ -12,7 +12,7 @@ from mistakes.table import SHORT, TRAINED, Place, mistake
 WRITING = {  # commands that write into {out}
     "extract": "extract --load-config {run} --output",
     "export": "export --load-config {run} --all --output",
-    "a mesh": "export --load-config {run} --object cup --format glb --resolution 16 --min-views 1 --output",
+    "a mesh": "export --load-config {run} --object cup --format glb --resolution 8 --min-views 1 --output",
     "spz": "export --load-config {run} --object cup --format spz --output",
     "render": "render --load-config {run} --object cup --size 16 --frames 2 --output",
     "a picture": "render --load-config {run} --object cup --size 16 --views 1 --format sheet --output",

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from data_folders import noise, write_image
 
 from mistakes.table import SHORT, Place, mistake
 
@@ -77,7 +78,7 @@ mistake("configs", "a command to run")(config(lambda text: "!!python/object/appl
 mistake("configs", "a command to run, hidden in a field")(
     config(lambda text: text + "hidden: !!python/object/apply:os.system ['touch ran']\n")
 )
-mistake("configs", "nested 10,000 deep")(config(lambda text: "[" * 10_000))
+mistake("configs", "nested 2,000 deep")(config(lambda text: "[" * 2_000))
 mistake("configs", "aliases that grow without end")(
     config(
         lambda text: (
@@ -274,7 +275,7 @@ mistake("resuming", "a prepared mask is missing")(
     resumed(lambda at, run: next((run / "prepared/masks").iterdir()).unlink())
 )
 mistake("resuming", "a prepared mask is of another size")(
-    resumed(lambda at, run: shutil.copyfile(at.data / "masks/v01.png", next((run / "prepared/masks").iterdir())))
+    resumed(lambda at, run: write_image(run / "prepared/masks/v01.png", noise(0, 4, 3)[..., 0]))
 )
 
 

@@ -1,30 +1,41 @@
-"""What is said of each mistake, kept in a file beside this one: a line with its name, one with the sentence."""
+"""What is said of each mistake, kept in a file beside this one.
+
+A line has the mistake's name, the next the sentence. A line "was: ..." between them says what the first run of the
+table found instead, where something had to be mended.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 _FILE = Path(__file__).with_name("sentences.txt")
-_INDENT = "    "
+_INDENT, _WAS = "    ", "    was: "
+
+SENTENCES: dict[str, str] = {}
+WAS: dict[str, str] = {}
 
 
-def _read() -> dict[str, str]:
-    found: dict[str, str] = {}
+def _read() -> None:
     name = ""
     for line in _FILE.read_text("utf8").splitlines() if _FILE.exists() else ():
-        if line.startswith(_INDENT):
-            found[name] = line.removeprefix(_INDENT)
+        if line.startswith(_WAS):
+            WAS[name] = line.removeprefix(_WAS)
+        elif line.startswith(_INDENT):
+            SENTENCES[name] = line.removeprefix(_INDENT)
         else:
             name = line
-    return found
 
 
-SENTENCES = _read()
+_read()
 
 
 def write_sentence(name: str, sentence: str) -> None:
     """Keep what is said of a mistake; those that are in the table no more go."""
     from mistakes.table import TABLE
 
-    found = {**_read(), name: sentence}
-    _FILE.write_text("".join(f"{title}\n{_INDENT}{found[title]}\n" for title in TABLE if title in found), "utf8")
+    SENTENCES[name] = sentence
+    lines = []
+    for title in TABLE:
+        if title in SENTENCES:
+            lines += [title, *([_WAS + WAS[title]] if title in WAS else []), _INDENT + SENTENCES[title]]
+    _FILE.write_text("\n".join(lines) + "\n", "utf8")

@@ -10,7 +10,7 @@ import os
 import shutil
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -32,26 +32,24 @@ SHORT = (
 class Mistake:
     """One mistake.
 
-    make: makes it in a ``Place`` and returns the command that meets it. mended: whether the first run of this table
-    found a traceback, another exit code, or a sentence without the file or the remedy.
+    make: makes it in a ``Place`` and returns the command that meets it.
     """
 
     area: str
     name: str
     make: Callable[[Place], Command]
-    mended: bool
 
 
 TABLE: dict[str, Mistake] = {}
 
 
-def mistake(area: str, name: str, mended: bool = False) -> Callable:
+def mistake(area: str, name: str) -> Callable:
     """Add what makes a mistake to the table."""
 
     def add(make: Callable[[Place], Command]) -> Callable[[Place], Command]:
         title = f"{area}: {name}"
         assert title not in TABLE
-        TABLE[title] = Mistake(area, name, make, mended)
+        TABLE[title] = Mistake(area, name, make)
         return make
 
     return add
@@ -221,17 +219,43 @@ class _FullText(io.TextIOBase):
 
 @lru_cache(None)
 def _parsed(preset: str, flags: Sequence[str]) -> Any:
-    """The config that ns-train makes of its flags."""
-    import tyro
-
-    from beags_plugin.plugin.config import BeagsTrainerConfig
+    """The config that ns-train makes of its flags; read here, as its own parser takes half a second a time."""
     from beags_plugin.plugin.presets import load_preset
 
     config = load_preset(preset).config
-    if not flags:
-        return config
-    kind = tyro.conf.SuppressFixed[tyro.conf.FlagConversionOff[BeagsTrainerConfig]]
-    return tyro.cli(kind, args=list(flags), default=config)
+    whole, words = config, list(flags)
+    while words:
+        word = words.pop(0)
+        if word == "beags-data":
+            config = whole.pipeline.datamanager.dataparser
+            continue
+        *parents, last = word.removeprefix("--").replace("-", "_").split(".")
+        values = []
+        while words and not words[0].startswith("--") and words[0] != "beags-data":
+            values.append(words.pop(0))
+        _set(config, parents, last, values)
+    return whole
+
+
+def _set(holder: Any, parents: list[str], name: str, values: list[str]) -> None:
+    """Set an option, also of a frozen part, as a value of the kind that it has."""
+    if not parents:
+        setattr(holder, name, _converted(getattr(holder, name), name, values))
+        return
+    part = getattr(holder, parents[0])
+    if type(part).__dataclass_params__.frozen:
+        setattr(holder, parents[0], replace(part, **{name: _converted(getattr(part, name), name, values)}))
+    else:
+        _set(part, parents[1:], name, values)
+
+
+def _converted(current: Any, name: str, values: list[str]) -> Any:
+    if isinstance(current, tuple):
+        kind = type(current[0]) if current else {"ignore_ids": int}.get(name, str)
+        return tuple(kind(value) for value in values)
+    if current is None:
+        return Path(values[0])
+    return type(current)(values[0]) if not isinstance(current, Path) else Path(values[0])
 
 
 def _ns_train(config: Any) -> None:
@@ -245,10 +269,12 @@ def _ns_train(config: Any) -> None:
 
 def summary() -> str:
     """The table by area, in Markdown: how many mistakes are in it, and how many of them had to be mended."""
+    from mistakes.sentences import WAS
+
     areas = list(dict.fromkeys(one.area for one in TABLE.values()))
     rows = []
     for area in areas:
         own = [one for one in TABLE.values() if one.area == area]
-        rows.append(f"| {area} | {len(own)} | {sum(one.mended for one in own)} |")
-    total = f"| all | {len(TABLE)} | {sum(one.mended for one in TABLE.values())} |"
+        rows.append(f"| {area} | {len(own)} | {sum(f'{area}: {one.name}' in WAS for one in own)} |")
+    total = f"| all | {len(TABLE)} | {len(WAS)} |"
     return "\n".join(["| area | mistakes | mended |", "|---|---|---|", *rows, total])
