@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from resumed_runs import forget_writers
+from resumed_runs import Killed, forget_writers, run_to_end
 from run_folders import write_scene, write_trained
 
 Command = Callable[[], None]
@@ -56,17 +57,39 @@ def mistake(area: str, name: str) -> Callable:
 
 
 class Templates:
-    """A good scene and a good run, made once and copied for every mistake."""
+    """A good scene and a run that was broken off, made once and copied for every mistake."""
 
     def __init__(self, root: Path) -> None:
+        self.root = root
         self.scene = write_scene(root / "scene")
+
+    def broken_off(self, config: Any) -> Path:
+        """A run on the scene that was killed in the middle of refinement, with a checkpoint to go on from."""
+        from beags_plugin.plugin.trainer import BeagsTrainer
+
+        train = BeagsTrainer.train_iteration
+
+        def iteration(trainer, step):
+            if step == 9:
+                trainer.save_checkpoint(8)
+                raise Killed
+            return train(trainer, step)
+
+        folder = self.root / "broken_off"
+        if not folder.exists():
+            config.data, config.run_dir = self.scene, folder
+            with pytest.MonkeyPatch.context() as patch, suppress(Killed):
+                patch.setattr(BeagsTrainer, "train_iteration", iteration)
+                run_to_end(config)
+            forget_writers()
+        return folder
 
 
 class Place:
     """The folder of one mistake: ``data``, a good scene, and ``run``, a refined run of it, appear when asked for."""
 
     def __init__(self, root: Path, templates: Templates, patch: pytest.MonkeyPatch) -> None:
-        self.root, self.patch, self._templates = root, patch, templates
+        self.root, self.patch, self.templates = root, patch, templates
         self.may_change: set[Path] = set()
 
     @property
@@ -74,7 +97,7 @@ class Place:
         """A scene of nine photos with masks, transforms.json and classes.json."""
         folder = self.root / "data"
         if not folder.exists():
-            shutil.copytree(self._templates.scene, folder)
+            shutil.copytree(self.templates.scene, folder)
         return folder
 
     @property
@@ -116,6 +139,7 @@ class Place:
         config.data = self.data if data is None else data
         config.run_dir = self.root / TRAINED
         config.vis = "tensorboard"
+        self.patch.setattr(type(config), "print_to_terminal", lambda config: None)  # of half a second
         config.logging.local_writer.enable = False
         return config
 
@@ -223,6 +247,7 @@ def _parsed(preset: str, flags: Sequence[str]) -> Any:
     from beags_plugin.plugin.presets import load_preset
 
     config = load_preset(preset).config
+    config.pipeline.datamanager.dataparser.num_random_points = 200
     whole, words = config, list(flags)
     while words:
         word = words.pop(0)
