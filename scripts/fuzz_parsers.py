@@ -13,16 +13,17 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import random
 import re
 import resource
 import shutil
 import signal
-import subprocess
 import sys
 import time
 import traceback
 from collections.abc import Callable
+from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -60,10 +61,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, help="file for what was done")
     parser.add_argument("--findings", type=Path, default=Path("outputs/fuzz_parsers"), help="folder of files that fail")
-    parser.add_argument("--guided", help=argparse.SUPPRESS)  # a process of its own under atheris
-    options, rest = parser.parse_known_args()
-    if options.guided:
-        return guided(options.guided, rest)
+    options = parser.parse_args()
     if (options.seconds is None) == (options.count is None):
         parser.error("give --seconds or --count")
     done, failed = {}, False
@@ -191,47 +189,55 @@ CHANGES = (_flip, _flip, _cut, _repeat, _number, _number, _word, _digits, _digit
 
 
 def in_a_process(name: str, options: argparse.Namespace) -> dict:
-    """Let atheris look for files that fail, in a process that it may end."""
+    """Let atheris look for files that fail, in a copy of this process, which it may end."""
+    instrumented()
     start = time.monotonic()
-    work = options.findings / f"work_{name.replace(' ', '_')}"
+    work = (options.findings / f"work_{name.replace(' ', '_')}").absolute()
     shutil.rmtree(work, ignore_errors=True)
     (work / "corpus").mkdir(parents=True)
-    command = [
-        sys.executable,
-        __file__,
-        "--guided",
-        name,
-        str(work / "corpus"),
-        f"-max_total_time={options.seconds:.0f}",
-    ]
-    command += [f"-artifact_prefix={work}/", f"-timeout={SECONDS}", "-rss_limit_mb=8192", f"-max_len={LONGEST}"]
-    command += ["-print_final_stats=1", "-verbosity=1", f"-seed={options.seed + 1}"]
-    ended = subprocess.run(command, capture_output=True, text=True, errors="replace")
-    told = ended.stderr + ended.stdout
+    if (child := os.fork()) == 0:
+        with open(work / "log.txt", "wb") as log:
+            os.dup2(log.fileno(), 1)
+            os.dup2(log.fileno(), 2)
+        guided(name, work, options)
+        os._exit(0)
+    ended = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    told = (work / "log.txt").read_text(errors="replace")
     counts = re.findall(r"number_of_executed_units: (\d+)", told) or re.findall(r"^#(\d+)", told, re.MULTILINE)
     finding = ""
-    if ended.returncode != 0:
-        kept = [str(path) for path in work.iterdir() if path.is_file()]
+    if ended != 0:
+        kept = [str(path) for path in work.iterdir() if path.is_file() and path.name != "log.txt"]
         finding = f"{' '.join(kept)}\n{told[-4000:]}"
     return record("atheris", int(counts[-1]) if counts else 0, start, finding)
 
 
-def guided(name: str, arguments: list[str]) -> int:
-    """The process of one parser under atheris; never returns."""
+@lru_cache(None)
+def instrumented() -> None:
+    """Import the parsers so that atheris sees which of their lines run; each reads its seeds, and imports the rest."""
     import atheris  # pyright: ignore[reportMissingImports]  (installed on demand)
 
     with atheris.instrument_imports(include=INSTRUMENTED, enable_loader_override=False):
         from parser_targets import TARGETS, examine
-    target, corpus = TARGETS[name], Path(next(word for word in arguments if not word.startswith("-")))
+
+        for target in TARGETS.values():
+            for content in target.seeds():
+                examine(target, content)
+
+
+def guided(name: str, work: Path, options: argparse.Namespace) -> None:
+    """The process of one parser under atheris; never returns."""
+    import atheris  # pyright: ignore[reportMissingImports]
+    from parser_targets import TARGETS, examine
+
+    target = TARGETS[name]
     for number, content in enumerate(target.seeds()):
-        (corpus / f"seed{number}").write_bytes(content)
-        with atheris.instrument_imports(include=INSTRUMENTED, enable_loader_override=False):
-            examine(target, content)  # imports what it needs
+        (work / "corpus" / f"seed{number}").write_bytes(content)
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, size + MEMORY))
-    atheris.Setup([sys.argv[0], *arguments], lambda content: void(examine(target, content)))
+    command = [sys.argv[0], str(work / "corpus"), f"-max_total_time={options.seconds:.0f}", f"-artifact_prefix={work}/"]
+    command += [f"-timeout={SECONDS}", "-rss_limit_mb=16384", f"-max_len={LONGEST}", "-print_final_stats=1"]
+    atheris.Setup([*command, f"-seed={options.seed + 1}"], lambda content: void(examine(target, content)))
     atheris.Fuzz()
-    return 0
 
 
 def void(_: object) -> None:

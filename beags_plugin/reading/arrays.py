@@ -61,7 +61,7 @@ def check_header(file: BinaryIO | Any, size: int) -> None:
         raise ValueError(f"its header is damaged ({type(error).__name__})") from None
     if dtype.hasobject:
         raise ValueError("it holds objects, which are not loaded, since they may run code")
-    if any(length < 0 for length in shape):
+    if not all(0 <= length < 1 << 62 for length in shape):
         raise ValueError(f"its shape is {list(shape)}")
     promised = math.prod(shape) * max(dtype.itemsize, 1)  # in Python's integers, which do not overflow
     if promised > size - file.tell():
