@@ -265,7 +265,8 @@ def _point_files() -> list[bytes]:
 
 
 def _transforms_files() -> list[bytes]:
-    frames = [{"file_path": f"images/{name}.png", "transform_matrix": np.eye(4).tolist()} for name in "abc"]
+    poses = [np.c_[np.eye(4)[:, :3], [0.3 * index, 0.1, index, 1.0]].tolist() for index in range(3)]
+    frames = [{"file_path": f"images/{name}.png", "transform_matrix": poses[i]} for i, name in enumerate("abc")]
     meta = {"fl_x": 5.0, "fl_y": 5.0, "cx": 3.0, "cy": 3.0, "w": SIDE, "h": SIDE, "camera_model": "OPENCV"}
     more = {"k1": 0.1, "train_filenames": ["images/a.png"], "val_filenames": ["images/b.png"], "applied_scale": 1.0}
     return [_json({**meta, "frames": frames}), _json({**meta, **more, "frames": [{**frames[0], **meta}, frames[1]]})]

@@ -28,7 +28,7 @@ from beags_plugin.plugin.poses import Normalization, PosedViews, read_poses
 from beags_plugin.plugin.seed_points import starting_points
 from beags_plugin.rasterizers.interface import IGNORE
 
-LEAST_PIXELS = 4  # of a side that was scaled down; fewer show nothing
+LEAST_PIXELS = 2  # of a side that was scaled down; fewer show nothing
 
 
 @dataclass

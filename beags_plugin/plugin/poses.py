@@ -81,7 +81,7 @@ def read_poses(poses: Poses, root: Path, normalization: Normalization) -> PosedV
     named_as = sorted(index_of, key=lambda path: path.as_posix())
     if not named_as:
         raise UserError(f"{file} holds no images: give poses for at least two.")
-    if len(named_as) < 2:
+    if len(named_as) < 2 and not named:
         raise UserError(f"{file} holds the pose of one image alone: give poses for at least two.")
     cameras = concatenate_cameras([part.cameras for part in parts])[torch.tensor([index_of[i] for i in named_as])]
     members = None
@@ -169,6 +169,8 @@ def _delegate(parser: DataParser, split: str, file: Path) -> DataparserOutputs:
         return parser.get_dataparser_outputs(split)
     except UserError:
         raise
+    except ZeroDivisionError as error:  # while the world is scaled by how far the cameras are apart
+        raise UserError(f"the poses in {file} are all of one place: give photos from several places.") from error
     # nerfstudio asserts, and its readers let KeyError, struct.error and the like through
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__

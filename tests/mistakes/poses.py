@@ -52,6 +52,19 @@ mistake("poses", "not a number in a pose")(frames(set_row(1, [0, 1, 0, NAN])))
 mistake("poses", "infinite place of a camera")(frames(set_row(0, [1, 0, 0, float("inf")])))
 mistake("poses", "singular")(frames(lambda frame: frame.update(transform_matrix=[[0.0] * 4] * 3 + [[0, 0, 0, 1]])))
 mistake("poses", "mirrored")(frames(lambda frame: frame.update(transform_matrix=np.diag([-1.0, 1, 1, 1]).tolist())))
+
+
+@mistake("poses", "all of one place")
+def _(at: Place):
+    def move(meta):
+        for frame in meta["frames"]:
+            for row in frame["transform_matrix"]:
+                row[3] = float(row[3] == 1.0 and row[:3] == [0.0, 0.0, 0.0])
+
+    at.edit_poses(move)
+    return at.train()
+
+
 mistake("poses", "a matrix of 2 x 2")(frames(lambda frame: frame.update(transform_matrix=[[1, 0], [0, 1]])))
 mistake("poses", "words instead of numbers")(frames(set_row(0, ["a", "b", "c", "d"])))
 mistake("poses", "a frame without a matrix")(frames(lambda frame: frame.pop("transform_matrix")))
