@@ -5,14 +5,14 @@ from __future__ import annotations
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import tyro
 from rich.console import Console
 from rich.markup import escape
 
 from beags_plugin.bench.commands import Measurement
-from beags_plugin.errors import UserError
+from beags_plugin.errors import UserError, refused
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.masks_commands import Masks
@@ -277,6 +277,13 @@ Command = (
 )
 
 
+def say(error: UserError) -> NoReturn:
+    """Print a user's mistake and end with exit code 2."""
+    if not error.told:
+        CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}")
+    sys.exit(2)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the command ``beags``; a user's mistake prints one sentence and ends with exit code 2."""
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
@@ -285,8 +292,11 @@ def main(arguments: list[str] | None = None) -> None:
         command = tyro.cli(Command, args=arguments, description=description, config=config)
         command.run()
     except UserError as error:
-        CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}")
-        sys.exit(2)
+        say(error)
+    except OSError as error:
+        if (told := refused(error)) is None:
+            raise
+        say(told)
     except KeyboardInterrupt:
         CONSOLE.print("[bold red]beags:[/bold red] interrupted.")
         sys.exit(130)

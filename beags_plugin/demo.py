@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import shutil
 import subprocess
 import sys
@@ -43,7 +44,11 @@ def run_demo(
     data: Path | None, output: Path | None, preset: str, downscale: float | None, seed: int, fresh: bool
 ) -> None:
     """Do the whole job in ``output`` and print the table; see ``cli.Demo`` for the arguments."""
+    from beags_plugin.data.layout import read_scene
+
     check_preset(preset)
+    if downscale is not None and not 1.0 <= downscale < math.inf:
+        raise UserError(f"downscale is {downscale}: give 1 (full size) or more.")
     seconds: dict[str, float] = {}
     if data is None:
         output = output or Path("outputs/demo")
@@ -54,6 +59,7 @@ def run_demo(
     elif not data.is_dir():
         raise UserError(f"{data} is no folder: name one with images, poses and masks.")
     else:
+        read_scene(data)  # which says what is missing, before a training is started
         output = output or Path("outputs") / data.resolve().name
         downscale = downscale or quick_downscale(data)
     run = output / "run"
@@ -68,7 +74,6 @@ def run_demo(
             resume(run)
         else:
             _clear(output)
-            output.mkdir(parents=True, exist_ok=True)
             write_stamp(output, {STARTED: request})
             train(data, run, preset, downscale)
         write_stamp(output, request)
@@ -216,7 +221,8 @@ def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
     training = json.loads((run / "training.json").read_text())
     stages = {"sample": seconds.pop("sample", 0.0), **training["seconds"], **seconds}
     memory = training["peak_memory_mb"]
-    (output / "summary.json").write_text(json.dumps(summary_json(metrics, stages, memory), indent=2))
+    summary = json.dumps(summary_json(metrics, stages, memory), indent=2)
+    write_whole(output / "summary.json", lambda file: file.write(summary.encode()))
     print_run(metrics, stages, memory, CONSOLE)
     CONSOLE.print(f"objects: {', '.join(str(item.ply) for item in extracted)}")
     CONSOLE.print(f"figures: {output / 'summary.json'}")

@@ -11,9 +11,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from beags_plugin.errors import UserError
+from beags_plugin.errors import UserError, writing
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.progress import progress_bar
+from beags_plugin.whole_files import write_whole
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 PICTURES = (".png", ".jpg", ".jpeg")
@@ -37,10 +38,8 @@ class Outputs:
         for path in (self.json, self.csv, self.picture):
             if path is None:
                 continue
-            try:
+            with writing(path):
                 path.parent.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise UserError(f"{path} cannot be written ({error.strerror}): choose another place.") from error
             if path.is_dir():
                 raise UserError(f"{path} is a folder: name the file to write.")
 
@@ -89,7 +88,7 @@ def scene_names(configs: Sequence[Path]) -> list[str]:
     Raises ``UserError`` for a file that is no run's config, and for a run given twice.
     """
     from beags_plugin.plugin.evaluate import scene_name
-    from beags_plugin.plugin.extract import load_run_config
+    from beags_plugin.plugin.run_config import load_run_config
 
     if not configs:
         raise UserError("no run is named: give --load-config the config.yml of at least one.")
@@ -105,10 +104,7 @@ def scene_names(configs: Sequence[Path]) -> list[str]:
 
 
 def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text + "\n", "utf8")
-    except OSError as error:
-        raise UserError(f"{path} cannot be written ({error.strerror}): choose another place.") from error
+    write_whole(path, lambda file: file.write(f"{text}\n".encode()))
     CONSOLE.print(f"figures: {path}")
 
 

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
 from beags_plugin.errors import UserError
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # pyright: ignore[reportMissingImports]  (installed on Python 3.10 only)
+from beags_plugin.reading.text import load_toml, reason
 
 _PACKAGE = Path(__file__).resolve().parent
 
@@ -25,7 +20,9 @@ def shipped_folder(name: str) -> Path:
 def read_toml(path: Path, what: str) -> dict[str, Any]:
     """The content of a TOML file; raises ``UserError`` if it cannot be read. what: for the sentence, e.g. "preset"."""
     try:
-        return tomllib.loads(path.read_text("utf8"))
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(f"the {what} {path} cannot be read ({reason}): name an existing file of that kind.") from error
+        return load_toml(path)
+    except OSError as error:
+        told = f"the {what} {path} cannot be read ({reason(error)}): name an existing file of that kind."
+        raise UserError(told) from error
+    except ValueError as error:
+        raise UserError(f"the {what} {path} is no TOML ({reason(error)}): correct the file.") from error

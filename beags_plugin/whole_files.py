@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
+
+from beags_plugin.errors import writing
 
 PART = ".part"
 """Ends the names of files that are being written; their names start with a dot."""
@@ -14,17 +17,20 @@ PART = ".part"
 def write_whole(path: Path, write: Callable[[BinaryIO], Any], beside: Path | None = None) -> None:
     """Let ``write`` write a file that takes the place of ``path`` once it is safe on disk.
 
-    beside: folder of the unfinished file, on the same disk; that of ``path`` if None.
+    beside: folder of the unfinished file, on the same disk; that of ``path`` if None. Raises ``UserError`` if the
+    system does not let it: the disk is full, or nothing may be written there.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = unfinished(path, beside)
-    try:
-        with open(part, "wb") as file:
-            write(file)
-        put_in_place(part, path)
-    except (Exception, KeyboardInterrupt):
-        part.unlink(missing_ok=True)  # it may be what fills the disk
-        raise
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = unfinished(path, beside)
+        try:
+            with open(part, "wb") as file:
+                write(file)
+            put_in_place(part, path)
+        except (Exception, KeyboardInterrupt):
+            with suppress(OSError):
+                part.unlink(missing_ok=True)  # it may be what fills the disk
+            raise
 
 
 def unfinished(path: Path, beside: Path | None = None) -> Path:

@@ -74,8 +74,8 @@ SENTENCES = {
     f"export --load-config {RUN} --object cup --format stl": "there is no exporter 'stl': choose one of glb, obj, ply, "
     "ply-2dgs, spz.",
     f"export --load-config {RUN} --object cup --frame moon": "there is no frame 'moon': choose one of world, object.",
-    f"export --load-config {RUN} --object cup --format glb --resolution 0": "resolution is 0: a mesh needs at least 8 "
-    "voxels along its longest side.",
+    f"export --load-config {RUN} --object cup --format glb --resolution 0": "resolution is 0: give 8 to 4096 voxels "
+    "along the longest side.",
     f"export --load-config {RUN} --object cup --json {{tmp}}/file/x.json": "{tmp}/file/x.json cannot be written (File "
     "exists): choose another place.",
     # render

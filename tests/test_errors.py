@@ -19,7 +19,7 @@ def _run(error: str) -> subprocess.CompletedProcess[str]:
 
 def test_a_user_error_prints_its_sentence_alone():
     done = _run("UserError('masks/a.png is no image: replace it.')")
-    assert done.returncode != 0
+    assert done.returncode == 2
     assert done.stderr.strip() == "beags: masks/a.png is no image: replace it."
 
 

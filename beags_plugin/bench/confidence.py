@@ -54,7 +54,7 @@ def _distance(run: Run) -> float:
 
 
 def _views(run: Run, outcomes: Mapping[str, Outcome]) -> list[TrainingMasks]:
-    from beags_plugin.plugin.extract import load_run_config
+    from beags_plugin.plugin.run_config import load_run_config
     from beags_plugin.plugin.training_masks import training_masks
 
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits

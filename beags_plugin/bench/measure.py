@@ -19,7 +19,7 @@ def measure_run(config_path: Path) -> dict[str, Any]:
     this very run, which is what assignment alone gives. mask_error_...: see ``mask_errors``.
     """
     from beags_plugin.plugin.evaluate import evaluate_run
-    from beags_plugin.plugin.extract import load_run_config
+    from beags_plugin.plugin.run_config import load_run_config
     from beags_plugin.plugin.training_masks import training_masks
 
     found = evaluate_run(config_path).to_json()

@@ -26,6 +26,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.errors import UserError
 from beags_plugin.evaluation.metrics import mask_metrics, mean_metrics
 from beags_plugin.masks import REPROJECTIONS
+from beags_plugin.reading.arrays import load_array
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 DEPTHS = ("trained", "exact")
@@ -146,7 +147,7 @@ def load_views(options: Options, views: int) -> Scene:
     exact = [torch.from_numpy(read_class_map(path).astype(np.int32)) for path in truth["masks"]]
     transform = read_transform(config.parent)
     factor = 1.0 if transform is None else transform[1]  # from the sample's units to those of the run
-    of_sample = [torch.from_numpy(factor * np.load(data / f"ground_truth/depth/{view.name}.npy")) for view in found]
+    of_sample = [torch.from_numpy(factor * load_array(data / f"ground_truth/depth/{view.name}.npy")) for view in found]
     rasterizer = make_rasterizer(scene.config.model_config.rasterizer)
     settings, surfels = raster_settings(scene), geometry_inputs(scene.surfels())
     kind = scene.config.model_config.prepare.depth

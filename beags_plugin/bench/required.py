@@ -66,6 +66,7 @@ def run_required(config: Path, json: Path | None = None, csv: Path | None = None
 def load(config: Path) -> Scene:
     """Read the run, its data and what its preparation kept."""
     from beags_plugin.plugin.evaluate import EvaluatedRun
+    from beags_plugin.plugin.prepared_grid import grid_state
     from beags_plugin.plugin.runs import last_prepared
 
     run = EvaluatedRun(config)
@@ -74,7 +75,7 @@ def load(config: Path) -> Scene:
         raise UserError(f"{config.parent} keeps no base beside its scene: name a run of beags that was refined.")
     before: SavedScene = run.stages.get("before", after)
     kept = last_prepared(config.parent) / "grid.pt"
-    state = torch.load(kept, weights_only=True) if kept.exists() else {}
+    state = grid_state(kept) if kept.exists() else {}
     manager: BeagsDataManager = after.config.data_config.setup(
         device="cpu", test_mode="test", world_size=1, local_rank=0
     )

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from beags_plugin.bench.trials import Trial
+from beags_plugin.errors import writing
 
 Progress = Callable[[int, int], None]
 
@@ -59,7 +60,6 @@ def _run(trial: Trial, folder: Path, base: Outcome | None, worker: Worker) -> Ou
             return Outcome(folder, result)
         if folder.exists():
             shutil.rmtree(folder)  # what an interrupted or failed trial left
-        folder.mkdir(parents=True)
         request = {
             "preset": trial.preset,
             "data": str(trial.scene.data.absolute()),
@@ -70,7 +70,9 @@ def _run(trial: Trial, folder: Path, base: Outcome | None, worker: Worker) -> Ou
             "overrides": dict(trial.overrides),
             "digest": trial.digest,
         }
-        (folder / "trial.json").write_text(json.dumps(request, indent=1))
+        with writing(folder):
+            folder.mkdir(parents=True)
+            (folder / "trial.json").write_text(json.dumps(request, indent=1))
         code = worker.run(folder)
         if (result := _read(folder / "result.json")) is not None:
             return Outcome(folder, result)
@@ -130,8 +132,10 @@ def _environment() -> dict[str, str]:
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
     """Two programs that want the same trial: the second waits, and finds it done."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with open(folder.parent / f".{folder.name}.lock", "w") as lock:
+    with writing(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        file = open(folder.parent / f".{folder.name}.lock", "w")  # noqa: SIM115  (closed below)
+    with file as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from beags_plugin.digests import folder_digest, value_digest
-from beags_plugin.errors import UserError
+from beags_plugin.errors import UserError, writing
 from beags_plugin.masks.classes import read_mask, write_class_map
 from beags_plugin.progress import progress_bar
 from beags_plugin.rasterizers.interface import IGNORE
@@ -77,7 +77,8 @@ def damaged_masks(scene: Scene, degree: float, folder: Path) -> Path:
     if (target / "complete").exists():
         return target
     shutil.rmtree(target, ignore_errors=True)
-    target.mkdir(parents=True)
+    with writing(target):
+        target.mkdir(parents=True)
     parser = BeagsDataParserConfig(data=scene.data).setup()
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
         splits = {split: parser.get_dataparser_outputs(split) for split in ("test", "train")}

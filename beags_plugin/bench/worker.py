@@ -135,18 +135,17 @@ def trial_config(request: dict[str, Any], run_folder: Path) -> BeagsTrainerConfi
 
 
 def _gaussians(config: BeagsTrainerConfig) -> int:
-    import torch
-
     from beags_plugin.plugin.runs import newest_checkpoint
+    from beags_plugin.plugin.training_state import read_checkpoint
 
-    checkpoint = torch.load(newest_checkpoint(config.get_checkpoint_dir()), map_location="cpu", weights_only=True)
+    checkpoint = read_checkpoint(newest_checkpoint(config.get_checkpoint_dir()))
     return len(checkpoint["pipeline"]["_model.class_ids"])
 
 
 def _voxel_size(grid: Path) -> float | None:
-    import torch
+    from beags_plugin.plugin.prepared_grid import grid_state
 
-    state = torch.load(grid, weights_only=True)
+    state = grid_state(grid)
     return float(state["voxel_size"]) if state else None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import tempfile
 import weakref
 import zipfile
@@ -16,6 +17,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.errors import UserError
+from beags_plugin.reading.arrays import check_header, check_members
 
 
 class FiledTensors(Sequence[Tensor]):
@@ -30,10 +32,13 @@ class FiledTensors(Sequence[Tensor]):
         if not isinstance(source, Path):
             weakref.finalize(self, source.close)
         try:
-            self._held = np.load(source, allow_pickle=False)  # reads the list of what is there, and no more
-            self._count = len(self._held.files)
-        except (zipfile.BadZipFile, AttributeError) as error:
+            self._held = zipfile.ZipFile(source)  # reads the list of what is there, and no more
+            size = source.stat().st_size if isinstance(source, Path) else os.fstat(source.fileno()).st_size
+            check_members(self._held, size)
+            self._count = len(self._held.namelist())
+        except (zipfile.BadZipFile, NotImplementedError) as error:
             raise ValueError(f"{source} holds no tensors: {error}") from None
+        weakref.finalize(self, self._held.close)
         self.device = torch.device(device)
 
     def __len__(self) -> int:
@@ -45,7 +50,15 @@ class FiledTensors(Sequence[Tensor]):
         return self._read(chosen) if isinstance(chosen, int) else [self._read(each) for each in chosen]
 
     def _read(self, index: int) -> Tensor:
-        return torch.from_numpy(self._held[str(index)]).to(self.device)
+        member = f"{index}.npy"
+        try:
+            with self._held.open(member) as file:
+                check_header(file, self._held.getinfo(member).file_size)
+            with self._held.open(member) as file:
+                return torch.from_numpy(np.lib.format.read_array(file, allow_pickle=False)).to(self.device)
+        # what zipfile raises for members that are damaged, and torch for numbers that it does not know
+        except (zipfile.BadZipFile, NotImplementedError, RuntimeError, KeyError, TypeError, EOFError) as error:
+            raise ValueError(f"tensor {index} cannot be read: {error}") from None
 
 
 def write_tensors(file: BinaryIO, tensors: Iterable[Tensor]) -> None:

@@ -44,7 +44,7 @@ class Gaussians:
         for field in fields(self):
             values = getattr(self, field.name)
             bad = values.isnan() if field.name == "opacity_logits" else ~values.isfinite()
-            usable &= ~bad.reshape(len(self), -1).any(dim=1)
+            usable &= ~bad.flatten(1).any(dim=1) if bad.dim() > 1 else ~bad
         return usable
 
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from beags_plugin.errors import UserError
+from beags_plugin.reading.images import read_image
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 LARGEST_WIDTH = 1600  # pixels; with it Mip-NeRF 360 gets images_4 outdoors and images_2 indoors, LLFF images_4
@@ -47,15 +48,10 @@ def choose_images(root: Path, chosen: Path | None = None) -> Path:
 
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height in pixels, from the file's header; raises ``UserError`` if it is no readable image."""
-    from PIL import Image, UnidentifiedImageError
-
     try:
-        with Image.open(path) as image:
-            return image.size
+        return read_image(path, lambda image: image.size)
     except FileNotFoundError:
         raise UserError(f"the image {path} does not exist: restore it, or remove it from the poses.") from None
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError) as error:
-        raise UserError(f"{path} cannot be read as an image: replace it ({error}).") from error
 
 
 def photo_names(images: Sequence[Path]) -> list[str]:

@@ -10,6 +10,8 @@ from beags_plugin.data.files import list_images
 from beags_plugin.data.layouts.colmap import points_file
 from beags_plugin.data.scene import PoseTable
 from beags_plugin.errors import UserError
+from beags_plugin.reading.arrays import load_array
+from beags_plugin.reading.text import reason
 
 FILE = "poses_bounds.npy"
 # LLFF's camera axes are down, right, backward; OpenGL's right, up, backward.
@@ -25,9 +27,9 @@ def read_poses_bounds(file: Path, images: Path) -> PoseTable:
     Raises ``UserError`` if the file is something else or has another number of rows than there are images.
     """
     try:
-        rows = np.load(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise UserError(f"the poses {file} cannot be read: save them as LLFF does ({error}).") from error
+        rows = load_array(file)
+    except (OSError, ValueError) as error:
+        raise UserError(f"the poses {file} cannot be read ({reason(error)}): save them as LLFF does.") from error
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f" or not np.isfinite(rows).all():
         raise UserError(f"the poses {file} are no finite [views, 17] numbers: save them as LLFF does.")
     files = list_images(images)
@@ -37,12 +39,29 @@ def read_poses_bounds(file: Path, images: Path) -> PoseTable:
         )
     matrices = rows[:, :15].reshape(-1, 3, 5).astype(np.float64)
     height, width, focal = matrices[:, :, 4].T
+    _check_rows(file, files, rows)
     K = np.zeros((len(rows), 3, 3))
     K[:, 0, 0] = K[:, 1, 1] = focal
     K[:, 0, 2], K[:, 1, 2], K[:, 2, 2] = width / 2, height / 2, 1.0
     poses = np.concatenate([matrices[:, :, :3] @ _TO_OPENGL.T, matrices[:, :, 3:4]], axis=2)
     sizes = np.stack([width, height], axis=1).astype(np.int64)
     return PoseTable(file, tuple(files), poses, K, sizes, rows[:, 15:].astype(np.float64), _cameras_file(file.parent))
+
+
+def _check_rows(file: Path, images: list[Path], rows: np.ndarray) -> None:
+    """Raise ``UserError`` for the first row that no camera has."""
+    for image, row in zip(images, rows, strict=True):
+        (height, width, focal), (near, far) = row[[4, 9, 14]], row[15:]
+        if not (height >= 1 and width >= 1 and focal > 0):
+            raise UserError(
+                f"{file} gives {image.name} {width:g} x {height:g} pixels and the focal length {focal:g}: save the "
+                "poses as LLFF does."
+            )
+        if not 0 < near < far:
+            raise UserError(
+                f"{file} gives {image.name} the depths {near:g} to {far:g}: they must grow from above 0; save the "
+                "poses as LLFF does."
+            )
 
 
 def seed_points(root: Path) -> Path | None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beags_plugin.errors import UserError
+from beags_plugin.errors import UserError, writing
 
 CAPTION = 18  # pixels of text above each cell
 GAP = 4  # pixels between cells
@@ -88,8 +88,8 @@ def write_picture(path: str | Path, picture: np.ndarray) -> None:
     from PIL import Image
 
     try:
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(picture).save(path)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(f"the picture {path} cannot be written ({reason}): choose another place.") from error
+        with writing(path, "the picture "):
+            Path(path).parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(picture).save(path)
+    except ValueError as error:
+        raise UserError(f"the picture {path} cannot be written ({error}): choose another name.") from error

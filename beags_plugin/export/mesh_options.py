@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from beags_plugin.errors import UserError
 
+MOST_VOXELS = 4096  # along a side; memory_mb bounds their number besides
+
 
 @dataclass(frozen=True)
 class MeshOptions:
@@ -25,8 +27,8 @@ class MeshOptions:
     """Meshes: loose parts with fewer faces than this share of the largest part's are left out."""
 
     def __post_init__(self) -> None:
-        if self.resolution < 8:
-            raise UserError(f"resolution is {self.resolution}: a mesh needs at least 8 voxels along its longest side.")
+        if not 8 <= self.resolution <= MOST_VOXELS:
+            raise UserError(f"resolution is {self.resolution}: give 8 to {MOST_VOXELS} voxels along the longest side.")
         if not 1.0 <= self.truncation <= 64.0:
             raise UserError(f"truncation is {self.truncation}: it must lie in 1..64 voxels.")
         if not (self.memory_mb >= 50.0 and math.isfinite(self.memory_mb)):

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from beags_plugin.errors import UserError
+from beags_plugin.errors import writing
 from beags_plugin.whole_files import put_in_place, unfinished
 
 
@@ -20,11 +20,10 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     part = unfinished(path)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield part
-        put_in_place(part, path)
-    except OSError as error:
-        raise UserError(f"{path} cannot be written ({error.strerror}): choose another place.") from error
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            yield part
+            put_in_place(part, path)
     finally:
         with suppress(OSError):
             part.unlink(missing_ok=True)

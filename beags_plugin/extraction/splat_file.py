@@ -11,6 +11,7 @@ from torch import Tensor
 
 from beags_plugin.core.flattening import Gaussians
 from beags_plugin.errors import UserError
+from beags_plugin.reading.text import reason
 
 _HEADER_BYTES = 1 << 20  # a header is longer than this in no file that is one
 _SIZES = {
@@ -40,22 +41,24 @@ def read_splat_file(path: str | Path) -> SplatFile:
 
     path = Path(path)
     try:
-        _check_size(path)
+        check_ply_size(path)
         vertex = PlyData.read(str(path))["vertex"]
         lists = [prop.name for prop in vertex.properties if hasattr(prop, "len_dtype")]
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror}): name an existing .ply file.") from error
-    except (PlyParseError, KeyError, ValueError) as error:
-        raise UserError(f"{path} is not a splat .ply file: {' '.join(str(error).split())}.") from error
+    except (PlyParseError, KeyError, ValueError, TypeError, MemoryError, OverflowError, RecursionError) as error:
+        raise UserError(f"{path} is not a splat .ply file ({reason(error)}): name one.") from error
     present = {prop.name for prop in vertex.properties} - set(lists)
     rest_count = sum(name.startswith("f_rest_") for name in present)
     scale_count = 3 if "scale_2" in present else 2
     if rest_count not in (0, 9, 24, 45):
-        raise UserError(f"{path} has {rest_count} f_rest columns, but 0, 9, 24 or 45 make whole colour bands.")
+        raise UserError(
+            f"{path} has {rest_count} f_rest columns, but 0, 9, 24 or 45 make whole colour bands: export it again."
+        )
     blocks = [("x", "y", "z"), _numbered("f_dc", 3), ("opacity",), _numbered("scale", scale_count)]
     blocks += [_numbered("rot", 4), _numbered("f_rest", rest_count)]
     if missing := sorted({name for block in blocks for name in block} - present):
-        raise UserError(f"{path} is not a splat .ply file: it has no column {missing[0]!r}.")
+        raise UserError(f"{path} is not a splat .ply file (it has no column {missing[0]!r}): name one.")
 
     def take(names: tuple[str, ...]) -> Tensor:
         table = np.empty((vertex.count, len(names)), np.float32)
@@ -69,7 +72,7 @@ def read_splat_file(path: str | Path) -> SplatFile:
     return SplatFile(Gaussians(means, quats, scales, opacity[:, 0], dc, rest), ids)
 
 
-def _check_size(path: Path) -> None:
+def check_ply_size(path: Path) -> None:
     """Raise ``UserError`` if what the header promises does not fit into the file; a wrong header is a ValueError."""
     with open(path, "rb") as file:
         head = file.read(_HEADER_BYTES)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import pickle
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,6 +12,8 @@ from beags_plugin.core.flattening import Gaussians
 from beags_plugin.core.sh import sh_basis
 from beags_plugin.errors import UserError
 from beags_plugin.importers.base import ImportedScene, Importer
+from beags_plugin.reading.tensors import load_tensors
+from beags_plugin.reading.text import load_json, reason
 
 _TRANSFORM = "dataparser_transforms.json"  # nerfstudio's name for how the poses were normalised
 _PREFIX = "_model.gauss_params."
@@ -57,37 +57,26 @@ def _newest(path: Path) -> Path | None:
 
 def _normalization(file: Path) -> tuple[Tensor, float] | None:
     try:
-        content = json.loads(file.read_text("utf8"))
+        content = load_json(file)
         transform, scale = torch.tensor(content["transform"], dtype=torch.float64), float(content["scale"])
         if transform.shape != (3, 4):
             raise ValueError(f"its transform is {list(transform.shape)}, not [3, 4]")
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{file} cannot be read ({error}): restore it.") from error
+        raise UserError(f"{file} cannot be read ({reason(error)}): restore it.") from error
     return transform, scale
 
 
 def _gaussians(checkpoint: Path) -> Gaussians:
     """The Gaussians of a checkpoint; tensors only are loaded, from a file that is mapped, not read into memory."""
     try:
-        content = torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=True)
-        state = content["pipeline"]
+        state = load_tensors(checkpoint, mmap=True)["pipeline"]
         found = {name[len(_PREFIX) :]: value for name, value in state.items() if name.startswith(_PREFIX)}
     except OSError as error:
         raise UserError(f"{checkpoint} cannot be read ({error.strerror}): name an existing checkpoint.") from error
-    # torch and pickle raise these, and more, for files that are damaged, or hold more than tensors
-    except (
-        pickle.UnpicklingError,
-        RuntimeError,
-        EOFError,
-        ValueError,
-        LookupError,
-        TypeError,
-        AttributeError,
-    ) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise UserError(f"{checkpoint} is not a checkpoint of nerfstudio ({reason}): name another.") from error
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise UserError(f"{checkpoint} is not a checkpoint of nerfstudio ({reason(error)}): name another.") from error
     tensors = _checked(checkpoint, found)
     dc, rest, scales = tensors["features_dc"], tensors["features_rest"], tensors["scales"]
     if scales.shape[1] == 3 and rest.shape[1] == 0:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import colorsys
-import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from beags_plugin.errors import UserError
+from beags_plugin.errors import UserError, writing
 from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.reading.images import read_image
+from beags_plugin.reading.text import load_json, reason
 
 BACKGROUND = 0
 _ID_MODES = {"1", "L", "P", "I", "I;16", "I;16L", "I;16B"}  # Pillow's names of images with one integer per pixel
@@ -62,15 +63,12 @@ def read_mask(path: Path | str, kind: str, ignore_ids: Iterable[int] = ()) -> np
 
 def _read_pixels(path: Path | str) -> tuple[str, np.ndarray]:
     """Pillow's mode and the values of an image without loss."""
-    from PIL import Image, UnidentifiedImageError
-
     try:
-        with Image.open(path) as image:
-            form, mode, values = image.format, image.mode, np.asarray(image)
+        form, mode, values = read_image(
+            path, lambda image: (image.format, image.mode, np.asarray(image)), "the mask", "save it as PNG again"
+        )
     except FileNotFoundError:
         raise UserError(f"the mask {path} does not exist: check the path.") from None
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
-        raise UserError(f"the mask {path} cannot be read as an image ({error}): save it as PNG again.") from None
     if form == "JPEG":
         raise UserError(f"the mask {path} is a JPEG, which blurs class ids: save it as 8-bit or 16-bit grey PNG.")
     return mode, values
@@ -90,10 +88,8 @@ def write_class_map(path: Path | str, array: np.ndarray) -> None:
         raise UserError(
             f"the class map for {path} holds ids {array.min()}..{array.max()}: only 0..{IGNORE} can be saved."
         )
-    try:
+    with writing(path, "the class map "):
         Image.fromarray(array.astype(np.uint8 if array.max() <= 255 else np.uint16)).save(path, format="PNG")
-    except OSError as error:
-        raise UserError(f"the class map {path} cannot be written: {error}.") from None
 
 
 def check_names(names: Mapping[int, str]) -> None:
@@ -133,20 +129,25 @@ def read_classes(path: Path | str | None, ids_present: Iterable[int] | None = No
 
 def _read_names(path: Path) -> dict[int, str]:
     try:
-        pairs = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=list)
+        pairs = load_json(path, object_pairs_hook=list)
     except FileNotFoundError:
-        raise UserError(f"the class names {path} do not exist: check the path.") from None
+        raise UserError(f"the class names {path} do not exist: correct the path.") from None
     except (OSError, ValueError) as error:
-        raise UserError(f"the class names {path} cannot be read as JSON: {error}.") from None
+        told = f'the class names {path} cannot be read as JSON ({reason(error)}): write e.g. {{"1": "cup"}}.'
+        raise UserError(told) from None
     # The hook turns every object into a list of pairs, so that an id given twice is still seen.
     if not isinstance(pairs, list) or not all(isinstance(pair, tuple) for pair in pairs):
         raise UserError(f'the class names {path} must be one JSON object such as {{"1": "cup"}}.')
     names: dict[int, str] = {}
     for key, name in pairs:
-        if not (key.isascii() and key.isdigit() and int(key) < IGNORE):
-            raise UserError(f"{path} has the class id {key!r}: ids are whole numbers in 0..{IGNORE - 1}.")
+        digits = key.isascii() and key.isdigit()
+        if not digits or len(key) > 9 or int(key) >= IGNORE:  # Python refuses to convert thousands of digits
+            shown = key if len(key) <= 40 else f"{key[:37]}..."
+            raise UserError(f"{path} has the class id {shown!r}: ids are whole numbers in 0..{IGNORE - 1}.")
         if not isinstance(name, str) or not name.strip():
             raise UserError(f"{path} gives class {key} no name: write a non-empty string.")
+        if not name.strip().isprintable():
+            raise UserError(f"{path} gives class {key} the name {name!r:.60}: write one line of plain text.")
         if int(key) in names:
             raise UserError(f"{path} names class {int(key)} twice: keep one of the lines.")
         names[int(key)] = name.strip()

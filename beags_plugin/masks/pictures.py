@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from beags_plugin.errors import writing
 from beags_plugin.evaluation.cells import below, beside, cell, write_picture
 from beags_plugin.masks.classes import colorize
 from beags_plugin.rasterizers.interface import IGNORE
@@ -119,5 +120,6 @@ def coverage_picture(
     axes.tick_params(labelsize=7)
     axes.set_title("Share of each view that an object covers (white: absent, hatched: no mask)", fontsize=9)
     figure.colorbar(image, ax=axes, label="% of the view")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=110)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -77,9 +78,20 @@ def check_cameras(cameras: Cameras, images: Sequence[Path]) -> None:
             raise UserError(f"the camera of {path} is of type {kind}: undistort the images to a pinhole camera first.")
         if not rigid[i]:
             raise UserError(f"the pose of {path} is not a rotation and a translation: correct its transform_matrix.")
+        K = [float(getattr(cameras, name)[i]) for name in ("fx", "fy", "cx", "cy")]
+        if not all(map(math.isfinite, K)) or not min(K[:2]) > 0:
+            raise UserError(
+                f"the camera of {path} has the focal length {K[0]:g}, {K[1]:g} and the principal point {K[2]:g}, "
+                f"{K[3]:g}: correct its poses."
+            )
+        if min(int(cameras.width[i]), int(cameras.height[i])) < 1:
+            raise UserError(f"the camera of {path} has no pixels: correct its width and height.")
     fisheye = cameras.camera_type[:, 0] == CameraType.FISHEYE.value
     parameters = cameras.distortion_params
     assert parameters is not None  # both of nerfstudio's parsers give them, zeros for no distortion
+    if not bool(parameters.isfinite().all()):
+        index = int((~parameters.isfinite()).any(1).nonzero()[0])
+        raise UserError(f"the lens distortion of {images[index]} is no number: correct the poses.")
     if (parameters[~fisheye, 3] != 0).any():
         raise UserError(f"the cameras have k4 != 0, which cannot be undone: undistort {images[0].parent} first.")
     # nerfstudio takes all-zero parameters for "no distortion", which is wrong for an equidistant fisheye: it has to be

@@ -78,6 +78,14 @@ class BeagsTrainerConfig(TrainerConfig):
         """The folder (or transforms .json) that the run is trained on: --data, or the data parser's own."""
         return Path(self.data_config.data or self.data_config.dataparser.data)
 
+    def check(self) -> None:
+        """Raise ``UserError`` for a value with which no training can run."""
+        if self.max_num_iterations < 0:
+            raise UserError(f"--max-num-iterations is {self.max_num_iterations}: give a number of steps, 0 for all.")
+        if self.steps_per_save < 1:
+            raise UserError(f"--steps-per-save is {self.steps_per_save}: give a number of steps, 1 or more.")
+        self.model_config.check()
+
     def get_base_dir(self) -> Path:
         """Folder of the run."""
         return self.run_dir if self.run_dir is not None else super().get_base_dir()

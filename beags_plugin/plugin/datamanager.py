@@ -23,6 +23,7 @@ from torch import Tensor
 import beags_plugin.plugin.nerfstudio_patches  # noqa: F401  (checkpoints load again)
 from beags_plugin.core import processes
 from beags_plugin.core.cameras import Camera
+from beags_plugin.errors import UserError
 from beags_plugin.masks.label_maps import PackedMap, narrowed, widened
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.dataparser import BeagsDataParserConfig, absolute
@@ -222,9 +223,12 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on with the views in the order in which the run that gave ``state`` would have."""
-        if state["sizes"] != [len(self.train_dataset), len(self.eval_dataset)]:
-            CONSOLE.print("The data has another number of views than when training began: their order starts anew.")
-            return
+        now = [len(self.train_dataset), len(self.eval_dataset)]
+        if (began := list(state["sizes"])) != now:
+            raise UserError(
+                f"training began with {began[0]} views and {began[1]} held out, but {self.config.data} has {now[0]} "
+                f"and {now[1]} now: restore the data, or train again."
+            )
         self.train_unseen_cameras = list(state["train"])
         self.eval_unseen_cameras = list(state["eval"])
         self._eval_order.setstate(state["eval_generator"])

@@ -5,6 +5,7 @@ Nothing here may import a data manager: nerfstudio loads this module while it is
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +26,9 @@ from beags_plugin.errors import UserError
 from beags_plugin.plugin.cameras import check_cameras, downscaled_size, resize_cameras
 from beags_plugin.plugin.poses import Normalization, PosedViews, read_poses
 from beags_plugin.plugin.seed_points import starting_points
+from beags_plugin.rasterizers.interface import IGNORE
+
+LEAST_PIXELS = 2  # of a side that was scaled down; fewer show nothing
 
 
 @dataclass
@@ -69,6 +73,22 @@ class BeagsDataParserConfig(DataParserConfig):
     """Number of points to start from where the data brings none."""
     random_points_seed: int = 0
     """Seed of these points."""
+
+    def check(self) -> None:
+        """Raise ``UserError`` for a value that nothing can be made of."""
+        if not 1.0 <= self.downscale_factor < math.inf:
+            raise UserError(f"downscale_factor is {self.downscale_factor}: give 1 (full size) or more.")
+        for name in ("scale_factor", "scene_scale"):
+            if not 0.0 < (value := getattr(self, name)) < math.inf:
+                raise UserError(f"{name} is {value}: give a number above 0.")
+        if self.eval_interval < 0:
+            raise UserError(f"eval_interval is {self.eval_interval}: give a number of views, or 0 to hold out none.")
+        if self.num_random_points < 4:
+            raise UserError(f"num_random_points is {self.num_random_points}: a scene starts from at least 4.")
+        if self.random_points_seed < 0:
+            raise UserError(f"random_points_seed is {self.random_points_seed}: give 0 or more.")
+        if wrong := [index for index in self.ignore_ids if not 0 <= index <= IGNORE]:
+            raise UserError(f"ignore_ids holds {wrong[0]}: ids are whole numbers in 0..{IGNORE}.")
 
     def __setattr__(self, name: str, value: object) -> None:
         """Keep ``data`` absolute, so that a saved config.yml works from any folder."""
@@ -119,8 +139,7 @@ class BeagsDataParser(DataParser):
     def posed_views(self) -> tuple[Scene, PosedViews]:
         """The scene and all its views, before anything is asked of masks."""
         config = self.config
-        if not config.downscale_factor >= 1.0:
-            raise UserError(f"downscale_factor is {config.downscale_factor}: give 1 (full size) or more.")
+        config.check()
         self._scene = scene = read_scene(Path(config.data).absolute(), config.layout, config.images_path)
         options = {name: getattr(config, name) for name in Normalization.__dataclass_fields__}
         views = read_poses(scene.poses, scene.root, Normalization(**options))
@@ -160,6 +179,7 @@ class BeagsDataParser(DataParser):
         check_same_size(masks, sizes)
         present = [mask for mask in masks if mask is not None and kind == "ids"]
         classes_file = scene.root / config.classes_path
+        self._check_named(folder, classes_file)
         known = (scene.class_names, scene.class_names_file)
         return {
             **starting_points(scene, views, config.num_random_points, config.random_points_seed),
@@ -169,6 +189,14 @@ class BeagsDataParser(DataParser):
             "ignore_ids": tuple(config.ignore_ids),
             "ground_truth": find_ground_truth(scene.root / config.ground_truth_path, scene, views.images, images_root),
         }
+
+    def _check_named(self, masks: Path, classes: Path) -> None:
+        """Raise ``UserError`` where the user has named masks or classes that are not there."""
+        if self.config.masks_path is not None and not masks.is_dir():
+            raise UserError(f"the folder of masks {masks} does not exist: correct masks_path.")
+        usual = self.config.classes_path == Path("classes.json")
+        if classes.is_dir() or not (usual or classes.is_file()):
+            raise UserError(f"the class names {classes} are no file: correct classes_path.")
 
     def _masks(self, scene: Scene) -> tuple[Path, MaskKind]:
         """The folder of the masks, and what they are."""
@@ -190,6 +218,11 @@ class BeagsDataParser(DataParser):
                 )
         actual = torch.tensor(sizes).to(torch.int64)
         size = downscaled_size(actual, self.config.downscale_factor)
+        if int(size.min()) < LEAST_PIXELS <= int(actual.min()):
+            raise UserError(
+                f"downscale_factor is {self.config.downscale_factor:g}, which leaves {int(size.min())} pixels of "
+                f"a side of {views.images[0]}: give less, so that {LEAST_PIXELS} or more are left."
+            )
         resize_cameras(cameras, size[:, :1], size[:, 1:])
 
     def _views_of_split(self, views: PosedViews, split: str) -> list[int]:

@@ -12,6 +12,7 @@ from PIL import Image
 from beags_plugin.errors import UserError
 from beags_plugin.plugin.cameras import downscaled_size, resize_cameras
 from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.reading.images import read_image
 
 
 class BeagsDataset(InputDataset):
@@ -39,22 +40,25 @@ class BeagsDataset(InputDataset):
     def get_numpy_image(self, image_idx: int) -> np.ndarray:
         """The image [H, W, 3] uint8, sRGB, before undistortion."""
         path = self._dataparser_outputs.image_filenames[image_idx]
-        with Image.open(path) as image:
+
+        def read(image: Image.Image) -> np.ndarray:
             if image.mode.startswith(("I", "F")):
                 raise UserError(f"the image {path} has more than 8 bits per channel: convert it to 8 bits.")
             if image.has_transparency_data:
                 image = image.convert("RGBA")
                 image = Image.alpha_composite(Image.new("RGBA", image.size, (0, 0, 0, 255)), image)
-            pixels = np.array(image.convert("RGB"))
-        return resize_area(pixels, *self.file_sizes[image_idx])
+            return np.array(image.convert("RGB"))
+
+        return resize_area(read_image(path, read), *self.file_sizes[image_idx])
 
     def get_alpha(self, image_idx: int) -> np.ndarray | None:
         """The image's alpha [H, W] uint8, before undistortion; None if it is opaque everywhere."""
-        with Image.open(self._dataparser_outputs.image_filenames[image_idx]) as image:
-            if not image.has_transparency_data:
-                return None
-            alpha = np.array(image.convert("RGBA").getchannel("A"))
-        return None if (alpha == 255).all() else resize_area(alpha, *self.file_sizes[image_idx])
+
+        def read(image: Image.Image) -> np.ndarray | None:
+            return np.array(image.convert("RGBA").getchannel("A")) if image.has_transparency_data else None
+
+        alpha = read_image(self._dataparser_outputs.image_filenames[image_idx], read)
+        return None if alpha is None or (alpha == 255).all() else resize_area(alpha, *self.file_sizes[image_idx])
 
     def get_metadata(self, data: dict) -> dict:
         """The class map that belongs to ``data["image_idx"]``."""

@@ -22,12 +22,12 @@ from beags_plugin.plugin.extract import (
     SavedScene,
     file_name,
     folder_names,
-    load_run_config,
     load_scene,
     objects_with_gaussians,
     read_scene,
     read_transform,
 )
+from beags_plugin.plugin.run_config import load_run_config
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -11,13 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-import yaml
 from torch import Tensor
 
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
+from beags_plugin.errors import UserError, writing
 from beags_plugin.extraction.ply import write_ply
 from beags_plugin.extraction.select import remove_class, select_class
+from beags_plugin.plugin.run_config import load_run_config
 from beags_plugin.plugin.runs import (
     EXTRACTION_FILE,
     TRANSFORM_FILE,
@@ -26,7 +27,9 @@ from beags_plugin.plugin.runs import (
     write_run,
     write_text_atomically,
 )
+from beags_plugin.plugin.saved_state import check_state
 from beags_plugin.plugin.training_state import read_checkpoint
+from beags_plugin.reading.text import load_json, reason
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
@@ -68,27 +71,14 @@ class SavedScene:
         return self.state["class_ids"] if self.assigned else None
 
 
-def load_run_config(config_path: Path) -> BeagsTrainerConfig:
-    """The config of a run of ours; raises ``UserError`` if the file is none."""
-    from beags_plugin.plugin.config import BeagsTrainerConfig
-
-    try:
-        config = yaml.load(config_path.read_text("utf8"), Loader=yaml.Loader)
-    except OSError as error:
-        raise UserError(f"{config_path} cannot be read ({error.strerror}): name the config.yml of a run.") from error
-    except Exception as error:  # yaml raises whatever the named classes raise
-        raise UserError(f"{config_path} is not a readable run config ({type(error).__name__}: {error}).") from error
-    if not isinstance(config, BeagsTrainerConfig):
-        raise UserError(f"{config_path} is not a run of ns-train beags: name the config.yml of one.")
-    return config
-
-
 def read_scene(config_path: Path) -> SavedScene:
     """Read a run's newest checkpoint; raises ``UserError`` if the run is incomplete or the file is damaged."""
     config = load_run_config(config_path)
-    checkpoint = read_checkpoint(newest_checkpoint(config.get_checkpoint_dir()))
+    path = newest_checkpoint(config.get_checkpoint_dir())
+    checkpoint = read_checkpoint(path)
     prefix = "_model."
     state = {name[len(prefix) :]: value for name, value in checkpoint["pipeline"].items() if name.startswith(prefix)}
+    check_state(state, path)
     return SavedScene(config, state, checkpoint["step"], state["_extra_state"]["classes"])
 
 
@@ -124,10 +114,8 @@ def extract_objects(
     transform = read_transform(run)
     select = remove_class if remove else select_class
     folders, target = folder_names(scene.classes), output or run / "extracted"
-    try:
+    with writing(target):
         target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{target} cannot be written ({error.strerror}): choose another place.") from error
     prepared = prepared_digests(run)  # tells whether the run was trained again later
     written = []
     for name in names:
@@ -167,12 +155,23 @@ def _rows(state: dict[str, Any], index: Tensor) -> dict[str, Any]:
 
 
 def read_transform(run: Path) -> tuple[Tensor, float] | None:
-    """The data parser's transform ([3, 4], scale) that a run was trained in; None if the run has not kept it."""
+    """The data parser's transform ([3, 4], scale) that a run was trained in; None if the run has not kept it.
+
+    Raises ``UserError`` if the file is damaged.
+    """
     path = run / TRANSFORM_FILE
     if not path.exists():
         return None
-    content = json.loads(path.read_text("utf8"))
-    return torch.tensor(content["transform"], dtype=torch.float64), float(content["scale"])
+    try:
+        content = load_json(path)
+        transform, scale = torch.tensor(content["transform"], dtype=torch.float64), float(content["scale"])
+        if transform.shape != (3, 4):
+            raise ValueError(f"its transform is {list(transform.shape)}, not [3, 4]")
+        if not (bool(transform.isfinite().all()) and math.isfinite(scale) and scale > 0):
+            raise ValueError("it holds what is no number, or a scale that is not above 0")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path} cannot be read ({reason(error)}): restore it.") from error
+    return transform, scale
 
 
 def folder_names(classes: dict[int, str]) -> dict[int, str]:

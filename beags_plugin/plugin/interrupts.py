@@ -56,4 +56,5 @@ def stop(error: UserError) -> NoReturn:
     """End the program with the sentence of a user's mistake, and exit code 2."""
     CONSOLE.quiet = False  # as it is in other processes than the first
     CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}", highlight=False, soft_wrap=True)
+    error.told = True
     raise SystemExit(2) from error  # the cause is for callers from Python

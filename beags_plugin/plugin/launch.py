@@ -54,7 +54,7 @@ def resumed_config(run: Path) -> BeagsTrainerConfig:
     """The config with which ``resume`` trains."""
     from nerfstudio.utils.rich_utils import CONSOLE
 
-    from beags_plugin.plugin.extract import load_run_config
+    from beags_plugin.plugin.run_config import load_run_config
     from beags_plugin.plugin.runs import newest_checkpoint
     from beags_plugin.plugin.training_state import read_checkpoint, scene_alone
 

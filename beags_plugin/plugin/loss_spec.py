@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+import math
+from dataclasses import dataclass, field, fields
+from typing import Literal, get_args
 
+from beags_plugin.errors import UserError
 from beags_plugin.losses import LOSSES
 from beags_plugin.losses.base import Loss
 from beags_plugin.plugin.schedule import PhaseSchedule
+
+Phase = Literal["base", "refine", "both"]
 
 
 @dataclass
@@ -16,7 +20,7 @@ class LossSpec:
 
     weight: float = 1.0
     """Factor in the sum; 0 switches the term off."""
-    phase: Literal["base", "refine", "both"] = "both"
+    phase: Phase = "both"
     """Where the term may act."""
     start: int = 0
     """First step of the term: of the run, stated for a base of schedule_steps; or, for phase "refine", of the
@@ -25,9 +29,20 @@ class LossSpec:
     """Options of the loss itself, e.g. ssim_weight or samples."""
 
     def build(self, name: str, schedule: PhaseSchedule) -> Loss:
-        """The loss, with its steps made absolute."""
+        """The loss, with its steps made absolute; raises ``UserError`` for a value that it cannot have."""
+        kind = LOSSES.get(name)
+        if not 0.0 <= self.weight < math.inf:
+            raise UserError(f"the loss {name} has the weight {self.weight}: give 0 (off) or more.")
+        if self.phase not in (phases := get_args(Phase)):
+            raise UserError(f"the loss {name} has the phase {self.phase!r}: choose one of {', '.join(phases)}.")
+        if self.start < 0:
+            raise UserError(f"the loss {name} starts at step {self.start}: give 0 or more.")
+        known = [field.name for field in fields(kind) if field.name not in ("weight", "start", "stop")]
+        if unknown := sorted(set(self.options) - set(known)):
+            choice = f"choose of {', '.join(known)}" if known else "it has none"
+            raise UserError(f"the loss {name} has no option {unknown[0]!r}: {choice}.")
         first = schedule.base_steps + self.start if self.phase == "refine" else schedule.scaled(self.start)
         if self.phase != "refine" and (schedule.base_steps == 0 or schedule.warm):
             first = 0  # the base was trained elsewhere: its terms have long started
         last = schedule.base_steps if self.phase == "base" else None
-        return LOSSES.get(name)(weight=self.weight, start=first, stop=last, **self.options)
+        return kind(weight=self.weight, start=first, stop=last, **self.options)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.data.files import image_size, photo_names
-from beags_plugin.errors import UserError
+from beags_plugin.errors import UserError, writing
 from beags_plugin.masks.classes import check_names, write_class_map
 from beags_plugin.masks.pictures import overlay
 from beags_plugin.masks.rims import snap_to_edges
@@ -136,8 +136,13 @@ def make_masks(
     made_of = SourceScene(scene.root, photos, RunGeometry(run) if run is not None and source.needs_run else None)
     shares: list[float] = []
     shown: list[tuple[Photo, Path]] = []
-    folder.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=".masks_", dir=folder) as temporary, progress_bar("Making masks") as progress:
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    with (
+        writing(folder),
+        TemporaryDirectory(prefix=".masks_", dir=folder) as temporary,
+        progress_bar("Making masks") as progress,
+    ):
         unfinished = {place: Path(temporary) / place.name for place in (masks, look_at)}
         made = source.make(made_of, progress)
         check_names(made.names)
@@ -158,7 +163,7 @@ def make_masks(
         for place, new in unfinished.items():
             _take_the_place(new, place, {image.stem for image in views.images})
     names = {str(i): name for i, name in sorted(made.names.items())}
-    write_whole(classes, lambda file: file.write(json.dumps(names, indent=1).encode("utf8")))
+    write_whole(classes, lambda file: file.write(json.dumps(names, indent=1).encode()))
     _picture(folder / "made.png", shown)
     aside = len(shown) - len(shares)
     return [

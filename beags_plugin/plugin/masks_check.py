@@ -12,7 +12,7 @@ import numpy as np
 
 from beags_plugin.data.files import image_size, photo_names
 from beags_plugin.data.scene import Scene
-from beags_plugin.errors import UserError
+from beags_plugin.errors import UserError, writing
 from beags_plugin.masks.check.areas import Area, contradicted
 from beags_plugin.masks.check.consistency import Agreement, labels_at, ranks_of
 from beags_plugin.masks.check.disagreement import views_against_others
@@ -22,9 +22,9 @@ from beags_plugin.masks.classes import read_classes
 from beags_plugin.masks.pictures import contradictions, coverage_picture
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.dataparser import BeagsDataParser, BeagsDataParserConfig
-from beags_plugin.plugin.extract import load_run_config
 from beags_plugin.plugin.lenses import project_through_lens
 from beags_plugin.plugin.poses import PosedViews
+from beags_plugin.plugin.run_config import load_run_config
 from beags_plugin.plugin.seed_points import random_points, starting_points
 from beags_plugin.progress import progress_bar
 from beags_plugin.rasterizers.interface import IGNORE
@@ -191,12 +191,13 @@ def _areas(run: ReprojectedRun, index: int) -> list[Area]:
 
 def write_report(report: Report, output: Path, run: ReprojectedRun | None = None, shown: int = 6) -> list[Path]:
     """Write report.json, coverage.png and, with a run that contradicts masks, contradicted.png; what was written."""
-    output.mkdir(parents=True, exist_ok=True)
     coverage = report.coverage
     share = coverage.pixels / np.maximum(coverage.size, 1)[:, None]
     written = [output / "report.json", output / "coverage.png"]
-    written[0].write_text(json.dumps(report.to_json(), indent=1), "utf8")
-    coverage_picture(written[1], report.stems, coverage.ids, report.names, share, coverage.usable)
+    with writing(output):
+        output.mkdir(parents=True, exist_ok=True)
+        written[0].write_text(json.dumps(report.to_json(), indent=1), "utf8")
+        coverage_picture(written[1], report.stems, coverage.ids, report.names, share, coverage.usable)
     if run is not None and report.areas:
         boxes: dict[str, list[tuple[int, int, int, int]]] = {}
         for area in report.areas:

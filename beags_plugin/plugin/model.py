@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +16,8 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import DensifyConfig, initial_surfels
+from beags_plugin.core.sh import MAX_DEGREE
+from beags_plugin.errors import UserError
 from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.photometric import ssim
 from beags_plugin.occupancy.grid import VisibilityGrid
@@ -88,6 +91,24 @@ class BeagsModelConfig(ModelConfig):
     """Near plane in units of the scene's extent."""
     far: float = 100.0
     """Far plane in units of the scene's extent."""
+
+    def check(self) -> None:
+        """Raise ``UserError`` for a value that training could not work with, or would only end with."""
+        for name in ("base_steps", "refine_steps", "schedule_steps"):
+            if (steps := getattr(self, name)) < 0:
+                raise UserError(f"{name} is {steps}: give a number of steps, 0 or more.")
+        if not 0 <= self.sh_degree <= MAX_DEGREE:
+            raise UserError(f"sh_degree is {self.sh_degree}: choose 0 to {MAX_DEGREE}.")
+        for name, value in (("sh_degree_interval", self.sh_degree_interval), ("densify.every", self.densify.every)):
+            if value < 1:
+                raise UserError(f"{name} is {value}: give a number of steps, 1 or more.")
+        if not 0 < self.near < self.far < math.inf:
+            raise UserError(f"near is {self.near} and far {self.far}: near must lie above 0 and below far.")
+        if not all(0 < rate < math.inf for rate in self.position_lr):
+            raise UserError(f"position_lr is {self.position_lr}: give two learning rates above 0.")
+        for name in ("base_lr_power", "refine_position_lr_factor", "refine_shape_lr_factor"):
+            if not 0 <= (value := getattr(self, name)) < math.inf:
+                raise UserError(f"{name} is {value}: give 0 or more.")
 
     def schedule(self) -> PhaseSchedule:
         """Steps of both phases."""

@@ -5,7 +5,6 @@ Nothing here may import a data manager: nerfstudio loads this module while it is
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -20,9 +19,11 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from beags_plugin.data.colmap_binary import check_colmap_binary
 from beags_plugin.data.files import existing_images, photo_names
 from beags_plugin.data.layouts.colmap import points_file
 from beags_plugin.data.scene import ColmapModel, Poses, PoseTable, TransformsFile
+from beags_plugin.data.transforms_file import read_transforms
 from beags_plugin.errors import UserError
 from beags_plugin.plugin.cameras import concatenate_cameras
 from beags_plugin.plugin.colmap_files import read_lens
@@ -80,6 +81,8 @@ def read_poses(poses: Poses, root: Path, normalization: Normalization) -> PosedV
     named_as = sorted(index_of, key=lambda path: path.as_posix())
     if not named_as:
         raise UserError(f"{file} holds no images: give poses for at least two.")
+    if len(named_as) < 2 and not named:
+        raise UserError(f"{file} holds the pose of one image alone: give poses for at least two.")
     cameras = concatenate_cameras([part.cameras for part in parts])[torch.tensor([index_of[i] for i in named_as])]
     members = None
     if named:
@@ -126,13 +129,7 @@ class _Transforms(Nerfstudio):
 def _transforms_parser(poses: TransformsFile, root: Path, normalization: Normalization) -> tuple[DataParser, list[str]]:
     """nerfstudio's parser, and the splits that transforms.json names."""
     file = poses.file
-    try:
-        meta = json.loads(file.read_text(encoding="utf-8"))
-        frames = meta["frames"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{file} is not a nerfstudio transforms file: {error!r}.") from error
-    if not frames:
-        raise UserError(f"{file} names no frames: give poses for at least two images.")
+    meta = read_transforms(file)
     parser = _Transforms(
         NerfstudioDataParserConfig(
             data=root if file.name == "transforms.json" else file,
@@ -148,6 +145,9 @@ def _transforms_parser(poses: TransformsFile, root: Path, normalization: Normali
 
 def _colmap_parser(poses: ColmapModel, root: Path, normalization: Normalization) -> tuple[DataParser, list[str]]:
     """nerfstudio's COLMAP parser, and the splits named by ``<split>_list.txt``."""
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        if (poses.folder / name).is_file():
+            check_colmap_binary(poses.folder / name)
     parser = ColmapDataParser(
         ColmapDataParserConfig(
             data=root,
@@ -169,6 +169,8 @@ def _delegate(parser: DataParser, split: str, file: Path) -> DataparserOutputs:
         return parser.get_dataparser_outputs(split)
     except UserError:
         raise
+    except ZeroDivisionError as error:  # while the world is scaled by how far the cameras are apart
+        raise UserError(f"the poses in {file} are all of one place: give photos from several places.") from error
     # nerfstudio asserts, and its readers let KeyError, struct.error and the like through
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__

@@ -17,12 +17,14 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.assignment.assignment import Assignment
 from beags_plugin.core import processes
+from beags_plugin.core.cameras import Camera
 from beags_plugin.digests import code_digest
-from beags_plugin.errors import UserError
+from beags_plugin.errors import UserError, writing
 from beags_plugin.masks.classes import read_class_map, write_class_map
 from beags_plugin.masks.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.memory import peak_memory_mb
+from beags_plugin.plugin.prepared_grid import read_grid
 from beags_plugin.plugin.runs import BASE_SNAPSHOT, PREPARED, STAGES, round_folder, write_run, write_text_atomically
 from beags_plugin.plugin.scene_edits import edit_scene
 from beags_plugin.progress import progress_bar
@@ -204,28 +206,44 @@ class RefinementSwitch:
                 f"{former} was refining, but its folder {PREPARED} with masks and voxel grids is missing: restore it, "
                 f"or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
             )
-        state = torch.load(folder / "grid.pt", weights_only=True)
-        if state and self._background_voxels() and not bool((state["classes"] == 0).any()):
+        grid = read_grid(folder / "grid.pt")
+        if grid is not None and self._background_voxels() and not bool((grid.classes == 0).any()):
             raise UserError(
                 f"{folder / 'grid.pt'} has no voxels of the background, which a loss now asks about: set background of "
                 f"the occupancy loss to False, or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
             )
         labels = LabelMaps(
-            torch.from_numpy(read_class_map(folder / "masks" / f"{view.name}.png").astype(np.int32))
+            _prepared_labels(folder / "masks" / f"{view.name}.png", view.camera)
             for view in self.datamanager.views("train")
         )
-        self._start(VisibilityGrid.from_state_dict(state) if state else None, labels)
+        self._start(grid, labels)
         self.model.refining_since = time.perf_counter()
         CONSOLE.print(f"  refinement taken up from {folder}", highlight=False, markup=False, soft_wrap=True)
 
 
+def _prepared_labels(path: Path, camera: Camera) -> torch.Tensor:
+    """[H, W] int32 of the mask that refinement was prepared with for a view of this camera."""
+    if not path.is_file():
+        raise UserError(
+            f"the prepared mask {path} is missing: restore it, or refine again from base/nerfstudio_models."
+        )
+    labels = torch.from_numpy(read_class_map(path).astype(np.int32))
+    if labels.shape != (camera.height, camera.width):
+        raise UserError(
+            f"the prepared mask {path} is {labels.shape[1]}x{labels.shape[0]} pixels but its view is "
+            f"{camera.width}x{camera.height}: restore the data, or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
+        )
+    return labels
+
+
 def save_prepared(prepared: Preparation, names: list[str], folder: Path) -> None:
     """Keep what refinement needs; grid.pt is written last, so its presence says that all is there."""
-    (folder / "grid.pt").unlink(missing_ok=True)  # an earlier run's
-    if folder.name == PREPARED:
-        _clear(folder)
-    (folder / "masks").mkdir(parents=True, exist_ok=True)
-    (folder / "confidence").mkdir(exist_ok=True)
+    with writing(folder):
+        (folder / "grid.pt").unlink(missing_ok=True)  # an earlier run's
+        if folder.name == PREPARED:
+            _clear(folder)
+        (folder / "masks").mkdir(parents=True, exist_ok=True)
+        (folder / "confidence").mkdir(exist_ok=True)
     for index, name in enumerate(names):
         labels = prepared.labels[index]
         write_class_map(folder / "masks" / f"{name}.png", labels.cpu().numpy().astype(np.uint16))
@@ -255,6 +273,7 @@ def released(lock: Lock) -> Iterator[None]:
 
 
 def _write_grey(path: Path, values: torch.Tensor) -> None:
-    import cv2
+    from PIL import Image
 
-    cv2.imwrite(str(path), values.cpu().numpy())
+    with writing(path):  # cv2 would say nothing of a full disk
+        Image.fromarray(values.cpu().numpy()).save(path)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from beags_plugin.core.filed_tensors import filed
-from beags_plugin.errors import UserError
+from beags_plugin.errors import UserError, writing
 from beags_plugin.masks.classes import write_class_map
 from beags_plugin.masks.label_maps import LabelMaps, PackedMaps
 from beags_plugin.masks.pictures import Changed, before_and_after
@@ -148,6 +148,11 @@ def write_reprojection(found: ReprojectedRun, output: Path, min_confidence: floa
     All maps are of the size of the photographs, lens distortion included, so that ``beags-data --masks-path`` takes
     them (at the run's own size if that was asked for). min_confidence: less certain pixels become IGNORE.
     """
+    with writing(output):
+        return _write_reprojection(found, output, min_confidence, shown)
+
+
+def _write_reprojection(found: ReprojectedRun, output: Path, min_confidence: float, shown: int) -> list[str]:
     from PIL import Image
 
     changes = []

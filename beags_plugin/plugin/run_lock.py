@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import IO
 
-from beags_plugin.errors import UserError
+from beags_plugin.errors import UserError, writing
 
 LOCK = ".lock"
 """File of a run's folder, locked by the process that trains there; without one it means nothing."""
@@ -57,8 +57,9 @@ def _locked(run: Path) -> IO[bytes] | None:
         import fcntl
     except ImportError:  # Windows
         return None
-    run.mkdir(parents=True, exist_ok=True)
-    file = open(run / LOCK, "ab")  # noqa: SIM115  (open as long as the lock is held)
+    with writing(run):
+        run.mkdir(parents=True, exist_ok=True)
+        file = open(run / LOCK, "ab")  # noqa: SIM115  (open as long as the lock is held)
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

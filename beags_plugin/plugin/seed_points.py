@@ -13,8 +13,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from beags_plugin.core.cameras import Camera
 from beags_plugin.data.scene import PoseTable, Scene
 from beags_plugin.errors import UserError
+from beags_plugin.extraction.splat_file import check_ply_size
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.colmap_files import read_colmap_points
+from beags_plugin.reading.text import reason
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.poses import PosedViews
@@ -60,10 +62,17 @@ def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if not path.is_file():
         raise UserError(f"the seed points {path} (ply_file_path) do not exist: restore the file or remove the key.")
     try:
+        check_ply_size(path)
         vertices = PlyData.read(str(path))["vertex"].data
         points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
-    except (PlyParseError, KeyError, ValueError) as error:
-        raise UserError(f"the seed points {path} cannot be read as a .ply with x, y, z: {error}.") from error
+    except OSError as error:
+        raise UserError(f"the seed points {path} cannot be read ({error.strerror}): restore the file.") from error
+    # plyfile lets through what numpy and the text of a header raise
+    except (PlyParseError, LookupError, ValueError, TypeError, MemoryError, OverflowError, RecursionError) as error:
+        told = f"the seed points {path} cannot be read as a .ply with x, y, z ({reason(error)}): export them again."
+        raise UserError(told) from error
+    if points.ndim != 2 or not np.isfinite(points).all():
+        raise UserError(f"the seed points {path} are not all numbers: export them again, or remove the key.")
     if not all(name in vertices.dtype.names for name in ("red", "green", "blue")):
         return points, np.full(points.shape, 128, np.uint8)
     colors = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1)

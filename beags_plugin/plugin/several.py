@@ -31,6 +31,9 @@ def default_device() -> str:
 
 def check_machine(machine: MachineConfig) -> None:
     """Raise ``UserError`` for devices that are not there."""
+    for name in ("num_devices", "num_machines"):
+        if (count := getattr(machine, name)) < 1:
+            raise UserError(f"--machine.{name.replace('_', '-')} is {count}: give 1 or more.")
     if machine.device_type == "cuda":
         if reason := cuda_extension.found()[1]:
             raise UserError(f"--machine.device-type cuda: {reason} Or train with --machine.device-type cpu.")

@@ -15,7 +15,7 @@ from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.core import processes
-from beags_plugin.errors import UserError
+from beags_plugin.errors import UserError, refused, unwritable
 from beags_plugin.plugin.forecast import MemoryWatch, check_memory, forecast, is_out_of_memory
 from beags_plugin.plugin.held_out import HeldOutCurve
 from beags_plugin.plugin.interrupts import Interrupts, stop
@@ -31,9 +31,11 @@ from beags_plugin.plugin.runs import (
     save_atomically,
     write_text_atomically,
 )
+from beags_plugin.plugin.saved_state import check_state
 from beags_plugin.plugin.several import Rank, check_machine
 from beags_plugin.plugin.training_state import STATE, VERSION, GlobalRandom, Part, read_checkpoint, training_state
 from beags_plugin.plugin.warm_start import check_start, start_from_scene
+from beags_plugin.reading.text import reason
 from beags_plugin.whole_files import remove_unfinished
 
 if TYPE_CHECKING:
@@ -57,6 +59,7 @@ class BeagsTrainer(Trainer):
         self.curve: HeldOutCurve | None = None
         self._parts: dict[str, Part] = {}
         self._loaded_states: dict[str, Any] = {}
+        self._loaded_from: Path | None = None
         self._interrupts = Interrupts(self._go_on)
         self._lock: RunLock | None = None
         self._saved_step: int | None = None
@@ -74,6 +77,7 @@ class BeagsTrainer(Trainer):
         """Load data, build the model, load a checkpoint; a user's mistake ends here, with one sentence."""
         try:
             check_machine(self.config.machine)
+            self.config.check()
             if processes.rank() == 0:
                 self._lock = run_lock(self.base_dir)
                 self._set_aside()  # at once: config.yml is this run's already, and a resume would take both for one run
@@ -88,6 +92,9 @@ class BeagsTrainer(Trainer):
         except UserError as error:
             self._release()
             stop(error)
+        except OSError as error:
+            self._release()
+            stop(self._told(error))
         except BaseException:
             self._release()
             raise
@@ -100,6 +107,10 @@ class BeagsTrainer(Trainer):
         sizes = datamanager.train_dataset.file_sizes, datamanager.eval_dataset.file_sizes
         points, program = self._model.num_points, memory_mb()
         check_memory(forecast(self.config, *sizes, seeds=points, device=self.device, program=program))
+
+    def _told(self, error: OSError) -> UserError:
+        """What the system refused where nothing else has told it, as to nerfstudio's own writers."""
+        return refused(error) or unwritable(self.base_dir, error)
 
     def _release(self) -> None:
         """Let others train in this run's folder."""
@@ -177,6 +188,8 @@ class BeagsTrainer(Trainer):
                     "smaller photos or fewer Gaussians."
                 )
             )
+        except OSError as error:
+            stop(self._told(error))
         except KeyboardInterrupt as interrupt:
             if (self.base_dir / REPORT_FILE).exists():  # complete: the signal ended what shows it in the browser
                 return
@@ -206,7 +219,10 @@ class BeagsTrainer(Trainer):
         """Let checkpoints hold the state of ``part``; it goes on from what the loaded one holds, if that does."""
         self._parts[name] = part
         if name in self._loaded_states:
-            part.restore(self._loaded_states[name])
+            try:
+                part.restore(self._loaded_states[name])
+            except (RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
+                raise _misfit(self._loaded_from, error, name) from error
 
     def _loads(self) -> bool:
         """Whether a checkpoint is loaded: what it holds counts, not the scene that its run may have started from."""
@@ -229,16 +245,26 @@ class BeagsTrainer(Trainer):
             return super()._load_checkpoint()
         checkpoint = read_checkpoint(path)
         states = training_state(checkpoint, path)
+        named = dict(self._model.classes)  # by the data
         self._start_step = checkpoint["step"] + 1
-        self.pipeline.load_pipeline(checkpoint["pipeline"], checkpoint["step"])
-        self.optimizers.load_optimizers(checkpoint["optimizers"])
-        self.grad_scaler.load_state_dict(checkpoint["scalers"])
+        check_state(_of_model(checkpoint["pipeline"]), path)
+        try:
+            self.pipeline.load_pipeline(checkpoint["pipeline"], checkpoint["step"])
+            self.optimizers.load_optimizers(checkpoint["optimizers"])
+            self.grad_scaler.load_state_dict(checkpoint["scalers"])
+        except (RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
+            raise _misfit(path, error) from error
+        if self._loads_own() and self._model.classes != named:
+            raise UserError(
+                f"the classes of {self.config.data_path} are not those with which training began "
+                f"({', '.join(self._model.classes.values())}): restore classes.json and the masks, or train again."
+            )
         CONSOLE.print(f"Loaded {path}", highlight=False, markup=False, soft_wrap=True)
         self.loaded_run = self.base_dir.absolute() if self._loads_own() else path.absolute().parent.parent
         if self.schedule.base_steps == 0 and int(self._model.refined_steps) == 0:
             self._start_step = 0  # a base that was loaded: refinement counts its own steps, and begins anew
         else:
-            self._loaded_states = states
+            self._loaded_states, self._loaded_from = states, path
 
     def _checkpoint_path(self) -> Path | None:
         config = self.config
@@ -332,3 +358,17 @@ class BeagsTrainer(Trainer):
         write_text_atomically(json.dumps(report, indent=2), self.base_dir / REPORT_FILE)
         if not self.config.keep_stages:  # a complete run asks for them no more
             shutil.rmtree(self.base_dir / PREPARED / STAGES, ignore_errors=True)
+
+
+def _of_model(pipeline: dict[str, Any]) -> dict[str, Any]:
+    """The model's part of the state of a pipeline."""
+    return {name.removeprefix("_model."): value for name, value in pipeline.items() if name.startswith("_model.")}
+
+
+def _misfit(path: Path | None, error: Exception, part: str = "") -> UserError:
+    """The sentence for a checkpoint that is whole, but of another run than this one, or changed."""
+    state = f"the state of {part} in {path}" if part else f"{path}"
+    return UserError(
+        f"{state} does not fit this run ({reason(error)}): name an earlier checkpoint, or refine again from "
+        "base/nerfstudio_models."
+    )

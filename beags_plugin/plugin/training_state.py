@@ -11,6 +11,7 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.errors import UserError
+from beags_plugin.reading.tensors import load_tensors
 
 STATE = "beags"
 """Key of a checkpoint, beside nerfstudio's own."""
@@ -50,12 +51,14 @@ class GlobalRandom:
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """All that a checkpoint holds, on the CPU; raises ``UserError`` for a file that is none."""
     try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        checkpoint = load_tensors(path)
     except FileNotFoundError:
         raise UserError(f"there is no checkpoint {path}: name one of an earlier run.") from None
-    except Exception as error:  # torch raises many kinds
-        raise UserError(f"the checkpoint {path} is damaged ({type(error).__name__}): name an earlier one.") from error
+    except ValueError as error:
+        raise UserError(f"the checkpoint {path} is damaged ({error}): name an earlier one.") from error
     if not isinstance(checkpoint, dict) or not {"step", "pipeline", "optimizers", "scalers"} <= set(checkpoint):
+        raise UserError(f"{path} is no checkpoint of ns-train: name a step-….ckpt of a run.")
+    if not isinstance(checkpoint["pipeline"], dict) or type(checkpoint["step"]) is not int:
         raise UserError(f"{path} is no checkpoint of ns-train: name a step-….ckpt of a run.")
     return checkpoint
 
@@ -68,9 +71,13 @@ def scene_alone(checkpoint: dict[str, Any]) -> bool:
 def training_state(checkpoint: dict[str, Any], path: Path) -> dict[str, Any]:
     """The states of all parts of the training by name; says so if there are none to go on from bit for bit.
 
-    Raises ``UserError`` for a checkpoint of a newer version.
+    Raises ``UserError`` for a checkpoint of a newer version, or a damaged one.
     """
     state = checkpoint.get(STATE)
+    if state is not None and not (
+        isinstance(state, dict) and isinstance(state.get("version"), int) and isinstance(state.get("parts"), dict)
+    ):
+        raise UserError(f"the state of training in {path} is damaged: name an earlier checkpoint.")
     if state is not None and state["version"] > VERSION:
         raise UserError(
             f"{path} was saved by a newer version of beags: update beags to train on from it (viewing and evaluation "

@@ -16,6 +16,7 @@ from beags_plugin.evaluation.metrics import resize_nearest
 from beags_plugin.masks.classes import read_class_map
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
+from beags_plugin.plugin.prepared_grid import grid_state, read_grid
 from beags_plugin.plugin.runs import EXTRACTION_FILE, prepared_digests, preparing_run, round_digest, round_folder
 from beags_plugin.plugin.views import unique_names
 
@@ -90,17 +91,15 @@ class ViewedRun:
     @property
     def has_grid(self) -> bool:
         """Whether refinement was prepared with a voxel grid (some refiners need none, and keep an empty file)."""
-        return self.prepared is not None and bool(torch.load(self.prepared / "grid.pt", weights_only=True, mmap=True))
+        return self.prepared is not None and bool(grid_state(self.prepared / "grid.pt", mmap=True))
 
     def load_grid(self) -> bool:
         """Read the voxel grid; tells whether there was one to read."""
         prepared = self.prepared
         if self.grid is not None or prepared is None:
             return False
-        state = torch.load(prepared / "grid.pt", weights_only=True)
-        if state:
-            self.grid = VisibilityGrid.from_state_dict(state)
-        return bool(state)
+        self.grid = read_grid(prepared / "grid.pt")
+        return self.grid is not None
 
     def mask(self, view: int, kind: str, width: int, height: int) -> Tensor | None:
         """[height, width] int32 ids or IGNORE of a training view, "before" reprojection or "after"; None without one.

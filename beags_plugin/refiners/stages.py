@@ -18,6 +18,7 @@ from beags_plugin.core.processes import is_first
 from beags_plugin.digests import input_digest
 from beags_plugin.masks.label_maps import LabelMaps, PackedMap, PackedMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.reading.tensors import load_tensors
 from beags_plugin.whole_files import write_whole
 
 FORMAT = 2
@@ -42,10 +43,8 @@ class StageStore:
         """What was kept of the stage with these inputs; None if it is not there or cannot be read."""
         for folder in (self.folder, *self.former):
             try:
-                return torch.load(_file(folder, name, digest), weights_only=True)
-            except FileNotFoundError:
-                continue
-            except Exception:  # damaged; torch raises many kinds: the stage is done again
+                return load_tensors(_file(folder, name, digest))
+            except (OSError, ValueError):  # not there, or damaged: the stage is done again
                 continue
         return None
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from beags_plugin.errors import UserError
+from beags_plugin.errors import UserError, unwritable, writing
 from beags_plugin.sample.arrangement import make_still
 from beags_plugin.sample.degrade import Degradation, degrade_mask, dropped_views, resolve_degradation
 from beags_plugin.sample.lighting import Light
@@ -23,6 +23,7 @@ from beags_plugin.sample.views import Picture, View, make_views, render_view
 
 VERSION = 8
 """Raise it whenever the same config would give other files: older samples are then rebuilt."""
+LARGEST_SIDE = 8192  # pixels
 POINT_NOISE = 0.03
 """World units, two to three pixels at 256 x 192: as a hand-held capture gives."""
 SAMPLE_FILE = "sample.json"
@@ -53,6 +54,9 @@ class SampleConfig:
         for name, low in least.items():
             if getattr(self, name) < low:
                 raise UserError(f"the sample's {name} is {getattr(self, name)}: give at least {low}.")
+        for name in ("width", "height"):
+            if getattr(self, name) > LARGEST_SIDE:
+                raise UserError(f"the sample's {name} is {getattr(self, name)}: give at most {LARGEST_SIDE}.")
         resolve_degradation(self.degradation)
 
     def as_dict(self) -> dict[str, Any]:
@@ -103,13 +107,14 @@ def write_sample(
         target.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(prefix=f".{target.name}.partial-", dir=target.parent))
     except OSError as error:
-        raise UserError(f"{target} cannot be written ({error.strerror}): choose another folder.") from error
+        raise unwritable(target, error) from error
     try:
         built = partial / "new"
-        _build(built, config, progress)
-        if old:
-            target.rename(partial / "old")
-        built.rename(target)
+        with writing(target):
+            _build(built, config, progress)
+            if old:
+                target.rename(partial / "old")
+            built.rename(target)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return target

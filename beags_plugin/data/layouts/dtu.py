@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +11,8 @@ from beags_plugin.data.files import choose_images, image_size, list_images
 from beags_plugin.data.layout import Layout
 from beags_plugin.data.scene import PoseTable, Scene
 from beags_plugin.errors import UserError
+from beags_plugin.reading.arrays import load_arrays
+from beags_plugin.reading.text import reason
 
 FILE = "cameras_sphere.npz"
 IMAGES = ("image", "images")
@@ -64,10 +65,9 @@ def read_cameras(
     sphere to the world. Raises ``UserError`` if an entry is missing or is no camera's.
     """
     try:
-        with np.load(file, allow_pickle=False) as entries:
-            table = {name: entries[name].astype(np.float64) for name in entries.files if "_mat_" in name}
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
-        raise UserError(f"the cameras {file} cannot be read: restore the file ({error}).") from error
+        table = {name: entry.astype(np.float64) for name, entry in load_arrays(file).items() if "_mat_" in name}
+    except (OSError, ValueError, TypeError) as error:
+        raise UserError(f"the cameras {file} cannot be read ({reason(error)}): restore the file.") from error
     count = sum(name.startswith("world_mat_") and not name.startswith("world_mat_inv_") for name in table)
     if count != len(images):
         raise UserError(f"{file} has {count} cameras but there are {len(images)} images: keep the images it is of.")
@@ -76,7 +76,13 @@ def read_cameras(
         projection = table.get(f"world_mat_{index}")
         if projection is None or projection.shape != (4, 4):
             raise UserError(f"{file} lacks the 4 x 4 matrix world_mat_{index}: restore the file.")
-        K, rotation, center = decompose((projection @ table.get(f"scale_mat_{index}", np.eye(4)))[:3])
+        scale = table.get(f"scale_mat_{index}", np.eye(4))
+        if scale.shape != (4, 4):
+            raise UserError(f"scale_mat_{index} in {file} is {list(scale.shape)}, not 4 x 4: restore the file.")
+        projection = (projection @ scale)[:3]
+        if not np.isfinite(projection).all() or np.linalg.matrix_rank(projection[:, :3]) < 3:
+            raise UserError(f"world_mat_{index} in {file} projects no space to an image: restore the file.")
+        K, rotation, center = decompose(projection)
         if not np.isfinite(K).all() or abs(K[0, 1]) > LARGEST_SKEW:
             raise UserError(f"world_mat_{index} in {file} is no camera with axes at right angles: correct the file.")
         K[0, 1] = 0.0

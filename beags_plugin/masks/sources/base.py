@@ -15,6 +15,7 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.errors import UserError
 from beags_plugin.masks.sources.matching import PhotoNames
+from beags_plugin.reading.images import read_image
 
 Progress = Callable[[int, int], None]
 
@@ -32,10 +33,8 @@ class Photo:
 
     def pixels(self) -> np.ndarray:
         """[H, W, 3] uint8 RGB."""
-        from PIL import Image
-
-        with Image.open(self.path) as image:
-            return np.array(image.convert("RGB"))  # a copy: torch wants memory that can be written to
+        # a copy: torch wants memory that can be written to
+        return read_image(self.path, lambda image: np.array(image.convert("RGB")))
 
 
 class Geometry(Protocol):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,9 @@ import numpy as np
 from beags_plugin.errors import UserError
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo, stacked
 from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.reading.text import load_json, reason
 
+FARTHEST = 1e5  # pixels of a polygon's points from the image's corner; the library rasterizes every one
 INSTANCE_KEYS = ("instance_id", "track_id", "object_id")
 
 
@@ -32,14 +33,16 @@ class CocoSource(MaskSource):
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
         path = scene.below(self.file)
         try:
-            content = json.loads(path.read_text("utf8"))
+            content = load_json(path)
             views = {image["id"]: str(image["file_name"]) for image in content["images"]}
             categories = {entry["id"]: str(entry["name"]) for entry in content.get("categories", [])}
             annotations = [(views[entry["image_id"]], self._key(entry), entry) for entry in content["annotations"]]
         except OSError as error:
             raise UserError(f"{path} cannot be read ({error.strerror}): give options file=...") from error
         except (AttributeError, ValueError, KeyError, TypeError) as error:
-            raise UserError(f"{path} is no COCO JSON with images and annotations: {error!r}.") from error
+            raise UserError(
+                f"{path} is no COCO JSON with images and annotations ({reason(error)}): export it again."
+            ) from error
         meant = scene.names.assigned(
             {name: name for name in views.values()}, lambda name: f"the image {name} of {path}"
         )
@@ -88,6 +91,44 @@ def _number_or_word(value: Any) -> int | str:
     return value
 
 
+def packed_total(counts: str) -> int:
+    """The sum of the run lengths in COCO's packed text: 5 bits a character, every length less that before the last.
+
+    Raises ``ValueError`` for other text, and for a length below 0. The library that unpacks it checks neither.
+    """
+    lengths: list[int] = []
+    value = shift = 0
+    for character in counts:
+        code = ord(character) - 48
+        if not 0 <= code < 64 or shift > 30:
+            raise ValueError("the counts are no packed run lengths")
+        value |= (code & 31) << shift
+        shift += 5
+        if code & 32:
+            continue
+        if code & 16:
+            value -= 1 << shift
+        length = value + (lengths[-2] if len(lengths) > 2 else 0)
+        if length < 0:
+            raise ValueError("a run is shorter than nothing")
+        lengths.append(length)
+        value = shift = 0
+    if shift:
+        raise ValueError("the counts are cut off")
+    return sum(lengths)
+
+
+def _check_polygons(polygons: Any) -> None:
+    """Raise ``ValueError`` unless these are lists of at least three x, y that lie near some image."""
+    if not isinstance(polygons, list) or not polygons:
+        raise ValueError("it is no list of polygons")
+    for polygon in polygons:
+        if not isinstance(polygon, list) or len(polygon) < 6 or len(polygon) % 2:
+            raise ValueError("a polygon is no list of three points or more")
+        if not all(type(value) in (int, float) and abs(value) < FARTHEST for value in polygon):
+            raise ValueError("a polygon has a point that lies in no image")
+
+
 def decoded(segmentation: Any, shape: tuple[int, int], where: str) -> np.ndarray:
     """[H, W] bool of one annotation: {"size", "counts"} or a list of polygons; ``where`` names it in errors."""
     from pycocotools import mask
@@ -103,12 +144,19 @@ def decoded(segmentation: Any, shape: tuple[int, int], where: str) -> np.ndarray
                 )
             counts = segmentation["counts"]
             if isinstance(counts, list):
+                if not all(type(count) is int and 0 <= count <= height * width for count in counts):
+                    raise ValueError("the counts are no lengths of runs")
                 if sum(counts) != height * width:
                     raise ValueError(f"the counts sum to {sum(counts)}")
                 runs = coco.frPyObjects(segmentation, height, width)
             else:
-                runs = {"size": [height, width], "counts": counts.encode() if isinstance(counts, str) else counts}
+                if not isinstance(counts, str):
+                    raise ValueError("its counts are neither a list nor text")
+                if (total := packed_total(counts)) != height * width:
+                    raise ValueError(f"the counts sum to {total}")
+                runs = {"size": [height, width], "counts": counts.encode("ascii")}
         else:
+            _check_polygons(segmentation)
             runs = coco.merge(coco.frPyObjects(segmentation, height, width))
         return coco.decode(runs).astype(bool)
     except UserError:

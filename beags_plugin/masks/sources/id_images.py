@@ -13,6 +13,7 @@ from beags_plugin.masks.classes import read_class_map, read_classes
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo
 from beags_plugin.masks.sources.matching import files_by_name
 from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.reading.images import read_image
 
 
 @dataclass(frozen=True)
@@ -58,13 +59,12 @@ class IdImagesSource(MaskSource):
     def _ids(self, path: Path, palette: dict[int, int]) -> np.ndarray:
         if not self.colors:
             return read_class_map(path, self.ignore_ids)
-        from PIL import Image, UnidentifiedImageError
-
-        try:
-            with Image.open(path) as image:
-                form, pixels = image.format, np.asarray(image.convert("RGB")).astype(np.uint32)
-        except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
-            raise UserError(f"the mask {path} cannot be read as an image ({error}): save it as PNG again.") from error
+        form, pixels = read_image(
+            path,
+            lambda image: (image.format, np.asarray(image.convert("RGB")).astype(np.uint32)),
+            "the mask",
+            "save it as PNG again",
+        )
         if form == "JPEG":
             raise UserError(f"the mask {path} is a JPEG, which blurs the colours of objects: save it as PNG.")
         packed = pixels[..., 0] << 16 | pixels[..., 1] << 8 | pixels[..., 2]

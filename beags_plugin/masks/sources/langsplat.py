@@ -13,6 +13,8 @@ from beags_plugin.errors import UserError
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo
 from beags_plugin.masks.sources.matching import files_by_name
 from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.reading.arrays import load_array
+from beags_plugin.reading.text import reason
 
 LEVELS = ("default", "small", "medium", "large")
 
@@ -105,9 +107,9 @@ class LangSplatSource(MaskSource):
 def _array(path: Path) -> np.ndarray:
     """A .npy file of numbers."""
     try:
-        array = np.load(path)
-    except (OSError, ValueError, EOFError) as error:
-        raise UserError(f"{path} cannot be read as an array ({error}): make it again.") from error
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+        array = load_array(path)
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read as an array ({reason(error)}): make it again.") from error
+    if array.dtype.kind not in "biuf":
         raise UserError(f"{path} is no array of numbers: give LangSplat's own files.")
     return array

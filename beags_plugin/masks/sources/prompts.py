@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from beags_plugin.errors import UserError
+from beags_plugin.reading.text import load_json, reason
 
 EXAMPLE = '{"objects": [{"name": "cup", "prompts": [{"view": "IMG_1", "box": [10, 20, 90, 80]}]}]}'
 
@@ -44,11 +44,11 @@ def read_prompts(path: Path) -> list[PromptedObject]:
     bottom], "points": [[x, y], ...], "outside": [[x, y], ...]}, ...]}, ...]}
     """
     try:
-        content = json.loads(path.read_text("utf8"))
+        content = load_json(path)
     except OSError as error:
         raise UserError(f"the prompts {path} cannot be read ({error.strerror}): give options prompts=FILE.") from error
     except ValueError as error:
-        raise UserError(f"the prompts {path} are no JSON ({error}): write e.g. {EXAMPLE}.") from error
+        raise UserError(f"the prompts {path} are no JSON ({reason(error)}): write e.g. {EXAMPLE}.") from error
     entries = content.get("objects") if isinstance(content, dict) else None
     if not isinstance(entries, list) or not entries:
         raise UserError(f'the prompts {path} have no list "objects": write e.g. {EXAMPLE}.')
@@ -58,7 +58,7 @@ def read_prompts(path: Path) -> list[PromptedObject]:
             objects.append(_object(entry, index))
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
             raise UserError(
-                f"object {index} of the prompts {path} is wrong ({error}): write e.g. {EXAMPLE}."
+                f"object {index} of the prompts {path} is wrong ({reason(error)}): write e.g. {EXAMPLE}."
             ) from error
     for what, values in (("id", [o.class_id for o in objects]), ("name", [o.name for o in objects])):
         if len(set(values)) < len(values):

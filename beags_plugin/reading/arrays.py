@@ -1,0 +1,87 @@
+"""Arrays in .npy and .npz files; nothing is unpickled, and no more memory is taken than the file can fill."""
+
+from __future__ import annotations
+
+import math
+import os
+import zipfile
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.lib import format as npy
+
+MOST_RATIO = 1_000
+"""Members of an archive that are packed more tightly are refused: no photo's poses or features are."""
+MOST_UNPACKED = 1 << 30
+"""Bytes of all members of a packed archive."""
+
+
+def load_array(path: Path) -> np.ndarray:
+    """The array of numbers (or plain values) in a .npy file.
+
+    Raises ``OSError`` if the file cannot be read, ``ValueError`` with the reason if it holds none, or objects, or is
+    shorter than its header says.
+    """
+    with open(path, "rb") as file:
+        check_header(file, os.fstat(file.fileno()).st_size)
+        file.seek(0)
+        return npy.read_array(file, allow_pickle=False)
+
+
+def load_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays in a .npz file by name; raises as ``load_array``, and for archives that unpack to too much."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            check_members(archive, path.stat().st_size)
+            found = {}
+            for member in archive.infolist():
+                with archive.open(member) as file:
+                    check_header(file, member.file_size)
+                with archive.open(member) as file:
+                    found[member.filename.removesuffix(".npy")] = npy.read_array(file, allow_pickle=False)
+            return found
+    # what zipfile and zlib raise for archives that are damaged, have passwords or ask for what Python lacks
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OverflowError, _zlib_error()) as error:
+        raise ValueError(str(error) or type(error).__name__) from None
+
+
+def check_header(file: BinaryIO | Any, size: int) -> None:
+    """Raise ``ValueError`` unless ``file`` begins with the header of an array that ``size`` bytes, all of it, can hold.
+
+    file: at its start; left behind the header.
+    """
+    try:
+        version = npy.read_magic(file)
+        header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        if version not in ((1, 0), (2, 0), (3, 0)):
+            raise ValueError(f"its format {version} is unknown")
+        shape, _, dtype = header(file)
+    except Exception as error:  # the header is a Python literal, whose reader and dtype let many kinds through
+        raise ValueError(f"its header is damaged ({type(error).__name__})") from None
+    if dtype.hasobject:
+        raise ValueError("it holds objects, which are not loaded, since they may run code")
+    if not all(0 <= length < 1 << 62 for length in shape):
+        raise ValueError(f"its shape is {list(shape)}")
+    promised = math.prod(shape) * max(dtype.itemsize, 1)  # in Python's integers, which do not overflow
+    if promised > size - file.tell():
+        raise ValueError(f"it is cut off: its header promises {promised} bytes, but {size - file.tell()} follow")
+
+
+def check_members(archive: zipfile.ZipFile, size: int) -> None:
+    """Raise ``ValueError`` for an archive, a file of ``size`` bytes, whose members would fill the memory."""
+    members = archive.infolist()
+    stored = sum(member.file_size for member in members if member.compress_type == zipfile.ZIP_STORED)
+    packed = [member for member in members if member.compress_type != zipfile.ZIP_STORED]
+    if stored > size:
+        raise ValueError("its members are longer than the file")
+    if any(member.file_size > MOST_RATIO * max(member.compress_size, 1) for member in packed):
+        raise ValueError(f"it unpacks to more than {MOST_RATIO} times its size")
+    if sum(member.file_size for member in packed) > MOST_UNPACKED:
+        raise ValueError(f"it unpacks to more than {MOST_UNPACKED} bytes")
+
+
+def _zlib_error() -> type[Exception]:
+    import zlib
+
+    return zlib.error

@@ -1,0 +1,60 @@
+"""Files of ``torch.save``: tensors and plain values only, none larger than the file."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def load_tensors(path: Path, mmap: bool = False) -> Any:
+    """What a file of ``torch.save`` holds, on the CPU.
+
+    mmap: leave tensors in the file until they are used. Raises ``FileNotFoundError``; ``ValueError`` with the reason
+    for any other file that cannot be read, holds more than tensors and plain values, or tensors that it cannot fill.
+    """
+    try:
+        size = path.stat().st_size
+        _check_archive(path, size)
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
+        _check_sizes(content, size)
+        return content
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise ValueError(error.strerror or "it is cut off") from error
+    except Exception as error:  # torch raises many kinds
+        words = " ".join(str(error).split())
+        told = "it holds more than tensors and plain values" if "Weights only load failed" in words else words[:120]
+        raise ValueError(told or type(error).__name__) from error
+
+
+def _check_archive(path: Path, size: int) -> None:
+    """Raise ``ValueError`` for what is no archive of ``torch.save``, whose members are never packed."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+    except zipfile.BadZipFile:
+        raise ValueError("it is cut off, or no file of torch.save") from None
+    if any(member.compress_type != zipfile.ZIP_STORED for member in members):
+        raise ValueError("its members are packed, which torch.save never does")
+    if sum(member.file_size for member in members) > size:
+        raise ValueError("its members are longer than the file")
+
+
+def _check_sizes(content: Any, size: int) -> None:
+    """Raise ``ValueError`` for a tensor that a few numbers stand for, or none: a copy could fill the memory."""
+    waiting, seen = [content], set()
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, Tensor):
+            if value.layout != torch.strided or value.is_meta or value.is_quantized:
+                raise ValueError("it holds tensors of an unusual kind")
+            if value.numel() * value.element_size() > size:
+                raise ValueError("it holds a tensor that is larger than the file")
+        elif isinstance(value, (dict, list, tuple, set)) and id(value) not in seen:
+            seen.add(id(value))
+            waiting += [*value.keys(), *value.values()] if isinstance(value, dict) else value

@@ -1,0 +1,305 @@
+"""The table of mistakes: what is done to a good scene or run, and the command that must then say so."""
+
+from __future__ import annotations
+
+import builtins
+import errno
+import io
+import json
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+from resumed_runs import Killed, forget_writers, run_to_end
+from run_folders import write_scene, write_trained
+
+Command = Callable[[], None]
+TRAINED = "trained"  # the folder of the run that ``Place.train`` begins
+SHORT = (
+    *("--pipeline.model.base-steps", "4", "--pipeline.model.refine-steps", "2", "--pipeline.model.prepare.k", "5"),
+    *("--pipeline.model.split.rounds", "0", "--pipeline.model.prepare.reprojection", "voxel"),
+)
+"""Flags of ns-train for a run that comes through all its phases in a second."""
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """One mistake.
+
+    make: makes it in a ``Place`` and returns the command that meets it.
+    """
+
+    area: str
+    name: str
+    make: Callable[[Place], Command]
+
+
+TABLE: dict[str, Mistake] = {}
+
+
+def mistake(area: str, name: str) -> Callable:
+    """Add what makes a mistake to the table."""
+
+    def add(make: Callable[[Place], Command]) -> Callable[[Place], Command]:
+        title = f"{area}: {name}"
+        assert title not in TABLE
+        TABLE[title] = Mistake(area, name, make)
+        return make
+
+    return add
+
+
+class Templates:
+    """A good scene and a run that was broken off, made once and copied for every mistake."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.scene = write_scene(root / "scene")
+
+    def broken_off(self, config: Any) -> Path:
+        """A run on the scene that was killed in the middle of refinement, with a checkpoint to go on from."""
+        from beags_plugin.plugin.trainer import BeagsTrainer
+
+        train = BeagsTrainer.train_iteration
+
+        def iteration(trainer, step):
+            if step == 9:
+                trainer.save_checkpoint(8)
+                raise Killed
+            return train(trainer, step)
+
+        folder = self.root / "broken_off"
+        if not folder.exists():
+            config.data, config.run_dir = self.scene, folder
+            with pytest.MonkeyPatch.context() as patch, suppress(Killed):
+                patch.setattr(BeagsTrainer, "train_iteration", iteration)
+                run_to_end(config)
+            forget_writers()
+        return folder
+
+
+class Place:
+    """The folder of one mistake: ``data``, a good scene, and ``run``, a refined run of it, appear when asked for."""
+
+    def __init__(self, root: Path, templates: Templates, patch: pytest.MonkeyPatch) -> None:
+        self.root, self.patch, self.templates = root, patch, templates
+        self.may_change: set[Path] = set()
+
+    @property
+    def data(self) -> Path:
+        """A scene of nine photos with masks, transforms.json and classes.json."""
+        folder = self.root / "data"
+        if not folder.exists():
+            shutil.copytree(self.templates.scene, folder)
+        return folder
+
+    @property
+    def run(self) -> Path:
+        """A refined run on ``data``."""
+        folder = self.root / "run"
+        if not folder.exists():
+            write_trained(folder, self.data)
+        return folder
+
+    @property
+    def checkpoint(self) -> Path:
+        """That of the run."""
+        return next((self.run / "nerfstudio_models").iterdir())
+
+    def beags(self, *words: object) -> Command:
+        """The command ``beags``; {run} stands for the config of the run."""
+        from beags_plugin import cli
+
+        texts = [str(word) for text in words for word in ([text] if isinstance(text, Path) else str(text).split())]
+        texts = [str(self.run / "config.yml") if text == "{run}" else text for text in texts]
+        return lambda: cli.main(texts)
+
+    def train(self, *flags: str, preset: str = "beags-tiny", data: Path | None = None, **settings: Any) -> Command:
+        """The command ``ns-train`` on ``data``, as nerfstudio's entry point runs it."""
+        config = self.config(*flags, preset=preset, data=data)
+        for name, value in settings.items():
+            setattr(config, name, value)
+        return self.trained(config)
+
+    @staticmethod
+    def trained(config: Any) -> Command:
+        """``ns-train`` with this config."""
+        return lambda: _ns_train(config)
+
+    def config(self, *flags: str, preset: str = "beags-tiny", data: Path | None = None) -> Any:
+        """What ns-train makes of its flags, to train in ``trained``."""
+        config = deepcopy(_parsed(preset, flags))
+        config.data = self.data if data is None else data
+        config.run_dir = self.root / TRAINED
+        config.vis = "tensorboard"
+        self.patch.setattr(type(config), "print_to_terminal", lambda config: None)  # of half a second
+        config.logging.local_writer.enable = False
+        return config
+
+    def edit_json(self, path: Path, change: Callable[[Any], Any]) -> None:
+        """Change what a JSON file holds, in place."""
+        content = json.loads(path.read_text("utf8"))
+        change(content)
+        path.write_text(json.dumps(content), "utf8")
+
+    def edit_poses(self, change: Callable[[Any], Any]) -> None:
+        """Change transforms.json."""
+        self.edit_json(self.data / "transforms.json", change)
+
+    def cut(self, path: Path, share: float = 0.5) -> Path:
+        """Keep the first part of a file only."""
+        content = path.read_bytes()
+        path.write_bytes(content[: int(share * len(content))])
+        return path
+
+    def fail_to_write(self, folder: Path, code: int = errno.ENOSPC, after: int = 0) -> None:
+        """Let the system refuse what is written below ``folder``: no space, no permission, a disk that is read-only.
+
+        after: bytes of each file that it still takes.
+        """
+        opened = io.open
+
+        def refusing(file, mode="r", *rest, **options):
+            inside = isinstance(file, (str, os.PathLike)) and Path(file).absolute().is_relative_to(folder)
+            if not inside or not set(mode) & set("wax+"):
+                return opened(file, mode, *rest, **options)
+            if code != errno.ENOSPC:
+                raise OSError(code, os.strerror(code), str(file))
+            stream = opened(file, mode, *rest, **options)
+            return _Full(stream, after) if "b" in mode else _FullText(stream)
+
+        self.patch.setattr(builtins, "open", refusing)
+        self.patch.setattr(io, "open", refusing)
+        if code != errno.ENOSPC:
+            made = os.mkdir
+
+            def refusing_folder(path, *rest, **options):
+                if Path(path).absolute().is_relative_to(folder):
+                    raise OSError(code, os.strerror(code), str(path))
+                made(path, *rest, **options)
+
+            self.patch.setattr(os, "mkdir", refusing_folder)
+
+
+def _no_space() -> OSError:
+    return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+class _Full(io.RawIOBase):
+    """A binary file on a disk that is full after some bytes."""
+
+    def __init__(self, stream: Any, left: int) -> None:
+        self._stream, self._left = stream, left
+
+    def write(self, content: Any) -> int:
+        self._left -= memoryview(content).nbytes
+        if self._left < 0:
+            raise _no_space()
+        return self._stream.write(content)
+
+    def writable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, *where: int) -> int:
+        return self._stream.seek(*where)
+
+    def tell(self) -> int:
+        return self._stream.tell()
+
+    def fileno(self) -> int:
+        return self._stream.fileno()
+
+    def close(self) -> None:
+        self._stream.close()
+        super().close()
+
+
+class _FullText(io.TextIOBase):
+    """A text file on a full disk."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def write(self, content: str) -> int:
+        raise _no_space()
+
+    def fileno(self) -> int:
+        return self._stream.fileno()
+
+    def close(self) -> None:
+        self._stream.close()
+        super().close()
+
+
+@lru_cache(None)
+def _parsed(preset: str, flags: Sequence[str]) -> Any:
+    """The config that ns-train makes of its flags; read here, as its own parser takes half a second a time."""
+    from beags_plugin.plugin.presets import load_preset
+
+    config = load_preset(preset).config
+    config.pipeline.datamanager.dataparser.num_random_points = 200
+    whole, words = config, list(flags)
+    while words:
+        word = words.pop(0)
+        if word == "beags-data":
+            config = whole.pipeline.datamanager.dataparser
+            continue
+        *parents, last = word.removeprefix("--").replace("-", "_").split(".")
+        values = []
+        while words and not words[0].startswith("--") and words[0] != "beags-data":
+            values.append(words.pop(0))
+        _set(config, parents, last, values)
+    return whole
+
+
+def _set(holder: Any, parents: list[str], name: str, values: list[str]) -> None:
+    """Set an option, also of a frozen part, as a value of the kind that it has."""
+    if not parents:
+        setattr(holder, name, _converted(getattr(holder, name), name, values))
+        return
+    part = getattr(holder, parents[0])
+    if type(part).__dataclass_params__.frozen:
+        setattr(holder, parents[0], replace(part, **{name: _converted(getattr(part, name), name, values)}))
+    else:
+        _set(part, parents[1:], name, values)
+
+
+def _converted(current: Any, name: str, values: list[str]) -> Any:
+    if isinstance(current, tuple):
+        kind = type(current[0]) if current else {"ignore_ids": int}.get(name, str)
+        return tuple(kind(value) for value in values)
+    if current is None:
+        return Path(values[0])
+    return type(current)(values[0]) if not isinstance(current, Path) else Path(values[0])
+
+
+def _ns_train(config: Any) -> None:
+    from nerfstudio.scripts.train import main
+
+    try:
+        main(config)
+    finally:
+        forget_writers()
+
+
+def summary() -> str:
+    """The table by area, in Markdown: how many mistakes are in it, and how many of them had to be mended."""
+    from mistakes.sentences import WAS
+
+    areas = list(dict.fromkeys(one.area for one in TABLE.values()))
+    rows = []
+    for area in areas:
+        own = [one for one in TABLE.values() if one.area == area]
+        rows.append(f"| {area} | {len(own)} | {sum(f'{area}: {one.name}' in WAS for one in own)} |")
+    total = f"| all | {len(TABLE)} | {len(WAS)} |"
+    return "\n".join(["| area | mistakes | mended |", "|---|---|---|", *rows, total])
