@@ -12,6 +12,7 @@ import torch
 from beags_plugin.doctor.check import Check
 from beags_plugin.errors import UserError
 from beags_plugin.plugin.memory import available_mb, memory_mb
+from beags_plugin.refiners.consistent_masks import AUTO, PAIRWISE_PIXELS
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
@@ -117,7 +118,8 @@ def forecast(
     prepares = model.schedule().refine_steps > 0
     everywhere = sum(pixels) / 1e6
     preparation = min(PREPARATION_MB, everywhere * PREPARATION_BYTES_OF_PIXEL)
-    if model.prepare.reprojection == "pairwise":
+    reprojection = model.prepare.reprojection
+    if reprojection == "pairwise" or (reprojection == AUTO and sum(pixels) <= PAIRWISE_PIXELS):
         preparation += everywhere * PAIRWISE_BYTES_OF_PIXEL
     return Forecast(
         program=program,
