@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Literal, NoReturn
 
 import tyro
 from rich.console import Console
@@ -51,11 +52,14 @@ class Resume:
     run_folder: tyro.conf.Positional[Path]
     """Folder of the run (or its config.yml)."""
 
+    device: Literal["cpu", "cuda"] | None = None
+    """Go on here instead of where it was begun; the result is then no longer the same in every bit."""
+
     def run(self) -> None:
         from beags_plugin.plugin.launch import resume
 
         try:
-            resume(self.run_folder)
+            resume(self.run_folder, self.device)
         except KeyboardInterrupt:
             sys.exit(130)
 
@@ -288,6 +292,8 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point of the command ``beags``; a user's mistake prints one sentence and ends with exit code 2."""
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
     description = "BEA-GS: clean objects out of Gaussian-splat scenes."
+    # What torch says to nerfstudio's authors, who wrote for an older one.
+    warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|nerfstudio)\.")
     try:
         command = tyro.cli(Command, args=arguments, description=description, config=config)
         command.run()

@@ -57,12 +57,12 @@ def run_to_end(config):
         forget_writers()
 
 
-def resume_to_end(run: Path):
+def resume_to_end(run: Path, device: str | None = None):
     """What ``beags resume`` does."""
     from beags_plugin.plugin.launch import resume
 
     try:
-        resume(run)
+        resume(run, device)
     finally:
         forget_writers()
 

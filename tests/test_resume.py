@@ -261,6 +261,21 @@ def test_ctrl_c_saves_the_step_and_a_resume_goes_on(data, whole, tmp_path, monke
     assert_same_run(run, whole)
 
 
+def test_a_run_of_a_gpu_goes_on_without_one_if_asked(data, tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        kill_at(patch, 20)
+        run_to_end(short_config(data, run))
+    config = run / "config.yml"
+    config.write_text(config.read_text().replace("device_type: cpu", "device_type: cuda"))
+    assert "device_type: cuda" in config.read_text()
+    if not torch.cuda.is_available():
+        with pytest.raises(UserError, match="beags resume: --device cpu"):
+            resume_to_end(run)
+    resume_to_end(run, "cpu")
+    assert checkpoint_of(run)["step"] == LAST
+
+
 def test_a_kill_before_the_first_checkpoint_starts_again(data, whole, tmp_path, monkeypatch, capsys):
     run = tmp_path / "run"
     broken_off(data, run, monkeypatch, lambda patch: kill_at(patch, 5))
