@@ -26,8 +26,8 @@ def train(config: BeagsTrainerConfig) -> None:
 def resume(run: Path, device: str | None = None) -> None:
     """Train a run that was broken off to its end, in its own folder and with the config that it was started with.
 
-    run: its folder, or config.yml in there. device: "cpu" or "cuda" in place of the config's. Without a checkpoint it starts from the beginning. Raises ``UserError`` for
-    what is no such run, and for one that is complete.
+    run: its folder, or config.yml in there. device: "cpu" or "cuda" in place of the config's. Without a checkpoint it
+    starts from the beginning. Raises ``UserError`` for what is no such run, and for one that is complete.
     """
     from nerfstudio.scripts.train import launch, train_loop
 

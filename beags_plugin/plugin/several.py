@@ -36,7 +36,10 @@ def check_machine(machine: MachineConfig) -> None:
             raise UserError(f"--machine.{name.replace('_', '-')} is {count}: give 1 or more.")
     if machine.device_type == "cuda":
         if reason := cuda_extension.found()[1]:
-            raise UserError(f"--machine.device-type cuda: {reason} Or train with --machine.device-type cpu (beags resume: --device cpu).")
+            raise UserError(
+                f"--machine.device-type cuda: {reason} Or train with --machine.device-type cpu (beags resume: --device "
+                "cpu)."
+            )
         there = torch.cuda.device_count()
         if machine.num_devices > there:
             raise UserError(f"--machine.num-devices is {machine.num_devices}, but this machine has {there} GPU(s).")
