@@ -436,7 +436,10 @@ DTU_MISTAKES = {
     "mask gone": (lambda root: (root / "mask/003.png").unlink(), "mask holds 8 masks for 9 images"),
     "smaller images": (with_smaller_images, "far from the middle of its 10x6 pixels: keep the images .* --images-path"),
     "skew": (with_skew, "world_mat_2 in .* is no camera with axes at right angles"),
-    "half a file": (lambda root: (root / "cameras_sphere.npz").write_bytes(b"PK\x03\x04"), "cannot be read .*: restore"),
+    "half a file": (
+        lambda root: (root / "cameras_sphere.npz").write_bytes(b"PK\x03\x04"),
+        "cannot be read .*: restore",
+    ),
 }
 
 
