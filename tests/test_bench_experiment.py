@@ -74,8 +74,8 @@ def test_a_file_says_variants_and_sweeps(experiment):
         ("[both]", "[sample]\nwidth = 2\n[both]", "sample: the sample's width is 2"),
         ("[both]", "[sample]\nwidht = 64\n[both]", "widht"),
         ("[both]", '[paper]\nsource = "p"\ncolumns = ["a", "b"]\n[paper.rows]\nx = [[1, 2]]\n[both]', "row 'x' must"),
-        ("[[variant]]", "[variant]", "cannot be read"),
-        ("description", "=", "cannot be read"),
+        ("[[variant]]", "[variant]", "is no TOML"),
+        ("description", "=", "is no TOML"),
     ],
 )
 def test_a_mistake_in_the_file_gets_one_sentence(tmp_path, old, new, words):

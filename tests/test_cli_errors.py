@@ -30,7 +30,7 @@ SENTENCES = {
     "sample --output {tmp}/s --degradation heavy": "there is no mask degradation 'heavy': choose one of none, mild, "
     "strong, or a degree from 0 on (1 is mild, 2 strong).",
     "sample --output {tmp}/s --width 0": "the sample's width is 0: give at least 16.",
-    "sample --output {tmp}/file/s": "{tmp}/file/s cannot be written (File exists): choose another folder.",
+    "sample --output {tmp}/file/s": "{tmp}/file/s cannot be written (File exists): choose another place.",
     "sample --output {tmp}/lab": "{tmp}/lab exists and is no sample scene: choose another folder or empty it.",
     # resume
     "resume {tmp}/absent.yml": NO_FILE,

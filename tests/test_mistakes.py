@@ -67,11 +67,10 @@ def test_every_sentence_is_of_a_mistake():
 
 
 @pytest.mark.parametrize("name", SENTENCES)
-def test_a_sentence_names_the_thing_and_the_remedy(name):
+def test_a_sentence_ends_with_the_remedy(name):
     sentence = SENTENCES[name]
-    assert sentence.endswith((".", ").")) and len(sentence) < 420, sentence
-    assert re.search(r"[{/.\w-]*(\{tmp\}|--|=| is | has | holds |'|\.json|\.toml)", sentence), sentence
-    assert re.search(r"(: |; |\. |, or )[A-Za-z-]", sentence), sentence  # what to do follows what is wrong
+    assert sentence.endswith(".") and len(sentence) < 500, sentence
+    assert re.search(r"(: |; |\. )[A-Za-z-]", sentence), sentence  # what to do follows what is wrong
 
 
 def test_the_documented_counts():

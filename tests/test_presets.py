@@ -79,7 +79,7 @@ def test_presets_do_not_share_state():
         ('description="x"\n[overrides]\n"pipeline.model.losses.nothing.weight" = 1.0', "nothing"),
         ('description="x"\n[overrides]\n"pipeline.model.base_steps" = "many"', "must be int"),
         ('description="x"\nextra=1', "unknown entries"),
-        ("description=", "cannot be read"),
+        ("description=", "is no TOML"),
     ],
 )
 def test_a_wrong_preset_is_refused_in_one_sentence(tmp_path, text, words):

@@ -160,6 +160,16 @@ def test_a_tensor_that_a_few_numbers_stand_for_is_refused(tmp_path):
     assert load_tensors(tmp_path / "b.pt")["a"].shape == (5,)
 
 
+def test_a_checkpoint_of_something_else_is_refused(tmp_path):
+    """Found by fuzzing: a bare storage is no table, and says so in an error of its own."""
+    from beags_plugin.importers.checkpoint import CheckpointImporter
+
+    for content in (torch.zeros(3).storage(), [1, 2], {"pipeline": 3}, {"pipeline": {1: 2}}):
+        torch.save(content, tmp_path / "step-000000001.ckpt")
+        with pytest.raises(UserError):
+            CheckpointImporter().read(tmp_path / "step-000000001.ckpt")
+
+
 def packed(path: Path, members: dict[str, bytes]) -> Path:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in members.items():

@@ -46,12 +46,12 @@ def choose_images(root: Path, chosen: Path | None = None) -> Path:
     return next(fitting, folders[-1])
 
 
-def image_size(path: Path) -> tuple[int, int]:
+def image_size(path: Path, what: str = "the image") -> tuple[int, int]:
     """Width and height in pixels, from the file's header; raises ``UserError`` if it is no readable image."""
     try:
-        return read_image(path, lambda image: image.size)
+        return read_image(path, lambda image: image.size, what)
     except FileNotFoundError:
-        raise UserError(f"the image {path} does not exist: restore it, or remove it from the poses.") from None
+        raise UserError(f"{what} {path} does not exist: restore it, or remove it from the poses.") from None
 
 
 def photo_names(images: Sequence[Path]) -> list[str]:
@@ -136,7 +136,7 @@ def files_of_views(folder: Path, images: Sequence[Path], images_root: Path) -> l
 def check_same_size(masks: Sequence[Path | None], sizes: Sequence[tuple[int, int]]) -> None:
     """Raise ``UserError`` for the first mask that is not as large as its image, ``sizes`` (width, height)."""
     for mask, (width, height) in zip(masks, sizes, strict=True):
-        if mask is not None and (found := image_size(mask)) != (width, height):
+        if mask is not None and (found := image_size(mask, "the mask")) != (width, height):
             raise UserError(
                 f"the mask {mask} is {found[0]}x{found[1]} pixels but its image is {width}x{height}: "
                 f"make the mask from the image at its full size."

@@ -71,7 +71,10 @@ def _normalization(file: Path) -> tuple[Tensor, float] | None:
 def _gaussians(checkpoint: Path) -> Gaussians:
     """The Gaussians of a checkpoint; tensors only are loaded, from a file that is mapped, not read into memory."""
     try:
-        state = load_tensors(checkpoint, mmap=True)["pipeline"]
+        content = load_tensors(checkpoint, mmap=True)
+        if not isinstance(content, dict) or not isinstance(content.get("pipeline"), dict):
+            raise ValueError("it holds no pipeline")
+        state = content["pipeline"]
         found = {name[len(_PREFIX) :]: value for name, value in state.items() if name.startswith(_PREFIX)}
     except OSError as error:
         raise UserError(f"{checkpoint} cannot be read ({error.strerror}): name an existing checkpoint.") from error

@@ -137,7 +137,7 @@ def _read_names(path: Path) -> dict[int, str]:
         raise UserError(told) from None
     # The hook turns every object into a list of pairs, so that an id given twice is still seen.
     if not isinstance(pairs, list) or not all(isinstance(pair, tuple) for pair in pairs):
-        raise UserError(f'the class names {path} must be one JSON object such as {{"1": "cup"}}.')
+        raise UserError(f'the class names {path} must be one JSON object: write e.g. {{"1": "cup"}}.')
     names: dict[int, str] = {}
     for key, name in pairs:
         digits = key.isascii() and key.isdigit()

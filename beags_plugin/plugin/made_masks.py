@@ -90,7 +90,9 @@ def configured_source(name: str, options: Sequence[str]) -> MaskSource:
     try:
         source: MaskSource = tyro.cli(kind, args=arguments, console_outputs=False)
     except SystemExit:
-        raise UserError(f"the options {' '.join(options)} of the mask source {name} have a wrong value.") from None
+        usual = ", ".join(f"{key}={getattr(kind, key)}" for key in known if hasattr(kind, key))
+        told = f"the options {' '.join(options)} of the mask source {name} have a wrong value: give such as {usual}."
+        raise UserError(told) from None
     if reason := source.unavailable():
         raise UserError(f"the mask source {name} cannot run: {reason}")
     return source

@@ -296,7 +296,7 @@ def summary() -> str:
     """The table by area, in Markdown: how many mistakes are in it, and how many of them had to be mended."""
     from mistakes.sentences import WAS
 
-    areas = list(dict.fromkeys(one.area for one in TABLE.values()))
+    areas = sorted({one.area for one in TABLE.values()})
     rows = []
     for area in areas:
         own = [one for one in TABLE.values() if one.area == area]
