@@ -38,7 +38,8 @@ def test_the_images_that_the_layout_takes_decide(tmp_path):
     for name, shape in (("images/a.png", (1500, 2000)), ("images_4/a.png", (375, 500))):
         write_image(tmp_path / name, np.zeros(shape, np.uint8))
     assert quick_downscale(tmp_path) == 8.0
-    np.save(tmp_path / "poses_bounds.npy", np.eye(17)[:1])
+    pose = np.column_stack([np.eye(3), [0.0, 0.0, 0.0], [1500.0, 2000.0, 1800.0]])
+    np.save(tmp_path / "poses_bounds.npy", np.concatenate([pose.ravel(), [1.0, 2.0]])[None])
     assert quick_downscale(tmp_path) == 2.0  # 250 x 187 are 46,750 pixels
 
 
