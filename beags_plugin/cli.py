@@ -55,11 +55,14 @@ class Resume:
     device: Literal["cpu", "cuda"] | None = None
     """Go on here instead of where it was begun; the result is then no longer the same in every bit."""
 
+    check_memory: bool = True
+    """Stop where memory or disk will not do."""
+
     def run(self) -> None:
         from beags_plugin.plugin.launch import resume
 
         try:
-            resume(self.run_folder, self.device)
+            resume(self.run_folder, self.device, self.check_memory)
         except KeyboardInterrupt:
             sys.exit(130)
 

@@ -24,8 +24,12 @@ run() { # kind, options of CMake, tests...
   cp "$folder"/cmake/_*.so "$folder/tree/beags_plugin/"
   # The sanitizer's runtime comes first; libstdc++ with it, whose exceptions it wraps.
   local runtime
-  runtime="$(cc -print-file-name="lib${kind/address/asan}.so")"
-  runtime="${runtime/thread/tsan}"
+  case "$kind" in address) runtime=libasan.so ;; thread) runtime=libtsan.so ;; esac
+  runtime="$(cc -print-file-name="$runtime")"
+  [ -e "$runtime" ] || {
+    echo "sanitize: $(cc --version | head -1) has no runtime of the $kind sanitizer: install it" >&2
+    exit 1
+  }
   (cd "$folder/tree" && BEAGS_REQUIRE_NATIVE=1 LD_PRELOAD="$runtime $(c++ -print-file-name=libstdc++.so.6)" \
     ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
     TSAN_OPTIONS="suppressions=$root/tests/native/tsan.supp exitcode=66" \

@@ -260,7 +260,7 @@ def test_without_open3d_one_sentence_says_so(monkeypatch):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"resolution": 4}, "resolution is 4: a mesh needs at least 8 voxels"),
+        ({"resolution": 4}, "resolution is 4: give 8 to 4096 voxels"),
         ({"truncation": 0.5}, "truncation is 0.5: it must lie in 1..64"),
         ({"memory_mb": 1.0}, "memory_mb is 1.0: give the voxel grid at least 50 MB"),
         ({"min_views": 0}, "min_views is 0: a surface needs at least 1 view"),

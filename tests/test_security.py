@@ -119,6 +119,42 @@ def test_merged_tables_that_grow_without_end_are_refused(tmp_path):
         load_run_config(tmp_path / "config.yml")
 
 
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("? !!python/tuple [1, 2]\n: 3\n", "a key in it is no text"),
+        ("a: " + "1:" * 200 + "1\n", "a number in it has more than 100 digits"),
+    ],
+)
+def test_what_takes_forever_to_read_is_refused(tmp_path, text, told):
+    (tmp_path / "config.yml").write_text(text)
+    with pytest.raises(UserError, match=told):
+        load_run_config(tmp_path / "config.yml")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        (
+            "relative_model_dir:",
+            "relative_model_dir: !!python/object/apply:pathlib.PosixPath [/etc]\nspare:",
+            "elsewhere",
+        ),
+        (
+            "_target: !!python/name:beags_plugin.plugin.trainer.BeagsTrainer ''",
+            "_target: !!python/name:nerfstudio.engine.trainer.Trainer ''",
+            "lets BeagsTrainerConfig make a Trainer",
+        ),
+    ],
+)
+def test_a_config_makes_its_own_kinds_in_its_own_folder(config, tmp_path, old, new, told):
+    text = config.read_text("utf8")
+    assert old in text
+    (tmp_path / "config.yml").write_text(text.replace(old, new, 1))
+    with pytest.raises(UserError, match=told):
+        load_run_config(tmp_path / "config.yml")
+
+
 # -- tensors and arrays ----------------------------------------------------------------------------------------------
 
 

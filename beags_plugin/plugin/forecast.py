@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +39,9 @@ SMALLER = (
     "train with smaller photos (end the command with beags-data --downscale-factor 2), or bound the Gaussians "
     "(--pipeline.model.densify.pixels-per-surfel 100)"
 )
+
+
+NO_MEMORY = f"memory ran out before the first step: close other programs, or {SMALLER}."
 
 
 @dataclass(frozen=True)
@@ -102,16 +106,21 @@ def forecast(
     train_sizes: list[tuple[int, int]],
     eval_sizes: list[tuple[int, int]],
     seeds: int,
+    grows: bool = True,
     device: str = "cpu",
     program: float = PROGRAM_MB,
 ) -> Forecast:
-    """What a run will need; train_sizes, eval_sizes: (width, height) of every view; seeds: points to start from."""
+    """What a run will need.
+
+    train_sizes, eval_sizes: (width, height) of every view. seeds: Gaussians to start from. grows: whether their number
+    will grow. device: "cpu" or another, of whose memory nothing is known. program: what the process holds, MB.
+    """
     model, data = config.model_config, config.data_config
     pixels = [width * height for width, height in train_sizes]
     held_out = [width * height for width, height in eval_sizes]
     densify = model.densify.bounded(sum(pixels))
-    grows = model.schedule().base_steps > 0
-    most = max(seeds, densify.max_surfels) if densify.max_surfels > 0 or not grows else None
+    grows = grows and model.schedule().base_steps > 0
+    most = None if grows and densify.max_surfels <= 0 else max(seeds, densify.max_surfels if grows else 0)
     floats = 11 + 3 * (model.sh_degree + 1) ** 2
     photo = 3 * (1 if data.cache_images_type == "uint8" else 4)
     kept = [split for split in (pixels, held_out) if not _streams(data, sum(split) * photo / 1e9)]
@@ -140,19 +149,24 @@ def check_memory(found: Forecast) -> None:
     """Raise ``UserError`` where the run cannot end well."""
     lacking = found.lacking()
     if lacking is not None:
-        raise UserError(f"this run would take {found.told()}: {lacking}; --check-memory False tries it all the same.")
+        raise UserError(
+            f"this run would take {found.told()}: {lacking}; --check-memory False (beags resume: --no-check-memory) "
+            "tries it all the same."
+        )
 
 
 def checks_of_run(data: Path, preset: str, downscale_factor: float = 1.0) -> list[Check]:
     """What the doctor says of a training on ``data``: its memory and its disk. Raises ``UserError`` for bad data."""
     from beags_plugin.plugin.dataparser import BeagsDataParserConfig
     from beags_plugin.plugin.presets import preset_config
+    from beags_plugin.plugin.several import default_device
 
     config = preset_config(preset, {}, Path(preset))
     parser = BeagsDataParserConfig(data=data, downscale_factor=downscale_factor).setup()
     outputs = [parser.get_dataparser_outputs(split) for split in ("train", "val")]
     sizes = [torch.cat([one.cameras.width, one.cameras.height], 1).tolist() for one in outputs]
-    found = forecast(config, *sizes, seeds=len(outputs[0].metadata["points3D_xyz"]))
+    seeds = len(outputs[0].metadata["points3D_xyz"])
+    found = forecast(config, *sizes, seeds, device=default_device())
     fits = found.room is None or found.room >= max(found.surfels or 0, 1)
     disk = f"two checkpoints of {found.disk / 2000:.2f} GB" if found.surfels is not None else (
         f"two checkpoints, of {found.checkpoint_bytes / 1000:.1f} kB for each Gaussian"
@@ -190,7 +204,9 @@ def is_out_of_memory(error: BaseException) -> bool:
     """Whether memory could not be had: Python's error, that of the compiled code, torch's on a CPU or a GPU."""
     text = str(error)
     return isinstance(error, MemoryError) or (
-        isinstance(error, RuntimeError) and ("can't allocate memory" in text or "out of memory" in text)
+        (isinstance(error, OSError) and error.errno == errno.ENOMEM)
+        or isinstance(error, RuntimeError)
+        and any(words in text for words in ("can't allocate memory", "Cannot allocate memory", "out of memory"))
     )
 
 

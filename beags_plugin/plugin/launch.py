@@ -23,11 +23,12 @@ def train(config: BeagsTrainerConfig) -> None:
     _complete(lambda: main(config), config)
 
 
-def resume(run: Path, device: str | None = None) -> None:
+def resume(run: Path, device: str | None = None, check_memory: bool = True) -> None:
     """Train a run that was broken off to its end, in its own folder and with the config that it was started with.
 
-    run: its folder, or config.yml in there. device: "cpu" or "cuda" in place of the config's. Without a checkpoint it
-    starts from the beginning. Raises ``UserError`` for what is no such run, and for one that is complete.
+    run: its folder, or config.yml in there. device: "cpu" or "cuda" in place of the config's. check_memory: as in
+    ``BeagsTrainerConfig``. Without a checkpoint it starts from the beginning. Raises ``UserError`` for what is no such
+    run, and for one that is complete.
     """
     from nerfstudio.scripts.train import launch, train_loop
 
@@ -35,6 +36,7 @@ def resume(run: Path, device: str | None = None) -> None:
 
     config = resumed_config(run)
     machine = config.machine
+    config.check_memory = config.check_memory and check_memory
     if device is not None:
         machine.device_type, machine.num_devices = device, machine.num_devices if device == "cuda" else 1
     check_machine(machine)

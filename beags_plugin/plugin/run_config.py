@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
 
 MOST_BYTES = 1 << 20
+MOST_DIGITS = 100
 _PATHS = (pathlib.PurePath, pathlib.PosixPath, pathlib.WindowsPath, pathlib.Path, pathlib.PurePosixPath)
 _FUNCTIONS = {"nerfstudio.data.utils.nerfstudio_collate.nerfstudio_collate"}  # the only one in nerfstudio's configs
 _GROUPS = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
@@ -95,6 +96,19 @@ class RunConfigLoader(yaml.UnsafeLoader):
             raise Refused(None, None, f"{type(instance).__name__} has no such fields", None)
         instance.__dict__.update(state)
 
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        """A table, whose keys may only be text: lists of lists as keys take forever to hash."""
+        if any(not isinstance(key, yaml.ScalarNode) for key, _ in getattr(node, "value", ())):
+            raise Refused(None, None, "a key in it is no text", node.start_mark)
+        return super().construct_mapping(node, deep)
+
+    def construct_scalar(self, node: Any) -> Any:
+        """A value; a number is short."""
+        number = node.tag in ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
+        if number and len(str(node.value)) > MOST_DIGITS:
+            raise Refused(None, None, f"a number in it has more than {MOST_DIGITS} digits", node.start_mark)
+        return super().construct_scalar(node)
+
     def flatten_mapping(self, node: Any) -> None:
         """Merged tables, which configs do not have, may grow without end."""
         if any(key.tag == "tag:yaml.org,2002:merge" for key, _ in node.value):
@@ -140,10 +154,17 @@ def _wrong(config: BeagsTrainerConfig) -> Iterator[str]:
 
     kinds = {"model": BeagsModelConfig, "datamanager": BeagsDataManagerConfig}
     for name, kind in kinds.items():
-        if not isinstance(getattr(config.pipeline, name, None), kind):
+        if not isinstance(getattr(getattr(config, "pipeline", None), name, None), kind):
             yield f"has no {name} of beags"
-    if not isinstance(config.data_config.dataparser, BeagsDataParserConfig):
+    if not isinstance(getattr(config.data_config, "dataparser", None), BeagsDataParserConfig):
         yield "has no data parser of beags"
+    logging = getattr(config, "logging", None)
+    for name, folder in (
+        ("model", getattr(config, "relative_model_dir", "")),
+        ("log", getattr(logging, "relative_log_dir", "")),
+    ):
+        if Path(folder).is_absolute() or ".." in Path(folder).parts:
+            yield f"keeps its {name} folder elsewhere ({folder})"
     waiting: list[Any] = [config]
     seen = set()
     while waiting:
@@ -156,6 +177,8 @@ def _wrong(config: BeagsTrainerConfig) -> Iterator[str]:
                 held = getattr(value, field.name, dataclasses.MISSING)
                 if held is dataclasses.MISSING:
                     yield f"lacks {field.name} of {type(value).__name__}"
+                elif field.name == "_target" and not _is_own(held, field):
+                    yield f"lets {type(value).__name__} make a {getattr(held, '__name__', held)}"
                 elif isinstance(field.default, (int, float)) and not isinstance(held, (int, float, type(None))):
                     yield f"gives {field.name} of {type(value).__name__} no number"
                 waiting.append(held)
@@ -163,3 +186,9 @@ def _wrong(config: BeagsTrainerConfig) -> Iterator[str]:
             waiting += value.values()
         elif isinstance(value, (list, tuple)):
             waiting += value
+
+
+def _is_own(target: Any, field: dataclasses.Field) -> bool:
+    """Whether a config makes what its class is for, or a kind of it."""
+    usual = field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+    return target == usual or (isinstance(target, type) and isinstance(usual, type) and issubclass(target, usual))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from copy import deepcopy
 from pathlib import Path
@@ -14,6 +13,7 @@ from torch import Tensor
 
 from beags_plugin.digests import content_digest
 from beags_plugin.errors import UserError
+from beags_plugin.reading.text import load_json, reason
 from beags_plugin.whole_files import write_whole
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def preparing_run(run: Path) -> Path:
     """The run that prepared refinement for what ``run`` holds: itself, or the one it is the base or an extract of."""
     origin = run / EXTRACTION_FILE
     if origin.exists():
-        return preparing_run(Path(json.loads(origin.read_text("utf8"))["run"]).parent)
+        return preparing_run(Path(_origin(origin, "run", str, "")).parent)
     return run.parent if run.name == BASE_SNAPSHOT and (run.parent / PREPARED).is_dir() else run
 
 
@@ -95,11 +95,22 @@ def prepared_digests(run: Path) -> list[str] | None:
     """
     origin = run / EXTRACTION_FILE
     if origin.exists():
-        return json.loads(origin.read_text("utf8")).get("prepared")
+        return _origin(origin, "prepared", list, None)
     digests = []
     while (digest := round_digest(round_folder(preparing_run(run), len(digests)))) is not None:
         digests.append(digest)
     return digests
+
+
+def _origin(path: Path, name: str, kind: type, absent: Any) -> Any:
+    """An entry of an extract's file; ``UserError`` if the file is damaged."""
+    try:
+        found = load_json(path).get(name, absent)
+    except (OSError, ValueError, AttributeError) as error:
+        raise UserError(f"{path} cannot be read ({reason(error)}): extract the object again.") from error
+    if found is not absent and not isinstance(found, kind) or found == "":
+        raise UserError(f"{path} has no usable {name!r}: extract the object again.")
+    return found
 
 
 def round_digest(folder: Path) -> str | None:

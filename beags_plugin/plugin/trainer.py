@@ -16,7 +16,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.core import processes
 from beags_plugin.errors import UserError, refused, unwritable
-from beags_plugin.plugin.forecast import MemoryWatch, check_memory, forecast, is_out_of_memory
+from beags_plugin.plugin.forecast import NO_MEMORY, MemoryWatch, check_memory, forecast, is_out_of_memory
 from beags_plugin.plugin.held_out import HeldOutCurve
 from beags_plugin.plugin.interrupts import Interrupts, stop
 from beags_plugin.plugin.memory import memory_mb, peak_memory_mb
@@ -94,7 +94,12 @@ class BeagsTrainer(Trainer):
             stop(error)
         except OSError as error:
             self._release()
-            stop(self._told(error))
+            stop(UserError(NO_MEMORY) if is_out_of_memory(error) else self._told(error))
+        except (MemoryError, RuntimeError) as error:
+            self._release()
+            if not is_out_of_memory(error):
+                raise
+            stop(UserError(NO_MEMORY))
         except BaseException:
             self._release()
             raise
@@ -106,7 +111,8 @@ class BeagsTrainer(Trainer):
         datamanager = cast("BeagsDataManager", self.pipeline.datamanager)
         sizes = datamanager.train_dataset.file_sizes, datamanager.eval_dataset.file_sizes
         points, program = self._model.num_points, memory_mb()
-        check_memory(forecast(self.config, *sizes, seeds=points, device=self.device, program=program))
+        grows = self.config.model_config.start_from is None and self._start_step < self.schedule.base_steps
+        check_memory(forecast(self.config, *sizes, points, grows, device=self.device, program=program))
 
     def _told(self, error: OSError) -> UserError:
         """What the system refused where nothing else has told it, as to nerfstudio's own writers."""
@@ -178,17 +184,17 @@ class BeagsTrainer(Trainer):
                 super().train()
         except UserError as error:
             stop(error)
-        except (MemoryError, RuntimeError) as error:
-            if not is_out_of_memory(error):
-                raise
-            stop(
-                UserError(
-                    f"memory ran out after step {self._done} ({str(error).splitlines()[0]}): the last checkpoint is "
-                    f"whole. Close other programs and go on with beags resume {self.base_dir}, or begin anew with "
-                    "smaller photos or fewer Gaussians."
+        except (MemoryError, RuntimeError, OSError) as error:
+            if is_out_of_memory(error):
+                stop(
+                    UserError(
+                        f"memory ran out after step {self._done} ({reason(error)}): the last checkpoint is whole. "
+                        f"Close other programs and go on with beags resume {self.base_dir}, or begin anew with smaller "
+                        "photos or fewer Gaussians."
+                    )
                 )
-            )
-        except OSError as error:
+            if not isinstance(error, OSError):
+                raise
             stop(self._told(error))
         except KeyboardInterrupt as interrupt:
             if (self.base_dir / REPORT_FILE).exists():  # complete: the signal ended what shows it in the browser
@@ -202,12 +208,6 @@ class BeagsTrainer(Trainer):
         self._estimate.before_step(step - self._start_step)
         found = super().train_iteration(step)
         self._done = step
-        if self.config.check_memory and (short := self._watch.short_of(step)) is not None:
-            self._save_once(step)
-            raise UserError(
-                f"{short}: saved and stopped after step {step}. Close other programs and go on with beags resume "
-                f"{self.base_dir}, or bound the Gaussians of a new run (--pipeline.model.densify.max-surfels)."
-            )
         if self.curve is not None:
             self.curve.after_step(step)  # before the scene grows, from which it needs some steps to recover
             self._model.clock.skip()
@@ -321,11 +321,17 @@ class BeagsTrainer(Trainer):
             self.training_state = "training"
 
     def stop_if_asked(self, step: int) -> None:
-        """Before ``step``: save the one before it and end, if a signal asked for that."""
+        """Before ``step``: save the one before it and end, if a signal asked for that, or memory is running out."""
         if processes.in_any(self._interrupts.asked is not None):
             if step > self._start_step:
                 self._save_once(step - 1)
             raise KeyboardInterrupt
+        if self.config.check_memory and step > self._start_step and (short := self._watch.short_of(step)) is not None:
+            self._save_once(step - 1)
+            raise UserError(
+                f"{short}: saved and stopped after step {step - 1}. Close other programs and go on with beags resume "
+                f"{self.base_dir}, or bound the Gaussians of a new run (--pipeline.model.densify.max-surfels)."
+            )
 
     @contextmanager
     def long_stage(self, step: int) -> Iterator[None]:

@@ -4,6 +4,7 @@
 #include <pthread.h>
 
 #include <atomic>
+#include <cstdlib>
 #include <thread>
 #include <vector>
 
@@ -26,7 +27,8 @@ thread_local int member = 0, loop_number = 0;
 thread_local Loop loop;
 
 bool claim(long* first, long* last) {
-  const long index = team->claimed[loop_number % kMostLoops].fetch_add(1, std::memory_order_relaxed);
+  if (loop_number >= kMostLoops) std::abort();
+  const long index = team->claimed[loop_number].fetch_add(1, std::memory_order_relaxed);
   const long at = loop.start + index * loop.chunk * loop.step;
   if (loop.step > 0 ? at >= loop.end : at <= loop.end) return false;
   const long until = at + loop.chunk * loop.step;
