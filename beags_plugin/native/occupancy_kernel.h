@@ -150,9 +150,10 @@ BEAGS_OPS_INLINE Boxes<T> boxes_around(const Discs<T>& discs) {
     // The samples and this box round differently, by a few units in the last place.
     const R size = select(center < zero, -center, center);
     const R half = T(3) * sqrt(u * u + v * v) * (1 + 16 * kEpsilon) + 16 * kEpsilon * size;
-    boxes.low[axis] = floor_to_int(center - half);
-    boxes.size[axis] = floor_to_int(center + half) - boxes.low[axis] + 1;
-    const auto seen = select(size + half < static_cast<T>(kVoxelHalf), boxes.size[axis], far_off);
+    const auto near = size + half < static_cast<T>(kVoxelHalf);  // others, and NaN, have no whole numbers
+    boxes.low[axis] = floor_to_int(select(near, center - half, zero));
+    boxes.size[axis] = floor_to_int(select(near, center + half, zero)) - boxes.low[axis] + 1;
+    const auto seen = select(near, boxes.size[axis], far_off);
     boxes.largest = select(seen > boxes.largest, seen, boxes.largest);
   }
   return boxes;
