@@ -70,7 +70,8 @@ if [ "$packages_now" != "$packages_before" ]; then
     pins=()
   fi
   rm -f "$env/.beags-packages" "$env/.beags-source"
-  pip install -qq "${pins[@]}" scikit-build-core nanobind ninja 'setuptools<81'
+  # pybind11 is for fpsample, which comes to some machines as source only.
+  pip install -qq "${pins[@]}" scikit-build-core nanobind ninja pybind11 'setuptools<81'
   if ! command -v cmake >/dev/null; then pip install -qq cmake; fi
   # sam2 (transformers) is for the tests of its masks; it brings no weights.
   # The build tools are in the environment by now, so the build needs no isolated copy of them.
