@@ -16,6 +16,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.core import processes
 from beags_plugin.errors import UserError, refused, unwritable
+from beags_plugin.plugin.checkpoints import Checkpoints
 from beags_plugin.plugin.forecast import NO_MEMORY, MemoryWatch, check_memory, forecast, is_out_of_memory
 from beags_plugin.plugin.held_out import HeldOutCurve
 from beags_plugin.plugin.interrupts import Interrupts, stop
@@ -23,17 +24,9 @@ from beags_plugin.plugin.memory import memory_mb, peak_memory_mb
 from beags_plugin.plugin.optimizers import JointOptimizers
 from beags_plugin.plugin.run_lock import RunLock, run_lock
 from beags_plugin.plugin.run_seconds import Estimate, StageSeconds
-from beags_plugin.plugin.runs import (
-    PREPARED,
-    REPORT_FILE,
-    STAGES,
-    newest_checkpoint,
-    save_atomically,
-    write_text_atomically,
-)
-from beags_plugin.plugin.saved_state import check_state
+from beags_plugin.plugin.runs import PREPARED, REPORT_FILE, STAGES, write_text_atomically
 from beags_plugin.plugin.several import Rank, check_machine
-from beags_plugin.plugin.training_state import STATE, VERSION, GlobalRandom, Part, read_checkpoint, training_state
+from beags_plugin.plugin.training_state import GlobalRandom, Part
 from beags_plugin.plugin.warm_start import check_start, start_from_scene
 from beags_plugin.reading.text import reason
 from beags_plugin.whole_files import remove_unfinished
@@ -42,8 +35,6 @@ if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
     from beags_plugin.plugin.datamanager import BeagsDataManager
     from beags_plugin.plugin.model import BeagsModel
-
-REPLACED = "replaced_models"  # checkpoints of an earlier run into the same folder, until the new one has its own
 
 
 class BeagsTrainer(Trainer):
@@ -55,19 +46,15 @@ class BeagsTrainer(Trainer):
         self.schedule = config.model_config.schedule()
         self.last_step = config.max_num_iterations or self.schedule.total
         config.max_num_iterations = self.last_step
-        self.loaded_run: Path | None = None
         self.curve: HeldOutCurve | None = None
-        self._parts: dict[str, Part] = {}
-        self._loaded_states: dict[str, Any] = {}
-        self._loaded_from: Path | None = None
         self._interrupts = Interrupts(self._go_on)
         self._lock: RunLock | None = None
-        self._saved_step: int | None = None
         self._watch = MemoryWatch(config.machine.device_type)
         self._done = 0  # the last step that was trained
         self._complete = False
         self._rank = Rank(config, local_rank)
         super().__init__(config, local_rank, world_size)
+        self._checkpoints = Checkpoints(config, self.base_dir, self.checkpoint_dir)
 
     @property
     def _model(self) -> BeagsModel:
@@ -80,8 +67,9 @@ class BeagsTrainer(Trainer):
             self.config.check()
             if processes.rank() == 0:
                 self._lock = run_lock(self.base_dir)
-                self._set_aside()  # at once: config.yml is this run's already, and a resume would take both for one run
-            if not self._loads():
+                # At once: config.yml is this run's already, and a resume would take both for one run.
+                self._checkpoints.set_aside()
+            if not self._checkpoints.loads:
                 check_start(self.config.model_config)
             used = any((self.base_dir / self.config.logging.relative_log_dir).glob("events.out.tfevents.*"))
             super().setup(test_mode)
@@ -142,7 +130,7 @@ class BeagsTrainer(Trainer):
 
         A scene to start from takes its place before: the optimizers hold what they are built with.
         """
-        if self.config.model_config.start_from is not None and not self._loads():
+        if self.config.model_config.start_from is not None and not self._checkpoints.loads:
             start_from_scene(self._model, cast("BeagsDataManager", self.pipeline.datamanager), self.base_dir)
         return JointOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups(), self._model.clock)
 
@@ -178,7 +166,7 @@ class BeagsTrainer(Trainer):
             )
             self.keep("held_out", self.curve)
         self.keep("random", GlobalRandom())
-        self._loaded_states = {}
+        self._checkpoints.all_are_kept()
         try:
             with self._interrupts:
                 super().train()
@@ -215,103 +203,33 @@ class BeagsTrainer(Trainer):
 
     # -- checkpoints -------------------------------------------------------------------------------------------------
 
+    @property
+    def loaded_run(self) -> Path | None:
+        """The folder of the run whose training goes on here; None where nothing was loaded."""
+        return self._checkpoints.loaded_run
+
     def keep(self, name: str, part: Part) -> None:
         """Let checkpoints hold the state of ``part``; it goes on from what the loaded one holds, if that does."""
-        self._parts[name] = part
-        if name in self._loaded_states:
-            try:
-                part.restore(self._loaded_states[name])
-            except (RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
-                raise _misfit(self._loaded_from, error, name) from error
-
-    def _loads(self) -> bool:
-        """Whether a checkpoint is loaded: what it holds counts, not the scene that its run may have started from."""
-        return self.config.load_dir is not None or self.config.load_checkpoint is not None
-
-    def _loads_own(self) -> bool:
-        """Whether this run goes on in its own folder."""
-        loaded = self.config.load_dir or (self.config.load_checkpoint and self.config.load_checkpoint.parent)
-        return loaded is not None and loaded.resolve().parent == self.base_dir.resolve()
+        self._checkpoints.keep(name, part)
 
     def _load_checkpoint(self) -> None:
-        path = self._checkpoint_path()
-        if path is None:
-            if self.schedule.base_steps == 0 and self.config.model_config.start_from is None:
-                raise UserError(
-                    f"{self.config.method_name} starts from a trained base: add --load-dir <run>/nerfstudio_models of "
-                    "one (or <run>/base/nerfstudio_models), or --pipeline.model.start-from with a splat .ply or "
-                    "another run."
-                )
-            return super()._load_checkpoint()
-        checkpoint = read_checkpoint(path)
-        states = training_state(checkpoint, path)
-        named = dict(self._model.classes)  # by the data
-        self._start_step = checkpoint["step"] + 1
-        check_state(_of_model(checkpoint["pipeline"]), path)
-        try:
-            self.pipeline.load_pipeline(checkpoint["pipeline"], checkpoint["step"])
-            self.optimizers.load_optimizers(checkpoint["optimizers"])
-            self.grad_scaler.load_state_dict(checkpoint["scalers"])
-        except (RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
-            raise _misfit(path, error) from error
-        if self._loads_own() and self._model.classes != named:
+        path = self._checkpoints.path
+        if path is not None:
+            self._start_step = self._checkpoints.restore(path, self)
+            return
+        if self.schedule.base_steps == 0 and self.config.model_config.start_from is None:
             raise UserError(
-                f"the classes of {self.config.data_path} are not those with which training began "
-                f"({', '.join(self._model.classes.values())}): restore classes.json and the masks, or train again."
+                f"{self.config.method_name} starts from a trained base: add --load-dir <run>/nerfstudio_models of "
+                "one (or <run>/base/nerfstudio_models), or --pipeline.model.start-from with a splat .ply or "
+                "another run."
             )
-        CONSOLE.print(f"Loaded {path}", highlight=False, markup=False, soft_wrap=True)
-        self.loaded_run = self.base_dir.absolute() if self._loads_own() else path.absolute().parent.parent
-        if self.schedule.base_steps == 0 and int(self._model.refined_steps) == 0:
-            self._start_step = 0  # a base that was loaded: refinement counts its own steps, and begins anew
-        else:
-            self._loaded_states, self._loaded_from = states, path
-
-    def _checkpoint_path(self) -> Path | None:
-        config = self.config
-        if config.load_dir is None:
-            return config.load_checkpoint
-        if config.load_step is None:
-            return newest_checkpoint(config.load_dir)
-        return config.load_dir / f"step-{config.load_step:09d}.ckpt"
+        super()._load_checkpoint()
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
-        """Save all that decides the rest of the run; the file appears whole or not at all, and only then are older
-        ones removed."""
-        if self._complete:  # nerfstudio saves at the end too, under a number of its own
-            return
-        path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
-        content = {
-            "step": step,
-            "pipeline": self.pipeline.state_dict(),
-            "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()},
-            "schedulers": {},
-            "scalers": self.grad_scaler.state_dict(),
-            STATE: {"version": VERSION, "parts": {name: part.state() for name, part in self._parts.items()}},
-        }
-        save_atomically(content, path)
-        self._saved_step = step
-        if self.config.save_only_latest_checkpoint:
-            for old in self.checkpoint_dir.glob("*.ckpt"):
-                if old != path:
-                    old.unlink()
-        shutil.rmtree(self.base_dir / REPLACED, ignore_errors=True)
-
-    def _set_aside(self) -> None:
-        """Move away the checkpoints of an earlier run into this folder, and remove its report: a resume would take
-        them for this run's."""
-        if self._loads_own():
-            return
-        (self.base_dir / REPORT_FILE).unlink(missing_ok=True)
-        former = self.base_dir / REPLACED
-        if any(self.checkpoint_dir.glob("*.ckpt")):
-            shutil.rmtree(former, ignore_errors=True)
-            self.checkpoint_dir.rename(former)
-            CONSOLE.print(
-                f"{self.base_dir} holds an earlier run; its checkpoint is in {REPLACED} until this one saves its "
-                "first. (beags resume goes on with a run instead.)",
-                highlight=False, markup=False, soft_wrap=True,
-            )  # fmt: skip
+        """Save all that decides the rest of the run, whole or not at all."""
+        if not self._complete:  # nerfstudio saves at the end too, under a number of its own
+            self._checkpoints.save(step, self)
 
     # -- breaks --------------------------------------------------------------------------------------------------------
 
@@ -347,7 +265,7 @@ class BeagsTrainer(Trainer):
             self._interrupts.at_once = False
 
     def _save_once(self, step: int) -> None:
-        if self._saved_step != step:
+        if not self._checkpoints.holds(step):
             self.save_checkpoint(step)
 
     # -- the end -------------------------------------------------------------------------------------------------------
@@ -364,17 +282,3 @@ class BeagsTrainer(Trainer):
         write_text_atomically(json.dumps(report, indent=2), self.base_dir / REPORT_FILE)
         if not self.config.keep_stages:  # a complete run asks for them no more
             shutil.rmtree(self.base_dir / PREPARED / STAGES, ignore_errors=True)
-
-
-def _of_model(pipeline: dict[str, Any]) -> dict[str, Any]:
-    """The model's part of the state of a pipeline."""
-    return {name.removeprefix("_model."): value for name, value in pipeline.items() if name.startswith("_model.")}
-
-
-def _misfit(path: Path | None, error: Exception, part: str = "") -> UserError:
-    """The sentence for a checkpoint that is whole, but of another run than this one, or changed."""
-    state = f"the state of {part} in {path}" if part else f"{path}"
-    return UserError(
-        f"{state} does not fit this run ({reason(error)}): name an earlier checkpoint, or refine again from "
-        "base/nerfstudio_models."
-    )
