@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 POLISH_SCHEDULE_FROM = 0.5  # a base that starts from a trained scene repeats the second half of the base schedule
 RATES_STATED_FOR = 30_000  # steps of the base for which the official learning rates are made
-MAX_RATE_FACTOR = 16.0  # of a short base's first steps; of 3,000 steps, 16 are worse than 8 (docs/experiments.md)
+MAX_RATE_FACTOR = 16.0  # of a short base's first steps; of 3,000 steps, 16 are worse than 8 (docs/measured_base.md)
 REFINE_SCHEDULE_FROM = 0.9  # refinement repeats the learning rates of the last tenth (27,000..30,000) of the base
 
 
