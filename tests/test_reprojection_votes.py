@@ -103,10 +103,10 @@ def _poll(point, votes):
 
 
 def _read(point, step, label, votes):
-    """The label and the confidence of one pixel, and whether it was read before and behind its point."""
+    """The label and the confidence of one pixel, and whether it was read a step before and behind its point."""
     poll, agreed = _poll(point, votes)
     if not agreed:
-        for k in (-2, 2):
+        for k in (-1, 1):
             for other, n in _poll([p + k * s for p, s in zip(point, step, strict=True)], votes)[0].items():
                 poll[other] = poll.get(other, 0) + n
     leaders = [other for other, n in poll.items() if n and n == max(poll.values())]
@@ -119,8 +119,10 @@ def _read(point, step, label, votes):
 
 
 @both
-def test_voxels_equal_loops(monkeypatch):
-    """Each pixel's label from a dictionary of votes per voxel."""
+@pytest.mark.parametrize(("pixels", "look"), [(0.6, 0.4), (10.0, 2.0), (None, 2.0)])
+def test_voxels_equal_loops(monkeypatch, pixels, look):
+    """Each pixel's label from a dictionary of votes per voxel. pixels: how far depths disagree."""
+    monkeypatch.setattr(voxel_reprojection, "disagreement", lambda *_: pixels)
     monkeypatch.setattr(voxel_reprojection, "VOXEL_PIXELS", 1.5)
     depths, cameras, labels = _scene()
     g = torch.Generator().manual_seed(5)
@@ -145,7 +147,7 @@ def test_voxels_equal_loops(monkeypatch):
         old = [IGNORE] * depth.numel() if mask is None else mask.view(-1).tolist()
         rays = (lift(torch.ones_like(depth), camera) - camera.center).view(-1, 3)
         middle = torch.linalg.inv(camera.K) @ torch.tensor([camera.width / 2, camera.height / 2, 1.0]).double()
-        steps = (rays / middle.norm()).tolist()  # one voxel long where the ray is that of the image's centre
+        steps = (look * rays / middle.norm()).tolist()  # `look` voxels long where the ray is that of the image's centre
         found = zip(result.labels.view(-1).tolist(), result.confidence.view(-1).tolist(), strict=True)
         for d, label, point, step, pair in zip(depth.view(-1).tolist(), old, points[i], steps, found, strict=True):
             expected = _read(point, step, label, votes) if d > 0 else (label, 0.0, False)

@@ -11,7 +11,7 @@ _BITS = 21  # of each of the three voxel indices in a key
 _HALF = 1 << (_BITS - 1)
 _MARGIN = 8  # what is read about a point is in reach too
 _PARTS = 64  # of a voxel, in interpolation weights: whole numbers, whose sums have no order
-LOOKS = (-2, 2)  # voxels before and behind a point along its ray, where votes disagree
+LOOKS = (-2, 2)  # steps before and behind a point along its ray, where votes disagree; a step is a voxel at most
 
 
 class TorchVotes:

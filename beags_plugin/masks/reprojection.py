@@ -57,7 +57,7 @@ def reproject_pairwise(
     if not cameras:
         return
     depths = list(depths)  # every view is projected into every other
-    maps, held = _PixelMaps(cameras), _held(labels)
+    maps, held = PixelMaps(cameras), _held(labels)
     compiled = extension.can_take(*depths) or cuda_extension.module_for(*depths) is not None
     i = 0
     while i < len(cameras):
@@ -86,7 +86,7 @@ def _held(labels: Sequence[Tensor | None]) -> list[Tensor | None]:
     return [mask if mask is None or mask.dtype == torch.uint8 else widened(mask) for mask in narrow]
 
 
-def _by_torch(depths, cameras, labels, num_classes: int, tau: float, i: int, maps: _PixelMaps) -> ReprojectedMask:
+def _by_torch(depths, cameras, labels, num_classes: int, tau: float, i: int, maps: PixelMaps) -> ReprojectedMask:
     """View i, as the compiled op does it; its reference."""
     camera = cameras[i]
     votes = _Votes(camera.height * camera.width, num_classes, depths[i].device)
@@ -131,7 +131,7 @@ def check_view(index: int, depth: Tensor, camera: Camera, mask: Tensor | None, n
         )
 
 
-class _PixelMaps:
+class PixelMaps:
     """Between the pixels of all views: lifting and projecting in one step, so that no point has to be kept."""
 
     def __init__(self, cameras: Sequence[Camera]) -> None:

@@ -9,13 +9,15 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.filed_tensors import filed
-from beags_plugin.masks.pooled_votes import TorchVotes
+from beags_plugin.masks.depth_agreement import disagreement
+from beags_plugin.masks.pooled_votes import LOOKS, TorchVotes
 from beags_plugin.masks.reprojection import ReprojectedMask, check_counts, check_view
 from beags_plugin.masks.slabs import Slabs, slabs_of
 from beags_plugin.ops.voxel_votes import votes_for
 from beags_plugin.rasterizers.interface import IGNORE
 
 VOXEL_PIXELS = 1.5  # side of a voxel, in pixels seen at the objects' median depth
+_DOUBTS = 0.95  # share of depths that are no further off than the second look reaches
 _FOOTPRINTS = 1 << 16  # pixels that measure the voxel size, spread over all views
 
 
@@ -33,9 +35,12 @@ def reproject_voxel(
     the voxel that holds its lifted point; voxels are ``VOXEL_PIXELS`` pixels wide at the median depth of the objects.
     It reads the votes of the eight voxels about its point, each weighted by how near it is (trilinear), so that it does
     not matter where the borders of the voxels lie. Unless one class has more than half of the votes of each, it reads
-    them two voxels before and two behind its point along its ray too: an error of its own depth then does less harm.
+    them before and behind its point along its ray too: an error of its own depth then does less harm. That second look
+    reaches as far as depths disagree between neighbouring views, up to two voxels: with depth that is right, it would
+    only bring votes about other things.
     The confidence is the label's share of the votes in the voxel of the point, or of those read if that has none.
-    The points are lifted from what each view sees, so no vote passes through a surface, and ``tau`` is not used.
+    The points are lifted from what each view sees, so no vote passes through a surface; ``tau`` tells only which points
+    neighbouring views both see.
     Cost O(V pixels), whatever the number of classes. Depth and masks are asked for several times, one view at a time:
     they may lie on disk (``core.filed_tensors``). Where the voxels would take more than about 0.4 GB, space is cut into
     slabs (``masks.slabs``) and the views are gone through once more for each; results are the same bits.
@@ -45,6 +50,7 @@ def reproject_voxel(
         return
     size, alike = _survey(depths, cameras, labels, num_classes)
     lifts = _to_voxels(cameras, _origin(cameras), size)
+    lifts[:, -1] *= _second_look(depths, cameras, tau) / LOOKS[-1]
     slabs = slabs_of(depths, cameras, lifts)
     votes = _Votes(depths, labels, lifts, slabs, alike, progress)
     if len(slabs) == 1:
@@ -100,6 +106,12 @@ class _Votes:
             self._progress(self._done, self._total)
 
 
+def _second_look(depths: Sequence[Tensor], cameras: Sequence[Camera], tau: float) -> float:
+    """How many voxels it reaches before a point and behind it."""
+    pixels = disagreement(depths, cameras, tau, _DOUBTS)
+    return LOOKS[-1] if pixels is None else min(pixels / VOXEL_PIXELS, LOOKS[-1])
+
+
 def _where(chosen: Tensor | None, depth: Tensor) -> Tensor:
     return depth if chosen is None else torch.where(chosen, depth, 0.0)
 
@@ -143,7 +155,8 @@ def _origin(cameras: Sequence[Camera]) -> Tensor:
 
 
 def _to_voxels(cameras: Sequence[Camera], origin: Tensor, size: float) -> Tensor:
-    """[V, 13] float64: A row by row, b, and the depth that is one voxel long along the ray of the image's centre.
+    """[V, 13] float64: A row by row, b, and the depth that is one voxel long along the ray of the image's centre: what
+    ``LOOKS`` are multiples of.
 
     A pixel (x, y) at depth d lies at d A (x, y, 1) + b, in voxels.
     """

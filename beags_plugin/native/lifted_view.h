@@ -22,7 +22,7 @@ struct LiftedView {
 constexpr int32_t kHalf = 1 << 20;  // voxels along each axis, to either side
 constexpr int32_t kMargin = 8;      // what is read about a point is in reach too
 constexpr int32_t kParts = 64;      // of a voxel, in interpolation weights
-constexpr int kLook = 2;            // voxels before and behind a point along its ray, where votes disagree
+constexpr int kLook = 2;            // steps before and behind a point along its ray, where votes disagree
 
 BEAGS_HD inline uint64_t hash_of(uint64_t key) {
   key = (key ^ key >> 32) * kGolden;

@@ -17,7 +17,7 @@ class VoxelVotes:
     """Counts votes per (voxel, class), then tells each pixel who leads about its point.
 
     A pixel (x, y) at depth d lies at d A (x, y, 1) + b, in voxels; ``to_voxels`` [13] is A row by row, b, and the depth
-    that is one voxel long along the ray of the image's centre. Pixels whose depth is not positive and finite, or whose
+    of one of the ``masks.pooled_votes.LOOKS``' steps. Pixels whose depth is not positive and finite, or whose
     point is 2^20 - 8 voxels or more from 0 along an axis, neither vote nor are told. ``masks.voxel_reprojection`` says
     how votes are read. Memory is linear in the voxels; neither time nor memory depends on how many classes there are.
 

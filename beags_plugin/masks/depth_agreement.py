@@ -1,0 +1,61 @@
+"""How far the depths of neighbouring views disagree: what one pixel's depth may be wrong by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.masks.reprojection import PixelMaps
+
+_SAMPLES = 1 << 16  # pixels that are looked at, spread over all views
+_ALIKE = 0.7  # least cosine between the axes of two views that see the same sides of things: 45 degrees
+
+
+def disagreement(depths: Sequence[Tensor], cameras: Sequence[Camera], tau: float, share: float) -> float | None:
+    """The ``share`` of points that lie nearest to what the neighbouring view shows there lie nearer than this, along
+    its axis; in pixels (z / focal length).
+
+    depths: V x [H, W] float, world units along z; 0 where nothing is drawn. Each view is compared with the one that
+    stands nearest to it among those that look the same way. tau: points further than tau z from what is shown are
+    hidden, and do not count. None where no two views show the same point.
+    """
+    step = max(1, sum(camera.height * camera.width for camera in cameras) // _SAMPLES)
+    apart = [
+        _apart(depths[i], depths[j], cameras[i], cameras[j], tau, step)
+        for i, j in enumerate(_neighbours(cameras))
+        if j is not None
+    ]
+    found = torch.cat(apart) if apart else torch.zeros(0)
+    return float(found.quantile(share)) if len(found) else None
+
+
+def _neighbours(cameras: Sequence[Camera]) -> list[int | None]:
+    """Of each view the number of its neighbour, if it has one."""
+    views = [camera.to("cpu", torch.float64) for camera in cameras]
+    centres, axes = (torch.stack(values) for values in zip(*((v.center, v.rotation[2]) for v in views), strict=True))
+    found = []
+    for i in range(len(views)):
+        distance = (centres - centres[i]).norm(dim=1)
+        distance[(axes * axes[i]).sum(dim=1) < _ALIKE] = torch.inf
+        distance[i] = torch.inf
+        nearest = int(distance.argmin())
+        found.append(nearest if distance[nearest] < torch.inf else None)
+    return found
+
+
+def _apart(depth: Tensor, shown: Tensor, camera: Camera, other: Camera, tau: float, step: int) -> Tensor:
+    """[P] float64 on the CPU: of every ``step``-th pixel of a view whose point the other view sees."""
+    pixel = torch.arange(0, depth.numel(), step, device=depth.device)
+    x, y, d = pixel % camera.width + 0.5, pixel // camera.width + 0.5, depth.reshape(-1)[pixel]
+    A, b = (values[0].to(depth) for values in PixelMaps([camera, other]).towards(1))
+    hx, hy, z = (d * (A[r, 0] * x + (A[r, 1] * y + A[r, 2])) + b[r] for r in range(3))
+    lands = (d > 0) & (z > 0) & (hx >= 0) & (hy >= 0) & (hx < other.width * z) & (hy < other.height * z)
+    hx, hy, z = hx[lands], hy[lands], z[lands]
+    column, row = (hx / z).long().clamp_(max=other.width - 1), (hy / z).long().clamp_(max=other.height - 1)
+    error = (z - shown[row, column]).abs()
+    seen = error <= tau * z  # False for NaN
+    focal = (float(other.K[0, 0]) * float(other.K[1, 1])) ** 0.5
+    return (error[seen] * focal / z[seen]).double().cpu()
