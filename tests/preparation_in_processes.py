@@ -1,11 +1,12 @@
 """Prepares a small scene in this process, one of several, and saves what it found: a program of test_processes.py.
 
-Arguments: rank, number of processes, file through which they meet, file to write.
+Arguments: rank, number of processes, file through which they meet, file to write, folder that keeps finished stages.
 """
 
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import torch
 import torch.distributed as dist
@@ -14,26 +15,29 @@ from raster_scenes import CLASSES
 
 from beags_plugin.refiners import REFINERS
 from beags_plugin.refiners.preparation import PreparationConfig, prepare
+from beags_plugin.refiners.stages import StageStore
+
+METHODS = ("pairwise", "voxel")
 
 
-def found() -> list[torch.Tensor]:
-    """Labels, confidence, classes, margins and voxels of five views."""
+def found(reprojection: str, store: StageStore | None = None) -> tuple[list[torch.Tensor], list[str]]:
+    """Labels, confidence, classes, margins and voxels of five views, and what is told of the stages."""
     surfels, cameras, masks, rasterizer, settings = labelled_views(5, 0.15)
     names = {index: str(index) for index in range(CLASSES)}
-    prepared = prepare(
-        surfels, cameras, masks, names, rasterizer, settings, REFINERS.get("bea")(), PreparationConfig(k=20)
-    )
+    config = PreparationConfig(k=20, reprojection=reprojection)
+    prepared = prepare(surfels, cameras, masks, names, rasterizer, settings, REFINERS.get("bea")(), config, store=store)
     assigned, grid = prepared.assignment, prepared.grid
     return [
         *prepared.labels, *prepared.confidence, assigned.class_ids, assigned.margin, assigned.strongest,
         grid.keys, grid.classes, torch.tensor(grid.voxel_size, dtype=torch.float64),
-    ]  # fmt: skip
+    ], prepared.findings  # fmt: skip
 
 
-def main(rank: int, processes: int, meeting: str, out: str) -> None:
+def main(rank: int, processes: int, meeting: str, out: str, kept: str) -> None:
     torch.set_num_threads(1)
     dist.init_process_group("gloo", init_method=f"file://{meeting}", rank=rank, world_size=processes)
-    torch.save(found(), out)
+    results = {method: found(method, StageStore(Path(kept) / method)) for method in METHODS}
+    torch.save(results, out)
     dist.destroy_process_group()
 
 

@@ -47,12 +47,14 @@ def test_tensors_of_a_gpu_travel_over_the_cpu():
         assert isinstance(sent, processes._FromGpu) and sent.values.is_cpu and torch.equal(sent.values, values)
 
 
-@pytest.mark.skipif(not dist.is_gloo_available(), reason="torch was built without gloo")
-def test_two_processes_find_what_one_finds(tmp_path):
+def in_two_processes(folder: Path, kept: Path) -> list[dict]:
+    """What each of two processes finds; ``kept`` holds the stages that are finished."""
     root = str(PROGRAM.parents[1])
+    folder.mkdir()
 
     def start(rank):
-        command = [sys.executable, str(PROGRAM), str(rank), "2", str(tmp_path / "meeting"), str(tmp_path / str(rank))]
+        files = [str(path) for path in (folder / "meeting", folder / str(rank), kept)]
+        command = [sys.executable, str(PROGRAM), str(rank), "2", *files]
         return subprocess.Popen(command, cwd=root, env=environment(root))
 
     running = [start(0), start(1)]
@@ -61,11 +63,27 @@ def test_two_processes_find_what_one_finds(tmp_path):
     finally:
         for process in running:
             process.kill()
-    alone = preparation_in_processes.found()
-    for found in (torch.load(tmp_path / str(rank)) for rank in (0, 1)):
-        assert len(found) == len(alone)
-        assert all(torch.equal(a, b) for a, b in zip(found, alone, strict=True))
-    assert len(alone[-3]) > 10  # voxels
+    return [torch.load(folder / str(rank)) for rank in (0, 1)]
+
+
+@pytest.mark.skipif(not dist.is_gloo_available(), reason="torch was built without gloo")
+def test_two_processes_find_what_one_finds_and_reuse_it_together(tmp_path):
+    fresh = in_two_processes(tmp_path / "first", tmp_path / "kept")
+    for file in (tmp_path / "kept/voxel").glob("voxel grids-*"):
+        file.unlink()  # done again, by both
+    again = in_two_processes(tmp_path / "again", tmp_path / "kept")
+    for method in preparation_in_processes.METHODS:
+        alone, told = preparation_in_processes.found(method)
+        assert len(alone[-3]) > 10  # voxels
+        for found, findings in (result[method] for result in (*fresh, *again)):
+            assert len(found) == len(alone)
+            assert all(torch.equal(a, b) for a, b in zip(found, alone, strict=True))
+            assert [line.removesuffix(" (kept from before)") for line in findings] == told
+        assert not any("kept from before" in line for result in fresh for line in result[method][1])
+        for result in again:
+            kept = [line for line in result[method][1] if "kept from before" in line]
+            assert len(kept) == len(told) - (method == "voxel")
+    assert sorted(path.name for path in (tmp_path / "kept").iterdir()) == ["pairwise", "voxel"]
 
 
 def environment(root: str) -> dict[str, str]:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.processes import each_view
 from beags_plugin.errors import UserError
 from beags_plugin.masks.label_maps import LabelMaps, widened
 from beags_plugin.ops import cuda_extension, extension
@@ -59,23 +60,26 @@ def reproject_pairwise(
     depths = list(depths)  # every view is projected into every other
     maps, held = PixelMaps(cameras), _held(labels)
     compiled = extension.can_take(*depths) or cuda_extension.module_for(*depths) is not None
-    i = 0
-    while i < len(cameras):
-        size = max(camera.height * camera.width for camera in cameras) * num_classes
-        if compiled and size <= _DENSE_COUNTERS:
-            # as many views at a time as there are threads, each with its own counters
-            batch = range(i, min(i + max(1, min(extension.threads(), 2 * _DENSE_COUNTERS // size)), len(cameras)))
-            towards = torch.stack([torch.cat([A.flatten(1), b], dim=1) for A, b in map(maps.towards, batch)])
-            own = [labels[view] for view in batch]
-            found = reprojection_votes(depths, held, own, towards.to(depths[0].dtype), i, num_classes, tau, IGNORE)
-            results = [ReprojectedMask(*pair) for pair in zip(*found, strict=True)]
-        else:
-            results = [_by_torch(depths, cameras, labels, num_classes, tau, i, maps)]
-        for result in results:
-            i += 1
+    size = max(camera.height * camera.width for camera in cameras) * num_classes
+    dense = compiled and size <= _DENSE_COUNTERS
+    # as many views at a time as there are threads, each with its own counters
+    together = max(1, min(extension.threads(), 2 * _DENSE_COUNTERS // size)) if dense else 1
+    batches = [range(i, min(i + together, len(cameras))) for i in range(0, len(cameras), together)]
+
+    def votes(number: int) -> list[tuple[Tensor, Tensor]]:
+        batch = batches[number]
+        if not dense:
+            return [_by_torch(depths, cameras, labels, num_classes, tau, i, maps) for i in batch]
+        towards = torch.stack([torch.cat([A.flatten(1), b], dim=1) for A, b in map(maps.towards, batch)])
+        own = [labels[view] for view in batch]
+        found = reprojection_votes(depths, held, own, towards.to(depths[0].dtype), batch[0], num_classes, tau, IGNORE)
+        return list(zip(*found, strict=True))
+
+    for number, results in enumerate(each_view(len(batches), votes)):
+        for i, result in zip(batches[number], results, strict=True):
             if progress:
-                progress(i, len(cameras))
-            yield result
+                progress(i + 1, len(cameras))
+            yield ReprojectedMask(*result)
 
 
 def _held(labels: Sequence[Tensor | None]) -> list[Tensor | None]:
@@ -86,7 +90,7 @@ def _held(labels: Sequence[Tensor | None]) -> list[Tensor | None]:
     return [mask if mask is None or mask.dtype == torch.uint8 else widened(mask) for mask in narrow]
 
 
-def _by_torch(depths, cameras, labels, num_classes: int, tau: float, i: int, maps: PixelMaps) -> ReprojectedMask:
+def _by_torch(depths, cameras, labels, num_classes: int, tau: float, i: int, maps: PixelMaps) -> tuple[Tensor, Tensor]:
     """View i, as the compiled op does it; its reference."""
     camera = cameras[i]
     votes = _Votes(camera.height * camera.width, num_classes, depths[i].device)
@@ -220,7 +224,8 @@ class _Votes:
         return winner, most, leaders, total
 
 
-def _decide(votes: _Votes, original: Tensor | None, camera: Camera) -> ReprojectedMask:
+def _decide(votes: _Votes, original: Tensor | None, camera: Camera) -> tuple[Tensor, Tensor]:
+    """The label and the confidence of each pixel."""
     winner, most, leaders, total = votes.winners()
     size = (camera.height, camera.width)
     if original is None:
@@ -228,4 +233,4 @@ def _decide(votes: _Votes, original: Tensor | None, camera: Camera) -> Reproject
     clear = (most > 0) & (leaders == 1)
     labels = torch.where(clear, winner.int(), original.reshape(-1).int())
     confidence = most.float() / total.clamp(min=1).float()
-    return ReprojectedMask(labels.view(size), confidence.view(size))
+    return labels.view(size), confidence.view(size)

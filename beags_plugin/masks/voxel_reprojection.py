@@ -9,6 +9,7 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.filed_tensors import filed
+from beags_plugin.core.processes import each_view
 from beags_plugin.masks.depth_agreement import disagreement
 from beags_plugin.masks.pooled_votes import LOOKS, TorchVotes
 from beags_plugin.masks.reprojection import ReprojectedMask, check_counts, check_view
@@ -85,9 +86,15 @@ class _Votes:
                 votes.add(_where(about, depth), self.lifts[i].to(depth), mask.int())
             self._tick()
         votes.decide()
-        for i, (depth, mask) in enumerate(zip(self.depths, self.labels, strict=True)):
+
+        def told(i: int) -> tuple[Tensor, Tensor, Tensor | None]:
+            depth = self.depths[i]
             inside = self._of_slab(i, depth, slab, self.slabs.inside)
-            yield *votes.read(_where(inside, depth), self.lifts[i].to(depth), _known(depth, mask)), inside
+            known = _known(depth, self.labels[i])
+            return *votes.read(_where(inside, depth), self.lifts[i].to(depth), known), inside
+
+        for found in each_view(len(self.depths), told):
+            yield found
             self._tick()
 
     def pieces_of(self, slab: int) -> Iterator[Tensor]:

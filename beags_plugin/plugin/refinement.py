@@ -151,22 +151,20 @@ class RefinementSwitch:
             self._start(prepared.grid, prepared.labels)
         self._count(prepared.seconds, time.perf_counter() - start, first)
 
-    def _stage_store(self) -> StageStore | None:
+    def _stage_store(self) -> StageStore:
         """Where the stages of this round are kept; those of the run that this one goes on from are looked into too.
 
-        None for several processes, which must all do a stage or none. What an earlier run into the same folder kept of
-        more rounds is removed.
+        What an earlier run into the same folder kept of more rounds is removed.
         """
-        if processes.size() > 1:
-            return None
         kept, rounds = self.trainer.base_dir / PREPARED / STAGES, self.model.config.refine_rounds
-        for folder in kept.glob("round_*"):
-            if folder.name not in {f"round_{index + 1}" for index in range(rounds)}:
+        own = {f"round_{index + 1}" for index in range(rounds)}
+        for folder in kept.glob("round_*") if processes.is_first() else ():
+            if folder.name not in own:
                 shutil.rmtree(folder)
         former = self.trainer.loaded_run
         runs = [self.trainer.base_dir] if former in (None, self.trainer.base_dir) else [self.trainer.base_dir, former]
-        own, *others = (run / PREPARED / STAGES / f"round_{self.rounds + 1}" for run in runs)
-        return StageStore(own, others)
+        here, *others = (run / PREPARED / STAGES / f"round_{self.rounds + 1}" for run in runs)
+        return StageStore(here, others)
 
     def _count(self, seconds: dict[str, float], spent: float, first: bool) -> None:
         """Add the time of a preparation to that of the stages; it is none of the refinement's."""

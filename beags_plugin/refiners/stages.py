@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.filed_tensors import FiledTensors, filed, write_tensors
-from beags_plugin.core.processes import is_first
+from beags_plugin.core.processes import in_any, is_first
 from beags_plugin.digests import input_digest
 from beags_plugin.masks.label_maps import LabelMaps, PackedMap, PackedMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
@@ -138,14 +138,15 @@ class Stages:
     def run(self, name: str, key: str, compute: Callable[[], T], form: Form[T]) -> T:
         """The stage's result, computed, or from the store if it was computed with the same ``key`` before."""
         start, aside = time.perf_counter(), self._aside
-        if self.store is not None and (kept := self.store.kept(name, key)) is not None:
+        kept = None if self.store is None else self.store.kept(name, key)
+        if not in_any(kept is None) and kept is not None:  # several processes go the same way
             self._reused.add(name)
             self.seconds[name] = kept["seconds"]
             self._aside += time.perf_counter() - start - kept["seconds"]
             return moved(form.unpack(kept["content"]), self.device)
         found = compute()
         self.seconds[name] = time.perf_counter() - start - (self._aside - aside)
-        if self.store is not None:
+        if self.store is not None and is_first():  # of several processes, one writes to the run's folder
             start = time.perf_counter()
             self.store.keep(name, key, {"seconds": self.seconds[name], "content": form.pack(found)})
             self._aside += time.perf_counter() - start
@@ -165,19 +166,20 @@ class Stages:
             self.seconds[name] = time.perf_counter() - start
             yield torch.tensor(self.seconds[name], dtype=torch.float64)  # the last one: what the stage took
 
-        if self.store is not None and (kept := self.store.kept_tensors(name, key, device)) is not None:
+        kept = None if self.store is None else self.store.kept_tensors(name, key, device)
+        if not in_any(kept is None) and kept is not None:
             self._reused.add(name)
             self.seconds[name] = float(kept[-1])
             self._aside += time.perf_counter() - start - self.seconds[name]
             return _AllButLast(kept)
-        if self.store is None or not is_first():  # of several processes, one writes to the run's folder
+        if self.store is None or not is_first():
             return _AllButLast(filed(timed(), device))
         return _AllButLast(self.store.keep_tensors(name, key, timed(), device))
 
     def drop(self, name: str) -> None:
         """Forget a stage that nothing asks for again; its seconds are part of another's."""
         self.seconds.pop(name, None)
-        if self.store is not None:
+        if self.store is not None and is_first():
             self.store.drop(name)
 
     def found(self, name: str, finding: str) -> None:
