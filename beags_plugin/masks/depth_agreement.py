@@ -10,7 +10,8 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.masks.reprojection import PixelMaps
 
-_SAMPLES = 1 << 16  # pixels that are looked at, spread over all views
+_VIEWS = 48  # at most so many are compared with their neighbours, and
+_SAMPLES = 1 << 16  # so many pixels of them
 _ALIKE = 0.7  # least cosine between the axes of two views that see the same sides of things: 45 degrees
 
 
@@ -19,15 +20,13 @@ def disagreement(depths: Sequence[Tensor], cameras: Sequence[Camera], tau: float
     its axis; in pixels (z / focal length).
 
     depths: V x [H, W] float, world units along z; 0 where nothing is drawn. Each view is compared with the one that
-    stands nearest to it among those that look the same way. tau: points further than tau z from what is shown are
-    hidden, and do not count. None where no two views show the same point.
+    stands nearest to it among those that look the same way; of many views, some are. tau: points further than tau z
+    from what is shown are hidden, and do not count. None where no two views show the same point.
     """
-    step = max(1, sum(camera.height * camera.width for camera in cameras) // _SAMPLES)
-    apart = [
-        _apart(depths[i], depths[j], cameras[i], cameras[j], tau, step)
-        for i, j in enumerate(_neighbours(cameras))
-        if j is not None
-    ]
+    pairs = [(i, j) for i, j in enumerate(_neighbours(cameras)) if j is not None]
+    pairs = [pairs[n * len(pairs) // _VIEWS] for n in range(_VIEWS)] if len(pairs) > _VIEWS else pairs
+    step = max(1, sum(cameras[i].height * cameras[i].width for i, _ in pairs) // _SAMPLES)
+    apart = [_apart(depths[i], depths[j], cameras[i], cameras[j], tau, step) for i, j in pairs]
     found = torch.cat(apart) if apart else torch.zeros(0)
     return float(found.quantile(share)) if len(found) else None
 
