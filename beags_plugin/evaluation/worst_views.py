@@ -100,7 +100,7 @@ def draw_worst(
     """
     names = run.names()
     found = []
-    chosen = [(kind, index) for kind in KINDS for index in worst_records(run, kind, count, by)]
+    chosen: list[tuple[Kind, int]] = [(kind, index) for kind in KINDS for index in worst_records(run, kind, count, by)]
     with torch.no_grad():
         for kind, index in chosen:
             record = run.after.masks[index]

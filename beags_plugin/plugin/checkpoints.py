@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
@@ -16,6 +16,7 @@ from beags_plugin.reading.text import reason
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
+    from beags_plugin.plugin.model import BeagsModel
     from beags_plugin.plugin.trainer import BeagsTrainer
 
 REPLACED = "replaced_models"
@@ -68,7 +69,7 @@ class Checkpoints:
         """
         checkpoint = read_checkpoint(path)
         states = training_state(checkpoint, path)
-        model = trainer.pipeline.model
+        model = cast("BeagsModel", trainer.pipeline.model)
         named = dict(model.classes)  # by the data
         check_state(_of_model(checkpoint["pipeline"]), path)
         try:

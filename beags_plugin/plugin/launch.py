@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from beags_plugin.errors import UserError
 from beags_plugin.plugin.runs import CONFIG_FILE, EXTRACTION_FILE, REPORT_FILE
@@ -23,7 +23,7 @@ def train(config: BeagsTrainerConfig) -> None:
     _complete(lambda: main(config), config)
 
 
-def resume(run: Path, device: str | None = None, check_memory: bool = True) -> None:
+def resume(run: Path, device: Literal["cpu", "cuda"] | None = None, check_memory: bool = True) -> None:
     """Train a run that was broken off to its end, in its own folder and with the config that it was started with.
 
     run: its folder, or config.yml in there. device: "cpu" or "cuda" in place of the config's. check_memory: as in
