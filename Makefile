@@ -16,6 +16,8 @@ help:
 setup:
 	@bash scripts/setup_env.sh "$(BEAGS_VENV)"
 
+# Tests of what is not there are skipped, with the reason: CUDA needs a GPU; the viewer in a browser needs Chromium
+# (Debian: apt install chromium).
 test: setup
 	BEAGS_REQUIRE_NATIVE=1 "$(BIN)/python" -m pytest -q
 

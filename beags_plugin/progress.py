@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from time import monotonic
+from typing import TypeVar
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 A_MOMENT = 2.0  # seconds
+
+Item = TypeVar("Item")
 
 
 @contextmanager
@@ -40,4 +43,14 @@ def progress_bar(name: str, passing: bool = False) -> Iterator[Callable[[int, in
         progress.live.transient = True  # what stopped it says more than half a bar
         raise
     finally:
-        progress.stop()
+        if progress.live.transient:
+            progress.live.stop()  # progress.stop() would print a blank line where output is no terminal
+        else:
+            progress.stop()
+
+
+def counted(items: Iterable[Item], total: int, progress: Callable[[int, int], None]) -> Iterator[Item]:
+    """The items, one by one; progress: is told (done, total) when the next one is asked for."""
+    for done, item in enumerate(items, start=1):
+        yield item
+        progress(done, total)

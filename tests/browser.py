@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import base64
 import json
-import shutil
 import subprocess
 import tempfile
 import time
 import urllib.request
 from pathlib import Path
 
+import pytest
 from websockets.sync.client import connect
+
+from beags_plugin.doctor.diagnosis import browser
 
 _FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-gpu-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
@@ -19,9 +21,11 @@ _FLAGS = (
 )  # fmt: skip
 
 
-def chromium() -> str | None:
-    """The program, or None."""
-    return shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+NEEDED = pytest.mark.skipif(
+    browser() is None,
+    reason="there is no Chromium, so nobody looks at the viewer in a browser (Debian: apt install chromium)",
+)
+"""For tests that open a page."""
 
 
 def _labelled(label: str) -> str:
@@ -34,8 +38,8 @@ class Page:
     """One page at ``url``; a context manager that ends the browser."""
 
     def __init__(self, url: str, width: int = 1280, height: int = 800) -> None:
-        program = chromium()
-        assert program is not None, "there is no chromium"
+        program = browser()
+        assert program is not None, "there is no Chromium (Debian: apt install chromium)"
         self._profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         command = [program, *_FLAGS, f"--user-data-dir={self._profile.name}", f"--window-size={width},{height}", url]
         self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

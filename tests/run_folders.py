@@ -94,11 +94,11 @@ def write_trained(
     parser.auto_scale_poses, parser.scale_factor = False, scale
     config.model_config.background_color = background
     if assigned and base:
-        write_run(config, folder / "base", _state(*discs(shift=0.15), scale=scale), 99)
-    return write_run(config, folder, _state(*discs(), assigned=assigned, scale=scale), 199)
+        write_run(config, folder / "base", state_of(*discs(shift=0.15), scale=scale), 99)
+    return write_run(config, folder, state_of(*discs(), assigned=assigned, scale=scale), 199)
 
 
-def _state(surfels: Surfels, class_ids: torch.Tensor, assigned: bool = True, scale: float = 1.0) -> dict:
+def state_of(surfels: Surfels, class_ids: torch.Tensor, assigned: bool = True, scale: float = 1.0) -> dict:
     return {
         "gauss_params.means": scale * surfels.means,
         "gauss_params.quats": surfels.quats,

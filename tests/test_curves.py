@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from beags_plugin.plugin.step_clock import StepClock
 from beags_plugin.rasterizers.interface import IGNORE
 
 LAST = sum(STEPS) - 1
+TOLD: list[tuple[str, list[tuple[int, int]]]] = []  # what the bars of ``run`` were told
 
 
 def events_of(run):
@@ -40,8 +42,24 @@ def run(data, tmp_path_factory):
     run = tmp_path_factory.mktemp("curves") / "run"
     config = short_config(data, run, steps_per_objects=5)
     config.logging.steps_per_log = 3
-    run_to_end(config)
+
+    @contextmanager
+    def bar(name, passing=False):
+        assert passing
+        steps: list[tuple[int, int]] = []
+        TOLD.append((name, steps))
+        yield lambda *step: steps.append(step)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("beags_plugin.plugin.curves.progress_bar", bar)
+        run_to_end(config)
     return run
+
+
+def test_the_objects_have_a_bar(run):
+    """Two objects in two held-out views, and a picture of each."""
+    whole = [(done, 6) for done in range(1, 7)]
+    assert len(TOLD) == 4 and all(told == ("Measuring objects", whole) for told in TOLD)
 
 
 def test_every_curve_and_picture_is_in_the_event_file(run):

@@ -20,6 +20,7 @@ def checks() -> dict[str, Check]:
 
 def test_everything_is_looked_at(checks):
     expected = {"python", "torch", "CUDA device", "nerfstudio", "opencv contrib", "open3d", "C++ compiler", "ffmpeg"}
+    expected |= {"Chromium"}
     expected |= {"CPU", "presets", "codecs png, jpg", "codec mp4", "export formats"}
     assert expected | {f"rasterizer {name}" for name in RASTERIZERS.names()} <= set(checks)
     assert all(check.sentence and "\n" not in check.sentence for check in checks.values())
@@ -59,9 +60,11 @@ def test_a_check_that_breaks_in_any_way_is_reported():
 def test_no_programs_on_the_path(monkeypatch):
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CXX", raising=False)
-    for check in (building.compiler(), diagnosis._ffmpeg()):
+    for check in (building.compiler(), diagnosis._ffmpeg(), diagnosis._browser()):
         assert not check.ok and not check.required and "install" in check.sentence
-        assert check.repair in ("apt install g++", "apt install ffmpeg", "xcode-select --install")
+        assert check.repair in (
+            "apt install g++", "apt install ffmpeg", "apt install chromium", "xcode-select --install",
+        )  # fmt: skip
 
 
 def test_a_backend_that_kills_its_process_is_a_finding(monkeypatch):

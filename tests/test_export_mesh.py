@@ -12,11 +12,11 @@ import torch
 open3d = pytest.importorskip("open3d")
 trimesh = pytest.importorskip("trimesh")
 
+from covered_things import camera_of, color_at, covered, hits, thing_called
 from scipy.spatial import cKDTree
 
-from beags_plugin.core.cameras import Camera, viewmat_from_opengl
-from beags_plugin.core.lifting import pixel_rays, project
-from beags_plugin.core.surfels import Surfels
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.lifting import project
 from beags_plugin.errors import UserError
 from beags_plugin.export.base import NothingToExport, Piece, Viewpoints, make_exporter
 from beags_plugin.export.frames import bounding_box
@@ -27,67 +27,28 @@ from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.export.zoom import close_up
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
-from beags_plugin.sample.arrangement import Thing, make_still
+from beags_plugin.sample.arrangement import Thing
 from beags_plugin.sample.views import make_views
 
 OPTIONS = {"resolution": 96, "truncation": 4.0}  # the cup's wall is 9 voxels thick: its two sides stay apart
-C0 = 0.28209479177387814
 
 
 def cameras(count: int = 24) -> list[Camera]:
-    views = make_views(2, 64, 48, count, 1)
-    return [
-        Camera(
-            viewmat_from_opengl(torch.from_numpy(view.camera_to_world)).float(),
-            torch.tensor([[view.focal, 0, view.cx], [0, view.focal, view.cy], [0, 0, 1]]).float(),
-            view.width,
-            view.height,
-        )
-        for view in views
-        if view.split == "train"
-    ]
-
-
-def hits(thing: Thing, camera: Camera) -> np.ndarray:
-    """World points of the thing's surface under the pixels of a view, [P, 3]; computed by ray casting."""
-    rays = pixel_rays(camera, torch.zeros(1, dtype=torch.float64)).reshape(-1, 3).numpy()
-    directions = rays @ camera.rotation.double().numpy()
-    origin = camera.center.double().numpy()[None]
-    t = thing.solid.first_hit(np.repeat(thing.to_local(origin), len(rays), axis=0), directions @ thing.rotation)
-    return origin + directions[np.isfinite(t)] * t[np.isfinite(t), None]
-
-
-def color_at(points: np.ndarray) -> np.ndarray:
-    """A colour for each place, sRGB 0..1."""
-    return 0.5 + 0.35 * np.sin(7.0 * points + np.array([0.0, 1.0, 2.0]))
+    return [camera_of(view) for view in make_views(2, 64, 48, count, 1) if view.split == "train"]
 
 
 @pytest.fixture(scope="module")
 def thing() -> Thing:
-    return next(thing for thing in make_still(1).things if thing.name == "cup")
+    return thing_called("cup")
 
 
 @pytest.fixture(scope="module")
 def piece(thing) -> Piece:
     """The cup covered with small opaque discs where the views see it."""
-    generator = np.random.default_rng(0)
     views = cameras()
-    low, high = torch.from_numpy(thing.position - 0.25), torch.from_numpy(thing.position + 0.25)
-    points = np.concatenate([hits(thing, close_up(camera, low, high, 0.05, 96)) for camera in views])
-    points = points[generator.permutation(len(points))[:25_000]]
-    normals = thing.solid.normals(thing.to_local(points)) @ thing.rotation.T
-    # the rotation that takes z to the normal: half way between them, turned by 180 degrees
-    half = torch.nn.functional.normalize(torch.from_numpy(normals) + torch.tensor([1e-6, 0.0, 1.0]), dim=1)
-    count = len(points)
-    surfels = Surfels.of(
-        torch.from_numpy(points).float(),
-        torch.cat([torch.zeros(count, 1), half.float()], dim=1),
-        torch.full((count, 2), float(np.log(0.004))),
-        torch.full((count,), 4.0),
-        torch.from_numpy((color_at(points) - 0.5) / C0).float()[:, None],
-    )
+    surfels = covered(thing, views)
     viewpoints = Viewpoints(views, make_rasterizer("auto"), RasterSettings(0.05, 50.0))
-    return Piece("cup", surfels, torch.ones(count, dtype=torch.int32), viewpoints)
+    return Piece("cup", surfels, torch.ones(len(surfels), dtype=torch.int32), viewpoints)
 
 
 @pytest.fixture(scope="module")

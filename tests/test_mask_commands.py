@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from data_folders import HEIGHT, WIDTH, write_image, write_transforms
+from data_folders import HEIGHT, WIDTH, write_colmap, write_image, write_transforms
 from run_folders import write_scene, write_trained
 from source_scenes import truth
 
@@ -59,6 +59,38 @@ def test_the_command_writes_masks_that_training_finds(tmp_path, capsys):
         with pytest.raises(SystemExit):
             main(wrong)
         assert message in " ".join(capsys.readouterr().out.split())
+
+
+def test_masks_of_other_methods_are_trained_on(tmp_path, capsys):
+    """Gaussian Grouping's ids and LangSplat's segments, from their files to what the data parser reads of them."""
+    write_colmap(tmp_path)
+    own, features = np.array([0, 37, 112], np.uint8), np.eye(6)
+    (tmp_path / "language_features").mkdir()
+    for index in range(9):
+        ids = own[truth(index % 4)]
+        ids[11, 0] = 200 if index < 2 else 0
+        write_image(tmp_path / f"object_mask/v{index:02d}.png", ids)
+        segments = np.full((4, HEIGHT, WIDTH), -1)
+        segments[3] = (truth(index % 4) + index) % 3  # numbered anew in each view
+        np.save(tmp_path / f"language_features/v{index:02d}_s.npy", segments)
+        np.save(tmp_path / f"language_features/v{index:02d}_f.npy", features[(np.arange(3) - index) % 3])
+    for source in ("gaussian-grouping", "langsplat"):
+        folder = tmp_path / "made" / source
+        main(["masks", "make", "--data", str(tmp_path), "--source", source, "--output", str(folder)])
+        out = capsys.readouterr().out
+        assert "9 masks of 9 views" in out and ("1 ids in fewer than 3 views" in out) == (source[0] == "g")
+        parser = BeagsDataParserConfig(
+            data=tmp_path, masks_path=folder / "masks", classes_path=folder / "classes.json"
+        )  # fmt: skip
+        metadata = parser.setup().get_dataparser_outputs("train").metadata
+        count = 3 if source[0] == "g" else 4  # LangSplat has a segment for the background too
+        assert len(metadata["classes"]) == count and len(metadata["class_map_filenames"]) == 7
+        pairs = set()
+        for path in metadata["class_map_filenames"]:
+            exact = truth(int(path.stem[1:]) % 4)
+            pairs |= set(zip(read_class_map(path).ravel().tolist(), exact.ravel().tolist(), strict=True))
+        assert len(pairs) == 3  # an id for each object, the same in all views
+        assert source[0] == "l" or pairs == {(0, 0), (37, 1), (112, 2)}
 
 
 @dataclass(frozen=True)

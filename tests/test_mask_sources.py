@@ -66,6 +66,24 @@ def test_id_images_and_colours_and_rare_ids(tmp_path):
         make(GaussianGroupingSource(), scene)
 
 
+def test_ids_of_gaussian_groupings_tracker(tmp_path):
+    """8-bit grey as DEVA writes it: ids of no order up to 255, many of them in a view or two only."""
+    scene, own = scene_of(tmp_path), np.array([0, 37, 255], np.uint8)
+    for index in range(4):
+        ids = own[truth(index)]
+        ids[11, 0] = 201 + index  # one view each
+        ids[11, 19] = 90 if index < 2 else 0
+        write_image(tmp_path / f"object_mask/v{index}.png", ids)
+    made = GaussianGroupingSource().make(scene, lambda done, total: None)
+    assert dict(made.names) == {0: "background", 37: "class_37", 255: "class_255"}
+    assert made.notes == ["5 ids in fewer than 3 views became background."]
+    for index, class_map in enumerate(made.maps):
+        assert class_map is not None
+        np.testing.assert_array_equal(class_map, own[truth(index)])
+    names, maps = make(GaussianGroupingSource(least_views=2), scene)
+    assert set(names) == {0, 37, 90, 255} and maps[1] is not None and maps[1][11, 19] == 90 and maps[1][11, 0] == 0
+
+
 def test_one_image_per_object_in_either_order(tmp_path):
     scene = scene_of(tmp_path)
     for index in range(2):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from beags_plugin import progress
-from beags_plugin.progress import progress_bar
+from beags_plugin.progress import counted, progress_bar
 
 
 def clock(monkeypatch, seconds_per_call: float) -> None:
@@ -17,6 +17,21 @@ def test_a_bar_says_what_is_done(capsys):
     with progress_bar("Counting sheep") as told:
         told(3, 7)
     assert "Counting sheep" in (said := capsys.readouterr().out) and "3/7" in said
+
+
+def test_a_passing_bar_leaves_nothing_where_output_is_no_terminal(capsys, monkeypatch):
+    for seconds in (0.4, 3.0):
+        clock(monkeypatch, seconds)
+        with progress_bar("Counting sheep", passing=True) as told:
+            assert list(counted("abc", 3, told)) == ["a", "b", "c"]
+    assert capsys.readouterr().out == ""
+
+
+def test_counted_items_are_told_once_they_are_done():
+    told = []
+    for item in counted("ab", 2, lambda *steps: told.append(steps)):
+        assert len(told) == "ab".index(item)
+    assert told == [(1, 2), (2, 2)]
 
 
 @pytest.mark.parametrize(("seconds", "drawn"), [(0.4, False), (3.0, True)])

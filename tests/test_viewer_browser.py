@@ -8,12 +8,12 @@ from run_folders import CLASSES, write_prepared, write_scene, write_trained
 
 pytest.importorskip("nerfstudio")
 
-from browser import Page, chromium
+from browser import NEEDED, Page
 from viewer_pages import COLORS, HEIGHT, WIDTH, awaited, differing, painted, varied, viewed
 
 from beags_plugin.extraction.ply import read_ply
 
-pytestmark = pytest.mark.skipif(chromium() is None, reason="there is no chromium (Debian: apt-get install chromium)")
+pytestmark = NEEDED
 OUTPUTS = (
     "rgb", "depth", "normal", "accumulation", "class_map", "class_confidence", "boundary_error", "occupancy_violation",
     "mask_before", "mask_after",

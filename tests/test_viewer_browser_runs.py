@@ -12,13 +12,13 @@ from run_folders import write_drawn_scene, write_prepared, write_scene, write_tr
 
 pytest.importorskip("nerfstudio")
 
-from browser import Page, chromium
+from browser import NEEDED, Page
 from viewer_pages import HEIGHT, WIDTH, awaited, differing, free_port, painted, picture, started, varied, viewed
 
 from beags_plugin.extraction.ply import read_ply, write_ply
 from beags_plugin.plugin.extract import extract_objects
 
-pytestmark = pytest.mark.skipif(chromium() is None, reason="there is no chromium (Debian: apt-get install chromium)")
+pytestmark = NEEDED
 STEPS = 60, 240  # of base and refinement
 
 

@@ -38,6 +38,7 @@ def diagnose() -> list[Check]:
         _films,
         _formats,
         _ffmpeg,
+        _browser,
     ]
     return [_safely(check) for check in checks]
 
@@ -164,3 +165,15 @@ def _ffmpeg() -> Check:
         return Check("ffmpeg", True, path, False)
     sentence = "not on PATH: ns-render cannot write videos (Debian: apt install ffmpeg); beags render can"
     return Check("ffmpeg", False, sentence, False, "apt install ffmpeg")
+
+
+def browser() -> str | None:
+    """The program of a Chromium, or None; only the tests of the viewer and the picture of its page need one."""
+    return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+def _browser() -> Check:
+    if path := browser():
+        return Check("Chromium", True, f"{path}, for the tests of the viewer", False)
+    sentence = "none: tests that look at the viewer in a browser are skipped (Debian: apt install chromium)"
+    return Check("Chromium", False, sentence, False, "apt install chromium")

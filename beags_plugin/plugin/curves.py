@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.evaluation.metrics import mask_metrics
 from beags_plugin.evaluation.protocol import Protocol
@@ -20,6 +21,7 @@ from beags_plugin.evaluation.violations import boundary_errors, occupancy_violat
 from beags_plugin.extraction.select import select_class
 from beags_plugin.masks.classes import BACKGROUND, colorize
 from beags_plugin.plugin.memory import memory_mb, peak_memory_mb
+from beags_plugin.progress import progress_bar
 from beags_plugin.rasterizers.drawing import draw_class_map, surfel_inputs
 
 if TYPE_CHECKING:
@@ -90,6 +92,11 @@ class Curves:
     def _objects(self, step: int) -> None:
         """Extracted IoU on some held-out views, occupancy violations, pictures of one of the views."""
         self._measured = True
+        with progress_bar("Measuring objects", passing=True) as progress:
+            self._measure(step, progress)
+
+    def _measure(self, step: int, progress: Callable[[int, int], None]) -> None:
+        """progress: is told (done, total) of the masks and of the pictures."""
         model = self.model
         surfels, class_ids = model.surfels().detach(), model.class_ids
         if model.grid is not None:
@@ -101,9 +108,11 @@ class Curves:
         parts = {index: select_class(surfels, class_ids, index)[0] for index in objects}
         settings = model.settings(geometry=False)
         values: list[float] = []
+        done, total = 0, len(objects) * (len(views) + 1)
         for index in objects:
             scores = []
             for view in views:
+                progress(done := done + 1, total)
                 if (truth := extracted_truth(view, index)) is not None:
                     mask = extracted_mask(parts[index], view.camera, model.rasterizer, settings, Protocol().threshold)
                     scores.append(mask_metrics(mask, truth[1], truth[2]).iou)
@@ -114,7 +123,7 @@ class Curves:
         if values:
             writer.put_scalar("Extracted IoU/mean", float(np.mean(values)), step)
         if views:
-            self._pictures(step, views[0], parts)
+            self._pictures(step, views[0], parts, lambda drawn: progress(done + drawn, total))
 
     def _looked_at(self) -> list[EvalView]:
         """The held-out views, none if they cannot be read: no reason to end a training."""
@@ -127,13 +136,16 @@ class Curves:
                 self._views = []
         return self._views
 
-    def _pictures(self, step: int, view: EvalView, parts) -> None:
+    def _pictures(
+        self, step: int, view: EvalView, parts: Mapping[int, Surfels], progress: Callable[[int], None]
+    ) -> None:
         model, camera = self.model, view.camera
         surfels, settings = model.surfels().detach(), model.settings(geometry=False)
         classes, _ = draw_class_map(model.rasterizer, surfels, model.class_ids, camera, settings)
         writer.put_image("Scene/class map", _colored(classes), step)
         background = model.background_color.to(model.device)
-        for index, part in parts.items():
+        for drawn_so_far, (index, part) in enumerate(parts.items(), start=1):
+            progress(drawn_so_far)
             if len(part):
                 drawn = model.rasterizer.rasterize(surfel_inputs(part, camera), camera, settings, background)
                 writer.put_image(f"Objects/{model.classes[index]}", drawn.color.clamp(0.0, 1.0), step)

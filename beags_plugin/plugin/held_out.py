@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 import time
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from beags_plugin.core import processes
 from beags_plugin.losses.photometric import ssim
 from beags_plugin.plugin.runs import write_text_atomically
-from beags_plugin.progress import progress_bar
+from beags_plugin.progress import counted, progress_bar
 from beags_plugin.rasterizers.drawing import surfel_inputs
 
 if TYPE_CHECKING:
@@ -66,13 +64,9 @@ class HeldOutCurve:
             self._started = {name: self._started[name] + now - began[name] for name, now in _clocks().items()}
 
     def _measure(self, done: int) -> dict[str, float]:
-        views, qualities = [*self.held_out, *self.train], []
-        first = processes.rank() == 0
-        with progress_bar("Measuring held-out views", passing=True) if first else nullcontext() as progress:
-            for view in views:
-                qualities.append(self._quality(view))
-                if progress:
-                    progress(len(qualities), len(views))
+        views = [*self.held_out, *self.train]
+        with progress_bar("Measuring held-out views", passing=True) as progress:
+            qualities = [self._quality(view) for view in counted(views, len(views), progress)]
         psnr, similarity = zip(*qualities[: len(self.held_out)], strict=True)
         train_psnr = [quality for quality, _ in qualities[len(self.held_out) :]]
         return {

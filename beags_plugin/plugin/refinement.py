@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -27,7 +27,7 @@ from beags_plugin.plugin.memory import peak_memory_mb
 from beags_plugin.plugin.prepared_grid import read_grid
 from beags_plugin.plugin.runs import BASE_SNAPSHOT, PREPARED, STAGES, round_folder, write_run, write_text_atomically
 from beags_plugin.plugin.scene_edits import edit_scene
-from beags_plugin.progress import progress_bar
+from beags_plugin.progress import counted, progress_bar
 from beags_plugin.refiners import REFINERS
 from beags_plugin.refiners.preparation import Preparation, prepare
 from beags_plugin.refiners.stages import StageStore
@@ -119,11 +119,13 @@ class RefinementSwitch:
         start = time.perf_counter()
         with self.trainer.long_stage(step):
             views = self.datamanager.views("train", original=True)
+            with _bar("Reading masks", passing=True) as progress:
+                masks = LabelMaps(view.stored_labels for view in counted(views, len(views), progress))
             with released(self.trainer.train_lock):  # minutes, which read the scene only: a viewer may draw it
                 prepared = prepare(
                     model.surfels(),
                     [view.camera for view in views],
-                    LabelMaps(view.stored_labels for view in views),
+                    masks,
                     model.classes,
                     model.rasterizer,
                     model.settings(),
@@ -132,7 +134,7 @@ class RefinementSwitch:
                     model.config.split,
                     background_voxels=self._background_voxels(),
                     seed=model.seed,
-                    stage=progress_bar if processes.rank() == 0 else lambda name: nullcontext(),
+                    stage=_bar,
                     store=self._stage_store(),
                     code=code_digest(),
                 )
@@ -210,13 +212,20 @@ class RefinementSwitch:
                 f"{folder / 'grid.pt'} has no voxels of the background, which a loss now asks about: set background of "
                 f"the occupancy loss to False, or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
             )
-        labels = LabelMaps(
-            _prepared_labels(folder / "masks" / f"{view.name}.png", view.camera)
-            for view in self.datamanager.views("train")
-        )
+        views = self.datamanager.views("train")
+        with _bar("Reading masks", passing=True) as progress:
+            labels = LabelMaps(
+                _prepared_labels(folder / "masks" / f"{view.name}.png", view.camera)
+                for view in counted(views, len(views), progress)
+            )
         self._start(grid, labels)
         self.model.refining_since = time.perf_counter()
         CONSOLE.print(f"  refinement taken up from {folder}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _bar(name: str, passing: bool = False) -> AbstractContextManager[Callable[[int, int], None]]:
+    """A progress bar, in the first of several processes."""
+    return progress_bar(name, passing) if processes.rank() == 0 else nullcontext(lambda done, total: None)
 
 
 def _prepared_labels(path: Path, camera: Camera) -> torch.Tensor:
@@ -242,11 +251,12 @@ def save_prepared(prepared: Preparation, names: list[str], folder: Path) -> None
             _clear(folder)
         (folder / "masks").mkdir(parents=True, exist_ok=True)
         (folder / "confidence").mkdir(exist_ok=True)
-    for index, name in enumerate(names):
-        labels = prepared.labels[index]
-        write_class_map(folder / "masks" / f"{name}.png", labels.cpu().numpy().astype(np.uint16))
-        if prepared.confidence is not None:
-            _write_grey(folder / "confidence" / f"{name}.png", prepared.confidence[index])
+    with _bar("Keeping masks", passing=True) as progress:
+        for index, name in enumerate(counted(names, len(names), progress)):
+            labels = prepared.labels[index]
+            write_class_map(folder / "masks" / f"{name}.png", labels.cpu().numpy().astype(np.uint16))
+            if prepared.confidence is not None:
+                _write_grey(folder / "confidence" / f"{name}.png", prepared.confidence[index])
     report = {"findings": prepared.findings, "seconds": prepared.seconds, "peak_memory_mb": peak_memory_mb()}
     write_text_atomically(json.dumps(report, indent=2), folder / "report.json")
     state = {} if prepared.grid is None else prepared.grid.state_dict()

@@ -21,7 +21,7 @@ from beags_plugin.masks.label_maps import LabelMaps, PackedMaps
 from beags_plugin.masks.pictures import Changed, before_and_after
 from beags_plugin.plugin.evaluate import raster_settings
 from beags_plugin.plugin.extract import read_scene
-from beags_plugin.progress import progress_bar
+from beags_plugin.progress import counted, progress_bar
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.refiners.consistent_masks import chosen_reprojection, render_depths, reprojected_masks
@@ -100,7 +100,8 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     config.check()
     start = time.perf_counter()
     views = manager.views("train")
-    given = LabelMaps(view.stored_labels for view in views)
+    with progress_bar("Reading masks", passing=True) as progress:
+        given = LabelMaps(view.stored_labels for view in counted(views, len(views), progress))
     if all(mask is None for mask in given.stored):
         raise UserError(f"no training view of {scene.config.data_path} has a mask: give --masks-path, or make some.")
     classes = manager.train_dataset.metadata["classes"]
