@@ -25,6 +25,8 @@ from typing import Any
 
 import torch
 
+from beags_plugin.child_processes import bound
+
 BIN = Path(sys.executable).parent
 OPTIONS = {
     "--pipeline.model.base-steps": 320, "--pipeline.model.refine-steps": 80, "--pipeline.model.refine-rounds": 2,
@@ -126,7 +128,7 @@ def run_whole(command: list[str], log: Path, config: Path) -> tuple[int, float, 
 def started(command: list[str], log: Any) -> subprocess.Popen:
     """A process that writes to ``log``."""
     environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ}
-    return subprocess.Popen(command, stdout=log, stderr=log, env=environment)
+    return subprocess.Popen(bound(command, signal.SIGKILL), stdout=log, stderr=log, env=environment)
 
 
 def cpu_time(pid: int) -> float:

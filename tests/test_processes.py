@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 import torch
 import torch.distributed as dist
 
+from beags_plugin.child_processes import bound
 from beags_plugin.core import processes
 from beags_plugin.core.processes import each_view
 
@@ -53,7 +55,7 @@ def test_two_processes_find_what_one_finds(tmp_path):
 
     def start(rank):
         command = [sys.executable, str(PROGRAM), str(rank), "2", str(tmp_path / "meeting"), str(tmp_path / str(rank))]
-        return subprocess.Popen(command, cwd=root, env=environment(root))
+        return subprocess.Popen(bound(command, signal.SIGKILL), cwd=root, env=environment(root))
 
     running = [start(0), start(1)]
     try:

@@ -30,6 +30,7 @@ from resumed_runs import (
 )
 from run_folders import write_scene
 
+from beags_plugin.child_processes import bound
 from beags_plugin.errors import UserError
 from beags_plugin.plugin.extract import read_scene
 from beags_plugin.plugin.trainer import BeagsTrainer
@@ -463,7 +464,7 @@ def test_a_real_kill(data, whole, tmp_path):
         f"run_to_end(short_config(Path({str(data)!r}), Path({str(run)!r})))"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), os.getcwd()])}
-    with subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.DEVNULL) as process:
+    with subprocess.Popen(bound([sys.executable, "-c", code]), env=environment, stdout=subprocess.DEVNULL) as process:
         deadline = time.monotonic() + 120
         while not (run / "nerfstudio_models" / "step-000000021.ckpt").exists():
             assert process.poll() is None and time.monotonic() < deadline
