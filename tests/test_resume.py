@@ -22,7 +22,6 @@ from resumed_runs import (
     assert_same_run,
     checkpoint_of,
     differences,
-    forget_writers,
     resume_to_end,
     run_to_end,
     short_config,
@@ -73,7 +72,6 @@ def broken_off(data, run, monkeypatch, kill, **overrides):
         kill(patch)
         with pytest.raises(Killed):
             run_to_end(short_config(data, run, **overrides))
-    forget_writers()
 
 
 def test_the_run_grows_splits_and_prepares_twice(whole):

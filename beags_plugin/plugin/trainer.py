@@ -123,8 +123,13 @@ class BeagsTrainer(Trainer):
         return unwritable(self.base_dir, error)
 
     def _release(self) -> None:
-        """Let others train in this run's folder."""
+        """Let others train in this run's folder, and end what writes curves, a thread of tensorboard's too."""
         self._rank.end()
+        for each in writer.EVENT_WRITERS:
+            if isinstance(each, writer.TensorboardWriter):
+                each.tb_writer.close()
+        writer.EVENT_WRITERS.clear()
+        writer.EVENT_STORAGE.clear()
         if self._lock is not None:
             self._lock.release()
             self._lock = None
