@@ -140,14 +140,15 @@ def draw(record: list[dict[str, Any]], base_steps: int, path: Path) -> None:
     figure, (above, below) = plt.subplots(2, 1, figsize=(6, 3.6), sharex=True, height_ratios=(2, 1))
     above.plot(steps, [line["memory_mb"] for line in lines], color="tab:blue")
     above.set_ylabel("resident memory (MB)")
+    above.set_ylim(0, 1.15 * max(line["memory_mb"] for line in lines))
     for name, color in (("threads", "tab:orange"), ("files", "tab:green"), ("children", "tab:red")):
         below.plot(steps, [len(line[name]) for line in lines], color=color, label=name)
+    below.set_ylim(-0.5, 1.5 + max(len(line[name]) for line in lines for name in COUNTED))
     below.legend(fontsize=7, ncols=3)
     below.set_xlabel("step")
     for axes in (above, below):
         axes.axvline(base_steps, color="0.6", linewidth=0.8, linestyle="--")
         axes.grid(alpha=0.3)
-        axes.set_ylim(bottom=0)
     figure.tight_layout()
     figure.savefig(path, dpi=90)
 
