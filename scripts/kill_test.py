@@ -36,11 +36,12 @@ import same_bits  # noqa: E402
 from beags_plugin.bench.provenance import commit, describe_machine  # noqa: E402
 
 OPTIONS = {
-    "--pipeline.model.base-steps": 120, "--pipeline.model.refine-steps": 40, "--pipeline.model.refine-rounds": 2,
-    "--pipeline.model.densify.start": 20, "--pipeline.model.densify.stop": 100, "--pipeline.model.densify.every": 20,
-    "--pipeline.model.prepare.k": 200, "--steps-per-save": 10, "--steps-per-held-out": 50, "--vis": "tensorboard",
+    "pipeline.model.base_steps": 80, "pipeline.model.refine_steps": 30, "pipeline.model.refine_rounds": 2,
+    "pipeline.model.densify.start": 20, "pipeline.model.densify.stop": 70, "pipeline.model.densify.every": 20,
+    "pipeline.model.densify.max_surfels": 2500, "pipeline.model.prepare.k": 200, "steps_per_save": 5,
+    "steps_per_held_out": 40, "vis": "tensorboard",
 }  # fmt: skip
-EXPORT = ("--all", "--format", "ply", "ply-2dgs", "spz", "glb", "--resolution", "48", "--min-views", "1")
+EXPORT = ("--all", "--format", "ply", "ply-2dgs", "spz", "glb", "--resolution", "32", "--min-views", "1")
 KINDS = ("anywhere", "checkpoint", "preparation", "anywhere", "export")  # in turn
 ATTEMPTS = 20  # at a kill of one kind, as a run may end before its moment comes
 
@@ -68,14 +69,14 @@ class Tester:
             raise RuntimeError(f"the sample could not be written: {log}")
         seen: dict[str, float] = {}
         child = forked.forked(lambda: train(self.data, self.whole), log)
-        marks = {"base": self.whole / "base", "grid": self.whole / "prepared/grid.pt"}
+        marks = {"stages": self.whole / "prepared/stages", "grid": self.whole / "prepared/grid.pt"}
         while (code := forked.ended(child)) is None:
             self.run_seconds = max(self.run_seconds, forked.cpu_time(child))
             for name, path in marks.items():
                 if name not in seen and path.exists():
                     seen[name] = self.run_seconds
             time.sleep(0.005)
-        self.preparation = seen.get("base", 0.0), seen.get("grid", 0.0)
+        self.preparation = seen["stages"], seen["grid"]
         never = lambda: False  # noqa: E731
         exporting = lambda: export(self.whole, self.exported)  # noqa: E731
         export_code, self.export_seconds = forked.kill_when(exporting, log, float("inf"), never)
@@ -186,16 +187,17 @@ def write_data(folder: Path) -> None:
     """The sample at a quarter of its size."""
     from beags_plugin.sample.writer import SampleConfig, write_sample
 
-    write_sample(folder, SampleConfig(seed=3, width=96, height=72, num_train=12, num_test=2))
+    write_sample(folder, SampleConfig(seed=3, width=96, height=72, num_train=10, num_test=2))
 
 
 def train(data: Path, run: Path) -> None:
-    """What ns-train does."""
-    from nerfstudio.scripts.train import entrypoint
+    """What ns-train does, once it has read its arguments."""
+    from beags_plugin.plugin.launch import train
+    from beags_plugin.plugin.presets import preset_config
 
-    options = [str(word) for pair in OPTIONS.items() for word in pair]
-    sys.argv = ["ns-train", "beags-tiny", "--data", str(data), "--run-dir", str(run), *options]
-    entrypoint()
+    config = preset_config("beags-tiny", OPTIONS, Path("kill_test.py"))
+    config.data, config.run_dir = data, run
+    train(config)
 
 
 def go_on(data: Path, run: Path) -> None:
