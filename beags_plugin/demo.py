@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from rich.console import Console
 
+from beags_plugin.child_processes import bound
 from beags_plugin.digests import code_digest, folder_digest, value_digest
 from beags_plugin.errors import UserError
 from beags_plugin.plugin.run_lock import RunLock
@@ -189,7 +190,7 @@ def resume(run: Path) -> None:
 
 
 def _finish(command: list[str]) -> None:
-    code = subprocess.run(command).returncode
+    code = subprocess.run(bound(command)).returncode
     if code != 0:
         raise UserError(f"training ended with exit code {code}; what it printed above says why.")
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import errno
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_OF_DISKS = (*_FULL, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENODEV, errno.ENXIO, errno.ESTALE)
+"""What a disk answers to what is written into an open file; such an error names no file."""
 
 
 class UserError(Exception):
@@ -23,15 +26,21 @@ class UserError(Exception):
 
 
 def system_error(error: BaseException) -> OSError | None:
-    """What the operating system refused, if that is why ``error`` was raised: torch hides it behind its own errors."""
-    seen: set[int] = set()
+    """What the operating system refused, if that is why ``error`` was raised.
+
+    An error that was only raised while another one was handled is a mistake of its own. torch's writer of files is the
+    exception: it cannot close a file whose disk is full, and says that instead.
+    """
     at: BaseException | None = error
-    while at is not None and id(at) not in seen:
-        if isinstance(at, OSError):
-            return at
-        seen.add(id(at))
-        at = at.__cause__ or at.__context__
-    return None
+    while at is not None and not isinstance(at, OSError):
+        torchs = isinstance(at, RuntimeError) and "inline_container" in str(at)
+        at = at.__cause__ or (at.__context__ if torchs else None)
+    return at
+
+
+def is_of_disk(error: OSError) -> bool:
+    """Whether a disk refused what was written into an open file; other errors without a file are no user's mistake."""
+    return error.errno in _OF_DISKS
 
 
 def unwritable(path: str | Path, error: OSError) -> UserError:
@@ -45,7 +54,8 @@ def unwritable(path: str | Path, error: OSError) -> UserError:
 def writing(path: str | Path, what: str = "") -> Iterator[None]:
     """Tell what the system refuses in the block as a ``UserError`` about ``path``, a file or the folder of many.
 
-    what: stands before the path in the sentence. What is refused of a file elsewhere, as when one is read, passes.
+    what: stands before the path in the sentence. Other errors pass: those of files elsewhere, as when one is read, and
+    those of no file, as of a closed pipe.
     """
     try:
         yield
@@ -53,11 +63,16 @@ def writing(path: str | Path, what: str = "") -> Iterator[None]:
         raise
     except Exception as error:
         cause = system_error(error)
-        named = None if cause is None else cause.filename
-        own = Path(path).absolute().parent
-        if cause is None or (isinstance(named, str) and not Path(named).absolute().is_relative_to(own)):
+        if cause is None or not _is_below(Path(path).absolute().parent, cause):
             raise
         raise unwritable(f"{what}{path}", cause) from error
+
+
+def _is_below(folder: Path, error: OSError) -> bool:
+    """Whether an error is of a file in ``folder``, as far as it tells."""
+    if isinstance(error.filename, (str, os.PathLike)):
+        return Path(error.filename).absolute().is_relative_to(folder)
+    return is_of_disk(error)
 
 
 def refused(error: OSError) -> UserError | None:

@@ -1,141 +1,225 @@
-"""Kill a training at random moments, resume it, and compare: does it end bit for bit as without the kill?
+"""Kill runs at random moments with SIGKILL, go on, and compare: do they end bit for bit as without the kill?
 
-    python scripts/kill_test.py --kills 8
+    python scripts/kill_test.py --kills 50 --json kills.json
 
-Trains a short run of beags-tiny on a small generated scene once to its end. Then, again and again, starts the same run
-in a folder of its own with ns-train, ends it with SIGKILL after a random amount of CPU time (Linux), resumes it with
-``beags resume`` (which may be killed too), and compares what both left: the checkpoint with the optimizers' state, the
-curve of held-out quality, the masks, the voxel grids. Prints a line per kill and leaves a JSON behind. Exit code 1:
-something differed.
+Trains a short run of beags-tiny on a small generated sample, and exports it, once without a kill. Then, again and
+again, the same is begun in a folder of its own, killed, and done again or resumed (and sometimes killed once more):
+
+- anywhere: at a random moment of the training, before its first file too;
+- checkpoint: while a checkpoint is being written;
+- preparation: between base and refinement;
+- export: ``beags export`` of all objects, splats and meshes. What lies in its folder after the kill must be whole.
+
+Compared are the checkpoints with the optimizers' state, the base, the curve of held-out quality, the masks, the voxel
+grids, the exported files. Moments are counted in CPU time, so that a busy machine changes nothing (Linux). All are
+forks of this process, which imports everything once. Exit status 1: something differed.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import random
 import shutil
 import signal
-import subprocess
 import sys
 import time
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import torch
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(Path(__file__).resolve().parent)]
+import forked  # noqa: E402
+import same_bits  # noqa: E402
 
-BIN = Path(sys.executable).parent
+from beags_plugin.bench.provenance import commit, describe_machine  # noqa: E402
+
 OPTIONS = {
-    "--pipeline.model.base-steps": 320, "--pipeline.model.refine-steps": 80, "--pipeline.model.refine-rounds": 2,
-    "--pipeline.model.densify.start": 100, "--pipeline.model.densify.stop": 300, "--pipeline.model.prepare.k": 200,
-    "--steps-per-save": 20, "--steps-per-held-out": 50, "--vis": "tensorboard",
+    "pipeline.model.base_steps": 80, "pipeline.model.refine_steps": 30, "pipeline.model.refine_rounds": 2,
+    "pipeline.model.densify.start": 20, "pipeline.model.densify.stop": 70, "pipeline.model.densify.every": 20,
+    "pipeline.model.densify.max_surfels": 2500, "pipeline.model.prepare.k": 200, "steps_per_save": 5,
+    "steps_per_held_out": 40, "vis": "tensorboard",
 }  # fmt: skip
+EXPORT = ("--all", "--format", "ply", "ply-2dgs", "spz", "glb", "--resolution", "32", "--min-views", "1")
+KINDS = ("anywhere", "checkpoint", "preparation", "anywhere", "export")  # in turn
+ATTEMPTS = 20  # at a kill of one kind, as a run may end before its moment comes
+
+
+class Tester:
+    """Runs without a kill in ``folder``, and runs with kills that are compared with them.
+
+    seconds: CPU time of the training and of the export; preparation: from and to when, of the training's.
+    """
+
+    def __init__(self, folder: Path, seed: int, again: float) -> None:
+        self.folder, self.again = folder, again
+        self.moments = random.Random(seed)
+        self.data, self.whole = folder / "data", folder / "whole"
+        self.exported = folder / "whole_export"
+        self.run_seconds = self.export_seconds = 0.0
+        self.preparation = 0.0, 0.0
+        self.kills: list[dict] = []
+        self.trials = self.wrong = 0
+
+    def without_kill(self) -> None:
+        """Make what is compared with; raises ``RuntimeError`` if that fails."""
+        log = self.folder / "whole.log"
+        if forked.run(lambda: write_data(self.data), log) != 0:
+            raise RuntimeError(f"the sample could not be written: {log}")
+        seen: dict[str, float] = {}
+        child = forked.forked(lambda: train(self.data, self.whole), log)
+        marks = {"stages": self.whole / "prepared/stages", "grid": self.whole / "prepared/grid.pt"}
+        while (code := forked.ended(child)) is None:
+            self.run_seconds = max(self.run_seconds, forked.cpu_time(child))
+            for name, path in marks.items():
+                if name not in seen and path.exists():
+                    seen[name] = self.run_seconds
+            time.sleep(0.005)
+        self.preparation = seen["stages"], seen["grid"]
+        never = lambda: False  # noqa: E731
+        exporting = lambda: export(self.whole, self.exported)  # noqa: E731
+        export_code, self.export_seconds = forked.kill_when(exporting, log, float("inf"), never)
+        if code != 0 or export_code != 0:
+            raise RuntimeError(f"the run without a kill ended with exit codes {code}, {export_code}: {log}")
+
+    def trial(self, kind: str) -> None:
+        """Kill once or more, go on to the end, compare; what is found goes to ``kills``."""
+        place = self.folder / f"{self.trials}_{kind}"
+        self.trials += 1
+        found = self._killed_export(place) if kind == "export" else self._killed_run(kind, place)
+        self.wrong += bool(found)
+        self.kills[-1]["differs"] = found
+        print(f"{self.kills[-1]['at']}: {'; '.join(found[:3]) or 'the same bits'}", flush=True)
+        if not found:
+            shutil.rmtree(place)
+
+    def _killed_run(self, kind: str, run: Path) -> list[str]:
+        log, killed = self.folder / f"{run.name}.log", 0
+        while not killed or (self.moments.random() < self.again and not is_complete(run)):
+            code = self._kill(kind if not killed else "anywhere", run, log)
+            if code == -signal.SIGKILL:
+                killed += 1
+                self.kills.append({"kind": kind if killed == 1 else "resumed", "at": f"{kind}: {state_of(run)}"})
+            elif code != 0:
+                return [f"ended with exit code {code}: {log}"]
+            elif not killed:
+                shutil.rmtree(run)  # it was done before the moment came
+        if not is_complete(run) and (code := forked.run(lambda: go_on(self.data, run), log)) != 0:
+            return [f"going on ended with exit code {code}: {log}"]
+        return self._compared(lambda: same_bits.run_differences(self.whole, run))
+
+    def _kill(self, kind: str, run: Path, log: Path) -> int:
+        """The exit code of a run that is killed, if its moment comes."""
+        from_, to = self.preparation if kind == "preparation" else (0.0, self.run_seconds)
+        models = run / "nerfstudio_models"
+        there = (lambda: any(models.glob(".*.part"))) if kind == "checkpoint" else (lambda: True)
+        return forked.kill_when(lambda: go_on(self.data, run), log, self.moments.uniform(from_, to), there)[0]
+
+    def _killed_export(self, folder: Path) -> list[str]:
+        log, call = self.folder / f"{folder.name}.log", lambda: export(self.whole, folder)
+        for _ in range(ATTEMPTS):
+            code, used = forked.kill_when(call, log, self.moments.uniform(0.0, self.export_seconds))
+            if code == -signal.SIGKILL:
+                break
+            shutil.rmtree(folder, ignore_errors=True)
+        else:
+            raise RuntimeError(f"an export cannot be killed: {log}")
+        there = [path.name for path in folder.rglob("*") if path.is_file()]
+        self.kills.append({"kind": "export", "at": f"export after {used:.1f} s, {len(there)} files there"})
+        found = self._compared(lambda: same_bits.half_written(self.exported, folder))
+        if (code := forked.run(call, log)) != 0:
+            return [*found, f"the second export ended with exit code {code}: {log}"]
+        return found + self._compared(lambda: same_bits.export_differences(self.exported, folder))
+
+    def _compared(self, call: Callable[[], list[str]]) -> list[str]:
+        """What ``call`` finds, in a process of its own."""
+        answer, log = self.folder / "answer.json", self.folder / "compare.log"
+        code = forked.run(lambda: answer.write_text(json.dumps(call())), log)
+        return json.loads(answer.read_text()) if code == 0 else [f"the comparison failed: {log}"]
 
 
 def main() -> int:
-    """Parse arguments, run, report; returns the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--kills", type=int, default=8, help="how many kills in all")
-    parser.add_argument("--again", type=float, default=0.3, help="share of resumes that are killed too")
+    """Parse arguments, kill, report; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=8, help="how many kills, at least")
+    parser.add_argument("--again", type=float, default=0.2, help="share of resumes that are killed too")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     parser.add_argument("--output", type=Path, default=Path("outputs/kill_test"), help="folder for everything")
+    parser.add_argument("--json", type=Path, default=None, help="file for what was found")
     arguments = parser.parse_args()
-    output = arguments.output.absolute()
+    output, start = arguments.output.absolute(), time.monotonic()
     shutil.rmtree(output, ignore_errors=True)
     output.mkdir(parents=True)
-    data, whole = output / "data", output / "whole"
-    write_data(data)
-    code, first, seconds = run_whole(train_command(data, whole), output / "whole.log", whole / "config.yml")
-    if code != 0:
-        print(f"the run without a kill ended with exit code {code}: see {output / 'whole.log'}")
-        return 1
-    print(f"without a kill: {seconds:.1f} s of CPU time, of which {first:.1f} s before the run began", flush=True)
-    moments, kills, trials = random.Random(arguments.seed), 0, []
-    while kills < arguments.kills:
-        run = output / f"run_{len(trials)}"
-        killed, command = [], train_command(data, run)
-        while kills < arguments.kills and (not killed or moments.random() < arguments.again):
-            after = moments.uniform(first, seconds)
-            log = output / f"{run.name}_{len(killed)}.log"
-            if run_for(command, log, after, moments.uniform(0.0, 0.1)) == -signal.SIGKILL:
-                kills += 1
-                killed.append({"after": round(after, 2), "at": state_of(run)})
-            if (run / "config.yml").exists():
-                command = resume_command(run)
-            if (run / "training.json").exists():
-                break
-        if not (run / "training.json").exists():
-            run_for(command, output / f"{run.name}_end.log", None)
-        found = differences(whole, run)
-        trials.append({"killed": killed, "differs": found})
-        at = "; ".join(f"{one['after']} s of CPU time: {one['at']}" for one in killed)
-        print(f"{run.name}: killed at {at}: {'; '.join(found[:3]) or 'the same bits'}", flush=True)
-        if not found:
-            shutil.rmtree(run)
-    wrong = sum(bool(trial["differs"]) for trial in trials)
-    (output / "kill_test.json").write_text(json.dumps({"kills": kills, "seconds": seconds, "trials": trials}, indent=1))
-    print(f"{kills} kills in {len(trials)} runs; {wrong} runs differ from the whole one. {output / 'kill_test.json'}")
-    return int(wrong > 0)
+    import_everything()
+    tester = Tester(output, arguments.seed, arguments.again)
+    tester.without_kill()
+    begin, end = tester.preparation
+    print(f"without a kill: {tester.run_seconds:.1f} s of CPU time (preparation {begin:.1f} to {end:.1f} s), export "
+          f"{tester.export_seconds:.1f} s", flush=True)  # fmt: skip
+    while len(tester.kills) < arguments.kills:
+        tester.trial(KINDS[tester.trials % len(KINDS)])
+        report = {
+            "kills": len(tester.kills), "runs": tester.trials, "runs_that_differ": tester.wrong,
+            "by_kind": Counter(kill["kind"] for kill in tester.kills),
+            "cpu_seconds_of_run": tester.run_seconds, "cpu_seconds_of_export": tester.export_seconds,
+            "seed": arguments.seed, "seconds": time.monotonic() - start, "commit": commit(),
+            "machine": describe_machine(), "moments": tester.kills,
+        }  # fmt: skip
+        (arguments.json or output / "kill_test.json").write_text(json.dumps(report, indent=1))
+    print(f"{len(tester.kills)} kills in {tester.trials} runs; {tester.wrong} runs differ from the whole one.")
+    return int(tester.wrong > 0)
+
+
+def import_everything() -> None:
+    """Import what a run needs, but compute nothing: threads would not survive the forks."""
+    from nerfstudio.scripts import train  # noqa: F401
+
+    from beags_plugin import cli  # noqa: F401
+    from beags_plugin.ops import extension
+    from beags_plugin.plugin import export, launch, methods  # noqa: F401
+    from beags_plugin.sample import writer  # noqa: F401
+
+    extension.load()
 
 
 def write_data(folder: Path) -> None:
     """The sample at a quarter of its size."""
     from beags_plugin.sample.writer import SampleConfig, write_sample
 
-    write_sample(folder, SampleConfig(seed=3, width=96, height=72, num_train=16, num_test=3))
+    write_sample(folder, SampleConfig(seed=3, width=96, height=72, num_train=10, num_test=2))
 
 
-def train_command(data: Path, run: Path) -> list[str]:
-    """What starts the run."""
-    options = [str(word) for pair in OPTIONS.items() for word in pair]
-    return [str(BIN / "ns-train"), "beags-tiny", "--data", str(data), "--run-dir", str(run), *options]
+def train(data: Path, run: Path) -> None:
+    """What ns-train does, once it has read its arguments."""
+    from beags_plugin.plugin.launch import train
+    from beags_plugin.plugin.presets import preset_config
+
+    config = preset_config("beags-tiny", OPTIONS, Path("kill_test.py"))
+    config.data, config.run_dir = data, run
+    train(config)
 
 
-def resume_command(run: Path) -> list[str]:
-    """What goes on with it."""
-    return [sys.executable, "-m", "beags_plugin.cli", "resume", str(run)]
+def go_on(data: Path, run: Path) -> None:
+    """Begin a run, or do what ``beags resume`` does with one that has begun."""
+    from beags_plugin.cli import main
+
+    if (run / "config.yml").exists():
+        main(["resume", str(run)])
+    else:
+        train(data, run)
 
 
-def run_for(command: list[str], log: Path, cpu_seconds: float | None, jitter: float = 0.0) -> int:
-    """Run a command; kill it once it has had so much CPU time, if given, and ``jitter`` seconds have passed.
+def export(run: Path, folder: Path) -> None:
+    """What ``beags export`` does."""
+    from beags_plugin.cli import main
 
-    Returns its exit code (-9: killed).
-    """
-    with open(log, "wb") as file, started(command, file) as process:
-        while cpu_seconds is not None and process.poll() is None:
-            if cpu_time(process.pid) >= cpu_seconds:
-                time.sleep(jitter)  # a program that waits for the disk uses no CPU time
-                process.kill()
-                break
-            time.sleep(0.002)
-        return process.wait()
+    main(["export", "--load-config", str(run / "config.yml"), "--output", str(folder), *EXPORT])
 
 
-def run_whole(command: list[str], log: Path, config: Path) -> tuple[int, float, float]:
-    """Exit code of a command, and its CPU time until it had written ``config`` and in all."""
-    first = last = 0.0
-    with open(log, "wb") as file, started(command, file) as process:
-        while process.poll() is None:
-            last = max(last, cpu_time(process.pid))
-            first = first if config.exists() else last
-            time.sleep(0.02)
-    return process.returncode, first, last
-
-
-def started(command: list[str], log: Any) -> subprocess.Popen:
-    """A process that writes to ``log``."""
-    environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ}
-    return subprocess.Popen(command, stdout=log, stderr=log, env=environment)
-
-
-def cpu_time(pid: int) -> float:
-    """Seconds of CPU time that a process has had (Linux): a moment in a run, however busy the machine is."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return 0.0
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+def is_complete(run: Path) -> bool:
+    """Whether a run has ended by itself."""
+    return (run / "training.json").exists()
 
 
 def state_of(run: Path) -> str:
@@ -145,50 +229,12 @@ def state_of(run: Path) -> str:
     saved = sorted(path.stem for path in run.glob("nerfstudio_models/*.ckpt"))
     unfinished = sorted(path.name for path in run.rglob(".*.part"))
     stages = sorted(path.name.split("-")[0] for path in run.glob("prepared/stages/*/*.pt"))
-    words = [f"checkpoint {saved[-1]}" if saved else "no checkpoint yet"]
+    words = [saved[-1] if saved else "no checkpoint yet"]
     if unfinished:
         words.append(f"while {unfinished[0]} was written")
     if stages:
         words.append(f"{len(stages)} stages kept")
     return ", ".join(words)
-
-
-def differences(whole: Path, run: Path) -> list[str]:
-    """What of two complete runs is not the same bits."""
-    found = []
-    checkpoints = [sorted(folder.glob("nerfstudio_models/*.ckpt")) for folder in (whole, run)]
-    if [[path.name for path in paths] for paths in checkpoints] != [[checkpoints[0][0].name]] * 2:
-        return [f"checkpoints: {[str(path) for path in checkpoints[1]]}"]
-    one, other = (without_clocks(torch.load(paths[0], weights_only=True)) for paths in checkpoints)
-    found += compare(one, other, "checkpoint")
-    curves = [without_clocks(json.loads((folder / "held_out.json").read_text())) for folder in (whole, run)]
-    found += compare(*curves, "curve")
-    for file in sorted(path.relative_to(whole) for path in whole.glob("prepared/**/*.png")):
-        if not (run / file).exists() or (whole / file).read_bytes() != (run / file).read_bytes():
-            found.append(str(file))
-    for file in sorted(path.relative_to(whole) for path in whole.glob("prepared/**/grid.pt")):
-        found += compare(*(torch.load(folder / file, weights_only=True) for folder in (whole, run)), str(file))
-    return found
-
-
-def without_clocks(value: Any) -> Any:
-    """The same without what a clock said."""
-    if isinstance(value, dict):
-        clocks = ("seconds", "cpu_seconds", "clocks")
-        return {name: without_clocks(item) for name, item in value.items() if name not in clocks}
-    return [without_clocks(item) for item in value] if isinstance(value, (list, tuple)) else value
-
-
-def compare(one: Any, other: Any, where: str) -> list[str]:
-    """Where two nested values are not the same bits."""
-    if isinstance(one, torch.Tensor) and isinstance(other, torch.Tensor):
-        return [] if one.dtype == other.dtype and torch.equal(one, other) else [where]
-    if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
-        return [found for key in one for found in compare(one[key], other[key], f"{where}/{key}")]
-    if isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
-        pairs = enumerate(zip(one, other, strict=True))
-        return [found for index, pair in pairs for found in compare(*pair, f"{where}/{index}")]
-    return [] if one == other else [where]
 
 
 if __name__ == "__main__":

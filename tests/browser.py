@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import signal
 import subprocess
 import tempfile
 import time
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 from websockets.sync.client import connect
 
+from beags_plugin.child_processes import bound
 from beags_plugin.doctor.diagnosis import browser
 
 _FLAGS = (
@@ -42,18 +44,28 @@ class Page:
         assert program is not None, "there is no Chromium (Debian: apt install chromium)"
         self._profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         command = [program, *_FLAGS, f"--user-data-dir={self._profile.name}", f"--window-size={width},{height}", url]
-        self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        port = self._wait_for(lambda: (Path(self._profile.name) / "DevToolsActivePort").read_text().split()[0])
-        target = self._wait_for(lambda: self._page_target(port))
-        self._socket = connect(target, max_size=None, compression=None)
-        self._number = 0
-        self._send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self._process = subprocess.Popen(
+            bound(command, signal.SIGKILL), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        try:
+            port = self._wait_for(lambda: (Path(self._profile.name) / "DevToolsActivePort").read_text().split()[0])
+            target = self._wait_for(lambda: self._page_target(port))
+            self._socket = connect(target, max_size=None, compression=None)
+            self._number = 0
+            size = {"width": width, "height": height, "deviceScaleFactor": 1}
+            self._send("Emulation.setDeviceMetricsOverride", **size, mobile=False)
+        except BaseException:
+            self._end()
+            raise
 
     def __enter__(self) -> Page:
         return self
 
     def __exit__(self, *_) -> None:
         self._socket.close()
+        self._end()
+
+    def _end(self) -> None:
         self._process.kill()
         self._process.wait()
         self._profile.cleanup()

@@ -48,30 +48,17 @@ def short_config(data: Path, run: Path, **overrides):
 
 
 def run_to_end(config):
-    """Train as ns-train does; the writers of nerfstudio are the process's, so they are forgotten afterwards."""
+    """Train as ns-train does."""
     from beags_plugin.plugin.launch import train
 
-    try:
-        train(config)
-    finally:
-        forget_writers()
+    train(config)
 
 
 def resume_to_end(run: Path, device: str | None = None):
     """What ``beags resume`` does."""
     from beags_plugin.plugin.launch import resume
 
-    try:
-        resume(run, device)
-    finally:
-        forget_writers()
-
-
-def forget_writers():
-    from nerfstudio.utils import writer
-
-    writer.EVENT_WRITERS.clear()
-    writer.EVENT_STORAGE.clear()
+    resume(run, device)
 
 
 def checkpoint_of(run: Path) -> dict:

@@ -16,6 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.append(str(ROOT))  # benchmarks/ is not installed
 
+from beags_plugin.child_processes import bound
 from beags_plugin.errors import UserError
 from beags_plugin.rasterizers import native
 from benchmarks import backends, goals, machine, scenes
@@ -34,7 +35,7 @@ def quick(tmp_path_factory):
     """The file and the text that a quick run gives."""
     target = tmp_path_factory.mktemp("benchmark") / "result.json"
     done = subprocess.run(
-        [sys.executable, ROOT / "benchmarks" / "rasterizer.py", "--quick", "--no-gsplat", "--json", target],
+        bound([sys.executable, ROOT / "benchmarks" / "rasterizer.py", "--quick", "--no-gsplat", "--json", target]),
         capture_output=True, text=True, cwd=target.parent, env={**os.environ, "OMP_WAIT_POLICY": "PASSIVE"},
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr

@@ -15,6 +15,7 @@ pytest.importorskip("nerfstudio")
 plyfile = pytest.importorskip("plyfile")
 yaml = pytest.importorskip("yaml")
 
+from beags_plugin.child_processes import bound
 from beags_plugin.sample.writer import SampleConfig, write_sample
 
 BIN = Path(sys.executable).parent
@@ -23,7 +24,7 @@ BIN = Path(sys.executable).parent
 def run(*command, **options):
     environment = {**os.environ, "OMP_WAIT_POLICY": "PASSIVE", "COLUMNS": "200"}
     done = subprocess.run(
-        [str(BIN / command[0]), *map(str, command[1:])],
+        bound([BIN / command[0], *command[1:]]),
         capture_output=True, text=True, env=environment, timeout=900, **options,
     )  # fmt: skip
     return done.returncode, done.stdout + done.stderr

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import subprocess
 import sys
+
+import pytest
+import torch
+
+from beags_plugin.errors import UserError, writing
 
 PROGRAM = """
 import beags_plugin.plugin
@@ -27,3 +34,57 @@ def test_other_errors_keep_their_traceback():
     done = _run("ValueError('a defect')")
     assert done.returncode != 0
     assert "Traceback" in done.stderr and "ValueError: a defect" in done.stderr
+
+
+def error_in(path, cause: BaseException) -> BaseException:
+    """What comes out of a block that writes ``path`` and in which ``cause`` is raised."""
+    with pytest.raises(BaseException) as raised, writing(path):
+        raise cause
+    return raised.value
+
+
+def refusal(code: int, *file) -> OSError:
+    return OSError(code, os.strerror(code), *map(str, file))
+
+
+@pytest.mark.parametrize(
+    "code", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM]
+)
+def test_what_a_disk_refuses_is_told_of_the_path(tmp_path, code):
+    told = error_in(tmp_path / "a.png", refusal(code))
+    assert isinstance(told, UserError) and f"{tmp_path}/a.png cannot be written ({os.strerror(code)})" in str(told)
+    part = refusal(code, tmp_path / ".a.png.part")
+    assert isinstance(error_in(tmp_path / "a.png", part), UserError)
+
+
+def test_mistakes_in_the_program_blame_no_path(tmp_path):
+    """Errors of the system's kind too: a closed pipe, a closed file, a picture of a kind that cannot be saved."""
+    pipe, closed = refusal(errno.EPIPE), refusal(errno.EBADF)
+    for cause in (KeyError("x"), pipe, closed, OSError("cannot write mode F as PNG"), refusal(errno.EINVAL)):
+        assert error_in(tmp_path / "a.png", cause) is cause
+    elsewhere = refusal(errno.ENOENT, "/nowhere/photo.png")
+    assert error_in(tmp_path / "a.png", elsewhere) is elsewhere
+
+
+def test_a_mistake_made_while_a_refusal_is_handled_is_a_mistake(tmp_path):
+    with pytest.raises(KeyError), writing(tmp_path / "a.png"):
+        try:
+            raise refusal(errno.EACCES, tmp_path / "a.png")
+        except OSError:
+            {}["missing"]
+    with pytest.raises(UserError, match="cannot be written"), writing(tmp_path / "a.png"):
+        try:
+            raise refusal(errno.EACCES, tmp_path / "a.png")
+        except OSError as error:
+            raise ValueError("the library's own kind") from error
+
+
+def test_what_torch_makes_of_a_full_disk_is_known(tmp_path):
+    if not os.path.exists("/dev/full"):
+        pytest.skip("this system has no /dev/full")
+    with (
+        pytest.raises(UserError, match=os.strerror(errno.ENOSPC)),
+        writing(tmp_path / "a.pt"),
+        open("/dev/full", "wb", buffering=0) as file,
+    ):
+        torch.save({"a": torch.zeros(100_000)}, file)

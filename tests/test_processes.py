@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 import torch
 import torch.distributed as dist
 
+from beags_plugin.child_processes import bound
 from beags_plugin.core import processes
 from beags_plugin.core.processes import each_view
 
@@ -55,7 +57,7 @@ def in_two_processes(folder: Path, kept: Path) -> list[dict]:
     def start(rank):
         files = [str(path) for path in (folder / "meeting", folder / str(rank), kept)]
         command = [sys.executable, str(PROGRAM), str(rank), "2", *files]
-        return subprocess.Popen(command, cwd=root, env=environment(root))
+        return subprocess.Popen(bound(command, signal.SIGKILL), cwd=root, env=environment(root))
 
     running = [start(0), start(1)]
     try:

@@ -22,7 +22,6 @@ from resumed_runs import (
     assert_same_run,
     checkpoint_of,
     differences,
-    forget_writers,
     resume_to_end,
     run_to_end,
     short_config,
@@ -30,6 +29,7 @@ from resumed_runs import (
 )
 from run_folders import write_scene
 
+from beags_plugin.child_processes import bound
 from beags_plugin.errors import UserError
 from beags_plugin.plugin.extract import read_scene
 from beags_plugin.plugin.trainer import BeagsTrainer
@@ -72,7 +72,6 @@ def broken_off(data, run, monkeypatch, kill, **overrides):
         kill(patch)
         with pytest.raises(Killed):
             run_to_end(short_config(data, run, **overrides))
-    forget_writers()
 
 
 def test_the_run_grows_splits_and_prepares_twice(whole):
@@ -463,7 +462,7 @@ def test_a_real_kill(data, whole, tmp_path):
         f"run_to_end(short_config(Path({str(data)!r}), Path({str(run)!r})))"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), os.getcwd()])}
-    with subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.DEVNULL) as process:
+    with subprocess.Popen(bound([sys.executable, "-c", code]), env=environment, stdout=subprocess.DEVNULL) as process:
         deadline = time.monotonic() + 120
         while not (run / "nerfstudio_models" / "step-000000021.ckpt").exists():
             assert process.poll() is None and time.monotonic() < deadline

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import struct
+import threading
 import zipfile
 from pathlib import Path
 
@@ -24,13 +26,15 @@ from beags_plugin.core.filed_tensors import FiledTensors, write_tensors
 from beags_plugin.data.colmap_binary import check_colmap_binary
 from beags_plugin.data.transforms_file import read_transforms
 from beags_plugin.errors import UserError
+from beags_plugin.masks.classes import read_classes
 from beags_plugin.masks.sources.coco import packed_total
 from beags_plugin.plugin import run_config
 from beags_plugin.plugin.run_config import load_run_config
 from beags_plugin.reading.arrays import MOST_RATIO, load_array, load_arrays
 from beags_plugin.reading.images import read_image
 from beags_plugin.reading.tensors import load_tensors
-from beags_plugin.reading.text import load_json
+from beags_plugin.reading.text import MOST_BYTES, load_json
+from beags_plugin.shipped import read_toml
 
 # -- configs ---------------------------------------------------------------------------------------------------------
 
@@ -295,6 +299,25 @@ def test_deep_json_is_refused(tmp_path):
     (tmp_path / "a.json").write_text('{"a":' * 200_000)
     with pytest.raises(ValueError, match="nested too deeply"):
         load_json(tmp_path / "a.json")
+
+
+def test_text_that_is_too_long_is_refused_before_it_is_parsed(tmp_path):
+    """Also where the system tells no size, as of a pipe; the bound is what such a file may have."""
+    path = tmp_path / "a.json"
+    path.write_text("[" + "0," * 1000 + "0]")
+    assert len(load_json(path, most_bytes=3000)) == 1001
+    with pytest.raises(ValueError, match="it is longer than the 0 MB"):
+        load_json(path, most_bytes=2001)
+    path.write_bytes(b" " * (MOST_BYTES + 1))
+    with pytest.raises(UserError, match=r"class names .*a.json cannot be read as JSON \(it is longer than the 16 MB"):
+        read_classes(path)
+    with pytest.raises(UserError, match="is no TOML .it is longer than the 1 MB that such a file may have"):
+        read_toml(path, "preset")
+    os.mkfifo(tmp_path / "pipe")
+    writer = threading.Thread(target=lambda: (tmp_path / "pipe").write_bytes(b"[1]"))
+    writer.start()
+    assert load_json(tmp_path / "pipe") == [1]
+    writer.join()
 
 
 def test_packed_run_lengths_are_counted_as_the_library_unpacks_them():

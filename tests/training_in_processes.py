@@ -9,13 +9,17 @@ from __future__ import annotations
 import hashlib
 import json
 import multiprocessing
+import signal
 from pathlib import Path
 
 import torch
 
+from beags_plugin.child_processes import end_with_parent
+
 _TRUE = (torch.cuda.is_available, torch.cuda.device_count)
 if multiprocessing.current_process().name != "MainProcess":
     torch.cuda.is_available, torch.cuda.device_count = lambda: True, lambda: 2
+    end_with_parent(signal.SIGKILL)
 
 
 def worker(local_rank: int, world_size: int, config, global_rank: int = 0) -> None:

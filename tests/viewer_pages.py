@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from browser import Page
 from PIL import Image
 from run_folders import CLASSES
 
+from beags_plugin.child_processes import bound
 from beags_plugin.masks.classes import colorize
 
 WIDTH, HEIGHT = 640, 400
@@ -39,16 +41,19 @@ def started(command: list[object], log: Path, ready: str) -> Iterator[subprocess
     """
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path[1:]])}
     with open(log, "wb") as out:
-        process = subprocess.Popen(
-            [sys.executable, *map(str, command)], stdout=out, stderr=subprocess.STDOUT, env=environment
-        )
-    end = time.monotonic() + 200
-    while ready not in log.read_text():
-        assert process.poll() is None and time.monotonic() < end, log.read_text()[-3000:]
-        time.sleep(0.2)
-    yield process
-    process.terminate()
-    process.wait()
+        words = bound([sys.executable, *command], signal.SIGKILL)
+        process = subprocess.Popen(words, stdout=out, stderr=subprocess.STDOUT, env=environment)
+    try:
+        end = time.monotonic() + 200
+        while ready not in log.read_text():
+            assert process.poll() is None and time.monotonic() < end, log.read_text()[-3000:]
+            time.sleep(0.2)
+        yield process
+        process.terminate()
+        process.wait(30)
+    finally:
+        process.kill()  # where the test failed, or it did not end
+        process.wait()
     assert "Traceback" not in log.read_text()
 
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from beags_plugin.child_processes import bound
 from beags_plugin.errors import UserError
 
 STAMP = "trained.json"
@@ -28,7 +29,7 @@ def trained_base(data: Path, run: Path, preset: str) -> Path:
         str(Path(sys.executable).parent / "ns-train"), preset, "--data", str(data), "--run-dir", str(run.absolute()),
         "--vis", "tensorboard", "--pipeline.model.refine-steps", "0", "beags-data", "--downscale-factor", "1",
     ]  # fmt: skip
-    code = subprocess.run(command).returncode
+    code = subprocess.run(bound(command)).returncode
     if code != 0:
         raise UserError(f"training ended with exit code {code}; what it printed above says why.")
     stamp.write_text(json.dumps(request))

@@ -7,25 +7,20 @@ prints the exit code of the process that it forked: imports, which take longer t
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import resource
-import signal
 import sys
 import traceback
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from beags_plugin.child_processes import end_with_parent
 from beags_plugin.errors import UserError
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.config import BeagsTrainerConfig
     from beags_plugin.plugin.dataparser import BeagsDataParserConfig
-
-
-PR_SET_PDEATHSIG = 1  # of Linux's prctl
 
 
 def serve() -> None:
@@ -52,8 +47,7 @@ def _import_everything() -> None:
 
 def _in_child(folder: Path) -> int:
     """The exit code of the trial in ``folder``."""
-    with suppress(OSError, AttributeError):  # Linux: end with the program that waits for the trial
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+    end_with_parent()  # the program that waits for the trial
     code = 1
     try:
         with open(folder / "log.txt", "wb") as log, open(os.devnull) as nothing:

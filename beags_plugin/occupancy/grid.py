@@ -156,6 +156,8 @@ class VisibilityGrid:
         for step in sorted(itertools.product(range(_BOX), repeat=3), key=max):
             if max(step) != 1:  # few reach further than to the next voxel
                 asked = torch.nonzero(inside & (span.amax(-1) >= max(step)))[:, 0]
+            if len(asked) == 0:
+                break
             offset = span.new_tensor(step)
             chosen = asked[(span[asked] >= offset).all(-1)]
             inside[chosen] = self._member(low[chosen] + offset, class_ids[chosen]) & inside[chosen]

@@ -15,7 +15,7 @@ from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.core import processes
-from beags_plugin.errors import UserError, refused, unwritable
+from beags_plugin.errors import UserError, is_of_disk, refused, unwritable
 from beags_plugin.plugin.checkpoints import Checkpoints
 from beags_plugin.plugin.forecast import NO_MEMORY, MemoryWatch, check_memory, forecast, is_out_of_memory
 from beags_plugin.plugin.held_out import HeldOutCurve
@@ -103,12 +103,21 @@ class BeagsTrainer(Trainer):
         check_memory(forecast(self.config, *sizes, points, grows, device=self.device, program=program))
 
     def _told(self, error: OSError) -> UserError:
-        """What the system refused where nothing else has told it, as to nerfstudio's own writers."""
-        return refused(error) or unwritable(self.base_dir, error)
+        """What the system refused where nothing else has told it, as to nerfstudio's own writers; other errors pass."""
+        if (told := refused(error)) is not None:
+            return told
+        if not is_of_disk(error):
+            raise error
+        return unwritable(self.base_dir, error)
 
     def _release(self) -> None:
-        """Let others train in this run's folder."""
+        """Let others train in this run's folder, and end what writes curves, a thread of tensorboard's too."""
         self._rank.end()
+        for each in writer.EVENT_WRITERS:
+            if isinstance(each, writer.TensorboardWriter):
+                each.tb_writer.close()
+        writer.EVENT_WRITERS.clear()
+        writer.EVENT_STORAGE.clear()
         if self._lock is not None:
             self._lock.release()
             self._lock = None

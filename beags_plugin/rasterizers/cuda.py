@@ -28,7 +28,7 @@ from beags_plugin.rasterizers.autograd import (
     Needed,
     check_image,
 )
-from beags_plugin.rasterizers.interface import IGNORE, RasterSettings, SurfelInputs
+from beags_plugin.rasterizers.interface import IGNORE, RasterSettings, SurfelInputs, map_ids
 
 _FLOATS = ("means", "quats", "log_scales", "opacity_logits", "colors")
 _GEOMETRY, _DISTORTION, _BOUNDARY = 1, 2, 4  # Parts of native/types.h
@@ -164,11 +164,8 @@ class CudaRasterizer(KernelRasterizer):
     ) -> tuple[Tensor, Tensor]:
         """See ``Rasterizer.class_map``."""
         inputs = _detached(inputs.checked())
-        ids, like = inputs.class_ids, inputs.means
-        if ids is None:
-            raise ValueError("class_ids must be given for a class map")
-        if ids.numel() and not (int(ids.min()) >= 0 and int(ids.max()) < min(num_classes, IGNORE)):
-            raise ValueError(f"class_ids must lie in 0..{num_classes - 1}, not {int(ids.min())}..{int(ids.max())}")
+        map_ids(inputs, min(num_classes, IGNORE))
+        like = inputs.means
         classes = torch.empty(camera.height, camera.width, dtype=torch.int32, device=like.device)
         share = like.new_empty(camera.height, camera.width)
 

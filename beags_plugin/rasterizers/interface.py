@@ -83,6 +83,16 @@ class SurfelInputs:
         return replace(self, **{name: getattr(self, name).contiguous() for name in scattered}) if scattered else self
 
 
+def map_ids(inputs: SurfelInputs, num_classes: int) -> Tensor:
+    """The class ids [N] int32 that a class map is drawn of; raises ``ValueError`` if any is no class."""
+    ids = inputs.class_ids
+    if ids is None:
+        raise ValueError("class_ids must be given for a class map")
+    if ids.numel() and not (int(ids.min()) >= 0 and int(ids.max()) < num_classes):
+        raise ValueError(f"class_ids must lie in 0..{num_classes - 1}, not {int(ids.min())}..{int(ids.max())}")
+    return ids
+
+
 @dataclass(frozen=True)
 class RasterOutputs:
     """What is seen (E4). H, W are the camera's; floats have the inputs' dtype.

@@ -21,7 +21,7 @@ from beags_plugin.rasterizers.autograd import (
     Needed,
     check_image,
 )
-from beags_plugin.rasterizers.interface import RasterSettings, SurfelInputs
+from beags_plugin.rasterizers.interface import RasterSettings, SurfelInputs, map_ids
 
 _FLOATS = ("means", "quats", "log_scales", "opacity_logits", "colors")
 
@@ -141,11 +141,7 @@ class NativeRasterizer(KernelRasterizer):
     ) -> tuple[Tensor, Tensor]:
         """See ``Rasterizer.class_map``."""
         inputs = _detached(inputs.checked())
-        ids = inputs.class_ids
-        if ids is None:
-            raise ValueError("class_ids must be given for a class map")
-        if ids.numel() and not (int(ids.min()) >= 0 and int(ids.max()) < num_classes):
-            raise ValueError(f"class_ids must lie in 0..{num_classes - 1}, not {int(ids.min())}..{int(ids.max())}")
+        map_ids(inputs, num_classes)
         frame, _ = _frame(inputs, camera, settings)
         classes = torch.empty(camera.height, camera.width, dtype=torch.int32)
         share = inputs.means.new_empty(camera.height, camera.width)

@@ -63,10 +63,12 @@ def project(inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> P
         opacity = torch.sigmoid(inputs.opacity_logits)
         index = (finite & (depth > settings.near) & (opacity >= MIN_ALPHA)).nonzero()[:, 0]
         index = index[depth[index].argsort(stable=True)]  # by centre depth, ties by index
-        sound = _is_finite(_project(inputs, index, camera))
-        dropped = int((~finite).sum()) + int((~sound).sum())
-    # Projected anew without those that overflow: in the backward even a discarded infinity would turn into NaN.
-    return replace(_project(inputs, index[sound], camera), num_nonfinite=dropped)
+    projected = _project(inputs, index, camera)
+    sound = _is_finite(projected)
+    if not bool(sound.all()):
+        # Projected anew without those that overflow: in the backward even a discarded infinity would turn into NaN.
+        projected = _project(inputs, index[sound], camera)
+    return replace(projected, num_nonfinite=int((~finite).sum()) + int((~sound).sum()))
 
 
 def _is_finite(projected: ProjectedSurfels) -> Tensor:

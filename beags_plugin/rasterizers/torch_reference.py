@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.class_ranks import ClassRanks
 from beags_plugin.rasterizers.interface import (
     IGNORE,
     MIN_TRANSMITTANCE,
@@ -17,6 +18,7 @@ from beags_plugin.rasterizers.interface import (
     RasterOutputs,
     RasterSettings,
     SurfelInputs,
+    map_ids,
 )
 from beags_plugin.rasterizers.reference_geometry import ProjectedSurfels, hits, on_screen, project
 
@@ -104,20 +106,20 @@ class TorchRasterizer(Rasterizer):
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
     ) -> tuple[Tensor, Tensor]:
         inputs, camera = inputs.checked(), camera.to(inputs.means)
-        if inputs.class_ids is None:
-            raise ValueError("a class map needs class_ids")
+        class_ids = map_ids(inputs, num_classes)
         projected = project(inputs, camera, settings)
         rows = _Rows(camera.height, camera.width)
         for block in self._blocks(projected, camera, settings):
-            classes = inputs.class_ids[block.index].long()
-            one_hot = (classes[:, None] == torch.arange(num_classes, device=classes.device)).to(block.weights)
+            ids = class_ids[block.index]
+            here = ClassRanks(ids)  # of the classes in this block alone: there may be 65,535 in all
+            one_hot = (here.ranks(ids)[:, None] == torch.arange(len(here), device=ids.device)).to(block.weights)
             per_class = block.weights @ one_hot
             best = per_class.argmax(dim=-1)  # the first of equals, so ties go to the lower id
             alpha = block.weights.sum(dim=-1)
             share = per_class.gather(1, best[:, None])[:, 0] / torch.where(alpha > 0, alpha, torch.ones_like(alpha))
-            rows.put(block.rows, block.columns, {"class": best[:, None].to(per_class), "share": share[:, None]})
+            rows.put(block.rows, block.columns, {"class": here.class_ids(best)[:, None], "share": share[:, None]})
         images = rows.join()
-        return images["class"][..., 0].to(torch.int32), images["share"][..., 0]
+        return images["class"][..., 0], images["share"][..., 0]
 
     @torch.no_grad()
     def heaviest(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:

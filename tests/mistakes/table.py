@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from resumed_runs import Killed, forget_writers, run_to_end
+from resumed_runs import Killed, run_to_end
 from run_folders import write_scene, write_trained
 
 Command = Callable[[], None]
@@ -81,7 +81,6 @@ class Templates:
             with pytest.MonkeyPatch.context() as patch, suppress(Killed):
                 patch.setattr(BeagsTrainer, "train_iteration", iteration)
                 run_to_end(config)
-            forget_writers()
         return folder
 
 
@@ -286,10 +285,7 @@ def _converted(current: Any, name: str, values: list[str]) -> Any:
 def _ns_train(config: Any) -> None:
     from nerfstudio.scripts.train import main
 
-    try:
-        main(config)
-    finally:
-        forget_writers()
+    main(config)
 
 
 def summary() -> str:

@@ -9,6 +9,8 @@ from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.colmap import complete_model
 from beags_plugin.data.poses_bounds import FILE, read_poses_bounds, seed_points
 from beags_plugin.data.scene import ColmapModel, PoseTable, Scene, Split
+from beags_plugin.errors import UserError
+from beags_plugin.reading.text import load_text, reason
 
 NVOS_TARGETS = {
     "fern": "IMG_4027",
@@ -72,7 +74,11 @@ def nvos_target(root: Path, folder: Path) -> tuple[str, ...]:
     stems = [path.stem for path in list_images(folder)]
     pairs = dict(zip((path.stem for path in _originals(root, len(stems))), stems, strict=False))
     if (root / ORIGINAL_NAMES).is_file():
-        lines = (line.split() for line in (root / ORIGINAL_NAMES).read_text(encoding="utf-8").splitlines())
+        try:
+            lines = [line.split() for line in load_text(root / ORIGINAL_NAMES).splitlines()]
+        except (OSError, ValueError) as error:
+            told = f"{root / ORIGINAL_NAMES} cannot be read ({reason(error)}): restore or remove it."
+            raise UserError(told) from error
         pairs |= {Path(names[1]).stem: Path(names[0]).stem for names in lines if len(names) == 2}
     return (target,) if target in stems else (pairs.get(target, target),)
 

@@ -9,6 +9,7 @@ from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.llff import lacks_poses, model_or_bounds
 from beags_plugin.data.scene import Scene, Split
 from beags_plugin.errors import UserError
+from beags_plugin.reading.text import load_text, reason
 
 CLASSES = "segmentations/classes.txt"
 
@@ -55,7 +56,10 @@ class ThreeDOvs(Layout):
 
 
 def _class_names(file: Path) -> list[str]:
-    names = [line.strip() for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
+    try:
+        names = [line.strip() for line in load_text(file).splitlines() if line.strip()]
+    except (OSError, ValueError) as error:
+        raise UserError(f"{file} cannot be read ({reason(error)}): write one class name on each line.") from error
     if not names or len(set(names)) < len(names):
         raise UserError(f"{file} names {'a class twice' if names else 'no class'}: write one name on each line.")
     return names

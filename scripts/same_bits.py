@@ -1,0 +1,79 @@
+"""What of two runs, or of two exports, is not the same bits."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+
+CLOCKS = ("seconds", "cpu_seconds", "clocks")
+
+
+def run_differences(whole: Path, run: Path) -> list[str]:
+    """What of two complete runs differs: checkpoints with all that they hold, base, curve, masks and grids."""
+    found = []
+    for pattern in ("nerfstudio_models/*.ckpt", "base/nerfstudio_models/*.ckpt", "prepared/**/grid.pt"):
+        found += _name_by_name(whole, run, pattern, _tensor_differences)
+    found += _name_by_name(whole, run, "held_out.json", _json_differences)
+    found += _name_by_name(whole, run, "prepared/**/*.png", _byte_differences)
+    return found + unfinished(run)
+
+
+def export_differences(whole: Path, folder: Path) -> list[str]:
+    """What of two finished exports differs."""
+    return _name_by_name(whole, folder, "**/*", _byte_differences) + unfinished(folder)
+
+
+def half_written(whole: Path, folder: Path) -> list[str]:
+    """What of an export that was killed is neither absent nor as it should be; hidden files do not count."""
+    files = [path for path in folder.rglob("*") if path.is_file() and not path.name.startswith(".")]
+    return [str(path) for path in files if _byte_differences(whole / path.relative_to(folder), path)]
+
+
+def unfinished(folder: Path) -> list[str]:
+    """Files that were begun and left."""
+    return [f"left behind: {path}" for path in folder.rglob("*.part")]
+
+
+def _name_by_name(one: Path, other: Path, pattern: str, differ) -> list[str]:
+    names = [{path.relative_to(folder) for path in folder.glob(pattern) if path.is_file()} for folder in (one, other)]
+    missing = [f"only in one: {name}" for name in sorted(names[0] ^ names[1])]
+    if not names[0]:
+        missing.append(f"the run without a kill has no {pattern}")
+    return missing + [
+        f"{name}{where}" for name in sorted(names[0] & names[1]) for where in differ(one / name, other / name)
+    ]
+
+
+def _byte_differences(one: Path, other: Path) -> list[str]:
+    return [] if one.is_file() and one.read_bytes() == other.read_bytes() else [" has other bytes"]
+
+
+def _tensor_differences(one: Path, other: Path) -> list[str]:
+    return compare(*(_without_clocks(torch.load(path, weights_only=True)) for path in (one, other)), "")
+
+
+def _json_differences(one: Path, other: Path) -> list[str]:
+    return compare(*(_without_clocks(json.loads(path.read_text())) for path in (one, other)), "")
+
+
+def _without_clocks(value: Any) -> Any:
+    """The same without what a clock said."""
+    if isinstance(value, dict):
+        return {name: _without_clocks(item) for name, item in value.items() if name not in CLOCKS}
+    return [_without_clocks(item) for item in value] if isinstance(value, (list, tuple)) else value
+
+
+def compare(one: Any, other: Any, where: str) -> list[str]:
+    """Where two nested values are not the same bits."""
+    if isinstance(one, torch.Tensor) and isinstance(other, torch.Tensor):
+        same = one.dtype == other.dtype and one.shape == other.shape
+        return [] if same and one.numpy().tobytes() == other.numpy().tobytes() else [where]
+    if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
+        return [found for key in one for found in compare(one[key], other[key], f"{where}/{key}")]
+    if isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        pairs = enumerate(zip(one, other, strict=True))
+        return [found for index, pair in pairs for found in compare(*pair, f"{where}/{index}")]
+    return [] if one == other else [where or " differs"]
