@@ -42,13 +42,15 @@ def started(command: list[object], log: Path, ready: str) -> Iterator[subprocess
         process = subprocess.Popen(
             [sys.executable, *map(str, command)], stdout=out, stderr=subprocess.STDOUT, env=environment
         )
-    end = time.monotonic() + 200
-    while ready not in log.read_text():
-        assert process.poll() is None and time.monotonic() < end, log.read_text()[-3000:]
-        time.sleep(0.2)
-    yield process
-    process.terminate()
-    process.wait()
+    try:
+        end = time.monotonic() + 200
+        while ready not in log.read_text():
+            assert process.poll() is None and time.monotonic() < end, log.read_text()[-3000:]
+            time.sleep(0.2)
+        yield process
+    finally:
+        process.terminate()
+        process.wait()
     assert "Traceback" not in log.read_text()
 
 
