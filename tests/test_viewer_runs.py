@@ -1,0 +1,156 @@
+"""Which masks and grids a viewer shows of a run: in training, used again, a base alone, extracted from another."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from run_folders import write_prepared, write_scene, write_trained
+
+pytest.importorskip("nerfstudio")
+
+from nerfstudio.utils.eval_utils import eval_setup
+from viewer_windows import ALWAYS, Stand, write_finished
+
+from beags_plugin.errors import UserError
+from beags_plugin.masks.classes import write_class_map
+from beags_plugin.plugin.extract import extract_objects
+from beags_plugin.plugin.schedule import PhaseSchedule
+from beags_plugin.plugin.viewing import CHANNELS
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    return write_finished(tmp_path_factory.mktemp("viewer"))
+
+
+def test_a_run_in_training_lists_what_will_come(finished):
+    trainer = SimpleNamespace(training_state="training")
+    window = Stand(finished, trainer, lambda model: model.assigned.fill_(False))
+    assert set(window.look()) == ALWAYS | set(CHANNELS)
+    assert window.look("class_map")["class_map"].sum() == 0.0
+    assert "no classes yet" in window.model.viewing.notes["classes"]
+    window.model.assigned.fill_(True)
+    window.panel.follow()
+    assert window.look("class_map")["class_map"].sum() > 0.0 and window.panel.object.options[1] == "cup"
+
+
+def test_masks_of_a_former_run_in_the_folder_are_not_shown_while_a_base_is_trained(tmp_path):
+    config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"))
+    write_prepared(tmp_path / "run", shift=1)
+    window = Stand(config, SimpleNamespace(training_state="training"), lambda model: model.assigned.fill_(False))
+    run = window.model.viewing.run
+    assert run.mask(0, "before", 20, 12) is not None and run.mask(0, "after", 20, 12) is None
+    assert not run.has_grid and not run.load_grid()
+    window.model.viewing.rounds = lambda: 1  # as the switch to refinement says once it is done
+    first = run.mask(0, "after", 20, 12)
+    path = tmp_path / "run/prepared/masks" / f"{run.names[0]}.png"
+    write_class_map(path, np.zeros((12, 20), np.uint8))  # prepared again
+    os.utime(path, ns=(1, path.stat().st_mtime_ns + 1))
+    assert set(first.unique().tolist()) == {0, 1, 2} and not run.mask(0, "after", 20, 12).any()
+    assert run.has_grid and run.load_grid()
+
+
+def test_a_base_opened_again_shows_no_masks_of_a_former_run_in_its_folder(tmp_path):
+    config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"), assigned=False)
+    write_prepared(tmp_path / "run", shift=1)
+    window = Stand(config)
+    run = window.model.viewing.run
+    assert run.mask(0, "after", 20, 12) is None and not run.has_grid and not run.load_grid()
+    assert set(window.look()) == ALWAYS | {"mask_before"}
+
+
+@pytest.mark.parametrize(("done", "masks"), [(0, 0), (1, 0), (3, 0), (4, 2), (6, 2)])
+def test_only_rounds_that_the_scene_has_been_through_are_shown(tmp_path, done, masks):
+    """Three rounds of nine steps are prepared before steps 0, 3 and 6; this run has come to step 6, and a former run
+    in its folder had another round."""
+    config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"))
+    for folder, shift in (("", 0), ("round_2", 2), ("round_3", 3)):
+        write_prepared(tmp_path / "run", shift, folder)
+
+    def change(model):
+        model.config.refine_rounds, model.schedule = 3, PhaseSchedule(10, 9)
+        model.refined_steps.fill_(done)
+
+    run = Stand(config, change=change).model.viewing.run
+    before, after = (run.mask(0, kind, 20, 12) for kind in ("before", "after"))
+    assert torch.equal(before.roll(masks, 0), after)
+
+
+def test_an_extracted_run_shows_its_object_and_the_masks_of_the_run_it_is_from(finished, tmp_path):
+    (extracted,) = extract_objects(finished, ["cup"], output=tmp_path / "out")
+    window = Stand(extracted.config)
+    assert window.panel.object.options == ["cup"]
+    outputs = window.look("mask_after")
+    assert set(outputs) == ALWAYS | set(CHANNELS)
+    window.panel.follow()
+    assert window.look("mask_after")["mask_after"].sum() > 0
+    window.look("occupancy_violation")
+    window.panel.follow()
+    assert window.look("occupancy_violation")["occupancy_violation"].sum() > 0
+    assert window.panel.files.write() == extracted.config.parent / "exports/shown_scene.ply"
+
+
+@pytest.mark.parametrize("changed", ["a mask", "the grid"])
+def test_an_extracted_run_whose_origin_was_trained_again_shows_none_of_its_masks(tmp_path, changed):
+    run = tmp_path / "run"
+    config = write_trained(run, write_scene(tmp_path / "lab"))
+    write_prepared(run, shift=1)
+    (extracted,) = extract_objects(config, ["cup"], output=tmp_path / "out")
+    (of_extracted,) = extract_objects(extracted.config, ["cup"], output=tmp_path / "twice")
+    for each in (extracted, of_extracted):
+        assert Stand(each.config).panel.notes == {}
+    open_now = Stand(extracted.config).model.viewing.run
+    shutil.rmtree(run / "prepared")
+    write_prepared(run, shift=1, **({"scale": 2.0} if changed == "the grid" else {}))
+    if changed == "a mask":
+        write_class_map(run / "prepared/masks/v03.png", np.zeros((12, 20), np.uint8))
+    os.utime(run / "prepared/grid.pt", ns=(1, 1))  # another file, even where the clock is coarse
+    assert open_now.prepared is None and open_now.mask(0, "after", 20, 12) is None
+    for each in (extracted, of_extracted):
+        window = Stand(each.config)
+        assert set(window.look("rgb")) == ALWAYS | {"class_map", "class_confidence", "boundary_error", "mask_before"}
+        assert window.panel.notes["run"] == (
+            f"No masks after reprojection and no voxel grid: {run} has been trained again since this was extracted "
+            "from it. Extract it again."
+        )
+    origin = Stand(config)  # the run itself shows what it has
+    assert origin.panel.notes == {} and {"mask_after", "occupancy_violation"} <= set(origin.look())
+    (again,) = extract_objects(config, ["cup"], output=tmp_path / "out")
+    assert Stand(again.config).panel.notes == {}
+
+
+def test_an_extract_that_does_not_say_what_it_was_prepared_with_shows_what_is_there(finished, tmp_path):
+    (extracted,) = extract_objects(finished, ["cup"], output=tmp_path / "out")
+    origin = extracted.config.parent / "extraction.json"
+    content = json.loads(origin.read_text())
+    assert len(content.pop("prepared")) == 1
+    origin.write_text(json.dumps(content))
+    assert {"mask_after", "occupancy_violation"} <= set(Stand(extracted.config).look())
+
+
+def test_an_extracted_run_whose_origin_is_gone_lists_less(finished, tmp_path):
+    (extracted,) = extract_objects(finished, ["cup"], output=tmp_path / "out")
+    origin = extracted.config.parent / "extraction.json"
+    origin.write_text(json.dumps({**json.loads(origin.read_text()), "run": str(tmp_path / "gone/config.yml")}))
+    window = Stand(extracted.config)
+    listed = set(window.look())
+    assert listed == ALWAYS | {"class_map", "class_confidence", "boundary_error", "mask_before"}
+
+
+def test_a_base_without_masks_lists_what_it_has(tmp_path):
+    window = Stand(write_trained(tmp_path / "run", write_scene(tmp_path / "lab", masks=False), assigned=False))
+    assert set(window.look()) == ALWAYS
+    window.panel.follow()
+    assert window.panel.object.options == ["none yet"]
+
+
+def test_without_a_viewer_there_is_no_export(finished):
+    _, pipeline, _, _ = eval_setup(finished, test_mode="test")
+    with pytest.raises(UserError, match="beags export"):
+        pipeline.model.viewer_panel.files.write()

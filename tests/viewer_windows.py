@@ -1,0 +1,100 @@
+"""Nerfstudio's viewer of a run, or what stands for it, without a browser."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.utils.eval_utils import eval_setup
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
+from nerfstudio.viewer.utils import CameraState
+from nerfstudio.viewer.viewer import Viewer
+from run_folders import write_prepared, write_scene, write_trained
+
+from beags_plugin.core.cameras import Camera, viewmat_from_opengl
+
+ALWAYS = {"rgb", "depth", "normal", "accumulation"}
+
+
+def write_finished(root: Path) -> Path:
+    """config.yml of a run that was prepared."""
+    config = write_trained(root / "run", write_scene(root / "lab"))
+    write_prepared(root / "run", shift=1)
+    return config
+
+
+class Window:
+    """Nerfstudio's viewer of a run, with a client that keeps the pictures it is sent."""
+
+    def __init__(self, config_path, trainer=None, change=lambda model: None) -> None:
+        config, pipeline, _, _ = eval_setup(config_path, test_mode="test")
+        change(pipeline.model)
+        pipeline.model.viewer_panel._follow = lambda: None  # the tests call follow() when they want it
+        config.viewer.websocket_port = None
+        self.lock = threading.Lock()
+        log = config.get_base_dir() / "viewer.log"
+        self.viewer = Viewer(config.viewer, log, pipeline.datamanager.get_datapath(), pipeline, trainer, self.lock)
+        self.model = pipeline.model
+        self.panel = pipeline.model.viewer_panel
+        self.sent: list[np.ndarray] = []
+        scene = SimpleNamespace(set_background_image=lambda image, **_: self.sent.append(image))
+        self.client = SimpleNamespace(scene=scene, camera=SimpleNamespace(aspect=1.5))
+
+    def close(self) -> None:
+        self.viewer.viser_server.stop()
+
+    def look(self, output: str = "rgb") -> dict[str, torch.Tensor]:
+        """Draw and send as the render thread does; the outputs of the model. An error there is raised here."""
+        self.viewer.control_panel._output_render.set_options([output])
+        machine = RenderStateMachine(self.viewer, 10.0, self.client)
+        found: list = []
+
+        def draw() -> None:
+            try:
+                state = CameraState(0.9, 1.5, camera_to_world(), CameraType.PERSPECTIVE)
+                outputs = machine._render_img(state)
+                machine.output_keys = set(outputs)  # the drop-down keeps the one option
+                machine._send_output_to_viewer(outputs)
+                found.append(outputs)
+            except BaseException as error:
+                found.append(error)
+
+        machine.run = draw
+        machine.start()
+        machine.join()
+        if isinstance(found[0], BaseException):
+            raise found[0]
+        return found[0]
+
+
+class Stand:
+    """The same without server and pictures: what the panel is told of a viewer, quick to make."""
+
+    def __init__(self, config_path, trainer=None, change=lambda model: None) -> None:
+        _, pipeline, _, _ = eval_setup(config_path, test_mode="test")
+        self.model, self.panel = pipeline.model, pipeline.model.viewer_panel
+        change(self.model)
+        self.panel._follow = lambda: None
+        self.controls = SimpleNamespace(output_render="rgb", split=False, crop_viewport=False)
+        viewer = SimpleNamespace(
+            log_filename=config_path.parent / "viewer.log", pipeline=pipeline, trainer=trainer, train_lock=None,
+            control_panel=self.controls, _trigger_rerender=lambda: None,
+        )  # fmt: skip
+        self.panel.refresh_objects()
+        self.panel.attach(viewer, SimpleNamespace(register_pointer_cb=lambda *_: None))
+
+    def look(self, output: str = "rgb") -> dict[str, torch.Tensor]:
+        """What the viewer's render thread would be given."""
+        self.controls.output_render = output
+        K = torch.tensor([[60.0, 0, 45], [0, 60, 30], [0, 0, 1]])
+        with torch.no_grad():
+            return self.model.eval().viewing.outputs(Camera(viewmat_from_opengl(camera_to_world()), K, 90, 60))
+
+
+def camera_to_world() -> torch.Tensor:
+    """From 3 along x towards the origin, OpenGL axes, z up."""
+    return torch.tensor([[0.0, 0, 1, 3], [1, 0, 0, 0], [0, 1, 0, 0.2]])
