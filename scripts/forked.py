@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any, BinaryIO
+from unittest import mock
 
+from beags_plugin import whole_files
 from beags_plugin.child_processes import end_with_parent
 
 
@@ -52,20 +57,13 @@ def run(call: Callable[[], object], log: Path) -> int:
     return os.waitstatus_to_exitcode(os.waitpid(forked(call, log), 0)[1])
 
 
-def kill_when(
-    call: Callable[[], object], log: Path, cpu_seconds: float, there: Callable[[], bool] = lambda: True
-) -> tuple[int, float]:
-    """Start ``call`` and kill it once it has had so much CPU time and ``there`` says so.
-
-    Returns its exit code (-9: killed) and its CPU time.
-    """
+def kill_after(call: Callable[[], object], log: Path, cpu_seconds: float) -> tuple[int, float]:
+    """Start ``call`` and kill it once it has had so much CPU time; returns its exit code (-9: killed) and CPU time."""
     child, used = forked(call, log), 0.0
     while (code := ended(child)) is None:
         used = max(used, cpu_time(child))
         if used < cpu_seconds:
             time.sleep(0.002)
-        elif not there():
-            time.sleep(0.0002)  # what is waited for may last a millisecond
         else:
             os.kill(child, signal.SIGKILL)
             return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), used
@@ -79,3 +77,61 @@ def cpu_time(child: int) -> float:
     except OSError:
         return 0.0
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+@contextmanager
+def killed_in_write(ends: str, number: int, share: float) -> Iterator[None]:
+    """Let this process end by SIGKILL while it writes a file whose name ends so: the ``number``-th, from 1.
+
+    share: 0 to 1 of the bytes that the file before it had, after which it ends; beyond 1, and in the first file: once
+    all is written, before the file is put in its place.
+    """
+    seen, last, put = 0, 0, whole_files.put_in_place
+    write_whole = whole_files.write_whole
+
+    def writing(path: Path, write: Callable[[BinaryIO], object], beside: Path | None = None) -> None:
+        nonlocal seen, last
+        if not path.name.endswith(ends):
+            return write_whole(path, write, beside)
+        seen += 1
+        most = int(share * last) if seen == number and last and share < 1.0 else None
+
+        def counted(file: BinaryIO) -> None:
+            nonlocal last
+            ending = _Ending(file, most)
+            write(ending)  # type: ignore[arg-type]
+            last = ending.tell()
+
+        write_whole(path, counted, beside)
+
+    def placing(part: Path, path: Path) -> None:
+        if path.name.endswith(ends) and seen == number:
+            os.kill(os.getpid(), signal.SIGKILL)
+        put(part, path)
+
+    users = [module for module in list(sys.modules.values()) if getattr(module, "write_whole", None) is write_whole]
+    with ExitStack() as patches:
+        for module in users:
+            patches.enter_context(mock.patch.object(module, "write_whole", writing))
+        patches.enter_context(mock.patch.object(whole_files, "put_in_place", placing))
+        yield
+
+
+class _Ending(io.RawIOBase):
+    """A file that ends the process once ``most`` bytes are in it, unless that is None."""
+
+    def __init__(self, file: BinaryIO, most: int | None) -> None:
+        self._file, self._most = file, most
+
+    def write(self, content: Any) -> int:
+        if self._most is not None and self._file.tell() + memoryview(content).nbytes > self._most:
+            self._file.write(memoryview(content).cast("B")[: max(self._most - self._file.tell(), 0)])
+            self._file.flush()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return self._file.write(content)
+
+    def writable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._file.tell()

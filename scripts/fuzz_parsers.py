@@ -6,7 +6,8 @@
 
 With --seconds, atheris (``pip install atheris``) chooses what to change by which lines a file reaches; where it is not
 installed, and with --count, files are changed at random. A parser that raises anything but ``UserError``, takes more
-than 20 seconds or asks for more than 4 GB of memory is a finding: its file is kept and named. Exit status 1: findings.
+than 20 seconds of CPU time or asks for more than 4 GB of memory is a finding: its file is kept and named. Exit status
+1: findings.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -32,10 +34,11 @@ sys.path[:0] = [str(ROOT), str(Path(__file__).resolve().parent)]
 
 NAMES = (
     "ply", "seed points", "npy poses", "npz cameras", "npz member", "colmap images", "colmap cameras", "colmap points",
-    "transforms.json", "classes.json", "coco", "prompts", "experiment", "checkpoint", "checkpoint pickle", "voxel grid",
-    "filed tensors", "mask", "mask rows", "run config",
+    "transforms.json", "classes.json", "coco", "prompts", "experiment", "run config", "checkpoint", "checkpoint pickle",
+    "voxel grid", "filed tensors", "mask", "mask rows",
 )  # fmt: skip
-SECONDS = 20  # of one file
+SECONDS = 20  # of CPU time for one file
+STUCK = 600  # seconds of wall time after which atheris takes a parser to be stuck
 MEMORY = 4 << 30  # bytes beyond what the libraries take
 LONGEST = 1 << 14  # bytes of a changed file
 NUMBERS = (0, 1, 127, 128, 255, 256, 32767, 65535, 65536, 1 << 31, (1 << 32) - 1, 1 << 40, 1 << 60, (1 << 64) - 1)
@@ -103,19 +106,28 @@ def failure_of(name: str, content: bytes) -> str | None:
     """How a parser fails on a file; None if it takes or refuses it."""
     from parser_targets import TARGETS, examine
 
+    try:
+        with limited():
+            examine(TARGETS[name], content)
+    except Exception:
+        return traceback.format_exc()
+    return None
+
+
+@contextmanager
+def limited() -> Iterator[None]:
+    """Raise ``TimeoutError`` in what takes more CPU time than ``SECONDS``: a busy machine changes nothing."""
+
     def late(*_: object) -> None:
         raise TimeoutError(f"more than {SECONDS} s")
 
-    former = signal.signal(signal.SIGALRM, late)
-    signal.alarm(SECONDS)
+    former = signal.signal(signal.SIGPROF, late)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
     try:
-        examine(TARGETS[name], content)
-    except Exception:
-        return traceback.format_exc()
+        yield
     finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, former)
-    return None
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, former)
 
 
 def changed(seeds: list[bytes], seed: int):
@@ -227,13 +239,14 @@ def guided(name: str, work: Path, options: argparse.Namespace) -> None:
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, size + MEMORY))
     command = [sys.argv[0], str(work / "corpus"), f"-max_total_time={options.seconds:.0f}", f"-artifact_prefix={work}/"]
-    command += [f"-timeout={SECONDS}", "-rss_limit_mb=16384", f"-max_len={LONGEST}", "-print_final_stats=1"]
-    atheris.Setup([*command, f"-seed={options.seed + 1}"], lambda content: void(examine(target, content)))
+    command += [f"-timeout={STUCK}", "-rss_limit_mb=16384", f"-max_len={LONGEST}", "-print_final_stats=1"]
+
+    def once(content: bytes) -> None:
+        with limited():
+            examine(target, content)
+
+    atheris.Setup([*command, f"-seed={options.seed + 1}"], once)
     atheris.Fuzz()
-
-
-def void(_: object) -> None:
-    """libFuzzer asks for no result."""
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ Trains a short run of beags-tiny on a small generated sample, and exports it, on
 again, the same is begun in a folder of its own, killed, and done again or resumed (and sometimes killed once more):
 
 - anywhere: at a random moment of the training, before its first file too;
-- checkpoint: while a checkpoint is being written;
+- checkpoint: after a random number of a checkpoint's bytes are written, or all, before it takes its place;
 - preparation: between base and refinement;
 - export: ``beags export`` of all objects, splats and meshes. What lies in its folder after the kill must be whole.
 
@@ -43,6 +43,7 @@ OPTIONS = {
 }  # fmt: skip
 EXPORT = ("--all", "--format", "ply", "ply-2dgs", "spz", "glb", "--resolution", "32", "--min-views", "1")
 KINDS = ("anywhere", "checkpoint", "preparation", "anywhere", "export")  # in turn
+CHECKPOINTS = 20  # of a run, about
 ATTEMPTS = 20  # at a kill of one kind, as a run may end before its moment comes
 
 
@@ -77,9 +78,8 @@ class Tester:
                     seen[name] = self.run_seconds
             time.sleep(0.005)
         self.preparation = seen["stages"], seen["grid"]
-        never = lambda: False  # noqa: E731
-        exporting = lambda: export(self.whole, self.exported)  # noqa: E731
-        export_code, self.export_seconds = forked.kill_when(exporting, log, float("inf"), never)
+        exporting = forked.kill_after(lambda: export(self.whole, self.exported), log, float("inf"))
+        export_code, self.export_seconds = exporting
         if code != 0 or export_code != 0:
             raise RuntimeError(f"the run without a kill ended with exit codes {code}, {export_code}: {log}")
 
@@ -111,15 +111,21 @@ class Tester:
 
     def _kill(self, kind: str, run: Path, log: Path) -> int:
         """The exit code of a run that is killed, if its moment comes."""
+        if kind == "checkpoint":
+            number, share = self.moments.randint(1, CHECKPOINTS), self.moments.uniform(0.0, 1.2)
+
+            def ending() -> None:
+                with forked.killed_in_write(".ckpt", number, share):
+                    go_on(self.data, run)
+
+            return forked.run(ending, log)
         from_, to = self.preparation if kind == "preparation" else (0.0, self.run_seconds)
-        models = run / "nerfstudio_models"
-        there = (lambda: any(models.glob(".*.part"))) if kind == "checkpoint" else (lambda: True)
-        return forked.kill_when(lambda: go_on(self.data, run), log, self.moments.uniform(from_, to), there)[0]
+        return forked.kill_after(lambda: go_on(self.data, run), log, self.moments.uniform(from_, to))[0]
 
     def _killed_export(self, folder: Path) -> list[str]:
         log, call = self.folder / f"{folder.name}.log", lambda: export(self.whole, folder)
         for _ in range(ATTEMPTS):
-            code, used = forked.kill_when(call, log, self.moments.uniform(0.0, self.export_seconds))
+            code, used = forked.kill_after(call, log, self.moments.uniform(0.0, self.export_seconds))
             if code == -signal.SIGKILL:
                 break
             shutil.rmtree(folder, ignore_errors=True)

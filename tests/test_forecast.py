@@ -29,14 +29,39 @@ def of(preset: str, sizes=VIEWS, **overrides):
 
 
 def test_surfels_are_bounded_by_pixels_by_number_or_by_nothing():
-    assert of("beags-fast").surfels == 750_000  # one for 100 pixels
-    assert of("beags-tiny").surfels == 10_000
-    assert of("beags").surfels is None
-    assert of("beags-refine").surfels == 5000  # nothing grows
+    assert of("beags-fast").grown == 750_000  # one for 100 pixels
+    assert of("beags-tiny").grown == 10_000
+    assert of("beags").grown is of("beags").surfels is None
+    assert of("beags-refine").grown == 5000  # nothing grows
+
+
+def test_splits_at_borders_count():
+    tiny, base = of("beags-tiny"), of("beags-tiny", **{"pipeline.model.refine_steps": 0})
+    assert tiny.surfels == int(10_000 * forecasts.GROWTH_OF_SPLIT**2) and base.surfels == base.grown == 10_000
+    unsplit = of("beags-tiny", **{"pipeline.model.split.rounds": 0})
+    assert unsplit.surfels == 10_000 and "before those at borders" not in unsplit.told()
+    more = of("beags-tiny", **{"pipeline.model.refine_rounds": 2})
+    assert more.surfels == int(10_000 * forecasts.GROWTH_OF_SPLIT**4)
+
+
+def test_disk_holds_the_base_the_prepared_masks_and_temporary_files_too():
+    run, base = of("beags-tiny"), of("beags-tiny", **{"pipeline.model.refine_steps": 0})
+    pixels = 75.0  # MB at a byte each
+    assert base.temporary == 0 and base.disk == pytest.approx(forecasts.RUN_MB + 0.01 * base.disk_bytes_of_surfel)
+    assert run.temporary == pytest.approx(forecasts.TEMPORARY_BYTES_OF_PIXEL * pixels)
+    kept = forecasts.PREPARED_BYTES_OF_PIXEL + forecasts.DEPTH_BYTES_OF_PIXEL
+    assert run.run_disk - base.run_disk == pytest.approx(kept * pixels)
+    assert run.disk_bytes_of_surfel > base.disk_bytes_of_surfel > 2 * 3 * 4 * 23
+    unbounded = of("beags")
+    assert unbounded.disk == pytest.approx(unbounded.run_disk + 0.005 * unbounded.disk_bytes_of_surfel)
+    assert f"room for {unbounded.room_on_disk:,} of them" in unbounded.told_of_disk()
 
 
 def test_memory_grows_with_surfels_and_photos_and_not_with_streamed_ones():
-    few, many = (of("beags-tiny", **{"pipeline.model.densify.max_surfels": n}) for n in (10_000, 1_010_000))
+    few, many = (
+        of("beags-tiny", **{"pipeline.model.densify.max_surfels": n, "pipeline.model.split.rounds": 0})
+        for n in (10_000, 1_010_000)
+    )
     assert many.peak - few.peak == pytest.approx(few.bytes_of_surfel)  # a million of them, in MB
     assert 4 * 4 * 23 < few.bytes_of_surfel < 1000  # a gradient and two moments beside each of 23 numbers, and more
     kept = of("beags-tiny", VIEWS, **{"pipeline.datamanager.stream": "never"})
@@ -50,10 +75,19 @@ def test_memory_grows_with_surfels_and_photos_and_not_with_streamed_ones():
 def test_what_does_not_fit_is_refused_with_a_remedy():
     found = replace(of("beags-fast"), available=100_000.0, free_disk=1e6)
     check_memory(found)
-    with pytest.raises(UserError, match=r"with 750,000 Gaussians; 1.0 GB are free.*downscale-factor 2.*check-memory"):
+    told = r"with 1,920,000 Gaussians, 750,000 before .*; 1.0 GB are free.*downscale-factor 2.*check-memory"
+    with pytest.raises(UserError, match=told):
         check_memory(replace(found, available=1000.0))
-    with pytest.raises(UserError, match=r"checkpoints need 1.1 GB of disk and 0.5 GB are free"):
+    with pytest.raises(
+        UserError, match=r"the run needs about 4.06 GB at most .*; 0.5 GB are free: free some space, or"
+    ):
         check_memory(replace(found, free_disk=500.0))
+    with pytest.raises(UserError, match=r"temporary files need 0.60 GB and 0.10 GB are free there: .* TMPDIR"):
+        check_memory(replace(found, free_temporary=100.0))
+    enough = found.run_disk + 750_000 * found.disk_bytes_of_surfel / 1e6 + 1.0
+    check_memory(replace(found, free_disk=enough, one_disk=False))
+    with pytest.raises(UserError, match="the run needs"):  # temporary files lie there too
+        check_memory(replace(found, free_disk=enough, one_disk=True))
     check_memory(replace(found, available=None))  # nobody knows
 
 
@@ -115,7 +149,7 @@ def test_errors_of_memory_are_known():
 def test_the_doctor_tells_of_a_run(tmp_path):
     write_scene(tmp_path)
     memory, disk = checks_of_run(tmp_path, "beags-tiny")
-    assert "50,000 Gaussians" in memory.sentence and memory.ok and disk.ok
+    assert "50,000 before those at borders are split" in memory.sentence and memory.ok and disk.ok
     assert checks_of_run(tmp_path, "beags")[0].sentence.count("room for") == 1
     with pytest.raises(UserError, match="nowhere"):
         checks_of_run(tmp_path / "nowhere", "beags")

@@ -49,3 +49,13 @@ def test_a_parser_that_fails_is_noticed(monkeypatch):
     monkeypatch.setitem(TARGETS, "mask", Target("a", read, lambda: [b"a"]))
     assert fuzz_parsers.failure_of("mask", b"a") is None
     assert "KeyError" in (fuzz_parsers.failure_of("mask", b"x") or "")
+
+
+def test_a_parser_that_takes_forever_is_noticed(monkeypatch):
+    def read(path: Path) -> None:
+        while True:
+            pass
+
+    monkeypatch.setattr(fuzz_parsers, "SECONDS", 0.2)
+    monkeypatch.setitem(TARGETS, "mask", Target("a", read, lambda: [b"a"]))
+    assert "TimeoutError: more than 0.2 s" in (fuzz_parsers.failure_of("mask", b"a") or "")

@@ -1,0 +1,56 @@
+"""Parsers of photos and masks."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from beags_plugin.errors import UserError
+from parser_targets.target import SIDE, Target
+
+
+def _mask(path: Path) -> None:
+    from beags_plugin.masks.classes import read_binary_mask, read_class_map
+
+    try:
+        read_class_map(path, (255,))
+    except UserError:
+        read_binary_mask(path)
+
+
+def _png_files() -> list[bytes]:
+    found = []
+    for array, form in ((np.eye(SIDE), "PNG"), (300 * np.eye(SIDE), "PNG"), (np.ones((SIDE, SIDE, 3)), "BMP")):
+        file = io.BytesIO()
+        Image.fromarray(array.astype(np.uint16 if array.max() > 255 else np.uint8)).save(file, form)
+        found.append(file.getvalue())
+    for form in ("TIFF", "JPEG", "WEBP"):
+        file = io.BytesIO()
+        Image.fromarray(np.eye(SIDE, dtype=np.uint8)).save(file, form)
+        found.append(file.getvalue())
+    return found
+
+
+def _as_png(content: bytes) -> bytes:
+    """A PNG with the header that the first 13 bytes give and the rows that the rest give, its sums correct."""
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header, rows = content[:13].ljust(13, b"\0"), zlib.compress(content[13:])
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+def _png_rows() -> list[bytes]:
+    return [struct.pack(">IIBBBBB", SIDE, SIDE, 8, 0, 0, 0, 0) + bytes(SIDE * (SIDE + 1))]
+
+
+TARGETS = {
+    "mask": Target("a.png", _mask, _png_files),
+    "mask rows": Target("a.png", _mask, _png_rows, _as_png),
+}
