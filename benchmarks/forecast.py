@@ -17,13 +17,14 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 from beags_plugin.bench.provenance import commit, describe_machine
 from beags_plugin.child_processes import bound
 
-SIZES = ((12, 96, 72), (30, 192, 144), (60, 320, 240), (16, 800, 600))  # training views, width, height
+SIZES = ((12, 96, 72), (30, 192, 144), (40, 320, 240), (16, 800, 600))  # training views, width, height
 PRESET = "beags-tiny"
 OPTIONS = {
     "pipeline.model.base_steps": 300, "pipeline.model.refine_steps": 20, "pipeline.model.densify.start": 50,
@@ -34,11 +35,11 @@ OPTIONS = {
 def main() -> None:
     """Parse arguments, run, print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sizes", type=int, default=len(SIZES), help="how many of the sizes, small ones first")
+    parser.add_argument("--sizes", type=int, nargs="+", default=range(len(SIZES)), help="which of them, from 0")
     parser.add_argument("--json", type=Path, default=None)
     arguments = parser.parse_args()
     rows = []
-    for views, width, height in SIZES[: arguments.sizes]:
+    for views, width, height in (SIZES[index] for index in arguments.sizes):
         with tempfile.TemporaryDirectory(prefix="beags-forecast-") as folder:
             rows.append(measured(Path(folder), views, width, height))
         print(line(rows[-1]), flush=True)
@@ -103,11 +104,10 @@ def gaussians(run: Path) -> int:
 def size_below(folder: Path) -> float:
     """MB (10^6 bytes) of the files in a folder and below."""
     total = 0
-    for path in folder.rglob("*"):
-        try:
-            total += path.stat().st_size
-        except OSError:  # gone meanwhile
-            continue
+    for place, _, names in os.walk(folder):  # which passes over folders that go meanwhile
+        for name in names:
+            with suppress(OSError):
+                total += os.stat(os.path.join(place, name)).st_size
     return total / 1e6
 
 
@@ -115,12 +115,10 @@ def unnamed_size(pid: int, folder: Path) -> float:
     """MB of the files that a process has open in a folder where they no longer have a name."""
     total = 0
     for path in Path(f"/proc/{pid}/fd").glob("*"):
-        try:
+        with suppress(OSError):
             target = os.readlink(path)
             if target.startswith(str(folder)) and target.endswith("(deleted)"):
                 total += path.stat().st_size
-        except OSError:
-            continue
     return total / 1e6
 
 

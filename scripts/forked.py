@@ -39,7 +39,7 @@ def forked(call: Callable[[], object], log: Path) -> int:
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(end.code is not None)
     except BaseException:  # an interrupt too must not go on in the loop of the parent
-        traceback.print_exc()
+        os.write(2, traceback.format_exc().encode())
     finally:
         sys.stdout.flush()
         sys.stderr.flush()
