@@ -236,10 +236,10 @@ def forecast_of_data(config: BeagsTrainerConfig, data: Path, downscale_factor: f
 
     parser = BeagsDataParserConfig(data=data, downscale_factor=downscale_factor).setup()
     outputs = [parser.get_dataparser_outputs(split) for split in ("train", "val")]
-    sizes = [torch.cat([one.cameras.width, one.cameras.height], 1).tolist() for one in outputs]
+    train_sizes, eval_sizes = (torch.cat([one.cameras.width, one.cameras.height], 1).tolist() for one in outputs)
     seeds = len(outputs[0].metadata["points3D_xyz"])
     program = max(PROGRAM_MB, memory_mb())  # this process has the same libraries
-    return forecast(config, *sizes, seeds, device=default_device(), program=program)
+    return forecast(config, train_sizes, eval_sizes, seeds, device=default_device(), program=program)
 
 
 class MemoryWatch:
