@@ -9,6 +9,7 @@ import subprocess
 import tempfile
 import time
 import urllib.request
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -126,21 +127,6 @@ class Page:
             self._send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
             time.sleep(0.05)
 
-    def drag(self, start: tuple[float, float], end: tuple[float, float], button: str = "left") -> None:
-        """Move the mouse from ``start`` to ``end`` with a button held down."""
-        held = {"button": button, "buttons": {"left": 1, "right": 2}[button], "clickCount": 1}
-        self._send("Input.dispatchMouseEvent", type="mouseMoved", x=start[0], y=start[1])
-        moves = [("mouseMoved", k / 8) for k in range(1, 9)]
-        for kind, share in (("mousePressed", 0.0), *moves, ("mouseReleased", 1.0)):
-            x, y = (a + share * (b - a) for a, b in zip(start, end, strict=True))
-            self._send("Input.dispatchMouseEvent", type=kind, x=x, y=y, **held)
-            time.sleep(0.1)
-
-    def scroll(self, x: float, y: float, amount: float) -> None:
-        """Turn the mouse's wheel; a viewer comes closer if ``amount`` is below 0."""
-        self._send("Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=0, deltaY=amount)
-        time.sleep(0.5)
-
     def press(self, label: str) -> None:
         """Press the button of that name; not with the mouse: the panel may still be moving."""
         self.evaluate(
@@ -153,14 +139,21 @@ class Page:
 
     def choose(self, label: str, option: str) -> None:
         """Choose an option of the drop-down list called ``label``."""
-        self.evaluate(f"{_labelled(label)}.click()")  # not with the mouse: the panel may still be moving
         listed = (
             "[...document.querySelectorAll('[role=option]')]"
             f".find(o => o.innerText.trim() == {json.dumps(option)} && o.offsetParent)"
         )
-        # at once: the panel may put the list together anew in between
-        self.wait(lambda: self.evaluate(f"(() => {{ const o = {listed}; o?.click(); return !!o; }})()"))
-        self.wait(lambda: self.chosen(label) == option)
+        tries = count()
+
+        def done() -> bool:
+            if self.chosen(label) == option:
+                return True
+            if next(tries) % 10 == 0:  # again after a while: a panel that is put together anew closes the list
+                self.evaluate(f"{_labelled(label)}.click()")  # not with the mouse: the panel may still be moving
+            self.evaluate(f"{listed}?.click()")
+            return False
+
+        self.wait(done)
 
     def chosen(self, label: str) -> str:
         """What the drop-down list called ``label`` shows."""

@@ -71,6 +71,21 @@ def test_every_output_is_a_picture_whatever_is_shown(window):
     assert len(model.viewing.copy().surfels) == model.num_points
 
 
+def test_the_split_screen_shows_two_outputs_as_soon_as_it_is_opened(window):
+    """Nerfstudio would put its small depth into it, which does not fit."""
+    controls = window.viewer.control_panel
+    size = controls._max_res.value
+    controls._split.value, controls._max_res.value = True, 1024
+    try:
+        drawn = window.look_as_it_opens()
+        height, width = drawn["rgb"].shape[:2]
+        assert drawn["gl_z_buf_depth"].shape[:2] != (height, width) and window.sent[-1].shape == (height, width, 3)
+        assert controls.split_output_render in (*ALWAYS, *CHANNELS)
+        assert "gl_z_buf_depth" not in (*controls._output_render.options, *controls._split_output_render.options)
+    finally:
+        controls._split.value, controls._max_res.value = False, size
+
+
 def test_what_is_hidden_in_the_viewer_changes_no_figure(window):
     """Evaluation draws the whole scene on the run's background, also while a viewer shows something else."""
     model = window.model

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -50,14 +51,22 @@ class Window:
     def look(self, output: str = "rgb") -> dict[str, torch.Tensor]:
         """Draw and send as the render thread does; the outputs of the model. An error there is raised here."""
         self.viewer.control_panel._output_render.set_options([output])
+        # the drop-down keeps the one option
+        return self._drawn(lambda machine, outputs: setattr(machine, "output_keys", set(outputs)))
+
+    def look_as_it_opens(self) -> dict[str, torch.Tensor]:
+        """The same in full size, with the outputs that nerfstudio chooses itself."""
+        return self._drawn(lambda machine, outputs: None, "high")
+
+    def _drawn(self, before_sending: Callable, state: str = "low_static") -> dict[str, torch.Tensor]:
         machine = RenderStateMachine(self.viewer, 10.0, self.client)
+        machine.state = state
         found: list = []
 
         def draw() -> None:
             try:
-                state = CameraState(0.9, 1.5, camera_to_world(), CameraType.PERSPECTIVE)
-                outputs = machine._render_img(state)
-                machine.output_keys = set(outputs)  # the drop-down keeps the one option
+                outputs = machine._render_img(CameraState(0.9, 1.5, camera_to_world(), CameraType.PERSPECTIVE))
+                before_sending(machine, outputs)
                 machine._send_output_to_viewer(outputs)
                 found.append(outputs)
             except BaseException as error:
@@ -79,7 +88,9 @@ class Stand:
         self.model, self.panel = pipeline.model, pipeline.model.viewer_panel
         change(self.model)
         self.panel._follow = lambda: None
-        self.controls = SimpleNamespace(output_render="rgb", split=False, crop_viewport=False)
+        self.controls = SimpleNamespace(
+            output_render="rgb", split=False, crop_viewport=False, update_output_options=lambda names: None
+        )  # fmt: skip
         viewer = SimpleNamespace(
             log_filename=config_path.parent / "viewer.log", pipeline=pipeline, trainer=trainer, train_lock=None,
             control_panel=self.controls, _trigger_rerender=lambda: None,

@@ -122,6 +122,7 @@ class ObjectPanel(ViewerElement[None]):
         self.viewing.wanted, self.viewing.crop_box = self._wanted, self._crop_box
         if run.note is not None:
             self.note("run", run.note)
+        _offer_whole_pictures(viewer.control_panel)
         self._listen(self.clicks.value)
         threading.Thread(target=self._follow, name="beags panel", daemon=True).start()
 
@@ -278,3 +279,13 @@ class ObjectPanel(ViewerElement[None]):
                 with suppress(KeyError):  # the viewer is being closed
                     handle.content = text
                 self._said[index] = text
+
+
+def _offer_whole_pictures(controls: Any) -> None:
+    """Leave nerfstudio's "gl_z_buf_depth" out of the lists of outputs.
+
+    It is made smaller than the picture. nerfstudio puts it into the split screen at first, and joining the two ends the
+    render thread.
+    """
+    offer = controls.update_output_options
+    controls.update_output_options = lambda names: offer([name for name in names if name != "gl_z_buf_depth"])

@@ -1,0 +1,85 @@
+"""The picture of docs/viewer.md: nerfstudio's viewer with our panel, of a run, in a headless Chromium.
+
+Run ``beags demo`` first; then ``python scripts/viewer_picture.py``. Another run or object: ``--help``. It opens what
+the tests of the viewer open (tests/viewer_pages.py, tests/browser.py), so Chromium must be there: ``beags doctor``.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import tyro
+from PIL import Image
+
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
+
+from browser import Page  # noqa: E402
+from viewer_pages import viewed  # noqa: E402
+
+from beags_plugin.errors import UserError  # noqa: E402
+from beags_plugin.plugin.extract import load_scene  # noqa: E402
+
+
+@dataclass
+class Picture:
+    """The scene beside its class map, and the panel with an object chosen."""
+
+    load_config: Path = Path("outputs/demo/run/config.yml")
+    """config.yml of a refined run."""
+    output: Path = Path("docs/images/viewer.jpg")
+    """The file."""
+    object: str = "cup"
+    """Name of the object that the panel's buttons are about."""
+    width: int = 1280
+    height: int = 800
+    """Pixels of the window."""
+
+    def write(self) -> None:
+        scene = load_scene(self.load_config)
+        if self.object not in scene.classes.values():
+            raise UserError(f"{self.load_config} has no object {self.object!r}.")
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            viewed(self.load_config.absolute(), Path(folder) / "log.txt") as address,
+            Page(address, self.width, self.height) as page,
+        ):
+            page.wait_for_text("Export what is shown", 300)
+            page.tick("Enable")  # the split screen's: the first of that name
+            page.wait_for_text("Output render split")
+            page.choose("Output render split", "class_map")
+            page.choose("Object", self.object)
+            page.evaluate(_TO_OUR_CONTROLS)
+            Image.fromarray(_settled(page)).save(self.output, quality=85, optimize=True)
+
+
+_TO_OUR_CONTROLS = """[...document.querySelectorAll('button')].find(b => b.innerText.trim() == 'Isolate')
+    .scrollIntoView({block: 'center'})"""
+
+
+def _settled(page: Page, seconds: float = 15.0) -> np.ndarray:
+    """What the page shows once it has been the same for a while; coarse pictures come before fine ones."""
+    shown, since = _pixels(page), time.monotonic()
+
+    def still() -> bool:
+        nonlocal shown, since
+        now = _pixels(page)
+        if not np.array_equal(now, shown):
+            shown, since = now, time.monotonic()
+        return time.monotonic() - since > seconds
+
+    page.wait(still, 300)
+    return shown
+
+
+def _pixels(page: Page) -> np.ndarray:
+    return np.asarray(Image.open(BytesIO(page.picture())).convert("RGB"))
+
+
+if __name__ == "__main__":
+    tyro.cli(Picture).write()
