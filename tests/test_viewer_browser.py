@@ -50,6 +50,11 @@ def page(opened):
     return opened
 
 
+def struck(page: Page) -> str:
+    """What the legend says is not shown."""
+    return page.evaluate("[...document.querySelectorAll('del')].map(e => e.innerText).join()")
+
+
 def test_every_output_is_a_picture_of_its_own(page):
     assert all(name in page.text() for name in (*CLASSES.values(), "Least opacity"))
     seen: dict[str, np.ndarray] = {}
@@ -67,13 +72,9 @@ def test_objects_are_isolated_hidden_faded_and_removed(page):
     page.choose("Output type", "class_map")
     whole = awaited(page, lambda now: painted(now, "cup") > 0.01 < painted(now, "box"))
     page.choose("Object", "cup")
-
-    def struck() -> str:
-        return page.evaluate("[...document.querySelectorAll('del')].map(e => e.innerText).join()")
-
     page.press("Isolate")
     awaited(page, lambda now: painted(now, "box") < 0.001 and painted(now, "cup") > 0.9 * painted(whole, "cup"))
-    page.wait(lambda: struck() == "background,box")
+    page.wait(lambda: struck(page) == "background,box")
     page.press("Show all objects")
     awaited(page, lambda now: painted(now, "box") > 0.01)
     page.press("Hide")
@@ -82,7 +83,7 @@ def test_objects_are_isolated_hidden_faded_and_removed(page):
     awaited(page, lambda now: painted(now, "cup") > 0.01)
     page.press("Remove")
     awaited(page, lambda now: painted(now, "cup") < 0.001 and painted(now, "box") > 0.01)
-    page.wait(lambda: struck() == "cup")
+    page.wait(lambda: struck(page) == "cup")
 
 
 def test_the_sliders_fade_and_thin_out(page):
@@ -115,6 +116,7 @@ def test_a_click_picks_what_is_under_the_cursor(page):
 def test_what_is_shown_is_exported(page, served):
     page.choose("Object", "cup")
     page.press("Isolate")
+    page.wait(lambda: struck(page) == "background,box")  # buttons are heard in threads of their own
     page.press("Export what is shown")
     page.wait_for_text("Exported to")
     surfels, classes = read_ply(served[0].parent / "exports/shown_cup.ply")
