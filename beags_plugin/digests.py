@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 _PACKAGE = Path(__file__).parent
-_TELLING = ("cli.py", "demo.py", "doctor.py", "bench")  # print and draw what the rest has computed
+_TELLING = ("cli.py", "demo.py", "doctor", "bench")  # print and draw what the rest has computed
 
 
 def code_digest() -> str:
