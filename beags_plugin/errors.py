@@ -32,10 +32,12 @@ def system_error(error: BaseException) -> OSError | None:
     exception: it cannot close a file whose disk is full, and says that instead.
     """
     at: BaseException | None = error
-    while at is not None and not isinstance(at, OSError):
+    seen: set[int] = set()
+    while at is not None and not isinstance(at, OSError) and id(at) not in seen:
+        seen.add(id(at))
         torchs = isinstance(at, RuntimeError) and "inline_container" in str(at)
         at = at.__cause__ or (at.__context__ if torchs else None)
-    return at
+    return at if isinstance(at, OSError) else None
 
 
 def is_of_disk(error: OSError) -> bool:

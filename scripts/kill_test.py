@@ -102,6 +102,7 @@ class Tester:
                 killed += 1
                 self.kills.append({"kind": kind if killed == 1 else "resumed", "at": f"{kind}: {state_of(run)}"})
             elif code != 0:
+                self.kills.append({"kind": kind, "at": f"{kind}: ended by itself, {state_of(run)}"})
                 return [f"ended with exit code {code}: {log}"]
             elif not killed:
                 shutil.rmtree(run)  # it was done before the moment came

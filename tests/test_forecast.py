@@ -73,7 +73,7 @@ def test_memory_grows_with_surfels_and_photos_and_not_with_streamed_ones():
 
 
 def test_what_does_not_fit_is_refused_with_a_remedy():
-    found = replace(of("beags-fast"), available=100_000.0, free_disk=1e6)
+    found = replace(of("beags-fast"), available=100_000.0, free_disk=1e6, free_temporary=1e6, one_disk=True)
     check_memory(found)
     told = r"with 1,920,000 Gaussians, 750,000 before .*; 1.0 GB are free.*downscale-factor 2.*check-memory"
     with pytest.raises(UserError, match=told):

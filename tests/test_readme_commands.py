@@ -14,10 +14,14 @@ import subprocess
 import sys
 import time
 import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from test_documented_commands import ROOT, code_lines
+
+from beags_plugin.child_processes import bound
 
 pytest.importorskip("nerfstudio")
 
@@ -122,20 +126,28 @@ class Reader:
                 line = re.sub(name, own.replace("{run}", str(self.run)) if "{run}" in own else own, line)
         return shlex.split(f"{line} {more}")
 
-    def started(self, line: str, more: str) -> subprocess.Popen[str]:
+    @contextmanager
+    def started(self, line: str, more: str) -> Iterator[subprocess.Popen[bytes]]:
+        """The program, which ends with this block at the latest."""
+        command = bound(self.words(line, more), signal.SIGKILL)
         with open(self.folder / "log.txt", "w") as log:
-            return subprocess.Popen(
-                self.words(line, more), cwd=self.folder, env=self.environment, stdout=log, stderr=subprocess.STDOUT,
-                text=True,
-            )  # fmt: skip
+            process = subprocess.Popen(
+                command, cwd=self.folder, env=self.environment, stdout=log, stderr=subprocess.STDOUT
+            )
+        try:
+            yield process
+        finally:
+            process.kill()
+            process.wait()
 
     def does(self, line: str, more: str) -> str:
-        process = self.started(line, more)
-        code, text = process.wait(600), (self.folder / "log.txt").read_text()
+        with self.started(line, more) as process:
+            code = process.wait(600)
+        text = (self.folder / "log.txt").read_text()
         assert code == 0 and "Traceback" not in text, f"{line}: exit code {code}\n{text[-3000:]}"
         return text
 
-    def waits(self, process: subprocess.Popen[str], until) -> None:
+    def waits(self, process: subprocess.Popen[bytes], until) -> None:
         end = time.monotonic() + 300
         while not until():
             assert process.poll() is None and time.monotonic() < end, (self.folder / "log.txt").read_text()[-3000:]
@@ -143,17 +155,15 @@ class Reader:
 
     def trains_and_is_killed(self, line: str, more: str) -> None:
         """After the first checkpoint."""
-        process = self.started(line, more)
-        self.waits(process, lambda: any(self.folder.glob("outputs/my_scene/*/*/nerfstudio_models/step-*.ckpt")))
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+        with self.started(line, more) as process:
+            self.waits(process, lambda: any(self.folder.glob("outputs/my_scene/*/*/nerfstudio_models/step-*.ckpt")))
 
     def views(self, line: str) -> None:
         port = free_port()
-        process = self.started(line, f"--viewer.websocket-port {port}")
-        self.waits(process, lambda: answers(port))
-        process.terminate()
-        process.wait(60)
+        with self.started(line, f"--viewer.websocket-port {port}") as process:
+            self.waits(process, lambda: answers(port))
+            process.terminate()
+            process.wait(120)
         assert "Traceback" not in (self.folder / "log.txt").read_text()
 
 

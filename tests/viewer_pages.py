@@ -50,7 +50,7 @@ def started(command: list[object], log: Path, ready: str) -> Iterator[subprocess
             time.sleep(0.2)
         yield process
         process.terminate()
-        process.wait(30)
+        process.wait(120)
     finally:
         process.kill()  # where the test failed, or it did not end
         process.wait()

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from beags_plugin.core import processes
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.processes import each_view
 from beags_plugin.errors import UserError
 from beags_plugin.masks.label_maps import LabelMaps, widened
 from beags_plugin.ops import cuda_extension, extension
@@ -62,8 +62,9 @@ def reproject_pairwise(
     compiled = extension.can_take(*depths) or cuda_extension.module_for(*depths) is not None
     size = max(camera.height * camera.width for camera in cameras) * num_classes
     dense = compiled and size <= _DENSE_COUNTERS
-    # as many views at a time as there are threads, each with its own counters
-    together = max(1, min(extension.threads(), 2 * _DENSE_COUNTERS // size)) if dense else 1
+    # as many views at a time as there are threads, each with its own counters; several processes take them one by one
+    threads = extension.threads() if processes.size() == 1 else 1
+    together = max(1, min(threads, 2 * _DENSE_COUNTERS // size)) if dense else 1
     batches = [range(i, min(i + together, len(cameras))) for i in range(0, len(cameras), together)]
 
     def votes(number: int) -> list[tuple[Tensor, Tensor]]:
@@ -75,7 +76,7 @@ def reproject_pairwise(
         found = reprojection_votes(depths, held, own, towards.to(depths[0].dtype), batch[0], num_classes, tau, IGNORE)
         return list(zip(*found, strict=True))
 
-    for number, results in enumerate(each_view(len(batches), votes)):
+    for number, results in enumerate(processes.each_view(len(batches), votes)):
         for i, result in zip(batches[number], results, strict=True):
             if progress:
                 progress(i + 1, len(cameras))

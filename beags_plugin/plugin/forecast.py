@@ -200,7 +200,7 @@ def forecast(
         # two checkpoints with two moments of each number, the base, and each round's split scene
         disk_bytes_of_surfel=2 * (scene_bytes + 2 * 4 * floats) + (1 + rounds) * scene_bytes,
         temporary=everywhere * TEMPORARY_BYTES_OF_PIXEL * (rounds > 0),
-        free_disk=_free_disk(run),
+        free_disk=_free_disk(run) + _size(run),  # a run that goes on writes over what it has
         free_temporary=_free_disk(temporary),
         one_disk=_existing(run).stat().st_dev == _existing(temporary).stat().st_dev,
     )
@@ -276,6 +276,10 @@ def _streams(data, gigabytes: float) -> bool:
 
 def _free_disk(folder: Path) -> float:
     return shutil.disk_usage(_existing(folder)).free / 1e6
+
+
+def _size(folder: Path) -> float:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6
 
 
 def _existing(folder: Path) -> Path:

@@ -158,13 +158,14 @@ class RefinementSwitch:
 
         What an earlier run into the same folder kept of more rounds is removed.
         """
-        kept, rounds = self.trainer.base_dir / PREPARED / STAGES, self.model.config.refine_rounds
+        own_run, rounds = self.trainer.run, self.model.config.refine_rounds
+        kept = own_run / PREPARED / STAGES
         own = {f"round_{index + 1}" for index in range(rounds)}
         for folder in kept.glob("round_*") if processes.is_first() else ():
             if folder.name not in own:
                 shutil.rmtree(folder)
         former = self.trainer.loaded_run
-        runs = [self.trainer.base_dir] if former in (None, self.trainer.base_dir) else [self.trainer.base_dir, former]
+        runs = [own_run] if former in (None, own_run.absolute()) else [own_run, former]
         here, *others = (run / PREPARED / STAGES / f"round_{self.rounds + 1}" for run in runs)
         return StageStore(here, others)
 

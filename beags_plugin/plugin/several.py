@@ -55,10 +55,12 @@ class Rank:
 
     config: the run's; in processes other than the first it is changed to write elsewhere, to show nothing, and to
     measure nothing. local_rank: number of this process, and of its GPU, on its machine.
+    run: the folder of the run, which the first process alone writes to.
     """
 
     def __init__(self, config: BeagsTrainerConfig, local_rank: int) -> None:
         self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self.run = config.get_base_dir()
         if config.machine.device_type == "cuda" and cuda_extension.found()[1] is None:
             torch.cuda.set_device(local_rank)  # else all processes would exchange objects through the first GPU
         if processes.rank() > 0:

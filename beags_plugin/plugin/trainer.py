@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -112,15 +112,16 @@ class BeagsTrainer(Trainer):
 
     def _release(self) -> None:
         """Let others train in this run's folder, and end what writes curves, a thread of tensorboard's too."""
-        self._rank.end()
-        for each in writer.EVENT_WRITERS:
-            if isinstance(each, writer.TensorboardWriter):
-                each.tb_writer.close()
-        writer.EVENT_WRITERS.clear()
-        writer.EVENT_STORAGE.clear()
         if self._lock is not None:
             self._lock.release()
             self._lock = None
+        self._rank.end()
+        for each in writer.EVENT_WRITERS:
+            if isinstance(each, writer.TensorboardWriter):
+                with suppress(OSError):  # a disk that was full while it wrote, which has been told
+                    each.tb_writer.close()
+        writer.EVENT_WRITERS.clear()
+        writer.EVENT_STORAGE.clear()
 
     def _forget_events(self) -> None:
         """Let tensorboard forget what was once done here after the checkpoint, which is done again, or by another run.
@@ -211,6 +212,11 @@ class BeagsTrainer(Trainer):
         return found
 
     # -- checkpoints -------------------------------------------------------------------------------------------------
+
+    @property
+    def run(self) -> Path:
+        """The run's folder, also in processes that write elsewhere."""
+        return self._rank.run
 
     @property
     def loaded_run(self) -> Path | None:

@@ -31,10 +31,15 @@ class Target:
     wrap: Callable[[bytes], bytes] = lambda content: content
 
 
+_FOLDERS: list[tempfile.TemporaryDirectory[str]] = []
+
+
 @lru_cache(None)
 def folder() -> Path:
     """Where the files of this process go."""
-    return Path(tempfile.mkdtemp(prefix="beags-fuzz-", dir=FOLDER))
+    made = tempfile.TemporaryDirectory(prefix="beags-fuzz-", dir=FOLDER)  # removed when the process ends
+    _FOLDERS.append(made)
+    return Path(made.name)
 
 
 def examine(target: Target, content: bytes) -> str | None:
