@@ -90,16 +90,16 @@ def _(at: Place):
 
 @mistake("full disk", "ns-train writes its checkpoint")
 def _(at: Place):
-    from beags_plugin.plugin import trainer
+    from beags_plugin.plugin import checkpoints
 
     command = at.train(*SHORT, preset="beags-tiny")
-    save = trainer.save_atomically
+    save = checkpoints.save_atomically
 
     def full(content, path):
         at.fail_to_write(at.root / TRAINED, after=1000)
         save(content, path)
 
-    at.patch.setattr(trainer, "save_atomically", full)
+    at.patch.setattr(checkpoints, "save_atomically", full)
     return command
 
 
