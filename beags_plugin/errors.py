@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -89,7 +90,8 @@ def refused(error: OSError) -> UserError | None:
 def print_user_errors_plainly() -> None:
     """Let a ``UserError`` that nobody catches print its sentence instead of a traceback, in programs that are not ours.
 
-    The program then ends with exit code 2.
+    The program then ends with exit code 2. A full disk under tensorboard's files prints nothing in the thread that
+    writes them, which hands the error on to whoever adds the next curve.
 
     Calling it again changes nothing; other exceptions go where they went before.
     """
@@ -106,3 +108,11 @@ def print_user_errors_plainly() -> None:
 
     hook.prints_user_errors = True  # type: ignore[attr-defined]
     sys.excepthook = hook
+    former_of_threads = threading.excepthook
+
+    def thread_hook(args: threading.ExceptHookArgs) -> None:
+        told_elsewhere = type(args.thread).__module__.startswith("tensorboard.")
+        if not (told_elsewhere and isinstance(args.exc_value, OSError) and is_of_disk(args.exc_value)):
+            former_of_threads(args)
+
+    threading.excepthook = thread_hook

@@ -20,6 +20,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from beags_plugin.child_processes import bound
+
 WIDTH, HEIGHT, STEPS = 1000, 750, 40
 
 
@@ -68,7 +70,7 @@ def main(views: int, flags: list[str]) -> None:
             "--pipeline.model.base-steps", str(STEPS), "--pipeline.model.refine-steps", str(STEPS), *flags,
         ]  # fmt: skip
         start = time.perf_counter()
-        process = subprocess.Popen(command)
+        process = subprocess.Popen(bound(command))
         _, status, used = os.wait4(process.pid, 0)
         seconds = time.perf_counter() - start
         if status != 0:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import itertools
 import os
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -80,40 +82,58 @@ def cpu_time(child: int) -> float:
 
 
 @contextmanager
+def killed_in_call(owner: type, name: str, number: int, seconds: float) -> Iterator[None]:
+    """Let this process end by SIGKILL so many seconds after the ``number``-th call, from 1, of a method begins."""
+    method, calls = getattr(owner, name), itertools.count(1)
+
+    def called(*args: Any, **options: Any) -> Any:
+        if next(calls) == number:
+            threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGKILL)).start()
+        return method(*args, **options)
+
+    with mock.patch.object(owner, name, called):
+        yield
+
+
+@contextmanager
 def killed_in_write(ends: str, number: int, share: float) -> Iterator[None]:
     """Let this process end by SIGKILL while it writes a file whose name ends so: the ``number``-th, from 1.
 
-    share: 0 to 1 of the bytes that the file before it had, after which it ends; beyond 1, and in the first file: once
-    all is written, before the file is put in its place.
+    share: 0 to 1 of the bytes that the file before it had, after which it ends; beyond 1, in the first file, and in
+    files that another library writes: once all is written, before the file is put in its place.
     """
-    seen, last, put = 0, 0, whole_files.put_in_place
-    write_whole = whole_files.write_whole
+    seen, last, writing = 0, 0, False
+    write_whole, put_in_place = whole_files.write_whole, whole_files.put_in_place
 
-    def writing(path: Path, write: Callable[[BinaryIO], object], beside: Path | None = None) -> None:
-        nonlocal seen, last
+    def write(path: Path, content: Callable[[BinaryIO], object], beside: Path | None = None) -> None:
+        nonlocal seen, last, writing
         if not path.name.endswith(ends):
-            return write_whole(path, write, beside)
+            return write_whole(path, content, beside)
         seen += 1
         most = int(share * last) if seen == number and last and share < 1.0 else None
 
         def counted(file: BinaryIO) -> None:
             nonlocal last
             ending = _Ending(file, most)
-            write(ending)  # type: ignore[arg-type]
+            content(ending)  # type: ignore[arg-type]
             last = ending.tell()
 
+        writing = True
         write_whole(path, counted, beside)
+        writing = False
 
-    def placing(part: Path, path: Path) -> None:
-        if path.name.endswith(ends) and seen == number:
-            os.kill(os.getpid(), signal.SIGKILL)
-        put(part, path)
+    def put(part: Path, path: Path) -> None:
+        nonlocal seen
+        if path.name.endswith(ends):
+            seen += not writing
+            if seen == number:
+                os.kill(os.getpid(), signal.SIGKILL)
+        put_in_place(part, path)
 
-    users = [module for module in list(sys.modules.values()) if getattr(module, "write_whole", None) is write_whole]
     with ExitStack() as patches:
-        for module in users:
-            patches.enter_context(mock.patch.object(module, "write_whole", writing))
-        patches.enter_context(mock.patch.object(whole_files, "put_in_place", placing))
+        for name, former, new in (("write_whole", write_whole, write), ("put_in_place", put_in_place, put)):
+            for module in [module for module in list(sys.modules.values()) if getattr(module, name, None) is former]:
+                patches.enter_context(mock.patch.object(module, name, new))
         yield
 
 

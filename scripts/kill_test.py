@@ -6,13 +6,15 @@ Trains a short run of beags-tiny on a small generated sample, and exports it, on
 again, the same is begun in a folder of its own, killed, and done again or resumed (and sometimes killed once more):
 
 - anywhere: at a random moment of the training, before its first file too;
+- step: in a random step of the training, or soon after it;
 - checkpoint: after a random number of a checkpoint's bytes are written, or all, before it takes its place;
 - preparation: between base and refinement;
-- export: ``beags export`` of all objects, splats and meshes. What lies in its folder after the kill must be whole.
+- export: ``beags export`` of all objects, splats and meshes, at a random moment;
+- exported file: the same, while it writes a random one of its files. After both, what lies in its folder must be whole.
 
 Compared are the checkpoints with the optimizers' state, the base, the curve of held-out quality, the masks, the voxel
-grids, the exported files. Moments are counted in CPU time, so that a busy machine changes nothing (Linux). All are
-forks of this process, which imports everything once. Exit status 1: something differed.
+grids, the exported files. Random moments are counted in CPU time, so that a busy machine changes nothing (Linux). All
+are forks of this process, which imports everything once. Exit status 1: something differed.
 """
 
 from __future__ import annotations
@@ -42,8 +44,11 @@ OPTIONS = {
     "steps_per_held_out": 40, "vis": "tensorboard",
 }  # fmt: skip
 EXPORT = ("--all", "--format", "ply", "ply-2dgs", "spz", "glb", "--resolution", "32", "--min-views", "1")
-KINDS = ("anywhere", "checkpoint", "preparation", "anywhere", "export")  # in turn
+KINDS = ("step", "checkpoint", "anywhere", "export", "step", "preparation", "anywhere", "exported file")  # in turn
 CHECKPOINTS = 20  # of a run, about
+STEPS = OPTIONS["pipeline.model.base_steps"] + OPTIONS["pipeline.model.refine_steps"]
+STEP_SECONDS = 0.05  # of a slow step, about
+EXPORTS = KINDS[3], KINDS[7]
 ATTEMPTS = 20  # at a kill of one kind, as a run may end before its moment comes
 
 
@@ -87,7 +92,7 @@ class Tester:
         """Kill once or more, go on to the end, compare; what is found goes to ``kills``."""
         place = self.folder / f"{self.trials}_{kind}"
         self.trials += 1
-        found = self._killed_export(place) if kind == "export" else self._killed_run(kind, place)
+        found = self._killed_export(kind, place) if kind in EXPORTS else self._killed_run(kind, place)
         self.wrong += bool(found)
         self.kills[-1]["differs"] = found
         print(f"{self.kills[-1]['at']}: {'; '.join(found[:3]) or 'the same bits'}", flush=True)
@@ -120,24 +125,50 @@ class Tester:
                     go_on(self.data, run)
 
             return forked.run(ending, log)
+        if kind == "step":
+            from beags_plugin.plugin.trainer import BeagsTrainer
+
+            step, seconds = self.moments.randint(1, STEPS), self.moments.uniform(0.0, STEP_SECONDS)
+
+            def training() -> None:
+                with forked.killed_in_call(BeagsTrainer, "train_iteration", step, seconds):
+                    go_on(self.data, run)
+
+            return forked.run(training, log)
         from_, to = self.preparation if kind == "preparation" else (0.0, self.run_seconds)
         return forked.kill_after(lambda: go_on(self.data, run), log, self.moments.uniform(from_, to))[0]
 
-    def _killed_export(self, folder: Path) -> list[str]:
+    def _killed_export(self, kind: str, folder: Path) -> list[str]:
         log, call = self.folder / f"{folder.name}.log", lambda: export(self.whole, folder)
         for _ in range(ATTEMPTS):
-            code, used = forked.kill_after(call, log, self.moments.uniform(0.0, self.export_seconds))
-            if code == -signal.SIGKILL:
+            if self._kill_export(kind, call, log) == -signal.SIGKILL:
                 break
             shutil.rmtree(folder, ignore_errors=True)
         else:
             raise RuntimeError(f"an export cannot be killed: {log}")
-        there = [path.name for path in folder.rglob("*") if path.is_file()]
-        self.kills.append({"kind": "export", "at": f"export after {used:.1f} s, {len(there)} files there"})
+        whole = sum(path.is_file() for path in self.exported.rglob("*"))
+        there = sum(path.is_file() and not path.name.startswith(".") for path in folder.rglob("*"))
+        at = f"{kind}: {there} of {whole} files there"
+        if unfinished := [path.name for path in folder.rglob(".*.part")]:
+            at += f", while {unfinished[0]} was written"
+        self.kills.append({"kind": kind, "at": at})
         found = self._compared(lambda: same_bits.half_written(self.exported, folder))
         if (code := forked.run(call, log)) != 0:
             return [*found, f"the second export ended with exit code {code}: {log}"]
         return found + self._compared(lambda: same_bits.export_differences(self.exported, folder))
+
+    def _kill_export(self, kind: str, call: Callable[[], None], log: Path) -> int:
+        """The exit code of an export that is killed, if its moment comes."""
+        if kind == EXPORTS[0]:
+            return forked.kill_after(call, log, self.moments.uniform(0.0, self.export_seconds))[0]
+        files = sum(path.is_file() for path in self.exported.rglob("*"))
+        number, share = self.moments.randint(1, files), self.moments.uniform(0.0, 1.2)
+
+        def ending() -> None:
+            with forked.killed_in_write("", number, share):
+                call()
+
+        return forked.run(ending, log)
 
     def _compared(self, call: Callable[[], list[str]]) -> list[str]:
         """What ``call`` finds, in a process of its own."""

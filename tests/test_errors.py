@@ -36,6 +36,31 @@ def test_other_errors_keep_their_traceback():
     assert "Traceback" in done.stderr and "ValueError: a defect" in done.stderr
 
 
+CURVES = """
+import errno, sys
+import beags_plugin.plugin
+from tensorboard.summary.writer.event_file_writer import EventFileWriter
+from tensorboard.summary.writer.record_writer import RecordWriter
+
+def refuse(*_):
+    raise {error}
+
+RecordWriter.write = refuse
+try:
+    EventFileWriter(sys.argv[1])
+except OSError:
+    print("handed on")
+"""
+
+
+@pytest.mark.parametrize("code, silent", [("ENOSPC", True), ("EBADF", False)])
+def test_a_full_disk_under_curves_prints_no_traceback_of_their_thread(tmp_path, code, silent):
+    program = CURVES.format(error=f"OSError(errno.{code}, 'refused')")
+    done = subprocess.run([sys.executable, "-c", program, tmp_path], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout == "handed on\n"
+    assert ("Traceback" not in done.stderr) == silent
+
+
 def error_in(path, cause: BaseException) -> BaseException:
     """What comes out of a block that writes ``path`` and in which ``cause`` is raised."""
     with pytest.raises(BaseException) as raised, writing(path):

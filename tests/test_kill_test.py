@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -75,6 +76,37 @@ def test_a_process_ends_in_the_write_that_is_chosen(tmp_path, share, part):
     assert forked.run(write, tmp_path / "log") == -signal.SIGKILL
     there = {path.name: path.stat().st_size for path in tmp_path.iterdir() if path.name != "log"}
     assert there == {"one.ckpt": 1000, "between.json": 1000, ".two.ckpt.part": part}
+
+
+def test_a_process_ends_before_a_file_of_another_library_takes_its_place(tmp_path):
+    def write() -> None:
+        from beags_plugin.extraction.files import whole_file
+
+        with forked.killed_in_write("", 2, 0.5):
+            whole_files.write_whole(tmp_path / "one", lambda file: file.write(bytes(10)))
+            for name in ("two", "three"):
+                with whole_file(tmp_path / name) as part:
+                    part.write_bytes(bytes(20))
+
+    assert forked.run(write, tmp_path / "log") == -signal.SIGKILL
+    there = {path.name: path.stat().st_size for path in tmp_path.iterdir() if path.name != "log"}
+    assert there == {"one": 10, ".two.part": 20}
+
+
+def test_a_process_ends_in_the_call_that_is_chosen(tmp_path):
+    class Work:
+        def step(self, number: int) -> int:
+            (tmp_path / str(number)).touch()
+            time.sleep(0.0 if number < 3 else 60.0)
+            return number
+
+    def work() -> None:
+        with forked.killed_in_call(Work, "step", 3, 0.01):
+            assert [Work().step(number) for number in (1, 2)] == [1, 2]
+            Work().step(3)
+
+    assert forked.run(work, tmp_path / "log") == -signal.SIGKILL
+    assert {path.name for path in tmp_path.iterdir()} == {"1", "2", "3", "log"}
 
 
 def test_a_process_is_killed_after_its_cpu_time_or_ends_itself(tmp_path):

@@ -54,7 +54,7 @@ def worker(local_rank: int, world_size: int, config, global_rank: int = 0) -> No
                 for state in optimizer.state.values()
             )
         ).hexdigest()
-        ended["folder"] = str(self.base_dir)
+        ended["folder"], ended["run"] = str(self.base_dir), str(self.run)
         after(self)
 
     trainer.BeagsTrainer._after_train = end

@@ -33,6 +33,11 @@ class Camera:
         return self.viewmat[:3, 3]
 
     @property
+    def focal(self) -> float:
+        """The focal length in pixels, the geometric mean of both axes': at depth z a pixel is z / focal wide."""
+        return (float(self.K[0, 0]) * float(self.K[1, 1])) ** 0.5
+
+    @property
     def center(self) -> Tensor:
         """[3] the camera's position in the world."""
         if self.viewmat.requires_grad or not self.viewmat.is_cpu:

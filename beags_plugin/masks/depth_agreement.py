@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.masks.reprojection import PixelMaps
+from beags_plugin.masks.reprojection import PixelMaps, landing
 
 _VIEWS = 48  # at most so many are compared with their neighbours, and
 _SAMPLES = 1 << 16  # so many pixels of them
@@ -49,12 +49,8 @@ def _apart(depth: Tensor, shown: Tensor, camera: Camera, other: Camera, tau: flo
     """[P] float64 on the CPU: of every ``step``-th pixel of a view whose point the other view sees."""
     pixel = torch.arange(0, depth.numel(), step, device=depth.device)
     x, y, d = pixel % camera.width + 0.5, pixel // camera.width + 0.5, depth.reshape(-1)[pixel]
-    A, b = (values[0].to(depth) for values in PixelMaps([camera, other]).towards(1))
-    hx, hy, z = (d * (A[r, 0] * x + (A[r, 1] * y + A[r, 2])) + b[r] for r in range(3))
-    lands = (d > 0) & (z > 0) & (hx >= 0) & (hy >= 0) & (hx < other.width * z) & (hy < other.height * z)
-    hx, hy, z = hx[lands], hy[lands], z[lands]
-    column, row = (hx / z).long().clamp_(max=other.width - 1), (hy / z).long().clamp_(max=other.height - 1)
-    error = (z - shown[row, column]).abs()
+    A, b = (values[0] for values in PixelMaps([camera, other]).towards(1))
+    _, there, z = landing(x, y, d, (A, b), (other.width, other.height), d > 0)
+    error = (z - shown.reshape(-1)[there]).abs()
     seen = error <= tau * z  # False for NaN
-    focal = (float(other.K[0, 0]) * float(other.K[1, 1])) ** 0.5
-    return (error[seen] * focal / z[seen]).double().cpu()
+    return (error[seen] * other.focal / z[seen]).double().cpu()

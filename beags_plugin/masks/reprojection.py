@@ -163,24 +163,36 @@ def _product(left: Tensor, right: Tensor) -> Tensor:
     return sum(left[..., k, None] * right[..., k, None, :] for k in range(3))  # type: ignore[return-value]
 
 
+def landing(
+    x: Tensor, y: Tensor, depth: Tensor, pixel_map: tuple[Tensor, Tensor], size: tuple[int, int], counted: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Where pixels fall in another view: which do [..] bool, and of these [M] the number of the pixel there and z.
+
+    x, y, depth: of the pixels, centres at + 0.5, world units along z; they may be broadcast to one shape [..].
+    pixel_map: A [3, 3] and b [3] of ``PixelMaps.towards``. size: width and height of the other view. counted: [..]
+    bool, those that are looked at.
+    """
+    (A, b), (width, height) = (value.to(depth) for value in pixel_map), size
+    hx, hy, z = (depth * (A[r, 0] * x + (A[r, 1] * y + A[r, 2])) + b[r] for r in range(3))
+    # Written as products so that z = 0, infinite and NaN points simply fail.
+    lands = counted & (z > 0) & (hx >= 0) & (hy >= 0) & (hx < width * z) & (hy < height * z)
+    hx, hy, z = hx[lands], hy[lands], z[lands]
+    # The quotient may round up to the border itself.
+    column, row = (hx / z).long().clamp_(max=width - 1), (hy / z).long().clamp_(max=height - 1)
+    return lands, row * width + column, z
+
+
 def _cast(votes: _Votes, depth: Tensor, mask: Tensor, target_depth: Tensor, pixel_map, tau: float) -> None:
     """Add the votes of one view (``depth``, ``mask``) in another (``target_depth``)."""
     height, width = depth.shape
-    target_height, target_width = target_depth.shape
-    A, b = (value.to(depth) for value in pixel_map)
     x = torch.arange(width, dtype=depth.dtype, device=depth.device) + 0.5
     rows = max(1, _CHUNK_PIXELS // width)
     for top in range(0, height, rows):
         d, label = depth[top : top + rows], mask[top : top + rows]
         y = torch.arange(top, top + d.shape[0], dtype=depth.dtype, device=depth.device)[:, None] + 0.5
-        hx, hy, z = (d * (A[r, 0] * x + (A[r, 1] * y + A[r, 2])) + b[r] for r in range(3))
-        # Written as products so that z = 0, infinite and NaN points simply fail.
-        lands = (z > 0) & (hx >= 0) & (hy >= 0) & (hx < target_width * z) & (hy < target_height * z)
-        hx, hy, z, label = (value[lands & (d > 0) & (label != IGNORE)] for value in (hx, hy, z, label))
-        # The quotient may round up to the border itself.
-        column = (hx / z).long().clamp_(max=target_width - 1)
-        row = (hy / z).long().clamp_(max=target_height - 1)
-        pixel = row * target_width + column
+        size = (target_depth.shape[1], target_depth.shape[0])
+        lands, pixel, z = landing(x, y, d, pixel_map, size, (d > 0) & (label != IGNORE))
+        label = label[lands]
         if not math.isinf(tau):
             visible = (z - target_depth.reshape(-1)[pixel]).abs() <= tau * z
             pixel, label = pixel[visible], label[visible]

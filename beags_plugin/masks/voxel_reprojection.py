@@ -139,8 +139,7 @@ def _survey(depths, cameras, labels, num_classes: int) -> tuple[float, bool]:
     thinned, labelled, kinds = [], [], set()
     for index, (depth, camera, mask) in enumerate(zip(depths, cameras, labels, strict=True)):
         check_view(index, depth, camera, mask, num_classes)
-        focal = (float(camera.K[0, 0]) * float(camera.K[1, 1])) ** 0.5
-        thinned.append((depth.reshape(-1)[::step] / focal).double().cpu())
+        thinned.append((depth.reshape(-1)[::step] / camera.focal).double().cpu())
         label = torch.zeros(len(thinned[-1]), dtype=torch.int32) if mask is None else mask.reshape(-1)[::step].cpu()
         labelled.append(label.clone())  # not a piece of the view's map, which would stay in memory as a whole
         kinds.add((depth.dtype, depth.device))

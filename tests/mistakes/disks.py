@@ -103,6 +103,23 @@ def _(at: Place):
     return command
 
 
+@mistake("full disk", "ns-train writes its curves")
+def _(at: Place):
+    from tensorboard.summary.writer.record_writer import RecordWriter
+
+    command = at.train(*SHORT, preset="beags-tiny")
+    write, left = RecordWriter.write, [10]  # events that the disk still takes
+
+    def full(self, event):
+        left[0] -= 1
+        if left[0] < 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(self, event)
+
+    at.patch.setattr(RecordWriter, "write", full)
+    return command
+
+
 @mistake("full disk", "ns-train prepares refinement")
 def _(at: Place):
     from beags_plugin.plugin import refinement
