@@ -10,8 +10,10 @@ from test_reprojection_votes import larger_scene, same
 
 from beags_plugin.masks import slabs, voxel_reprojection
 from beags_plugin.masks.pooled_votes import lift
-from beags_plugin.masks.slabs import WHOLE, slabs_of
+from beags_plugin.masks.slabs import WHOLE, slabs_of, torch_brick_sample
 from beags_plugin.masks.voxel_reprojection import _to_voxels, reproject_voxel
+from beags_plugin.ops import extension
+from beags_plugin.ops.voxel_votes import brick_sample
 
 
 @pytest.mark.usefixtures("ops")
@@ -52,6 +54,19 @@ def test_slabs_hold_about_as_many_bricks_as_they_may():
     in_slab = torch.bucketize(bricks[:, 2].contiguous(), torch.tensor(found.borders[1:-1]) / 4, right=True)
     sizes = torch.bincount(in_slab, minlength=len(found))
     assert len(sizes) == len(found) and int(sizes.max()) < 2 * 1500
+
+
+@pytest.mark.skipif(extension.load() is None, reason="beags_plugin._native was not built")
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_compiled_sample_of_bricks_is_that_of_torch(dtype):
+    depths, cameras, *_ = larger_scene(dtype)
+    depth = depths[0].clone()
+    depth[:4] = torch.tensor([0.0, math.nan, math.inf, 1e30], dtype=dtype)[:, None]  # these lift no point
+    to_voxels = _to_voxels(cameras, torch.zeros(3, dtype=torch.float64), 0.01)[0].to(dtype)
+    every = torch_brick_sample(depth, to_voxels, 1)
+    assert len(every) > 100 and torch.equal(brick_sample(depth, to_voxels, 1), every)
+    some = torch_brick_sample(depth, to_voxels, 3)
+    assert 0 < len(some) < len(every) / 2 and torch.equal(brick_sample(depth, to_voxels, 3), some)
 
 
 def test_each_point_is_in_one_slab_and_what_matters_to_it_is_about():

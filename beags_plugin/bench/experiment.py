@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -162,9 +163,10 @@ class _Reader:
         if phase not in PHASES:
             raise self.wrong(f"{where}phase is {phase!r}: choose one of {', '.join(PHASES)}.")
         values = sweep.get("values")
-        if not isinstance(values, list) or not values or any(isinstance(v, (str, list, dict)) for v in values):
+        if not isinstance(values, list) or not values or not all(map(_is_number, values)):
             raise self.wrong(f"{where}values must be a list of numbers.")
-        lines = self.table(sweep, "lines", where) or {"": {}}
+        given = self.table(sweep, "lines", where) or {"": {}}
+        lines = {line: self.table(given, line, f"{where}lines: ") for line in given}
         variants = []
         for line, overrides in lines.items():
             for value in values:
@@ -181,13 +183,15 @@ class _Reader:
             return None
         table = self.table(self.content, "paper", "")
         self.known(table, {"source", "columns", "rows"}, "paper: ")
-        columns = tuple(table.get("columns", ()))
+        columns = table.get("columns", [])
+        if not isinstance(columns, list) or not all(isinstance(column, str) for column in columns):
+            raise self.wrong("paper: columns must be a list of names.")
         rows = {}
         for name, pairs in self.table(table, "rows", "paper: ").items():
             if not (isinstance(pairs, list) and len(pairs) == len(columns) and all(_is_pair(p) for p in pairs)):
                 raise self.wrong(f"paper: the row {name!r} must have a pair [IoU, BIoU] for each of the columns.")
             rows[name] = tuple((float(iou), float(biou)) for iou, biou in pairs)
-        return Paper(self.value(table, "source", str, where="paper: "), columns, rows)
+        return Paper(self.value(table, "source", str, where="paper: "), tuple(columns), rows)
 
     def checked_sample(self, options: dict[str, Any]) -> dict[str, Any]:
         from beags_plugin.sample.writer import SampleConfig
@@ -201,7 +205,7 @@ class _Reader:
     def degree(self, value: Any) -> float:
         from beags_plugin.sample.degrade import degradation_of_degree
 
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
+        if not _is_number(value):
             raise self.wrong(f"damage is {value!r}: give a number (1 is mild, 2 strong).")
         try:
             degradation_of_degree(float(value))
@@ -247,5 +251,10 @@ def _by_phase(common: dict[str, dict[str, Any]], own: dict[str, dict[str, Any]])
     return tuple({**common["both"], **common[p], **own["both"], **own[p]} for p in ("base", "refine"))  # type: ignore[return-value]
 
 
+def _is_number(value: Any) -> bool:
+    """Whether it is one that a float can hold, which not every whole number is."""
+    return type(value) in (int, float) and -sys.float_info.max <= value <= sys.float_info.max
+
+
 def _is_pair(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(isinstance(number, (int, float)) for number in value)
+    return isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))

@@ -10,12 +10,14 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.masks.pooled_votes import LOOKS
+from beags_plugin.masks.pooled_votes import LOOKS, lift
+from beags_plugin.ops import extension
+from beags_plugin.ops.voxel_votes import brick_sample
 
 MOST_BRICKS = 1 << 19  # bricks of 4 x 4 x 4 voxels that may be in memory: about 0.4 GB
 _BRICK = 4
-_PART = 64  # one brick of so many is counted
-_PRIMES = (73856093, 19349663, 83492791)
+_PART = 64  # one brick of about so many is counted
+_PRIMES = (73856093, 19349663, 83492791)  # as in native/voxel_votes.cpp
 
 
 @dataclass(frozen=True)
@@ -54,14 +56,13 @@ def slabs_of(depths: Sequence[Tensor], cameras: Sequence[Camera], to_voxels: Ten
     """As many slabs as keep about ``most`` (``MOST_BRICKS``) bricks of voxels in each, along the longest axis.
 
     depths: V x [H, W], asked for once, one view at a time. to_voxels: [V, 13] float64, see ``ops.voxel_votes``.
-    Bricks are counted by those whose hash is a multiple of 64, so that memory is that of a 64th of them.
+    Bricks are counted by about a 64th of them, which is what is kept in memory of each view.
     """
     most = MOST_BRICKS if most is None else most
     if sum(camera.height * camera.width for camera in cameras) <= most:
         return WHOLE
-    found = torch.zeros(0, 3, dtype=torch.int64)
-    for depth, own in zip(depths, to_voxels, strict=True):
-        found = torch.unique(torch.cat([found, _counted(depth, own.to(depth))]), dim=0)
+    samples = [_sample(depth, own.to(depth)) for depth, own in zip(depths, to_voxels, strict=True)]
+    found = torch.unique(torch.cat(samples), dim=0)
     count = -(-_PART * len(found) // most)
     if count <= 1:
         return WHOLE
@@ -81,13 +82,20 @@ def _along(axis: int, depth: Tensor, to_voxels: Tensor) -> Tensor:
     return found.masked_fill_(~(depth > 0), math.nan)
 
 
-def _counted(depth: Tensor, to_voxels: Tensor) -> Tensor:
-    """[M, 3] int64, on the CPU: of the bricks that hold the points of a view those that are counted."""
-    along = [_along(axis, depth, to_voxels) for axis in range(3)]
-    bricks = [values.div(_BRICK).floor_().nan_to_num_(0.0, 0.0, 0.0).int() for values in along]
-    x, y, z = (brick * prime for brick, prime in zip(bricks, _PRIMES, strict=True))  # int32: wraps around
-    chosen = (((x ^ y ^ z) >> 8) % _PART == 0) & along[0].isfinite()
-    return torch.unique(torch.stack([brick[chosen] for brick in bricks], dim=1), dim=0).long().cpu()
+def _sample(depth: Tensor, to_voxels: Tensor) -> Tensor:
+    compiled = extension.can_take(depth)
+    return (brick_sample if compiled else torch_brick_sample)(depth, to_voxels, _PART)
+
+
+def torch_brick_sample(depth: Tensor, to_voxels: Tensor, part: int) -> Tensor:
+    """[M, 3] int64, sorted, on the CPU: of the bricks that hold the points of a view [H, W] about one in ``part``.
+
+    The same bricks are chosen in every view. to_voxels: [13] like ``depth``, see ``ops.voxel_votes``.
+    """
+    points, _, near = lift(depth, to_voxels)
+    bricks = torch.floor(points[near] / _BRICK).int()
+    x, y, z = (bricks * torch.tensor(_PRIMES, dtype=torch.int32, device=bricks.device)).unbind(1)  # wraps around
+    return torch.unique(bricks[((x ^ y ^ z) >> 8) % part == 0], dim=0).long().cpu()
 
 
 def _margin(cameras: Sequence[Camera]) -> float:

@@ -104,6 +104,13 @@ void bind_functions(nb::module_& m, const char* suffix) {
         "means"_a, "quats"_a, "log_scales"_a, "opacity_logits"_a, "class_ids"_a, "lookup"_a, "stream"_a, "samples"_a,
         "background"_a, "g_means"_a.none(), "g_quats"_a.none(), "g_log_scales"_a.none(), "g_opacity_logits"_a.none(),
         "threads"_a, "weight"_a = 1.0, "skip"_a = true);
+  m.def(("brick_sample_" + end).c_str(),
+        [](In depth, In to_voxels, int32_t part) {
+          const LiftedView<T> view = lifted_view(depth, to_voxels);
+          nb::gil_scoped_release release;
+          return brick_sample(view, part);
+        },
+        "depth"_a, "to_voxels"_a, "part"_a);
   m.def(("sh_colors_" + end).c_str(),
         [](In sh_dc, In sh_rest, In means, const std::vector<double>& center, int degree, Out colors,
            Array<uint8_t> clamped, int threads) {

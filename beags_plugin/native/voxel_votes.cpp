@@ -1,6 +1,7 @@
 #include "voxel_votes.h"
 
 #include <algorithm>
+#include <array>
 
 #include "voxel_space.h"
 
@@ -11,6 +12,7 @@ namespace {
 constexpr uint64_t kNowhere = ~uint64_t(0);  // pixels without a depth, or too far away
 constexpr int kShares = 64;
 constexpr int kBlock = 64;  // voxels that are fetched at a time
+constexpr uint32_t kPrimes[3] = {73856093, 19349663, 83492791};  // as in masks/slabs.py
 
 // Of three bricks in a row along an axis, bits of the middle one: set there or in the next voxel below, or above.
 void with_next(int axis, const uint64_t* bricks, uint64_t* below, uint64_t* above) {
@@ -263,6 +265,31 @@ void VoxelVotes::settle(uint64_t key, Brick& brick) const {
   }
 }
 
+template <class T>
+std::vector<int32_t> brick_sample(const LiftedView<T>& view, int32_t part) {
+  std::vector<std::array<int32_t, 3>> found;
+  std::array<int32_t, 3> last = {INT32_MAX, 0, 0};  // neighbours mostly lie in one brick
+  for (int y = 0; y < view.height; ++y) {
+    for (int x = 0; x < view.width; ++x) {
+      T point[3], ray[3];
+      if (!lift(view, x, y, point, ray)) continue;
+      const std::array<int32_t, 3> brick = {floor_of(point[0]) >> 2, floor_of(point[1]) >> 2, floor_of(point[2]) >> 2};
+      if (brick == last) continue;
+      last = brick;
+      uint32_t hash = 0;
+      for (int a = 0; a < 3; ++a) hash ^= static_cast<uint32_t>(brick[a]) * kPrimes[a];
+      if ((static_cast<int32_t>(hash) >> 8) % part == 0) found.push_back(brick);
+    }
+  }
+  std::sort(found.begin(), found.end());
+  found.erase(std::unique(found.begin(), found.end()), found.end());
+  std::vector<int32_t> flat;
+  for (const auto& brick : found) flat.insert(flat.end(), brick.begin(), brick.end());
+  return flat;
+}
+
+template std::vector<int32_t> brick_sample(const LiftedView<float>&, int32_t);
+template std::vector<int32_t> brick_sample(const LiftedView<double>&, int32_t);
 template void VoxelVotes::add(const LiftedView<float>&, const int32_t*, int32_t);
 template void VoxelVotes::add(const LiftedView<double>&, const int32_t*, int32_t);
 

@@ -77,6 +77,14 @@ class CudaVoxelVotes:
         return labels, self._tally.read(depth, to_voxels.cpu(), labels)
 
 
+def brick_sample(depth: Tensor, to_voxels: Tensor, part: int) -> Tensor:
+    """What ``masks.slabs.torch_brick_sample`` tells of depth [H, W] on the CPU; the caller asks
+    ``extension.can_take(depth)`` first."""
+    depth, to_voxels = _view(depth, to_voxels)
+    found = extension.function("brick_sample", depth)(depth, to_voxels, part)
+    return torch.tensor(found, dtype=torch.int64).reshape(-1, 3)
+
+
 def votes_for(depths: Sequence[Tensor], ignore: int) -> VoxelVotes | CudaVoxelVotes | None:
     """What counts the votes of pixels with these depths, compiled for where they lie; None: nothing was."""
     if (module := cuda_extension.module_for(*depths)) is not None:
