@@ -14,14 +14,18 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.class_ranks import ClassRanks
 from beags_plugin.core.densification import GradientStatistics
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.losses import silhouette
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.boundary import BoundaryLoss
+from beags_plugin.losses.class_members import ClassMembers
 from beags_plugin.losses.distortion import DistortionLoss
 from beags_plugin.losses.normal import NormalConsistencyLoss
 from beags_plugin.losses.occupancy import OccupancyLoss
 from beags_plugin.losses.opacity import OpacityLoss
 from beags_plugin.losses.photometric import PhotometricLoss
+from beags_plugin.losses.silhouette import SilhouetteLoss
 from beags_plugin.ops import cuda_extension
+from beags_plugin.ops.voxel_lookup import VoxelLookup
 from beags_plugin.rasterizers.interface import RasterOutputs
 
 N, HEIGHT, WIDTH = 50, 40, 60
@@ -32,6 +36,8 @@ LOSSES = [
     OccupancyLoss(samples=20),
     DistortionLoss(weight=1.0),
     OpacityLoss(weight=1.0),
+    SilhouetteLoss(objects=2),
+    SilhouetteLoss(objects=1, seen=9),
 ]
 
 
@@ -57,6 +63,9 @@ def gpu(monkeypatch):
     on_gpu = lambda *tensors: module if tensors[0].device.type == "cuda" else None  # noqa: E731
     monkeypatch.setattr(cuda_extension, "module_for", on_gpu)
     monkeypatch.setattr(cuda_extension, "call", lambda *_: None)
+    # What the host draws at random, and what it reads of a camera on the host, would have no data either.
+    monkeypatch.setattr(silhouette, "_chosen", lambda count, wanted, *_: list(range(count))[:wanted])
+    monkeypatch.setattr(silhouette, "surfel_inputs", lambda surfels, camera, degree: surfels)
     with FakeTensorMode(), Fetches() as fetches:
         yield fetches
 
@@ -65,23 +74,36 @@ def rand(*shape: int, **options) -> torch.Tensor:
     return torch.rand(*shape, device="cuda", **options)
 
 
-def inputs(surfels: Surfels) -> LossInputs:
+def outputs(alpha: torch.Tensor | None = None) -> RasterOutputs:
     image = (HEIGHT, WIDTH)
-    render = RasterOutputs(
-        color=rand(*image, 3, requires_grad=True), alpha=rand(*image), depth=rand(*image, requires_grad=True),
-        median_depth=rand(*image), normal=rand(*image, 3, requires_grad=True),
-        distortion=rand(*image, requires_grad=True), boundary=rand(*image, requires_grad=True),
-        visible=rand(N) > 0.5, num_nonfinite=0,
+    return RasterOutputs(
+        color=rand(*image, 3, requires_grad=True), alpha=rand(*image) if alpha is None else alpha,
+        depth=rand(*image, requires_grad=True), median_depth=rand(*image),
+        normal=rand(*image, 3, requires_grad=True), distortion=rand(*image, requires_grad=True),
+        boundary=rand(*image, requires_grad=True), visible=rand(N) > 0.5, num_nonfinite=0,
     )  # fmt: skip
-    class_ids = torch.zeros(N, dtype=torch.int32, device="cuda")
+
+
+def inputs(surfels: Surfels, members: ClassMembers | None) -> LossInputs:
+    image = (HEIGHT, WIDTH)
     ranks = ClassRanks.__new__(ClassRanks)
     ranks._table = torch.zeros(9, dtype=torch.int32, device="cuda")
-    lookup = SimpleNamespace(voxels=lambda *_: None, ranks=ranks.ranks, native=None)
+    lookup = VoxelLookup.__new__(VoxelLookup)
+    lookup._ranks, lookup._native, lookup.voxels = ranks, None, lambda *_: None
     return LossInputs(
-        step=20_000, seed=1, surfels=surfels, camera=Camera(rand(4, 4), rand(3, 3), WIDTH, HEIGHT), render=render,
-        image=rand(*image, 3), labels=torch.zeros(image, dtype=torch.int32, device="cuda"), class_ids=class_ids,
-        grid=SimpleNamespace(lookup=lambda: lookup),
+        step=20_000, seed=1, surfels=surfels, camera=Camera(rand(4, 4), rand(3, 3), WIDTH, HEIGHT), render=outputs(),
+        image=rand(*image, 3), labels=torch.zeros(image, dtype=torch.int32, device="cuda"),
+        class_ids=torch.zeros(N, dtype=torch.int32, device="cuda"),
+        grid=SimpleNamespace(lookup=lambda: lookup, count=lookup.count),
+        draw=lambda drawn, camera: outputs(drawn.means.mean() + rand(*image)), members=members, objects=[1, 3],
     )  # fmt: skip
+
+
+def members_of_two() -> ClassMembers:
+    """As a step before has left it."""
+    members = ClassMembers(torch.zeros(N, dtype=torch.int32, device="cuda"))
+    members._order, members._spans = torch.arange(N, device="cuda"), {0: (0, 20), 1: (20, 40), 3: (40, 50)}
+    return members
 
 
 def parameters() -> list[torch.Tensor]:
@@ -92,7 +114,7 @@ def parameters() -> list[torch.Tensor]:
 @pytest.mark.parametrize("loss", LOSSES, ids=lambda loss: type(loss).__name__)
 def test_a_loss_waits_for_nothing(loss, gpu):
     """The forward; autograd's own way back needs a device, and asks for no numbers."""
-    value = loss.weighted(inputs(Surfels(*parameters())))
+    value = loss.weighted(inputs(Surfels(*parameters()), members_of_two()))
     assert value.device.type == "cuda" and value.shape == () and value.requires_grad
     assert gpu.found == []
 
@@ -109,6 +131,11 @@ def test_growth_and_adam_wait_for_nothing(gpu):
     assert statistics.mean().device.type == "cuda"
     step_all(optimizers)
     assert gpu.found == []
+
+
+def test_a_loss_that_is_not_told_what_the_host_knows_waits(gpu):
+    with pytest.raises(Exception, match="item|local_scalar|unique"):
+        SilhouetteLoss().weighted(inputs(Surfels(*parameters()), None))
 
 
 def test_what_fetches_is_noticed(gpu):

@@ -12,6 +12,7 @@ from beags_plugin.core.lifting import lift
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.errors import UserError
 from beags_plugin.losses.base import LossInputs
+from beags_plugin.losses.class_members import ClassMembers, objects_in
 from beags_plugin.losses.silhouette import SilhouetteLoss
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.rasterizers import make_rasterizer
@@ -60,6 +61,15 @@ def test_equals_the_alpha_of_each_object_against_its_mask():
         wrong = (alpha - (labels == class_id).float()).abs()
         expected += float(wrong[labels != IGNORE].sum())
     assert float(found) == pytest.approx(expected / (SIZE * (SIZE - 2)), rel=1e-5)
+
+
+def test_what_the_host_knows_changes_no_bit():
+    surfels, class_ids = scene([3.0, 3.0, 3.2]), [1, 2, 1]
+    asked = inputs_of(surfels, class_ids, columns((1, 8), (2, 6), (IGNORE, 2), (0, 8)))
+    told = replace(asked, members=ClassMembers(asked.class_ids), objects=objects_in(asked.labels))
+    for loss in (SilhouetteLoss(), SilhouetteLoss(objects=2)):
+        assert torch.equal(loss.value(told), loss.value(asked)) and float(loss.value(told)) > 0.0
+    assert float(SilhouetteLoss().value(replace(told, objects=[]))) == 0.0
 
 
 def test_what_lies_behind_another_surface_may_be_covered():

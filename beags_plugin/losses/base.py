@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -14,6 +14,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.rasterizers.interface import RasterOutputs, SurfelInputs
 
 if TYPE_CHECKING:
+    from beags_plugin.losses.class_members import ClassMembers
     from beags_plugin.occupancy.grid import VisibilityGrid
 
 
@@ -31,6 +32,8 @@ class LossInputs:
     class_ids: [N] int32, phi; None before assignment.
     grid: the visibility voxel grids; None before refinement.
     draw: draws other surfels than the render's, with geometry, on black; for losses that need a drawing of their own.
+    members: which surfels each class has, and objects: ids of the objects that ``labels`` shows, ascending, where the
+        host knows them; None: a loss that needs them looks at ``class_ids`` and ``labels``, for which a GPU must wait.
     """
 
     step: int
@@ -43,6 +46,8 @@ class LossInputs:
     class_ids: Tensor | None = None
     grid: VisibilityGrid | None = None
     draw: Callable[[SurfelInputs, Camera], RasterOutputs] | None = None
+    members: ClassMembers | None = None
+    objects: Sequence[int] | None = None
 
 
 @dataclass(frozen=True)

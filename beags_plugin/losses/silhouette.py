@@ -15,6 +15,7 @@ from torch import Tensor
 from beags_plugin.core.lifting import lift
 from beags_plugin.errors import UserError
 from beags_plugin.losses.base import Loss, LossInputs
+from beags_plugin.losses.class_members import ClassMembers, objects_in
 from beags_plugin.losses.reduction import ordered_sum
 from beags_plugin.rasterizers.drawing import surfel_inputs
 from beags_plugin.rasterizers.interface import IGNORE
@@ -59,20 +60,22 @@ class SilhouetteLoss(Loss):
         if inputs.draw is None or inputs.class_ids is None or inputs.render.median_depth is None:
             raise ValueError("the silhouette loss needs class ids, a way to draw, and a render with geometry")
         known = inputs.labels != IGNORE
-        present = torch.unique(inputs.labels[known & (inputs.labels != 0)])
-        if len(present) == 0:
+        present = objects_in(inputs.labels) if inputs.objects is None else inputs.objects
+        if not present:
             return nothing
+        members = ClassMembers(inputs.class_ids) if inputs.members is None else inputs.members
         chosen = _chosen(len(present), int(self.objects), inputs.seed, inputs.step)
-        terms = [self._of_object(int(present[rank]), known, inputs) for rank in chosen]
-        return torch.stack(terms).sum() * (len(present) / len(terms) / int(known.sum()))
+        terms = [self._of_object(present[rank], members.of(present[rank]), known, inputs) for rank in chosen]
+        share = len(present) / len(terms) / known.sum().double()
+        return torch.stack(terms).sum() * share.to(nothing)
 
-    def _of_object(self, class_id: int, known: Tensor, inputs: LossInputs) -> Tensor:
+    def _of_object(self, class_id: int, members: Tensor, known: Tensor, inputs: LossInputs) -> Tensor:
         """Sum over the pixels that count."""
-        assert inputs.draw is not None and inputs.class_ids is not None and inputs.labels is not None
-        part = inputs.surfels[(inputs.class_ids == class_id).nonzero()[:, 0]]
-        inside = inputs.labels == class_id
-        if len(part) == 0:
+        assert inputs.draw is not None and inputs.labels is not None
+        if len(members) == 0:
             return inputs.render.color.new_zeros(())
+        inside = inputs.labels == class_id
+        part = inputs.surfels[members]
         alone = inputs.draw(surfel_inputs(part, inputs.camera, 0), inputs.camera)
         assert alone.depth is not None and alone.median_depth is not None
         assert inputs.render.median_depth is not None
@@ -91,11 +94,10 @@ class SilhouetteLoss(Loss):
         """[H, W] bool: the pixels of ``asked`` [H, W] bool at whose ``depth`` [H, W] some view saw the object."""
         if inputs.grid is None:
             raise ValueError("the silhouette loss needs a visibility grid where seen > 0")
-        points = lift(depth, inputs.camera)[asked]
-        ids = torch.full((len(points),), class_id, dtype=torch.int32, device=points.device)
-        found = torch.zeros_like(asked)
-        found[asked] = inputs.grid.count(points, ids) >= self.seen
-        return found
+        points = lift(depth, inputs.camera).reshape(-1, 3)
+        # All pixels, as a GPU would have to say which to choose; of those that are not asked about, no voxel is read.
+        ids = torch.where(asked, class_id, IGNORE).int().reshape(-1)
+        return (inputs.grid.count(points, ids) >= self.seen).view_as(asked)
 
 
 def _chosen(count: int, wanted: int, seed: int, step: int) -> list[int]:

@@ -24,6 +24,7 @@ import beags_plugin.plugin.nerfstudio_patches  # noqa: F401  (checkpoints load a
 from beags_plugin.core import processes
 from beags_plugin.core.cameras import Camera
 from beags_plugin.errors import UserError
+from beags_plugin.losses.class_members import objects_in
 from beags_plugin.masks.label_maps import PackedMap, narrowed, widened
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.dataparser import BeagsDataParserConfig, absolute
@@ -66,9 +67,9 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
     """nerfstudio's data manager of full images, for CPUs too, with class maps in every batch.
 
     Batches hold ``image`` [H, W, 3], ``class_map`` [H, W] int32 and ``alpha`` [H, W] uint8 where the image has it, all
-    on the device; a training camera's metadata holds its ``class_map`` too. The cache holds class maps in the narrowest
-    type. Training views come in a random order without repetition within a round, given by
-    ``train_cameras_sampling_seed`` alone.
+    on the device, and, once ``replace_class_maps`` was called, ``objects``, the ids of ``class_map``. A training
+    camera's metadata holds its ``class_map`` too. The cache holds class maps in the narrowest type. Training views come
+    in a random order without repetition within a round, given by ``train_cameras_sampling_seed`` alone.
     """
 
     config: BeagsDataManagerConfig
@@ -82,6 +83,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         straighten(self.eval_dataset.cameras)
         self.train_cameras = self.train_dataset.cameras.to(self.device)
         self._cameras: dict[int, Camera] = {}
+        self._objects: list[list[int]] | None = None  # of each training view's class map, once they are replaced
         self._replaced = False  # whether the training class maps are no longer those of the files
         self._originals_kept = True
         self._originals: list[Tensor] | None = None  # those of the files, where they are kept beside the ones in use
@@ -185,6 +187,8 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         # the boundary is computed inside the rasterizer, which sees the camera only: the mask travels with it
         metadata = camera.metadata or {}
         camera.metadata = {**metadata, "class_map": data["class_map"], "camera": self._camera(metadata["cam_idx"])}
+        if self._objects is not None:
+            data["objects"] = self._objects[metadata["cam_idx"]]
         return camera, data
 
     def _camera(self, index: int) -> Camera:
@@ -283,6 +287,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
                 self._originals = [data["class_map"] for data in cache]
             for data, labels in zip(cache, class_maps, strict=True):
                 data["class_map"] = narrowed(labels.detach().int()).to(data["class_map"].device)
+        self._objects = [objects_in(labels) for labels in class_maps]
         self._originals = self._originals if keep else None
         self._originals_kept = keep
         self._replaced = True

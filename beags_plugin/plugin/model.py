@@ -19,6 +19,7 @@ from beags_plugin.core.densification import DensifyConfig, initial_surfels
 from beags_plugin.core.sh import MAX_DEGREE
 from beags_plugin.errors import UserError
 from beags_plugin.losses.base import Loss, LossInputs
+from beags_plugin.losses.class_members import ClassMembers
 from beags_plugin.losses.photometric import ssim
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.cameras import camera_from_nerfstudio
@@ -166,6 +167,7 @@ class BeagsModel(SurfelModel):
         self.rasterizer: Rasterizer = make_rasterizer(self.config.rasterizer)
         self._known_extent: tuple[Tensor, int, float] | None = None
         self.grid: VisibilityGrid | None = None
+        self._members: ClassMembers | None = None
         self.step = 0
         self.seed = 0
         self.frozen = False
@@ -294,6 +296,8 @@ class BeagsModel(SurfelModel):
             class_ids=self.class_ids,
             grid=self.grid,
             draw=self._draw_apart,
+            members=self._class_members(),
+            objects=batch.get("objects"),
         )
         terms = {name: loss.weighted(inputs) for name, loss in self.active_losses().items()}
         self.clock.mark("losses")
@@ -303,6 +307,11 @@ class BeagsModel(SurfelModel):
     def _draw_apart(self, inputs: SurfelInputs, camera: Camera) -> RasterOutputs:
         """Surfels that a loss wants to see apart from the scene, with geometry, on black."""
         return self.rasterizer.rasterize(inputs, camera, self.settings(), inputs.means.new_zeros(3))
+
+    def _class_members(self) -> ClassMembers:
+        if self._members is None or not self._members.current(self.class_ids):
+            self._members = ClassMembers(self.class_ids)
+        return self._members
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Any], batch: dict[str, Any]
