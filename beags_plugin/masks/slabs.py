@@ -90,7 +90,8 @@ def _sample(depth: Tensor, to_voxels: Tensor) -> Tensor:
 def torch_brick_sample(depth: Tensor, to_voxels: Tensor, part: int) -> Tensor:
     """[M, 3] int64, sorted, on the CPU: of the bricks that hold the points of a view [H, W] about one in ``part``.
 
-    The same bricks are chosen in every view. to_voxels: [13] like ``depth``, see ``ops.voxel_votes``.
+    The same bricks are chosen in every view. to_voxels: [13] like ``depth``, see ``ops.voxel_votes``. part: a power of
+    two.
     """
     points, _, near = lift(depth, to_voxels)
     bricks = torch.floor(points[near] / _BRICK).int()

@@ -36,18 +36,28 @@ BEAGS_HD inline int32_t floor_of(T x) {
   return whole - (static_cast<T>(whole) > x);
 }
 
-// A pixel's point and, for one unit of depth, the way along its ray, in voxels. False without a depth, or too far away.
+// The way along the ray of (px, py), in pixels, for one unit of depth, along one axis, in voxels.
+template <class T>
+BEAGS_HD inline T ray_of(const LiftedView<T>& view, int axis, T px, T py) {
+  const T* a = view.a + 3 * axis;
+  return a[0] * px + (a[1] * py + a[2]);
+}
+
+template <class T>
+BEAGS_HD inline bool in_reach(T coordinate) {
+  return fabs(coordinate) < static_cast<T>(kHalf - kMargin);  // false for NaN
+}
+
+// A pixel's point and the way along its ray. False without a depth, or too far away.
 template <class T>
 BEAGS_HD inline bool lift(const LiftedView<T>& view, int x, int y, T* point, T* ray) {
   const T d = view.depth[static_cast<int64_t>(y) * view.width + x];
-  if (!(d > 0)) return false;
   const T px = static_cast<T>(x) + T(0.5), py = static_cast<T>(y) + T(0.5);
-  bool near = true;
+  bool near = d > 0;
   for (int r = 0; r < 3; ++r) {
-    const T* a = view.a + 3 * r;
-    ray[r] = a[0] * px + (a[1] * py + a[2]);
+    ray[r] = ray_of(view, r, px, py);
     point[r] = d * ray[r] + view.b[r];
-    near = near && fabs(point[r]) < static_cast<T>(kHalf - kMargin);  // false for NaN
+    near = near && in_reach(point[r]);
   }
   return near;
 }

@@ -105,7 +105,7 @@ void bind_functions(nb::module_& m, const char* suffix) {
         "background"_a, "g_means"_a.none(), "g_quats"_a.none(), "g_log_scales"_a.none(), "g_opacity_logits"_a.none(),
         "threads"_a, "weight"_a = 1.0, "skip"_a = true);
   m.def(("brick_sample_" + end).c_str(),
-        [](In depth, In to_voxels, int32_t part) {
+        [](In depth, In to_voxels, uint32_t part) {
           const LiftedView<T> view = lifted_view(depth, to_voxels);
           nb::gil_scoped_release release;
           return brick_sample(view, part);

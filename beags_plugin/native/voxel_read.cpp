@@ -14,6 +14,7 @@ class VoxelVotes::Reader {
   // Sets labels and confidence. What all pixels of a tile will look at is fetched first, so that no pixel waits alone.
   template <class T>
   void read(const LiftedView<T>& view, int left, int right, int top, int bottom, int32_t* labels, float* confidence) {
+    const LiftedTile<T> tile(view, left, right, top, bottom);
     Query<T> queries[kTile * kTile];
     int count = 0;
     for (int y = top; y < bottom; ++y) {
@@ -21,9 +22,10 @@ class VoxelVotes::Reader {
         Query<T>& query = queries[count];
         query.pixel = static_cast<int64_t>(y) * view.width + x;
         confidence[query.pixel] = 0.0f;
-        if (!lift(view, x, y, query.point, query.ray)) continue;
+        const int place = (y - top) * kTile + x - left;
+        if (!tile.near[place]) continue;
         ++count;
-        locate(query);
+        locate(tile, place, query);
         if (kept_[kept_at(query.key)].key != query.key) votes_.fetch(query.key);
       }
     }
@@ -47,15 +49,15 @@ class VoxelVotes::Reader {
     }
     for (int i = 0; i < left_open; ++i) {
       const Query<T>& query = queries[open[i]];
-      confidence[query.pixel] = answer(query, view.voxel, labels + query.pixel);
+      confidence[query.pixel] = answer(view, query, labels + query.pixel);
     }
   }
 
  private:
-  // A pixel's point, the way along its ray, and the voxel and the eighth of it that hold the point.
+  // A pixel's point, and the voxel and the eighth of it that hold the point.
   template <class T>
   struct Query {
-    T point[3], ray[3];
+    T point[3];
     int64_t pixel;
     uint64_t key;
     const Brick* brick;
@@ -63,13 +65,14 @@ class VoxelVotes::Reader {
   };
 
   template <class T>
-  static void locate(Query<T>& query) {
+  static void locate(const LiftedTile<T>& tile, int place, Query<T>& query) {
     int32_t own[3];
     query.eighth = 0;
     for (int a = 0; a < 3; ++a) {
-      const int32_t whole = floor_of(query.point[a]);
+      const T at = query.point[a] = tile.point[a][place];
+      const int32_t whole = tile.voxel[a][place];
       own[a] = whole + kHalf;
-      query.eighth = query.eighth << 1 | (floor_of(query.point[a] - T(0.5)) == whole);
+      query.eighth = query.eighth << 1 | (floor_of(at - T(0.5)) == whole);
     }
     query.key = brick_key(own[0] >> 2, own[1] >> 2, own[2] >> 2);
     query.cell = cell_of(own[0], own[1], own[2]);
@@ -77,7 +80,7 @@ class VoxelVotes::Reader {
 
   // The pixel's confidence; sets its label.
   template <class T>
-  float answer(const Query<T>& query, T length, int32_t* label) {
+  float answer(const LiftedView<T>& view, const Query<T>& query, int32_t* label) {
     const Brick& at = *query.brick;
     const int cell = query.cell;
     if (at.agreed[query.eighth] >> cell & 1) {
@@ -85,24 +88,22 @@ class VoxelVotes::Reader {
       return share_in(at.voxels[cell], at.pairs, at.label);
     }
     const bool voted = at.voted >> cell & 1;
-    NearVoxels place = about(query.point);
-    gather(place);
-    const int32_t leader = agreed(place);
+    Look here;
+    look_about(query.point, here);
+    const int32_t leader = agreed(here);
     if (leader >= 0 && voted) {
       *label = leader;
       return share_in(at.voxels[cell], at.pairs, leader);
     }
     poll_.clear();
-    count(place);
     if (leader < 0) {
-      for (const T step : {-kLook * length, kLook * length}) {
-        T moved[3];
-        for (int a = 0; a < 3; ++a) moved[a] = query.point[a] + step * query.ray[a];
-        place = about(moved);
-        gather(place);
-        count(place);
-      }
+      Look before, behind;
+      look_along(view, query, -kLook, before);
+      look_along(view, query, kLook, behind);
+      count(before);
+      count(behind);
     }
+    count(here);
     const float share = decide(label);
     return voted ? share_in(at.voxels[cell], at.pairs, *label) : share;
   }
@@ -116,21 +117,40 @@ class VoxelVotes::Reader {
     uint64_t votes;
   };
 
-  // The bricks of the eight voxels: one to eight of them. `bricks_` has them by bits 4, 2, 1 for one step along x, y,
-  // z; the others of it are not asked for.
-  void gather(const NearVoxels& place) {
+  // Eight voxels about a point, and their bricks, one to eight of them, by bits 4, 2, 1 for one step along x, y, z; the
+  // others are not asked for.
+  struct Look {
+    NearVoxels place;
+    const Brick* bricks[8];
+  };
+
+  template <class T>
+  void look_about(const T* point, Look& look) {
+    look.place = about(point);
     int32_t near[3], end[3];
     for (int a = 0; a < 3; ++a) {
-      near[a] = place.corner[a] >> 2;
-      end[a] = (place.corner[a] + 1) >> 2;
+      near[a] = look.place.corner[a] >> 2;
+      end[a] = (look.place.corner[a] + 1) >> 2;
     }
     for (int32_t x = near[0]; x <= end[0]; ++x) {
       for (int32_t y = near[1]; y <= end[1]; ++y) {
         for (int32_t z = near[2]; z <= end[2]; ++z) {
-          bricks_[(x - near[0]) << 2 | (y - near[1]) << 1 | (z - near[2])] = find(brick_key(x, y, z));
+          look.bricks[(x - near[0]) << 2 | (y - near[1]) << 1 | (z - near[2])] = find(brick_key(x, y, z));
         }
       }
     }
+  }
+
+  // So many steps along the pixel's ray. Its voxels are fetched, as others are looked at first.
+  template <class T>
+  void look_along(const LiftedView<T>& view, const Query<T>& query, int steps, Look& look) {
+    const T px = static_cast<T>(query.pixel % view.width) + T(0.5);
+    const T py = static_cast<T>(query.pixel / view.width) + T(0.5);
+    const T step = static_cast<T>(steps) * view.voxel;
+    T moved[3];
+    for (int a = 0; a < 3; ++a) moved[a] = query.point[a] + step * ray_of(view, a, px, py);
+    look_about(moved, look);
+    each_voxel(look, [](const Brick&, const Voxel& voxel, uint32_t) { __builtin_prefetch(&voxel); });
   }
 
   const Brick* find(uint64_t key) {
@@ -142,9 +162,10 @@ class VoxelVotes::Reader {
     return kept.brick;
   }
 
-  // do_voxel(brick, voxel, weight) for those of the eight voxels of gathered bricks that have votes.
+  // do_voxel(brick, voxel, weight) for those of the eight voxels that have votes.
   template <class DoVoxel>
-  void each_voxel(const NearVoxels& place, DoVoxel do_voxel) const {
+  static void each_voxel(const Look& look, DoVoxel do_voxel) {
+    const NearVoxels& place = look.place;
     int brick[3][2], cell[3][2];
     uint32_t weight[3][2];
     for (int a = 0; a < 3; ++a) {
@@ -157,16 +178,16 @@ class VoxelVotes::Reader {
     }
     for (int i = 0; i < 8; ++i) {
       const int x = i >> 2, y = i >> 1 & 1, z = i & 1;
-      const Brick& at = *bricks_[brick[0][x] | brick[1][y] | brick[2][z]];
+      const Brick& at = *look.bricks[brick[0][x] | brick[1][y] | brick[2][z]];
       const int here = cell[0][x] | cell[1][y] | cell[2][z];
       if (at.voted >> here & 1) do_voxel(at, at.voxels[here], weight[0][x] * weight[1][y] * weight[2][z]);
     }
   }
 
   // The class with more than half of the votes of each of the eight voxels that has any, or kMany or kNobody.
-  int32_t agreed(const NearVoxels& place) const {
+  static int32_t agreed(const Look& look) {
     int32_t least = INT32_MAX, most = kNobody;
-    each_voxel(place, [&](const Brick&, const Voxel& voxel, uint32_t) {
+    each_voxel(look, [&](const Brick&, const Voxel& voxel, uint32_t) {
       least = std::min(least, voxel.label);
       most = std::max(most, voxel.label);
     });
@@ -174,8 +195,8 @@ class VoxelVotes::Reader {
   }
 
   // Adds the votes of the eight voxels, interpolated.
-  void count(const NearVoxels& place) {
-    each_voxel(place, [&](const Brick& at, const Voxel& voxel, uint64_t weight) {
+  void count(const Look& look) {
+    each_voxel(look, [&](const Brick& at, const Voxel& voxel, uint64_t weight) {
       if (!(voxel.votes & kSeveral)) return add(voxel.label, weight * voxel.votes);
       const Pair* pair = at.pairs + (voxel.votes & ~kSeveral);
       for (int32_t k = 1; k <= pair->label; ++k) add(pair[k].label, weight * pair[k].votes);
@@ -224,7 +245,6 @@ class VoxelVotes::Reader {
   const VoxelVotes& votes_;
   std::vector<Kept> kept_;
   const Brick nothing_;  // where nobody voted
-  const Brick* bricks_[8];
   std::vector<Entry> poll_;
 };
 

@@ -45,5 +45,37 @@ void each_tile(const LiftedView<T>& view, int row, DoTile do_tile) {
   for (int left = 0; left < view.width; left += kTile) do_tile(left, std::min(left + kTile, view.width), top, bottom);
 }
 
+// What `lift` tells of a tile's pixels, and the voxels of their points, at 8 (y - top) + x - left: plain arithmetic on
+// whole arrays, of which the compiler takes several places at a time. What lies outside the image is not near.
+template <class T>
+struct LiftedTile {
+  static constexpr int kPlaces = kTile * kTile;
+  T point[3][kPlaces];
+  int32_t voxel[3][kPlaces], near[kPlaces];
+
+  LiftedTile(const LiftedView<T>& view, int left, int right, int top, int bottom) {
+    T depth[kPlaces] = {}, px[kPlaces], py[kPlaces];
+    for (int y = top; y < bottom; ++y) {
+      const T* row = view.depth + static_cast<int64_t>(y) * view.width;
+      std::copy(row + left, row + right, depth + (y - top) * kTile);
+    }
+    for (int i = 0; i < kPlaces; ++i) {
+      px[i] = static_cast<T>(left + i % kTile) + T(0.5);
+      py[i] = static_cast<T>(top + i / kTile) + T(0.5);
+      near[i] = depth[i] > 0;
+    }
+    for (int a = 0; a < 3; ++a) {
+      const T shift = view.b[a];
+      for (int i = 0; i < kPlaces; ++i) {
+        point[a][i] = depth[i] * ray_of(view, a, px[i], py[i]) + shift;
+        near[i] &= in_reach(point[a][i]);
+      }
+    }
+    for (int a = 0; a < 3; ++a) {
+      for (int i = 0; i < kPlaces; ++i) voxel[a][i] = floor_of(near[i] ? point[a][i] : T(0));
+    }
+  }
+};
+
 }  // namespace ops
 }  // namespace beags

@@ -37,16 +37,17 @@ void VoxelVotes::add(const LiftedView<T>& view, const int32_t* labels, int32_t i
   for (int row = 0; row < rows; ++row) {
     int64_t place = static_cast<int64_t>(row) * kTile * view.width;
     each_tile(view, row, [&](int left, int right, int top, int bottom) {
+      const LiftedTile<T> tile(view, left, right, top, bottom);
       for (int y = top; y < bottom; ++y) {
         for (int x = left; x < right; ++x) {
           const int32_t label = labels[static_cast<int64_t>(y) * view.width + x];
-          T point[3], ray[3];
+          const int i = (y - top) * kTile + x - left;
           uint64_t& key = keys_[place];
           labels_[place++] = label;
           key = kNowhere;
-          if (label == ignore || !lift(view, x, y, point, ray)) continue;
+          if (label == ignore || !tile.near[i]) continue;
           int32_t v[3];
-          for (int a = 0; a < 3; ++a) v[a] = floor_of(point[a]) + kHalf;
+          for (int a = 0; a < 3; ++a) v[a] = tile.voxel[a][i] + kHalf;
           key = brick_key(v[0] >> 2, v[1] >> 2, v[2] >> 2) << 6 | cell_of(v[0], v[1], v[2]);
         }
       }
@@ -266,20 +267,21 @@ void VoxelVotes::settle(uint64_t key, Brick& brick) const {
 }
 
 template <class T>
-std::vector<int32_t> brick_sample(const LiftedView<T>& view, int32_t part) {
+std::vector<int32_t> brick_sample(const LiftedView<T>& view, uint32_t part) {
   std::vector<std::array<int32_t, 3>> found;
-  std::array<int32_t, 3> last = {INT32_MAX, 0, 0};  // neighbours mostly lie in one brick
-  for (int y = 0; y < view.height; ++y) {
-    for (int x = 0; x < view.width; ++x) {
-      T point[3], ray[3];
-      if (!lift(view, x, y, point, ray)) continue;
-      const std::array<int32_t, 3> brick = {floor_of(point[0]) >> 2, floor_of(point[1]) >> 2, floor_of(point[2]) >> 2};
-      if (brick == last) continue;
-      last = brick;
-      uint32_t hash = 0;
-      for (int a = 0; a < 3; ++a) hash ^= static_cast<uint32_t>(brick[a]) * kPrimes[a];
-      if ((static_cast<int32_t>(hash) >> 8) % part == 0) found.push_back(brick);
-    }
+  for (int row = 0; row < tile_rows(view); ++row) {
+    each_tile(view, row, [&](int left, int right, int top, int bottom) {
+      const LiftedTile<T> tile(view, left, right, top, bottom);
+      uint32_t hash[LiftedTile<T>::kPlaces] = {};
+      for (int a = 0; a < 3; ++a) {
+        for (int i = 0; i < tile.kPlaces; ++i) hash[i] ^= static_cast<uint32_t>(tile.voxel[a][i] >> 2) * kPrimes[a];
+      }
+      for (int i = 0; i < tile.kPlaces; ++i) {
+        if ((hash[i] >> 8 & (part - 1)) || !tile.near[i]) continue;
+        const std::array<int32_t, 3> brick = {tile.voxel[0][i] >> 2, tile.voxel[1][i] >> 2, tile.voxel[2][i] >> 2};
+        if (found.empty() || found.back() != brick) found.push_back(brick);
+      }
+    });
   }
   std::sort(found.begin(), found.end());
   found.erase(std::unique(found.begin(), found.end()), found.end());
@@ -288,8 +290,8 @@ std::vector<int32_t> brick_sample(const LiftedView<T>& view, int32_t part) {
   return flat;
 }
 
-template std::vector<int32_t> brick_sample(const LiftedView<float>&, int32_t);
-template std::vector<int32_t> brick_sample(const LiftedView<double>&, int32_t);
+template std::vector<int32_t> brick_sample(const LiftedView<float>&, uint32_t);
+template std::vector<int32_t> brick_sample(const LiftedView<double>&, uint32_t);
 template void VoxelVotes::add(const LiftedView<float>&, const int32_t*, int32_t);
 template void VoxelVotes::add(const LiftedView<double>&, const int32_t*, int32_t);
 

@@ -89,10 +89,10 @@ class VoxelVotes {
   std::vector<int32_t> labels_;
 };
 
-// Of the bricks of 4 x 4 x 4 voxels that hold the view's points about one in `part`, the same in every view: x, y, z of
-// each, sorted.
+// Of the bricks of 4 x 4 x 4 voxels that hold the view's points about one in `part`, a power of two, the same in every
+// view: x, y, z of each, sorted.
 template <class T>
-std::vector<int32_t> brick_sample(const LiftedView<T>& view, int32_t part);
+std::vector<int32_t> brick_sample(const LiftedView<T>& view, uint32_t part);
 
 }  // namespace ops
 }  // namespace beags
