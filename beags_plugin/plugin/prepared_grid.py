@@ -32,24 +32,26 @@ def grid_state(path: Path, mmap: bool = False) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         told = getattr(error, "strerror", None) or error
         raise UserError(f"the voxel grid {path} cannot be read ({told}): {_REMEDY}.") from error
-    if state and (part := _wrong_part(state)):
+    if part := _wrong_part(state):
         raise UserError(f"the voxel grid {path} is damaged ({part}): {_REMEDY}.")
     return state
 
 
 def _wrong_part(state: Any) -> str | None:
-    """What is wrong with the content of a grid; None for a good one."""
+    """What is wrong with the content of a grid; None for a good one, or none at all."""
     if not isinstance(state, dict):
         return "it is no table"
+    if not state:
+        return None
     for name in ("voxel_size", "origin", "num_classes", "keys", "classes"):
         if not isinstance(state.get(name), Tensor):
             return f"it has no {name}"
     size, origin, count = state["voxel_size"], state["origin"], state["num_classes"]
-    if size.numel() != 1 or not (math.isfinite(float(size)) and float(size) > 0):
+    if size.numel() != 1 or not size.is_floating_point() or not (math.isfinite(float(size)) and float(size) > 0):
         return "its voxel_size is no length"
-    if origin.shape != (3,) or not bool(torch.isfinite(origin).all()):
+    if origin.shape != (3,) or not origin.is_floating_point() or not bool(torch.isfinite(origin).all()):
         return "its origin is no point"
-    if count.numel() != 1 or not 1 <= int(count) <= 65_535:
+    if count.numel() != 1 or count.dtype not in (torch.int32, torch.int64) or not 1 <= int(count) <= 65_535:
         return "its num_classes is no number of classes"
     keys, classes = state["keys"], state["classes"]
     if keys.dim() != 1 or classes.shape != keys.shape or keys.dtype != torch.int64 or classes.dtype != torch.int32:

@@ -12,6 +12,7 @@ from torch import Tensor
 from beags_plugin.errors import UserError
 
 _WIDTHS = {"means": (3,), "quats": (4,), "scales": (2,), "opacities": (1,), "features_dc": (3,)}
+_FLOATS = [*(f"gauss_params.{name}" for name in (*_WIDTHS, "features_rest")), "class_margin", "extent"]
 
 
 def check_state(state: Mapping[str, Any], path: Path) -> None:
@@ -26,17 +27,19 @@ def _wrong(state: Mapping[str, Any]) -> str | None:
     for name, width in _WIDTHS.items():
         if wrong := _wrong_shape(state, f"gauss_params.{name}", (count, *width)):
             return wrong
-    rest = state.get("gauss_params.features_rest")
-    if not isinstance(rest, Tensor) or rest.dim() != 3 or (len(rest), *rest.shape[2:]) != (count, 3):
-        return "gauss_params.features_rest is missing or of another shape"
-    if rest.shape[1] not in (0, 3, 8, 15):
-        return f"gauss_params.features_rest has {rest.shape[1]} colour bands"
     for name in ("class_ids", "class_margin"):
         if wrong := _wrong_shape(state, name, (count,)):
             return wrong
     for name in ("assigned", "extent"):
         if wrong := _wrong_shape(state, name, ()):
             return wrong
+    rest = state.get("gauss_params.features_rest")
+    if not isinstance(rest, Tensor) or rest.dim() != 3 or (len(rest), *rest.shape[2:]) != (count, 3):
+        return "gauss_params.features_rest is missing or of another shape"
+    if wrong := next((name for name in _FLOATS if not state[name].is_floating_point()), None):
+        return f"{wrong} holds {state[wrong].dtype}"
+    if rest.shape[1] not in (0, 3, 8, 15):
+        return f"gauss_params.features_rest has {rest.shape[1]} colour bands"
     if not (bool(torch.isfinite(state["extent"])) and float(state["extent"]) > 0):
         return f"extent is {float(state['extent'])}"
     return _wrong_classes(state)
@@ -55,7 +58,7 @@ def _wrong_classes(state: Mapping[str, Any]) -> str | None:
     if not isinstance(names, dict) or not all(type(i) is int and isinstance(name, str) for i, name in names.items()):
         return "the names of its classes are missing"
     ids = state["class_ids"]
-    if ids.is_floating_point() or ids.dtype == torch.bool:
+    if ids.dtype not in (torch.int32, torch.int64):
         return "class_ids are no whole numbers"
     unnamed = sorted(set(ids.unique().tolist()) - set(names)) if bool(state["assigned"]) else []
     return f"it gives Gaussians the class {unnamed[0]}, which has no name" if unnamed else None

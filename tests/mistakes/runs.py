@@ -261,6 +261,9 @@ mistake("resuming", "the voxel grid is damaged")(resumed(lambda at, run: at.cut(
 mistake("resuming", "the voxel grid lacks a part")(
     resumed(lambda at, run: torch.save({"classes": torch.zeros(1)}, run / "prepared/grid.pt"))
 )
+mistake("resuming", "the voxel grid is one tensor")(
+    resumed(lambda at, run: torch.save(torch.zeros(3), run / "prepared/grid.pt"))
+)
 mistake("resuming", "a prepared mask is missing")(
     resumed(lambda at, run: next((run / "prepared/masks").iterdir()).unlink())
 )

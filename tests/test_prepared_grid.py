@@ -1,0 +1,55 @@
+"""The grid of a run is read whole, or refused in one sentence."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+pytest.importorskip("nerfstudio")
+
+from beags_plugin.errors import UserError
+from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.plugin.prepared_grid import read_grid
+
+
+def grid() -> VisibilityGrid:
+    keys, classes = torch.tensor([3, 4], dtype=torch.int64), torch.tensor([1, 0], dtype=torch.int32)
+    return VisibilityGrid(0.5, torch.zeros(3, dtype=torch.float64), 2, keys, classes)
+
+
+def test_a_grid_and_no_grid_are_read_as_they_were_written(tmp_path):
+    torch.save(grid().state_dict(), tmp_path / "grid.pt")
+    found = read_grid(tmp_path / "grid.pt")
+    assert found is not None and found.voxel_size == 0.5 and torch.equal(found.keys, grid().keys)
+    torch.save({}, tmp_path / "none.pt")
+    assert read_grid(tmp_path / "none.pt") is None
+
+
+@pytest.mark.parametrize("content", [torch.zeros(2), torch.zeros(()), None, 0, [], "grid"], ids=repr)
+def test_what_is_no_table_is_refused(tmp_path, content):
+    torch.save(content, tmp_path / "grid.pt")
+    with pytest.raises(UserError, match=r"grid.pt is damaged \(it is no table\): restore it"):
+        read_grid(tmp_path / "grid.pt")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("voxel_size", torch.tensor(1 + 2j), "no length"),
+        ("voxel_size", torch.tensor(float("nan")), "no length"),
+        ("voxel_size", torch.tensor(0.0), "no length"),
+        ("origin", torch.zeros(3, dtype=torch.complex64), "no point"),
+        ("origin", torch.full((3,), float("inf")), "no point"),
+        ("num_classes", torch.tensor(2.5), "no number of classes"),
+        ("num_classes", torch.tensor(1 + 0j), "no number of classes"),
+        ("num_classes", torch.tensor(70_000), "no number of classes"),
+        ("keys", torch.zeros(2), "do not fit together"),
+        ("classes", torch.zeros(3, dtype=torch.int32), "do not fit together"),
+        ("classes", torch.tensor([1, -1], dtype=torch.int32), "classes are none"),
+        ("classes", None, "has no classes"),
+    ],
+)
+def test_a_damaged_part_is_named(tmp_path, name, value, words):
+    torch.save({**grid().state_dict(), name: value}, tmp_path / "grid.pt")
+    with pytest.raises(UserError, match=words):
+        read_grid(tmp_path / "grid.pt")
