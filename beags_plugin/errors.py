@@ -111,7 +111,7 @@ def print_user_errors_plainly() -> None:
     former_of_threads = threading.excepthook
 
     def thread_hook(args: threading.ExceptHookArgs) -> None:
-        told_elsewhere = type(args.thread).__module__.startswith("tensorboard.")
+        told_elsewhere = type(args.thread).__module__ == "tensorboard.summary.writer.event_file_writer"
         if not (told_elsewhere and isinstance(args.exc_value, OSError) and is_of_disk(args.exc_value)):
             former_of_threads(args)
 

@@ -119,8 +119,10 @@ def killed_in_write(ends: str, number: int, share: float) -> Iterator[None]:
             last = ending.tell()
 
         writing = True
-        write_whole(path, counted, beside)
-        writing = False
+        try:
+            write_whole(path, counted, beside)
+        finally:
+            writing = False
 
     def put(part: Path, path: Path) -> None:
         nonlocal seen

@@ -44,11 +44,11 @@ OPTIONS = {
     "steps_per_held_out": 40, "vis": "tensorboard",
 }  # fmt: skip
 EXPORT = ("--all", "--format", "ply", "ply-2dgs", "spz", "glb", "--resolution", "32", "--min-views", "1")
-KINDS = ("step", "checkpoint", "anywhere", "export", "step", "preparation", "anywhere", "exported file")  # in turn
+EXPORTS = ANY_TIME, IN_A_FILE = "export", "exported file"
+KINDS = ("step", "checkpoint", "anywhere", ANY_TIME, "step", "preparation", "anywhere", IN_A_FILE)  # in turn
 CHECKPOINTS = 20  # of a run, about
 STEPS = OPTIONS["pipeline.model.base_steps"] + OPTIONS["pipeline.model.refine_steps"]
 STEP_SECONDS = 0.05  # of a slow step, about
-EXPORTS = KINDS[3], KINDS[7]
 ATTEMPTS = 20  # at a kill of one kind, as a run may end before its moment comes
 
 
@@ -159,7 +159,7 @@ class Tester:
 
     def _kill_export(self, kind: str, call: Callable[[], None], log: Path) -> int:
         """The exit code of an export that is killed, if its moment comes."""
-        if kind == EXPORTS[0]:
+        if kind == ANY_TIME:
             return forked.kill_after(call, log, self.moments.uniform(0.0, self.export_seconds))[0]
         files = sum(path.is_file() for path in self.exported.rglob("*"))
         number, share = self.moments.randint(1, files), self.moments.uniform(0.0, 1.2)

@@ -9,7 +9,8 @@ root="$PWD"
 case "${BEAGS_VENV:=.venv}" in /*) ;; *) BEAGS_VENV="$root/$BEAGS_VENV" ;; esac
 export PATH="$BEAGS_VENV/bin:$PATH" PYTHONDONTWRITEBYTECODE=1
 tests=(tests/test_{native,native_arguments,native_isa,native_work,rasterizer_reference,rasterizer_robustness,invariances,fuzz}.py
-  tests/test_{image_ops,occupancy_loss,ops_everywhere,reprojection_votes,sh_colors,sparse_sums,voxel_grid,voxel_lookup,class_maps}.py)
+  tests/test_{image_ops,occupancy_loss,ops_everywhere,reprojection_votes,sh_colors,slabs,sparse_sums,voxel_grid,voxel_lookup,class_maps}.py)
+tsan_options="suppressions=$root/tests/native/tsan.supp exitcode=66"
 emulated=(tests/test_cuda_{rasterizer,ops,votes}.py)
 
 run() { # kind, options of CMake, tests...
@@ -32,7 +33,7 @@ run() { # kind, options of CMake, tests...
   }
   (cd "$folder/tree" && BEAGS_REQUIRE_NATIVE=1 LD_PRELOAD="$runtime $(c++ -print-file-name=libstdc++.so.6)" \
     ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
-    TSAN_OPTIONS="suppressions=$root/tests/native/tsan.supp exitcode=66" \
+    TSAN_OPTIONS="$tsan_options" \
     python -m pytest -q -p no:cacheprovider "$@")
 }
 
@@ -42,7 +43,7 @@ race_is_seen() { # that the thread sanitizer finds one in a parallel loop, or it
   printf '%s\n' 'int main() {' '  int sum = 0;' '#pragma omp parallel for num_threads(2) schedule(static)' \
     '  for (int i = 0; i < 2; ++i) sum += i + 1;' '  return sum == 0;' '}' >"$folder/race.cpp"
   c++ -g -fopenmp -fsanitize=thread "$folder/race.cpp" tests/native/openmp_on_threads.cpp -o "$folder/race"
-  TSAN_OPTIONS=exitcode=66 "$folder/race" >"$folder/race.log" 2>&1 || status=$?
+  TSAN_OPTIONS="$tsan_options" "$folder/race" >"$folder/race.log" 2>&1 || status=$?
   [ "$status" = 66 ] || {
     echo "sanitize: the thread sanitizer does not see a race in a parallel loop ($folder/race.log)" >&2
     exit 1

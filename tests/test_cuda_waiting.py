@@ -84,7 +84,8 @@ def outputs(alpha: torch.Tensor | None = None) -> RasterOutputs:
     )  # fmt: skip
 
 
-def inputs(surfels: Surfels, members: ClassMembers | None) -> LossInputs:
+def inputs(surfels: Surfels, **known) -> LossInputs:
+    """known: what the host does."""
     image = (HEIGHT, WIDTH)
     ranks = ClassRanks.__new__(ClassRanks)
     ranks._table = torch.zeros(9, dtype=torch.int32, device="cuda")
@@ -95,7 +96,7 @@ def inputs(surfels: Surfels, members: ClassMembers | None) -> LossInputs:
         image=rand(*image, 3), labels=torch.zeros(image, dtype=torch.int32, device="cuda"),
         class_ids=torch.zeros(N, dtype=torch.int32, device="cuda"),
         grid=SimpleNamespace(lookup=lambda: lookup, count=lookup.count),
-        draw=lambda drawn, camera: outputs(drawn.means.mean() + rand(*image)), members=members, objects=[1, 3],
+        draw=lambda drawn, camera: outputs(drawn.means.mean() + rand(*image)), **known,
     )  # fmt: skip
 
 
@@ -114,7 +115,7 @@ def parameters() -> list[torch.Tensor]:
 @pytest.mark.parametrize("loss", LOSSES, ids=lambda loss: type(loss).__name__)
 def test_a_loss_waits_for_nothing(loss, gpu):
     """The forward; autograd's own way back needs a device, and asks for no numbers."""
-    value = loss.weighted(inputs(Surfels(*parameters()), members_of_two()))
+    value = loss.weighted(inputs(Surfels(*parameters()), members=members_of_two(), present=[1, 3]))
     assert value.device.type == "cuda" and value.shape == () and value.requires_grad
     assert gpu.found == []
 
@@ -133,9 +134,11 @@ def test_growth_and_adam_wait_for_nothing(gpu):
     assert gpu.found == []
 
 
-def test_a_loss_that_is_not_told_what_the_host_knows_waits(gpu):
-    with pytest.raises(Exception, match="item|local_scalar|unique"):
-        SilhouetteLoss().weighted(inputs(Surfels(*parameters()), None))
+@pytest.mark.parametrize("missing", ["members", "present"])
+def test_a_loss_that_is_not_told_what_the_host_knows_waits(gpu, missing):
+    known = {"members": members_of_two(), "present": [1, 3]}
+    with pytest.raises(Exception, match="item|local_scalar|unique|bincount|nonzero"):
+        SilhouetteLoss().weighted(inputs(Surfels(*parameters()), **{**known, missing: None}))
 
 
 def test_what_fetches_is_noticed(gpu):

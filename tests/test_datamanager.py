@@ -178,12 +178,12 @@ def test_replaced_class_maps_reach_batches_and_views(tmp_path):
     write_image(tmp_path / "masks/v01.png", np.full((HEIGHT, WIDTH), 1, np.uint8))
     data = manager(tmp_path)
     new = [torch.full((HEIGHT, WIDTH), 5 + index, dtype=torch.int32) for index in range(7)]
-    assert "objects" not in data.next_train(0)[1]  # the host knows those of the maps that it is given
+    assert "present" not in data.next_train(0)[1]  # the host knows those of the maps that it is given
     data.replace_class_maps(new)
     for step in range(1, 8):
         camera, batch = data.next_train(step)
         assert (batch["class_map"].int() == 5 + batch["image_idx"]).all()
-        assert batch["objects"] == [5 + batch["image_idx"]]
+        assert batch["present"] == [5 + batch["image_idx"]]
         assert torch.equal(camera.metadata["class_map"], batch["class_map"])
     assert all(torch.equal(view.labels, labels) for view, labels in zip(data.views("train"), new, strict=True))
     originals = [view.labels for view in data.views("train", original=True)]

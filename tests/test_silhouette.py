@@ -66,10 +66,10 @@ def test_equals_the_alpha_of_each_object_against_its_mask():
 def test_what_the_host_knows_changes_no_bit():
     surfels, class_ids = scene([3.0, 3.0, 3.2]), [1, 2, 1]
     asked = inputs_of(surfels, class_ids, columns((1, 8), (2, 6), (IGNORE, 2), (0, 8)))
-    told = replace(asked, members=ClassMembers(asked.class_ids), objects=objects_in(asked.labels))
+    told = replace(asked, members=ClassMembers(asked.class_ids), present=objects_in(asked.labels))
     for loss in (SilhouetteLoss(), SilhouetteLoss(objects=2)):
         assert torch.equal(loss.value(told), loss.value(asked)) and float(loss.value(told)) > 0.0
-    assert float(SilhouetteLoss().value(replace(told, objects=[]))) == 0.0
+    assert float(SilhouetteLoss().value(replace(told, present=[]))) == 0.0
 
 
 def test_what_lies_behind_another_surface_may_be_covered():

@@ -34,8 +34,9 @@ class Camera:
 
     @property
     def focal(self) -> float:
-        """The focal length in pixels, the geometric mean of both axes': at depth z a pixel is z / focal wide."""
-        return (float(self.K[0, 0]) * float(self.K[1, 1])) ** 0.5
+        """The focal length in pixels, the geometric mean of both axes': at depth z a pixel covers (z / focal)^2."""
+        K = self.host.K
+        return (float(K[0, 0]) * float(K[1, 1])) ** 0.5
 
     @property
     def center(self) -> Tensor:

@@ -32,7 +32,7 @@ class LossInputs:
     class_ids: [N] int32, phi; None before assignment.
     grid: the visibility voxel grids; None before refinement.
     draw: draws other surfels than the render's, with geometry, on black; for losses that need a drawing of their own.
-    members: which surfels each class has, and objects: ids of the objects that ``labels`` shows, ascending, where the
+    members: which surfels each class has, and present: ids of the objects that ``labels`` shows, ascending, where the
         host knows them; None: a loss that needs them looks at ``class_ids`` and ``labels``, for which a GPU must wait.
     """
 
@@ -47,7 +47,7 @@ class LossInputs:
     grid: VisibilityGrid | None = None
     draw: Callable[[SurfelInputs, Camera], RasterOutputs] | None = None
     members: ClassMembers | None = None
-    objects: Sequence[int] | None = None
+    present: Sequence[int] | None = None
 
 
 @dataclass(frozen=True)

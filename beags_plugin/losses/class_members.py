@@ -11,8 +11,8 @@ from beags_plugin.rasterizers.interface import IGNORE
 class ClassMembers:
     """The Gaussians of every class.
 
-    class_ids: [N] int class ids. They are looked at once, when a class is asked for first: ask ``current`` whether they
-    have changed since.
+    class_ids: [N] int class ids. They are looked at when a class is asked for first, and must be as they are now: ask
+    ``current``.
     """
 
     def __init__(self, class_ids: Tensor) -> None:
@@ -21,7 +21,8 @@ class ClassMembers:
         self._spans: dict[int, tuple[int, int]] | None = None
 
     def current(self, class_ids: Tensor) -> bool:
-        """Whether these are the ids that are looked at, unchanged."""
+        """Whether these are the ids that are looked at, unchanged by torch's operations in place (of what is written
+        through ``.data`` or numpy, torch keeps no count)."""
         return class_ids is self._source and class_ids._version == self._version
 
     def of(self, class_id: int) -> Tensor:
@@ -38,4 +39,5 @@ class ClassMembers:
 
 def objects_in(labels: Tensor) -> list[int]:
     """The ids of the objects that a mask [H, W] int shows, ascending: all but background (0) and IGNORE."""
-    return [class_id for class_id in torch.unique(labels).tolist() if class_id not in (0, IGNORE)]
+    found = torch.bincount(labels.reshape(-1)).nonzero()[:, 0].tolist()
+    return [class_id for class_id in found if class_id not in (0, IGNORE)]

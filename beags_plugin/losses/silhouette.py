@@ -60,13 +60,14 @@ class SilhouetteLoss(Loss):
         if inputs.draw is None or inputs.class_ids is None or inputs.render.median_depth is None:
             raise ValueError("the silhouette loss needs class ids, a way to draw, and a render with geometry")
         known = inputs.labels != IGNORE
-        present = objects_in(inputs.labels) if inputs.objects is None else inputs.objects
+        present = objects_in(inputs.labels) if inputs.present is None else inputs.present
         if not present:
             return nothing
         members = ClassMembers(inputs.class_ids) if inputs.members is None else inputs.members
         chosen = _chosen(len(present), int(self.objects), inputs.seed, inputs.step)
         terms = [self._of_object(present[rank], members.of(present[rank]), known, inputs) for rank in chosen]
-        share = len(present) / len(terms) / known.sum().double()
+        count = known.sum().double()
+        share = torch.full_like(count, len(present) / len(terms)) / count
         return torch.stack(terms).sum() * share.to(nothing)
 
     def _of_object(self, class_id: int, members: Tensor, known: Tensor, inputs: LossInputs) -> Tensor:
@@ -95,7 +96,7 @@ class SilhouetteLoss(Loss):
         if inputs.grid is None:
             raise ValueError("the silhouette loss needs a visibility grid where seen > 0")
         points = lift(depth, inputs.camera).reshape(-1, 3)
-        # All pixels, as a GPU would have to say which to choose; of those that are not asked about, no voxel is read.
+        # All pixels, as a GPU would have to say how many are chosen; of those that are not, no voxel is read.
         ids = torch.where(asked, class_id, IGNORE).int().reshape(-1)
         return (inputs.grid.count(points, ids) >= self.seen).view_as(asked)
 

@@ -48,7 +48,8 @@ BEAGS_HD inline bool in_reach(T coordinate) {
   return fabs(coordinate) < static_cast<T>(kHalf - kMargin);  // false for NaN
 }
 
-// A pixel's point and the way along its ray. False without a depth, or too far away.
+// A pixel's point and the way along its ray, for GPUs; `LiftedTile` is the CPU's. False without a depth, or too far
+// away.
 template <class T>
 BEAGS_HD inline bool lift(const LiftedView<T>& view, int x, int y, T* point, T* ray) {
   const T d = view.depth[static_cast<int64_t>(y) * view.width + x];

@@ -13,6 +13,7 @@ from beags_plugin.errors import UserError
 from beags_plugin.ops import cuda_extension, extension
 from beags_plugin.ops.voxel_lookup import VoxelLookup
 from beags_plugin.ops.voxel_tally import VoxelTally
+from beags_plugin.rasterizers.interface import IGNORE
 
 DENSE_BYTES = 256 * 2**20  # up to this size, validity is kept as one byte per class and voxel
 _BOX = 4  # voxels along each side of the largest box that ``disc_inside`` looks at
@@ -107,20 +108,23 @@ class VisibilityGrid:
     def count(self, points: Tensor, class_ids: Tensor) -> Tensor:
         """D_occ exactly: [P] int64 in 0..27; the plain definition, for checks and display.
 
-        points: [P, 3] float, world. class_ids: [P] int.
+        points: [P, 3] float, world. class_ids: [P] int; of IGNORE there are no voxels.
         """
         if (lookup := self._lookup_for(points)) is not None:
             return lookup.count(points, class_ids)
+        total = torch.zeros(len(points), dtype=torch.int64, device=points.device)
+        if len(asked := (class_ids != IGNORE).nonzero()[:, 0]) < len(points):
+            total[asked] = self.count(points[asked], class_ids[asked])
+            return total
         points, usable = self._usable(points)
         voxels = _voxels(points, self.origin, self.voxel_size)
-        total = torch.zeros(len(points), dtype=torch.int64, device=points.device)
         for offset in _offsets(points.device):
             neighbour = voxels + offset
-            known = ((neighbour >= -_HALF) & (neighbour < _HALF)).all(-1) & usable
+            near = ((neighbour >= -_HALF) & (neighbour < _HALF)).all(-1) & usable
             key = _pack(neighbour.clamp(-_HALF, _HALF - 1))
             position = torch.searchsorted(self.keys, key).clamp_(max=max(len(self.keys) - 1, 0))
             if len(self.keys):
-                total += known & (self.keys[position] == key) & (self.classes[position] == class_ids)
+                total += near & (self.keys[position] == key) & (self.classes[position] == class_ids)
         return total
 
     def valid(self, points: Tensor, class_ids: Tensor) -> Tensor:

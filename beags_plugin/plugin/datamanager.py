@@ -67,7 +67,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
     """nerfstudio's data manager of full images, for CPUs too, with class maps in every batch.
 
     Batches hold ``image`` [H, W, 3], ``class_map`` [H, W] int32 and ``alpha`` [H, W] uint8 where the image has it, all
-    on the device, and, once ``replace_class_maps`` was called, ``objects``, the ids of ``class_map``. A training
+    on the device, and, once ``replace_class_maps`` was called, ``present``, the objects of ``class_map``. A training
     camera's metadata holds its ``class_map`` too. The cache holds class maps in the narrowest type. Training views come
     in a random order without repetition within a round, given by ``train_cameras_sampling_seed`` alone.
     """
@@ -83,7 +83,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         straighten(self.eval_dataset.cameras)
         self.train_cameras = self.train_dataset.cameras.to(self.device)
         self._cameras: dict[int, Camera] = {}
-        self._objects: list[list[int]] | None = None  # of each training view's class map, once they are replaced
+        self._present: list[list[int]] | None = None  # objects of each training view's class map, once replaced
         self._replaced = False  # whether the training class maps are no longer those of the files
         self._originals_kept = True
         self._originals: list[Tensor] | None = None  # those of the files, where they are kept beside the ones in use
@@ -187,8 +187,8 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         # the boundary is computed inside the rasterizer, which sees the camera only: the mask travels with it
         metadata = camera.metadata or {}
         camera.metadata = {**metadata, "class_map": data["class_map"], "camera": self._camera(metadata["cam_idx"])}
-        if self._objects is not None:
-            data["objects"] = self._objects[metadata["cam_idx"]]
+        if self._present is not None:
+            data["present"] = self._present[metadata["cam_idx"]]
         return camera, data
 
     def _camera(self, index: int) -> Camera:
@@ -274,12 +274,14 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         cache, cameras = self.cached_train, self.train_dataset.cameras
         if len(class_maps) != len(cache):
             raise ValueError(f"{len(class_maps)} class maps for {len(cache)} training views")
+        present = []
         for index, labels in enumerate(class_maps):
             shape = (int(cameras.height[index]), int(cameras.width[index]))
             if labels.shape != shape:
                 raise ValueError(f"class map {tuple(labels.shape)} for a view of {shape}")
             if labels.numel() and not 0 <= int(labels.min()) <= int(labels.max()) <= IGNORE:
                 raise ValueError(f"class ids must lie in 0..{IGNORE}")
+            present.append(objects_in(labels))
         if isinstance(cache, StreamedViews):
             cache.class_maps = [PackedMap(labels.int()) for labels in class_maps]
         else:
@@ -287,9 +289,9 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
                 self._originals = [data["class_map"] for data in cache]
             for data, labels in zip(cache, class_maps, strict=True):
                 data["class_map"] = narrowed(labels.detach().int()).to(data["class_map"].device)
-        self._objects = [objects_in(labels) for labels in class_maps]
         self._originals = self._originals if keep else None
         self._originals_kept = keep
+        self._present = present
         self._replaced = True
 
     def _view(self, split: Literal["train", "eval"], cache: Any, index: int, name: str, original: bool) -> View:

@@ -297,7 +297,7 @@ class BeagsModel(SurfelModel):
             grid=self.grid,
             draw=self._draw_apart,
             members=self._class_members(),
-            objects=batch.get("objects"),
+            present=batch.get("present"),
         )
         terms = {name: loss.weighted(inputs) for name, loss in self.active_losses().items()}
         self.clock.mark("losses")

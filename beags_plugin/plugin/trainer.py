@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import gettempdir
 from typing import TYPE_CHECKING, Any, cast
 
 from nerfstudio.engine.trainer import Trainer
@@ -15,7 +16,7 @@ from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.core import processes
-from beags_plugin.errors import UserError, is_of_disk, refused, unwritable
+from beags_plugin.errors import UserError, is_of_disk, refused
 from beags_plugin.plugin.checkpoints import Checkpoints
 from beags_plugin.plugin.forecast import NO_MEMORY, MemoryWatch, check_memory, forecast, is_out_of_memory
 from beags_plugin.plugin.held_out import HeldOutCurve
@@ -104,11 +105,14 @@ class BeagsTrainer(Trainer):
 
     def _told(self, error: OSError) -> UserError:
         """What the system refused where nothing else has told it, as to nerfstudio's own writers; other errors pass."""
-        if (told := refused(error)) is not None:
-            return told
-        if not is_of_disk(error):
+        if error.filename is None and is_of_disk(error):
+            return UserError(
+                f"a file of {self.base_dir}, or a temporary one in {gettempdir()}, cannot be written "
+                f"({error.strerror}): free some space there, or choose other places (--run-dir, TMPDIR)."
+            )
+        if (told := refused(error)) is None:
             raise error
-        return unwritable(self.base_dir, error)
+        return told
 
     def _release(self) -> None:
         """Let others train in this run's folder, and end what writes curves, a thread of tensorboard's too."""

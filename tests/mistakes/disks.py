@@ -105,8 +105,11 @@ def _(at: Place):
 
 @mistake("full disk", "ns-train writes its curves")
 def _(at: Place):
+    import tempfile
+
     from tensorboard.summary.writer.record_writer import RecordWriter
 
+    at.patch.setattr(tempfile, "tempdir", str(at.root))
     command = at.train(*SHORT, preset="beags-tiny")
     write, left = RecordWriter.write, [10]  # events that the disk still takes
 
