@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -22,6 +23,7 @@ from beags_plugin.child_processes import bound
 from beags_plugin.masks.classes import colorize
 
 WIDTH, HEIGHT = 640, 400
+MAX_RESOLUTION = 512  # pixels of the longer side, the default of the viewer
 COLORS = {name: colorize(np.array([[index]]))[0, 0].astype(int) for index, name in CLASSES.items()}
 ENTRY = "from nerfstudio.scripts.viewer.run_viewer import entrypoint; entrypoint()"  # what ns-viewer runs
 
@@ -87,13 +89,19 @@ def painted(pixels: np.ndarray, name: str) -> float:
     return float((np.abs(pixels - np.array(COLORS[name])).max(axis=2) < 30).mean())
 
 
+def sharp(page: Page) -> bool:
+    """Whether the picture is of the full resolution: coarse ones, of which the panel tells too, come before it."""
+    found = re.search(r"Resolution: (\d+)x(\d+)px", page.text())
+    return found is not None and max(int(found[1]), int(found[2])) == MAX_RESOLUTION
+
+
 def awaited(page: Page, true) -> np.ndarray:
-    """The picture, once it is as asked for and stays so: coarse ones come before it."""
+    """The picture, once it is as asked for and stays so."""
     found = [picture(page)]
 
     def holds() -> bool:
         found.append(picture(page))
-        return differing(*found[-2:]) == 0.0 and true(found[-1])
+        return differing(*found[-2:]) == 0.0 and true(found[-1]) and sharp(page)
 
     page.wait(holds, 120)
     return found[-1]
