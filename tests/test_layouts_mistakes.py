@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -47,13 +48,17 @@ def without_camera(root: Path) -> None:
     np.savez(root / "cameras_sphere.npz", **kept)
 
 
-def with_skew(root: Path) -> None:
+def with_camera(root: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
     with np.load(root / "cameras_sphere.npz") as cameras:
         entries = dict(cameras)
-    entries["world_mat_2"] = (
-        np.array([[1.0, 0.4, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ entries["world_mat_2"]
-    )
+    entries["world_mat_2"] = change(entries["world_mat_2"])
     np.savez(root / "cameras_sphere.npz", **entries)
+
+
+SKEW = np.array([[1.0, 0.4, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+DENORMAL = np.zeros((4, 4))  # their products are 0
+DENORMAL[[0, 0, 1, 2, 2], [0, 1, 2, 1, 3]] = 5.4e-312, 1.4e-309, 5.3e-315, 1.3e-315, 5.3e-315
+FLAT = np.diag([1.0, 1.0, 1e-13, 1.0])
 
 
 DTU_MISTAKES = {
@@ -61,7 +66,10 @@ DTU_MISTAKES = {
     "image gone": (lambda root: (root / "image/000003.png").unlink(), "has 9 cameras but there are 8 images"),
     "mask gone": (lambda root: (root / "mask/003.png").unlink(), "mask holds 8 masks for 9 images"),
     "smaller images": (with_smaller_images, "far from the middle of its 10x6 pixels: keep the images .* --images-path"),
-    "skew": (with_skew, "world_mat_2 in .* is no camera with axes at right angles"),
+    "skew": (lambda root: with_camera(root, lambda camera: SKEW @ camera), "world_mat_2 in .* is no camera with axes"),
+    "denormal": (lambda root: with_camera(root, lambda _: DENORMAL), "far from the middle of its 20x12"),
+    "flat": (lambda root: with_camera(root, lambda _: FLAT), "world_mat_2 in .* projects no space"),
+    "infinite": (lambda root: with_camera(root, lambda camera: camera + np.inf), "world_mat_2 in .* projects no space"),
     "half a file": (
         lambda root: (root / "cameras_sphere.npz").write_bytes(b"PK\x03\x04"),
         "cannot be read .*: restore",

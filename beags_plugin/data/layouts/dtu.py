@@ -17,6 +17,7 @@ from beags_plugin.reading.text import reason
 FILE = "cameras_sphere.npz"
 IMAGES = ("image", "images")
 LARGEST_SKEW = 1.0  # pixels; the rasterizers know none
+LEAST_SINGULAR_VALUE = 1e-10  # of a projection's 3 x 3 part, relative to the largest; cameras have 1e-4 or so
 OFF_CENTRE = 0.2  # of the image's sides: the principal point of no camera lies farther from the middle
 
 
@@ -79,11 +80,13 @@ def read_cameras(
         scale = table.get(f"scale_mat_{index}", np.eye(4))
         if scale.shape != (4, 4):
             raise UserError(f"scale_mat_{index} in {file} is {list(scale.shape)}, not 4 x 4: restore the file.")
-        projection = (projection @ scale)[:3]
-        if not np.isfinite(projection).all() or np.linalg.matrix_rank(projection[:, :3]) < 3:
+        with np.errstate(over="ignore", invalid="ignore"):
+            projection = (projection @ scale)[:3]
+        size = np.abs(projection[:, :3]).max()  # which says nothing
+        if not (np.isfinite(projection).all() and size > 0 and _is_regular(projection[:, :3] / size)):
             raise UserError(f"world_mat_{index} in {file} projects no space to an image: restore the file.")
-        K, rotation, center = decompose(projection)
-        if not np.isfinite(K).all() or abs(K[0, 1]) > LARGEST_SKEW:
+        K, rotation, center = decompose(projection / size)
+        if not (np.isfinite(K).all() and np.isfinite(center).all()) or abs(K[0, 1]) > LARGEST_SKEW:
             raise UserError(f"world_mat_{index} in {file} is no camera with axes at right angles: correct the file.")
         K[0, 1] = 0.0
         K[:2, 2] += 0.5  # here pixel centres are whole numbers
@@ -98,6 +101,11 @@ def read_cameras(
                 "folder of smaller copies with --images-path."
             )
     return np.stack(poses), np.stack(intrinsics), sizes
+
+
+def _is_regular(matrix: npt.NDArray[np.float64]) -> bool:
+    values = np.linalg.svd(matrix, compute_uv=False)
+    return bool(values[-1] > LEAST_SINGULAR_VALUE * values[0])
 
 
 def decompose(projection: npt.NDArray[np.float64]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
