@@ -25,6 +25,7 @@ struct Lanes<float> {
   typedef float Real __attribute__((vector_size(32)));
   typedef int32_t Whole;
   typedef int32_t Int __attribute__((vector_size(32)));  // also a mask: 0 or -1
+  typedef uint32_t Bits __attribute__((vector_size(32)));
   static constexpr int kCount = 8;
 };
 
@@ -33,6 +34,7 @@ struct Lanes<double> {
   typedef double Real __attribute__((vector_size(32)));
   typedef int64_t Whole;
   typedef int64_t Int __attribute__((vector_size(32)));
+  typedef uint64_t Bits __attribute__((vector_size(32)));
   static constexpr int kCount = 4;
 };
 
@@ -90,11 +92,13 @@ BEAGS_OPS_INLINE IntD to_int(RealD x) { return __builtin_convertvector(x, IntD);
 BEAGS_OPS_INLINE RealF to_real(IntF x) { return __builtin_convertvector(x, RealF); }
 BEAGS_OPS_INLINE RealD to_real(IntD x) { return __builtin_convertvector(x, RealD); }
 
-// For |x| < 2^31.
+// For |x| < 2^31; other lanes hold any number, of which wrapping sums are taken.
+BEAGS_OPS_INLINE IntF wrapping_sum(IntF a, IntF b) { return (IntF)((Lanes<float>::Bits)a + (Lanes<float>::Bits)b); }
+BEAGS_OPS_INLINE IntD wrapping_sum(IntD a, IntD b) { return (IntD)((Lanes<double>::Bits)a + (Lanes<double>::Bits)b); }
 template <class R>
 BEAGS_OPS_INLINE auto floor_to_int(R x) {
   const auto whole = to_int(x);
-  return whole + (to_real(whole) > x);
+  return wrapping_sum(whole, to_real(whole) > x);
 }
 
 // e^x to 2 units in the last place; 0 below -87, infinity above 88.
