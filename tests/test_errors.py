@@ -37,7 +37,7 @@ def test_other_errors_keep_their_traceback():
 
 
 CURVES = """
-import errno, sys
+import errno, sys, threading
 import beags_plugin.plugin
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 from tensorboard.summary.writer.record_writer import RecordWriter
@@ -50,6 +50,9 @@ try:
     EventFileWriter(sys.argv[1])
 except OSError:
     print("handed on")
+for thread in threading.enumerate():  # what it prints comes after that
+    if thread is not threading.main_thread():
+        thread.join(30)
 """
 
 
