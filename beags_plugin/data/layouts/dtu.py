@@ -82,10 +82,11 @@ def read_cameras(
             raise UserError(f"scale_mat_{index} in {file} is {list(scale.shape)}, not 4 x 4: restore the file.")
         with np.errstate(over="ignore", invalid="ignore"):
             projection = (projection @ scale)[:3]
-        size = np.abs(projection[:, :3]).max()  # which says nothing
-        if not (np.isfinite(projection).all() and size > 0 and _is_regular(projection[:, :3] / size)):
+        # The scale of a projection means nothing, and may be a denormal number.
+        largest = np.abs(projection[:, :3]).max()
+        if not (np.isfinite(projection).all() and largest > 0 and _is_regular(projection[:, :3] / largest)):
             raise UserError(f"world_mat_{index} in {file} projects no space to an image: restore the file.")
-        K, rotation, center = decompose(projection / size)
+        K, rotation, center = decompose(projection / largest)
         if not (np.isfinite(K).all() and np.isfinite(center).all()) or abs(K[0, 1]) > LARGEST_SKEW:
             raise UserError(f"world_mat_{index} in {file} is no camera with axes at right angles: correct the file.")
         K[0, 1] = 0.0
@@ -104,6 +105,7 @@ def read_cameras(
 
 
 def _is_regular(matrix: npt.NDArray[np.float64]) -> bool:
+    """Whether a matrix [3, 3] can be inverted in float64; NumPy's rank takes one that it then cannot solve."""
     values = np.linalg.svd(matrix, compute_uv=False)
     return bool(values[-1] > LEAST_SINGULAR_VALUE * values[0])
 
