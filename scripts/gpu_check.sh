@@ -28,8 +28,9 @@ for stage in "${stages[@]}"; do
   case "$stage" in build | tests | memcheck | racecheck | synccheck | benchmark) ;; *) fail "there is no stage $stage" ;; esac
 done
 command -v nvidia-smi >/dev/null && nvidia-smi -L || fail "there is no NVIDIA GPU, or no driver for it"
-export PATH="$PATH:/usr/local/cuda/bin"
-command -v nvcc >/dev/null || fail "there is no nvcc: install the CUDA toolkit"
+packages="$("$python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))' 2>/dev/null)"
+for folder in /usr/local/cuda/bin "$packages"/nvidia/cu*/bin; do export PATH="$PATH:$folder"; done
+command -v nvcc >/dev/null || fail "there is no nvcc: install the CUDA toolkit, or pip install 'cuda-toolkit[nvcc]' nvidia-cuda-cccl"
 for tool in cmake c++; do command -v "$tool" >/dev/null || fail "there is no $tool: install it"; done
 for package in torch nanobind numpy scipy pytest; do
   "$python" -c "import $package" 2>/dev/null || fail "$python has no $package: pip install $package"

@@ -73,6 +73,11 @@ if [ "$packages_now" != "$packages_before" ]; then
   # pybind11 is for fpsample, which comes to some machines as source only.
   pip install -qq "${pins[@]}" scikit-build-core nanobind ninja pybind11 'setuptools<81'
   if ! command -v cmake >/dev/null; then pip install -qq cmake; fi
+  # Without a CUDA toolkit, nvcc of the version that torch was built with.
+  if [ "$(uname -s)" = Linux ] && [ ${#pins[@]} -gt 0 ] && ! command -v nvcc >/dev/null && [ ! -x /usr/local/cuda/bin/nvcc ]; then
+    pip install -qq "${pins[@]}" 'cuda-toolkit[nvcc]' nvidia-cuda-cccl ||
+      echo "beags setup: pip cannot install nvcc here; going on without kernels for GPUs"
+  fi
   # sam2 (transformers) is for the tests of its masks; it brings no weights.
   # The build tools are in the environment by now, so the build needs no isolated copy of them.
   pip install -qq --no-build-isolation "${build[@]}" "${pins[@]}" -e '.[dev,sam2]'

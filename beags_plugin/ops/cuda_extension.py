@@ -20,7 +20,11 @@ def found() -> tuple[ModuleType | None, str | None]:
         return None, reason
     cuda = getattr(module, "cuda", None)
     if cuda is None:
-        return None, "beags was built without CUDA; install the CUDA toolkit (nvcc 12 or newer) and reinstall beags."
+        return (
+            None,
+            "beags was built without CUDA; install the CUDA toolkit (nvcc 12 or newer; docs/cuda.md: with pip) and "
+            "reinstall beags.",
+        )
     if not torch.cuda.is_available():
         return None, "torch finds no CUDA device; it needs an NVIDIA GPU, its driver, and a torch built for CUDA."
     return cuda, None

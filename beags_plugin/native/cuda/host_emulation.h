@@ -1,7 +1,7 @@
 // CUDA's execution model on one CPU thread, for tests of the kernels' logic where there is no GPU: the same sources are
 // compiled by the C++ compiler. The threads of a block are fibers, which run in turn until they meet at a barrier or in
-// an operation of their warp. It shows wrong indices, wrong sums, and barriers that not all threads reach; it shows no
-// data race between barriers, nothing of the GPU's rounding, and no speed.
+// an operation of their warp. It shows wrong indices, wrong sums, and barriers that not all threads reach, and, where it
+// is built for GCC's thread sanitizer, data races (emulated_races.h); nothing of the GPU's rounding, and no speed.
 #pragma once
 
 #include <cstddef>
@@ -15,6 +15,8 @@
 #if !defined(__x86_64__)
 #include <ucontext.h>
 #endif
+
+#include "emulated_races.h"
 
 #define __global__
 #define __device__
@@ -71,6 +73,7 @@ enum class State { kReady, kInWarp, kAtBarrier, kDone };
 struct Fiber {
   State state;
   int operations;  // of its warp, so far
+  Races races;
 #if defined(__x86_64__)
   void* stack_pointer;
 #else
@@ -88,10 +91,11 @@ struct Warp {
 struct Block {
   Fiber fibers[kMostThreads];
   Warp warps[kMostThreads / kWarp];
-  std::unique_ptr<unsigned char[]> stacks{new unsigned char[kMostThreads * kStack]};
+  std::unique_ptr<unsigned char[]> stacks{new unsigned char[kMostThreads * kSets * kStack]};
   const std::function<void()>* body = nullptr;
   unsigned block = 0, threads = 0, current = 0;
   int voted = 0, votes = 0;  // of the barrier: threads that said yes so far; the result
+  Grid grid;
 #if defined(__x86_64__)
   void* scheduler = nullptr;
 #else
@@ -99,23 +103,24 @@ struct Block {
 #endif
 };
 
-inline Block& block() {
+BEAGS_UNSEEN inline Block& block() {
   static Block one;
   return one;
 }
-inline Index thread_index() { return {block().current}; }
-inline Index block_index() { return {block().block}; }
-inline Index block_size() { return {block().threads}; }
+BEAGS_UNSEEN inline Index thread_index() { return {block().current}; }
+BEAGS_UNSEEN inline Index block_index() { return {block().block}; }
+BEAGS_UNSEEN inline Index block_size() { return {block().threads}; }
 
 [[noreturn]] inline void fail(const char* what) {
   std::fprintf(stderr, "CUDA emulation: %s\n", what);
   std::abort();
 }
 
-inline void wait(State state) {
+BEAGS_UNSEEN inline void wait(State state) {
   Block& b = block();
   Fiber& fiber = b.fibers[b.current];
   fiber.state = state;
+  b.grid.leave();
 #if defined(__x86_64__)
   beags_switch_stack(&fiber.stack_pointer, b.scheduler);
 #else
@@ -123,18 +128,22 @@ inline void wait(State state) {
 #endif
 }
 
-inline void run_fiber() {
-  (*block().body)();
+BEAGS_UNSEEN inline void run_fiber() {
+  Block& b = block();
+  b.grid.begin(b.block);
+  (*b.body)();
+  b.grid.end(b.block);
   wait(State::kDone);
   fail("a thread that had ended went on");
 }
 
-inline void start(unsigned thread) {
+BEAGS_UNSEEN inline void start(unsigned thread) {
   Block& b = block();
   Fiber& fiber = b.fibers[thread];
   fiber.state = State::kReady;
   fiber.operations = 0;
-  unsigned char* stack = b.stacks.get() + thread * kStack;
+  const unsigned set = fiber.races.make(b.block);
+  unsigned char* stack = b.stacks.get() + (set * kMostThreads + thread) * kStack;
 #if defined(__x86_64__)
   void** top = reinterpret_cast<void**>(reinterpret_cast<uintptr_t>(stack + kStack) & ~uintptr_t(15));
   *--top = nullptr;  // where a return address would lie
@@ -150,9 +159,10 @@ inline void start(unsigned thread) {
 #endif
 }
 
-inline void resume(unsigned thread) {
+BEAGS_UNSEEN inline void resume(unsigned thread) {
   Block& b = block();
   b.current = thread;
+  b.fibers[thread].races.enter();
 #if defined(__x86_64__)
   beags_switch_stack(&b.scheduler, b.fibers[thread].stack_pointer);
 #else
@@ -160,7 +170,7 @@ inline void resume(unsigned thread) {
 #endif
 }
 
-inline void run_block(unsigned index, unsigned threads, const std::function<void()>& body) {
+BEAGS_UNSEEN inline void run_block(unsigned index, unsigned threads, const std::function<void()>& body) {
   Block& b = block();
   b.block = index;
   b.threads = threads;
@@ -192,14 +202,16 @@ inline void run_block(unsigned index, unsigned threads, const std::function<void
   }
 }
 
-inline void launch(int64_t blocks, unsigned threads, const std::function<void()>& body) {
+BEAGS_UNSEEN inline void launch(int64_t blocks, unsigned threads, const std::function<void()>& body) {
   if (threads > kMostThreads || threads % kWarp) fail("a block must have whole warps, and 1024 threads at most");
+  block().grid.launch();
   for (int64_t index = 0; index < blocks; ++index) run_block(static_cast<unsigned>(index), threads, body);
+  block().grid.finish();
 }
 
 // Meets the other threads of the warp; returns what each of them brought.
 template <class V>
-const V (*exchange(const char* operation, V value))[1] {
+BEAGS_UNSEEN const V (*exchange(const char* operation, V value))[1] {
   static_assert(sizeof(V) <= 16, "fits a slot");
   Block& b = block();
   Fiber& fiber = b.fibers[b.current];
@@ -221,7 +233,7 @@ const V (*exchange(const char* operation, V value))[1] {
 
 // One lane's value of what `exchange` returned.
 template <class V>
-V lane_value(const V (*values)[1], int lane) {
+BEAGS_UNSEEN V lane_value(const V (*values)[1], int lane) {
   V value;
   std::memcpy(&value, reinterpret_cast<const unsigned char*>(values) + 16 * lane, sizeof value);
   return value;
@@ -230,8 +242,13 @@ V lane_value(const V (*values)[1], int lane) {
 }  // namespace emulation
 }  // namespace beags
 
-inline void __syncthreads() { beags::emulation::wait(beags::emulation::State::kAtBarrier); }
-inline int __syncthreads_count(int yes) {
+BEAGS_UNSEEN inline void __syncthreads() {
+  beags::emulation::Races& races = beags::emulation::block().fibers[beags::emulation::block().current].races;
+  races.arrive();
+  beags::emulation::wait(beags::emulation::State::kAtBarrier);
+  races.pass();
+}
+BEAGS_UNSEEN inline int __syncthreads_count(int yes) {
   beags::emulation::block().voted += yes != 0;
   __syncthreads();
   return beags::emulation::block().votes;
@@ -255,32 +272,26 @@ V __shfl_sync(unsigned, V value, int lane) {
 
 template <class V, class W>
 V atomicAdd(V* at, W value) {
-  const V before = *at;
-  *at += static_cast<V>(value);
-  return before;
+  return __atomic_fetch_add(at, static_cast<V>(value), __ATOMIC_RELAXED);
 }
 template <class V>
 V atomicOr(V* at, V value) {
-  const V before = *at;
-  *at |= value;
-  return before;
+  return __atomic_fetch_or(at, value, __ATOMIC_RELAXED);
 }
 template <class V>
 V atomicCAS(V* at, V expected, V value) {
-  const V before = *at;
-  if (before == expected) *at = value;
-  return before;
+  __atomic_compare_exchange_n(at, &expected, value, false, __ATOMIC_RELAXED, __ATOMIC_RELAXED);
+  return expected;
 }
 template <class V>
 V atomicExch(V* at, V value) {
-  const V before = *at;
-  *at = value;
-  return before;
+  return __atomic_exchange_n(at, value, __ATOMIC_RELAXED);
 }
 template <class V>
 V atomicMax(V* at, V value) {
-  const V before = *at;
-  if (value > before) *at = value;
+  V before = __atomic_load_n(at, __ATOMIC_RELAXED);
+  while (before < value && !__atomic_compare_exchange_n(at, &before, value, false, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
+  }
   return before;
 }
 inline int __ffs(unsigned bits) { return __builtin_ffs(static_cast<int>(bits)); }

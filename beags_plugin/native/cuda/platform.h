@@ -15,6 +15,10 @@ using Stream = void*;
 inline void fill_bytes(void* to, int value, size_t bytes, Stream) {
   if (bytes) std::memset(to, value, bytes);
 }
+template <class V>
+V load_now(const V* at) {
+  return __atomic_load_n(at, __ATOMIC_RELAXED);
+}
 }  // namespace cuda
 }  // namespace beags
 // Runs `kernel`, a plain name, on `blocks` blocks (none is allowed).
@@ -36,6 +40,11 @@ inline void check(cudaError_t status, const char* what) {
 }
 inline void fill_bytes(void* to, int value, size_t bytes, Stream stream) {
   if (bytes) check(cudaMemsetAsync(to, value, bytes, stream), "filling memory");
+}
+// What other threads may be changing by atomic operations.
+template <class V>
+__device__ __forceinline__ V load_now(const V* at) {
+  return *static_cast<const volatile V*>(at);
 }
 }  // namespace cuda
 }  // namespace beags

@@ -14,7 +14,7 @@ BEAGS_DEVICE uint64_t voxel_key(int64_t x, int64_t y, int64_t z) {
 BEAGS_DEVICE int64_t claim(uint64_t* keys, int64_t slots, uint64_t key, bool* fresh) {
   *fresh = false;
   for (int64_t at = static_cast<int64_t>(hash_of(key) & (slots - 1));; at = (at + 1) & (slots - 1)) {
-    uint64_t found = *static_cast<volatile uint64_t*>(keys + at);  // once it is set, it stays
+    uint64_t found = load_now(keys + at);  // once it is set, it stays
     if (found == kEmptyKey) {
       found = atomicCAS(reinterpret_cast<unsigned long long*>(keys + at), static_cast<unsigned long long>(kEmptyKey),
                         static_cast<unsigned long long>(key));
