@@ -11,7 +11,9 @@ from torch import Tensor
 from beags_plugin.masks.reprojection import reproject_pairwise
 from beags_plugin.masks.voxel_reprojection import reproject_voxel
 from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.ops.normal_consistency import normal_consistency
 from beags_plugin.ops.occupancy_loss import occupancy_loss
+from beags_plugin.ops.photometric import photometric
 from beags_plugin.ops.sh_colors import sh_colors
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings, SurfelInputs
 from benchmarks.scenes import CLASSES, Scene, Size, make_scene, on_device
@@ -67,6 +69,7 @@ def _results(
     shape = [inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits]
     loss = occupancy_loss(shape[0], shape[1], shape[2], shape[3], ids, lookup, stream=7, samples=20)
     yield "occupancy loss", [loss, *_gradients(loss, shape)]
+    yield "image losses", _compared(rasterizer, scene, plain)
     yield "reprojection", list(_reprojected(rasterizer, scene, plain))
 
 
@@ -79,6 +82,17 @@ def _reprojected(rasterizer: Rasterizer, scene: Scene, inputs: SurfelInputs) -> 
     for reproject in (reproject_pairwise, reproject_voxel):
         for voted in reproject(depths, [scene.camera] * 2, masks, CLASSES):
             yield voted.confidence
+
+
+def _compared(rasterizer: Rasterizer, scene: Scene, inputs: SurfelInputs) -> list[Tensor]:
+    """L1 with SSIM, and normal consistency, of a view; with their gradients."""
+    settings, background = replace(scene.settings, geometry=True), scene.background.to(inputs.means.dtype)
+    drawn = rasterizer.rasterize(inputs, scene.camera, settings, background)
+    images = [image.requires_grad_() for image in (drawn.color, drawn.depth, drawn.normal) if image is not None]
+    color, depth, normal = images
+    likeness = photometric(color, color.detach().flip(0).contiguous(), 0.8, -0.2, 1e-4, 9e-4)
+    smoothness = normal_consistency(depth, normal, drawn.alpha, scene.camera.host.K)
+    return [likeness, smoothness, *_gradients(likeness + smoothness, images)]
 
 
 def _drawn(

@@ -45,7 +45,7 @@ endif()
 message(STATUS "Kernels for GPUs: ${CMAKE_CUDA_COMPILER} ${CMAKE_CUDA_COMPILER_VERSION}, for ${CMAKE_CUDA_ARCHITECTURES}")
 
 set(kernels project forward backward products primitives sh_colors voxel_lookup voxel_tally
-    reprojection_votes occupancy_loss)
+    reprojection_votes occupancy_loss image_losses)
 list(TRANSFORM kernels PREPEND ${cuda}/)
 list(TRANSFORM kernels APPEND .cu)
 add_library(beags_cuda STATIC ${kernels})

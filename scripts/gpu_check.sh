@@ -48,7 +48,7 @@ build() {
 }
 
 tests() { # everything that draws or uses an op on the GPU; nothing here imports nerfstudio
-  "$python" -m pytest -q -p no:cacheprovider tests/test_cuda_rasterizer.py tests/test_cuda_ops.py tests/test_cuda_votes.py tests/test_cuda_gpu.py \
+  "$python" -m pytest -q -p no:cacheprovider tests/test_cuda_rasterizer.py tests/test_cuda_ops.py tests/test_cuda_votes.py tests/test_cuda_gpu.py tests/test_image_ops.py \
     tests/test_rasterizer_reference.py tests/test_rasterizer_robustness.py tests/test_screen_shift.py \
     -k "cuda and not emulated"
 }

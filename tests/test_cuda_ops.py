@@ -141,6 +141,7 @@ def test_the_smoke_test_launches_every_variant_and_finds_what_is_not_finite(devi
     monkeypatch.setattr(cuda_extension, "call", lambda m, name, *rest: called.add(name) or call(m, name, *rest))
     assert cuda_smoke.smoke(rasterizer, device.type, Size(60, 24, 20)) == []
     ops = {"sh_colors", "sh_colors_backward", "occupancy_loss", "count", "valid", "disc_inside"}
+    ops |= {"photometric", "normal_consistency"}
     assert called == ops | {"vote_points", "vote_pixels", "read_votes", "reprojection_votes"}
     monkeypatch.setattr(cuda_smoke, "sh_colors", lambda dc, *_: dc * torch.inf)
     wrong = cuda_smoke.smoke(rasterizer, device.type, Size(60, 24, 20))

@@ -29,6 +29,7 @@ from beags_plugin.ops.voxel_lookup import VoxelLookup
 from beags_plugin.rasterizers.interface import RasterOutputs
 
 N, HEIGHT, WIDTH = 50, 40, 60
+ON_HOST = Camera(torch.eye(4), torch.eye(3), WIDTH, HEIGHT)  # with data
 LOSSES = [
     PhotometricLoss(),
     NormalConsistencyLoss(),
@@ -59,7 +60,7 @@ class Fetches(TorchDispatchMode):
 @pytest.fixture
 def gpu(monkeypatch):
     """Tensors on a GPU that is not there, and kernels that do nothing."""
-    module = SimpleNamespace(OCCUPANCY_THREADS=128)
+    module = SimpleNamespace(OCCUPANCY_THREADS=128, PHOTOMETRIC_TILE=16, NORMAL_THREADS=256)
     on_gpu = lambda *tensors: module if tensors[0].device.type == "cuda" else None  # noqa: E731
     monkeypatch.setattr(cuda_extension, "module_for", on_gpu)
     monkeypatch.setattr(cuda_extension, "call", lambda *_: None)
@@ -87,12 +88,14 @@ def outputs(alpha: torch.Tensor | None = None) -> RasterOutputs:
 def inputs(surfels: Surfels, **known) -> LossInputs:
     """known: what the host does."""
     image = (HEIGHT, WIDTH)
+    camera = Camera(rand(4, 4), rand(3, 3), WIDTH, HEIGHT)
+    camera.__dict__["_host"] = ON_HOST
     ranks = ClassRanks.__new__(ClassRanks)
     ranks._table = torch.zeros(9, dtype=torch.int32, device="cuda")
     lookup = VoxelLookup.__new__(VoxelLookup)
     lookup._ranks, lookup._native, lookup.voxels = ranks, None, lambda *_: None
     return LossInputs(
-        step=20_000, seed=1, surfels=surfels, camera=Camera(rand(4, 4), rand(3, 3), WIDTH, HEIGHT), render=outputs(),
+        step=20_000, seed=1, surfels=surfels, camera=camera, render=outputs(),
         image=rand(*image, 3), labels=torch.zeros(image, dtype=torch.int32, device="cuda"),
         class_ids=torch.zeros(N, dtype=torch.int32, device="cuda"),
         grid=SimpleNamespace(lookup=lambda: lookup, count=lookup.count),

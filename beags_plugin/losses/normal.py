@@ -12,7 +12,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.lifting import pixel_rays
 from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.reduction import ordered_sum
-from beags_plugin.ops import extension
+from beags_plugin.ops import cuda_extension
 from beags_plugin.ops.normal_consistency import normal_consistency
 
 
@@ -40,8 +40,8 @@ class NormalConsistencyLoss(Loss):
         render = inputs.render
         if render.depth is None or render.normal is None:
             raise ValueError("the normal loss needs a render with geometry")
-        if extension.can_take(render.depth, render.normal, render.alpha):
-            return normal_consistency(render.depth, render.normal, render.alpha, inputs.camera.K, weight)
+        if cuda_extension.can_take(render.depth, render.normal, render.alpha):
+            return normal_consistency(render.depth, render.normal, render.alpha, inputs.camera.host.K, weight)
         slope, known = depth_normals(render.depth, inputs.camera)
         error = 1.0 - (render.normal[1:-1, 1:-1] * slope).sum(-1)
         error = torch.where(known, render.alpha.detach()[1:-1, 1:-1] * error, 0.0)

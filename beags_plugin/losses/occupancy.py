@@ -14,7 +14,7 @@ from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.reduction import ordered_sum
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.occupancy.sampling import RADIUS, disc_points, sample_stream, sample_words
-from beags_plugin.ops import cuda_extension, extension
+from beags_plugin.ops import cuda_extension
 from beags_plugin.ops.occupancy_loss import occupancy_loss
 
 _CHUNK_POINTS = 1 << 16  # points looked up at a time: their temporaries stay in the cache; never changes the result
@@ -60,7 +60,7 @@ class OccupancyLoss(Loss):
         num_samples = int(self.samples)
         parameters = (surfels.means, surfels.quats, surfels.log_scales, surfels.opacity_logits)
         lookup = grid.lookup()
-        compiled = extension.can_take(*parameters) or cuda_extension.module_for(*parameters) is not None
+        compiled = cuda_extension.can_take(*parameters)
         if lookup is not None and compiled:
             stream = sample_stream(inputs.seed, inputs.step)
             ids = class_ids.int()

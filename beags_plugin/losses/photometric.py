@@ -11,7 +11,7 @@ from torch import Tensor
 from beags_plugin.errors import UserError
 from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.reduction import ordered_mean
-from beags_plugin.ops import extension
+from beags_plugin.ops import cuda_extension
 from beags_plugin.ops import photometric as compiled
 
 WINDOW = 11
@@ -59,7 +59,7 @@ def ssim(image: Tensor, reference: Tensor) -> Tensor:
 
 def _compiled_takes(image: Tensor, reference: Tensor) -> bool:
     same = image.ndim == 3 and image.shape == reference.shape and image.shape[2] == 3 and image.numel() > 0
-    return same and not reference.requires_grad and extension.can_take(image, reference)
+    return same and not reference.requires_grad and cuda_extension.can_take(image, reference)
 
 
 class _Ssim(torch.autograd.Function):

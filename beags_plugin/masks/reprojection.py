@@ -59,7 +59,7 @@ def reproject_pairwise(
         return
     depths = list(depths)  # every view is projected into every other
     maps, held = PixelMaps(cameras), _held(labels)
-    compiled = extension.can_take(*depths) or cuda_extension.module_for(*depths) is not None
+    compiled = cuda_extension.can_take(*depths)
     size = max(camera.height * camera.width for camera in cameras) * num_classes
     dense = compiled and size <= _DENSE_COUNTERS
     # as many views at a time as there are threads, each with its own counters; several processes take them one by one

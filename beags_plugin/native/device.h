@@ -1,6 +1,9 @@
 // Functions that the CPU and GPUs share.
 #pragma once
 
+#if !defined(BEAGS_ISA) && (defined(__CUDACC__) || defined(BEAGS_CUDA_EMULATION))
+#define BEAGS_ISA device  // of what is shared
+#endif
 #if defined(__CUDACC__)
 #define BEAGS_HD __host__ __device__
 #define BEAGS_HD_INLINE __host__ __device__ __forceinline__

@@ -4,10 +4,12 @@
 
 #include <stdint.h>
 
+#include <cmath>
+
 namespace beags {
 namespace ops {
 
-constexpr int kWindow = 11, kReach = kWindow / 2;  // of SSIM, pixels
+constexpr int kSsimWindow = 11, kSsimReach = kSsimWindow / 2;  // of SSIM, pixels
 constexpr int kChannels = 3;
 
 // L1 and SSIM of an image against a reference; see ops/photometric.py. Images are [H, W, 3], row-major.
@@ -15,13 +17,22 @@ template <class T>
 struct PhotometricJob {
   int width, height;
   const T *image, *reference;
-  T window[kWindow];
+  T window[kSsimWindow];
   T c1, c2;                // the constants of SSIM
   T l1_scale, ssim_scale;  // of the gradient: of sum |x - y| and of the sum of the index
   T* slopes;               // [3, H, W, 3] by blurred x, blurred x^2 + y^2, blurred x y; null: no gradient wanted
   T* gradient;             // [H, W, 3]
   double* sums;            // [H, 2] sum of |x - y| and of the index, by row
 };
+
+// The window: Gaussian, sigma 1.5 pixels, of sum 1.
+template <class T>
+void set_window(PhotometricJob<T>& job) {
+  double window[kSsimWindow], total = 0;
+  for (int k = 0; k < kSsimWindow; ++k)
+    total += window[k] = std::exp(-0.5 * (k - kSsimReach) * (k - kSsimReach) / (1.5 * 1.5));
+  for (int k = 0; k < kSsimWindow; ++k) job.window[k] = static_cast<T>(window[k] / total);
+}
 
 // Normal consistency of a drawn view; see ops/normal_consistency.py. Images are [H, W] or [H, W, 3].
 template <class T>

@@ -1,6 +1,5 @@
 #include "image_losses.h"
 
-#include <cmath>
 #include <memory>
 #include <vector>
 
@@ -21,9 +20,6 @@ int team(int width, int height, int threads) {
 template <class T>
 PhotometricSums photometric(PhotometricJob<T> job, int threads) {
   const ImageKernels<T>& kernels = best_table<ImageKernels<T>>();
-  double window[kWindow], total = 0;
-  for (int k = 0; k < kWindow; ++k) total += window[k] = std::exp(-0.5 * (k - kReach) * (k - kReach) / (1.5 * 1.5));
-  for (int k = 0; k < kWindow; ++k) job.window[k] = static_cast<T>(window[k] / total);
   const int64_t numbers = static_cast<int64_t>(job.width) * job.height * kChannels;
   const std::unique_ptr<T[]> slopes(job.gradient ? new T[3 * numbers] : nullptr);
   std::vector<double> sums(2 * static_cast<size_t>(job.height));

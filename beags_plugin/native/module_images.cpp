@@ -5,6 +5,7 @@
 
 #include "arrays.h"
 #include "image_losses.h"
+#include "op_jobs.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -21,16 +22,7 @@ void bind(nb::module_& m, const std::string& suffix) {
   m.def(
       ("photometric_" + suffix).c_str(),
       [](In image, In reference, double c1, double c2, double l1_scale, double ssim_scale, Out gradient, int threads) {
-        PhotometricJob<T> job{};
-        job.height = static_cast<int>(image.shape(0));
-        job.width = static_cast<int>(image.shape(1));
-        job.image = image.data();
-        job.reference = reference.data();
-        job.c1 = static_cast<T>(c1);
-        job.c2 = static_cast<T>(c2);
-        job.l1_scale = static_cast<T>(l1_scale);
-        job.ssim_scale = static_cast<T>(ssim_scale);
-        job.gradient = gradient.data();
+        const PhotometricJob<T> job = photometric_job<T>(image, reference, c1, c2, l1_scale, ssim_scale, gradient);
         PhotometricSums sums;
         {
           nb::gil_scoped_release release;
@@ -42,20 +34,7 @@ void bind(nb::module_& m, const std::string& suffix) {
   m.def(("normal_consistency_" + suffix).c_str(),
         [](In depth, In normal, In alpha, double fx, double fy, double skew, double cx, double cy, double scale,
            Out g_depth, Out g_normal, int threads) {
-          NormalJob<T> job{};
-          job.height = static_cast<int>(depth.shape(0));
-          job.width = static_cast<int>(depth.shape(1));
-          job.fx_inverse = static_cast<T>(1 / fx);
-          job.fy_inverse = static_cast<T>(1 / fy);
-          job.skew = static_cast<T>(skew);
-          job.cx = static_cast<T>(cx);
-          job.cy = static_cast<T>(cy);
-          job.depth = depth.data();
-          job.normal = normal.data();
-          job.alpha = alpha.data();
-          job.scale = static_cast<T>(scale);
-          job.g_depth = g_depth.data();
-          job.g_normal = g_normal.data();
+          const NormalJob<T> job = normal_job<T>(depth, normal, alpha, fx, fy, skew, cx, cy, scale, g_depth, g_normal);
           nb::gil_scoped_release release;
           return normal_consistency(job, threads);
         },

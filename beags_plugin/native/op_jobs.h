@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "arrays.h"
+#include "image_kernels.h"
 #include "lifted_view.h"
 #include "op_kernels.h"
 #include "reprojection_votes.h"
@@ -40,6 +41,47 @@ OccupancyJob<T> occupancy_job(const Array<const T, kMemory>& means, const Array<
   job.g_quats = g_quats.data();
   job.g_log_scales = g_log_scales.data();
   job.g_opacity_logits = g_opacity_logits.data();
+  return job;
+}
+
+// The job but for the slopes' and the sums' memory.
+template <class T, Memory kMemory>
+PhotometricJob<T> photometric_job(const Array<const T, kMemory>& image, const Array<const T, kMemory>& reference,
+                                  double c1, double c2, double l1_scale, double ssim_scale,
+                                  const Array<T, kMemory>& gradient) {
+  PhotometricJob<T> job{};
+  job.height = static_cast<int>(image.shape(0));
+  job.width = static_cast<int>(image.shape(1));
+  job.image = image.data();
+  job.reference = reference.data();
+  set_window(job);
+  job.c1 = static_cast<T>(c1);
+  job.c2 = static_cast<T>(c2);
+  job.l1_scale = static_cast<T>(l1_scale);
+  job.ssim_scale = static_cast<T>(ssim_scale);
+  job.gradient = gradient.data();
+  return job;
+}
+
+// The job but for the shares' and the sums' memory.
+template <class T, Memory kMemory>
+NormalJob<T> normal_job(const Array<const T, kMemory>& depth, const Array<const T, kMemory>& normal,
+                        const Array<const T, kMemory>& alpha, double fx, double fy, double skew, double cx, double cy,
+                        double scale, const Array<T, kMemory>& g_depth, const Array<T, kMemory>& g_normal) {
+  NormalJob<T> job{};
+  job.height = static_cast<int>(depth.shape(0));
+  job.width = static_cast<int>(depth.shape(1));
+  job.fx_inverse = static_cast<T>(1 / fx);
+  job.fy_inverse = static_cast<T>(1 / fy);
+  job.skew = static_cast<T>(skew);
+  job.cx = static_cast<T>(cx);
+  job.cy = static_cast<T>(cy);
+  job.depth = depth.data();
+  job.normal = normal.data();
+  job.alpha = alpha.data();
+  job.scale = static_cast<T>(scale);
+  job.g_depth = g_depth.data();
+  job.g_normal = g_normal.data();
   return job;
 }
 

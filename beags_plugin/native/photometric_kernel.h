@@ -4,12 +4,13 @@
 #pragma once
 
 #include "row_vectors.h"
+#include "ssim_terms.h"
 
 namespace beags {
 namespace ops {
 namespace BEAGS_ISA {
 
-constexpr int kPad = kReach * kChannels;  // numbers beyond a row's ends that the window reaches, held at 0
+constexpr int kPad = kSsimReach * kChannels;  // numbers beyond a row's ends that the window reaches, held at 0
 
 // Numbers in one buffer of a row.
 template <class T>
@@ -34,9 +35,9 @@ BEAGS_OPS_INLINE void clear_pads(T* scratch, int width, int buffers) {
 template <class T>
 BEAGS_OPS_INLINE RealOf<T> blur_row(const PhotometricJob<T>& job, const T* from) {
   RealOf<T> sum = {};
-  for (int k = 0; k < kWindow; ++k) {
+  for (int k = 0; k < kSsimWindow; ++k) {
     RealOf<T> value;
-    __builtin_memcpy(&value, from + (k - kReach) * kChannels, sizeof value);
+    __builtin_memcpy(&value, from + (k - kSsimReach) * kChannels, sizeof value);
     sum = fma(RealOf<T>{} + job.window[k], value, sum);
   }
   return sum;
@@ -46,14 +47,14 @@ template <class T>
 void photometric(const PhotometricJob<T>& job, int row, T* scratch) {
   using R = RealOf<T>;
   const int64_t line = static_cast<int64_t>(job.width) * kChannels, length = buffer_length<T>(job.width);
-  const int first = row < kReach ? -row : -kReach;
-  const int last = row + kReach < job.height ? kReach : job.height - 1 - row;
+  const int first = row < kSsimReach ? -row : -kSsimReach;
+  const int last = row + kSsimReach < job.height ? kSsimReach : job.height - 1 - row;
   clear_pads(scratch, job.width, 4);
   for_each_vector<T>(line, [&](int64_t i, auto lanes) {
     R x = {}, y = {}, squares = {}, product = {};
     for (int k = first; k <= last; ++k) {
       const int64_t at = (row + k) * line + i;
-      const R w = R{} + job.window[k + kReach];
+      const R w = R{} + job.window[k + kSsimReach];
       const R a = lanes.load(job.image + at), b = lanes.load(job.reference + at);
       const R wa = w * a, wb = w * b;
       x += wa;
@@ -73,20 +74,17 @@ void photometric(const PhotometricJob<T>& job, int row, T* scratch) {
     const T* from = scratch + kPad + i;
     const R m_x = blur_row(job, from), m_y = blur_row(job, from + length);
     const R squares = blur_row(job, from + 2 * length), product = blur_row(job, from + 3 * length);
-    const R m_xx_yy = fma(m_x, m_x, m_y * m_y), m_xy = m_x * m_y;
-    const R a1 = T(2) * m_xy + job.c1, a2 = T(2) * (product - m_xy) + job.c2;
-    const R b1 = m_xx_yy + job.c1, b2 = squares - m_xx_yy + job.c2;
-    const R inverse = T(1) / (b1 * b2), index = a1 * a2 * inverse;
+    const SsimTerms<R> terms = ssim_terms(m_x, m_y, squares, product, job.c1, job.c2);
     const int64_t at = row * line + i;
     const R difference = lanes.load(job.image + at) - lanes.load(job.reference + at);
     absolute += select(difference < R{}, -difference, difference);
     T counted[Lanes<T>::kCount] = {};
-    lanes.store(counted, index);
+    lanes.store(counted, terms.index);
     similar += Whole::load(counted);
     if (job.slopes) {
-      lanes.store(job.slopes + at, T(2) * (m_y * (a2 - a1) + m_x * index * (b1 - b2)) * inverse);
-      lanes.store(job.slopes + map + at, -index * (b1 * inverse));
-      lanes.store(job.slopes + 2 * map + at, T(2) * a1 * inverse);
+      lanes.store(job.slopes + at, terms.by_mean);
+      lanes.store(job.slopes + map + at, terms.by_squares);
+      lanes.store(job.slopes + 2 * map + at, terms.by_product);
     }
   });
   double sums[2] = {};
@@ -104,14 +102,14 @@ void photometric_gradient(const PhotometricJob<T>& job, int row, T* scratch) {
   using R = RealOf<T>;
   const int64_t line = static_cast<int64_t>(job.width) * kChannels, length = buffer_length<T>(job.width);
   const int64_t map = static_cast<int64_t>(job.height) * line;
-  const int first = row < kReach ? -row : -kReach;
-  const int last = row + kReach < job.height ? kReach : job.height - 1 - row;
+  const int first = row < kSsimReach ? -row : -kSsimReach;
+  const int last = row + kSsimReach < job.height ? kSsimReach : job.height - 1 - row;
   clear_pads(scratch, job.width, 3);
   for_each_vector<T>(line, [&](int64_t i, auto lanes) {
     R sums[3] = {};
     for (int k = first; k <= last; ++k) {
       const T* from = job.slopes + (row + k) * line + i;
-      const R w = R{} + job.window[k + kReach];
+      const R w = R{} + job.window[k + kSsimReach];
       for (int m = 0; m < 3; ++m) sums[m] = fma(w, lanes.load(from + m * map), sums[m]);
     }
     for (int m = 0; m < 3; ++m) lanes.store(scratch + m * length + kPad + i, sums[m]);

@@ -45,6 +45,11 @@ def module_for(*tensors: Tensor) -> ModuleType | None:
     return load()
 
 
+def can_take(*tensors: Tensor) -> bool:
+    """Whether the compiled ops take these float tensors: all float32 or all float64, on the CPU or on one GPU."""
+    return extension.can_take(*tensors) or module_for(*tensors) is not None
+
+
 def stream(device: torch.device) -> int:
     """torch's current stream there; 0, the emulation's, for the CPU."""
     return torch.cuda.current_stream(device).cuda_stream if device.type == "cuda" else 0

@@ -4,6 +4,7 @@
 #endif
 #include "backward.cu"
 #include "forward.cu"
+#include "image_losses.cu"
 #include "occupancy_loss.cu"
 #include "primitives.cu"
 #include "products.cu"

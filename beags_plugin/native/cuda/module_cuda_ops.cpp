@@ -22,8 +22,10 @@ using namespace cuda;
 using ops::add_gradients;
 using ops::color_job;
 using ops::ColorJob;
+using ops::NormalJob;
 using ops::occupancy_job;
 using ops::OccupancyJob;
+using ops::PhotometricJob;
 using ops::VoxelTable;
 
 template <class T>
@@ -94,6 +96,33 @@ void bind(nb::module_& m, const char* suffix) {
         },
         "sh_dc"_a, "sh_rest"_a, "means"_a, "center"_a, "degree"_a, "clamped"_a, "g_colors"_a, "g_dc"_a.none(),
         "g_rest"_a.none(), "g_means"_a.none(), "stream"_a);
+}
+
+template <class T>
+void bind_images(nb::module_& m, const char* suffix) {
+  using In = Device<const T>;
+  using Out = Device<T>;
+  const std::string end(suffix);
+  m.def(("photometric_" + end).c_str(),
+        [](In image, In reference, double c1, double c2, double l1_scale, double ssim_scale, double offset, Out slopes,
+           Out gradient, Device<double> sums, Out value, uintptr_t stream) {
+          PhotometricJob<T> job = ops::photometric_job<T>(image, reference, c1, c2, l1_scale, ssim_scale, gradient);
+          job.slopes = slopes.data();
+          job.sums = sums.data();
+          photometric(job, offset, value.data(), stream_of(stream));
+        },
+        "image"_a, "reference"_a, "c1"_a, "c2"_a, "l1_scale"_a, "ssim_scale"_a, "offset"_a, "slopes"_a.none(),
+        "gradient"_a.none(), "sums"_a, "value"_a, "stream"_a);
+  m.def(("normal_consistency_" + end).c_str(),
+        [](In depth, In normal, In alpha, double fx, double fy, double skew, double cx, double cy, double scale,
+           Out g_depth, Out g_normal, Out shares, Device<double> sums, Out value, uintptr_t stream) {
+          NormalJob<T> job = ops::normal_job<T>(depth, normal, alpha, fx, fy, skew, cx, cy, scale, g_depth, g_normal);
+          job.shares = shares.data();
+          job.sums = sums.data();
+          normal_consistency(job, value.data(), stream_of(stream));
+        },
+        "depth"_a, "normal"_a, "alpha"_a, "fx"_a, "fy"_a, "skew"_a, "cx"_a, "cy"_a, "scale"_a, "g_depth"_a.none(),
+        "g_normal"_a.none(), "shares"_a.none(), "sums"_a, "value"_a, "stream"_a);
 }
 
 template <class T>
@@ -178,8 +207,12 @@ void bind_cuda_ops(nb::module_& m) {
           },
           "tables"_a, "origin"_a, "voxel_size"_a);
   m.attr("OCCUPANCY_THREADS") = kOccupancyThreads;
+  m.attr("PHOTOMETRIC_TILE") = kPhotometricTile;
+  m.attr("NORMAL_THREADS") = kNormalThreads;
   bind<float>(m, "f32");
   bind<double>(m, "f64");
+  bind_images<float>(m, "f32");
+  bind_images<double>(m, "f64");
   bind_votes<float>(m, "f32");
   bind_votes<double>(m, "f64");
   bind_tally(m);

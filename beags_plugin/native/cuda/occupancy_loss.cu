@@ -3,6 +3,7 @@
 // voxels, and gives the others to its first threads, so that warps are full. What is computed is as in
 // ../occupancy_kernel.h.
 #include "../quaternion.h"
+#include "block_sums.h"
 #include "ops.h"
 
 namespace beags {
@@ -179,7 +180,6 @@ __global__ void __launch_bounds__(kOccupancyThreads)
   constexpr int kWarps = kOccupancyThreads / kWarpThreads;
   __shared__ int active[kOccupancyThreads];
   __shared__ int found[kWarps];
-  __shared__ double sums[kWarps];
   const int thread = threadIdx.x, warp = thread / kWarpThreads, lane = thread % kWarpThreads;
   const int64_t first = static_cast<int64_t>(blockIdx.x) * kOccupancyThreads, i = first + thread;
   bool wanted = false;
@@ -211,25 +211,17 @@ __global__ void __launch_bounds__(kOccupancyThreads)
   }
   if (wanted) active[place] = thread;
   __syncthreads();
-  double loss = 0;
-  if (thread < total) loss = sample(job, voxels.valid[0], first + active[thread]);
-  loss = warp_sum(loss);
-  if (lane == 0) sums[warp] = loss;
-  __syncthreads();
-  if (thread == 0) {
-    double sum = 0;
-    for (int w = 0; w < kWarps; ++w) sum += sums[w];
-    partial[blockIdx.x] = sum;
-  }
+  double loss[1] = {};
+  if (thread < total) loss[0] = sample(job, voxels.valid[0], first + active[thread]);
+  block_sums<kOccupancyThreads>(loss);
+  if (thread == 0) partial[blockIdx.x] = loss[0];
 }
 
-// One warp adds up all blocks, in a fixed order.
 template <class T>
-__global__ void sum_kernel(int64_t blocks, const double* partial, T* value) {
-  double sum = 0;
-  for (int64_t i = threadIdx.x; i < blocks; i += kWarpThreads) sum += partial[i];
-  sum = warp_sum(sum);
-  if (threadIdx.x == 0) *value = static_cast<T>(sum);
+__global__ void __launch_bounds__(kSumThreads) occupancy_value_kernel(int64_t blocks, const double* partial, T* value) {
+  double sums[1];
+  sum_of_blocks(blocks, partial, sums);
+  if (threadIdx.x == 0) *value = static_cast<T>(sums[0]);
 }
 
 }  // namespace
@@ -240,8 +232,8 @@ void occupancy_loss(const OccupancyJob<T>& job, const Voxels& voxels, int64_t co
   const int64_t blocks = blocks_for(count, kOccupancyThreads);
   const auto kernel = occupancy_kernel<T>;
   BEAGS_LAUNCH(kernel, blocks, kOccupancyThreads, stream, job, voxels, count, partial);
-  const auto sum = sum_kernel<T>;
-  BEAGS_LAUNCH(sum, 1, kWarpThreads, stream, blocks, partial, value);
+  const auto finish = occupancy_value_kernel<T>;
+  BEAGS_LAUNCH(finish, 1, kSumThreads, stream, blocks, partial, value);
 }
 
 #define BEAGS_INSTANTIATE(T) \

@@ -4,6 +4,7 @@
 #if !defined(BEAGS_ISA)
 #define BEAGS_ISA device  // of what is shared with the CPU
 #endif
+#include "../image_kernels.h"
 #include "../op_kernels.h"
 #include "../pairwise_votes.h"
 #include "../reprojection_votes.h"
@@ -50,6 +51,18 @@ constexpr int kOccupancyThreads = 128;
 template <class T>
 void occupancy_loss(const ops::OccupancyJob<T>& job, const Voxels& voxels, int64_t count, double* partial, T* value,
                     Stream stream);
+
+// The image losses; see ../image_losses.h. All of the job's memory is the caller's: `sums` has 2 numbers for each tile
+// of kPhotometricTile x kPhotometricTile pixels; without a gradient there are no slopes. value: [1], offset + l1_scale
+// * sum |x - y| + ssim_scale * sum of the index.
+constexpr int kPhotometricTile = 16;
+template <class T>
+void photometric(const ops::PhotometricJob<T>& job, double offset, T* value, Stream stream);
+
+// `sums` has a number for each kNormalThreads pixels; without gradients there are no shares. value: [1], times scale.
+constexpr int kNormalThreads = 256;
+template <class T>
+void normal_consistency(const ops::NormalJob<T>& job, T* value, Stream stream);
 
 }  // namespace cuda
 }  // namespace beags

@@ -1,0 +1,216 @@
+// The image losses on a GPU: one pass over the image for the value and the slopes, one for the gradient.
+#include "../normal_terms.h"
+#include "../ssim_terms.h"
+#include "block_sums.h"
+#include "ops.h"
+
+namespace beags {
+namespace cuda {
+namespace {
+
+using namespace ops;
+using namespace ops::BEAGS_ISA;
+
+constexpr int kSide = kPhotometricTile, kHalo = kSide + 2 * kSsimReach;  // pixels; with those that the window reaches
+constexpr int kSideThreads = kSide * kSide;
+
+// A block's tile of the image: its first pixel, and this thread's.
+struct PhotometricTile {
+  int left, top, column, row, x, y;
+  bool inside;
+
+  BEAGS_DEVICE PhotometricTile(int width, int height) {
+    const int across = (width + kSide - 1) / kSide, block = static_cast<int>(blockIdx.x);
+    left = block % across * kSide;
+    top = block / across * kSide;
+    column = static_cast<int>(threadIdx.x) % kSide;
+    row = static_cast<int>(threadIdx.x) / kSide;
+    x = left + column;
+    y = top + row;
+    inside = x < width && y < height;
+  }
+};
+
+// The window along the rows of maps that were blurred down the columns.
+template <class T, int kMaps>
+BEAGS_DEVICE void blur_across(const T (&window)[kSsimWindow], const T (&maps)[kMaps][kSide][kHalo],
+                              const PhotometricTile& tile, T (&sums)[kMaps]) {
+  for (int m = 0; m < kMaps; ++m) {
+    sums[m] = 0;
+    for (int k = 0; k < kSsimWindow; ++k) sums[m] = fused(window[k], maps[m][tile.row][tile.column + k], sums[m]);
+  }
+}
+
+template <class T>
+__global__ void __launch_bounds__(kSideThreads) photometric_kernel(PhotometricJob<T> job) {
+  __shared__ T pictures[2][kHalo][kHalo * kChannels];  // zeros outside the image
+  __shared__ T down[4][kSide][kHalo];
+  const PhotometricTile tile(job.width, job.height);
+  const int64_t line = static_cast<int64_t>(job.width) * kChannels, map = job.height * line;
+  for (int i = threadIdx.x; i < kHalo * kHalo * kChannels; i += kSideThreads) {
+    const int row = i / (kHalo * kChannels), number = i % (kHalo * kChannels), y = tile.top + row - kSsimReach;
+    const int64_t x = (tile.left - kSsimReach) * kChannels + number;
+    const bool inside = y >= 0 && y < job.height && x >= 0 && x < line;
+    pictures[0][row][number] = inside ? job.image[y * line + x] : T(0);
+    pictures[1][row][number] = inside ? job.reference[y * line + x] : T(0);
+  }
+  __syncthreads();
+  double sums[2] = {};
+  for (int c = 0; c < kChannels; ++c) {
+    for (int i = threadIdx.x; i < kSide * kHalo; i += kSideThreads) {
+      const int row = i / kHalo, column = i % kHalo;
+      T x = 0, y = 0, squares = 0, product = 0;
+      for (int k = 0; k < kSsimWindow; ++k) {
+        const T a = pictures[0][row + k][column * kChannels + c], b = pictures[1][row + k][column * kChannels + c];
+        const T wa = job.window[k] * a, wb = job.window[k] * b;
+        x += wa;
+        y += wb;
+        squares = fused(wa, a, fused(wb, b, squares));
+        product = fused(wa, b, product);
+      }
+      down[0][row][column] = x;
+      down[1][row][column] = y;
+      down[2][row][column] = squares;
+      down[3][row][column] = product;
+    }
+    __syncthreads();
+    if (tile.inside) {
+      T blurred[4];
+      blur_across(job.window, down, tile, blurred);
+      const auto terms = ssim_terms(blurred[0], blurred[1], blurred[2], blurred[3], job.c1, job.c2);
+      const int number = (tile.column + kSsimReach) * kChannels + c;
+      const T difference = pictures[0][tile.row + kSsimReach][number] - pictures[1][tile.row + kSsimReach][number];
+      sums[0] += difference < 0 ? -difference : difference;
+      sums[1] += terms.index;
+      if (job.slopes) {
+        T* to = job.slopes + tile.y * line + tile.x * kChannels + c;
+        to[0] = terms.by_mean;
+        to[map] = terms.by_squares;
+        to[2 * map] = terms.by_product;
+      }
+    }
+    __syncthreads();
+  }
+  block_sums<kSideThreads>(sums);
+  if (threadIdx.x == 0) {
+    for (int k = 0; k < 2; ++k) job.sums[2 * static_cast<int64_t>(blockIdx.x) + k] = sums[k];
+  }
+}
+
+// As in the CPU's kernel, the way back is the same blur.
+template <class T>
+__global__ void __launch_bounds__(kSideThreads) photometric_gradient_kernel(PhotometricJob<T> job) {
+  __shared__ T slopes[3][kHalo][kHalo];
+  __shared__ T down[3][kSide][kHalo];
+  const PhotometricTile tile(job.width, job.height);
+  const int64_t line = static_cast<int64_t>(job.width) * kChannels, map = job.height * line;
+  for (int c = 0; c < kChannels; ++c) {
+    for (int i = threadIdx.x; i < kHalo * kHalo; i += kSideThreads) {
+      const int row = i / kHalo, column = i % kHalo, y = tile.top + row - kSsimReach,
+                x = tile.left + column - kSsimReach;
+      const bool inside = y >= 0 && y < job.height && x >= 0 && x < job.width;
+      for (int m = 0; m < 3; ++m) {
+        slopes[m][row][column] = inside ? job.slopes[m * map + y * line + x * kChannels + c] : T(0);
+      }
+    }
+    __syncthreads();
+    for (int i = threadIdx.x; i < kSide * kHalo; i += kSideThreads) {
+      const int row = i / kHalo, column = i % kHalo;
+      for (int m = 0; m < 3; ++m) {
+        T sum = 0;
+        for (int k = 0; k < kSsimWindow; ++k) sum = fused(job.window[k], slopes[m][row + k][column], sum);
+        down[m][row][column] = sum;
+      }
+    }
+    __syncthreads();
+    if (tile.inside) {
+      T blurred[3];
+      blur_across(job.window, down, tile, blurred);
+      const int64_t at = tile.y * line + tile.x * kChannels + c;
+      const T x = job.image[at], y = job.reference[at], sign = x > y ? T(1) : x < y ? T(-1) : T(0);
+      const T similar = blurred[0] + T(2) * x * blurred[1] + y * blurred[2];
+      job.gradient[at] = job.l1_scale * sign + job.ssim_scale * similar;
+    }
+    __syncthreads();
+  }
+}
+
+template <class T>
+__global__ void __launch_bounds__(kSumThreads)
+    photometric_value_kernel(int64_t blocks, PhotometricJob<T> job, double offset, T* value) {
+  double sums[2];
+  sum_of_blocks(blocks, job.sums, sums);
+  if (threadIdx.x == 0) *value = static_cast<T>(offset + job.l1_scale * sums[0] + job.ssim_scale * sums[1]);
+}
+
+template <class T>
+__global__ void __launch_bounds__(kNormalThreads) normal_kernel(NormalJob<T> job) {
+  const int64_t pixels = static_cast<int64_t>(job.width) * job.height;
+  const int64_t at = static_cast<int64_t>(blockIdx.x) * kNormalThreads + threadIdx.x;
+  double error[1] = {};
+  if (at < pixels) {
+    const int x = static_cast<int>(at % job.width), y = static_cast<int>(at / job.width);
+    NormalTerms<T> terms = {};  // at the image's border there is no error
+    if (x > 0 && x + 1 < job.width && y > 0 && y + 1 < job.height) {
+      const T* d = job.depth + at;
+      const Depths<T> depths = {d[0], d[1], d[-1], d[job.width], d[-job.width]};
+      const Triple<T> n = {job.normal[3 * at], job.normal[3 * at + 1], job.normal[3 * at + 2]};
+      terms = normal_terms(job, static_cast<T>(x), y, depths, n, job.alpha[at]);
+    }
+    error[0] = terms.error;
+    if (job.shares) {
+      for (int i = 0; i < 4; ++i) job.shares[i * pixels + at] = terms.shares[i];
+      job.g_normal[3 * at] = terms.g_normal.x;
+      job.g_normal[3 * at + 1] = terms.g_normal.y;
+      job.g_normal[3 * at + 2] = terms.g_normal.z;
+    }
+  }
+  block_sums<kNormalThreads>(error);
+  if (threadIdx.x == 0) job.sums[blockIdx.x] = error[0];
+}
+
+template <class T>
+__global__ void __launch_bounds__(kNormalThreads) normal_gradient_kernel(NormalJob<T> job) {
+  const int64_t pixels = static_cast<int64_t>(job.width) * job.height;
+  const int64_t at = static_cast<int64_t>(blockIdx.x) * kNormalThreads + threadIdx.x;
+  if (at < pixels) job.g_depth[at] = gathered_shares(job, at);
+}
+
+template <class T>
+__global__ void __launch_bounds__(kSumThreads) normal_value_kernel(int64_t blocks, NormalJob<T> job, T* value) {
+  double sums[1];
+  sum_of_blocks(blocks, job.sums, sums);
+  if (threadIdx.x == 0) *value = static_cast<T>(job.scale * sums[0]);
+}
+
+}  // namespace
+
+template <class T>
+void photometric(const PhotometricJob<T>& job, double offset, T* value, Stream stream) {
+  const int64_t blocks = blocks_for(job.width, kSide) * blocks_for(job.height, kSide);
+  const auto kernel = photometric_kernel<T>, gradient = photometric_gradient_kernel<T>;
+  BEAGS_LAUNCH(kernel, blocks, kSideThreads, stream, job);
+  if (job.gradient) BEAGS_LAUNCH(gradient, blocks, kSideThreads, stream, job);
+  const auto finish = photometric_value_kernel<T>;
+  BEAGS_LAUNCH(finish, 1, kSumThreads, stream, blocks, job, offset, value);
+}
+
+template <class T>
+void normal_consistency(const NormalJob<T>& job, T* value, Stream stream) {
+  const int64_t blocks = blocks_for(static_cast<int64_t>(job.width) * job.height, kNormalThreads);
+  const auto kernel = normal_kernel<T>, gradient = normal_gradient_kernel<T>;
+  BEAGS_LAUNCH(kernel, blocks, kNormalThreads, stream, job);
+  if (job.g_depth) BEAGS_LAUNCH(gradient, blocks, kNormalThreads, stream, job);
+  const auto finish = normal_value_kernel<T>;
+  BEAGS_LAUNCH(finish, 1, kSumThreads, stream, blocks, job, value);
+}
+
+#define BEAGS_INSTANTIATE(T)                                               \
+  template void photometric(const PhotometricJob<T>&, double, T*, Stream); \
+  template void normal_consistency(const NormalJob<T>&, T*, Stream);
+BEAGS_INSTANTIATE(float)
+BEAGS_INSTANTIATE(double)
+#undef BEAGS_INSTANTIATE
+
+}  // namespace cuda
+}  // namespace beags
