@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from beags_plugin.rasterizers.cuda import CudaRasterizer
+from beags_plugin.rasterizers.cuda import CudaAheadRasterizer, CudaRasterizer
 from beags_plugin.rasterizers.interface import SurfelInputs
 from benchmarks.cuda_smoke import LEAVES, smoke
 from benchmarks.machine import commit, describe_machine
@@ -70,9 +70,9 @@ def peak_mb(call: Callable[[], Any]) -> float:
     return (torch.cuda.max_memory_allocated() - before) / 2**20
 
 
-def make_cuda() -> CudaRasterizer:
-    """The backend that is measured."""
-    return CudaRasterizer()
+def make_cuda(ahead: bool = False) -> CudaRasterizer:
+    """The backend that is measured; ahead: the one that does not wait for the number of pairs."""
+    return CudaAheadRasterizer() if ahead else CudaRasterizer()
 
 
 class Drawing:
@@ -100,7 +100,9 @@ class Drawing:
 
 
 class GsplatDrawing(Drawing):
-    """gsplat's ``rasterization_2dgs``: colour with expected depth, alpha and normal."""
+    """gsplat's ``rasterization_2dgs``: colour with expected depth, alpha, normal; and the depth's normals, unasked."""
+
+    mode = "RGB+ED"
 
     def images(self) -> dict[str, Tensor]:
         from gsplat.rendering import rasterization_2dgs
@@ -110,9 +112,19 @@ class GsplatDrawing(Drawing):
         color, alpha, normal, *_ = rasterization_2dgs(
             p["means"], p["quats"], scales, torch.sigmoid(p["opacity_logits"]), p["colors"], camera.viewmat[None],
             camera.K[None], camera.width, camera.height, near_plane=self.settings.near, far_plane=self.settings.far,
-            render_mode="RGB+ED", backgrounds=None,
+            render_mode=self.mode, backgrounds=None,
         )  # fmt: skip
-        return {"color": color[0, ..., :3], "alpha": alpha[0, ..., 0], "depth": color[0, ..., 3], "normal": normal[0]}
+        images = {"color": color[0, ..., :3], "alpha": alpha[0, ..., 0], "normal": normal[0]}
+        return images | ({"depth": color[0, ..., 3]} if self.mode == "RGB+ED" else {})
+
+
+class GsplatWithoutDepth(GsplatDrawing):
+    """Less than the others draw: no depth."""
+
+    mode = "RGB"
+
+
+BACKENDS = (("beags", Drawing), ("gsplat", GsplatDrawing), ("gsplat RGB", GsplatWithoutDepth))
 
 
 def drawing_row(scene: Scene, drawing: Drawing, name: str, repeats: int) -> dict[str, Any]:
@@ -173,16 +185,19 @@ def copy_rate() -> float:
 
 
 def step_rows(size: Size, repeats: int) -> list[dict[str, Any]]:
-    """A training step without and with the two losses; Z from 1 to 1000. A row that fails holds the reason."""
+    """A training step without and with the two losses; Z from 1 to 1000. A row that fails holds the reason.
+
+    The last row is a base step whose host does not wait for the number of pairs.
+    """
     rows: list[dict[str, Any]] = []
     scene: Scene | None = None
-    for samples in (None, *SAMPLES):
-        row: dict[str, Any] = {**size_of(size), "samples": samples}
+    for samples, ahead in ((None, False), *((z, False) for z in SAMPLES), (None, True)):
+        row: dict[str, Any] = {**size_of(size), "samples": samples, "ahead": ahead}
         try:
             scene = scene or on_device(make_scene(size), DEVICE)
-            step = TrainingStep(scene, samples)
+            step = TrainingStep(scene, samples, make_cuda(ahead=True) if ahead else None)
             row = {**row, "step_ms": milliseconds(step.run, repeats), "peak_mb": peak_mb(step.run)}
-            if samples is not None and "step_ms" in rows[0]:
+            if rows and "step_ms" in rows[0]:
                 row["ratio_to_base"] = row["step_ms"] / rows[0]["step_ms"]
                 row["extra_ms"] = row["step_ms"] - rows[0]["step_ms"]
         except Exception as error:
@@ -196,7 +211,7 @@ def drawing_rows(size: Size, repeats: int, gsplat: bool) -> list[dict[str, Any]]
     """Both backends on one scene; where one fails (no memory, say), the reason stands in its row."""
     rows: list[dict[str, Any]] = []
     scene: Scene | None = None
-    for name, kind in (("beags", Drawing), ("gsplat", GsplatDrawing))[: 2 if gsplat else 1]:
+    for name, kind in BACKENDS[: None if gsplat else 1]:
         try:
             scene = scene or on_device(make_scene(size), DEVICE)
             rows.append(drawing_row(scene, kind(scene), name, repeats))
@@ -273,15 +288,21 @@ def measure(machine: dict[str, Any], chosen: argparse.Namespace, end: float) -> 
         save()
     save()
     print(table(out), flush=True)
-    return 1 if any("failed" in row and row.get("backend") != "gsplat" for row in out["rows"] + out["steps"]) else 0
+    return (
+        1
+        if any(
+            "failed" in row and not str(row.get("backend")).startswith("gsplat") for row in out["rows"] + out["steps"]
+        )
+        else 0
+    )
 
 
 def table(out: dict[str, Any]) -> str:
     """The rows for a reader."""
     lines = [f"{out.get('gpu')}, a copy moves {out['copy_gb_per_s']:.0f} GB/s, gsplat: {out['gsplat']}"]
-    lines.append("surfels    image        backend  forward   both ms   MB   of copy rate")
+    lines.append("surfels    image        backend    forward   both ms   MB   of copy rate")
     for row in out["rows"]:
-        name = f"{row['n']:<10} {row['width']}x{row['height']:<7} {row['backend']:<8}"
+        name = f"{row['n']:<10} {row['width']}x{row['height']:<7} {row['backend']:<10}"
         if "failed" in row:
             lines.append(f"{name} failed: {row['failed']}")
             continue
@@ -289,7 +310,7 @@ def table(out: dict[str, Any]) -> str:
         lines.append(f"{name} {row['forward_ms']:7.2f} {row['both_ms']:9.2f} {row['peak_mb']:6.0f}  {share}")
     lines.append("step       Z        ms     MB   times the base step")
     for row in out["steps"]:
-        name = f"{row['n']:<10} {row['samples'] or 'base'!s:<5}"
+        name = f"{row['n']:<10} {row['samples'] or ('ahead' if row['ahead'] else 'base')!s:<5}"
         if "failed" in row:
             lines.append(f"{name} failed: {row['failed']}")
             continue

@@ -18,7 +18,7 @@ from beags_plugin.losses.photometric import PhotometricLoss
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.drawing import surfel_inputs
-from beags_plugin.rasterizers.interface import RasterOutputs, SurfelInputs
+from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, SurfelInputs
 from benchmarks.clock import Seconds
 from benchmarks.scenes import CLASSES, Scene
 
@@ -30,11 +30,12 @@ class TrainingStep:
     """The step of the preset ``beags`` on one scene: L1 + SSIM and normal losses; in refinement two more.
 
     samples: Z of the occupancy loss, in a refinement step with boundary and occupancy losses; None: a base step.
+    rasterizer: None for the best one here.
     """
 
-    def __init__(self, scene: Scene, samples: int | None = None) -> None:
+    def __init__(self, scene: Scene, samples: int | None = None, rasterizer: Rasterizer | None = None) -> None:
         self.scene = scene
-        self.rasterizer = make_rasterizer("auto")
+        self.rasterizer = rasterizer or make_rasterizer("auto")
         self.settings = replace(scene.settings, distortion=False)  # the preset's weight of the distortion is 0
         self.refining = samples is not None
         self.losses: dict[str, Loss] = {"photometric loss": PhotometricLoss(), "normal loss": NormalConsistencyLoss()}

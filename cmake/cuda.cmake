@@ -55,6 +55,11 @@ set_target_properties(beags_cuda PROPERTIES CUDA_STANDARD 17 CUDA_STANDARD_REQUI
 target_compile_options(beags_cuda PRIVATE -O3 --fmad=false --expt-relaxed-constexpr)
 target_sources(_native PRIVATE ${cuda_bindings})
 target_compile_definitions(_native PRIVATE BEAGS_HAS_CUDA)
+set(compiled ${CMAKE_CUDA_ARCHITECTURES})
+list(FILTER compiled EXCLUDE REGEX "-virtual$")
+if(NOT compiled)
+  target_compile_definitions(_native PRIVATE BEAGS_CUDA_PTX_ONLY)
+endif()
 # torch brings a CUDA runtime of its own: the names of ours stay inside.
 find_package(Threads REQUIRED)
 target_include_directories(_native SYSTEM PRIVATE ${CMAKE_CUDA_TOOLKIT_INCLUDE_DIRECTORIES})

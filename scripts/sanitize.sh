@@ -12,6 +12,7 @@ tests=(tests/test_{native,native_arguments,native_isa,native_work,rasterizer_ref
   tests/test_{image_ops,occupancy_loss,ops_everywhere,reprojection_votes,sh_colors,slabs,sparse_sums,voxel_grid,voxel_lookup,class_maps}.py)
 tsan_options="suppressions=$root/tests/native/tsan.supp exitcode=66"
 emulated=(tests/test_cuda_{rasterizer,ops,votes}.py)
+kernels=("${emulated[@]}" tests/test_image_ops.py)
 
 run() { # kind, sanitizer, whether with the emulation, tests...
   local kind="$1" sanitizer="$2" emulation="$3" folder="$root/build/sanitize/$1"
@@ -76,10 +77,10 @@ for kind in "${@:-address thread kernels}"; do
       ;;
     kernels)
       races_in_kernels_are_seen
-      OMP_NUM_THREADS=1 run kernels thread ON "${emulated[@]}" -k emulated
+      OMP_NUM_THREADS=1 run kernels thread ON "${kernels[@]}"
       # Blocks unordered; shared memory, which is one place for all of them here, is passed over.
       tsan_options="${tsan_options/tsan.supp/tsan_shared.supp}"
-      BEAGS_EMULATION_UNORDERED=1 OMP_NUM_THREADS=1 run kernels thread ON "${emulated[@]}" -k emulated
+      BEAGS_EMULATION_UNORDERED=1 OMP_NUM_THREADS=1 run kernels thread ON "${kernels[@]}"
       ;;
     *)
       echo "sanitize: there is no sanitizer $one: address, thread or kernels" >&2

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from importlib import import_module
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 from beags_plugin.ops import cuda_extension
-from beags_plugin.rasterizers.cuda import CudaRasterizer
+from beags_plugin.rasterizers.cuda import CudaAheadRasterizer, CudaRasterizer
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, SurfelInputs
 
 
@@ -50,6 +51,24 @@ class EmulatedCudaRasterizer(CudaRasterizer):
     @classmethod
     def unavailable(cls) -> str | None:
         return None if emulation() else "beags_plugin._cuda_emulation was not built (BEAGS_CUDA_EMULATION=ON)"
+
+
+class EmulatedAheadRasterizer(CudaAheadRasterizer):
+    """The one that does not wait, likewise; it notes of which drawings it asked for the number of pairs."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._module = emulation()
+        self.sent: list[Any] = []
+        self.asked: list[int] = []
+
+    def _send(self, totals):
+        self.sent.append(super()._send(totals))
+        return self.sent[-1]
+
+    def _receive(self, sent):
+        self.asked.append(next(i for i, one in enumerate(self.sent) if one is sent))
+        return super()._receive(sent)
 
 
 class CudaOnCpuTensors(Rasterizer):

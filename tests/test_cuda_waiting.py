@@ -43,7 +43,10 @@ LOSSES = [
 
 
 class Fetches(TorchDispatchMode):
-    """Notes what copies from a GPU to the CPU. (Numbers asked of a tensor without data raise by themselves.)"""
+    """Notes what copies from a GPU to the CPU, and what copies the other way while the host waits.
+
+    (Numbers asked of a tensor without data raise by themselves.)
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -52,8 +55,11 @@ class Fetches(TorchDispatchMode):
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         out = function(*args, **(kwargs or {}))
         devices = {value.device.type for value in args if isinstance(value, torch.Tensor)}
-        if isinstance(out, torch.Tensor) and out.device.type == "cpu" and "cuda" in devices:
-            self.found.append(str(function))
+        if isinstance(out, torch.Tensor):
+            there = out.device.type == "cuda" and "cpu" in devices and "copy" in str(function)
+            waits = there and not (kwargs or {}).get("non_blocking", False)
+            if waits or (out.device.type == "cpu" and "cuda" in devices):
+                self.found.append(str(function))
         return out
 
 

@@ -74,6 +74,8 @@ def test_two_processes_find_what_one_finds_and_reuse_it_together(tmp_path):
     for file in (tmp_path / "kept/voxel").glob("voxel grids-*"):
         file.unlink()  # done again, by both
     again = in_two_processes(tmp_path / "again", tmp_path / "kept")
+    for mean, total in (result["exchanged"] for result in (*fresh, *again)):
+        assert mean.tolist() == [0.0, 1.5, 3.0] and total.tolist() == [3]
     for method in preparation_in_processes.METHODS:
         alone, told = preparation_in_processes.found(method)
         assert len(alone[-3]) > 10  # voxels

@@ -58,7 +58,7 @@ try:
     K = torch.tensor([[9.0, 0.0, 4.0], [0.0, 9.0, 4.0], [0.0, 0.0, 1.0]])
     values = (torch.tensor([[0.0, 0.0, 1.0]]), torch.ones(1, 4), torch.full((1, 2), -2.0), torch.zeros(1),
               torch.ones(1, 3), torch.zeros(3))
-    *values, background = (value.to("cuda" if name == "cuda" else "cpu") for value in values)
+    *values, background = (value.to("cuda" if name.startswith("cuda") else "cpu") for value in values)
     inputs = SurfelInputs(values[0].requires_grad_(), *values[1:])
     render = rasterizer.rasterize(inputs, Camera(torch.eye(4), K, 8, 8), RasterSettings(0.1, 9.0), background)
     render.color.sum().backward()
@@ -85,7 +85,7 @@ def _try_in_process(name: str) -> Check:
         [sys.executable, "-c", TRIAL, json.dumps(sys.path), name], capture_output=True, text=True, timeout=120
     )
     if done.returncode < 0:
-        processor, killer = "GPU" if name == "cuda" else "processor", signal.Signals(-done.returncode).name
+        processor, killer = "GPU" if name.startswith("cuda") else "processor", signal.Signals(-done.returncode).name
         cause = f"it ends with {killer}, so it is damaged or made for another {processor}"
         sentence = f"{cause}: reinstall beags from source; {avoided}"
         return Check(name, False, sentence, repair=REBUILD)

@@ -27,7 +27,17 @@ def found() -> tuple[ModuleType | None, str | None]:
         )
     if not torch.cuda.is_available():
         return None, "torch finds no CUDA device; it needs an NVIDIA GPU, its driver, and a torch built for CUDA."
+    driver, needed = cuda.driver_version(), cuda.needed_driver_version()
+    if driver < needed:
+        return None, (
+            f"the GPU's driver knows CUDA up to {_dotted(driver)}, but beags was built with nvcc for {_dotted(needed)} "
+            "or newer; update the driver, or reinstall beags with an older nvcc (CUDACXX names one)."
+        )
     return cuda, None
+
+
+def _dotted(version: int) -> str:
+    return f"{version // 1000}.{version % 1000 // 10}"
 
 
 def load() -> ModuleType | None:

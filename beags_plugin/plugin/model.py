@@ -16,6 +16,7 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import DensifyConfig, initial_surfels
+from beags_plugin.core.devices import sent
 from beags_plugin.core.sh import MAX_DEGREE
 from beags_plugin.errors import UserError
 from beags_plugin.losses.base import Loss, LossInputs
@@ -130,9 +131,9 @@ class Drawn:
     labels: Tensor | None = None
 
 
-def fixed_background(config: BeagsModelConfig) -> Tensor:
+def fixed_background(config: BeagsModelConfig, device: torch.device | str = "cpu") -> Tensor:
     """[3], the colour behind a scene that is looked at or scored: the one that it was trained on, black for random."""
-    return torch.full((3,), 1.0 if config.background_color == "white" else 0.0)
+    return torch.full((3,), 1.0 if config.background_color == "white" else 0.0, device=device)
 
 
 class BeagsModel(SurfelModel):
@@ -248,8 +249,8 @@ class BeagsModel(SurfelModel):
     def _training_background(self) -> Tensor:
         if self.config.background_color == "random":
             generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.step)
-            return torch.rand(3, generator=generator).to(self.device)
-        return fixed_background(self.config).to(self.device)
+            return sent(torch.rand(3, generator=generator), self.device)
+        return fixed_background(self.config, self.device)
 
     def set_background(self, background_color: Tensor) -> None:
         """Take the viewer's background [3]: for its pictures alone, so that no figure depends on it."""

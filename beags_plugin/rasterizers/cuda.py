@@ -3,11 +3,13 @@
 All memory is torch's, all kernels run on torch's current stream. The number of pairs (of a tile and a surfel that
 reaches it) is known on the GPU only, so that their memory is guessed from the drawings before. All kernels of a drawing
 are launched on that guess; then the host waits for the number, which the GPU knew long before the image, and launches
-the last ones again in the rare case that the guess was too small. The GPU never waits for the host.
+the last ones again in the rare case that the guess was too small. The GPU never waits for the host. Where the host
+shall not wait either (``CudaAheadRasterizer``, CUDA graphs), such a drawing has no gradients.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
 from threading import get_ident
 from types import ModuleType
@@ -34,10 +36,10 @@ _FLOATS = ("means", "quats", "log_scales", "opacity_logits", "colors")
 _GEOMETRY, _DISTORTION, _BOUNDARY = 1, 2, 4  # Parts of native/types.h
 _TILE = 16
 _SPARE = 1.25  # memory for so many times as many pairs as the largest drawing so far had
-_FADING = 0.98  # of that largest number, a drawing
 _STEP = 1 << 14  # pairs, or an eighth of the power of two below: few different sizes leave torch's allocator no holes
+_AHEAD = 4  # drawings whose numbers of pairs the host need not know yet
 UNKNOWN = -1
-"""``num_nonfinite`` of a drawing that is captured into a CUDA graph."""
+"""``num_nonfinite`` of a drawing that the host does not wait for."""
 
 
 @dataclass
@@ -56,6 +58,18 @@ class _Frame:
     kept: tuple[Tensor | None, ...] = ()
 
 
+@dataclass
+class _Sent:
+    """Numbers on their way to the host: of pairs, and of surfels that are not finite.
+
+    capacity: for how many pairs there was memory, of a drawing that was not waited for.
+    """
+
+    numbers: Tensor
+    event: Any
+    capacity: int = 0
+
+
 class CudaRasterizer(KernelRasterizer):
     """Float32 and float64 on one GPU; the same bits in every run (there are no atomic additions of floats).
 
@@ -63,10 +77,14 @@ class CudaRasterizer(KernelRasterizer):
     the memory for its pairs is known, and ask ``overflowed`` after replays.
     """
 
+    _waits = True  # for the number of pairs of a drawing that wants gradients
+    _fading = 0.98  # of the largest number of pairs so far, a drawing
+
     def __init__(self) -> None:
         self._module: ModuleType | None = None
-        self._largest: dict[torch.device, float] = {}
-        self._pinned: dict[tuple[torch.device, int], Tensor] = {}
+        # By GPU and thread: what a viewer draws meanwhile changes nothing of a training.
+        self._largest: dict[tuple[torch.device, int], float] = {}
+        self._pending: dict[tuple[torch.device, int], deque[_Sent]] = {}
         self._captured: list[tuple[Tensor, int]] = []
 
     @classmethod
@@ -114,7 +132,7 @@ class CudaRasterizer(KernelRasterizer):
         def draw(frame: _Frame) -> None:
             frame.native.forward(drawing.background, drawing.target, *images, *kept, self._stream(like))
 
-        frame = self._frame(inputs, camera, settings, draw)
+        frame = self._frame(inputs, camera, settings, draw, waits=self._waits or not keep)
         frame.kept = kept
         return Forward(images, frame.visible, frame.num_nonfinite, frame)
 
@@ -195,8 +213,13 @@ class CudaRasterizer(KernelRasterizer):
     def _stream(like: Tensor) -> int:
         return cuda_extension.stream(like.device)
 
-    def _frame(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, draw: Any) -> _Frame:
-        """Project, sort into tiles and draw with ``draw(frame)``, which may be called twice."""
+    def _frame(
+        self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, draw: Any, waits: bool = True
+    ) -> _Frame:
+        """Project, sort into tiles and draw with ``draw(frame)``, which may be called twice.
+
+        waits: for the number of pairs; else what is drawn may be wrong, and then has no gradients.
+        """
         module, means = self._native(), inputs.means
         device, n = means.device, len(means)
         if device.type != ("cpu" if module.EMULATED else "cuda"):
@@ -209,24 +232,41 @@ class CudaRasterizer(KernelRasterizer):
         with cuda_extension.on_device(device):
             frame, totals = self._project(module, inputs, camera, settings)
             capturing = device.type == "cuda" and torch.cuda.is_current_stream_capturing()
-            told = None if capturing else self._send(totals)
-            guess = self._largest.get(device)
+            place = device, get_ident()
+            sent = None if capturing else self._send(totals)
+            pending = self._pending.setdefault(place, deque())
+            while not capturing and len(pending) >= (1 if waits else _AHEAD):
+                self._settle(place, pending.popleft())
+            guess = self._largest.get(place)
             if guess is None:
-                if told is None:
+                if sent is None:
                     raise UserError("draw the scene once before it is captured into a CUDA graph.")
-                guess = float(self._receive(told)[0])
+                guess = self._largest[place] = float(self._receive(sent)[0])
             capacity = self._bin(frame, camera, guess, n)
             draw(frame)
-            if told is None:
+            if sent is None:
                 self._captured.append((totals, capacity))
                 frame.num_nonfinite = UNKNOWN
-                return frame
-            pairs, frame.num_nonfinite = self._receive(told)
-            self._largest[device] = max(guess * _FADING, float(pairs))
-            if pairs > capacity:
-                self._bin(frame, camera, float(pairs), n)
-                draw(frame)
+            elif not waits:
+                sent.capacity = capacity
+                pending.append(sent)
+                frame.num_nonfinite = UNKNOWN
+            else:
+                pairs, frame.num_nonfinite = self._receive(sent)
+                self._expect(place, pairs)
+                if pairs > capacity:
+                    self._bin(frame, camera, float(pairs), n)
+                    draw(frame)
         return frame
+
+    def _expect(self, place: tuple[torch.device, int], pairs: int) -> None:
+        """Learn from a drawing how many pairs the next ones may have."""
+        self._largest[place] = max(self._largest[place] * self._fading, float(pairs))
+
+    def _settle(self, place: tuple[torch.device, int], sent: _Sent) -> None:
+        """Learn from a drawing that was not waited for."""
+        pairs, _ = self._receive(sent)
+        self._expect(place, pairs)
 
     def _project(
         self, module: ModuleType, inputs: SurfelInputs, camera: Camera, settings: RasterSettings
@@ -268,25 +308,43 @@ class CudaRasterizer(KernelRasterizer):
         frame.pairs = lasting
         return capacity
 
-    def _send(self, totals: Tensor) -> tuple[Tensor, Any]:
+    @staticmethod
+    def _send(totals: Tensor) -> _Sent:
         """Start to copy a few numbers to the host."""
         if not totals.is_cuda:
-            return totals, None
-        place = (totals.device, get_ident())  # a viewer's thread may draw at the same time
-        if place not in self._pinned:
-            self._pinned[place] = torch.empty(2, dtype=torch.int64, pin_memory=True)
-        self._pinned[place].copy_(totals, non_blocking=True)
+            return _Sent(totals, None)
+        numbers = torch.empty(2, dtype=torch.int64, pin_memory=True)  # torch keeps such memory for the next ones
+        numbers.copy_(totals, non_blocking=True)
         event = torch.cuda.Event()
         event.record()
-        return self._pinned[place], event
+        return _Sent(numbers, event)
 
     @staticmethod
-    def _receive(told: tuple[Tensor, Any]) -> tuple[int, int]:
-        numbers, event = told
-        if event is not None:
-            event.synchronize()
-        pairs, nonfinite = numbers.tolist()
+    def _receive(sent: _Sent) -> tuple[int, int]:
+        if sent.event is not None:
+            sent.event.synchronize()
+        pairs, nonfinite = sent.numbers.tolist()
         return pairs, nonfinite
+
+
+class CudaAheadRasterizer(CudaRasterizer):
+    """Does not wait for the number of pairs of a drawing that wants gradients, but for that of the fourth before it.
+
+    Where a drawing has more pairs than there is memory for, its farthest surfels are missing and all its gradients are
+    0. ``lost`` counts those that are known by now. The largest number of pairs so far is never forgotten, lest a view
+    that is larger than the others be lost again and again. Other drawings are as ``CudaRasterizer``'s.
+    """
+
+    _waits = False
+    _fading = 1.0
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lost = 0
+
+    def _settle(self, place: tuple[torch.device, int], sent: _Sent) -> None:
+        super()._settle(place, sent)
+        self.lost += int(sent.numbers[0]) > sent.capacity
 
 
 def _capacity(pairs: float) -> int:

@@ -33,6 +33,12 @@ BEAGS_DEVICE T warp_sum_4(T n0, T n1, T n2, T n3, int lane) {
   return sum;
 }
 
+// A drawing with more pairs than memory, which only happens where the host does not wait, has no gradients.
+template <class T>
+BEAGS_DEVICE bool fits(const Bins<T>& bins) {
+  return bins.totals[0] <= bins.capacity;
+}
+
 // What the backward knows of a pixel; g_ are gradients of the loss.
 template <class T>
 struct PixelGradients {
@@ -162,7 +168,7 @@ __global__ void __launch_bounds__(kTilePixels) backward_kernel(TileJob<T> job) {
   if (thread < 3) {
     T sum = 0;
     for (int warp = 0; warp < kTileWarps; ++warp) sum += sums[0][warp][thread];
-    job.g_background[3 * place.tile + thread] = sum;
+    job.g_background[3 * place.tile + thread] = fits(job.bins) ? sum : T(0);
   }
   __syncthreads();
   const int block_end = last;
@@ -208,7 +214,7 @@ __global__ void __launch_bounds__(kTilePixels) backward_kernel(TileJob<T> job) {
       for (int warp = 0; warp < kTileWarps; ++warp) sum += sums[j][warp][number];
       job.records[static_cast<int64_t>(job.bins.pairs[start + first + j]) * kSize + number] = sum;
     }
-    __syncthreads();
+    // The next batch may be loaded meanwhile; its sums are written after the barrier that follows.
   }
 }
 
@@ -243,7 +249,7 @@ __global__ void surfel_gradients_kernel(View view, Inputs<T> inputs, Bins<T> bin
   double sums[kRecord] = {};
   ShapeGradients g{};
   double g_opacity_logit = 0;
-  if (bins.counts[i]) {
+  if (bins.counts[i] && fits(bins)) {
 #pragma unroll
     for (int number = 0; number < kRecord; ++number) sums[number] = number < size ? to.sums[i * kRecord + number] : 0;
     const SurfelParameters surfel = parameters(inputs, i);

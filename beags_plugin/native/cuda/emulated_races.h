@@ -1,11 +1,11 @@
-// What tells GCC's thread sanitizer how the emulated threads of a kernel are ordered, so that it finds what compute-sanitizer's
-// racecheck would look for, and races in global memory besides: each thread is a fiber of the sanitizer's, and only
-// launches and barriers order them. Operations of a warp order nothing in memory, nor do atomic ones. Without the
-// sanitizer it is all empty.
+// What tells GCC's thread sanitizer how the emulated threads of a kernel are ordered, so that it finds what
+// compute-sanitizer's racecheck would look for, and races in global memory besides: each thread is a fiber of the
+// sanitizer's, and only launches and barriers order them. Operations of a warp order nothing in memory, nor do atomic
+// ones. Without the sanitizer it is all empty.
 //
-// Shared memory is one place for all blocks here, so that blocks must be ordered lest they race for it: then races between
-// blocks go unseen. BEAGS_EMULATION_UNORDERED=1 in the environment leaves a block and the two before it unordered; what is
-// said of shared memory is then to be passed over.
+// Shared memory is one place for all blocks here, so that blocks must be ordered lest they race for it: then races
+// between blocks go unseen. BEAGS_EMULATION_UNORDERED=1 in the environment leaves a block and the two before it
+// unordered; what is said of shared memory is then to be passed over.
 #pragma once
 
 #if defined(__SANITIZE_THREAD__)

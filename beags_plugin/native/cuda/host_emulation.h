@@ -1,7 +1,7 @@
 // CUDA's execution model on one CPU thread, for tests of the kernels' logic where there is no GPU: the same sources are
 // compiled by the C++ compiler. The threads of a block are fibers, which run in turn until they meet at a barrier or in
-// an operation of their warp. It shows wrong indices, wrong sums, and barriers that not all threads reach, and, where it
-// is built for GCC's thread sanitizer, data races (emulated_races.h); nothing of the GPU's rounding, and no speed.
+// an operation of their warp. It shows wrong indices, wrong sums, and barriers that not all threads reach, and, where
+// it is built for GCC's thread sanitizer, data races (emulated_races.h); nothing of the GPU's rounding, and no speed.
 #pragma once
 
 #include <cstddef>
@@ -72,7 +72,8 @@ enum class State { kReady, kInWarp, kAtBarrier, kDone };
 
 struct Fiber {
   State state;
-  int operations;  // of its warp, so far
+  int operations;       // of its warp, so far
+  const char* barrier;  // that it waits at
   Races races;
 #if defined(__x86_64__)
   void* stack_pointer;
@@ -192,13 +193,19 @@ BEAGS_UNSEEN inline void run_block(unsigned index, unsigned threads, const std::
     alive = false;
     b.votes = b.voted;
     b.voted = 0;
+    const char* barrier = nullptr;
+    unsigned ended = 0;
     for (unsigned thread = 0; thread < threads; ++thread) {
       Fiber& fiber = b.fibers[thread];
       if (fiber.state == State::kInWarp) fail("some threads of a warp never reach its operation");
+      ended += fiber.state == State::kDone;
       if (fiber.state != State::kAtBarrier) continue;
+      if (barrier && std::strcmp(barrier, fiber.barrier) != 0) fail("threads of a block are at different barriers");
+      barrier = fiber.barrier;
       fiber.state = State::kReady;
       alive = true;
     }
+    if (alive && ended) fail("some threads of a block never reach a barrier");
   }
 }
 
@@ -242,17 +249,30 @@ BEAGS_UNSEEN V lane_value(const V (*values)[1], int lane) {
 }  // namespace emulation
 }  // namespace beags
 
-BEAGS_UNSEEN inline void __syncthreads() {
-  beags::emulation::Races& races = beags::emulation::block().fibers[beags::emulation::block().current].races;
-  races.arrive();
-  beags::emulation::wait(beags::emulation::State::kAtBarrier);
-  races.pass();
+namespace beags {
+namespace emulation {
+
+BEAGS_UNSEEN inline void meet(const char* barrier) {
+  Fiber& fiber = block().fibers[block().current];
+  fiber.barrier = barrier;
+  fiber.races.arrive();
+  wait(State::kAtBarrier);
+  fiber.races.pass();
 }
-BEAGS_UNSEEN inline int __syncthreads_count(int yes) {
-  beags::emulation::block().voted += yes != 0;
-  __syncthreads();
-  return beags::emulation::block().votes;
+BEAGS_UNSEEN inline int meet_and_count(const char* barrier, int yes) {
+  block().voted += yes != 0;
+  meet(barrier);
+  return block().votes;
 }
+
+}  // namespace emulation
+}  // namespace beags
+
+#define BEAGS_PLACE_OF(line) __FILE__ ":" #line
+#define BEAGS_PLACE(line) BEAGS_PLACE_OF(line)
+#define __syncthreads() ::beags::emulation::meet(BEAGS_PLACE(__LINE__))
+#define __syncthreads_count(yes) ::beags::emulation::meet_and_count(BEAGS_PLACE(__LINE__), (yes))
+
 inline unsigned __ballot_sync(unsigned, int yes) {
   const auto values = beags::emulation::exchange("ballot", yes != 0 ? 1u : 0u);
   unsigned bits = 0;
@@ -290,7 +310,9 @@ V atomicExch(V* at, V value) {
 template <class V>
 V atomicMax(V* at, V value) {
   V before = __atomic_load_n(at, __ATOMIC_RELAXED);
-  while (before < value && !__atomic_compare_exchange_n(at, &before, value, false, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
+  // Writes even what is there already, as a GPU may: the thread sanitizer shall see a write.
+  while (!__atomic_compare_exchange_n(at, &before, before < value ? value : before, false, __ATOMIC_RELAXED,
+                                      __ATOMIC_RELAXED)) {
   }
   return before;
 }

@@ -131,7 +131,7 @@ __global__ void __launch_bounds__(kSideThreads) photometric_gradient_kernel(Phot
       const T similar = blurred[0] + T(2) * x * blurred[1] + y * blurred[2];
       job.gradient[at] = job.l1_scale * sign + job.ssim_scale * similar;
     }
-    __syncthreads();
+    // The next channel's slopes may be loaded meanwhile; `down` is written after the barrier that follows.
   }
 }
 

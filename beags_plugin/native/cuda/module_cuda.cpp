@@ -187,6 +187,21 @@ void bind_cuda(nb::module_& m) {
   m.attr("EMULATED") = true;
 #else
   m.attr("EMULATED") = false;
+  // As CUDA counts, 1000 major + 10 minor; asking takes no context on a GPU.
+  m.def("driver_version", [] {
+    int version = 0;
+    check(cudaDriverGetVersion(&version), "asking for the driver's version");
+    return version;
+  });
+  m.def("needed_driver_version", [] {
+    int version = 0;
+    check(cudaRuntimeGetVersion(&version), "asking for the runtime's version");
+#if defined(BEAGS_CUDA_PTX_ONLY)  // the driver compiles it
+    return version;
+#else
+    return version / 1000 * 1000;
+#endif
+  });
 #endif
   bind_frame<float>(m, "FrameF32");
   bind_frame<double>(m, "FrameF64");

@@ -70,7 +70,6 @@ __global__ void __launch_bounds__(kTilePixels)
     for (int i = found; i < kClassesAtOnce; ++i) ids[i] = -1;
     T sums[kClassesAtOnce] = {};
     walk = Walk<T>();
-    __syncthreads();  // all have left the walk before
     composite(job, place, walk, [&](int, const Splat<T>& s, const Hit<T>&, T w, T) {
 #pragma unroll
       for (int i = 0; i < kClassesAtOnce; ++i) sums[i] += s.class_id == ids[i] ? w : T(0);

@@ -1,0 +1,13 @@
+"""Tensors on their way from the host to a GPU."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def sent(value: Tensor, device: torch.device | str) -> Tensor:
+    """``value``, of the CPU, on ``device``; the host does not wait until it is there."""
+    if torch.device(device).type != "cuda":
+        return value.to(device)
+    return value.pin_memory().to(device, non_blocking=True)  # what is not pinned would be copied while the host waits

@@ -1,0 +1,40 @@
+"""Whether the CUDA part can be used, and the sentence where it cannot."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from beags_plugin.ops import cuda_extension, extension
+
+
+@pytest.fixture
+def found(monkeypatch):
+    """``cuda_extension.found`` on a machine with a GPU; driver, needed: CUDA versions, as CUDA counts."""
+
+    def ask(driver: int, needed: int):
+        cuda = SimpleNamespace(driver_version=lambda: driver, needed_driver_version=lambda: needed)
+        monkeypatch.setattr(extension, "found", lambda: (SimpleNamespace(cuda=cuda), None))
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+        module, reason = cuda_extension.found.__wrapped__()
+        assert (module is cuda) == (reason is None)
+        return reason
+
+    return ask
+
+
+def test_a_driver_that_is_new_enough_will_do(found):
+    assert found(13000, 13000) is None and found(13020, 13000) is None
+
+
+def test_a_driver_that_is_too_old_is_named(found):
+    reason = found(12060, 13000)
+    assert "knows CUDA up to 12.6" in reason and "nvcc for 13.0 or newer" in reason
+    assert found(13000, 13020) is not None  # of PTX
+
+
+def test_a_module_without_kernels_says_how_to_get_them(monkeypatch):
+    monkeypatch.setattr(extension, "found", lambda: (SimpleNamespace(), None))
+    assert "install the CUDA toolkit" in cuda_extension.found.__wrapped__()[1]
