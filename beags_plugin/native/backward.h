@@ -122,12 +122,8 @@ BEAGS_INLINE Real<T> weight_gradient(const Job<T>& job, int k, const Splat<T>& s
     g_hit = fma(w, load(p.g_depth), keep(median, load(p.g_median_depth)));
   }
   if (kWanted & kDistortion) {
-    // sum over pairs w_i w_j (m_i - m_j)^2: by w_i it is m (m A - 2 sum w m) + sum w m^2, of which g_alpha has the last
-    // term, and by m_i 2 w_i (m A - sum w m); dm/dd = k / d^2.
-    const Real<T> nearness = hits.get(hits.nearness, i), m = load(p.first) - nearness, g_moment = load(p.g_moment);
-    const Real<T> slope = m * load(p.g_alpha_m) - g_moment;
-    g_w = fma(m, slope - g_moment, g_w);
-    g_hit = fma(w * slope, all(T(2) / job.mapping) * (nearness * nearness), g_hit);
+    add_distortion(job.mapping, load(p.first), hits.get(hits.nearness, i), load(p.g_alpha_m), load(p.g_moment), w, g_w,
+                   g_hit);
   }
   if ((kWanted & kBoundary) && s.class_id != everywhere && !p.labels.all_right(s.class_id)) {
     g_w = g_w + drop(p.labels.right(s.class_id), load(p.g_boundary));
@@ -145,26 +141,23 @@ BEAGS_INLINE void add_gradients(const Job<T>& job, int k, const Splat<T>& s, con
   Real<T> g_hit = all(T(0));
   const Real<T> g_w = weight_gradient<kWanted>(job, k, s, hits, i, everywhere, p, w, sums, g_hit);
   store(p.transmittance, before);
-  // Towards log alpha: alpha dL/dalpha = w g_w - (what lies behind) alpha / (1 - alpha).
   const Real<T> behind = load(p.behind);
-  Real<T> g_log = w * g_w - behind * (alpha * inverse_left);
+  Real<T> g_log = log_alpha_slope(w, g_w, behind, alpha, inverse_left);
   store(p.behind, fma(w, g_w, behind));
   if (!kPlain) g_log = keep(alpha < all(T(kMaxAlpha)), g_log);  // E3: no slope at 0.99
   add(sums[kLogOpacity], g_log);
-  // rho3d: d rho / dq = 2 (u, v, -rho) / q2 and dL/d rho = -g_log / 2; depth = det / q2.
   const Real<T> inverse = hits.get(hits.inverse, i);
-  const Real<T> s_0 = g_log * (inverse * inverse), s_x = s_0 * dx, s_y = s_0 * dy;
+  const auto plane = plane_slopes<kDepths>(g_log, g_hit, inverse, hits.get(hits.rho, i),
+                                           kDepths ? hits.get(hits.depth, i) : all(T(0)));
+  const Real<T> s_x = plane.s_0 * dx, s_y = plane.s_0 * dy;
   add(sums[kSx], s_x);
   add(sums[kSy], s_y);
   add(sums[kSxx], s_x, dx);
   add(sums[kSxy], s_x, dy);
   add(sums[kSyy], s_y, dy);
-  Real<T> along = g_log * hits.get(hits.rho, i);
-  if (kDepths) along = along - g_hit * hits.get(hits.depth, i);
-  const Real<T> h = along * inverse;
-  add(sums[kH], h);
-  add(sums[kHx], h, dx);
-  add(sums[kHy], h, dy);
+  add(sums[kH], plane.h);
+  add(sums[kHx], plane.h, dx);
+  add(sums[kHy], plane.h, dy);
   if (kDepths) add(sums[kDet], g_hit, inverse);
   if (kPlain) return;
   // Low-pass: d rho2d / dc = -4 (dx, dy); depth = p_z.

@@ -2,6 +2,7 @@
 // set.
 #pragma once
 
+#include "pixel_terms.h"
 #include "simd.h"
 #include "types.h"
 
@@ -112,40 +113,21 @@ struct Hits {
   BEAGS_INLINE Real<T> get(const T* field, int i) const { return load(field + i * kLanes<T>); }
 };
 
-// Adds the pack to `hits` if the surfel contributes to one of its lanes that are `wanted`. A plain splat needs neither
-// the low-pass nor the near plane nor alpha's maximum. The forward and the backward must agree in every bit.
+// Adds the pack to `hits` if the surfel contributes to one of its lanes that are `wanted`.
 template <bool kPlain, unsigned kNeeds, class T>
 BEAGS_INLINE void evaluate(const Job<T>& job, const Splat<T>& s, int pack, Real<T> dx, Real<T> dy, Mask<T> wanted,
                            Hits<T>& hits) {
-  const Real<T> q0 = fma(all(s.u_y), dy, all(s.u_x) * dx);  // E2
-  const Real<T> q1 = fma(all(s.v_y), dy, all(s.v_x) * dx);
-  const Real<T> q2 = fma(all(s.w_y), dy, fma(all(s.w_x), dx, all(s.w_0)));
-  Real<T> inverse = all(T(1)) / q2;
-  const Real<T> u = q0 * inverse, v = q1 * inverse;
-  Real<T> rho = fma(u, u, v * v), depth = all(s.det) * inverse, nearness = all(s.nearness_det) * q2;
-  if (!kPlain) {
-    const Real<T> half = fma(dy, dy, dx * dx), rho2d = half + half;
-    const Mask<T> plane = rho <= rho2d;  // false for NaN: an edge-on surfel at its centre
-    rho = min(rho, rho2d);
-    inverse = keep(plane, inverse);
-    depth = select(plane, depth, all(s.z));
-    nearness = select(plane, nearness, all(s.nearness_z));
-  }
-  const Real<T> exponent = fma(all(T(-0.5 / kLn2)), rho, all(s.log2_opacity));
-  Mask<T> on = wanted & (all(T(kLog2MinAlpha)) <= exponent);
-  if (!kPlain) on = on & (all(job.near_plane) <= depth);
-  Real<T> alpha = exp2(exponent);  // E3
-  if (!kPlain) alpha = min(alpha, all(T(kMaxAlpha)));
+  const auto hit = surfel_hit(s, job.near_plane, dx, dy, wanted, Number<kPlain>{});
   const int at = hits.count * kLanes<T>;
-  store(hits.alpha + at, keep(on, alpha));
-  if (kNeeds & kNeedDepth) store(hits.depth + at, keep(on, depth));
-  if (kNeeds & kNeedNearness) store(hits.nearness + at, keep(on, nearness));
+  store(hits.alpha + at, keep(hit.on, hit.alpha));
+  if (kNeeds & kNeedDepth) store(hits.depth + at, keep(hit.on, hit.depth));
+  if (kNeeds & kNeedNearness) store(hits.nearness + at, keep(hit.on, hit.nearness));
   if (kNeeds & kNeedShape) {
-    store(hits.inverse + at, keep(on, inverse));
-    store(hits.rho + at, keep(on, rho));
+    store(hits.inverse + at, keep(hit.on, hit.inverse));
+    store(hits.rho + at, keep(hit.on, hit.rho));
   }
   hits.pack[hits.count] = pack;
-  hits.count += any(on);
+  hits.count += any(hit.on);
 }
 
 template <bool kValue>

@@ -114,31 +114,23 @@ BEAGS_DEVICE void pixel_gradients(T mapping, int k, const Splat<T>& s, const Hit
     g_w = fused(p.g_depth, hit.depth, g_w);
     g_hit = fused(w, p.g_depth, p.median_pair == k ? p.g_median_depth : T(0));
   }
-  if (kWanted & kDistortion) {  // see weight_gradient in ../backward.h
-    const T m = p.first - hit.nearness, slope = m * p.g_alpha_m - p.g_moment;
-    g_w = fused(m, slope - p.g_moment, g_w);
-    g_hit = fused(w * slope, T(2) / mapping * (hit.nearness * hit.nearness), g_hit);
-  }
+  if (kWanted & kDistortion) add_distortion(mapping, p.first, hit.nearness, p.g_alpha_m, p.g_moment, w, g_w, g_hit);
   if ((kWanted & kBoundary) && s.class_id != p.label) g_w += p.g_boundary;
   p.transmittance = before;
-  // Towards log alpha: alpha dL/dalpha = w g_w - (what lies behind) alpha / (1 - alpha).
-  T g_log = w * g_w - p.behind * (hit.alpha * inverse_left);
+  T g_log = log_alpha_slope(w, g_w, p.behind, hit.alpha, inverse_left);
   p.behind = fused(w, g_w, p.behind);
   if (!s.plain && !(hit.alpha < T(kMaxAlpha))) g_log = 0;  // E3: no slope at 0.99
   sums[kLogOpacity] = g_log;
-  // rho3d: d rho / dq = 2 (u, v, -rho) / q2 and dL/d rho = -g_log / 2; depth = det / q2.
-  const T s_0 = g_log * (hit.inverse * hit.inverse), s_x = s_0 * dx, s_y = s_0 * dy;
+  const auto plane = plane_slopes<kDepths>(g_log, g_hit, hit.inverse, hit.rho, hit.depth);
+  const T s_x = plane.s_0 * dx, s_y = plane.s_0 * dy;
   sums[kSx] = s_x;
   sums[kSy] = s_y;
   sums[kSxx] = s_x * dx;
   sums[kSxy] = s_x * dy;
   sums[kSyy] = s_y * dy;
-  T along = g_log * hit.rho;
-  if (kDepths) along -= g_hit * hit.depth;
-  const T h = along * hit.inverse;
-  sums[kH] = h;
-  sums[kHx] = h * dx;
-  sums[kHy] = h * dy;
+  sums[kH] = plane.h;
+  sums[kHx] = plane.h * dx;
+  sums[kHy] = plane.h * dy;
   if (kDepths) sums[kDet] = g_hit * hit.inverse;
   if (s.plain || hit.inverse != T(0)) return;
   // Low-pass: d rho2d / dc = -4 (dx, dy); depth = p_z.

@@ -2,52 +2,27 @@
 // warp has two neighbouring groups of the tile, so that a bit of a pair's mask tells whether half a warp is concerned.
 #pragma once
 
+#include "../pixel_terms.h"
 #include "frame.h"
 
 namespace beags {
 namespace cuda {
 
+using namespace BEAGS_ISA;
+
 constexpr int kBatch = 32;  // splats that a block holds at a time
 constexpr int kTileWarps = kTilePixels / kWarpThreads;
 static_assert(kTilePixels == kBlockThreads && kWarpThreads == 2 * kGroupPixels, "a thread is a pixel");
 
-// What of a surfel's hit later steps need; `on`: whether it contributes, else all is 0.
 template <class T>
-struct Hit {
-  bool on;
-  T alpha, depth, nearness;  // d and k / d of the hit
-  T inverse;                 // 1 / q2, and 0 where the low-pass wins over rho3d
-  T rho;
-};
+using Hit = SurfelHit<T, bool>;
 
-// As `evaluate` in ../composite.h. The forward and the backward must agree in every bit: fused operations are explicit,
-// and the compiler is told to make no others.
+// Where it does not contribute, all is 0.
 template <class T>
 BEAGS_DEVICE Hit<T> evaluate(T near_plane, const Splat<T>& s, T dx, T dy, bool wanted) {
-  const T q0 = fused(s.u_y, dy, s.u_x * dx);  // E2
-  const T q1 = fused(s.v_y, dy, s.v_x * dx);
-  const T q2 = fused(s.w_y, dy, fused(s.w_x, dx, s.w_0));
-  T inverse = T(1) / q2;
-  const T u = q0 * inverse, v = q1 * inverse;
-  T rho = fused(u, u, v * v), depth = s.det * inverse, nearness = s.nearness_det * q2;
-  if (!s.plain) {  // the same for the whole warp
-    const T half = fused(dy, dy, dx * dx), rho2d = half + half;
-    if (!(rho <= rho2d)) {  // true for NaN: an edge-on surfel at its centre
-      rho = rho2d;
-      inverse = 0;
-      depth = s.z;
-      nearness = s.nearness_z;
-    }
-  }
-  const T exponent = fused(T(-0.5 / kLn2), rho, s.log2_opacity);
-  T alpha = power_of_two(exponent);  // E3
-  bool on = wanted && T(kLog2MinAlpha) <= exponent;
-  if (!s.plain) {
-    on = on && near_plane <= depth;
-    alpha = least(alpha, T(kMaxAlpha));
-  }
-  if (!on) return {false, T(0), T(0), T(0), T(0), T(0)};
-  return {true, alpha, depth, nearness, inverse, rho};
+  const Hit<T> hit = surfel_hit(s, near_plane, dx, dy, wanted, s.plain);  // plain: the same for the whole warp
+  if (!hit.on) return {false, T(0), T(0), T(0), T(0), T(0)};
+  return hit;
 }
 
 // Splats of consecutive pairs of a tile, in shared memory.
