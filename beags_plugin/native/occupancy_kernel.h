@@ -4,6 +4,7 @@
 #pragma once
 
 #include "counter.h"
+#include "disc_terms.h"
 #include "lanes.h"
 #include "op_kernels.h"
 #include "quaternion.h"
@@ -90,34 +91,16 @@ BEAGS_OPS_INLINE Parameters<T> parameters(const OccupancyJob<T>& job, int64_t fi
   return {job, gaussian};
 }
 
-// Discs, and what turns the sums over their samples into gradients. What is not used costs nothing: all is inlined.
+// Discs. What is not used costs nothing: all is inlined.
 template <class T>
-struct Discs {
+struct Discs : DiscFrame<typename Lanes<T>::Real> {
   using R = typename Lanes<T>::Real;
-  R unit[4], inverse_length;          // the quaternion q / |q|, 1 / |q|
-  R r0[3], r1[3];                     // columns of the rotation
-  R scale[2];                         // world units
-  R center[3], axis_u[3], axis_v[3];  // voxels; s R0 and s R1
+  using Frame = DiscFrame<R>;
+  using Frame::inverse_length, Frame::r0, Frame::r1, Frame::scale;
 
   BEAGS_OPS_INLINE Discs(const OccupancyJob<T>& job, const Parameters<T>& raw) {
-    const R zero = {}, one = zero + T(1), two = zero + T(2);
-    const R* q = raw.quat;
-    inverse_length = one / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-    for (int part = 0; part < 4; ++part) unit[part] = q[part] * inverse_length;
-    const R w = unit[0], x = unit[1], y = unit[2], z = unit[3];
-    r0[0] = one - two * (y * y + z * z);
-    r0[1] = two * (x * y + w * z);
-    r0[2] = two * (x * z - w * y);
-    r1[0] = two * (x * y - w * z);
-    r1[1] = one - two * (x * x + z * z);
-    r1[2] = two * (y * z + w * x);
     for (int axis = 0; axis < 2; ++axis) scale[axis] = exponential(raw.log_scale[axis]);
-    const T per_voxel = T(1) / job.voxel_size;
-    for (int axis = 0; axis < 3; ++axis) {
-      axis_u[axis] = scale[0] * r0[axis] * per_voxel;
-      axis_v[axis] = scale[1] * r1[axis] * per_voxel;
-      center[axis] = (raw.mean[axis] - job.origin[axis]) * per_voxel;
-    }
+    fill_frame(job, raw.mean, raw.quat, static_cast<Frame&>(*this));
   }
 
   // NaN for those that count as nothing: a number is not finite, a scale is 0 or a quaternion cannot be used.
@@ -144,12 +127,9 @@ BEAGS_OPS_INLINE Boxes<T> boxes_around(const Discs<T>& discs) {
   Boxes<T> boxes;
   boxes.largest = typename Lanes<T>::Int{};
   const auto far_off = boxes.largest + kFarOff;
-  constexpr T kEpsilon = sizeof(T) == 4 ? T(1.1920929e-7) : T(2.220446049250313e-16);
   for (int axis = 0; axis < 3; ++axis) {
-    const R u = discs.axis_u[axis], v = discs.axis_v[axis], center = discs.center[axis];
-    // The samples and this box round differently, by a few units in the last place.
-    const R size = select(center < zero, -center, center);
-    const R half = T(3) * sqrt(u * u + v * v) * (1 + 16 * kEpsilon) + 16 * kEpsilon * size;
+    const R center = discs.center[axis], size = select(center < zero, -center, center);
+    const R half = reach_along<T>(discs.axis_u[axis], discs.axis_v[axis], size);
     const auto near = size + half < static_cast<T>(kVoxelHalf);  // others, and NaN, have no whole numbers
     boxes.low[axis] = floor_to_int(select(near, center - half, zero));
     boxes.size[axis] = floor_to_int(select(near, center + half, zero)) - boxes.low[axis] + 1;
@@ -165,31 +145,16 @@ BEAGS_OPS_INLINE double finish(const OccupancyJob<T>& job, const OccupancyBatch<
                                typename Lanes<T>::Real opacity, const typename Lanes<T>::Real* sums) {
   using R = typename Lanes<T>::Real;
   constexpr int kCount = Lanes<T>::kCount;
-  const R g = sums[0], gu = sums[1], gv = sums[2], guu = sums[3], gvv = sums[4], guv = sums[5];
   T value[kCount];
-  store(value, opacity * g);
+  store(value, opacity * sums[0]);
   double total = 0;
   for (int lane = 0; lane < batch.count; ++lane) total += value[lane];
   if (!job.g_means) return total * job.factor;
 
-  const R s_u = discs.scale[0], s_v = discs.scale[1];
-  const R o = opacity * static_cast<T>(job.factor);
+  R gradients[10];
+  disc_gradients(job, static_cast<const DiscFrame<R>&>(discs), opacity, sums, gradients);
   T out[10][kCount];
-  const R along_u = o * gu / s_u, along_v = o * gv / s_v;
-  for (int axis = 0; axis < 3; ++axis) {  // dG/dp = G (u / s_u R0 + v / s_v R1)
-    store(out[axis], along_u * discs.r0[axis] + along_v * discs.r1[axis]);
-  }
-  // With dG/dR0 = -G u (x - p) / s_u, dG/dR1 = -G v (x - p) / s_v and x - p = u s_u R0 + v s_v R1, the torque
-  // R0 x dG/dR0 + R1 x dG/dR1 is t n, t = G u v (s_u / s_v - s_v / s_u): only a turn within the plane changes G.
-  // A turn by w moves the unit quaternion q by (0, w) q / 2, hence dG/dq = 2 t (0, n) q = 2 t q (0, 0, 0, 1).
-  const R turn = T(2) * o * guv * (s_u / s_v - s_v / s_u) * discs.inverse_length;
-  store(out[3], -turn * discs.unit[3]);
-  store(out[4], turn * discs.unit[2]);
-  store(out[5], -turn * discs.unit[1]);
-  store(out[6], turn * discs.unit[0]);
-  store(out[7], o * guu);  // dG/ds_u = G u^2 / s_u, so dG/d(log s_u) = G u^2
-  store(out[8], o * gvv);
-  store(out[9], o * (T(1) - opacity) * g);
+  for (int number = 0; number < 10; ++number) store(out[number], gradients[number]);
   for (int lane = 0; lane < batch.count; ++lane) {
     const int64_t i = batch.gaussian[lane];
     for (int axis = 0; axis < 3; ++axis) job.g_means[3 * i + axis] = out[axis][lane];

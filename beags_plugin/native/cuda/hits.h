@@ -20,8 +20,8 @@ using Hit = SurfelHit<T, bool>;
 // Where it does not contribute, all is 0.
 template <class T>
 BEAGS_DEVICE Hit<T> evaluate(T near_plane, const Splat<T>& s, T dx, T dy, bool wanted) {
-  const Hit<T> hit = surfel_hit(s, near_plane, dx, dy, wanted, s.plain);  // plain: the same for the whole warp
-  if (!hit.on) return {false, T(0), T(0), T(0), T(0), T(0)};
+  Hit<T> hit = surfel_hit(s, near_plane, dx, dy, wanted, s.plain);  // plain: the same for the whole warp
+  if (!hit.on) hit = Hit<T>{};
   return hit;
 }
 

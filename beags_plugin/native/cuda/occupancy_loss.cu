@@ -2,6 +2,7 @@
 // depend on the number of samples. A block looks at its Gaussians, passes over those whose disc wholly lies in valid
 // voxels, and gives the others to its first threads, so that warps are full. What is computed is as in
 // ../occupancy_kernel.h.
+#include "../disc_terms.h"
 #include "../quaternion.h"
 #include "block_sums.h"
 #include "ops.h"
@@ -42,54 +43,36 @@ BEAGS_DEVICE bool is_finite(T x) {
 
 // A Gaussian's disc.
 template <class T>
-struct Disc {
-  T unit[4], inverse_length;          // the quaternion q / |q|, 1 / |q|
-  T r0[3], r1[3];                     // columns of the rotation
-  T scale[2];                         // world units
-  T center[3], axis_u[3], axis_v[3];  // voxels; s R0 and s R1
+struct Disc : DiscFrame<T> {
   bool broken;  // counts as nothing: a number is not finite, a scale is 0 or the quaternion cannot be used
 
   BEAGS_DEVICE Disc(const OccupancyJob<T>& job, int64_t i) {
-    const T* q = job.quats + 4 * i;
-    inverse_length = T(1) / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-    for (int part = 0; part < 4; ++part) unit[part] = q[part] * inverse_length;
-    const T w = unit[0], x = unit[1], y = unit[2], z = unit[3];
-    r0[0] = 1 - 2 * (y * y + z * z);
-    r0[1] = 2 * (x * y + w * z);
-    r0[2] = 2 * (x * z - w * y);
-    r1[0] = 2 * (x * y - w * z);
-    r1[1] = 1 - 2 * (x * x + z * z);
-    r1[2] = 2 * (y * z + w * x);
-    broken = !is_finite(job.opacity_logits[i]) || !usable_quaternion(inverse_length);
+    DiscFrame<T>& f = *this;
+    for (int axis = 0; axis < 2; ++axis) f.scale[axis] = exp(job.log_scales[2 * i + axis]);
+    fill_frame(job, job.means + 3 * i, job.quats + 4 * i, f);
+    broken = !is_finite(job.opacity_logits[i]) || !usable_quaternion(f.inverse_length);
     for (int axis = 0; axis < 2; ++axis) {
-      const T log_scale = job.log_scales[2 * i + axis];
-      scale[axis] = exp(log_scale);
-      broken = broken || !is_finite(log_scale) || !is_finite(T(1) / scale[axis]);
+      broken = broken || !is_finite(job.log_scales[2 * i + axis]) || !is_finite(T(1) / f.scale[axis]);
     }
     for (int axis = 0; axis < 3; ++axis) {
-      const T mean = job.means[3 * i + axis];
-      axis_u[axis] = scale[0] * r0[axis] / job.voxel_size;
-      axis_v[axis] = scale[1] * r1[axis] / job.voxel_size;
-      center[axis] = (mean - job.origin[axis]) / job.voxel_size;
-      broken = broken || !is_finite(mean) || !is_finite(T(3) * scale[0] * r0[axis] + T(3) * scale[1] * r1[axis]);
+      const T reach = T(3) * f.scale[0] * f.r0[axis] + T(3) * f.scale[1] * f.r1[axis];
+      broken = broken || !is_finite(job.means[3 * i + axis]) || !is_finite(reach);
     }
   }
 
   // The voxels that it reaches: `size` of them along each axis from `low` on. Returns the largest size; more than
   // all windows hold where they lie too far off to be looked up.
   BEAGS_DEVICE int box(int64_t* low, int* size) const {
-    constexpr T kEpsilon = sizeof(T) == 4 ? T(1.1920929e-7) : T(2.220446049250313e-16);
     constexpr int kFarOff = 1 << 20;
     int largest = 0;
     for (int axis = 0; axis < 3; ++axis) {
-      const T u = axis_u[axis], v = axis_v[axis], distance = fabs(center[axis]);
-      // The samples and this box round differently, by a few units in the last place.
-      const T half = T(3) * sqrt(u * u + v * v) * (1 + 16 * kEpsilon) + 16 * kEpsilon * distance;
+      const T center = this->center[axis], distance = fabs(center);
+      const T half = reach_along<T>(this->axis_u[axis], this->axis_v[axis], distance);
       low[axis] = 0;
       size[axis] = kFarOff;
       if (distance + half < static_cast<T>(kVoxelHalf)) {
-        low[axis] = static_cast<int64_t>(floor(center[axis] - half));
-        size[axis] = static_cast<int>(static_cast<int64_t>(floor(center[axis] + half)) - low[axis]) + 1;
+        low[axis] = static_cast<int64_t>(floor(center - half));
+        size[axis] = static_cast<int>(static_cast<int64_t>(floor(center + half)) - low[axis]) + 1;
       }
       largest = size[axis] > largest ? size[axis] : largest;
     }
@@ -125,7 +108,7 @@ BEAGS_DEVICE double sample(const OccupancyJob<T>& job, const VoxelTable& valid, 
   const bool near = disc.box(low, size) <= 4;
   const uint64_t bits = near && known ? voxel_box(valid, class_id, low, size) : 0;
   uint64_t word = mix(static_cast<uint64_t>(i) * kGolden + job.stream);  // hash of stream and Gaussian
-  T g = 0, gu = 0, gv = 0, guu = 0, gvv = 0, guv = 0;
+  T sums[6] = {};
   for (int64_t s = 0; s < job.samples; ++s, word += kGolden) {
     const uint64_t random = mix(word);
     const T area = static_cast<T>(static_cast<uint32_t>(random >> 40)) * T(1.0 / (1 << 24));  // (r / 3)^2
@@ -151,27 +134,22 @@ BEAGS_DEVICE double sample(const OccupancyJob<T>& job, const VoxelTable& valid, 
     }
     if (is_valid) continue;
     const T weight = exp(T(-4.5) * area), wu = weight * u, wv = weight * v;
-    g += weight;
-    gu += wu;
-    gv += wv;
-    guu = fused(wu, u, guu);
-    gvv = fused(wv, v, gvv);
-    guv = fused(wu, v, guv);
+    sums[0] += weight;
+    sums[1] += wu;
+    sums[2] += wv;
+    sums[3] = fused(wu, u, sums[3]);
+    sums[4] = fused(wv, v, sums[4]);
+    sums[5] = fused(wu, v, sums[5]);
   }
-  if (job.g_means) {  // see `finish` in ../occupancy_kernel.h
-    const T s_u = disc.scale[0], s_v = disc.scale[1], o = opacity * static_cast<T>(job.factor);
-    const T along_u = o * gu / s_u, along_v = o * gv / s_v;
-    for (int axis = 0; axis < 3; ++axis) job.g_means[3 * i + axis] = along_u * disc.r0[axis] + along_v * disc.r1[axis];
-    const T turn = T(2) * o * guv * (s_u / s_v - s_v / s_u) * disc.inverse_length;
-    job.g_quats[4 * i] = -turn * disc.unit[3];
-    job.g_quats[4 * i + 1] = turn * disc.unit[2];
-    job.g_quats[4 * i + 2] = -turn * disc.unit[1];
-    job.g_quats[4 * i + 3] = turn * disc.unit[0];
-    job.g_log_scales[2 * i] = o * guu;
-    job.g_log_scales[2 * i + 1] = o * gvv;
-    job.g_opacity_logits[i] = o * (T(1) - opacity) * g;
+  if (job.g_means) {
+    T out[10];
+    disc_gradients(job, static_cast<const DiscFrame<T>&>(disc), opacity, sums, out);
+    for (int axis = 0; axis < 3; ++axis) job.g_means[3 * i + axis] = out[axis];
+    for (int part = 0; part < 4; ++part) job.g_quats[4 * i + part] = out[3 + part];
+    for (int axis = 0; axis < 2; ++axis) job.g_log_scales[2 * i + axis] = out[7 + axis];
+    job.g_opacity_logits[i] = out[9];
   }
-  return static_cast<double>(opacity * g) * job.factor;
+  return static_cast<double>(opacity * sums[0]) * job.factor;
 }
 
 template <class T>
