@@ -14,6 +14,7 @@ from torch import Tensor
 from beags_plugin.ops import cuda_extension
 from beags_plugin.rasterizers.cuda import CudaAheadRasterizer, CudaRasterizer
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, SurfelInputs
+from beags_plugin.rasterizers.pair_counts import PairCounts
 
 
 def emulation() -> ModuleType | None:
@@ -53,22 +54,33 @@ class EmulatedCudaRasterizer(CudaRasterizer):
         return None if emulation() else "beags_plugin._cuda_emulation was not built (BEAGS_CUDA_EMULATION=ON)"
 
 
-class EmulatedAheadRasterizer(CudaAheadRasterizer):
-    """The one that does not wait, likewise; it notes of which drawings it asked for the number of pairs."""
+class Watched(PairCounts):
+    """Notes of which drawings the host asked for the number of pairs."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._module = emulation()
+    def __init__(self, fading: float) -> None:
+        super().__init__(fading)
         self.sent: list[Any] = []
         self.asked: list[int] = []
 
-    def _send(self, totals):
-        self.sent.append(super()._send(totals))
+    def send(self, totals):
+        self.sent.append(super().send(totals))
         return self.sent[-1]
 
-    def _receive(self, sent):
+    def receive(self, sent):
         self.asked.append(next(i for i, one in enumerate(self.sent) if one is sent))
-        return super()._receive(sent)
+        return super().receive(sent)
+
+
+class EmulatedAheadRasterizer(CudaAheadRasterizer):
+    """The one that does not wait, likewise."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._module, self._counts = emulation(), Watched(self._fading)
+
+    @property
+    def asked(self) -> list[int]:
+        return self._counts.asked
 
 
 class CudaOnCpuTensors(Rasterizer):

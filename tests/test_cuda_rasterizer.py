@@ -154,7 +154,7 @@ def test_poison_is_dropped_and_counted_without_spreading(cuda):
 
 def test_a_drawing_larger_than_the_guess_is_drawn_again(emulated, monkeypatch):
     """The memory for pairs is guessed from the drawings before: here from one with hardly any."""
-    monkeypatch.setattr("beags_plugin.rasterizers.cuda._STEP", 16)
+    monkeypatch.setattr("beags_plugin.rasterizers.pair_counts._STEP", 16)
     small, large = make_scene(count=2, size=-5.0), make_scene(count=200)
     small.draw(emulated)
     found, fresh = gradients(emulated, large), gradients(EmulatedCudaRasterizer(), large)
@@ -181,11 +181,11 @@ class Guarded:
 
 def test_the_backward_of_a_drawing_larger_than_its_memory_stays_in_its_memory(emulated, monkeypatch):
     """As in a CUDA graph, where nothing is drawn again: it has no gradients."""
-    monkeypatch.setattr("beags_plugin.rasterizers.cuda._STEP", 16)
+    monkeypatch.setattr("beags_plugin.rasterizers.pair_counts._STEP", 16)
     small, large = make_scene(count=2, size=-5.0), make_scene(count=200)
     small.draw(emulated)
     told = []
-    monkeypatch.setattr(emulated, "_receive", lambda sent: told.append(int(sent.numbers[0])) or (0, 0))
+    monkeypatch.setattr(emulated._counts, "receive", lambda sent: told.append(int(sent.numbers[0])) or (0, 0))
     forward = emulated.forward_kernel
 
     def guarded(drawing):
@@ -212,7 +212,7 @@ def test_the_host_runs_ahead_with_the_same_results(emulated):
 
 
 def test_a_drawing_ahead_that_was_larger_than_the_guess_has_no_gradients(emulated, monkeypatch):
-    monkeypatch.setattr("beags_plugin.rasterizers.cuda._STEP", 16)
+    monkeypatch.setattr("beags_plugin.rasterizers.pair_counts._STEP", 16)
     ahead, small, large = EmulatedAheadRasterizer(), make_scene(count=2, size=-5.0), make_scene(count=200)
     small.draw(ahead)
     lost = [gradients(ahead, large) for _ in range(4)]  # until the host knows
@@ -224,7 +224,7 @@ def test_a_drawing_ahead_that_was_larger_than_the_guess_has_no_gradients(emulate
 
 
 def test_a_large_view_among_small_ones_is_lost_but_once(emulated, monkeypatch):
-    monkeypatch.setattr("beags_plugin.rasterizers.cuda._STEP", 16)
+    monkeypatch.setattr("beags_plugin.rasterizers.pair_counts._STEP", 16)
     ahead, small, large = EmulatedAheadRasterizer(), make_scene(count=20), make_scene(count=200)
     small.draw(ahead)
     for _ in range(4):
@@ -250,8 +250,8 @@ def test_without_cuda_the_reason_is_told():
 
 
 def test_memory_for_pairs_comes_in_few_sizes():
-    from beags_plugin.rasterizers.cuda import _capacity
+    from beags_plugin.rasterizers.pair_counts import capacity_for
 
     for pairs in (0, 1, 5_000, 100_000, 3_000_000, 60_000_000):
-        assert 1.25 * pairs < _capacity(pairs) <= 1.25 * 1.125 * pairs + (1 << 14)
-    assert len({_capacity(pairs) for pairs in range(1_000_000, 2_000_000, 1_000)}) <= 9
+        assert 1.25 * pairs < capacity_for(pairs) <= 1.25 * 1.125 * pairs + (1 << 14)
+    assert len({capacity_for(pairs) for pairs in range(1_000_000, 2_000_000, 1_000)}) <= 9

@@ -9,9 +9,7 @@ shall not wait either (``CudaAheadRasterizer``, CUDA graphs), such a drawing has
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, field
-from threading import get_ident
 from types import ModuleType
 from typing import Any
 
@@ -31,12 +29,11 @@ from beags_plugin.rasterizers.autograd import (
     check_image,
 )
 from beags_plugin.rasterizers.interface import IGNORE, RasterSettings, SurfelInputs, map_ids
+from beags_plugin.rasterizers.pair_counts import PairCounts, capacity_for
 
 _FLOATS = ("means", "quats", "log_scales", "opacity_logits", "colors")
 _GEOMETRY, _DISTORTION, _BOUNDARY = 1, 2, 4  # Parts of native/types.h
 _TILE = 16
-_SPARE = 1.25  # memory for so many times as many pairs as the largest drawing so far had
-_STEP = 1 << 14  # pairs, or an eighth of the power of two below: few different sizes leave torch's allocator no holes
 _AHEAD = 4  # drawings whose numbers of pairs the host need not know yet
 UNKNOWN = -1
 """``num_nonfinite`` of a drawing that the host does not wait for."""
@@ -58,18 +55,6 @@ class _Frame:
     kept: tuple[Tensor | None, ...] = ()
 
 
-@dataclass
-class _Sent:
-    """Numbers on their way to the host: of pairs, and of surfels that are not finite.
-
-    capacity: for how many pairs there was memory, of a drawing that was not waited for.
-    """
-
-    numbers: Tensor
-    event: Any
-    capacity: int = 0
-
-
 class CudaRasterizer(KernelRasterizer):
     """Float32 and float64 on one GPU; the same bits in every run (there are no atomic additions of floats).
 
@@ -82,9 +67,7 @@ class CudaRasterizer(KernelRasterizer):
 
     def __init__(self) -> None:
         self._module: ModuleType | None = None
-        # By GPU and thread: what a viewer draws meanwhile changes nothing of a training.
-        self._largest: dict[tuple[torch.device, int], float] = {}
-        self._pending: dict[tuple[torch.device, int], deque[_Sent]] = {}
+        self._counts = PairCounts(self._fading)
         self._captured: list[tuple[Tensor, int]] = []
 
     @classmethod
@@ -98,7 +81,7 @@ class CudaRasterizer(KernelRasterizer):
 
     def pairs(self) -> int:
         """How many pairs of a tile and a surfel the largest drawing of late had, on any GPU; 0 before the first."""
-        return int(max(self._largest.values(), default=0))
+        return self._counts.largest()
 
     def forward_kernel(self, drawing: Drawing) -> Forward:
         """See ``KernelRasterizer.forward_kernel``."""
@@ -232,41 +215,32 @@ class CudaRasterizer(KernelRasterizer):
         with cuda_extension.on_device(device):
             frame, totals = self._project(module, inputs, camera, settings)
             capturing = device.type == "cuda" and torch.cuda.is_current_stream_capturing()
-            place = device, get_ident()
-            sent = None if capturing else self._send(totals)
-            pending = self._pending.setdefault(place, deque())
-            while not capturing and len(pending) >= (1 if waits else _AHEAD):
-                self._settle(place, pending.popleft())
-            guess = self._largest.get(place)
+            counts, place = self._counts, self._counts.place(device)
+            sent = None if capturing else counts.send(totals)
+            if not capturing:
+                counts.settle(place, remaining=0 if waits else _AHEAD - 1)
+            guess = counts.guess(place)
             if guess is None:
                 if sent is None:
                     raise UserError("draw the scene once before it is captured into a CUDA graph.")
-                guess = self._largest[place] = float(self._receive(sent)[0])
+                first, _ = counts.receive(sent)
+                counts.learn(place, first)
+                guess = float(first)
             capacity = self._bin(frame, camera, guess, n)
             draw(frame)
             if sent is None:
                 self._captured.append((totals, capacity))
                 frame.num_nonfinite = UNKNOWN
             elif not waits:
-                sent.capacity = capacity
-                pending.append(sent)
+                counts.leave(place, sent, capacity)
                 frame.num_nonfinite = UNKNOWN
             else:
-                pairs, frame.num_nonfinite = self._receive(sent)
-                self._expect(place, pairs)
+                pairs, frame.num_nonfinite = counts.receive(sent)
+                counts.learn(place, pairs)
                 if pairs > capacity:
                     self._bin(frame, camera, float(pairs), n)
                     draw(frame)
         return frame
-
-    def _expect(self, place: tuple[torch.device, int], pairs: int) -> None:
-        """Learn from a drawing how many pairs the next ones may have."""
-        self._largest[place] = max(self._largest[place] * self._fading, float(pairs))
-
-    def _settle(self, place: tuple[torch.device, int], sent: _Sent) -> None:
-        """Learn from a drawing that was not waited for."""
-        pairs, _ = self._receive(sent)
-        self._expect(place, pairs)
 
     def _project(
         self, module: ModuleType, inputs: SurfelInputs, camera: Camera, settings: RasterSettings
@@ -294,7 +268,7 @@ class CudaRasterizer(KernelRasterizer):
 
     def _bin(self, frame: _Frame, camera: Camera, pairs: float, n: int) -> int:
         """Sort the pairs into tiles; returns for how many there is memory."""
-        capacity = _capacity(pairs)
+        capacity = capacity_for(pairs)
         if capacity > 2**31 - 1 or n > 2**31 - 1:
             raise UserError("over 1.7 billion pairs of a tile and a surfel: draw fewer surfels or smaller images.")
         device, module = frame.visible.device, self._native()
@@ -308,50 +282,22 @@ class CudaRasterizer(KernelRasterizer):
         frame.pairs = lasting
         return capacity
 
-    @staticmethod
-    def _send(totals: Tensor) -> _Sent:
-        """Start to copy a few numbers to the host."""
-        if not totals.is_cuda:
-            return _Sent(totals, None)
-        numbers = torch.empty(2, dtype=torch.int64, pin_memory=True)  # torch keeps such memory for the next ones
-        numbers.copy_(totals, non_blocking=True)
-        event = torch.cuda.Event()
-        event.record()
-        return _Sent(numbers, event)
-
-    @staticmethod
-    def _receive(sent: _Sent) -> tuple[int, int]:
-        if sent.event is not None:
-            sent.event.synchronize()
-        pairs, nonfinite = sent.numbers.tolist()
-        return pairs, nonfinite
-
 
 class CudaAheadRasterizer(CudaRasterizer):
     """Does not wait for the number of pairs of a drawing that wants gradients, but for that of the fourth before it.
 
     Where a drawing has more pairs than there is memory for, its farthest surfels are missing and all its gradients are
-    0. ``lost`` counts those that are known by now. The largest number of pairs so far is never forgotten, lest a view
+    0 (``lost`` counts those). The largest number of pairs so far is never forgotten, lest a view
     that is larger than the others be lost again and again. Other drawings are as ``CudaRasterizer``'s.
     """
 
     _waits = False
     _fading = 1.0
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.lost = 0
-
-    def _settle(self, place: tuple[torch.device, int], sent: _Sent) -> None:
-        super()._settle(place, sent)
-        self.lost += int(sent.numbers[0]) > sent.capacity
-
-
-def _capacity(pairs: float) -> int:
-    """For how many pairs there shall be memory, where so many are expected."""
-    wanted = int(pairs * _SPARE)
-    step = max(1 << max(wanted.bit_length() - 4, 0), _STEP)
-    return (wanted // step + 1) * step
+    @property
+    def lost(self) -> int:
+        """How many drawings had more pairs than memory, as far as it is known by now."""
+        return self._counts.lost
 
 
 def _tiles(camera: Camera) -> int:

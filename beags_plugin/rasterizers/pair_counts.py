@@ -1,0 +1,99 @@
+"""How many pairs, of a tile and a surfel that reaches it, drawings on GPUs have.
+
+Only the GPU knows; the host guesses from the drawings before, so that there is memory before it is told.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from threading import get_ident
+from typing import Any
+
+import torch
+from torch import Tensor
+
+_SPARE = 1.25  # memory for so many times as many pairs as the largest drawing so far had
+_STEP = 1 << 14  # pairs, or an eighth of the power of two below: few different sizes leave torch's allocator no holes
+
+Place = tuple[torch.device, int]  # a GPU and a thread: what a viewer draws meanwhile changes nothing of a training
+
+
+@dataclass
+class Sent:
+    """A drawing's numbers on their way to the host: of pairs, and of surfels that are not finite.
+
+    capacity: for how many pairs there was memory, if the host did not wait to know whether that is enough.
+    """
+
+    numbers: Tensor
+    event: Any
+    capacity: int = 0
+
+
+class PairCounts:
+    """The largest number of pairs so far, and numbers that the host has not waited for.
+
+    fading: what becomes of that largest number with each drawing, as a factor.
+    """
+
+    def __init__(self, fading: float) -> None:
+        self.fading = fading
+        self.lost = 0  # drawings that there was too little memory for, of those not waited for
+        self._largest: dict[Place, float] = {}
+        self._pending: dict[Place, deque[Sent]] = {}
+
+    def largest(self) -> int:
+        """Of any GPU and thread; 0 before the first drawing."""
+        return int(max(self._largest.values(), default=0))
+
+    @staticmethod
+    def place(device: torch.device) -> Place:
+        """This thread's on a GPU."""
+        return device, get_ident()
+
+    def guess(self, place: Place) -> float | None:
+        """None before the first drawing there."""
+        return self._largest.get(place)
+
+    def learn(self, place: Place, pairs: int) -> None:
+        """How many pairs a drawing had."""
+        self._largest[place] = max(self._largest.get(place, 0.0) * self.fading, float(pairs))
+
+    def send(self, totals: Tensor) -> Sent:
+        """Start to copy the two numbers of a drawing to the host."""
+        if not totals.is_cuda:
+            return Sent(totals, None)
+        numbers = torch.empty(2, dtype=torch.int64, pin_memory=True)  # torch keeps such memory for the next ones
+        numbers.copy_(totals, non_blocking=True)
+        event = torch.cuda.Event()
+        event.record()
+        return Sent(numbers, event)
+
+    def receive(self, sent: Sent) -> tuple[int, int]:
+        """Wait for the numbers: of pairs, and of surfels that are not finite."""
+        if sent.event is not None:
+            sent.event.synchronize()
+        pairs, nonfinite = sent.numbers.tolist()
+        return pairs, nonfinite
+
+    def leave(self, place: Place, sent: Sent, capacity: int) -> None:
+        """Do not wait for a drawing that there was so much memory for; ``settle`` will."""
+        sent.capacity = capacity
+        self._pending.setdefault(place, deque()).append(sent)
+
+    def settle(self, place: Place, remaining: int = 0) -> None:
+        """Learn from the drawings that were left there, but for the last ``remaining`` ones."""
+        pending = self._pending.get(place, ())
+        while len(pending) > remaining:
+            sent = pending.popleft()  # type: ignore[union-attr]
+            pairs, _ = self.receive(sent)
+            self.learn(place, pairs)
+            self.lost += pairs > sent.capacity
+
+
+def capacity_for(pairs: float) -> int:
+    """For how many pairs there shall be memory, where so many are expected."""
+    wanted = int(pairs * _SPARE)
+    step = max(1 << max(wanted.bit_length() - 4, 0), _STEP)
+    return (wanted // step + 1) * step
