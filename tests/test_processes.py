@@ -10,6 +10,7 @@ from pathlib import Path
 
 import preparation_in_processes
 import pytest
+import steps_in_processes
 import torch
 import torch.distributed as dist
 
@@ -18,6 +19,7 @@ from beags_plugin.core import processes
 from beags_plugin.core.processes import each_view
 
 PROGRAM = Path(preparation_in_processes.__file__)
+needs_gloo = pytest.mark.skipif(not dist.is_gloo_available(), reason="torch was built without gloo")
 
 
 def test_alone_views_come_one_after_the_other():
@@ -49,14 +51,14 @@ def test_tensors_of_a_gpu_travel_over_the_cpu():
         assert isinstance(sent, processes._FromGpu) and sent.values.is_cpu and torch.equal(sent.values, values)
 
 
-def in_two_processes(folder: Path, kept: Path) -> list[dict]:
-    """What each of two processes finds; ``kept`` holds the stages that are finished."""
+def in_two_processes(program: Path, folder: Path, *more: Path) -> list:
+    """What each of two processes finds; ``more`` arguments of theirs."""
     root = str(PROGRAM.parents[1])
     folder.mkdir()
 
     def start(rank):
-        files = [str(path) for path in (folder / "meeting", folder / str(rank), kept)]
-        command = [sys.executable, str(PROGRAM), str(rank), "2", *files]
+        files = [str(path) for path in (folder / "meeting", folder / str(rank), *more)]
+        command = [sys.executable, str(program), str(rank), "2", *files]
         return subprocess.Popen(bound(command, signal.SIGKILL), cwd=root, env=environment(root))
 
     running = [start(0), start(1)]
@@ -68,12 +70,23 @@ def in_two_processes(folder: Path, kept: Path) -> list[dict]:
     return [torch.load(folder / str(rank)) for rank in (0, 1)]
 
 
-@pytest.mark.skipif(not dist.is_gloo_available(), reason="torch was built without gloo")
+@needs_gloo
+def test_steps_of_two_processes_are_those_of_one_that_sees_both_views(tmp_path):
+    alone = steps_in_processes.trained(0, 1)
+    for found in in_two_processes(Path(steps_in_processes.__file__), tmp_path / "steps"):
+        *exact, total = zip(found, alone, strict=True)
+        assert all(torch.equal(a, b) for a, b in exact)
+        torch.testing.assert_close(*total)  # a sum over all steps, in another order
+    start = steps_in_processes.labelled_views(4, 0.15)[0]
+    assert (alone[0] - start.means).abs().max() > 0.01  # they did move
+
+
+@needs_gloo
 def test_two_processes_find_what_one_finds_and_reuse_it_together(tmp_path):
-    fresh = in_two_processes(tmp_path / "first", tmp_path / "kept")
+    fresh = in_two_processes(PROGRAM, tmp_path / "first", tmp_path / "kept")
     for file in (tmp_path / "kept/voxel").glob("voxel grids-*"):
         file.unlink()  # done again, by both
-    again = in_two_processes(tmp_path / "again", tmp_path / "kept")
+    again = in_two_processes(PROGRAM, tmp_path / "again", tmp_path / "kept")
     for mean, total in (result["exchanged"] for result in (*fresh, *again)):
         assert mean.tolist() == [0.0, 1.5, 3.0] and total.tolist() == [3]
     for method in preparation_in_processes.METHODS:
