@@ -82,7 +82,7 @@ class ViewerClient(threading.Thread):
         with suppress(ConnectionClosed):
             while True:
                 self._look(0.4 * turn)
-                if "Output type" in self._ids and turn % 3 == 2:
+                if self.seen and "Output type" in self._ids and turn % 3 == 2:  # first a picture of colours
                     self._output = self.outputs[turn // 3 % len(self.outputs)]
                     self._send("GuiUpdateMessage", id=self._ids["Output type"], updates={"value": self._output})
                 turn += 1
