@@ -288,13 +288,8 @@ def measure(machine: dict[str, Any], chosen: argparse.Namespace, end: float) -> 
         save()
     save()
     print(table(out), flush=True)
-    return (
-        1
-        if any(
-            "failed" in row and not str(row.get("backend")).startswith("gsplat") for row in out["rows"] + out["steps"]
-        )
-        else 0
-    )
+    ours = [row for row in out["rows"] + out["steps"] if not row.get("backend", "").startswith("gsplat")]
+    return 1 if any("failed" in row for row in ours) else 0
 
 
 def table(out: dict[str, Any]) -> str:

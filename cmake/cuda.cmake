@@ -22,7 +22,7 @@ if(BEAGS_CUDA_ARCHITECTURES STREQUAL "native" AND CMAKE_VERSION VERSION_LESS 3.2
   message(FATAL_ERROR "BEAGS_CUDA_ARCHITECTURES=native needs CMake 3.24: name the architecture, such as 90.")
 endif()
 set(CMAKE_CUDA_ARCHITECTURES ${BEAGS_CUDA_ARCHITECTURES})
-# nvcc may also come from pip, as cuda-toolkit[nvcc,cudart,cccl].
+# nvcc may also come from pip: cuda-toolkit[nvcc] and nvidia-cuda-cccl.
 if(NOT CMAKE_CUDA_COMPILER AND NOT DEFINED ENV{CUDACXX})
   file(GLOB from_pip "${Python_SITELIB}/nvidia/cu*/bin")
   find_program(BEAGS_NVCC nvcc PATHS /usr/local/cuda/bin ${from_pip})

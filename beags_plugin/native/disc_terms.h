@@ -48,6 +48,18 @@ BEAGS_HD_INLINE R reach_along(R u, R v, R distance) {
   return T(3) * sqrt(u * u + v * v) * (1 + 16 * kEpsilon) + 16 * kEpsilon * distance;
 }
 
+// Adds a sample outside the valid voxels to the six sums: of G Q times 1, u, v, u^2, v^2, u v. weight: G Q, or 0.
+template <class R>
+BEAGS_HD_INLINE void add_sample(R weight, R u, R v, R* sums) {
+  const R wu = weight * u, wv = weight * v;
+  sums[0] += weight;
+  sums[1] += wu;
+  sums[2] += wv;
+  sums[3] = fma(wu, u, sums[3]);
+  sums[4] = fma(wv, v, sums[4]);
+  sums[5] = fma(wu, v, sums[5]);
+}
+
 // Gradients by mean [3], quaternion [4], log scales [2] and opacity logit, in that order. sums: of G Q times 1, u, v,
 // u^2, v^2, u v.
 template <class T, class R>

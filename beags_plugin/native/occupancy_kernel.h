@@ -231,13 +231,7 @@ BEAGS_OPS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& ba
       }
     }
     const R weight = (R)((I)exponential(T(-4.5) * area) & ~valid);
-    const R wu = weight * u, wv = weight * v;
-    sums[0] += weight;
-    sums[1] += wu;
-    sums[2] += wv;
-    sums[3] = fma(wu, u, sums[3]);
-    sums[4] = fma(wv, v, sums[4]);
-    sums[5] = fma(wu, v, sums[5]);
+    add_sample(weight, u, v, sums);
   }
   const double total = finish(job, batch, discs, opacity, sums);
   batch.count = 0;

@@ -133,13 +133,7 @@ BEAGS_DEVICE double sample(const OccupancyJob<T>& job, const VoxelTable& valid, 
       is_valid = brick_bits(valid, class_id, index[0] >> 2, index[1] >> 2, index[2] >> 2) >> place & 1;
     }
     if (is_valid) continue;
-    const T weight = exp(T(-4.5) * area), wu = weight * u, wv = weight * v;
-    sums[0] += weight;
-    sums[1] += wu;
-    sums[2] += wv;
-    sums[3] = fused(wu, u, sums[3]);
-    sums[4] = fused(wv, v, sums[4]);
-    sums[5] = fused(wu, v, sums[5]);
+    add_sample(exp(T(-4.5) * area), u, v, sums);
   }
   if (job.g_means) {
     T out[10];
