@@ -22,7 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from beags_plugin.bench.provenance import commit, describe_machine
-from beags_plugin.child_processes import bound
+from beags_plugin.system.child_processes import bound
 
 SIZES = ((12, 96, 72), (30, 192, 144), (40, 320, 240), (16, 800, 600))  # training views, width, height
 PRESET = "beags-tiny"
@@ -59,8 +59,8 @@ def line(row: dict) -> str:
 
 def measured(folder: Path, views: int, width: int, height: int) -> dict:
     """Forecast and peaks of one run."""
-    from beags_plugin.plugin.forecast import forecast_of_data
     from beags_plugin.plugin.presets import preset_config
+    from beags_plugin.plugin.training.memory_guard import forecast_of_data
     from beags_plugin.sample.writer import SampleConfig, write_sample
 
     data, run, temporary = folder / "data", folder / "run", folder / "tmp"

@@ -31,7 +31,7 @@ def folder_of(scene: str) -> Iterator[Path]:
     if scene not in SAMPLES:
         yield Path(scene).absolute()
         return
-    from beags_plugin.demo import make_sample
+    from beags_plugin.commands.demo import make_sample
 
     with tempfile.TemporaryDirectory() as folder:
         make_sample(Path(folder) / scene, 0, 256, 192, scene.removeprefix("sample-"), 60)
@@ -41,7 +41,7 @@ def folder_of(scene: str) -> Iterator[Path]:
 def swaps(data: Path) -> None:
     """Exchange two objects (or the only one and the background) in some views, and look for it."""
     from beags_plugin.masks.check.consistency import LEAST_POINTS, Agreement
-    from beags_plugin.plugin.masks_check import agreement_of, data_options
+    from beags_plugin.plugin.objects.check_masks import agreement_of, data_options
 
     labels, classes = agreement_of(data_options(data))
     usable = [view for view in range(labels.shape[1]) if (labels[:, view] >= 0).any()]
@@ -74,7 +74,7 @@ def swaps(data: Path) -> None:
 def rims(data: Path) -> None:
     """IoU and BIoU of ragged and of snapped masks, mean over objects and views."""
     from beags_plugin.evaluation.metrics import mask_metrics, mean_metrics
-    from beags_plugin.masks.classes import read_class_map
+    from beags_plugin.labels.classes import read_class_map
     from beags_plugin.masks.rims import snap_to_edges
     from beags_plugin.sample.degrade import rim_amplitude, roughen_rims
 

@@ -26,13 +26,13 @@ def measure(reprojection: str, views: int) -> None:
     from beags_plugin.bench.memory import peak_of
     from beags_plugin.bench.scaling_scene import SETTINGS, Sizes, make_scene
     from beags_plugin.core.cameras import Camera
-    from beags_plugin.masks.label_maps import LabelMaps
-    from beags_plugin.plugin.memory import peak_memory_mb
+    from beags_plugin.labels.label_maps import LabelMaps
+    from beags_plugin.preparation.pipeline import Preparation, PreparationConfig, prepare
+    from beags_plugin.preparation.stages import StageStore
     from beags_plugin.rasterizers import make_rasterizer
-    from beags_plugin.rasterizers.drawing import draw_class_map
+    from beags_plugin.rasterizers.rendering import draw_class_map
     from beags_plugin.refiners import REFINERS
-    from beags_plugin.refiners.preparation import Preparation, PreparationConfig, prepare
-    from beags_plugin.refiners.stages import StageStore
+    from beags_plugin.system.memory import peak_memory_mb
 
     rasterizer = make_rasterizer("auto")
     scene = make_scene(Sizes(views=views, gaussians=5000, pixels=48), rasterizer)  # its own pictures are not used

@@ -15,7 +15,7 @@ import tyro  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn  # noqa: E402
 
-from beags_plugin.errors import UserError  # noqa: E402
+from beags_plugin.system.errors import UserError  # noqa: E402
 from benchmarks.goals import as_json, check_goals  # noqa: E402
 from benchmarks.machine import busy_note, command, commit, describe_machine  # noqa: E402
 from benchmarks.measure import MEASURED_MEMORY, Options, Result, Session, measure_sizes, measure_step, total_work  # noqa: E402

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
 from beags_plugin.rasterizers.interface import RasterSettings, SurfelInputs
 from beags_plugin.rasterizers.reference_geometry import project
+from beags_plugin.system.errors import UserError
 
 OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion", "boundary")
 CLASSES = 4  # 0, the background, and three objects

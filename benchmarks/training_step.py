@@ -17,8 +17,8 @@ from beags_plugin.losses.occupancy import OccupancyLoss
 from beags_plugin.losses.photometric import PhotometricLoss
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.drawing import surfel_inputs
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, SurfelInputs
+from beags_plugin.rasterizers.rendering import surfel_inputs
 from benchmarks.clock import Seconds
 from benchmarks.scenes import CLASSES, Scene
 

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from beags_plugin.child_processes import bound
+from beags_plugin.system.child_processes import bound
 
 WIDTH, HEIGHT, STEPS = 1000, 750, 40
 
@@ -33,7 +33,7 @@ def write_data(root: Path, views: int) -> None:
     from beags_plugin.core.cameras import Camera
     from beags_plugin.extraction.ply import write_ply
     from beags_plugin.rasterizers import make_rasterizer
-    from beags_plugin.rasterizers.drawing import draw_class_map, surfel_inputs
+    from beags_plugin.rasterizers.rendering import draw_class_map, surfel_inputs
 
     rasterizer = make_rasterizer("auto")
     scene = make_scene(Sizes(views=views, gaussians=5000, pixels=48), rasterizer)  # its own pictures are not used

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 from unittest import mock
 
-from beags_plugin import whole_files
-from beags_plugin.child_processes import end_with_parent
+from beags_plugin.system import whole_files
+from beags_plugin.system.child_processes import end_with_parent
 
 
 def forked(call: Callable[[], object], log: Path) -> int:

@@ -36,9 +36,9 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.occupancy import OccupancyLoss
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.progress import progress_bar
 from beags_plugin.rasterizers import make_rasterizer, torch_reference
 from beags_plugin.rasterizers.interface import MIN_TRANSMITTANCE, Rasterizer
+from beags_plugin.system.progress import progress_bar
 from benchmarks.degenerate import FLOATS, Scene, degenerate_scene  # noqa: E402
 
 OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion", "boundary")

@@ -213,9 +213,11 @@ def import_everything() -> None:
     """Import what a run needs, but compute nothing: threads would not survive the forks."""
     from nerfstudio.scripts import train  # noqa: F401
 
-    from beags_plugin import cli  # noqa: F401
+    from beags_plugin.commands import cli  # noqa: F401
     from beags_plugin.ops import extension
-    from beags_plugin.plugin import export, launch, methods  # noqa: F401
+    from beags_plugin.plugin import methods  # noqa: F401
+    from beags_plugin.plugin.objects import export  # noqa: F401
+    from beags_plugin.plugin.runs import launch  # noqa: F401
     from beags_plugin.sample import writer  # noqa: F401
 
     extension.load()
@@ -230,8 +232,8 @@ def write_data(folder: Path) -> None:
 
 def train(data: Path, run: Path) -> None:
     """What ns-train does, once it has read its arguments."""
-    from beags_plugin.plugin.launch import train
     from beags_plugin.plugin.presets import preset_config
+    from beags_plugin.plugin.runs.launch import train
 
     config = preset_config("beags-tiny", OPTIONS, Path("kill_test.py"))
     config.data, config.run_dir = data, run
@@ -240,7 +242,7 @@ def train(data: Path, run: Path) -> None:
 
 def go_on(data: Path, run: Path) -> None:
     """Begin a run, or do what ``beags resume`` does with one that has begun."""
-    from beags_plugin.cli import main
+    from beags_plugin.commands.cli import main
 
     if (run / "config.yml").exists():
         main(["resume", str(run)])
@@ -250,7 +252,7 @@ def go_on(data: Path, run: Path) -> None:
 
 def export(run: Path, folder: Path) -> None:
     """What ``beags export`` does."""
-    from beags_plugin.cli import main
+    from beags_plugin.commands.cli import main
 
     main(["export", "--load-config", str(run / "config.yml"), "--output", str(folder), *EXPORT])
 

@@ -26,8 +26,8 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from beags_plugin.bench.provenance import commit, describe_machine  # noqa: E402
-from beags_plugin.child_processes import bound
 from beags_plugin.sample.writer import SampleConfig, write_sample
+from beags_plugin.system.child_processes import bound
 
 NOISE_MB = 2.0  # what allocators and libraries move it by, with nothing kept; 1 kB a step would be as much
 COUNTED = ("threads", "files", "children")

@@ -16,8 +16,8 @@ from typing import Any
 
 from nerfstudio.scripts.train import entrypoint
 
-from beags_plugin.plugin.memory import memory_mb
 from beags_plugin.plugin.trainer import BeagsTrainer
+from beags_plugin.system.memory import memory_mb
 
 
 def held(step: int | None, phase: str) -> dict[str, Any]:

@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from beags_plugin.evaluation.cells import GAP, below, beside, cell, write_picture
-from beags_plugin.evaluation.contact_sheet import mask_overlay
 from beags_plugin.evaluation.metrics import resize_nearest
 from beags_plugin.export.frames import bounding_box
 from beags_plugin.extraction.select import select_class
-from beags_plugin.plugin.evaluate import EvaluatedRun
-from beags_plugin.plugin.export import training_viewpoints
-from beags_plugin.turntable.orbit import orbit, orbit_settings, stand_of
-from beags_plugin.turntable.pictures import draw_alone
+from beags_plugin.pictures.cells import GAP, below, beside, cell, write_picture
+from beags_plugin.pictures.contact_sheet import mask_overlay
+from beags_plugin.pictures.objects import draw_alone
+from beags_plugin.pictures.orbit import orbit, orbit_settings, stand_of
+from beags_plugin.plugin.objects.evaluate import EvaluatedRun
+from beags_plugin.plugin.objects.export import training_viewpoints
 
 
 @dataclass

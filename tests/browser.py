@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 from websockets.sync.client import connect
 
-from beags_plugin.child_processes import bound
-from beags_plugin.doctor.diagnosis import browser
+from beags_plugin.commands.doctor.diagnosis import browser
+from beags_plugin.system.child_processes import bound
 
 _FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-gpu-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",

@@ -10,7 +10,7 @@ import torch
 from beags_plugin.core.cameras import Camera, viewmat_from_opengl
 from beags_plugin.core.lifting import pixel_rays
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.export.zoom import close_up
+from beags_plugin.export.close_up import close_up
 from beags_plugin.sample.arrangement import Thing, make_still
 from beags_plugin.sample.views import View
 

@@ -9,8 +9,8 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.drawing import draw_class_map
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+from beags_plugin.rasterizers.rendering import draw_class_map
 
 
 def labelled_views(

@@ -13,10 +13,10 @@ import torch.distributed as dist
 from labelled_views import labelled_views
 from raster_scenes import CLASSES
 
-from beags_plugin.core.processes import add_up, average
+from beags_plugin.preparation.pipeline import PreparationConfig, prepare
+from beags_plugin.preparation.stages import StageStore
 from beags_plugin.refiners import REFINERS
-from beags_plugin.refiners.preparation import PreparationConfig, prepare
-from beags_plugin.refiners.stages import StageStore
+from beags_plugin.system.processes import add_up, average
 
 METHODS = ("pairwise", "voxel")
 

@@ -56,8 +56,8 @@ def write_drawn_scene(root: Path, factor: int = 4) -> Surfels:
 
     from beags_plugin.core.cameras import Camera, viewmat_from_opengl
     from beags_plugin.rasterizers import make_rasterizer
-    from beags_plugin.rasterizers.drawing import draw_class_map, surfel_inputs
     from beags_plugin.rasterizers.interface import RasterSettings
+    from beags_plugin.rasterizers.rendering import draw_class_map, surfel_inputs
 
     surfels, class_ids = discs()
     rasterizer, settings = make_rasterizer("auto"), RasterSettings(0.03, 300.0)
@@ -84,8 +84,8 @@ def write_trained(
 
     scale: of the world, with its cameras.
     """
-    from beags_plugin.plugin.config import base_config
-    from beags_plugin.plugin.runs import write_run
+    from beags_plugin.plugin.options.config import base_config
+    from beags_plugin.plugin.runs.layout import write_run
 
     config = base_config()
     config.run_dir = folder
@@ -119,7 +119,7 @@ def write_prepared(run: Path, shift: int = 0, later: str = "", scale: float = 1.
     """Masks after reprojection, those of the data moved down by ``shift`` rows, and a grid in which all that is left
     of the middle is valid for the cup, as refinement would keep them. later: folder of a later round;
     scale: of the world."""
-    from beags_plugin.masks.classes import write_class_map
+    from beags_plugin.labels.classes import write_class_map
     from beags_plugin.occupancy.grid import VisibilityGrid
 
     folder = run / "prepared" / later

@@ -15,8 +15,8 @@ from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.extraction.frames import from_input_frame
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.drawing import surfel_inputs
 from beags_plugin.rasterizers.interface import RasterSettings
+from beags_plugin.rasterizers.rendering import surfel_inputs
 
 
 @dataclass(frozen=True)

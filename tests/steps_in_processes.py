@@ -14,10 +14,10 @@ from labelled_views import labelled_views
 
 from beags_plugin.core.adam import clear_gradients, step_all
 from beags_plugin.core.densification import GradientStatistics
-from beags_plugin.core.processes import add_up, average
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.photometric import ssim
-from beags_plugin.rasterizers.drawing import surfel_inputs
+from beags_plugin.rasterizers.rendering import surfel_inputs
+from beags_plugin.system.processes import add_up, average
 
 STEPS, VIEWS = 3, 2
 

@@ -10,10 +10,10 @@ from raster_scenes import CLASSES, make_scene
 
 from beags_plugin.assignment.assignment import assign_classes
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
 from beags_plugin.rasterizers import RASTERIZERS, make_rasterizer
-from beags_plugin.rasterizers.drawing import geometry_inputs
 from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
+from beags_plugin.rasterizers.rendering import geometry_inputs
+from beags_plugin.system.errors import UserError
 
 SETTINGS = RasterSettings(near=0.1, far=100.0)
 

@@ -93,7 +93,7 @@ def test_a_second_call_trains_only_what_failed(miniature, monkeypatch):
 
 
 def test_the_command_tells_a_mistake_in_one_sentence(capsys, tmp_path):
-    from beags_plugin.cli import main
+    from beags_plugin.commands.cli import main
 
     with pytest.raises(SystemExit) as end:
         main(["bench", "file", "ablatoin", "--output", str(tmp_path)])

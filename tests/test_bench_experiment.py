@@ -13,7 +13,7 @@ from experiment_files import GOOD, masks_of, scene, written
 from beags_plugin.bench.experiment import experiment_names, load_experiment
 from beags_plugin.bench.scenes import Scene
 from beags_plugin.bench.trials import MODEL, Trial, plan, steps_of
-from beags_plugin.errors import UserError
+from beags_plugin.system.errors import UserError
 
 
 @pytest.fixture

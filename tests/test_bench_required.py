@@ -12,9 +12,9 @@ import torch
 from run_folders import write_scene, write_trained
 
 from beags_plugin.bench.required import cells, load, run_required
-from beags_plugin.errors import UserError
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.ops import extension
+from beags_plugin.system.errors import UserError
 
 
 @pytest.fixture

@@ -13,8 +13,8 @@ from beags_plugin.bench.memory import peak_of
 from beags_plugin.bench.scaling import Options, Row, run_scaling, slopes
 from beags_plugin.bench.scaling_scene import Sizes, make_scene
 from beags_plugin.bench.scaling_stages import CHANNELS, STAGES, STEP, VOXEL, stages
-from beags_plugin.errors import UserError
 from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.system.errors import UserError
 
 SMALL = Sizes(classes=5, views=3, gaussians=800, pixels=1728)
 

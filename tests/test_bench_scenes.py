@@ -16,9 +16,9 @@ from beags_plugin.bench.experiment import load_experiment
 from beags_plugin.bench.run import Options, adapted, scenes_of
 from beags_plugin.bench.scenes import Scene, damaged_masks, given_scenes
 from beags_plugin.bench.trials import plan, steps_of
-from beags_plugin.errors import UserError
-from beags_plugin.masks.classes import read_class_map
+from beags_plugin.labels.classes import read_class_map
 from beags_plugin.sample.writer import SampleConfig, write_sample
+from beags_plugin.system.errors import UserError
 
 
 @pytest.fixture

@@ -16,9 +16,9 @@ ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.append(str(ROOT))  # benchmarks/ is not installed
 
-from beags_plugin.child_processes import bound
-from beags_plugin.errors import UserError
 from beags_plugin.rasterizers import native
+from beags_plugin.system.child_processes import bound
+from beags_plugin.system.errors import UserError
 from benchmarks import backends, goals, machine, scenes
 from benchmarks.measure import Options, Result, Session
 from benchmarks.training_step import TrainingStep

@@ -11,14 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from beags_plugin.child_processes import bound
+from beags_plugin.system.child_processes import bound
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="other systems do not end children with their parent")
 
 WAIT = "import time; print('here', flush=True); time.sleep(300)"
 PARENT = """
 import subprocess, sys, time
-from beags_plugin.child_processes import bound
+from beags_plugin.system.child_processes import bound
 child = subprocess.Popen(bound([sys.executable, "-c", {wait!r}], {kind}), stdout=subprocess.PIPE)
 child.stdout.readline()
 print(child.pid, flush=True)

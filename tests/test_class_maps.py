@@ -7,8 +7,7 @@ import pytest
 from PIL import Image
 
 from beags_plugin.data.files import image_size
-from beags_plugin.errors import UserError
-from beags_plugin.masks.classes import (
+from beags_plugin.labels.classes import (
     check_names,
     colorize,
     read_binary_mask,
@@ -18,6 +17,7 @@ from beags_plugin.masks.classes import (
     write_class_map,
 )
 from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.system.errors import UserError
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32, np.int64])

@@ -14,7 +14,7 @@ from run_folders import write_scene, write_trained
 
 pytest.importorskip("nerfstudio")
 
-from beags_plugin import cli
+from beags_plugin.commands import cli
 
 RUN = "{tmp}/run/config.yml"
 PRESETS = "beags, beags-accurate, beags-base, beags-fast, beags-paper, beags-refine, beags-tiny"
@@ -121,7 +121,7 @@ def folder(tmp_path_factory):
 
 @pytest.mark.parametrize("arguments", SENTENCES)
 def test_a_mistake_is_told_in_this_sentence(folder, monkeypatch, arguments):
-    from beags_plugin.doctor import diagnosis
+    from beags_plugin.commands.doctor import diagnosis
 
     out = io.StringIO()
     monkeypatch.setattr(cli, "CONSOLE", Console(file=out, soft_wrap=True, highlight=False))
@@ -137,7 +137,7 @@ def test_a_mistake_is_told_in_this_sentence(folder, monkeypatch, arguments):
 def test_every_subcommand_has_a_sentence():
     import typing
 
-    from beags_plugin.masks_commands import Action
+    from beags_plugin.commands.masks import Action
 
     def names(union) -> set[str]:
         return {info.name for one in typing.get_args(union) for info in typing.get_args(one)[1:]}

@@ -11,9 +11,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from beags_plugin.core.adam import clear_gradients, step_all
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.class_ranks import ClassRanks
 from beags_plugin.core.densification import GradientStatistics
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.losses import silhouette
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.boundary import BoundaryLoss

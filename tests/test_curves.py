@@ -17,7 +17,7 @@ from run_folders import CLASSES, discs, write_scene
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.evaluation.violations import boundary_errors, occupancy_violations
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.plugin.step_clock import StepClock
+from beags_plugin.plugin.training.step_clock import StepClock
 from beags_plugin.rasterizers.interface import IGNORE
 
 LAST = sum(STEPS) - 1
@@ -51,7 +51,7 @@ def run(data, tmp_path_factory):
         yield lambda *step: steps.append(step)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("beags_plugin.plugin.curves.progress_bar", bar)
+        patch.setattr("beags_plugin.plugin.training.curves.progress_bar", bar)
         run_to_end(config)
     return run
 
@@ -87,7 +87,7 @@ def test_every_curve_and_picture_is_in_the_event_file(run):
 
 
 def test_the_last_iou_is_that_of_the_evaluation(run):
-    from beags_plugin.plugin.evaluate import evaluate_run
+    from beags_plugin.plugin.objects.evaluate import evaluate_run
 
     metrics = evaluate_run(run / "config.yml").after
     events = events_of(run)
@@ -122,7 +122,7 @@ def test_a_resumed_run_has_each_step_once(data, tmp_path, monkeypatch, at):
 @pytest.mark.parametrize("where", ["preparation", 53])
 def test_a_resumed_run_has_the_iou_of_the_whole_one(data, run, tmp_path, monkeypatch, where):
     from beags_plugin.plugin.trainer import BeagsTrainer
-    from beags_plugin.refiners import preparation
+    from beags_plugin.preparation import pipeline as preparation
 
     broken, train = tmp_path / "run", BeagsTrainer.train_iteration
 
@@ -147,8 +147,8 @@ def test_a_resumed_run_has_the_iou_of_the_whole_one(data, run, tmp_path, monkeyp
 
 
 def test_a_bad_held_out_mask_leaves_out_curves_only(data, tmp_path, monkeypatch, capsys):
-    from beags_plugin.errors import UserError
-    from beags_plugin.plugin.evaluation_views import HeldOutViews
+    from beags_plugin.plugin.views.held_out_views import HeldOutViews
+    from beags_plugin.system.errors import UserError
 
     def bad(self, index):
         raise UserError("the mask view.png has other proportions.")

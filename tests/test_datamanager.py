@@ -10,10 +10,10 @@ import torch
 from data_folders import CX, CY, FX, FY, HEIGHT, WIDTH, noise, write_image, write_transforms
 from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
 
-from beags_plugin.plugin.datamanager import BeagsDataManager, BeagsDataManagerConfig
-from beags_plugin.plugin.dataparser import BeagsDataParserConfig
-from beags_plugin.plugin.undistortion import undistort_class_map
-from beags_plugin.plugin.views import unique_names
+from beags_plugin.plugin.views.datamanager import BeagsDataManager, BeagsDataManagerConfig
+from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+from beags_plugin.plugin.views.undistortion import undistort_class_map
+from beags_plugin.plugin.views.views import unique_names
 from beags_plugin.rasterizers.interface import IGNORE
 
 LARGE_W, LARGE_H = 160, 120

@@ -23,11 +23,11 @@ from data_folders import (
 )
 from PIL import Image
 
-from beags_plugin.errors import UserError
-from beags_plugin.plugin.cameras import camera_from_nerfstudio
-from beags_plugin.plugin.dataparser import BeagsDataParserConfig
-from beags_plugin.plugin.dataset import BeagsDataset
+from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
+from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+from beags_plugin.plugin.views.dataset import BeagsDataset
 from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.system.errors import UserError
 
 AS_GIVEN = dict(orientation_method="none", center_method="none", auto_scale_poses=False)
 
@@ -333,9 +333,9 @@ def test_data_is_kept_absolute(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("module", ["dataparser", "poses", "colmap_files", "cameras", "seed_points"])
 def test_no_import_of_a_data_manager(module):
-    import beags_plugin.plugin
+    import beags_plugin.plugin.views
 
-    source = (Path(beags_plugin.plugin.__path__[0]) / f"{module}.py").read_text()
+    source = (Path(beags_plugin.plugin.views.__path__[0]) / f"{module}.py").read_text()
     imported = [node.module or "" for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ImportFrom)]
     assert imported and not any("datamanager" in name for name in imported)
 

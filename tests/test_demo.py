@@ -14,11 +14,11 @@ import pytest
 from data_folders import write_image
 from run_folders import write_scene
 
-from beags_plugin import demo
-from beags_plugin.demo import STAMP, _clear, _trained, check_preset, quick_downscale
-from beags_plugin.errors import UserError
-from beags_plugin.plugin.config import base_config
-from beags_plugin.plugin.extract import folder_names
+from beags_plugin.commands import demo
+from beags_plugin.commands.demo import STAMP, _clear, _trained, check_preset, quick_downscale
+from beags_plugin.plugin.objects.extract import folder_names
+from beags_plugin.plugin.options.config import base_config
+from beags_plugin.system.errors import UserError
 
 
 def test_large_images_are_scaled_down_by_a_whole_factor(tmp_path):
@@ -130,7 +130,7 @@ def test_a_demo_that_was_killed_goes_on(tmp_path, monkeypatch):
 
 
 def test_a_demo_that_is_under_way_is_left_alone(tmp_path, monkeypatch):
-    from beags_plugin.plugin.run_lock import RunLock
+    from beags_plugin.system.lock import RunLock
 
     data, run = write_scene(tmp_path / "data"), tmp_path / "out/run"
     (tmp_path / "out").mkdir()
@@ -143,7 +143,7 @@ def test_a_demo_that_is_under_way_is_left_alone(tmp_path, monkeypatch):
 
 
 def test_brackets_in_a_path_are_no_markup(tmp_path):
-    command = [sys.executable, "-m", "beags_plugin.cli", "demo", "--data", str(tmp_path / "x[/y]")]
+    command = [sys.executable, "-m", "beags_plugin.commands.cli", "demo", "--data", str(tmp_path / "x[/y]")]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 2
     assert "x[/y] is no folder" in done.stdout.replace("\n", "") and "Traceback" not in done.stderr

@@ -8,8 +8,8 @@ import sys
 import pytest
 from rich.console import Console
 
-from beags_plugin.doctor import backends, building, diagnosis
-from beags_plugin.doctor.check import Check, print_report
+from beags_plugin.commands.doctor import backends, building, diagnosis
+from beags_plugin.commands.doctor.check import Check, print_report
 from beags_plugin.rasterizers import RASTERIZERS
 
 
@@ -93,7 +93,7 @@ def test_missing_codecs_and_presets_are_findings(monkeypatch):
     from importlib import metadata
 
     from beags_plugin.export.mesh import GlbExporter
-    from beags_plugin.turntable import video
+    from beags_plugin.pictures import video
 
     monkeypatch.setattr(video, "encoder", lambda: None)
     monkeypatch.setattr(metadata, "entry_points", lambda group: [])

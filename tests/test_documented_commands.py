@@ -20,7 +20,7 @@ from run_folders import write_scene, write_trained
 
 pytest.importorskip("nerfstudio")
 
-from beags_plugin import cli
+from beags_plugin.commands import cli
 from beags_plugin.extraction.ply import write_ply
 
 ROOT = Path(__file__).parent.parent
@@ -88,7 +88,7 @@ def folder(tmp_path_factory):
     write_scene(root / "my_scene")
     for name in ("run", "other"):
         config = write_trained(root / name, root / "my_scene")
-    from beags_plugin.plugin.extract import extract_objects, load_scene
+    from beags_plugin.plugin.objects.extract import extract_objects, load_scene
 
     extract_objects(config.parent.parent / "run/config.yml", ["cup"])
     write_ply(root / "scene.ply", load_scene(config).surfels())
@@ -104,7 +104,7 @@ def parsed_by_tyro(kind, words: list[str], **options):
 
 def training_config(words: list[str]):
     """The config that ns-train makes of ``words``."""
-    from beags_plugin.plugin.config import BeagsTrainerConfig
+    from beags_plugin.plugin.options.config import BeagsTrainerConfig
     from beags_plugin.plugin.presets import load_preset, preset_names
 
     preset, *flags = words
@@ -152,7 +152,7 @@ def test_a_documented_command_works(folder, monkeypatch, document, line):
 
 
 def test_the_training_of_the_quick_start_runs(folder, monkeypatch):
-    from beags_plugin.plugin.launch import train
+    from beags_plugin.plugin.runs.launch import train
 
     monkeypatch.chdir(folder)
     (line, *_) = [line for name, line in COMMANDS if name == "README.md" and line.startswith("ns-train")]

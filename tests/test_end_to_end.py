@@ -15,8 +15,8 @@ pytest.importorskip("nerfstudio")
 plyfile = pytest.importorskip("plyfile")
 yaml = pytest.importorskip("yaml")
 
-from beags_plugin.child_processes import bound
 from beags_plugin.sample.writer import SampleConfig, write_sample
+from beags_plugin.system.child_processes import bound
 
 BIN = Path(sys.executable).parent
 
@@ -75,7 +75,7 @@ def test_each_loss_has_its_own_curve(trained):
 
 
 def test_the_base_is_kept_apart_and_has_classes(trained):
-    from beags_plugin.plugin.extract import load_scene
+    from beags_plugin.plugin.objects.extract import load_scene
 
     folder, _ = trained
     base, refined = load_scene(folder / "base" / "config.yml"), load_scene(folder / "config.yml")
@@ -105,7 +105,7 @@ def extracted(trained):
 
 
 def test_extraction_writes_a_run_and_a_ply_per_object(trained, extracted):
-    from beags_plugin.plugin.extract import load_scene
+    from beags_plugin.plugin.objects.extract import load_scene
 
     folder, _ = trained
     whole = load_scene(folder / "config.yml")
@@ -168,7 +168,7 @@ def test_export_writes_every_object_and_the_background(trained, tmp_path):
 
 
 def test_removing_an_object_keeps_the_rest(trained):
-    from beags_plugin.plugin.extract import extract_objects, load_scene
+    from beags_plugin.plugin.objects.extract import extract_objects, load_scene
 
     folder, _ = trained
     whole = load_scene(folder / "config.yml")
@@ -203,7 +203,7 @@ def test_refine_starts_from_a_base_run(trained, data, tmp_path):
 
 
 def test_refiner_none_leaves_the_scene_as_it_is(trained, data, tmp_path):
-    from beags_plugin.plugin.extract import load_scene
+    from beags_plugin.plugin.objects.extract import load_scene
 
     folder, _ = trained
     code, text = run(
@@ -218,7 +218,7 @@ def test_refiner_none_leaves_the_scene_as_it_is(trained, data, tmp_path):
 
 
 def test_a_run_that_was_refining_is_resumed_with_its_classes_and_masks(trained, data, tmp_path):
-    from beags_plugin.plugin.extract import load_scene
+    from beags_plugin.plugin.objects.extract import load_scene
 
     folder, _ = trained
     code, text = run(
@@ -235,8 +235,8 @@ def test_a_run_that_was_refining_is_resumed_with_its_classes_and_masks(trained, 
 
 
 def test_a_second_round_makes_masks_again_also_after_a_resume(trained, data, tmp_path):
-    from beags_plugin.plugin.extract import load_scene
-    from beags_plugin.plugin.runs import last_prepared
+    from beags_plugin.plugin.objects.extract import load_scene
+    from beags_plugin.plugin.runs.layout import last_prepared
 
     folder, _ = trained
     options = (
@@ -270,7 +270,7 @@ def test_a_trained_scene_is_drawn_whole_cropped_and_in_the_viewer_by_object(trai
     from nerfstudio.data.scene_box import OrientedBox
     from nerfstudio.utils.eval_utils import eval_setup
 
-    from beags_plugin.plugin.cameras import camera_from_nerfstudio
+    from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 
     folder, _ = trained
     _, pipeline, _, _ = eval_setup(folder / "config.yml", test_mode="test")
@@ -290,7 +290,7 @@ def test_a_trained_scene_is_drawn_whole_cropped_and_in_the_viewer_by_object(trai
 
 def test_demo_on_a_folder_writes_table_figures_and_picture(trained, tmp_path, monkeypatch):
     """The measuring half of the demo, on the run that is there."""
-    from beags_plugin.demo import measure
+    from beags_plugin.commands.demo import measure
 
     folder, _ = trained
     measure(folder, tmp_path, {})

@@ -10,11 +10,11 @@ import sys
 import pytest
 import torch
 
-from beags_plugin.errors import UserError, writing
+from beags_plugin.system.errors import UserError, writing
 
 PROGRAM = """
 import beags_plugin.plugin
-from beags_plugin.errors import UserError, print_user_errors_plainly
+from beags_plugin.system.errors import UserError, print_user_errors_plainly
 print_user_errors_plainly()
 raise {error}
 """

@@ -14,8 +14,13 @@ import torch
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
-from beags_plugin.evaluation.contact_sheet import (
+from beags_plugin.evaluation.metrics import MaskMetrics
+from beags_plugin.evaluation.protocol import Protocol
+from beags_plugin.evaluation.records import EvalView, ObjectMetrics, SceneMetrics
+from beags_plugin.evaluation.report import RunMetrics
+from beags_plugin.evaluation.run_metrics import evaluate_scene
+from beags_plugin.evaluation.table import print_run, summary_json
+from beags_plugin.pictures.contact_sheet import (
     SheetRow,
     contact_sheet,
     draw_rows,
@@ -23,13 +28,8 @@ from beags_plugin.evaluation.contact_sheet import (
     novel_camera,
     write_contact_sheet,
 )
-from beags_plugin.evaluation.metrics import MaskMetrics
-from beags_plugin.evaluation.protocol import Protocol
-from beags_plugin.evaluation.records import EvalView, ObjectMetrics, SceneMetrics
-from beags_plugin.evaluation.report import RunMetrics
-from beags_plugin.evaluation.run_metrics import evaluate_scene
-from beags_plugin.evaluation.table import print_run, summary_json
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterOutputs, RasterSettings
+from beags_plugin.system.errors import UserError
 
 SIZE = 24
 SETTINGS = RasterSettings(near=0.1, far=100.0)

@@ -17,7 +17,7 @@ from test_extraction import a_rotation, random_surfels
 
 pytest.importorskip("nerfstudio")
 
-from beags_plugin.cli import main
+from beags_plugin.commands.cli import main
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export import EXPORTERS
@@ -26,10 +26,10 @@ from beags_plugin.export.frames import Frame, bounding_box
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.ply import read_ply
 from beags_plugin.extraction.select import select_class
-from beags_plugin.plugin.export import export_run
+from beags_plugin.plugin.objects.export import export_run
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.drawing import surfel_inputs
 from beags_plugin.rasterizers.interface import RasterSettings
+from beags_plugin.rasterizers.rendering import surfel_inputs
 
 SETTINGS = RasterSettings(0.01, 100.0)
 

@@ -17,18 +17,18 @@ from scipy.spatial import cKDTree
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.lifting import project
-from beags_plugin.errors import UserError
 from beags_plugin.export.base import NothingToExport, Piece, Viewpoints, make_exporter
+from beags_plugin.export.close_up import close_up
 from beags_plugin.export.frames import bounding_box
 from beags_plugin.export.fusion import Mesh, _grid_mb, sorted_mesh, voxel_size, without_small_parts
 from beags_plugin.export.glb import linear_from_srgb
 from beags_plugin.export.mesh import GlbExporter
 from beags_plugin.export.mesh_options import MeshOptions
-from beags_plugin.export.zoom import close_up
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.sample.arrangement import Thing
 from beags_plugin.sample.views import make_views
+from beags_plugin.system.errors import UserError
 
 OPTIONS = {"resolution": 96, "truncation": 4.0}  # the cup's wall is 9 voxels thick: its two sides stay apart
 

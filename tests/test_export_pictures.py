@@ -19,14 +19,14 @@ from covered_things import camera_of, covered, thing_called
 from data_folders import quaternion, write_image
 from run_folders import CLASSES, state_of
 
-from beags_plugin.cli import main
+from beags_plugin.commands.cli import main
 from beags_plugin.core.rotations import quat_product
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.extraction.select import select_class
-from beags_plugin.plugin.config import base_config
-from beags_plugin.plugin.evaluate import EvaluatedRun
-from beags_plugin.plugin.runs import TRANSFORM_FILE, write_run
-from beags_plugin.rasterizers.drawing import surfel_inputs
+from beags_plugin.plugin.objects.evaluate import EvaluatedRun
+from beags_plugin.plugin.options.config import base_config
+from beags_plugin.plugin.runs.layout import TRANSFORM_FILE, write_run
+from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.sample.views import View, make_views
 
 WIDTH, HEIGHT = 640, 480

@@ -15,9 +15,9 @@ from test_extraction import random_surfels
 
 from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
 from beags_plugin.export.base import Piece, make_exporter
 from beags_plugin.export.spz import fractional_bits
+from beags_plugin.system.errors import UserError
 
 SH_COUNT = {0: 0, 1: 3, 2: 8, 3: 15}
 

@@ -11,10 +11,10 @@ from plyfile import PlyData
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
 from beags_plugin.extraction.frames import quat_from_rotation, to_input_frame
 from beags_plugin.extraction.ply import THICKNESS, read_ply, write_ply
 from beags_plugin.extraction.select import remove_class, select_class
+from beags_plugin.system.errors import UserError
 
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 

@@ -12,17 +12,18 @@ import torch
 from labelled_views import labelled_views
 from raster_scenes import CLASSES
 
-from beags_plugin.core import filed_tensors
-from beags_plugin.core.filed_tensors import FiledTensors, filed, write_tensors
-from beags_plugin.errors import UserError
+from beags_plugin.labels.label_maps import LabelMaps, PackedMaps
 from beags_plugin.masks import REPROJECTIONS
-from beags_plugin.masks.label_maps import LabelMaps, PackedMaps
 from beags_plugin.masks.reprojection import check_views
 from beags_plugin.masks.voxel_reprojection import reproject_voxel
-from beags_plugin.refiners import REFINERS, consistent_masks
-from beags_plugin.refiners.preparation import PreparationConfig, prepare
-from beags_plugin.refiners.stages import Stages, StageStore
-from beags_plugin.whole_files import write_whole
+from beags_plugin.preparation import consistent_masks
+from beags_plugin.preparation.pipeline import PreparationConfig, prepare
+from beags_plugin.preparation.stages import Stages, StageStore
+from beags_plugin.refiners import REFINERS
+from beags_plugin.system import filed_tensors
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.filed_tensors import FiledTensors, filed, write_tensors
+from beags_plugin.system.whole_files import write_whole
 
 VALUES = [
     torch.tensor([[1.5, -0.0], [float("nan"), float("inf")]]),

@@ -14,12 +14,18 @@ pytest.importorskip("nerfstudio")
 from resumed_runs import assert_same_run, checkpoint_of, resume_to_end, run_to_end, short_config
 from run_folders import write_scene
 
-from beags_plugin.errors import UserError
-from beags_plugin.plugin import forecast as forecasts
-from beags_plugin.plugin.forecast import MemoryWatch, check_memory, checks_of_run, forecast, is_out_of_memory
-from beags_plugin.plugin.memory import available_mb, memory_mb
 from beags_plugin.plugin.presets import preset_config
 from beags_plugin.plugin.trainer import BeagsTrainer
+from beags_plugin.plugin.training import memory_guard as forecasts
+from beags_plugin.plugin.training.memory_guard import (
+    MemoryWatch,
+    check_memory,
+    checks_of_run,
+    forecast,
+    is_out_of_memory,
+)
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.memory import available_mb, memory_mb
 
 VIEWS = [(1000, 750)] * 100
 
@@ -126,7 +132,7 @@ def test_groups_limit_what_is_left(tmp_path, monkeypatch):
     def path(first, *rest):
         return real(tmp_path, *rest) if first == "/sys/fs/cgroup" else places.get(first, real(first, *rest))
 
-    monkeypatch.setattr("beags_plugin.plugin.memory.Path", path)
+    monkeypatch.setattr("beags_plugin.system.memory.Path", path)
     assert available_mb() == pytest.approx(250.0)
 
 

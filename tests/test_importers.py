@@ -17,7 +17,6 @@ from beags_plugin.core.flattening import Gaussians, flatten, flattening, without
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
 from beags_plugin.extraction.frames import from_input_frame, to_input_frame
 from beags_plugin.extraction.ply import write_ply
 from beags_plugin.extraction.splat_file import read_splat_file
@@ -25,6 +24,7 @@ from beags_plugin.importers import IMPORTERS
 from beags_plugin.importers.base import find_importer
 from beags_plugin.importers.checkpoint import CheckpointImporter
 from beags_plugin.importers.ply import PlyImporter
+from beags_plugin.system.errors import UserError
 
 
 def gaussians(count: int = 40, seed: int = 0) -> Gaussians:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from beags_plugin import whole_files
+from beags_plugin.system import whole_files
 
 if sys.platform != "linux":
     pytest.skip("processes are forked, and looked at in /proc", allow_module_level=True)

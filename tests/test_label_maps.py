@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_reprojection_votes import METHODS, larger_scene, same
 
-from beags_plugin.masks.label_maps import LabelMaps, narrowed, widened
+from beags_plugin.labels.label_maps import LabelMaps, narrowed, widened
 from beags_plugin.rasterizers.interface import IGNORE
 
 

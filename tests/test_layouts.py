@@ -26,9 +26,9 @@ import beags_plugin.data.files as files
 from beags_plugin.data import LAYOUTS
 from beags_plugin.data.layout import Layout
 from beags_plugin.data.scene import PoseTable, Scene
-from beags_plugin.errors import UserError
-from beags_plugin.plugin.cameras import camera_from_nerfstudio
-from beags_plugin.plugin.dataset import BeagsDataset
+from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
+from beags_plugin.plugin.views.dataset import BeagsDataset
+from beags_plugin.system.errors import UserError
 
 
 def test_the_registry_names_all_layouts():

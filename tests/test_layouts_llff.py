@@ -11,7 +11,7 @@ from data_folders import CX, CY, FX, FY, HEIGHT, WIDTH, noise, write_colmap, wri
 from layout_folders import FOCAL, opencv_matrices, write_copies, write_llff, write_poses_bounds
 from parsed_views import AS_GIVEN, POINT, moved, names, parse, pixel, real, title
 
-from beags_plugin.plugin.cameras import camera_from_nerfstudio
+from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 
 
 def test_llff_scales_the_intrinsics_to_the_images_and_turns_the_axes(tmp_path):

@@ -12,7 +12,7 @@ from data_folders import HEIGHT, WIDTH, noise, write_image
 from layout_folders import ids, write_dtu, write_lerf_mask, write_llff
 from parsed_views import parse
 
-from beags_plugin.errors import UserError
+from beags_plugin.system.errors import UserError
 
 MISTAKES = {
     "poses": (lambda root: np.save(root / "poses_bounds.npy", np.ones((10, 15))), "no finite .views, 17. numbers"),

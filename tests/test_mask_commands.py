@@ -12,13 +12,13 @@ from data_folders import HEIGHT, WIDTH, write_colmap, write_image, write_transfo
 from run_folders import write_scene, write_trained
 from source_scenes import truth
 
-from beags_plugin.cli import main
-from beags_plugin.errors import UserError
-from beags_plugin.masks.classes import read_class_map
+from beags_plugin.commands.cli import main
+from beags_plugin.labels.classes import read_class_map
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Progress, SourceScene
-from beags_plugin.plugin.dataparser import BeagsDataParserConfig
-from beags_plugin.plugin.made_masks import make_masks
+from beags_plugin.plugin.objects.make_masks import make_masks
+from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.system.errors import UserError
 
 
 def test_the_command_writes_masks_that_training_finds(tmp_path, capsys):
@@ -162,9 +162,9 @@ def test_reprojection_of_a_run_writes_masks_of_the_photos_size(tmp_path, lens, c
 
 
 def test_the_check_of_a_run_takes_its_options_and_what_replaces_them(tmp_path):
-    from beags_plugin.plugin.extract import read_scene
-    from beags_plugin.plugin.masks_check import options_beside
-    from beags_plugin.plugin.reprojected_run import ReprojectionOptions, data_of_run
+    from beags_plugin.plugin.objects.check_masks import options_beside
+    from beags_plugin.plugin.objects.extract import read_scene
+    from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, data_of_run
 
     data = write_scene(tmp_path / "scene")
     config = write_trained(tmp_path / "run", data)
@@ -181,7 +181,7 @@ def test_the_check_of_a_run_takes_its_options_and_what_replaces_them(tmp_path):
 
 
 def test_the_geometry_of_a_run_has_its_held_out_views_too(tmp_path):
-    from beags_plugin.plugin.made_masks import RunGeometry
+    from beags_plugin.plugin.objects.make_masks import RunGeometry
 
     data = write_scene(tmp_path / "scene")
     geometry = RunGeometry(write_trained(tmp_path / "run", data))

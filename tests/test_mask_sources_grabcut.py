@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from source_scenes import Wall, coloured, make
 
-from beags_plugin.errors import UserError
 from beags_plugin.masks.rims import snap_to_edges
 from beags_plugin.masks.sources.base import SourceScene
 from beags_plugin.masks.sources.grabcut import GrabCutSource, carry, cut_by_box
 from beags_plugin.masks.sources.prompts import Prompt
 from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.system.errors import UserError
 
 
 def test_grabcut_finds_the_object_in_its_box_and_repeats_itself():

@@ -12,12 +12,12 @@ import pytest
 import torch
 from data_folders import look_at, write_image, write_transforms
 
-from beags_plugin.cli import main
+from beags_plugin.commands.cli import main
+from beags_plugin.labels.classes import write_class_map
 from beags_plugin.masks.check.areas import contradicted
 from beags_plugin.masks.check.consistency import UNSEEN, Agreement, labels_at, ranks_of
-from beags_plugin.masks.check.findings import named, percent
-from beags_plugin.masks.classes import write_class_map
-from beags_plugin.masks.pictures import coverage_picture
+from beags_plugin.masks.check.issues import named, percent
+from beags_plugin.pictures.masks import coverage_picture
 from beags_plugin.rasterizers.interface import IGNORE
 
 VIEWS, SIDE = 12, 48
@@ -60,7 +60,7 @@ def write_balls(root: Path, change=lambda view, ids: ids) -> Path:
 
 
 def findings(root: Path, **options) -> dict[str, list]:
-    from beags_plugin.plugin.masks_check import check_scene, data_options
+    from beags_plugin.plugin.objects.check_masks import check_scene, data_options
 
     found: dict[str, list] = {}
     for finding in check_scene(data_options(root, **options)).findings:
@@ -219,8 +219,8 @@ def test_contradicted_areas_are_more_than_rims():
 
 
 def test_areas_that_a_run_contradicts_are_told_with_what_they_cost(tmp_path):
-    from beags_plugin.masks.label_maps import LabelMaps, PackedMaps
-    from beags_plugin.plugin.masks_check import check_scene, check_with_run, data_options
+    from beags_plugin.labels.label_maps import LabelMaps, PackedMaps
+    from beags_plugin.plugin.objects.check_masks import check_scene, check_with_run, data_options
 
     def change(view, ids):
         blob = ids.copy()

@@ -76,7 +76,7 @@ def test_a_forced_instruction_set_that_cannot_run_is_told_in_a_sentence():
     names = [name for name in (*NAMES, "mmx") if name not in native.instruction_sets()]
     program = """
 import os, sys
-from beags_plugin.errors import UserError
+from beags_plugin.system.errors import UserError
 from beags_plugin.rasterizers import make_rasterizer
 for name in sys.argv[1:]:
     os.environ["BEAGS_ISA"] = name

@@ -342,8 +342,8 @@ def test_a_gaussian_that_no_ray_sees_learns_position_scale_rotation_and_opacity(
     """Behind an opaque wall the image gives no gradient at all; the occupancy loss reaches every kind of parameter."""
     from beags_plugin.core.cameras import Camera
     from beags_plugin.rasterizers import make_rasterizer
-    from beags_plugin.rasterizers.drawing import surfel_inputs
     from beags_plugin.rasterizers.interface import RasterSettings
+    from beags_plugin.rasterizers.rendering import surfel_inputs
 
     wall = 20  # opaque layers, each large, before the camera's whole view
     means = torch.cat([torch.tensor([[0.0, 0.0, 2.0]]).repeat(wall, 1), torch.tensor([[0.05, 0.02, 4.0]])])

@@ -24,8 +24,8 @@ from beags_plugin.export.base import Piece, make_exporter
 from beags_plugin.extraction.ply import write_ply
 from beags_plugin.importers.ply import PlyImporter
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.drawing import surfel_inputs
 from beags_plugin.rasterizers.interface import RasterSettings
+from beags_plugin.rasterizers.rendering import surfel_inputs
 
 SIZE, FOCAL, DEPTH = 31, 40.0, 2.0  # pixels; the ray of the middle pixel meets the first disc's centre
 TURN = Rotation.from_euler("xyz", (0.4, -0.7, 1.1))  # of the camera in the world

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from beags_plugin.errors import UserError
 from beags_plugin.losses.occupancy import OccupancyLoss
 from beags_plugin.losses.photometric import PhotometricLoss
 from beags_plugin.masks import REPROJECTIONS
-from beags_plugin.refiners.preparation import PreparationConfig
+from beags_plugin.preparation.pipeline import PreparationConfig
+from beags_plugin.system.errors import UserError
 
 WRONG = [
     ({"reprojection": "pairs"}, "there is no reprojection 'pairs': choose one of auto, none, pairwise, voxel."),
@@ -56,8 +56,8 @@ def test_the_weight_of_ssim(weight):
 @pytest.mark.parametrize("refine_steps", [0, 10])
 def test_a_run_is_refused_at_its_start_only_if_it_refines(refine_steps):
     pytest.importorskip("nerfstudio")
-    from beags_plugin.plugin.config import base_config
-    from beags_plugin.plugin.refinement import RefinementSwitch
+    from beags_plugin.plugin.options.config import base_config
+    from beags_plugin.plugin.training.refinement import RefinementSwitch
 
     config = base_config().model_config
     config.refine_steps, config.prepare = refine_steps, PreparationConfig(k=0)
@@ -71,8 +71,8 @@ def test_a_run_is_refused_at_its_start_only_if_it_refines(refine_steps):
 
 def test_a_loss_with_a_wrong_option_is_refused_where_it_is_built():
     pytest.importorskip("nerfstudio")
-    from beags_plugin.plugin.loss_spec import LossSpec
-    from beags_plugin.plugin.schedule import PhaseSchedule
+    from beags_plugin.plugin.options.loss_spec import LossSpec
+    from beags_plugin.plugin.options.schedule import PhaseSchedule
 
     with pytest.raises(UserError, match="samples = 0"):
         LossSpec(phase="refine", options={"samples": 0}).build("occupancy", PhaseSchedule(10, 10))

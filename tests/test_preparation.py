@@ -11,15 +11,15 @@ from raster_scenes import CLASSES
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
-from beags_plugin.masks.label_maps import LabelMaps
+from beags_plugin.labels.label_maps import LabelMaps
+from beags_plugin.preparation import consistent_masks
+from beags_plugin.preparation.consistent_masks import chosen_reprojection
+from beags_plugin.preparation.pipeline import PreparationConfig, prepare
+from beags_plugin.preparation.stages import StageStore
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
-from beags_plugin.refiners import consistent_masks
-from beags_plugin.refiners.consistent_masks import chosen_reprojection
 from beags_plugin.refiners.none import NoRefiner
-from beags_plugin.refiners.preparation import PreparationConfig, prepare
-from beags_plugin.refiners.stages import StageStore
+from beags_plugin.system.errors import UserError
 
 SIZE = 12
 CAMERA = Camera(torch.eye(4), torch.tensor([[10.0, 0.0, 6.0], [0.0, 10.0, 6.0], [0.0, 0.0, 1.0]]), SIZE, SIZE)
@@ -131,8 +131,8 @@ def test_k_follows_the_training_pixels_where_it_is_stated_for_more():
 
 def test_a_run_says_which_rounds_it_could_not_make():
     pytest.importorskip("nerfstudio")
-    from beags_plugin.plugin.config import base_config
-    from beags_plugin.plugin.refinement import RefinementSwitch
+    from beags_plugin.plugin.options.config import base_config
+    from beags_plugin.plugin.training.refinement import RefinementSwitch
 
     config = base_config().model_config
     config.refine_steps = 3

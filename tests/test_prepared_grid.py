@@ -7,9 +7,9 @@ import torch
 
 pytest.importorskip("nerfstudio")
 
-from beags_plugin.errors import UserError
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.plugin.prepared_grid import read_grid
+from beags_plugin.plugin.runs.prepared_grid import read_grid
+from beags_plugin.system.errors import UserError
 
 
 def grid() -> VisibilityGrid:

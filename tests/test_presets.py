@@ -9,13 +9,13 @@ import pytest
 
 pytest.importorskip("nerfstudio")
 
-from beags_plugin.errors import UserError
 from beags_plugin.losses import LOSSES
 from beags_plugin.plugin import methods
-from beags_plugin.plugin.config import BeagsTrainerConfig, base_config
+from beags_plugin.plugin.options.config import BeagsTrainerConfig, base_config
 from beags_plugin.plugin.presets import load_preset, override, preset_names
 from beags_plugin.refiners import REFINERS
-from beags_plugin.shipped import read_toml
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.shipped import read_toml
 
 
 def write(folder, text):

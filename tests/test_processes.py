@@ -14,9 +14,9 @@ import steps_in_processes
 import torch
 import torch.distributed as dist
 
-from beags_plugin.child_processes import bound
-from beags_plugin.core import processes
-from beags_plugin.core.processes import each_view
+from beags_plugin.system import processes
+from beags_plugin.system.child_processes import bound
+from beags_plugin.system.processes import each_view
 
 PROGRAM = Path(preparation_in_processes.__file__)
 needs_gloo = pytest.mark.skipif(not dist.is_gloo_available(), reason="torch was built without gloo")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from beags_plugin import progress
-from beags_plugin.progress import counted, progress_bar
+from beags_plugin.system import progress
+from beags_plugin.system.progress import counted, progress_bar
 
 
 def clock(monkeypatch, seconds_per_call: float) -> None:

@@ -11,12 +11,12 @@ import torch
 from scipy.ndimage import binary_erosion
 from test_evaluation import BOX, CLASSES, CUP, FLOOR, SETTINGS, SIZE, Squares, camera, scene, square_mask, truth
 
-from beags_plugin.errors import UserError
 from beags_plugin.evaluation.metrics import METRICS, MaskMetrics, mask_metrics
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import EvalView, MaskRecord, ObjectMetrics, SceneMetrics, ViewRecord
 from beags_plugin.evaluation.report import RunMetrics, data_set
 from beags_plugin.evaluation.run_metrics import average, evaluate_scene
+from beags_plugin.system.errors import UserError
 
 pytestmark = pytest.mark.filterwarnings("ignore:Mean of empty slice")
 

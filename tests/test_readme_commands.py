@@ -21,7 +21,7 @@ from pathlib import Path
 import pytest
 from test_documented_commands import ROOT, code_lines
 
-from beags_plugin.child_processes import bound
+from beags_plugin.system.child_processes import bound
 
 pytest.importorskip("nerfstudio")
 

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 
 import pytest
 
-import beags_plugin.registry as registry_module
-from beags_plugin.errors import UserError
+import beags_plugin.system.registry as registry_module
 from beags_plugin.losses import LOSSES
 from beags_plugin.losses.base import Loss
-from beags_plugin.registry import Registry
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.registry import Registry
 
 
 def _registry(**more: str) -> Registry:

@@ -11,10 +11,10 @@ from run_folders import write_scene, write_trained
 
 pytest.importorskip("nerfstudio")
 
-from beags_plugin.cli import main
-from beags_plugin.errors import UserError
-from beags_plugin.plugin.render import render_run
-from beags_plugin.turntable.options import RenderOptions
+from beags_plugin.commands.cli import main
+from beags_plugin.pictures.options import RenderOptions
+from beags_plugin.plugin.objects.render import render_run
+from beags_plugin.system.errors import UserError
 
 SMALL = RenderOptions(size=32, frames=3, views=4)
 

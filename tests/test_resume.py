@@ -29,11 +29,11 @@ from resumed_runs import (
 )
 from run_folders import write_scene
 
-from beags_plugin.child_processes import bound
-from beags_plugin.errors import UserError
-from beags_plugin.plugin.extract import read_scene
+from beags_plugin.plugin.objects.extract import read_scene
 from beags_plugin.plugin.trainer import BeagsTrainer
-from beags_plugin.refiners import preparation
+from beags_plugin.preparation import pipeline as preparation
+from beags_plugin.system.child_processes import bound
+from beags_plugin.system.errors import UserError
 
 LAST = sum(STEPS) - 1
 
@@ -146,7 +146,7 @@ def test_a_kill_in_the_preparation_leaves_the_finished_stages(data, whole, tmp_p
 
 
 def test_a_kill_while_the_base_or_the_masks_are_written(data, whole, tmp_path, monkeypatch):
-    from beags_plugin.plugin import refinement
+    from beags_plugin.plugin.training import refinement
 
     for name in ("write_run", "write_class_map"):
         run = tmp_path / name
@@ -312,7 +312,7 @@ def test_a_failed_start_in_the_folder_of_another_run_is_not_mixed_with_it(data, 
 
 
 def test_a_run_that_is_training_cannot_be_resumed(whole):
-    from beags_plugin.plugin.run_lock import RunLock
+    from beags_plugin.system.lock import RunLock
 
     before = checkpoint_of(whole)["step"]
     part = whole / ".half.part"
@@ -336,7 +336,7 @@ def test_ns_train_into_the_folder_of_a_run_that_is_training_changes_nothing_ther
     """config.yml is the first that ns-train writes."""
     import fcntl
 
-    from beags_plugin.plugin.run_lock import LOCK
+    from beags_plugin.system.lock import LOCK
 
     before = contents(whole)
     with open(whole / LOCK, "ab") as file:
@@ -349,7 +349,7 @@ def test_ns_train_into_the_folder_of_a_run_that_is_training_changes_nothing_ther
 @pytest.mark.parametrize("devices", [1, 2])
 def test_the_lock_is_held_from_the_first_file_on(data, tmp_path, devices):
     """Two that start at once: one is refused; where each device has a process of its own, only while it is written."""
-    from beags_plugin.plugin.run_lock import RunLock, run_lock
+    from beags_plugin.system.lock import RunLock, run_lock
 
     config = short_config(data, tmp_path / "run")
     config.machine.num_devices = devices

@@ -10,10 +10,10 @@ import pytest
 import torch
 from data_folders import write_image
 
-from beags_plugin.errors import UserError
 from beags_plugin.masks.sources.base import Photo, SourceScene
 from beags_plugin.masks.sources.prompts import Prompt
 from beags_plugin.masks.sources.sam2 import GroundingDino, Sam2Predictor, Sam2Source, load
+from beags_plugin.system.errors import UserError
 
 transformers = pytest.importorskip("transformers", reason="the extra [sam2] (transformers) is not installed")
 

@@ -10,7 +10,6 @@ import torch
 from PIL import Image
 
 from beags_plugin.core.cameras import viewmat_from_opengl
-from beags_plugin.errors import UserError
 from beags_plugin.sample import writer
 from beags_plugin.sample.arrangement import DOME_RADIUS, make_still
 from beags_plugin.sample.degrade import (
@@ -27,6 +26,7 @@ from beags_plugin.sample.lighting import Light
 from beags_plugin.sample.solids import Ball, Cone, Solid, Tube, slab
 from beags_plugin.sample.views import make_views, render_view
 from beags_plugin.sample.writer import SampleConfig, is_sample, write_sample
+from beags_plugin.system.errors import UserError
 
 WIDTH, HEIGHT = 96, 72
 TINY = SampleConfig(seed=3, width=24, height=16, num_train=5, num_test=2, num_points=101, degradation="strong")
@@ -348,7 +348,7 @@ def test_folder_layout(folder):
 
 
 def test_class_maps_are_readable_by_the_mask_module(folder):
-    classes = pytest.importorskip("beags_plugin.masks.classes")
+    classes = pytest.importorskip("beags_plugin.labels.classes")
     for path in (folder / "masks").iterdir():
         assert np.array_equal(classes.read_class_map(path), grey(path))
     assert len(classes.read_classes(folder / "classes.json")) == 8

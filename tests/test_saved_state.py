@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from beags_plugin.errors import UserError
+from beags_plugin.system.errors import UserError
 
 pytest.importorskip("nerfstudio")
 
-from beags_plugin.plugin.saved_state import check_state
+from beags_plugin.plugin.runs.checkpoint_file import check_state
 
 
 def state(**changed) -> dict:

@@ -10,9 +10,9 @@ import torch
 pytest.importorskip("nerfstudio")
 
 from beags_plugin.core.densification import DensifyConfig
-from beags_plugin.plugin.scene_edits import move_adam_state
-from beags_plugin.plugin.schedule import PhaseSchedule, log_linear
-from beags_plugin.plugin.training import camera_extent
+from beags_plugin.plugin.options.schedule import PhaseSchedule, log_linear
+from beags_plugin.plugin.training.callbacks import camera_extent
+from beags_plugin.plugin.training.scene_edits import move_adam_state
 
 
 def test_refinement_repeats_the_last_tenth_of_the_base_schedule():
@@ -73,7 +73,7 @@ def model():
     """A model of the documented base config on a few random seed points."""
     from nerfstudio.data.scene_box import SceneBox
 
-    from beags_plugin.plugin.config import base_config
+    from beags_plugin.plugin.options.config import base_config
 
     g = torch.Generator().manual_seed(1)
     points = (torch.randn(30, 3, generator=g), torch.randint(0, 256, (30, 3), generator=g))
@@ -117,7 +117,7 @@ def test_stated_steps_are_scaled_with_the_length_of_the_base():
 
 
 def test_losses_start_at_their_share_of_the_base():
-    from beags_plugin.plugin.loss_spec import LossSpec
+    from beags_plugin.plugin.options.loss_spec import LossSpec
 
     short = PhaseSchedule(3_000, 300, 30_000)
     assert LossSpec(start=7_000).build("normal", short).start == 700
@@ -147,8 +147,8 @@ def test_the_official_losses_and_their_starts(model):
 
 
 def test_official_learning_rates(model):
-    from beags_plugin.plugin.config import base_config
-    from beags_plugin.plugin.training import set_learning_rates
+    from beags_plugin.plugin.options.config import base_config
+    from beags_plugin.plugin.training.callbacks import set_learning_rates
 
     configs = base_config().optimizers
     optimizers = {name: torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))]) for name in configs}
@@ -173,8 +173,8 @@ def test_official_learning_rates(model):
 
 
 def test_a_short_base_starts_with_larger_rates_and_refinement_does_not(model):
-    from beags_plugin.plugin.config import base_config
-    from beags_plugin.plugin.training import set_learning_rates
+    from beags_plugin.plugin.options.config import base_config
+    from beags_plugin.plugin.training.callbacks import set_learning_rates
 
     configs = base_config().optimizers
     optimizers = {name: torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))]) for name in configs}
@@ -212,7 +212,7 @@ def test_only_steps_of_growth_are_drawn_with_what_growth_looks_at(model):
 
     from nerfstudio.cameras.cameras import Cameras
 
-    from beags_plugin.plugin.training import Densifier
+    from beags_plugin.plugin.training.callbacks import Densifier
 
     pose = torch.eye(4)[None, :3]
     pose[0, 2, 3] = 4.0

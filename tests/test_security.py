@@ -22,19 +22,19 @@ from data_folders import write_colmap
 from mistakes.photos import huge_png
 from run_folders import write_scene, write_trained
 
-from beags_plugin.core.filed_tensors import FiledTensors, write_tensors
 from beags_plugin.data.colmap_binary import check_colmap_binary
 from beags_plugin.data.transforms_file import read_transforms
-from beags_plugin.errors import UserError
-from beags_plugin.masks.classes import read_classes
+from beags_plugin.labels.classes import read_classes
 from beags_plugin.masks.sources.coco import packed_total
-from beags_plugin.plugin import run_config
-from beags_plugin.plugin.run_config import load_run_config
-from beags_plugin.reading.arrays import MOST_RATIO, load_array, load_arrays
-from beags_plugin.reading.images import read_image
-from beags_plugin.reading.tensors import load_tensors
-from beags_plugin.reading.text import MOST_BYTES, load_json
-from beags_plugin.shipped import read_toml
+from beags_plugin.plugin.runs import run_config
+from beags_plugin.plugin.runs.run_config import load_run_config
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.filed_tensors import FiledTensors, write_tensors
+from beags_plugin.system.reading.arrays import MOST_RATIO, load_array, load_arrays
+from beags_plugin.system.reading.images import read_image
+from beags_plugin.system.reading.tensors import load_tensors
+from beags_plugin.system.reading.text import MOST_BYTES, load_json
+from beags_plugin.system.shipped import read_toml
 
 # -- configs ---------------------------------------------------------------------------------------------------------
 
@@ -46,7 +46,7 @@ ATTACKS = [
     "!!python/object/apply:builtins.open ['{ran}', 'w']",
     "!!python/object/apply:nerfstudio.utils.scripts.run_command ['touch {ran}']",
     "!!python/object/apply:nerfstudio.utils.scripts.subprocess.run [['touch', '{ran}']]",
-    "!!python/object/apply:beags_plugin.whole_files.write_whole ['{ran}', print]",
+    "!!python/object/apply:beags_plugin.system.whole_files.write_whole ['{ran}', print]",
     "!!python/object/apply:pathlib.Path.touch ['{ran}']",
     "!!python/object/apply:torch.optim.adam.Adam [[]]",
     "!!python/object/new:subprocess.Popen [['touch', '{ran}']]",
@@ -182,7 +182,7 @@ def test_checkpoints_run_nothing(tmp_path):
 def test_every_reader_of_tensors_refuses_code():
     """No module loads pickles otherwise."""
     root = Path(run_config.__file__).parents[1]
-    allowed = {"reading/tensors.py"}
+    allowed = {"system/reading/tensors.py"}
     for path in root.rglob("*.py"):
         text = path.read_text("utf8")
         name = path.relative_to(root).as_posix()

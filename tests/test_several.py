@@ -15,15 +15,15 @@ pytest.importorskip("nerfstudio")
 from nerfstudio.configs.base_config import MachineConfig
 from training_in_processes import train_in_two
 
-from beags_plugin.errors import UserError
 from beags_plugin.ops import cuda_extension
-from beags_plugin.plugin import several
 from beags_plugin.plugin.presets import preset_config, preset_names
+from beags_plugin.plugin.training import replicas as several
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.by_device import ByDevice
 from beags_plugin.rasterizers.cuda import CudaRasterizer
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 from beags_plugin.sample.writer import SampleConfig, write_sample
+from beags_plugin.system.errors import UserError
 
 
 @pytest.fixture

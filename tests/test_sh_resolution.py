@@ -12,13 +12,13 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.sh import sh_basis
 from beags_plugin.core.sh_resolution import gram_matrices, seen_coefficients, seen_degree, seen_shares, with_degree
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
+from beags_plugin.preparation.fewer_bands import changes_of_fewer_bands, without_unneeded_bands
+from beags_plugin.preparation.pipeline import PreparationConfig, prepare
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.refiners.bea import BeaRefiner
-from beags_plugin.refiners.fewer_bands import changes_of_fewer_bands, without_unneeded_bands
 from beags_plugin.refiners.none import NoRefiner
-from beags_plugin.refiners.preparation import PreparationConfig, prepare
+from beags_plugin.system.errors import UserError
 
 SETTINGS = RasterSettings(0.1, 100.0)
 

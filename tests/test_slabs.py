@@ -8,9 +8,10 @@ import pytest
 import torch
 from test_reprojection_votes import larger_scene, same
 
-from beags_plugin.masks import slabs, voxel_reprojection
+from beags_plugin.masks import spatial_chunks as slabs
+from beags_plugin.masks import voxel_reprojection
 from beags_plugin.masks.pooled_votes import lift
-from beags_plugin.masks.slabs import WHOLE, slabs_of, torch_brick_sample
+from beags_plugin.masks.spatial_chunks import WHOLE, slabs_of, torch_brick_sample
 from beags_plugin.masks.voxel_reprojection import _to_voxels, reproject_voxel
 from beags_plugin.ops import extension
 from beags_plugin.ops.voxel_votes import brick_sample

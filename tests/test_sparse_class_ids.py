@@ -8,17 +8,17 @@ import pytest
 import torch
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.class_ranks import ClassRanks
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
+from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.occupancy import OccupancyLoss
 from beags_plugin.masks import reprojection
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.rasterizers.drawing import draw_class_map
+from beags_plugin.preparation.pipeline import Preparation, PreparationConfig, prepare
 from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
+from beags_plugin.rasterizers.rendering import draw_class_map
 from beags_plugin.refiners.bea import BeaRefiner
-from beags_plugin.refiners.preparation import Preparation, PreparationConfig, prepare
+from beags_plugin.system.errors import UserError
 
 NEAR, FAR = (0, 1, 2), (0, 7, 65534)  # the same three classes
 SETTINGS = RasterSettings(near=0.1, far=100.0)

@@ -12,12 +12,12 @@ from start_scenes import a_frame, drawn
 
 from beags_plugin.core.lifting import project
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
+from beags_plugin.pictures import video
+from beags_plugin.pictures.objects import Subject, comparison, draw_alone, film, sheet
+from beags_plugin.pictures.options import RenderOptions
+from beags_plugin.pictures.orbit import orbit, orbit_settings, stand_of
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.turntable import video
-from beags_plugin.turntable.options import RenderOptions
-from beags_plugin.turntable.orbit import orbit, orbit_settings, stand_of
-from beags_plugin.turntable.pictures import Subject, comparison, draw_alone, film, sheet
+from beags_plugin.system.errors import UserError
 
 LOW, HIGH = torch.tensor([-1.0, -2.0, 0.0]), torch.tensor([1.0, 2.0, 3.0])
 

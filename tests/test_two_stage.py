@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beags_plugin.errors import UserError
 from beags_plugin.masks.sources.prompts import Prompt, PromptedObject
 from beags_plugin.masks.sources.two_stage import BestLabels, Retrieval, retrieve, runs_of
+from beags_plugin.system.errors import UserError
 
 SHAPE = (6, 8)
 BOX = (1.0, 1.0, 4.0, 4.0)

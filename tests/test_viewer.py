@@ -17,10 +17,10 @@ from nerfstudio.viewer.viewer_elements import ViewerClick
 from viewer_windows import ALWAYS, Window, write_finished
 
 from beags_plugin.extraction.ply import read_ply
-from beags_plugin.masks.classes import colorize
-from beags_plugin.plugin.viewed_run import ViewedRun
-from beags_plugin.plugin.viewing import CHANNELS
-from beags_plugin.viewing.choice import Choice
+from beags_plugin.labels.classes import colorize
+from beags_plugin.plugin.viewer.choice import Choice
+from beags_plugin.plugin.viewer.viewed_run import ViewedRun
+from beags_plugin.plugin.viewer.viewing import CHANNELS
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from browser import NEEDED, Page
 from viewer_pages import HEIGHT, WIDTH, awaited, differing, free_port, painted, picture, started, varied, viewed
 
 from beags_plugin.extraction.ply import read_ply, write_ply
-from beags_plugin.plugin.extract import extract_objects
+from beags_plugin.plugin.objects.extract import extract_objects
 
 pytestmark = NEEDED
 STEPS = 60, 240  # of base and refinement

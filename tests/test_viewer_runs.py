@@ -17,11 +17,11 @@ pytest.importorskip("nerfstudio")
 from nerfstudio.utils.eval_utils import eval_setup
 from viewer_windows import ALWAYS, Stand, write_finished
 
-from beags_plugin.errors import UserError
-from beags_plugin.masks.classes import write_class_map
-from beags_plugin.plugin.extract import extract_objects
-from beags_plugin.plugin.schedule import PhaseSchedule
-from beags_plugin.plugin.viewing import CHANNELS
+from beags_plugin.labels.classes import write_class_map
+from beags_plugin.plugin.objects.extract import extract_objects
+from beags_plugin.plugin.options.schedule import PhaseSchedule
+from beags_plugin.plugin.viewer.viewing import CHANNELS
+from beags_plugin.system.errors import UserError
 
 
 @pytest.fixture(scope="module")

@@ -11,15 +11,13 @@ from run_folders import discs
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels, opacities
-from beags_plugin.masks.classes import colorize
+from beags_plugin.labels.classes import colorize
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.occupancy.violation import violation_shares
-from beags_plugin.rasterizers.drawing import geometry_inputs
-from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
-from beags_plugin.viewing.choice import Choice, shown
-from beags_plugin.viewing.legend import LegendRow, escaped, hex_color, legend, unique_labels
-from beags_plugin.viewing.picking import camera_along, pick
-from beags_plugin.viewing.pictures import (
+from beags_plugin.plugin.viewer.choice import Choice, shown
+from beags_plugin.plugin.viewer.legend import LegendRow, escaped, hex_color, legend, unique_labels
+from beags_plugin.plugin.viewer.picking import camera_along, pick
+from beags_plugin.plugin.viewer.pictures import (
     boundary_picture,
     class_picture,
     fitted_camera,
@@ -27,6 +25,8 @@ from beags_plugin.viewing.pictures import (
     nearest_view,
     value_picture,
 )
+from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
+from beags_plugin.rasterizers.rendering import geometry_inputs
 
 SETTINGS = RasterSettings(0.01, 100.0)
 

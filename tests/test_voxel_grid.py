@@ -14,12 +14,12 @@ import torch
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.lifting import lift
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
 from beags_plugin.occupancy.build import build_visibility_grid
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.occupancy.voxel_size import voxel_size
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
+from beags_plugin.system.errors import UserError
 
 both = pytest.mark.usefixtures("ops")  # run with the torch versions and with the compiled ops
 

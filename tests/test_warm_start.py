@@ -14,10 +14,10 @@ pytest.importorskip("nerfstudio")
 
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
 from beags_plugin.extraction.ply import write_ply
+from beags_plugin.plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.presets import preset_config
-from beags_plugin.plugin.schedule import PhaseSchedule
+from beags_plugin.system.errors import UserError
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,7 @@ def test_a_run_of_the_same_frame_is_taken_bit_for_bit(scene, tmp_path):
 @pytest.mark.parametrize("form", ["ply", "ply-2dgs"])
 def test_a_base_is_exported_whole_and_started_from_again(scene, tmp_path, form):
     """Through the world of the input poses and back: the training views are as they were."""
-    from beags_plugin.cli import main
+    from beags_plugin.commands.cli import main
 
     start = write_splatfacto(tmp_path / "a", in_frame(scene.surfels, a_frame(4)), a_frame(4))
     base, report = started(scene, tmp_path / "base", start)
@@ -141,9 +141,9 @@ def test_a_wrong_frame_is_said_with_the_figure_and_the_frame_that_fits(scene, tm
 def test_refinement_starts_from_a_ply_and_does_not_need_it_later(scene, tmp_path):
     from nerfstudio.utils.eval_utils import eval_setup
 
-    from beags_plugin.plugin.evaluate import EvaluatedRun
-    from beags_plugin.plugin.extract import extract_objects
-    from beags_plugin.plugin.launch import train
+    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
+    from beags_plugin.plugin.objects.extract import extract_objects
+    from beags_plugin.plugin.runs.launch import train
 
     ply, run = tmp_path / "scene.ply", tmp_path / "run"
     write_ply(ply, scene.surfels, layout="2dgs")
@@ -164,7 +164,7 @@ def test_refinement_starts_from_a_ply_and_does_not_need_it_later(scene, tmp_path
 
 
 def test_base_steps_polish_a_scene_without_growth(scene, tmp_path):
-    from beags_plugin.plugin.launch import train
+    from beags_plugin.plugin.runs.launch import train
 
     run = tmp_path / "run"
     start = write_splatfacto(tmp_path / "theirs", scene.surfels, (torch.eye(4)[:3], 1.0))

@@ -7,13 +7,13 @@ import pytest
 import torch
 from test_evaluation import BOX, CLASSES, CUP, FLOOR, SETTINGS, SIZE, Squares, camera, scene, square_mask, truth
 
-from beags_plugin.evaluation.cells import CAPTION, GAP, crop, square_around, wrapped
 from beags_plugin.evaluation.metrics import MaskMetrics
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import EvalView
 from beags_plugin.evaluation.report import RunMetrics
 from beags_plugin.evaluation.run_metrics import evaluate_scene
-from beags_plugin.evaluation.worst_views import (
+from beags_plugin.pictures.cells import CAPTION, GAP, crop, square_around, wrapped
+from beags_plugin.pictures.worst_views import (
     COLORS,
     LEFT_OUT,
     MISSED,

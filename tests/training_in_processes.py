@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 
-from beags_plugin.child_processes import end_with_parent
+from beags_plugin.system.child_processes import end_with_parent
 
 _TRUE = (torch.cuda.is_available, torch.cuda.device_count)
 if multiprocessing.current_process().name != "MainProcess":
@@ -68,7 +68,7 @@ def train_in_two(data: Path, out: Path) -> None:
     from nerfstudio.scripts.train import launch
     from resumed_runs import short_config
 
-    from beags_plugin.plugin.run_lock import run_lock
+    from beags_plugin.system.lock import run_lock
 
     config = short_config(data, out / "run")
     config.pipeline.datamanager.data = data  # as nerfstudio's own main

@@ -19,8 +19,8 @@ from browser import Page
 from PIL import Image
 from run_folders import CLASSES
 
-from beags_plugin.child_processes import bound
-from beags_plugin.masks.classes import colorize
+from beags_plugin.labels.classes import colorize
+from beags_plugin.system.child_processes import bound
 
 WIDTH, HEIGHT = 640, 400
 MAX_RESOLUTION = 512  # pixels of the longer side, the default of the viewer

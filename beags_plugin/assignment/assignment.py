@@ -10,13 +10,13 @@ from torch import Tensor
 
 from beags_plugin.assignment.sparse_sums import TorchSparseSums, largest_in_rows
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.processes import each_view
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
 from beags_plugin.ops import extension
 from beags_plugin.ops.sparse_sums import SparseSums
-from beags_plugin.rasterizers.drawing import geometry_inputs
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
+from beags_plugin.rasterizers.rendering import geometry_inputs
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.processes import each_view
 
 _UNITS = float(1 << 38)  # of a pixel, in the sums of contributions on a GPU, which come in such units
 

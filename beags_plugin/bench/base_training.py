@@ -24,9 +24,9 @@ from beags_plugin.bench.run import TABLE_WIDTH, Options, adapted, scenes_of
 from beags_plugin.bench.runner import Outcome, run_trials
 from beags_plugin.bench.scenes import Scene
 from beags_plugin.bench.trials import MODEL, Trial, steps_of
-from beags_plugin.digests import code_digest
-from beags_plugin.plugin.held_out import CURVE
-from beags_plugin.progress import progress_bar
+from beags_plugin.plugin.training.held_out import CURVE
+from beags_plugin.system.digests import code_digest
+from beags_plugin.system.progress import progress_bar
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 MEASUREMENTS = 20  # of the held-out views during a run
@@ -35,7 +35,7 @@ Curve = Sequence[Mapping[str, float]]
 
 @dataclass(frozen=True)
 class Row:
-    """A variant's base on a scene. curve: records of ``plugin.held_out``; empty with the reason in ``failed``."""
+    """A variant's base on a scene. curve: records of ``plugin.training.held_out``; empty with the reason in ``failed``."""
 
     scene: str
     seed: int

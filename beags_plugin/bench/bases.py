@@ -8,8 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from beags_plugin.child_processes import bound
-from beags_plugin.errors import UserError
+from beags_plugin.system.child_processes import bound
+from beags_plugin.system.errors import UserError
 
 STAMP = "trained.json"
 

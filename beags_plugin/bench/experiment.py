@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from beags_plugin.errors import UserError
-from beags_plugin.shipped import read_toml, shipped_folder
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.shipped import read_toml, shipped_folder
 
 PHASES = ("base", "refine", "both")
 DAMAGE = "damage"  # the axis that is no config key: the degree of mask damage

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from beags_plugin.bench.provenance import commit, describe_machine
-from beags_plugin.errors import writing
-from beags_plugin.whole_files import write_whole
+from beags_plugin.system.errors import writing
+from beags_plugin.system.whole_files import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -23,10 +23,10 @@ from beags_plugin.bench.report import (
     write_json,
 )
 from beags_plugin.core.cameras import Camera
-from beags_plugin.errors import UserError
 from beags_plugin.evaluation.metrics import mask_metrics, mean_metrics
 from beags_plugin.masks import REPROJECTIONS
-from beags_plugin.reading.arrays import load_array
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.arrays import load_array
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 DEPTHS = ("trained", "exact")
@@ -129,12 +129,12 @@ def plain(options: Any) -> dict[str, Any]:
 def load_views(options: Options, views: int) -> Scene:
     """The sample with so many training views, and its depth as a base trained on it shows it."""
     from beags_plugin.bench.bases import trained_base
-    from beags_plugin.demo import make_sample
-    from beags_plugin.masks.classes import read_class_map
-    from beags_plugin.plugin.evaluate import raster_settings
-    from beags_plugin.plugin.extract import read_scene, read_transform
+    from beags_plugin.commands.demo import make_sample
+    from beags_plugin.labels.classes import read_class_map
+    from beags_plugin.plugin.objects.evaluate import raster_settings
+    from beags_plugin.plugin.objects.extract import read_scene, read_transform
     from beags_plugin.rasterizers import make_rasterizer
-    from beags_plugin.rasterizers.drawing import geometry_inputs, surface_depth
+    from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
 
     name = f"sample-{options.seed}-{options.width}x{options.height}-{views}"
     data = options.output / "scenes" / name

@@ -16,15 +16,15 @@ from beags_plugin.bench.report import number, plain_table, provenance, write_csv
 from beags_plugin.bench.required_rows import Row, Scene, draw, in_turn, mean_psnr
 from beags_plugin.bench.required_views import bands, objects, pairs
 from beags_plugin.bench.run import TABLE_WIDTH
-from beags_plugin.errors import UserError
-from beags_plugin.masks.label_maps import narrowed, widened
+from beags_plugin.labels.label_maps import narrowed, widened
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.occupancy.sampling import sample_stream
-from beags_plugin.progress import progress_bar
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.progress import progress_bar
 
 if TYPE_CHECKING:
-    from beags_plugin.plugin.datamanager import BeagsDataManager
-    from beags_plugin.plugin.extract import SavedScene
+    from beags_plugin.plugin.objects.extract import SavedScene
+    from beags_plugin.plugin.views.datamanager import BeagsDataManager
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 PIXELS = (0.25, 0.5, 1.0, 2.0, 4.0)  # what a Gaussian must fill in some view to be kept
@@ -65,9 +65,9 @@ def run_required(config: Path, json: Path | None = None, csv: Path | None = None
 
 def load(config: Path) -> Scene:
     """Read the run, its data and what its preparation kept."""
-    from beags_plugin.plugin.evaluate import EvaluatedRun
-    from beags_plugin.plugin.prepared_grid import grid_state
-    from beags_plugin.plugin.runs import last_prepared
+    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
+    from beags_plugin.plugin.runs.layout import last_prepared
+    from beags_plugin.plugin.runs.prepared_grid import grid_state
 
     run = EvaluatedRun(config)
     after: SavedScene = run.stages["after"]

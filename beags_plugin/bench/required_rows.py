@@ -14,11 +14,11 @@ from torch import Tensor
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import psnr
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.rasterizers.drawing import surfel_inputs
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+from beags_plugin.rasterizers.rendering import surfel_inputs
 
 if TYPE_CHECKING:
-    from beags_plugin.plugin.views import View
+    from beags_plugin.plugin.views.views import View
 
 CALLS = 5  # of which the median counts; both sides take turns
 

@@ -10,8 +10,8 @@ from beags_plugin.bench.required_rows import Row, Scene, draw, in_turn, mean_psn
 from beags_plugin.core.lifting import lift
 from beags_plugin.core.sh_resolution import inside, seen_shares, with_degree
 from beags_plugin.extraction.select import select_class
-from beags_plugin.rasterizers.drawing import geometry_inputs, surface_depth, surfel_inputs
-from beags_plugin.refiners.fewer_bands import changes_of_fewer_bands
+from beags_plugin.preparation.fewer_bands import changes_of_fewer_bands
+from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth, surfel_inputs
 
 _POINTS = 500  # of a view that are looked for in the others
 

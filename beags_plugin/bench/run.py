@@ -16,9 +16,9 @@ from beags_plugin.bench.results import Row, make_row, report_json, table_rows
 from beags_plugin.bench.runner import Outcome, run_trials
 from beags_plugin.bench.scenes import Scene, damaged_masks, given_scenes, sample_scene
 from beags_plugin.bench.trials import MODEL, Run, plan, steps_of
-from beags_plugin.digests import code_digest
-from beags_plugin.errors import UserError
-from beags_plugin.progress import progress_bar
+from beags_plugin.system.digests import code_digest
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.progress import progress_bar
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 TABLE_WIDTH = 170  # cells that are cut short say nothing: rather let a narrow terminal break the lines

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from beags_plugin.bench.trials import Trial
-from beags_plugin.errors import writing
+from beags_plugin.system.errors import writing
 
 Progress = Callable[[int, int], None]
 

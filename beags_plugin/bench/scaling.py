@@ -24,8 +24,8 @@ from beags_plugin.bench.report import (
 )
 from beags_plugin.bench.scaling_scene import Sizes, make_scene
 from beags_plugin.bench.scaling_stages import CHANNELS, STAGES, STEP, stages
-from beags_plugin.errors import UserError
-from beags_plugin.progress import progress_bar
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.progress import progress_bar
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 AXES = ("classes", "views", "gaussians", "pixels")

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.rasterizers.drawing import geometry_inputs, surfel_inputs
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+from beags_plugin.rasterizers.rendering import geometry_inputs, surfel_inputs
 
 SETTINGS = RasterSettings(near=0.1, far=20.0)
 _DISTANCE = 3.2  # of the cameras from the middle of the ball, whose radius is 1

@@ -20,8 +20,8 @@ from beags_plugin.losses.photometric import PhotometricLoss
 from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.occupancy.build import build_visibility_grid
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.rasterizers.drawing import geometry_inputs, surface_depth, surfel_inputs
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
+from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth, surfel_inputs
 
 STEP = "refinement step"
 CHANNELS = "step, a channel per class"

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from beags_plugin.digests import folder_digest, value_digest
-from beags_plugin.errors import UserError, writing
-from beags_plugin.masks.classes import read_mask, write_class_map
-from beags_plugin.progress import progress_bar
+from beags_plugin.labels.classes import read_mask, write_class_map
 from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.system.digests import folder_digest, value_digest
+from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.progress import progress_bar
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def given_scenes(folders: Sequence[Path], downscale: float | None) -> list[Scene
 
     Raises ``UserError`` for a folder that does not exist, and for two of one name.
     """
-    from beags_plugin.demo import quick_downscale
+    from beags_plugin.commands.demo import quick_downscale
 
     scenes = []
     for folder in folders:
@@ -69,7 +69,7 @@ def damaged_masks(scene: Scene, degree: float, folder: Path) -> Path:
     is decided by the scene's seed and the view's name. At degree 1 a sample gets the masks that it has by default.
     The masks of held-out views stay as they are. An existing folder of the same damage is used again.
     """
-    from beags_plugin.plugin.dataparser import BeagsDataParserConfig
+    from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
     from beags_plugin.sample.degrade import degradation_of_degree, degrade_mask, dropped_views
 
     degradation = degradation_of_degree(degree)

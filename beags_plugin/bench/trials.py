@@ -10,7 +10,7 @@ from typing import Any
 
 from beags_plugin.bench.experiment import Experiment, Variant
 from beags_plugin.bench.scenes import Scene
-from beags_plugin.digests import value_digest
+from beags_plugin.system.digests import value_digest
 
 MODEL = "pipeline.model."
 

@@ -15,12 +15,12 @@ import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from beags_plugin.child_processes import end_with_parent
-from beags_plugin.errors import UserError
+from beags_plugin.system.child_processes import end_with_parent
+from beags_plugin.system.errors import UserError
 
 if TYPE_CHECKING:
-    from beags_plugin.plugin.config import BeagsTrainerConfig
-    from beags_plugin.plugin.dataparser import BeagsDataParserConfig
+    from beags_plugin.plugin.options.config import BeagsTrainerConfig
+    from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 
 
 def serve() -> None:
@@ -40,7 +40,11 @@ def _import_everything() -> None:
 
     from beags_plugin.bench import measure  # noqa: F401
     from beags_plugin.ops import extension
-    from beags_plugin.plugin import evaluate, extract, presets  # noqa: F401
+    from beags_plugin.plugin import presets  # noqa: F401
+    from beags_plugin.plugin.objects import (
+        evaluate,  # noqa: F401
+        extract,  # noqa: F401
+    )
 
     extension.load()
 
@@ -84,8 +88,8 @@ def run(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
     the loaded program does not take)}; of a refinement also what
     ``measure.measure_run`` gives, "findings" (a line per stage), "voxel_size" and "training_pixels".
     """
-    from beags_plugin.plugin.launch import train
-    from beags_plugin.plugin.memory import peak_memory_mb
+    from beags_plugin.plugin.runs.launch import train
+    from beags_plugin.system.memory import peak_memory_mb
 
     start_memory_mb = peak_memory_mb()
     config = trial_config(request, run_folder)
@@ -129,15 +133,15 @@ def trial_config(request: dict[str, Any], run_folder: Path) -> BeagsTrainerConfi
 
 
 def _gaussians(config: BeagsTrainerConfig) -> int:
-    from beags_plugin.plugin.runs import newest_checkpoint
-    from beags_plugin.plugin.training_state import read_checkpoint
+    from beags_plugin.plugin.runs.layout import newest_checkpoint
+    from beags_plugin.plugin.training.resumable import read_checkpoint
 
     checkpoint = read_checkpoint(newest_checkpoint(config.get_checkpoint_dir()))
     return len(checkpoint["pipeline"]["_model.class_ids"])
 
 
 def _voxel_size(grid: Path) -> float | None:
-    from beags_plugin.plugin.prepared_grid import grid_state
+    from beags_plugin.plugin.runs.prepared_grid import grid_state
 
     state = grid_state(grid)
     return float(state["voxel_size"]) if state else None

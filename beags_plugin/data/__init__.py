@@ -1,6 +1,6 @@
 """What data sets look like on disk, as registered layouts (entry points: ``beags.layouts``); nothing of nerfstudio."""
 
-from beags_plugin.registry import Registry
+from beags_plugin.system.registry import Registry
 
 LAYOUTS = Registry(
     "layout",

@@ -8,8 +8,8 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from beags_plugin.errors import UserError
-from beags_plugin.reading.images import read_image
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.images import read_image
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 LARGEST_WIDTH = 1600  # pixels; with it Mip-NeRF 360 gets images_4 outdoors and images_2 indoors, LLFF images_4

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from beags_plugin.errors import UserError
 from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.system.errors import UserError
 
 
 def read_class_names(
@@ -24,7 +24,7 @@ def read_class_names(
     masks: id images. known, known_file: names that the layout brings, and where they stand.
     Raises ``UserError`` if a mask holds an id without a name where names are given. Reads all masks once.
     """
-    from beags_plugin.masks.classes import BACKGROUND, read_classes
+    from beags_plugin.labels.classes import BACKGROUND, read_classes
 
     with ThreadPoolExecutor(max_workers=4) as pool:  # decoding a .png releases the interpreter
         ids_of_masks = list(pool.map(lambda mask: ids_in_mask(mask, ignore_ids), masks))
@@ -45,7 +45,7 @@ def read_class_names(
 
 def ids_in_mask(mask: Path, ignore_ids: Sequence[int]) -> set[int]:
     """The class ids of an id image, without IGNORE."""
-    from beags_plugin.masks.classes import read_class_map
+    from beags_plugin.labels.classes import read_class_map
 
     counts = np.bincount(read_class_map(mask, ignore_ids).ravel(), minlength=IGNORE + 1)
     return {int(i) for i in np.flatnonzero(counts) if i != IGNORE}

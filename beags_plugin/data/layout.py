@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from beags_plugin.data import LAYOUTS
 from beags_plugin.data.scene import Scene
-from beags_plugin.errors import UserError
+from beags_plugin.system.errors import UserError
 
 
 class Layout(ABC):

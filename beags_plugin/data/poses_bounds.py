@@ -9,9 +9,9 @@ import numpy as np
 from beags_plugin.data.files import list_images
 from beags_plugin.data.layouts.colmap import points_file
 from beags_plugin.data.scene import PoseTable
-from beags_plugin.errors import UserError
-from beags_plugin.reading.arrays import load_array
-from beags_plugin.reading.text import reason
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.arrays import load_array
+from beags_plugin.system.reading.text import reason
 
 FILE = "poses_bounds.npy"
 # LLFF's camera axes are down, right, backward; OpenGL's right, up, backward.

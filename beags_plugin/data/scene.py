@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 MaskKind = Literal["ids", "binary"]
-"""Images of class ids, or of one object: not 0 is inside, see ``masks.classes.read_binary_mask``."""
+"""Images of class ids, or of one object: not 0 is inside, see ``labels.classes.read_binary_mask``."""
 
 
 @dataclass(frozen=True)

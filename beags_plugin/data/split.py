@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from beags_plugin.data.scene import Split
-from beags_plugin.errors import UserError
+from beags_plugin.system.errors import UserError
 
 
 def split_views(

@@ -6,8 +6,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from beags_plugin.errors import UserError
-from beags_plugin.reading.text import MOST_BYTES_OF_POSES, load_json, reason
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.text import MOST_BYTES_OF_POSES, load_json, reason
 
 _FOCAL = ("fl_x", "fl_y")
 _SIZE = ("w", "h")

@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args, get_type_hints
 
-from beags_plugin.errors import UserError
+from beags_plugin.system.errors import UserError
 
 
 @dataclass(frozen=True)

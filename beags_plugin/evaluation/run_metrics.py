@@ -15,8 +15,8 @@ from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import KINDS, EvalView, Kind, MaskRecord, ObjectMetrics, SceneMetrics, ViewRecord
 from beags_plugin.extraction.select import select_class
 from beags_plugin.losses.photometric import ssim
-from beags_plugin.rasterizers.drawing import geometry_inputs, surfel_inputs
 from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
+from beags_plugin.rasterizers.rendering import geometry_inputs, surfel_inputs
 
 
 def evaluate_scene(

@@ -1,6 +1,6 @@
 """Exporters, each a registered component (entry points: ``beags.exporters``)."""
 
-from beags_plugin.registry import Registry
+from beags_plugin.system.registry import Registry
 
 EXPORTERS = Registry(
     "exporter",

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+from beags_plugin.system.errors import UserError
 
 
 class NothingToExport(UserError):

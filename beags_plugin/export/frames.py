@@ -12,9 +12,9 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
 from beags_plugin.export.base import Viewpoints
 from beags_plugin.extraction.frames import to_input_frame
+from beags_plugin.system.errors import UserError
 
 Placement = Literal["world", "object"]
 _BULK = 0.01  # share of the surfels at each side that say nothing of how large the thing is: some are strays

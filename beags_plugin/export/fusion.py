@@ -18,9 +18,9 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.lifting import lift
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import Viewpoints
+from beags_plugin.export.close_up import close_up
 from beags_plugin.export.frames import bounding_box
-from beags_plugin.export.zoom import close_up
-from beags_plugin.rasterizers.drawing import surfel_inputs
+from beags_plugin.rasterizers.rendering import surfel_inputs
 
 BLOCK = 16
 """Voxels along a side of the blocks that Open3D allocates as a whole."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from beags_plugin.errors import UserError
+from beags_plugin.system.errors import UserError
 
 MOST_VOXELS = 4096  # along a side; memory_mb bounds their number besides
 

@@ -17,11 +17,11 @@ import numpy as np
 import torch
 
 from beags_plugin.core.surfels import Surfels, opacities
-from beags_plugin.errors import UserError
 from beags_plugin.export.base import Exporter, Piece
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.frames import to_input_frame
 from beags_plugin.extraction.ply import THICKNESS
+from beags_plugin.system.errors import UserError
 
 MAGIC = 0x5053474E
 VERSION = 2

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from beags_plugin.errors import writing
-from beags_plugin.whole_files import put_in_place, unfinished
+from beags_plugin.system.errors import writing
+from beags_plugin.system.whole_files import put_in_place, unfinished
 
 
 @contextmanager

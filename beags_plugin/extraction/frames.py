@@ -10,7 +10,7 @@ from torch import Tensor
 from beags_plugin.core.rotations import quat_product
 from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
+from beags_plugin.system.errors import UserError
 
 # Orthonormality is checked to this: the matrices are written as float32 by way of JSON.
 _ORTHONORMAL_TOLERANCE = 1e-4

@@ -12,10 +12,10 @@ from torch import Tensor
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.sh import MAX_DEGREE, num_sh_bases
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.frames import to_input_frame
 from beags_plugin.extraction.splat_file import read_splat_file
+from beags_plugin.system.errors import UserError
 
 THICKNESS = 1e-3
 """Written third scale, relative to the smaller of the two: flat, yet no viewer divides by 0."""

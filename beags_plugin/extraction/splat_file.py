@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.flattening import Gaussians
-from beags_plugin.errors import UserError
-from beags_plugin.reading.text import reason
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.text import reason
 
 _HEADER_BYTES = 1 << 20  # a header is longer than this in no file that is one
 _SIZES = {

@@ -1,6 +1,6 @@
 """What reads scenes to start from, each a registered component (entry points: ``beags.importers``)."""
 
-from beags_plugin.registry import Registry
+from beags_plugin.system.registry import Registry
 
 IMPORTERS = Registry(
     "importer",

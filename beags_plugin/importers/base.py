@@ -10,7 +10,7 @@ from typing import ClassVar
 from torch import Tensor
 
 from beags_plugin.core.flattening import Gaussians
-from beags_plugin.errors import UserError
+from beags_plugin.system.errors import UserError
 
 
 @dataclass(frozen=True)

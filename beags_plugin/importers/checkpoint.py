@@ -10,10 +10,10 @@ from torch import Tensor
 
 from beags_plugin.core.flattening import Gaussians
 from beags_plugin.core.sh import sh_basis
-from beags_plugin.errors import UserError
 from beags_plugin.importers.base import ImportedScene, Importer
-from beags_plugin.reading.tensors import load_tensors
-from beags_plugin.reading.text import load_json, reason
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.tensors import load_tensors
+from beags_plugin.system.reading.text import load_json, reason
 
 _TRANSFORM = "dataparser_transforms.json"  # nerfstudio's name for how the poses were normalised
 _PREFIX = "_model.gauss_params."

@@ -1,6 +1,6 @@
 """The losses, each a registered component (entry points: ``beags.losses``)."""
 
-from beags_plugin.registry import Registry
+from beags_plugin.system.registry import Registry
 
 LOSSES = Registry(
     "loss",

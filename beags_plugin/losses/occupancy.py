@@ -9,13 +9,13 @@ from torch import Tensor
 
 from beags_plugin.core.rotations import rotation_from_quat, usable_quats
 from beags_plugin.core.surfels import opacities as opacities_of
-from beags_plugin.errors import UserError
 from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.reduction import ordered_sum
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.occupancy.sampling import RADIUS, disc_points, sample_stream, sample_words
 from beags_plugin.ops import cuda_extension
 from beags_plugin.ops.occupancy_loss import occupancy_loss
+from beags_plugin.system.errors import UserError
 
 _CHUNK_POINTS = 1 << 16  # points looked up at a time: their temporaries stay in the cache; never changes the result
 

@@ -8,11 +8,11 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from beags_plugin.errors import UserError
 from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.reduction import ordered_mean
 from beags_plugin.ops import cuda_extension
 from beags_plugin.ops import photometric as compiled
+from beags_plugin.system.errors import UserError
 
 WINDOW = 11
 SIGMA = 1.5

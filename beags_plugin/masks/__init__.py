@@ -1,6 +1,6 @@
 """Class maps, and ways to make them consistent between views (entry points: ``beags.reprojections``)."""
 
-from beags_plugin.registry import Registry
+from beags_plugin.system.registry import Registry
 
 REPROJECTIONS = Registry(
     "reprojection",

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from beags_plugin.core import processes
 from beags_plugin.core.cameras import Camera
-from beags_plugin.errors import UserError
-from beags_plugin.masks.label_maps import LabelMaps, widened
+from beags_plugin.labels.label_maps import LabelMaps, widened
 from beags_plugin.ops import cuda_extension, extension
 from beags_plugin.ops.reprojection_votes import reprojection_votes
 from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.system import processes
+from beags_plugin.system.errors import UserError
 
 _CHUNK_PIXELS = 1 << 16  # source pixels projected at a time: their temporaries stay in the cache
 _DENSE_COUNTERS = 1 << 26  # up to this many (pixel, class) pairs a view's votes are counted in one array (256 MiB)

@@ -10,15 +10,15 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.filed_tensors import filed
 from beags_plugin.core.lifting import lift
-from beags_plugin.core.processes import each_view
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.errors import UserError
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.occupancy.voxel_size import reference_indices, voxel_size_of_reference
-from beags_plugin.rasterizers.drawing import draw_class_map, geometry_inputs, surface_depth
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+from beags_plugin.rasterizers.rendering import draw_class_map, geometry_inputs, surface_depth
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.filed_tensors import filed
+from beags_plugin.system.processes import each_view
 
 MIN_ALPHA_LIFTED = 0.5  # pixels with less alpha are not lifted
 

@@ -10,7 +10,7 @@ from types import ModuleType
 import torch  # before _native, which shares the OpenMP library that torch loads
 from torch import Tensor
 
-from beags_plugin.errors import UserError
+from beags_plugin.system.errors import UserError
 
 _SUFFIXES = {torch.float32: "f32", torch.float64: "f64"}
 

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from beags_plugin.core.class_ranks import ClassRanks
+from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.ops import cuda_extension, extension, voxel_bricks
 
 

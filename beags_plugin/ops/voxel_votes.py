@@ -78,7 +78,7 @@ class CudaVoxelVotes:
 
 
 def brick_sample(depth: Tensor, to_voxels: Tensor, part: int) -> Tensor:
-    """What ``masks.slabs.torch_brick_sample`` tells of depth [H, W] on the CPU; the caller asks
+    """What ``masks.spatial_chunks.torch_brick_sample`` tells of depth [H, W] on the CPU; the caller asks
     ``extension.can_take(depth)`` first."""
     depth, to_voxels = _view(depth, to_voxels)
     found = extension.function("brick_sample", depth)(depth, to_voxels, part)

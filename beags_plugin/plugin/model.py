@@ -16,26 +16,26 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import DensifyConfig, initial_surfels
-from beags_plugin.core.devices import sent
 from beags_plugin.core.sh import MAX_DEGREE
-from beags_plugin.errors import UserError
 from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.class_members import ClassMembers
 from beags_plugin.losses.photometric import ssim
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.plugin.cameras import camera_from_nerfstudio
-from beags_plugin.plugin.loss_spec import LossSpec
-from beags_plugin.plugin.schedule import PhaseSchedule
-from beags_plugin.plugin.step_clock import StepClock
-from beags_plugin.plugin.surfel_model import SurfelModel
-from beags_plugin.plugin.training import training_callbacks
-from beags_plugin.plugin.viewer_controls import ObjectPanel, ViewerLink
-from beags_plugin.plugin.viewing import Viewing, asked_by_viewer, scene_outputs
+from beags_plugin.plugin.options.loss_spec import LossSpec
+from beags_plugin.plugin.options.schedule import PhaseSchedule
+from beags_plugin.plugin.training.callbacks import training_callbacks
+from beags_plugin.plugin.training.scene_model import SurfelModel
+from beags_plugin.plugin.training.step_clock import StepClock
+from beags_plugin.plugin.viewer.panel import ObjectPanel, ViewerLink
+from beags_plugin.plugin.viewer.viewing import Viewing, asked_by_viewer, scene_outputs
+from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
+from beags_plugin.preparation.border_split import BorderSplitConfig
+from beags_plugin.preparation.pipeline import PreparationConfig
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.drawing import surfel_inputs
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings, SurfelInputs
-from beags_plugin.refiners.border_split import BorderSplitConfig
-from beags_plugin.refiners.preparation import PreparationConfig
+from beags_plugin.rasterizers.rendering import surfel_inputs
+from beags_plugin.system.devices import sent
+from beags_plugin.system.errors import UserError
 
 
 @dataclass
@@ -332,5 +332,5 @@ class BeagsModel(SurfelModel):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Schedules, densification and the switch to refinement: see ``plugin.training``."""
+        """Schedules, densification and the switch to refinement: see ``plugin.training.callbacks``."""
         return training_callbacks(self, training_callback_attributes)

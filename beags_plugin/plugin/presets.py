@@ -9,9 +9,9 @@ from typing import Any, cast
 
 from nerfstudio.plugins.types import MethodSpecification
 
-from beags_plugin.errors import UserError
-from beags_plugin.plugin.config import BeagsTrainerConfig, base_config
-from beags_plugin.shipped import read_toml, shipped_folder
+from beags_plugin.plugin.options.config import BeagsTrainerConfig, base_config
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.shipped import read_toml, shipped_folder
 
 
 def preset_folder() -> Path:

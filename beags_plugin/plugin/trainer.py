@@ -15,27 +15,27 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from beags_plugin.core import processes
-from beags_plugin.errors import UserError, is_of_disk, refused
-from beags_plugin.plugin.checkpoints import Checkpoints
-from beags_plugin.plugin.forecast import NO_MEMORY, MemoryWatch, check_memory, forecast, is_out_of_memory
-from beags_plugin.plugin.held_out import HeldOutCurve
-from beags_plugin.plugin.interrupts import Interrupts, stop
-from beags_plugin.plugin.memory import memory_mb, peak_memory_mb
-from beags_plugin.plugin.optimizers import JointOptimizers
-from beags_plugin.plugin.run_lock import RunLock, run_lock
-from beags_plugin.plugin.run_seconds import Estimate, StageSeconds
-from beags_plugin.plugin.runs import PREPARED, REPORT_FILE, STAGES, write_text_atomically
-from beags_plugin.plugin.several import Rank, check_machine
-from beags_plugin.plugin.training_state import GlobalRandom, Part
-from beags_plugin.plugin.warm_start import check_start, start_from_scene
-from beags_plugin.reading.text import reason
-from beags_plugin.whole_files import remove_unfinished
+from beags_plugin.plugin.runs.layout import PREPARED, REPORT_FILE, STAGES, write_text_atomically
+from beags_plugin.plugin.training.checkpoints import Checkpoints
+from beags_plugin.plugin.training.held_out import HeldOutCurve
+from beags_plugin.plugin.training.memory_guard import NO_MEMORY, MemoryWatch, check_memory, forecast, is_out_of_memory
+from beags_plugin.plugin.training.optimizers import JointOptimizers
+from beags_plugin.plugin.training.replicas import Rank, check_machine
+from beags_plugin.plugin.training.resumable import GlobalRandom, Part
+from beags_plugin.plugin.training.run_seconds import Estimate, StageSeconds
+from beags_plugin.plugin.training.warm_start import check_start, start_from_scene
+from beags_plugin.system import processes
+from beags_plugin.system.errors import UserError, is_of_disk, refused
+from beags_plugin.system.interrupts import Interrupts, stop
+from beags_plugin.system.lock import RunLock, run_lock
+from beags_plugin.system.memory import memory_mb, peak_memory_mb
+from beags_plugin.system.reading.text import reason
+from beags_plugin.system.whole_files import remove_unfinished
 
 if TYPE_CHECKING:
-    from beags_plugin.plugin.config import BeagsTrainerConfig
-    from beags_plugin.plugin.datamanager import BeagsDataManager
     from beags_plugin.plugin.model import BeagsModel
+    from beags_plugin.plugin.options.config import BeagsTrainerConfig
+    from beags_plugin.plugin.views.datamanager import BeagsDataManager
 
 
 class BeagsTrainer(Trainer):

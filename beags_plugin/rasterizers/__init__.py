@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from beags_plugin.errors import UserError
 from beags_plugin.rasterizers.interface import Rasterizer
-from beags_plugin.registry import Registry
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.registry import Registry
 
 RASTERIZERS = Registry(
     "rasterizer",

@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.errors import UserError
 from beags_plugin.ops import cuda_extension
 from beags_plugin.rasterizers.autograd import (
     Drawing,
@@ -30,6 +29,7 @@ from beags_plugin.rasterizers.autograd import (
 )
 from beags_plugin.rasterizers.interface import IGNORE, RasterSettings, SurfelInputs, map_ids
 from beags_plugin.rasterizers.pair_counts import PairCounts, capacity_for
+from beags_plugin.system.errors import UserError
 
 _FLOATS = ("means", "quats", "log_scales", "opacity_logits", "colors")
 _GEOMETRY, _DISTORTION, _BOUNDARY = 1, 2, 4  # Parts of native/types.h

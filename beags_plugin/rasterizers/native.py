@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.errors import UserError
 from beags_plugin.ops import extension
 from beags_plugin.rasterizers.autograd import (
     Drawing,
@@ -22,6 +21,7 @@ from beags_plugin.rasterizers.autograd import (
     check_image,
 )
 from beags_plugin.rasterizers.interface import RasterSettings, SurfelInputs, map_ids
+from beags_plugin.system.errors import UserError
 
 _FLOATS = ("means", "quats", "log_scales", "opacity_logits", "colors")
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.class_ranks import ClassRanks
+from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.rasterizers.interface import (
     IGNORE,
     MIN_TRANSMITTANCE,

@@ -1,6 +1,6 @@
 """What happens after assignment, as registered refiners (entry points: ``beags.refiners``)."""
 
-from beags_plugin.registry import Registry
+from beags_plugin.system.registry import Registry
 
 REFINERS = Registry(
     "refiner",

@@ -26,8 +26,8 @@ class AssignedScene:
     class_ids: [N] int32, phi.
     cameras: the training views.
     labels: per training view [H, W] int32, the masks M' that all refiners are given.
-    num_classes: ids lie below it, perhaps far apart: see ``core.class_ranks`` before an array has an entry per class.
-    depth: which depth stands for the surface: see ``rasterizers.drawing.surface_depth``.
+    num_classes: ids lie below it, perhaps far apart: see ``labels.class_ranks`` before an array has an entry per class.
+    depth: which depth stands for the surface: see ``rasterizers.rendering.surface_depth``.
     """
 
     surfels: Surfels

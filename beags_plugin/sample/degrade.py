@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beags_plugin.errors import UserError
 from beags_plugin.sample.textures import Noise
+from beags_plugin.system.errors import UserError
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from beags_plugin.errors import UserError, unwritable, writing
 from beags_plugin.sample.arrangement import make_still
 from beags_plugin.sample.degrade import Degradation, degrade_mask, dropped_views, resolve_degradation
 from beags_plugin.sample.lighting import Light
 from beags_plugin.sample.points import seed_points, write_ply
 from beags_plugin.sample.seen import seen_part, visible_surface, well_seen
 from beags_plugin.sample.views import Picture, View, make_views, render_view
+from beags_plugin.system.errors import UserError, unwritable, writing
 
 VERSION = 8
 """Raise it whenever the same config would give other files: older samples are then rebuilt."""

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from beags_plugin.errors import UserError
+from beags_plugin.system.errors import UserError
 from parser_targets.target import SIDE, Target
 
 
 def _mask(path: Path) -> None:
-    from beags_plugin.masks.classes import read_binary_mask, read_class_map
+    from beags_plugin.labels.classes import read_binary_mask, read_class_map
 
     try:
         read_class_map(path, (255,))

@@ -28,7 +28,7 @@ def _dtu(path: Path) -> None:
 def _colmap(path: Path) -> None:
     from nerfstudio.data.utils import colmap_parsing_utils as colmap
 
-    from beags_plugin.plugin.colmap_files import _read
+    from beags_plugin.plugin.views.colmap_files import _read
 
     kind = path.name.split(".")[0]
     _read(getattr(colmap, f"read_{kind}_binary"), path)
@@ -36,8 +36,8 @@ def _colmap(path: Path) -> None:
 
 def _transforms(path: Path) -> None:
     from beags_plugin.data.scene import TransformsFile
-    from beags_plugin.plugin.cameras import check_cameras
-    from beags_plugin.plugin.poses import Normalization, read_poses
+    from beags_plugin.plugin.views.cameras import check_cameras
+    from beags_plugin.plugin.views.poses import Normalization, read_poses
 
     pictures()
     views = read_poses(TransformsFile(path), path.parent, Normalization("up", "poses", True, 1.0, 1.0))

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from beags_plugin.errors import UserError
+from beags_plugin.system.errors import UserError
 
 SIDE = 6  # pixels of the pictures
 FOLDER = Path("/dev/shm") if Path("/dev/shm").is_dir() else Path(tempfile.gettempdir())

@@ -10,14 +10,14 @@ from typing import Any
 
 import torch
 
-from beags_plugin.errors import UserError
+from beags_plugin.system.errors import UserError
 from parser_targets.target import Target
 
 
 def _checkpoint(path: Path) -> None:
     from beags_plugin.importers.checkpoint import _gaussians
-    from beags_plugin.plugin.saved_state import check_state
-    from beags_plugin.plugin.training_state import read_checkpoint, training_state
+    from beags_plugin.plugin.runs.checkpoint_file import check_state
+    from beags_plugin.plugin.training.resumable import read_checkpoint, training_state
 
     try:
         state = read_checkpoint(path)
@@ -29,13 +29,13 @@ def _checkpoint(path: Path) -> None:
 
 
 def _grid(path: Path) -> None:
-    from beags_plugin.plugin.prepared_grid import read_grid
+    from beags_plugin.plugin.runs.prepared_grid import read_grid
 
     read_grid(path)
 
 
 def _filed(path: Path) -> None:
-    from beags_plugin.core.filed_tensors import FiledTensors
+    from beags_plugin.system.filed_tensors import FiledTensors
 
     try:
         list(FiledTensors(path))
@@ -92,7 +92,7 @@ def _grid_files() -> list[bytes]:
 
 
 def _filed_files() -> list[bytes]:
-    from beags_plugin.core.filed_tensors import write_tensors
+    from beags_plugin.system.filed_tensors import write_tensors
 
     file = io.BytesIO()
     write_tensors(file, [torch.ones(2, 2), torch.arange(3)])

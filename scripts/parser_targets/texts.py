@@ -10,7 +10,7 @@ from parser_targets.target import SIDE, Target, as_json, pictures
 
 
 def _classes(path: Path) -> None:
-    from beags_plugin.masks.classes import read_classes
+    from beags_plugin.labels.classes import read_classes
 
     read_classes(path)
 
@@ -38,7 +38,7 @@ def _experiment(path: Path) -> None:
 
 
 def _config(path: Path) -> None:
-    from beags_plugin.plugin.run_config import load_run_config
+    from beags_plugin.plugin.runs.run_config import load_run_config
 
     load_run_config(path)
 
@@ -77,7 +77,7 @@ def _experiment_files() -> list[bytes]:
 def _config_files() -> list[bytes]:
     import yaml
 
-    from beags_plugin.plugin.config import base_config
+    from beags_plugin.plugin.options.config import base_config
 
     text = yaml.dump(base_config())
     short = "!!python/object:beags_plugin.core.densification.DensifyConfig\nevery: 100\nstart: 500\n"

@@ -42,7 +42,7 @@ def writing(title: str, prepare: Callable[[Place, Path], Any]) -> Callable[[Plac
     """A command that writes where it cannot. prepare: is given the folder, which does not exist yet."""
 
     def make(at: Place):
-        from beags_plugin.doctor import diagnosis
+        from beags_plugin.commands.doctor import diagnosis
 
         at.patch.setattr(diagnosis, "diagnose", lambda: [])  # of the doctor's own work nothing is asked here
         folder = at.root / "out"
@@ -90,7 +90,7 @@ def _(at: Place):
 
 @mistake("full disk", "ns-train writes its checkpoint")
 def _(at: Place):
-    from beags_plugin.plugin import checkpoints
+    from beags_plugin.plugin.training import checkpoints
 
     command = at.train(*SHORT, preset="beags-tiny")
     save = checkpoints.save_atomically
@@ -125,7 +125,7 @@ def _(at: Place):
 
 @mistake("full disk", "ns-train prepares refinement")
 def _(at: Place):
-    from beags_plugin.plugin import refinement
+    from beags_plugin.plugin.training import refinement
 
     command = at.train(*SHORT, preset="beags-tiny")
     save = refinement.save_prepared
@@ -147,7 +147,7 @@ def _(at: Place):
     def full(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    from beags_plugin.core import filed_tensors
+    from beags_plugin.system import filed_tensors
 
     at.patch.setattr(filed_tensors, "write_tensors", full)
     at.patch.setattr(tempfile, "tempdir", str(at.root))

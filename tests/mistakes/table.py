@@ -114,7 +114,7 @@ class Place:
 
     def beags(self, *words: object) -> Command:
         """The command ``beags``; {run} stands for the config of the run."""
-        from beags_plugin import cli
+        from beags_plugin.commands import cli
 
         texts = [str(word) for text in words for word in ([text] if isinstance(text, Path) else str(text).split())]
         texts = [str(self.run / "config.yml") if text == "{run}" else text for text in texts]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from beags_plugin.data.layout import Layout
 from beags_plugin.data.scene import ColmapModel, Scene
-from beags_plugin.errors import UserError
+from beags_plugin.system.errors import UserError
 
 FOLDERS = ("sparse/0", "colmap/sparse/0", "sparse")
 

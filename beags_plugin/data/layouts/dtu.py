@@ -10,9 +10,9 @@ import numpy.typing as npt
 from beags_plugin.data.files import choose_images, image_size, list_images
 from beags_plugin.data.layout import Layout
 from beags_plugin.data.scene import PoseTable, Scene
-from beags_plugin.errors import UserError
-from beags_plugin.reading.arrays import load_arrays
-from beags_plugin.reading.text import reason
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.arrays import load_arrays
+from beags_plugin.system.reading.text import reason
 
 FILE = "cameras_sphere.npz"
 IMAGES = ("image", "images")

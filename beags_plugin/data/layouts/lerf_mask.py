@@ -8,7 +8,7 @@ from beags_plugin.data.files import choose_images, list_images
 from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.colmap import checked_model, model_folder
 from beags_plugin.data.scene import ColmapModel, Scene, Split
-from beags_plugin.errors import UserError
+from beags_plugin.system.errors import UserError
 
 
 class LerfMask(Layout):

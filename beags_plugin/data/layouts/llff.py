@@ -9,8 +9,8 @@ from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.colmap import complete_model
 from beags_plugin.data.poses_bounds import FILE, read_poses_bounds, seed_points
 from beags_plugin.data.scene import ColmapModel, PoseTable, Scene, Split
-from beags_plugin.errors import UserError
-from beags_plugin.reading.text import load_text, reason
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.text import load_text, reason
 
 NVOS_TARGETS = {
     "fern": "IMG_4027",

@@ -8,8 +8,8 @@ from beags_plugin.data.files import choose_images, list_images
 from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.llff import lacks_poses, model_or_bounds
 from beags_plugin.data.scene import Scene, Split
-from beags_plugin.errors import UserError
-from beags_plugin.reading.text import load_text, reason
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.text import load_text, reason
 
 CLASSES = "segmentations/classes.txt"
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from beags_plugin.masks.check.consistency import Agreement
 from beags_plugin.masks.check.files import Coverage, MaskFiles
-from beags_plugin.masks.check.findings import Finding, percent
+from beags_plugin.masks.check.issues import Finding, percent
 
 
 def views_against_others(

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from beags_plugin.data.files import IMAGE_SUFFIXES, image_size
-from beags_plugin.errors import UserError
-from beags_plugin.masks.check.findings import STOPS, Finding, named, percent
-from beags_plugin.masks.classes import BACKGROUND, read_mask
+from beags_plugin.labels.classes import BACKGROUND, read_mask
+from beags_plugin.masks.check.issues import STOPS, Finding, named, percent
 from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.system.errors import UserError
 
 FEW_VIEWS = 3  # an object needs two other views to outvote one
 MOST_IDS = 256  # in one file, or compared between views, which takes memory with their square
@@ -25,7 +25,7 @@ class MaskFiles:
     """The views of a scene and the mask of each.
 
     stems: names of the V images (``data.files.photo_names``); sizes: (width, height) of their files; masks: file or
-    None. folder: where masks are looked for. kind, ignore_ids: see ``masks.classes.read_mask``. trained: whether each
+    None. folder: where masks are looked for. kind, ignore_ids: see ``labels.classes.read_mask``. trained: whether each
     view is trained on. names: id to name where the user or the layout gave names, else None; names_file: where they
     stand.
     """

@@ -1,6 +1,6 @@
 """Where masks come from, as registered sources (entry points: ``beags.mask_sources``); nothing of nerfstudio."""
 
-from beags_plugin.registry import Registry
+from beags_plugin.system.registry import Registry
 
 MASK_SOURCES = Registry(
     "mask source",

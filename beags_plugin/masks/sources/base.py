@@ -13,9 +13,9 @@ import numpy as np
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.errors import UserError
 from beags_plugin.masks.sources.matching import PhotoNames
-from beags_plugin.reading.images import read_image
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.images import read_image
 
 Progress = Callable[[int, int], None]
 

@@ -9,10 +9,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from beags_plugin.errors import UserError
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo, stacked
 from beags_plugin.rasterizers.interface import IGNORE
-from beags_plugin.reading.text import MOST_BYTES_OF_MASKS, load_json, reason
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.text import MOST_BYTES_OF_MASKS, load_json, reason
 
 FARTHEST = 1e5  # pixels of a polygon's points from the image's corner; the library rasterizes every one
 INSTANCE_KEYS = ("instance_id", "track_id", "object_id")

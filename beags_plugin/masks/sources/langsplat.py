@@ -9,12 +9,12 @@ from typing import Literal
 
 import numpy as np
 
-from beags_plugin.errors import UserError
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo
 from beags_plugin.masks.sources.matching import files_by_name
 from beags_plugin.rasterizers.interface import IGNORE
-from beags_plugin.reading.arrays import load_array
-from beags_plugin.reading.text import reason
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.arrays import load_array
+from beags_plugin.system.reading.text import reason
 
 LEVELS = ("default", "small", "medium", "large")
 

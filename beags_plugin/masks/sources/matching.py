@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
 from beags_plugin.data.files import IMAGE_SUFFIXES
-from beags_plugin.errors import UserError
+from beags_plugin.system.errors import UserError
 
 Found = TypeVar("Found")
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from beags_plugin.errors import UserError
-from beags_plugin.masks.classes import read_binary_mask
+from beags_plugin.labels.classes import read_binary_mask
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo, stacked
 from beags_plugin.masks.sources.matching import files_by_name
+from beags_plugin.system.errors import UserError
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from beags_plugin.errors import UserError
-from beags_plugin.reading.text import load_json, reason
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.text import load_json, reason
 
 EXAMPLE = '{"objects": [{"name": "cup", "prompts": [{"view": "IMG_1", "box": [10, 20, 90, 80]}]}]}'
 

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from beags_plugin.errors import UserError
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene
 from beags_plugin.masks.sources.prompts import Prompt, read_prompts
 from beags_plugin.masks.sources.two_stage import BestLabels, Box, Retrieval, retrieve
+from beags_plugin.system.errors import UserError
 
 KEPT_FRAMES = 32  # of one object's memory behind the frame that is tracked; the model looks at 16 at most
 

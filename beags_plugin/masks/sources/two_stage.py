@@ -9,8 +9,8 @@ from typing import Protocol
 
 import numpy as np
 
-from beags_plugin.errors import UserError
 from beags_plugin.masks.sources.prompts import Prompt, PromptedObject
+from beags_plugin.system.errors import UserError
 
 Box = tuple[float, float, float, float]
 

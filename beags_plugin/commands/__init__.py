@@ -1,0 +1,1 @@
+"""Commands of ``beags``, one a file."""

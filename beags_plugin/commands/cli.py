@@ -1,0 +1,315 @@
+"""The command line: ``beags demo | resume | sample | masks | extract | export | render | eval | bench | doctor``."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Literal, NoReturn
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+from beags_plugin.bench.commands import Measurement
+from beags_plugin.commands.masks import Masks
+from beags_plugin.evaluation.protocol import Protocol
+from beags_plugin.export.mesh_options import MeshOptions
+from beags_plugin.pictures.options import RenderOptions
+from beags_plugin.system.errors import UserError, refused
+
+CONSOLE = Console(soft_wrap=True, highlight=False)
+
+
+@dataclass
+class Demo:
+    """Train, extract and measure: on the sample that ships with the code, or on a folder of your own."""
+
+    data: Path | None = None
+    """Folder with images, poses and masks; the generated sample if left out."""
+    output: Path | None = None
+    """Where everything goes; outputs/demo, or outputs/<name of the data folder>."""
+    preset: str = "beags-tiny"
+    """What to train with: a preset of method_configs/."""
+    downscale: float | None = None
+    """Divide the image size by this; chosen for a quick run if left out (a folder of your own only)."""
+    seed: int = 0
+    """Seed of the generated sample."""
+    fresh: bool = False
+    """Train again even if the same demo has been trained before."""
+
+    def run(self) -> None:
+        from beags_plugin.commands.demo import run_demo
+
+        run_demo(self.data, self.output, self.preset, self.downscale, self.seed, self.fresh)
+
+
+@dataclass
+class Resume:
+    """Go on with a training that was broken off, in its own folder; it ends as it would have without the break."""
+
+    run_folder: tyro.conf.Positional[Path]
+    """Folder of the run (or its config.yml)."""
+
+    device: Literal["cpu", "cuda"] | None = None
+    """Go on here instead of where it was begun; the result is then no longer the same in every bit."""
+
+    check_memory: bool = True
+    """Stop where memory or disk will not do."""
+
+    def run(self) -> None:
+        from beags_plugin.plugin.runs.launch import resume
+
+        try:
+            resume(self.run_folder, self.device, self.check_memory)
+        except KeyboardInterrupt:
+            sys.exit(130)
+
+
+@dataclass
+class Sample:
+    """Generate a scene with exact ground truth: photos, damaged masks, silhouettes, depth."""
+
+    output: Path = Path("outputs/sample")
+    """Folder to write."""
+    seed: int = 0
+    """Another seed gives another arrangement."""
+    width: int = 256
+    """Pixels."""
+    height: int = 192
+    """Pixels."""
+    degradation: str = "mild"
+    """How masks are damaged: none, mild or strong, or any degree from 0 on (1 is mild, 2 strong)."""
+    views: int = 60
+    """Views to train on; 12 more are held out."""
+
+    def run(self) -> None:
+        from beags_plugin.commands.demo import make_sample
+
+        make_sample(self.output, self.seed, self.width, self.height, self.degradation, self.views)
+        CONSOLE.print(f"sample: {self.output}", markup=False)
+
+
+@dataclass
+class Extract:
+    """Write a run folder and a .ply per object; ns-viewer, ns-render and ns-export work on each run."""
+
+    load_config: Path
+    """config.yml of a trained run."""
+    object: tuple[str, ...] = ()
+    """Names of the objects; all but the background if left out."""
+    remove: bool = False
+    """Keep everything but the object."""
+    output: Path | None = None
+    """Folder for the runs; extracted/ beside config.yml if left out."""
+    json: Path | None = None
+    """File that lists what was written."""
+
+    def run(self) -> None:
+        from beags_plugin.plugin.objects.extract import extract_objects
+        from beags_plugin.system.progress import progress_bar
+
+        with progress_bar("extracting") as progress:
+            extracted = extract_objects(self.load_config, self.object, self.remove, self.output, progress)
+        write_json(self.json, [vars(done) for done in extracted])
+        for done in extracted:
+            CONSOLE.print(
+                f"{done.name}: {done.gaussians} Gaussians\n  {done.ply}\n  ns-viewer --load-config {done.config}",
+                markup=False,
+            )
+
+
+@dataclass
+class Export:
+    """Write objects as files for other programs, in the frame of the input poses or centred on each object."""
+
+    load_config: Path
+    """config.yml of a trained run."""
+    object: tuple[str, ...] = ()
+    """Names of the objects."""
+    all: bool = False
+    """Every object, the emptied background, and a manifest.json."""
+    whole: bool = False
+    """The whole scene in one file; without --object and --all it needs no classes."""
+    format: tuple[str, ...] = ("ply",)
+    """ply (viewers of 3D Gaussians), ply-2dgs (the official 2DGS code), spz (small), glb, obj (meshes), or your own."""
+    frame: str = "world"
+    """world, that of the input poses; or object, the same with the middle of the object's box as origin."""
+    output: Path | None = None
+    """Folder for the files; exports/ beside config.yml if left out."""
+    json: Path | None = None
+    """File that lists what was written."""
+    mesh: tyro.conf.OmitArgPrefixes[MeshOptions] = MeshOptions()
+
+    def run(self) -> None:
+        from beags_plugin.plugin.objects.export import export_run
+        from beags_plugin.system.progress import progress_bar
+
+        options = {name: asdict(self.mesh) for name in ("glb", "obj")}
+        with progress_bar("exporting") as progress:
+            exported = export_run(
+                self.load_config,
+                self.object,
+                self.all,
+                self.format,
+                self.frame,
+                self.output,
+                options,
+                progress,
+                whole=self.whole,
+            )
+        write_json(self.json, [asdict(one) for one in exported])
+        for one in exported:
+            CONSOLE.print(f"{one.name}: {one.gaussians} Gaussians", markup=False)
+            for file in one.files:
+                CONSOLE.print(f"  {file.path or f'no {file.format}: {file.reason}'}", markup=False)
+
+
+@dataclass
+class Render:
+    """Draw objects alone: a turntable video, a contact sheet, or assignment alone beside the refined object."""
+
+    load_config: Path
+    """config.yml of a trained run."""
+    object: tuple[str, ...] = ()
+    """Names of the objects; all but the background if left out."""
+    format: str = "video"
+    """video (.mp4 or .gif), sheet (.png or .jpg), or before-after (any of these, by the name of the file)."""
+    output: Path | None = None
+    """The file; in renders/ beside config.yml if left out."""
+    options: tyro.conf.OmitArgPrefixes[RenderOptions] = RenderOptions()
+
+    def run(self) -> None:
+        from beags_plugin.plugin.objects.render import render_run
+        from beags_plugin.system.progress import progress_bar
+
+        with progress_bar("rendering") as progress:
+            path = render_run(self.load_config, self.object, self.format, self.output, self.options, progress)
+        CONSOLE.print(f"{self.format}: {path}", markup=False)
+
+
+@dataclass
+class Eval:
+    """Score runs on their held-out views: masks per object, PSNR and SSIM, before and after refinement.
+
+    Several runs are scenes of one data set: a table per scene, and their mean.
+    """
+
+    load_config: tuple[Path, ...]
+    """config.yml of one trained run or more."""
+    data_set_name: str = "mean"
+    """What the mean of several runs is called."""
+    json: Path | None = None
+    """File for all figures, down to single masks and views."""
+    csv: Path | None = None
+    """File for the figures of objects and scenes as a table."""
+    picture: Path | None = None
+    """File for a picture of the worst masks: what is right, missed and wrong, before and after."""
+    worst: int = 6
+    """How many masks of each kind the picture shows."""
+    protocol: tyro.conf.OmitArgPrefixes[Protocol] = Protocol()
+
+    def run(self) -> None:
+        from beags_plugin.commands.evaluate import Outputs, run_evaluation
+
+        outputs = Outputs(self.json, self.csv, self.picture, self.worst)
+        run_evaluation(self.load_config, self.data_set_name, self.protocol, outputs)
+
+
+@dataclass
+class Bench:
+    """Measure, and leave tables, JSON, CSV and a picture behind."""
+
+    what: Measurement
+
+    def run(self) -> None:
+        self.what.run()
+
+
+@dataclass
+class Doctor:
+    """Say what this installation can do, what is missing, and the one command that repairs each.
+
+    With --data: how much memory and disk a training on it will take, and whether they are there.
+    """
+
+    data: Path | None = None
+    """Folder of a scene (or a transforms .json)."""
+
+    preset: str = "beags"
+    """Preset that it would be trained with."""
+
+    downscale_factor: float = 1.0
+    """Divide the images' width and height by this."""
+
+    json: Path | None = None
+    """File for the same."""
+
+    def run(self) -> None:
+        from beags_plugin.commands.doctor.check import print_report
+        from beags_plugin.commands.doctor.diagnosis import diagnose
+
+        checks = diagnose()
+        if self.data is not None:
+            from beags_plugin.plugin.training.memory_guard import checks_of_run
+
+            checks += checks_of_run(self.data, self.preset, self.downscale_factor)
+        write_json(self.json, [check.to_json() for check in checks])
+        print_report(checks)
+
+
+def write_json(path: Path | None, content: object) -> None:
+    """Write plain values, and paths as text; None writes nothing. Raises ``UserError`` if it cannot be written."""
+    import json
+
+    from beags_plugin.extraction.files import whole_file
+
+    if path is not None:
+        with whole_file(path) as part:
+            part.write_text(json.dumps(content, indent=2, default=str) + "\n", "utf8")
+
+
+Command = (
+    Annotated[Demo, tyro.conf.subcommand(name="demo")]
+    | Annotated[Resume, tyro.conf.subcommand(name="resume")]
+    | Annotated[Sample, tyro.conf.subcommand(name="sample")]
+    | Annotated[Masks, tyro.conf.subcommand(name="masks")]
+    | Annotated[Extract, tyro.conf.subcommand(name="extract")]
+    | Annotated[Export, tyro.conf.subcommand(name="export")]
+    | Annotated[Render, tyro.conf.subcommand(name="render")]
+    | Annotated[Eval, tyro.conf.subcommand(name="eval")]
+    | Annotated[Bench, tyro.conf.subcommand(name="bench")]
+    | Annotated[Doctor, tyro.conf.subcommand(name="doctor")]
+)
+
+
+def say(error: UserError) -> NoReturn:
+    """Print a user's mistake and end with exit code 2."""
+    if not error.told:
+        CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}")
+    sys.exit(2)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point of the command ``beags``; a user's mistake prints one sentence and ends with exit code 2."""
+    config = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
+    description = "BEA-GS: clean objects out of Gaussian-splat scenes."
+    # What torch says to nerfstudio's authors, who wrote for an older one.
+    warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|nerfstudio)\.")
+    try:
+        command = tyro.cli(Command, args=arguments, description=description, config=config)
+        command.run()
+    except UserError as error:
+        say(error)
+    except OSError as error:
+        if (told := refused(error)) is None:
+            raise
+        say(told)
+    except KeyboardInterrupt:
+        CONSOLE.print("[bold red]beags:[/bold red] interrupted.")
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,243 @@
+"""``beags demo``: sample, training, extraction, measurement, one table and one picture."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from rich.console import Console
+
+from beags_plugin.system.child_processes import bound
+from beags_plugin.system.digests import code_digest, folder_digest, value_digest
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.lock import RunLock
+from beags_plugin.system.progress import progress_bar
+from beags_plugin.system.whole_files import write_whole
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.model import BeagsModelConfig
+
+CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
+QUICK_PIXELS = 50_000  # a folder of the user's is scaled down to at most so many pixels a view, to end in minutes
+STAMP = "trained.json"  # beside the run: what it was made from
+STARTED = "started"  # in there, as long as that is not done
+SHEET_VIEWS = 3  # held-out views in the picture
+
+
+def make_sample(folder: Path, seed: int, width: int, height: int, degradation: str, views: int = 60) -> None:
+    """Generate the sample with ``views`` training views in ``folder`` unless the same one lies there already."""
+    from beags_plugin.sample.writer import SampleConfig, write_sample
+
+    config = SampleConfig(seed=seed, width=width, height=height, degradation=degradation, num_train=views)
+    with progress_bar("Tracing the sample") as progress:
+        write_sample(folder, config, progress)
+
+
+def run_demo(
+    data: Path | None, output: Path | None, preset: str, downscale: float | None, seed: int, fresh: bool
+) -> None:
+    """Do the whole job in ``output`` and print the table; see ``cli.Demo`` for the arguments."""
+    from beags_plugin.data.layout import read_scene
+
+    check_preset(preset)
+    if downscale is not None and not 1.0 <= downscale < math.inf:
+        raise UserError(f"downscale is {downscale}: give 1 (full size) or more.")
+    seconds: dict[str, float] = {}
+    if data is None:
+        output = output or Path("outputs/demo")
+        data = output / "sample"
+        with _Timer(seconds, "sample"):
+            make_sample(data, seed, 256, 192, "mild")
+        downscale = downscale or 1.0
+    elif not data.is_dir():
+        raise UserError(f"{data} is no folder: name one with images, poses and masks.")
+    else:
+        read_scene(data)  # which says what is missing, before a training is started
+        output = output or Path("outputs") / data.resolve().name
+        downscale = downscale or quick_downscale(data)
+    run = output / "run"
+    request = {"preset": preset, "downscale": downscale, "inputs": _digest(data, preset)}
+    if not fresh and _trained(output, request):
+        CONSOLE.print(f"Trained before: {run} (add --fresh to train again).")
+    else:
+        if run.is_dir():
+            _check_own(output)  # before anything is written there
+            RunLock(run).release()  # says so if the same demo is being trained
+        if not fresh and _broken_off(output, request):
+            resume(run)
+        else:
+            _clear(output)
+            write_stamp(output, {STARTED: request})
+            train(data, run, preset, downscale)
+        write_stamp(output, request)
+    measure(run, output, seconds)
+
+
+def quick_downscale(data: Path) -> float:
+    """Whole factor that brings the images of ``data`` to ``QUICK_PIXELS`` or less."""
+    from beags_plugin.data.files import image_size
+
+    images = _images(data) or _first_frame(data)
+    if not images:
+        return 1.0  # the data parser names what is missing
+    width, height = image_size(images[0])
+    factor = 1
+    while width * height / factor**2 > QUICK_PIXELS:
+        factor += 1
+    return float(factor)
+
+
+def _images(data: Path) -> list[Path]:
+    """The images that the layout of ``data`` takes, or where it is not known, those in images/."""
+    from beags_plugin.data.layout import read_scene
+    from beags_plugin.data.scene import ColmapModel, PoseTable
+
+    folder, pattern = data, "images*/**/*"
+    with contextlib.suppress(UserError):  # the data parser names what is missing
+        poses = read_scene(data).poses
+        if isinstance(poses, PoseTable):
+            return list(poses.images)
+        if isinstance(poses, ColmapModel):
+            folder, pattern = poses.images, "**/*"
+    return sorted(path for path in folder.glob(pattern) if path.suffix.lower() in {".jpg", ".jpeg", ".png"})
+
+
+def _first_frame(data: Path) -> list[Path]:
+    """The first image that transforms.json names; none where there is no such file, or it is damaged."""
+    try:
+        return [data / json.loads((data / "transforms.json").read_text(encoding="utf-8"))["frames"][0]["file_path"]]
+    except (OSError, ValueError, LookupError, TypeError):
+        return []
+
+
+def check_preset(preset: str) -> None:
+    """Raise ``UserError`` unless the preset trains a base and refines it, which is what the demo compares."""
+    from beags_plugin.plugin.presets import load_preset, preset_names
+
+    if preset not in preset_names():
+        raise UserError(f"there is no preset {preset!r}: choose one of {', '.join(preset_names())}.")
+    model = cast("BeagsModelConfig", load_preset(preset).config.pipeline.model)
+    if not (model.base_steps and model.refine_steps):
+        raise UserError(f"the demo compares a base with its refinement, and {preset} trains only one: take beags-tiny.")
+
+
+def _digest(data: Path, preset: str) -> str:
+    """Changes with the preset, the package's code and any file of the data (by name, size and time)."""
+    from beags_plugin.plugin.presets import preset_folder
+
+    return value_digest([folder_digest(data), code_digest(), (preset_folder() / f"{preset}.toml").read_text("utf8")])
+
+
+def write_stamp(output: Path, content: dict[str, Any]) -> None:
+    """Say what the run in ``output`` was made from, or, under ``STARTED``, is being made from."""
+    write_whole(output / STAMP, lambda file: file.write(json.dumps(content).encode()))
+
+
+def _read_stamp(output: Path) -> dict[str, Any]:
+    try:
+        former = json.loads((output / STAMP).read_text())
+    except (OSError, ValueError):
+        return {}
+    return former if isinstance(former, dict) else {}
+
+
+def _trained(output: Path, request: dict[str, Any]) -> bool:
+    """Whether the same was trained before, to its end."""
+    former = _read_stamp(output)
+    return request in (former, former.get(STARTED)) and (output / "run" / "training.json").exists()
+
+
+def _broken_off(output: Path, request: dict[str, Any]) -> bool:
+    """Whether the same was being trained, and can go on."""
+    return _read_stamp(output).get(STARTED) == request and (output / "run" / "config.yml").exists()
+
+
+def _check_own(output: Path) -> None:
+    """Raise ``UserError`` if ``run`` is there and something else's."""
+    run = output / "run"
+    if run.exists() and not (output / STAMP).exists():
+        raise UserError(f"{run} is not the demo's: choose another --output, or move it away.")
+
+
+def _clear(output: Path) -> None:
+    """Remove the demo's own former run; raises ``UserError`` if ``run`` is something else's."""
+    _check_own(output)
+    shutil.rmtree(output / "run", ignore_errors=True)
+
+
+def train(data: Path, run: Path, preset: str, downscale: float) -> None:
+    """Run ns-train in a process of its own, as a user would."""
+    command = [
+        str(Path(sys.executable).parent / "ns-train"), preset, "--data", str(data), "--run-dir", str(run.absolute()),
+        "--vis", "tensorboard", "beags-data", "--downscale-factor", str(downscale),
+    ]  # fmt: skip
+    CONSOLE.print("$ " + " ".join(command))
+    _finish(command)
+
+
+def resume(run: Path) -> None:
+    """Go on with a training that was broken off, in a process of its own."""
+    CONSOLE.print(f"Going on with the training that was broken off (add --fresh to start anew).\n$ beags resume {run}")
+    _finish([sys.executable, "-m", "beags_plugin.commands.cli", "resume", str(run)])
+
+
+def _finish(command: list[str]) -> None:
+    code = subprocess.run(bound(command)).returncode
+    if code != 0:
+        raise UserError(f"training ended with exit code {code}; what it printed above says why.")
+
+
+def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
+    """Compare assignment alone with refinement, extract every object, write summary.json and the picture."""
+    from beags_plugin.evaluation.table import print_run, summary_json
+    from beags_plugin.pictures.contact_sheet import draw_rows, novel_camera, write_contact_sheet
+    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
+    from beags_plugin.plugin.objects.extract import extract_objects
+
+    with _Timer(seconds, "evaluation"), progress_bar("Evaluating") as progress:
+        evaluated = EvaluatedRun(run / "config.yml")
+        metrics = evaluated.metrics(progress=progress)
+    with _Timer(seconds, "extraction"), progress_bar("Extracting") as progress:
+        extracted = extract_objects(run / "config.yml", progress=progress)
+    picture = output / "contact_sheet.png"
+    with _Timer(seconds, "picture"), progress_bar("Drawing the picture") as progress:
+        views, classes = evaluated.views, evaluated.classes
+        shown = views[:: max(1, len(views) // SHEET_VIEWS)][:SHEET_VIEWS]
+        objects = [index for index in classes if index != 0]
+        base, refined = evaluated.stages["before"], evaluated.stages["after"]
+        assert base.class_ids is not None and refined.class_ids is not None
+        scenes = ((base.surfels(), base.class_ids), (refined.surfels(), refined.class_ids))
+        drawing = (evaluated.rasterizer, evaluated.settings)
+        scenery = {"novel": novel_camera(views), "background": views.background, "progress": progress}
+        rows = draw_rows(shown, *scenes, objects, *drawing, **scenery)
+        write_contact_sheet(picture, rows, classes)
+    training = json.loads((run / "training.json").read_text())
+    stages = {"sample": seconds.pop("sample", 0.0), **training["seconds"], **seconds}
+    memory = training["peak_memory_mb"]
+    summary = json.dumps(summary_json(metrics, stages, memory), indent=2)
+    write_whole(output / "summary.json", lambda file: file.write(summary.encode()))
+    print_run(metrics, stages, memory, CONSOLE)
+    CONSOLE.print(f"objects: {', '.join(str(item.ply) for item in extracted)}")
+    CONSOLE.print(f"figures: {output / 'summary.json'}")
+    CONSOLE.print(f"picture: {picture}")
+    CONSOLE.print(f"look:    ns-viewer --load-config {run / 'config.yml'}")
+
+
+@dataclass
+class _Timer:
+    seconds: dict[str, float]
+    name: str
+
+    def __enter__(self) -> None:
+        self.start = time.perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self.seconds[self.name] = time.perf_counter() - self.start

@@ -1,0 +1,159 @@
+"""The commands of ``beags masks``: check, reproject and make the masks of a scene."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from beags_plugin.system.errors import UserError
+
+CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
+
+
+@dataclass
+class Check:
+    """Look for mistakes in masks before training on them; ends with exit code 1 where training would stop.
+
+    Which views lack a mask, wrong sizes and types, ids without a name, objects in few views, ids exchanged between
+    views, how much of each view each object covers; with a trained run also where the views contradict each other.
+    """
+
+    data: Path | None = None
+    """Folder of the scene; that of the run if left out."""
+    load_config: Path | None = None
+    """config.yml of a run trained on the scene (beags-base will do): its depth shows where views disagree."""
+    layout: str | None = None
+    """How the data set lays out its files (docs/data.md); as in the run, else auto, which recognises it."""
+    images_path: Path | None = None
+    """Folder of the images, if not the run's or the layout's own."""
+    masks_path: Path | None = None
+    """Folder of the id images, relative to the scene, if not the run's or the layout's own."""
+    classes_path: Path | None = None
+    """File {"id": "name"} of the classes; as in the run, else classes.json."""
+    ignore_ids: tuple[int, ...] | None = None
+    """Ids in the masks that mean "not labelled", if not the run's own."""
+    min_views: int = 3
+    """An object in fewer training views is reported."""
+    output: Path = Path("outputs/masks_check")
+    """Folder for report.json, coverage.png and contradicted.png."""
+
+    def run(self) -> None:
+        from beags_plugin.plugin.objects.check_masks import check_scene, check_with_run, options_beside, write_report
+        from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, reproject_run
+
+        if self.data is None and self.load_config is None:
+            raise UserError("no scene is named: give --data its folder, or --load-config a run trained on it.")
+        names = ("layout", "images_path", "masks_path", "classes_path", "ignore_ids")
+        parser = options_beside(self.load_config, self.data, **{name: getattr(self, name) for name in names})
+        report = check_scene(parser, self.min_views)
+        run = None
+        readable = not any(finding.level == "error" for finding in report.findings)
+        if self.load_config is not None and readable:
+            run = reproject_run(self.load_config, ReprojectionOptions(method="voxel", run_size=True, parser=parser))
+            report = check_with_run(report, run)
+        for finding in report.findings:
+            CONSOLE.print(f"{finding.level}: {finding.message}\n    costs: {finding.cost}")
+        CONSOLE.print(report.summary())
+        for path in write_report(report, self.output, run):
+            CONSOLE.print(f"  {path}")
+        if self.load_config is not None and not readable:
+            CONSOLE.print("The run was not asked, as the masks cannot all be read.")
+        if not readable:
+            sys.exit(1)
+
+
+@dataclass
+class Reproject:
+    """Let all views vote on each other's masks with the depth of a trained run; write what they agree on."""
+
+    load_config: Path
+    """config.yml of any trained run; beags-base will do."""
+    masks_path: Path | None = None
+    """Folder of the id images, if not those that the run was trained on."""
+    classes_path: Path | None = None
+    """File {"id": "name"} for them; classes.json beside the folder if there is one."""
+    method: str | None = None
+    """pairwise (exact), voxel (quick), auto (the one that fits the views) or your own; as the run is configured
+    if left out."""
+    tau: float | None = None
+    """pairwise: a vote counts if |z - depth| <= tau z; inf counts all."""
+    voters: int | None = None
+    """How many views vote; 0: all with a mask."""
+    depth: str | None = None
+    """Which depth is lifted: median or expected."""
+    min_confidence: float = 0.0
+    """Pixels whose winner has a smaller share of the votes are written as unlabelled (65535)."""
+    run_size: bool = False
+    """Work at the size that was trained on instead of that of the photographs: quicker, smaller masks."""
+    output: Path | None = None
+    """Folder for masks, confidence, classes.json, report.json, before_after.png; reprojected/ beside config.yml."""
+
+    def run(self) -> None:
+        from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, reproject_run, write_reprojection
+
+        if not 0.0 <= self.min_confidence <= 1.0:
+            raise UserError(f"min_confidence is {self.min_confidence}: it must be a share of the votes, 0 to 1.")
+        options = ReprojectionOptions(
+            self.masks_path, self.classes_path, self.method, self.tau, self.voters, self.depth, self.run_size
+        )
+        found = reproject_run(self.load_config, options)
+        output = self.output or self.load_config.parent / "reprojected"
+        for line in write_reprojection(found, output, self.min_confidence):
+            CONSOLE.print(line)
+
+
+@dataclass
+class Make:
+    """Make masks with a registered source (docs/masks.md) and write them where ns-train finds them."""
+
+    data: Path
+    """Folder of the scene."""
+    source: str
+    """id-images, object-images, coco, gaussian-grouping, langsplat, grabcut, sam2, or your own."""
+    options: tuple[str, ...] = ()
+    """Of the source, as key=value, e.g. prompts=prompts.json."""
+    load_config: Path | None = None
+    """config.yml of a run trained on the scene (beags-base will do), for sources that need its depth."""
+    output: Path | None = None
+    """Folder for masks/, classes.json and made.png; the scene's own if left out."""
+    overwrite: bool = False
+    """Replace masks that are there already."""
+    snap: int = 0
+    """Move rims to edges of the photo that are at most so many pixels away; 0 leaves them."""
+    layout: str = "auto"
+    """How the data set lays out its files (docs/data.md); auto recognises it."""
+    images_path: Path | None = None
+    """Folder of the images, if not the layout's own."""
+
+    def run(self) -> None:
+        from beags_plugin.plugin.objects.check_masks import data_options
+        from beags_plugin.plugin.objects.make_masks import configured_source, make_masks
+
+        if self.snap < 0:
+            raise UserError(f"snap is {self.snap}: give a radius in pixels, or 0.")
+        source = configured_source(self.source, self.options)
+        data = data_options(self.data, self.layout, self.images_path)
+        for line in make_masks(data, source, self.load_config, self.output, self.overwrite, self.snap):
+            CONSOLE.print(line)
+
+
+Action = (
+    Annotated[Check, tyro.conf.subcommand(name="check")]
+    | Annotated[Make, tyro.conf.subcommand(name="make")]
+    | Annotated[Reproject, tyro.conf.subcommand(name="reproject")]
+)
+
+
+@dataclass
+class Masks:
+    """Check the masks of a scene, make them consistent, or make them in the first place."""
+
+    action: Action
+
+    def run(self) -> None:
+        self.action.run()

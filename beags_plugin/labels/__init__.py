@@ -1,0 +1,1 @@
+"""Class ids of pixels and Gaussians: names, colours, maps of all views."""

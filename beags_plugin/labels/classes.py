@@ -1,0 +1,175 @@
+"""Class maps (images of class ids) and the classes' names, on disk."""
+
+from __future__ import annotations
+
+import colorsys
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.reading.images import read_image
+from beags_plugin.system.reading.text import load_json, reason
+
+BACKGROUND = 0
+_ID_MODES = {"1", "L", "P", "I", "I;16", "I;16L", "I;16B"}  # Pillow's names of images with one integer per pixel
+_COLOR_MODES = {"RGB", "RGBA", "LA"}
+
+
+def read_class_map(path: Path | str, ignore_ids: Iterable[int] = ()) -> np.ndarray:
+    """The class ids in an 8-bit grey, 16-bit grey or palette image (a palette's indices, not its colours).
+
+    ignore_ids: ids of an 8-bit image that mean "unlabelled", e.g. 255; they become IGNORE.
+    Returns [H, W] uint16; 65535 is IGNORE. Raises ``UserError`` for a file that is no such image.
+    """
+    mode, values = _read_pixels(path)
+    if mode not in _ID_MODES or values.ndim != 2:
+        raise UserError(
+            f"the mask {path} has colours (mode {mode}) where class ids are needed: save it as 8-bit or 16-bit grey, "
+            "or as a palette PNG."
+        )
+    if values.min(initial=0) < 0 or values.max(initial=0) > IGNORE:
+        raise UserError(f"the mask {path} holds ids outside 0..{IGNORE}: save it as 8-bit or 16-bit grey PNG.")
+    class_map = values.astype(np.uint16)
+    if mode in {"1", "L", "P"}:
+        class_map[np.isin(class_map, list(ignore_ids))] = IGNORE
+    return class_map
+
+
+def read_binary_mask(path: Path | str) -> np.ndarray:
+    """Where the mask of one object is inside, [H, W] bool.
+
+    Brightness (8-bit grey or colours that reach 128 somewhere) is inside from 128 on, as rims may be blended; in other
+    images, such as labels 0 and 1, all but 0 and IGNORE is inside. Alpha says nothing.
+    Raises ``UserError`` for a file that is no such image.
+    """
+    mode, values = _read_pixels(path)
+    if mode in _COLOR_MODES:
+        values = values[..., : 1 if mode == "LA" else 3].max(axis=2)
+    elif mode not in _ID_MODES or values.ndim != 2:
+        raise UserError(f"the mask {path} is of mode {mode}: save it as grey PNG.")
+    if mode in {"L", *_COLOR_MODES} and values.max(initial=0) >= 128:
+        return values >= 128
+    return (values != 0) & (values != IGNORE)
+
+
+def read_mask(path: Path | str, kind: str, ignore_ids: Iterable[int] = ()) -> np.ndarray:
+    """[H, W] uint16, the class ids in a file of id images ("ids"), or 1 inside and 0 outside of a "binary" mask."""
+    return read_binary_mask(path).astype(np.uint16) if kind == "binary" else read_class_map(path, ignore_ids)
+
+
+def _read_pixels(path: Path | str) -> tuple[str, np.ndarray]:
+    """Pillow's mode and the values of an image without loss."""
+    try:
+        form, mode, values = read_image(
+            path, lambda image: (image.format, image.mode, np.asarray(image)), "the mask", "save it as PNG again"
+        )
+    except FileNotFoundError:
+        raise UserError(f"the mask {path} does not exist: check the path.") from None
+    if form == "JPEG":
+        raise UserError(f"the mask {path} is a JPEG, which blurs class ids: save it as 8-bit or 16-bit grey PNG.")
+    return mode, values
+
+
+def write_class_map(path: Path | str, array: np.ndarray) -> None:
+    """Write class ids as a grey PNG: 8 bits if they fit, else 16 (IGNORE needs 16).
+
+    array: [H, W] integers in 0..65535. Raises ``UserError`` for another shape, dtype or range.
+    """
+    from PIL import Image
+
+    array = np.asarray(array)
+    if array.ndim != 2 or array.dtype.kind not in "iu" or array.size == 0:
+        raise UserError(f"the class map for {path} must be [H, W] integers, not {list(array.shape)} {array.dtype}.")
+    if array.min() < 0 or array.max() > IGNORE:
+        raise UserError(
+            f"the class map for {path} holds ids {array.min()}..{array.max()}: only 0..{IGNORE} can be saved."
+        )
+    with writing(path, "the class map "):
+        Image.fromarray(array.astype(np.uint8 if array.max() <= 255 else np.uint16)).save(path, format="PNG")
+
+
+def check_names(names: Mapping[int, str]) -> None:
+    """Raise ``UserError`` for names of classes that ``read_classes`` would refuse."""
+    for class_id, name in names.items():
+        if not 0 <= class_id < IGNORE:
+            raise UserError(f"the masks hold the class id {class_id}: only 0..{IGNORE - 1} can be used.")
+        if not name.strip():
+            raise UserError(f"the class {class_id} of the masks has no name: name it.")
+    stripped = Counter(name.strip() for name in ({BACKGROUND: "background"} | dict(names)).values())
+    if repeated := sorted(name for name, uses in stripped.items() if uses > 1):
+        raise UserError(f"the masks give the name {repeated[0]!r} to two classes: rename one of the objects.")
+
+
+def read_classes(path: Path | str | None, ids_present: Iterable[int] | None = None) -> dict[int, str]:
+    """Names of the classes from a JSON file {"id": "name"}, sorted by id; background (0) is added.
+
+    path: the file. None, or (with ``ids_present``) a file that does not exist, means that nothing is named.
+    ids_present: ids that occur in the masks; those without a name get "class_<id>". IGNORE is left out.
+    Raises ``UserError`` for invalid JSON, an id outside 0..65534, an empty name, or one name or id given twice.
+    """
+    names = {BACKGROUND: "background"}
+    if path is not None and (ids_present is None or Path(path).exists()):
+        names.update(_read_names(Path(path)))
+    for class_id in ids_present or ():
+        if not 0 <= int(class_id) <= IGNORE:
+            raise UserError(f"the masks hold the class id {class_id}: only 0..{IGNORE - 1} can be used.")
+        if class_id != IGNORE:
+            names.setdefault(int(class_id), f"class_{int(class_id)}")
+    repeated = {name for name in names.values() if list(names.values()).count(name) > 1}
+    if repeated:
+        raise UserError(
+            f"{path or 'classes.json'} gives the name {min(repeated)!r} to two classes: rename one of them."
+        )
+    return dict(sorted(names.items()))
+
+
+def _read_names(path: Path) -> dict[int, str]:
+    try:
+        pairs = load_json(path, object_pairs_hook=list)
+    except FileNotFoundError:
+        raise UserError(f"the class names {path} do not exist: correct the path.") from None
+    except (OSError, ValueError) as error:
+        told = f'the class names {path} cannot be read as JSON ({reason(error)}): write e.g. {{"1": "cup"}}.'
+        raise UserError(told) from None
+    # The hook turns every object into a list of pairs, so that an id given twice is still seen.
+    if not isinstance(pairs, list) or not all(isinstance(pair, tuple) for pair in pairs):
+        raise UserError(f'the class names {path} must be one JSON object: write e.g. {{"1": "cup"}}.')
+    names: dict[int, str] = {}
+    for key, name in pairs:
+        digits = key.isascii() and key.isdigit()
+        if not digits or len(key) > 9 or int(key) >= IGNORE:  # Python refuses to convert thousands of digits
+            shown = key if len(key) <= 40 else f"{key[:37]}..."
+            raise UserError(f"{path} has the class id {shown!r}: ids are whole numbers in 0..{IGNORE - 1}.")
+        if not isinstance(name, str) or not name.strip():
+            raise UserError(f"{path} gives class {key} no name: write a non-empty string.")
+        if not name.strip().isprintable():
+            raise UserError(f"{path} gives class {key} the name {name!r:.60}: write one line of plain text.")
+        if int(key) in names:
+            raise UserError(f"{path} names class {int(key)} twice: keep one of the lines.")
+        names[int(key)] = name.strip()
+    return names
+
+
+def colorize(class_map: np.ndarray) -> np.ndarray:
+    """Colours for looking at: an id has the same colour in every image and scene.
+
+    class_map: [H, W] integers. Returns [H, W, 3] uint8 RGB; background is black, IGNORE mid-grey.
+    """
+    ids, inverse = np.unique(np.asarray(class_map), return_inverse=True)
+    colors = np.array([_color(int(class_id)) for class_id in ids], dtype=np.uint8).reshape(-1, 3)
+    return colors[inverse.reshape(np.shape(class_map))]
+
+
+def _color(class_id: int) -> tuple[int, int, int]:
+    if class_id == BACKGROUND:
+        return 0, 0, 0
+    if class_id == IGNORE:
+        return 128, 128, 128
+    hue = class_id * 0.6180339887498949 % 1.0  # steps of the golden ratio keep neighbouring ids far apart
+    value = (1.0, 0.8, 0.9)[class_id % 3]
+    red, green, blue = colorsys.hsv_to_rgb(hue, 0.75, value)
+    return round(255 * red), round(255 * green), round(255 * blue)

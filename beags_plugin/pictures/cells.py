@@ -1,0 +1,95 @@
+"""Pictures made of captioned cells: cropping round an object, resizing, joining."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from beags_plugin.system.errors import UserError, writing
+
+CAPTION = 18  # pixels of text above each cell
+GAP = 4  # pixels between cells
+MARGIN = 0.15  # of the crop, around the object: rims spread outside it
+
+Square = tuple[int, int, int]
+"""(top, left, side) in pixels; it may leave the image."""
+
+
+def square_around(shown: np.ndarray) -> Square:
+    """The square that holds the True pixels of ``shown`` [H, W] bool and a margin; the whole image for none."""
+    height, width = shown.shape
+    if not shown.any():
+        return 0, 0, max(height, width)
+    ys, xs = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
+    side = int(max(ys[-1] - ys[0], xs[-1] - xs[0]) + 1)
+    side = max(8, round(side * (1 + 2 * MARGIN)))
+    return int((ys[0] + ys[-1] + 1 - side) // 2), int((xs[0] + xs[-1] + 1 - side) // 2), side
+
+
+def crop(image: np.ndarray, square: Square, fill: int = 0) -> np.ndarray:
+    """[side, side, C]: the part of an image [H, W, C] in the square; ``fill`` outside the image."""
+    top, left, side = square
+    part = np.full((side, side, *image.shape[2:]), fill, dtype=image.dtype)
+    y0, x0 = max(top, 0), max(left, 0)
+    y1, x1 = min(top + side, image.shape[0]), min(left + side, image.shape[1])
+    if y1 > y0 and x1 > x0:
+        part[y0 - top : y1 - top, x0 - left : x1 - left] = image[y0:y1, x0:x1]
+    return part
+
+
+def cell(image: np.ndarray, size: tuple[int, int], caption: str) -> np.ndarray:
+    """[height + CAPTION, width, 3] uint8: the image resized to (width, height) under its caption."""
+    from PIL import Image, ImageDraw
+
+    width, height = size
+    enlarged = image.shape[1] < width  # enlarged pixels stay sharp, so that rims can be judged
+    resample = Image.Resampling.NEAREST if enlarged else Image.Resampling.BOX
+    picture = Image.new("RGB", (width, height + CAPTION), "white")
+    picture.paste(Image.fromarray(image).resize(size, resample), (0, CAPTION))
+    ImageDraw.Draw(picture).text((2, 3), printable(caption), fill="black")
+    return np.asarray(picture)
+
+
+def printable(text: str) -> str:
+    """The text with a question mark for what the picture's font lacks."""
+    return text.encode("latin-1", "replace").decode("latin-1")
+
+
+def beside(cells: Iterable[np.ndarray]) -> np.ndarray:
+    """Cells of one height in a line, a gap after each."""
+    return np.concatenate([np.pad(c, ((0, 0), (0, GAP), (0, 0)), constant_values=255) for c in cells], axis=1)
+
+
+def below(lines: Sequence[np.ndarray]) -> np.ndarray:
+    """Lines of any width below each other, a gap after each."""
+    widest = max(line.shape[1] for line in lines)
+    padded = [np.pad(line, ((0, GAP), (0, widest - line.shape[1]), (0, 0)), constant_values=255) for line in lines]
+    return np.concatenate(padded, axis=0)
+
+
+def wrapped(groups: Iterable[Sequence[np.ndarray]], width: int) -> list[np.ndarray]:
+    """Lines at most ``width`` pixels wide, unless one group alone is wider; a group of cells stays together."""
+    lines: list[list[np.ndarray]] = []
+    used = 0
+    for group in groups:
+        needed = sum(c.shape[1] + GAP for c in group)
+        if not lines or used + needed > width:
+            lines.append([])
+            used = 0
+        lines[-1] += group
+        used += needed
+    return [beside(line) for line in lines]
+
+
+def write_picture(path: str | Path, picture: np.ndarray) -> None:
+    """Write [H, W, 3] uint8 as a PNG; raises ``UserError`` if it cannot be written."""
+    from PIL import Image
+
+    try:
+        with writing(path, "the picture "):
+            Path(path).parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(picture).save(path)
+    except ValueError as error:
+        raise UserError(f"the picture {path} cannot be written ({error}): choose another name.") from error

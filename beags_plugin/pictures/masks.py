@@ -1,0 +1,125 @@
+"""Pictures of masks: before and after reprojection, where views contradict each other, what each view covers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from beags_plugin.labels.classes import colorize
+from beags_plugin.pictures.cells import below, beside, cell, write_picture
+from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.system.errors import writing
+
+_WIDTH = 300  # pixels of a cell
+CHANGED = (255, 0, 255)
+MARK = (255, 255, 0)
+
+
+@dataclass(frozen=True)
+class Changed:
+    """One view before and after: photo [H, W, 3] uint8; given (or None) and voted [H, W] ids; confidence uint8."""
+
+    name: str
+    photo: np.ndarray
+    given: np.ndarray | None
+    voted: np.ndarray
+    confidence: np.ndarray
+
+
+def overlay(photo: np.ndarray, class_map: np.ndarray, strength: float = 0.5) -> np.ndarray:
+    """[H, W, 3] uint8: the photo with its objects tinted (IGNORE grey), the background as it is."""
+    tint = colorize(class_map).astype(np.float32)
+    shown = (class_map != 0)[..., None]
+    return np.where(shown, (1 - strength) * photo + strength * tint, photo).astype(np.uint8)
+
+
+def before_and_after(path: Path, views: Sequence[Changed]) -> None:
+    """Write a picture, a line per view: mask before, mask after, what changed, confidence."""
+    lines = []
+    for view in views:
+        height, width = view.voted.shape
+        size = (_WIDTH, max(1, round(_WIDTH * height / width)))
+        marked = view.photo.copy()
+        text = "no mask before"
+        if view.given is not None:
+            differs = (view.given != view.voted) & (view.given != IGNORE)
+            marked[differs] = CHANGED
+            text = f"changed: {100 * differs.mean():.2f} % of the view"
+        before = view.photo if view.given is None else overlay(view.photo, view.given)
+        grey = np.repeat(view.confidence[..., None], 3, axis=2)
+        cells = [
+            (before, f"{view.name}: before"),
+            (overlay(view.photo, view.voted), "after"),
+            (marked, text),
+            (grey, f"share of the winning votes, mean {view.confidence.mean() / 255:.3f}"),
+        ]
+        lines.append(beside([cell(image, size, caption) for image, caption in cells]))
+    write_picture(path, below(lines))
+
+
+def contradictions(path: Path, views: Sequence[tuple[Changed, Sequence[tuple[int, int, int, int]]]]) -> None:
+    """Write a picture, a line per view: its mask with the contradicted boxes, and what the other views say."""
+    lines = []
+    for view, boxes in views:
+        height, width = view.voted.shape
+        size = (_WIDTH, max(1, round(_WIDTH * height / width)))
+        masks = [view.photo if view.given is None else overlay(view.photo, view.given), overlay(view.photo, view.voted)]
+        for mask in masks:
+            for box in boxes:
+                _frame(mask, box)
+        captions = (f"{view.name}: as given", "the other views")
+        lines.append(beside([cell(mask, size, text) for mask, text in zip(masks, captions, strict=True)]))
+    write_picture(path, below(lines))
+
+
+def _frame(image: np.ndarray, box: tuple[int, int, int, int]) -> None:
+    thick = max(1, round(image.shape[1] / _WIDTH))
+    left, top, right, bottom = box
+    top, left = max(top - thick, 0), max(left - thick, 0)
+    image[top : top + thick, left:right] = image[bottom : bottom + thick, left : right + thick] = MARK
+    image[top:bottom, left : left + thick] = image[top : bottom + thick, right : right + thick] = MARK
+
+
+def coverage_picture(
+    path: Path,
+    stems: Sequence[str],
+    ids: Sequence[int],
+    names: Mapping[int, str],
+    share: np.ndarray,
+    usable: np.ndarray,
+) -> None:
+    """Write a picture of how much of each view each object covers.
+
+    share: [V, C] of the view's pixels for each of ``ids``; usable: [V] bool, views without a mask are hatched.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
+    objects = [column for column, class_id in enumerate(ids) if class_id != 0]
+    table = np.where(share[:, objects] > 0, 100.0 * share[:, objects], np.nan).T
+    table[:, ~usable] = np.nan
+    wide = min(max(6.0, 0.14 * len(stems) + 3.0), 40.0)
+    figure = Figure(figsize=(wide, min(max(2.2, 0.3 * len(objects) + 1.6), 40.0)), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.set_facecolor("white")
+    known = table[np.isfinite(table)]
+    low, high = (float(known.min()), float(known.max())) if len(known) else (0.1, 100.0)
+    image = axes.imshow(
+        table, aspect="auto", interpolation="nearest", cmap="viridis", norm=LogNorm(low, max(high, 1.001 * low))
+    )
+    for view in np.flatnonzero(~usable):
+        axes.axvspan(view - 0.5, view + 0.5, facecolor="0.85", edgecolor="0.5", hatch="////", linewidth=0)
+    axes.set_yticks(range(len(objects)), [f"{ids[column]} {names[ids[column]]}" for column in objects])
+    step = max(1, len(stems) // 40)
+    axes.set_xticks(range(0, len(stems), step), [stems[view] for view in range(0, len(stems), step)], rotation=90)
+    axes.tick_params(labelsize=7)
+    axes.set_title("Share of each view that an object covers (white: absent, hatched: no mask)", fontsize=9)
+    figure.colorbar(image, ax=axes, label="% of the view")
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=110)

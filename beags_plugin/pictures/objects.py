@@ -1,0 +1,134 @@
+"""Objects alone before a plain background: single pictures, sheets of them, and films."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.pictures.cells import below, beside, cell, wrapped
+from beags_plugin.pictures.options import Background
+from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+from beags_plugin.rasterizers.rendering import surfel_inputs
+
+_CHECKER, _CHECKER_SIDE = (200, 236), 12  # two greys; pixels of a square
+_WIDTH = 1920  # of a sheet, pixels; what does not fit goes on below
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is shown of one object.
+
+    name: for captions. stages: caption to the surfels alone, such as {"before": ..., "after": ...}; {"": ...} for one.
+    cameras: the same for all stages. settings: their depth range.
+    """
+
+    name: str
+    stages: Mapping[str, Surfels]
+    cameras: Sequence[Camera]
+    settings: RasterSettings
+
+
+def draw_alone(
+    surfels: Surfels, camera: Camera, settings: RasterSettings, rasterizer: Rasterizer, background: Background
+) -> np.ndarray:
+    """[H, W, 3] uint8: surfels before a background."""
+    behind = torch.from_numpy(_behind(camera.height, camera.width, background))
+    with torch.no_grad():
+        if len(surfels) == 0:
+            return behind.numpy()
+        inputs = surfel_inputs(surfels.detach(), camera)
+        render = rasterizer.rasterize(inputs, camera, settings, surfels.means.new_zeros(3))
+    color = render.color.cpu() + (1.0 - render.alpha.cpu())[..., None] * behind.float() / 255.0
+    return (color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+
+
+def _behind(height: int, width: int, background: Background) -> np.ndarray:
+    if background != "checker":
+        return np.full((height, width, 3), 255 if background == "white" else 0, dtype=np.uint8)
+    y, x = np.mgrid[:height, :width] // _CHECKER_SIDE
+    return np.where((x + y) % 2, *_CHECKER).astype(np.uint8)[..., None].repeat(3, axis=2)
+
+
+def film(
+    subjects: Sequence[Subject], rasterizer: Rasterizer, background: Background, progress: Progress | None = None
+) -> Iterator[np.ndarray]:
+    """Frames [H, W, 3] uint8 of even size: all subjects and stages beside each other, captioned."""
+    count = len(subjects[0].cameras)
+    for index in range(count):
+        groups = []
+        for subject in subjects:
+            camera = subject.cameras[index]
+            groups.append(
+                [
+                    cell(
+                        draw_alone(surfels, camera, subject.settings, rasterizer, background),
+                        (camera.width, camera.height),
+                        _caption(subject.name, stage),
+                    )
+                    for stage, surfels in subject.stages.items()
+                ]
+            )
+        yield _even(below(wrapped(groups, _WIDTH)))
+        if progress:
+            progress(index + 1, count)
+
+
+def sheet(
+    subjects: Sequence[Subject], rasterizer: Rasterizer, background: Background, progress: Progress | None = None
+) -> np.ndarray:
+    """[H, W, 3] uint8: a line (or more) for each subject and stage, a picture for each camera."""
+    lines, done = [], 0
+    total = sum(len(subject.cameras) * len(subject.stages) for subject in subjects)
+    for subject in subjects:
+        for stage, surfels in subject.stages.items():
+            pictures = []
+            for number, camera in enumerate(subject.cameras):
+                picture = draw_alone(surfels, camera, subject.settings, rasterizer, background)
+                caption = _caption(subject.name, stage) if number == 0 else ""
+                pictures.append([cell(picture, (camera.width, camera.height), caption)])
+                done += 1
+                if progress:
+                    progress(done, total)
+            lines += wrapped(pictures, _WIDTH)
+    return below(lines)
+
+
+def comparison(
+    subjects: Sequence[Subject], rasterizer: Rasterizer, background: Background, progress: Progress | None = None
+) -> np.ndarray:
+    """[H, W, 3] uint8: the stages beside each other, a line for each subject and camera."""
+    lines, done = [], 0
+    total = sum(len(subject.cameras) for subject in subjects)
+    for subject in subjects:
+        for camera in subject.cameras:
+            lines.append(
+                beside(
+                    cell(
+                        draw_alone(surfels, camera, subject.settings, rasterizer, background),
+                        (camera.width, camera.height),
+                        _caption(subject.name, stage),
+                    )
+                    for stage, surfels in subject.stages.items()
+                )
+            )
+            done += 1
+            if progress:
+                progress(done, total)
+    return below(lines)
+
+
+def _caption(name: str, stage: str) -> str:
+    return f"{name}, {stage}" if stage else name
+
+
+def _even(picture: np.ndarray) -> np.ndarray:
+    """With a white line more where a side is odd: films store colour for squares of 2 x 2 pixels."""
+    height, width = picture.shape[:2]
+    return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), constant_values=255)

@@ -1,0 +1,243 @@
+"""``beags masks check``: what is wrong with the masks of a scene, before training on them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from beags_plugin.data.files import image_size, photo_names
+from beags_plugin.data.scene import Scene
+from beags_plugin.labels.classes import read_classes
+from beags_plugin.masks.check.areas import Area, contradicted
+from beags_plugin.masks.check.consistency import Agreement, labels_at, ranks_of
+from beags_plugin.masks.check.disagreement import views_against_others
+from beags_plugin.masks.check.files import FEW_VIEWS, MOST_IDS, Coverage, MaskFiles, check_files
+from beags_plugin.masks.check.issues import LEVELS, Finding, ordered, percent
+from beags_plugin.pictures.masks import contradictions, coverage_picture
+from beags_plugin.plugin.runs.run_config import load_run_config
+from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
+from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParserConfig
+from beags_plugin.plugin.views.lens import project_through_lens
+from beags_plugin.plugin.views.poses import PosedViews
+from beags_plugin.plugin.views.seed_points import random_points, starting_points
+from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.progress import progress_bar
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.objects.reproject_masks import ReprojectedRun
+
+RANDOM_POINTS = 50_000  # beside the seed points: an object that has none of these has some of them in it
+MOST_SEED_POINTS = 100_000
+MOST_COUNTS = 30_000_000  # points times classes that are counted at a time
+
+
+@dataclass
+class Report:
+    """What was found. names: class id to name. areas: where views disagree, if a trained run was given."""
+
+    data: Path
+    stems: list[str]
+    names: dict[int, str]
+    coverage: Coverage
+    findings: list[Finding]
+    areas: list[Area] = field(default_factory=list)
+
+    def summary(self) -> str:
+        """How many views, objects and findings, in a line."""
+        counts = [f"{sum(f.level == level for f in self.findings)} {level}s" for level in LEVELS]
+        objects = sum(i != 0 for i in self.coverage.ids)
+        return (
+            f"{self.data}: {len(self.stems)} views, {int(self.coverage.usable.sum())} usable masks, {objects} objects; "
+            f"{', '.join(counts)}."
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        pixels = self.coverage.pixels
+        views = [
+            {"view": stem, "pixels": {str(i): int(n) for i, n in zip(self.coverage.ids, row, strict=True) if n}}
+            for stem, row in zip(self.stems, pixels, strict=True)
+        ]
+        return {
+            "data": str(self.data),
+            "classes": {str(i): name for i, name in self.names.items()},
+            "findings": [finding.to_json() for finding in self.findings],
+            "coverage": views,
+            "areas": [area.to_json() for area in self.areas],
+        }
+
+
+def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Report:
+    """Check the masks of the scene that ``config`` names, at the size of the photographs.
+
+    Raises ``UserError`` only where poses or photos are bad.
+    """
+    config = replace(config, downscale_factor=1.0)
+    if few_views < 1:
+        raise UserError(f"min_views is {few_views}: give a number of views, at least 1.")
+    scene, views, files = _files(config)
+    with progress_bar("Reading masks") as progress:
+        coverage = check_files(files, few_views, progress)
+    shown = dict(files.names or {})
+    shown = {i: shown.get(i, "background" if i == 0 else f"class_{i}") for i in coverage.ids}
+    findings = list(coverage.findings)
+    if len(coverage.ids) > MOST_IDS:
+        findings.append(
+            Finding(
+                "note",
+                "not compared",
+                f"the masks hold {len(coverage.ids)} ids, so views are not compared: more than {MOST_IDS} take too "
+                "much memory; drop ids that are in few views.",
+                "ids exchanged between views are not looked for",
+            )
+        )
+    elif coverage.usable.sum() > 3 and len(coverage.ids) > 1:
+        points = _points(scene, views, config)
+        findings += views_against_others(_agreement(files, coverage, views, points), files, coverage, shown)
+    return Report(scene.root, list(files.stems), shown, coverage, ordered(findings))
+
+
+def agreement_of(config: BeagsDataParserConfig) -> tuple[np.ndarray, int]:
+    """What every view says of points in space, see ``consistency.Agreement``: labels [P, V], number of classes."""
+    scene, views, files = _files(config)
+    coverage = check_files(files)
+    return _agreement(files, coverage, views, _points(scene, views, config)).labels, len(coverage.ids)
+
+
+def _files(config: BeagsDataParserConfig) -> tuple[Scene, PosedViews, MaskFiles]:
+    parser: BeagsDataParser = config.setup()
+    scene, views = parser.posed_views()
+    sizes = [image_size(path) for path in views.images]
+    parser.fit_cameras(views, sizes)
+    masks, folder, kind = parser.mask_files(scene, views)
+    trained = set(parser.training_views(views))
+    names_file = scene.root / config.classes_path
+    names = read_classes(names_file) if names_file.is_file() else scene.class_names
+    files = MaskFiles(
+        photo_names(views.images),
+        sizes,
+        masks,
+        folder,
+        kind,
+        tuple(config.ignore_ids),
+        [view in trained for view in range(len(masks))],
+        names,
+        names_file if names_file.is_file() else scene.class_names_file or names_file,
+    )
+    return scene, views, files
+
+
+def _points(scene: Scene, views: PosedViews, config: BeagsDataParserConfig) -> np.ndarray:
+    """[P, 3] float64 in the cameras' world: seed points and points drawn where the cameras look."""
+    found = starting_points(scene, views, config.num_random_points, config.random_points_seed)
+    seeds = found["points3D_xyz"].double().numpy()
+    step = -(-len(seeds) // MOST_SEED_POINTS)
+    cameras = [camera_from_nerfstudio(views.cameras, index) for index in range(len(views.images))]
+    drawn, _ = random_points(cameras, RANDOM_POINTS, config.random_points_seed)
+    return np.concatenate([seeds[::step], drawn.astype(np.float64)])
+
+
+def _agreement(files: MaskFiles, coverage: Coverage, views: PosedViews, points: np.ndarray) -> Agreement:
+    step = -(-len(points) * len(coverage.ids) // MOST_COUNTS)
+    points = points[::step]
+    labels = np.full((len(points), len(files.stems)), -1, np.int16)
+    with progress_bar("Comparing views") as progress:
+        for view in range(len(files.stems)):
+            if coverage.usable[view]:
+                class_map = files.read(view)
+                assert class_map is not None
+                xy, z = project_through_lens(points, views.cameras, view)
+                labels[:, view] = labels_at(xy, z, ranks_of(class_map, coverage.ids, IGNORE))
+            progress(view + 1, len(files.stems))
+    return Agreement(labels, len(coverage.ids))
+
+
+def check_with_run(report: Report, run: ReprojectedRun) -> Report:
+    """The report with the areas of masks that the other views contradict where a trained run puts them."""
+    areas = [area for index in range(len(run.names)) for area in _areas(run, index)]
+    areas.sort(key=lambda area: -area.pixels)
+    findings = list(report.findings)
+    if areas:
+        pixels, views = sum(area.pixels for area in areas), {area.view for area in areas}
+        total = sum(mask.pixels for mask in run.given.stored if mask is not None)
+        findings.append(
+            Finding(
+                "warning",
+                "contradicted",
+                f"{len(areas)} areas in {len(views)} views are contradicted by the other views, the largest: "
+                f"{'; '.join(area.told(run.classes) for area in areas[:3])}: correct these masks of {report.data}, or "
+                "leave it to reprojection.",
+                f"{pixels} pixels ({percent(pixels, total)} of the masks) go to another class in reprojection; "
+                "with --pipeline.model.prepare.reprojection none they pull Gaussians to the wrong class",
+                tuple(sorted(views)),
+            )
+        )
+    return replace(report, findings=ordered(findings), areas=areas)
+
+
+def _areas(run: ReprojectedRun, index: int) -> list[Area]:
+    given = run.given[index]
+    if given is None:
+        return []
+    confidence = run.confidence[index].numpy() / np.float32(255.0)
+    return contradicted(given.numpy(), run.voted[index].numpy(), confidence, run.names[index])
+
+
+def write_report(report: Report, output: Path, run: ReprojectedRun | None = None, shown: int = 6) -> list[Path]:
+    """Write report.json, coverage.png and, with a run that contradicts masks, contradicted.png; what was written."""
+    coverage = report.coverage
+    share = coverage.pixels / np.maximum(coverage.size, 1)[:, None]
+    written = [output / "report.json", output / "coverage.png"]
+    with writing(output):
+        output.mkdir(parents=True, exist_ok=True)
+        written[0].write_text(json.dumps(report.to_json(), indent=1), "utf8")
+        coverage_picture(written[1], report.stems, coverage.ids, report.names, share, coverage.usable)
+    if run is not None and report.areas:
+        boxes: dict[str, list[tuple[int, int, int, int]]] = {}
+        for area in report.areas:
+            boxes.setdefault(area.view, []).append(area.box)
+        worst = list(boxes)[:shown]
+        contradictions(
+            output / "contradicted.png", [(run.changed(run.names.index(view)), boxes[view]) for view in worst]
+        )
+        written.append(output / "contradicted.png")
+    return written
+
+
+def options_beside(run: Path | None, data: Path | None, **given: Any) -> BeagsDataParserConfig:
+    """The data parser's options of a run, or the usual ones without any, replaced by those given that are not None.
+
+    run: config.yml. data: folder of the scene, that of the run if None.
+    """
+    config = BeagsDataParserConfig()
+    if run is not None:
+        trained = load_run_config(run)
+        config = replace(cast("BeagsDataParserConfig", trained.data_config.dataparser), data=trained.data_path)
+    if data is not None:
+        config = replace(config, data=data)
+    return replace(config, **{name: value for name, value in given.items() if value is not None})
+
+
+def data_options(
+    data: Path,
+    layout: str = "auto",
+    images_path: Path | None = None,
+    masks_path: Path | None = None,
+    classes_path: Path = Path("classes.json"),
+    ignore_ids: Sequence[int] = (),
+) -> BeagsDataParserConfig:
+    """The data parser's options that say where masks are."""
+    return BeagsDataParserConfig(
+        data=data,
+        layout=layout,
+        images_path=images_path,
+        masks_path=masks_path,
+        classes_path=classes_path,
+        ignore_ids=tuple(ignore_ids),
+    )

@@ -1,0 +1,145 @@
+"""Evaluation of runs on disk: their held-out views with ground truth, before and after refinement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.evaluation.protocol import Protocol
+from beags_plugin.evaluation.records import SceneMetrics
+from beags_plugin.evaluation.report import RunMetrics, Stage
+from beags_plugin.evaluation.run_metrics import evaluate_scene
+from beags_plugin.pictures.worst_views import By, WorstMask, draw_worst
+from beags_plugin.plugin.objects.extract import SavedScene, read_scene
+from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, EXTRACTION_FILE
+from beags_plugin.plugin.views.held_out_views import HeldOutViews
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+from beags_plugin.system.errors import UserError
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.options.config import BeagsTrainerConfig
+
+Progress = Callable[[int, int], None]
+
+
+def evaluate_run(
+    config_path: Path, protocol: Protocol | None = None, *, name: str = "", progress: Progress | None = None
+) -> RunMetrics:
+    """Score a trained run on the held-out views of its data, before refinement (if it has kept that) and after.
+
+    config_path: config.yml of a run. protocol: the choices behind the figures. name: of the scene in tables; that of
+    the data folder if empty. progress: is told (done, total) views. ``RunMetrics.to_json`` gives plain values.
+    Raises ``UserError`` for a run, data or a protocol that cannot be used.
+    """
+    return EvaluatedRun(config_path, name).metrics(protocol, progress)
+
+
+class EvaluatedRun:
+    """A run on disk with its held-out views, which are read when they are first asked for.
+
+    name: of the scene in tables. stages: "before" and "after", or "after" alone, to the saved scenes. complete: False
+    for a run of ``beags extract``, which holds a part of a scene. classes: id to name of what can be scored.
+    """
+
+    def __init__(self, config_path: Path, name: str = "") -> None:
+        self.config_path = Path(config_path)
+        after = read_scene(self.config_path)
+        self.stages: dict[Stage, SavedScene] = {"after": after}
+        snapshot = self.config_path.parent / BASE_SNAPSHOT / "config.yml"
+        if after.assigned and snapshot.exists() and (before := read_scene(snapshot)).assigned:
+            self.stages = {"before": before, "after": after}
+        self.complete = not (self.config_path.parent / EXTRACTION_FILE).exists()
+        self.classes = after.classes if self.complete else present_classes(after)
+        self.name = name or scene_name(after.config)
+        self.settings = raster_settings(after)
+        self.rasterizer: Rasterizer = make_rasterizer(after.config.model_config.rasterizer)
+
+    @cached_property
+    def views(self) -> HeldOutViews:
+        """The held-out views; raises ``UserError`` if the run's data cannot be read."""
+        config = self.stages["after"].config
+        if not (data := config.data_path).exists():
+            raise UserError(f"{self.config_path} was trained on {data}, which is gone: put it back.")
+        try:
+            return HeldOutViews(config, self.classes)
+        except UserError as error:
+            raise UserError(f"the data of {self.config_path} cannot be read: {error}") from error
+
+    def metrics(self, protocol: Protocol | None = None, progress: Progress | None = None) -> RunMetrics:
+        """The figures of all stages; arguments as of ``evaluate_run``."""
+        protocol = protocol or Protocol()
+        protocol.check()
+        found: dict[Stage, SceneMetrics] = {}
+        total = len(self.views) * len(self.stages)
+        for stage, scene in self.stages.items():
+            former = len(found) * len(self.views)
+            found[stage] = evaluate_scene(
+                scene.surfels(),
+                scene.class_ids,
+                self.rasterizer,
+                self.settings,
+                self.views,
+                self.classes,
+                protocol=protocol,
+                complete=self.complete,
+                background=self.views.background,
+                progress=None if progress is None else lambda done, _, former=former: progress(former + done, total),
+            )
+        return RunMetrics(
+            scene=self.name,
+            config=str(self.config_path.absolute()),
+            protocol=protocol,
+            classes=self.classes,
+            before=found.get("before"),
+            after=found["after"],
+            notes=tuple(self._notes(found["after"])),
+        )
+
+    def worst(
+        self, metrics: RunMetrics, count: int, by: By = "iou", progress: Progress | None = None
+    ) -> list[WorstMask]:
+        """The ``count`` worst masks of each kind, drawn; metrics: what ``metrics`` gave; progress: (done, total)."""
+        scenes: dict[Stage, tuple[Surfels, Tensor]] = {}
+        for stage, scene in self.stages.items():
+            if scene.class_ids is not None:
+                scenes[stage] = (scene.surfels(), scene.class_ids)
+        return draw_worst(metrics, scenes, self.views, self.rasterizer, self.settings, count, by, progress)
+
+    def _notes(self, after: SceneMetrics) -> Iterator[str]:
+        if not self.stages["after"].assigned:
+            yield "This run has no classes (it is a base alone), so only images are scored."
+        elif not after.masks and self.complete:
+            yield "No held-out view has a mask, so only images are scored."
+        elif not after.masks:
+            yield "No held-out view has a mask of what this extracted run holds, so nothing is scored."
+        elif not self.complete:
+            yield "This run holds a part of a scene, so only objects drawn alone are scored."
+        elif "before" not in self.stages:
+            yield "This run has kept no state before refinement, so there is nothing to compare with."
+        if trained_on := self.views.trained_on():
+            yield f"{trained_on} of these {len(self.views)} views were trained on, so the figures flatter the run."
+
+
+def present_classes(scene: SavedScene) -> dict[int, str]:
+    """Id to name of the classes that have Gaussians."""
+    assert scene.class_ids is not None  # what was extracted has classes
+    present = set(scene.class_ids.unique().tolist())
+    return {class_id: name for class_id, name in scene.classes.items() if class_id in present}
+
+
+def scene_name(config: BeagsTrainerConfig) -> str:
+    """The name of the run's data folder."""
+    data = config.data_path
+    return data.stem if data.suffix == ".json" else data.name
+
+
+def raster_settings(scene: SavedScene) -> RasterSettings:
+    """Depth range of a saved scene."""
+    extent, model = float(scene.state["extent"]), scene.config.model_config
+    return RasterSettings(model.near * extent, model.far * extent)

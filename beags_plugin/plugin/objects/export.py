@@ -1,0 +1,284 @@
+"""Export of runs: the files that other programs read, of each object and of the background."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, count
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.export.base import Exporter, NothingToExport, Piece, Viewpoints, make_exporter
+from beags_plugin.export.frames import Frame, bounding_box, check_placement
+from beags_plugin.extraction.files import whole_file
+from beags_plugin.extraction.select import select_class
+from beags_plugin.plugin.objects.extract import (
+    SavedScene,
+    file_name,
+    folder_names,
+    load_scene,
+    objects_with_gaussians,
+    read_scene,
+    read_transform,
+)
+from beags_plugin.plugin.runs.run_config import load_run_config
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.interface import RasterSettings
+from beags_plugin.system.errors import UserError
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.options.config import BeagsTrainerConfig
+
+MANIFEST = "manifest.json"
+WHOLE = "whole scene"  # what stands for a class where all Gaussians go into one file
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class ExportedFile:
+    """One file: its format and path, and what its exporter says of it; path None: nothing to write, for ``reason``."""
+
+    format: str
+    path: Path | None
+    facts: dict[str, Any]
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """One object (or the background, or the whole scene) and its files.
+
+    class_id: None of the whole scene. center: [3] the point of the world that is the files' origin.
+    low, high: [3] its box, in the files' frame. to_run: the 4 x 4 matrix from the files' frame to the run's normalised
+    one.
+    """
+
+    name: str
+    class_id: int | None
+    gaussians: int
+    center: list[float]
+    low: list[float]
+    high: list[float]
+    to_run: list[list[float]]
+    files: list[ExportedFile]
+
+    def to_json(self, folder: Path) -> dict[str, Any]:
+        """Plain values for the manifest in ``folder``."""
+        return {
+            "name": self.name,
+            "class_id": self.class_id,
+            "gaussians": self.gaussians,
+            "center": self.center,
+            "box": {"low": self.low, "high": self.high},
+            "to_run": self.to_run,
+            "files": [
+                {"format": file.format, "path": file.path.relative_to(folder).as_posix()}
+                | {"bytes": file.path.stat().st_size, **file.facts}
+                for file in self.files
+                if file.path is not None
+            ],
+            "left_out": [{"format": file.format, "reason": file.reason} for file in self.files if file.path is None],
+        }
+
+
+def export_run(
+    config_path: Path,
+    objects: Sequence[str] = (),
+    everything: bool = False,
+    formats: Sequence[str] = ("ply",),
+    placement: str = "world",
+    output: Path | None = None,
+    options: Mapping[str, Mapping[str, Any]] | None = None,
+    progress: Progress | None = None,
+    whole: bool = False,
+) -> list[Exported]:
+    """Write files of objects of a run.
+
+    config_path: config.yml of a refined (or assigned) run. objects: names; or everything: all that have Gaussians and
+    the emptied background, and a manifest. whole: the whole scene too, in one file; alone it needs no classes.
+    formats: names of exporters. placement: "world", the frame of the input poses (the run's own if it has not kept how
+    that was normalised), or "object", the same centred on each object. output: folder; ``exports/`` in the run by
+    default. options: format to its exporter's options. progress: is told (done, total) files, and
+    views drawn for the meshes among them.
+    Raises ``UserError`` for a mistake, before anything is written.
+    """
+    from beags_plugin.plugin.objects.evaluate import raster_settings
+
+    run, folder = config_path.parent, output or config_path.parent / "exports"
+    check_placement(placement)
+    exporters = {name: make_exporter(name, **(options or {}).get(name, {})) for name in formats}
+    if not exporters:
+        raise UserError("no format is named: name one with --format.")
+    scene = load_scene(config_path) if everything or objects or not whole else read_scene(config_path)
+    present = objects_with_gaussians(scene, objects, run) if scene.assigned else {}
+    if everything and objects:
+        raise UserError("--all exports every object: leave --object out.")
+    if not (everything or objects or whole):
+        raise UserError(
+            f"nothing to export is named: use --all, --whole, or --object with one of {', '.join(present)}."
+        )
+
+    transform = read_transform(run)
+    job = _Job(
+        scene,
+        exporters,
+        Frame.of_run() if transform is None else Frame(*transform),
+        placement == "object",
+        training_viewpoints(scene.config, raster_settings(scene), config_path)
+        if any(exporter.needs_views for exporter in exporters.values())
+        else None,
+        tolerant=everything,
+    )
+    names, titles = list(present) if everything else list(dict.fromkeys(objects)), folder_names(scene.classes)
+    pieces: list[tuple[str, int | None, str]] = [(name, present[name], titles[present[name]]) for name in names]
+    if whole:
+        pieces.append((WHOLE, None, "whole_scene"))
+    steps = _Steps(job.steps(), len(pieces), progress or (lambda done, total: None))
+    exported = [job.export(name, class_id, folder / title, steps) for name, class_id, title in pieces]
+    if everything:
+        world = "run" if transform is None else "input"
+        _write_manifest(folder, {"run": str(config_path.absolute()), "frame": placement, "world": world}, exported)
+    return exported
+
+
+class _Steps:
+    """Tells the progress of an export: a step for each file, and before it one for each view that it draws.
+
+    of_a_piece: steps of each exporter's file.
+    """
+
+    def __init__(self, of_a_piece: Sequence[int], pieces: int, tell: Progress) -> None:
+        self._of_files = list(of_a_piece) * pieces
+        self._file = 0
+        self._tell = tell
+        self.drew(0)
+
+    def drew(self, views: int) -> None:
+        """Some of the present file's views are drawn."""
+        self._tell(sum(self._of_files[: self._file]) + views, sum(self._of_files))
+
+    def wrote(self) -> None:
+        """The present file is done, whatever it took."""
+        self._file += 1
+        self.drew(0)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What all pieces of an export have in common.
+
+    world: frame of the files, but for the shift if they are ``centred``. views: in the run's frame.
+    tolerant: leave out a format for which a piece has nothing.
+    """
+
+    scene: SavedScene
+    exporters: Mapping[str, Exporter]
+    world: Frame
+    centred: bool
+    views: Viewpoints | None
+    tolerant: bool
+
+    def steps(self) -> list[int]:
+        """Of each file of a piece: see ``_Steps``."""
+        views = 0 if self.views is None else len(self.views.cameras)
+        return [1 + (views if exporter.needs_views else 0) for exporter in self.exporters.values()]
+
+    def export(self, name: str, class_id: int | None, stem: Path, steps: _Steps) -> Exported:
+        """All files of one class (None: of the whole scene), called ``stem`` and their suffixes."""
+        class_ids = self.scene.state["class_ids"]
+        chosen = self.scene.surfels()
+        if class_id is not None:
+            chosen, index = select_class(chosen, class_ids, class_id)
+            class_ids = class_ids[index]
+        low, high = bounding_box(self.world.surfels(chosen))
+        center = (low + high) / 2 if self.centred else torch.zeros(3, dtype=torch.float64)
+        frame = self.world.centred(center)
+        views = None if self.views is None else frame.views(self.views)
+        piece = Piece(name, frame.surfels(chosen), class_ids, views, drew=steps.drew)
+        files = []
+        for label, exporter in self.exporters.items():
+            files.append(self._write(label, exporter, stem.with_name(f"{stem.name}.{exporter.suffix}"), piece))
+            steps.wrote()
+        low, high = low - center, high - center
+        return Exported(
+            name, class_id, len(chosen), center.tolist(), low.tolist(), high.tolist(), frame.to_run(), files
+        )
+
+    def _write(self, label: str, exporter: Exporter, path: Path, piece: Piece) -> ExportedFile:
+        try:
+            return ExportedFile(label, path, exporter.write(path, piece))
+        except NothingToExport as error:
+            if not self.tolerant:
+                raise
+            return ExportedFile(label, None, {}, str(error))
+
+
+def export_shown(
+    config_path: Path,
+    surfels: Surfels,
+    class_ids: Tensor,
+    title: str,
+    format_name: str,
+    settings: RasterSettings,
+    progress: Progress = lambda done, total: None,
+) -> Path:
+    """Write surfels that a viewer shows into ``exports/`` of the run, without replacing a file; returns its path.
+
+    config_path: config.yml of the run. surfels: M of its frame; class_ids: [M] int32. title: what the file is called,
+    before the suffix. settings: depth range of the scene. progress: is told (done, total) views that a mesh is made of.
+    Raises ``UserError`` if nothing is shown, for an unknown format, or a file that cannot be written.
+    """
+    exporter = make_exporter(format_name)
+    if len(surfels) == 0:
+        raise UserError("nothing is shown, so there is nothing to export: show an object, or lower the least opacity.")
+    transform = read_transform(config_path.parent)
+    frame = Frame.of_run() if transform is None else Frame(*transform)
+    views = None
+    if exporter.needs_views:
+        views = frame.views(training_viewpoints(load_run_config(config_path), settings, config_path))
+    path = _free_path(config_path.parent / "exports", title, exporter.suffix)
+    total = 0 if views is None else len(views.cameras)
+    exporter.write(
+        path, Piece(title, frame.surfels(surfels), class_ids, views, drew=lambda done: progress(done, total))
+    )
+    return path
+
+
+def _free_path(folder: Path, title: str, suffix: str) -> Path:
+    """``title`` as a file name that is not taken, with a number if need be."""
+    stem = file_name(title)
+    names = chain([stem], (f"{stem}_{number}" for number in count(2)))
+    return next(path for name in names if not (path := folder / f"{name}.{suffix}").exists())
+
+
+def training_viewpoints(config: BeagsTrainerConfig, settings: RasterSettings, config_path: Path) -> Viewpoints:
+    """The training views of a run, in its own frame; raises ``UserError`` if its data cannot be read.
+
+    settings: depth range of the scene. config_path: of the run, for messages.
+    """
+    from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
+
+    if not (data := config.data_path).exists():
+        raise UserError(f"{config_path} was trained on {data}, which is gone: put it back.")
+    try:
+        # Poses alone: no photo is read, and lens distortion does not matter to where one looks from.
+        parser = replace(config.data_config.dataparser, data=data).setup()
+        cameras = parser.get_dataparser_outputs(split="train").cameras
+    except UserError as error:
+        raise UserError(f"the data of {config_path} cannot be read: {error}") from error
+    return Viewpoints(
+        [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))],
+        make_rasterizer(config.model_config.rasterizer),
+        settings,
+    )
+
+
+def _write_manifest(folder: Path, origin: dict[str, str], exported: Sequence[Exported]) -> None:
+    content = {**origin, "objects": [one.to_json(folder) for one in exported]}
+    with whole_file(folder / MANIFEST) as part:
+        part.write_text(json.dumps(content, indent=2), "utf8")

@@ -1,0 +1,200 @@
+"""``beags masks make``: masks of a scene from a registered source, written as id images."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import fields
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.data.files import image_size, photo_names
+from beags_plugin.labels.classes import check_names, write_class_map
+from beags_plugin.masks.rims import snap_to_edges
+from beags_plugin.masks.sources import MASK_SOURCES
+from beags_plugin.masks.sources.base import MaskSource, Photo, SourceScene
+from beags_plugin.pictures.masks import overlay
+from beags_plugin.plugin.objects.evaluate import raster_settings
+from beags_plugin.plugin.objects.extract import read_scene
+from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, data_of_run, mask_paths
+from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParserConfig
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
+from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.progress import progress_bar
+from beags_plugin.system.whole_files import write_whole
+
+
+class RunGeometry:
+    """The shape that a trained run found, at the size of the photographs: of its training views, then of the others."""
+
+    def __init__(self, config_path: Path) -> None:
+        self.scene = read_scene(config_path)
+        self.manager = data_of_run(self.scene, config_path, ReprojectionOptions())
+        self.images = list(self.manager.train_dataset.image_filenames)
+        self.cameras = [view.camera for view in self.manager.views("train")]
+        self._of_split: list[tuple[Literal["train", "eval"], int]] = [("train", i) for i in range(len(self.images))]
+        held_out = zip(self.manager.eval_dataset.image_filenames, self.manager.views("eval"), strict=True)
+        for index, (image, view) in enumerate(held_out):
+            if image not in self.images:  # without held-out views, those that are trained on serve both
+                self._of_split.append(("eval", index))
+                self.images.append(image)
+                self.cameras.append(view.camera)
+        self.rasterizer = make_rasterizer(self.scene.config.model_config.rasterizer)
+        self.settings = raster_settings(self.scene)
+
+    @cached_property
+    def _surfels(self):
+        return geometry_inputs(self.scene.surfels())
+
+    def depth(self, view: int) -> Tensor:
+        """[h, w] float32."""
+        kind = self.scene.config.model_config.prepare.depth
+        with torch.no_grad():
+            drawn = self.rasterizer.rasterize(self._surfels, self.cameras[view], self.settings, torch.zeros(3))
+            return surface_depth(drawn, kind)
+
+    def to_straight(self, class_map: np.ndarray, view: int) -> np.ndarray:
+        split, index = self._of_split[view]
+        of_eval, of_train = self.manager.undistort_eval_map, self.manager.straight_train_map
+        return of_eval(class_map, index) if split == "eval" else of_train(class_map, index)
+
+    def to_photo(self, class_map: np.ndarray, view: int) -> np.ndarray:
+        split, index = self._of_split[view]
+        return self.manager.as_in_file(class_map, index, split=split)
+
+
+def configured_source(name: str, options: Sequence[str]) -> MaskSource:
+    """A registered source with options "key=value"; raises ``UserError`` for an unknown key or a wrong value."""
+    import tyro
+
+    kind: Any = MASK_SOURCES.get(name)
+    known = [field.name for field in fields(kind)]
+    arguments = []
+    for option in options:
+        key, equals, value = option.partition("=")
+        if key not in known or not equals:
+            raise UserError(f"the mask source {name} has no option {option!r}: give {', '.join(known)} as key=value.")
+        if isinstance(getattr(kind, key, None), bool):
+            if value not in ("true", "false"):
+                raise UserError(f"the option {option!r} must be true or false.")
+            arguments.append(f"--{'' if value == 'true' else 'no-'}{key.replace('_', '-')}")
+        else:
+            arguments += [f"--{key.replace('_', '-')}", *value.split(",")]
+    try:
+        source: MaskSource = tyro.cli(kind, args=arguments, console_outputs=False)
+    except SystemExit:
+        usual = ", ".join(f"{key}={getattr(kind, key)}" for key in known if hasattr(kind, key))
+        told = f"the options {' '.join(options)} of the mask source {name} have a wrong value: give such as {usual}."
+        raise UserError(told) from None
+    if reason := source.unavailable():
+        raise UserError(f"the mask source {name} cannot run: {reason}")
+    return source
+
+
+def make_masks(
+    data: BeagsDataParserConfig,
+    source: MaskSource,
+    run: Path | None = None,
+    output: Path | None = None,
+    overwrite: bool = False,
+    snap: int = 0,
+) -> list[str]:
+    """Write the masks of a scene: <output>/masks/<stem>.png, classes.json and made.png, a picture of them.
+
+    The files take their places once all are made; no old mask of any view stays. Masks that are only to be looked at
+    go to <output>/masks_to_look_at/, which nothing reads; all else that is said of masks holds for them too.
+    data: names the scene. run: config.yml of a run trained on it, for sources that need its depth. output: the scene's
+    own folder if None, where ``beags-data`` looks for them. overwrite: replace masks that are there. snap: radius in
+    pixels of ``rims.snap_to_edges``, 0 leaves rims as they are.
+    Returns lines that tell what was written. Raises ``UserError`` before anything is written, or for bad input.
+    """
+    parser: BeagsDataParser = data.setup()
+    scene, views = parser.posed_views()
+    folder = output or scene.root
+    masks, look_at, classes = folder / "masks", folder / "masks_to_look_at", folder / "classes.json"
+    there = [*masks.rglob("*.png"), *look_at.rglob("*.png"), *([classes] if classes.exists() else [])]
+    if there and not overwrite:
+        raise UserError(
+            f"{folder} has masks or a classes.json already ({min(there).relative_to(folder)}): add --overwrite, or "
+            "give another --output."
+        )
+    if source.needs_run and run is None:
+        raise UserError(
+            "this mask source needs the scene's depth: train beags-base, then add --load-config <run>/config.yml."
+        )
+    trained = set(parser.training_views(views))
+    sizes = [image_size(path) for path in views.images]
+    photos = [
+        Photo(name, path, *size, trained=index in trained)
+        for index, (name, path, size) in enumerate(zip(photo_names(views.images), views.images, sizes, strict=True))
+    ]
+    made_of = SourceScene(scene.root, photos, RunGeometry(run) if run is not None and source.needs_run else None)
+    shares: list[float] = []
+    shown: list[tuple[Photo, Path]] = []
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    with (
+        writing(folder),
+        TemporaryDirectory(prefix=".masks_", dir=folder) as temporary,
+        progress_bar("Making masks") as progress,
+    ):
+        unfinished = {place: Path(temporary) / place.name for place in (masks, look_at)}
+        made = source.make(made_of, progress)
+        check_names(made.names)
+        for index, (path, class_map) in enumerate(zip(mask_paths(views.images), made.maps, strict=True)):
+            if class_map is None:
+                continue
+            if snap:
+                class_map = snap_to_edges(class_map, photos[index].pixels(), snap)
+            place = look_at if index in made.to_look_at else masks
+            file = unfinished[place] / path
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_class_map(file, class_map)
+            if place is masks:
+                shares.append(float((class_map != 0).mean()))
+            shown.append((photos[index], place / path))
+        if not shares:
+            raise UserError("the mask source gave no mask for any view: check its options.")
+        for place, new in unfinished.items():
+            _take_the_place(new, place, {image.stem for image in views.images})
+    names = {str(i): name for i, name in sorted(made.names.items())}
+    write_whole(classes, lambda file: file.write(json.dumps(names, indent=1).encode()))
+    _picture(folder / "made.png", shown)
+    aside = len(shown) - len(shares)
+    return [
+        *made.notes,
+        f"{len(shares)} masks of {len(photos)} views, {len(names) - 1} objects, which cover "
+        f"{100 * np.mean(shares):.1f} % on average: {masks}",
+        *([f"{aside} masks of held-out views, only to look at: {look_at}"] if aside else []),
+        f"names: {classes}; look at {folder / 'made.png'}",
+    ]
+
+
+def _take_the_place(unfinished: Path, masks: Path, stems: set[str]) -> None:
+    """Move the new masks to ``masks``, instead of all that are there for images of these stems."""
+    for old in list(masks.rglob("*.png")):
+        if old.stem in stems:
+            old.unlink()
+    for new in sorted(unfinished.rglob("*.png")):
+        place = masks / new.relative_to(unfinished)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        new.replace(place)
+
+
+def _picture(path: Path, shown: Sequence[tuple[Photo, Path]], most: int = 24) -> None:
+    from beags_plugin.labels.classes import read_class_map
+    from beags_plugin.pictures.cells import below, cell, wrapped, write_picture
+
+    step = -(-len(shown) // most)
+    cells = []
+    for photo, mask in shown[::step]:
+        size = (260, max(1, round(260 * photo.height / photo.width)))
+        cells.append([cell(overlay(photo.pixels(), read_class_map(mask)), size, photo.name)])
+    write_picture(path, below(wrapped(cells, 1100)))

@@ -1,0 +1,122 @@
+"""Pictures of the objects of a run: turntables, sheets, and before beside after."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import get_args
+
+from beags_plugin.export.frames import bounding_box
+from beags_plugin.extraction.select import select_class
+from beags_plugin.pictures.cells import write_picture
+from beags_plugin.pictures.objects import Subject, comparison, film, sheet
+from beags_plugin.pictures.options import PictureFormat, RenderOptions
+from beags_plugin.pictures.orbit import orbit, orbit_settings, stand_of
+from beags_plugin.pictures.video import FILMS, check_film, encoder, write_film
+from beags_plugin.plugin.objects.export import Progress, training_viewpoints
+from beags_plugin.plugin.objects.extract import SavedScene, folder_names, load_scene, objects_with_gaussians
+from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.system.errors import UserError
+
+_PICTURES = (".png", ".jpg", ".jpeg")
+
+
+def render_run(
+    config_path: Path,
+    objects: Sequence[str] = (),
+    form: str = "video",
+    output: Path | None = None,
+    options: RenderOptions | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Draw objects of a run alone, from cameras around each, into one file; returns its path.
+
+    config_path: config.yml of a refined (or assigned) run. objects: names; all but the background if empty.
+    form: "video" (.mp4, .gif), "sheet" (.png, .jpg), or "before-after": assignment alone beside the refined object
+    from the same cameras, either. output: the file; in ``renders/`` of the run if None.
+    progress: is told (done, total) pictures. Raises ``UserError`` for a mistake, before anything is drawn.
+    """
+    options = options or RenderOptions()
+    options.check()
+    if form not in get_args(PictureFormat):
+        raise UserError(f"there is no format {form!r}: choose one of {', '.join(get_args(PictureFormat))}.")
+    scene = load_scene(config_path)
+    present = objects_with_gaussians(scene, objects, config_path.parent)
+    names = list(dict.fromkeys(objects)) or [name for name, class_id in present.items() if class_id != 0]
+    if not names:
+        raise UserError(f"{config_path} holds no object but the background: name it with --object background.")
+    path = output or _default_output(config_path, scene, names, present, form)
+    moving = _check_output(path, form)
+    stages = {"": scene} if form != "before-after" else {"before": _base_of(config_path), "after": scene}
+    subjects = _subjects(config_path, stages, names, present, form, moving, options)
+    rasterizer = make_rasterizer(scene.config.model_config.rasterizer)
+    if moving:
+        write_film(path, film(subjects, rasterizer, options.background, progress), options.fps)
+    else:
+        draw = comparison if form == "before-after" else sheet
+        write_picture(path, draw(subjects, rasterizer, options.background, progress))
+    return path
+
+
+def _default_output(
+    config_path: Path, scene: SavedScene, names: Sequence[str], present: dict[str, int], form: str
+) -> Path:
+    title = folder_names(scene.classes)[present[names[0]]] if len(names) == 1 else "objects"
+    suffix = ".png" if form != "video" else ".gif" if encoder() is None else ".mp4"
+    return config_path.parent / "renders" / f"{title}_{form}{suffix}"
+
+
+def _check_output(path: Path, form: str) -> bool:
+    """Whether the file is a film; raises ``UserError`` for a name that does not fit the format."""
+    suffix = path.suffix.lower()
+    if form == "video" or (form == "before-after" and suffix in FILMS):
+        check_film(path)
+        return True
+    if suffix not in _PICTURES:
+        films = " (or .mp4, .gif)" if form == "before-after" else ""
+        raise UserError(f"the picture {path} is no .png or .jpg{films}: give it such a name.")
+    return False
+
+
+def _base_of(config_path: Path) -> SavedScene:
+    """The state with assignment alone, which a refined run has kept."""
+    snapshot = config_path.parent / BASE_SNAPSHOT / "config.yml"
+    if not snapshot.exists():
+        raise UserError(
+            f"{config_path.parent} has kept no state before refinement ({BASE_SNAPSHOT}/): name the run that was "
+            "refined, or another --format."
+        )
+    return load_scene(snapshot)
+
+
+def _subjects(
+    config_path: Path,
+    stages: dict[str, SavedScene],
+    names: Sequence[str],
+    present: dict[str, int],
+    form: str,
+    moving: bool,
+    options: RenderOptions,
+) -> list[Subject]:
+    from beags_plugin.plugin.objects.evaluate import raster_settings
+
+    last = list(stages.values())[-1]
+    try:
+        photos = training_viewpoints(last.config, raster_settings(last), config_path).cameras
+    except UserError:  # the data are gone: nerfstudio's frame has z up
+        photos = []
+    count = options.frames if moving else options.views
+    if form == "before-after" and not moving:
+        count = max(1, count // 2)
+    size = options.size or (480 if moving else 400 if form == "before-after" else 232)
+    subjects = []
+    for name in names:
+        shown = {
+            caption: select_class(scene.surfels(), scene.state["class_ids"], present[name])[0]
+            for caption, scene in stages.items()
+        }
+        stand = stand_of(*bounding_box(list(shown.values())[-1]), photos)
+        cameras = orbit(stand, count, size, options.elevation, options.turn)
+        subjects.append(Subject(name, shown, cameras, orbit_settings(stand)))
+    return subjects

@@ -1,0 +1,204 @@
+"""Masks reprojected with the depth of a trained run: ``beags masks reproject``."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+import torch
+
+from beags_plugin.labels.classes import write_class_map
+from beags_plugin.labels.label_maps import LabelMaps, PackedMaps
+from beags_plugin.pictures.masks import Changed, before_and_after
+from beags_plugin.plugin.objects.evaluate import raster_settings
+from beags_plugin.plugin.objects.extract import read_scene
+from beags_plugin.preparation.consistent_masks import chosen_reprojection, render_depths, reprojected_masks
+from beags_plugin.preparation.pipeline import known_classes
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.filed_tensors import filed
+from beags_plugin.system.progress import counted, progress_bar
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.objects.extract import SavedScene
+    from beags_plugin.plugin.views.datamanager import BeagsDataManager
+    from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+
+
+@dataclass(frozen=True)
+class ReprojectionOptions:
+    """What may differ from how the run itself prepares masks; None keeps its choice.
+
+    masks: folder of other id images. classes: their classes.json. method, tau, voters, depth: see
+    ``preparation.pipeline.PreparationConfig``. run_size: reproject at the size that was trained on, not at that of the
+    photographs. parser: the options of ``beags-data``, if not the run's own.
+    """
+
+    masks: Path | None = None
+    classes: Path | None = None
+    method: str | None = None
+    tau: float | None = None
+    voters: int | None = None
+    depth: str | None = None
+    run_size: bool = False
+    parser: BeagsDataParserConfig | None = None
+
+
+@dataclass(frozen=True)
+class ReprojectedRun:
+    """The masks of V training views before and after, without lens distortion.
+
+    given, voted: class ids; given is None where a view has no mask. confidence: [H, W] uint8, share of the votes
+    times 255. seconds: wall time. method: the reprojection; why: a line on why it was chosen, if it was not given.
+    """
+
+    scene: SavedScene
+    manager: BeagsDataManager
+    names: list[str]
+    classes: dict[int, str]
+    given: LabelMaps
+    voted: LabelMaps
+    confidence: PackedMaps
+    seconds: float
+    method: str
+    why: str | None
+
+    def changed(self, view: int) -> Changed:
+        """One view for a picture."""
+        given = self.given[view]
+        photo = self.manager.views("train")[view].image
+        return Changed(
+            self.names[view],
+            (255.0 * photo + 0.5).to(torch.uint8).numpy(),
+            None if given is None else given.numpy(),
+            self.voted[view].numpy(),
+            self.confidence[view].numpy(),
+        )
+
+
+def reproject_run(config_path: Path, options: ReprojectionOptions) -> ReprojectedRun:
+    """Reproject masks with the depth of a run, trained with or without masks.
+
+    config_path: config.yml of any run. Raises ``UserError`` for a run, data or an option that cannot be used, and if no
+    view has a mask.
+    """
+    scene = read_scene(config_path)
+    manager = data_of_run(scene, config_path, options)
+    own = {"reprojection": options.method, "tau": options.tau, "voters": options.voters, "depth": options.depth}
+    config = replace(scene.config.model_config.prepare, **{k: v for k, v in own.items() if v is not None})
+    if config.reprojection == "none":
+        config = replace(config, reprojection="voxel")
+    config = replace(config, min_confidence=0.0)
+    config.check()
+    start = time.perf_counter()
+    views = manager.views("train")
+    with progress_bar("Reading masks", passing=True) as progress:
+        given = LabelMaps(view.stored_labels for view in counted(views, len(views), progress))
+    if all(mask is None for mask in given.stored):
+        raise UserError(f"no training view of {scene.config.data_path} has a mask: give --masks-path, or make some.")
+    classes = manager.train_dataset.metadata["classes"]
+    cameras, rasterizer = [view.camera for view in views], make_rasterizer(scene.config.model_config.rasterizer)
+    method, why = chosen_reprojection(config.reprojection, config.voters, cameras, given)
+    config = replace(config, reprojection=method)
+    with progress_bar("Rendering depth") as progress:
+        surfels = scene.surfels().detach()
+        drawn = render_depths(surfels, cameras, rasterizer, raster_settings(scene), config.depth, progress)
+        depths = filed(drawn, surfels.means.device)
+    with progress_bar("Reprojecting masks") as progress:
+        masks = reprojected_masks(depths, cameras, given, known_classes(given, classes), config, progress)
+    assert masks.confidence is not None
+    names = [view.name for view in views]
+    seconds = time.perf_counter() - start
+    return ReprojectedRun(scene, manager, names, classes, given, masks.labels, masks.confidence, seconds, method, why)
+
+
+def data_of_run(scene: SavedScene, config_path: Path, options: ReprojectionOptions) -> BeagsDataManager:
+    """The data that a run was trained on, at the size and with the masks that ``options`` name."""
+    config = scene.config
+    if options.parser is not None:
+        parser = replace(options.parser)
+    else:
+        parser = cast("BeagsDataParserConfig", replace(config.data_config.dataparser, data=config.data_path))
+    if not parser.data.exists():
+        raise UserError(f"{config_path} was trained on {parser.data}, which is gone: put it back.")
+    if options.masks is not None:
+        if not options.masks.is_dir():
+            raise UserError(f"the folder of masks {options.masks} does not exist: correct --masks-path.")
+        parser.masks_path = options.masks.absolute()
+        beside = options.masks.absolute().parent / "classes.json"
+        classes = options.classes or (beside if beside.is_file() else None)
+        parser.classes_path = parser.classes_path if classes is None else classes.absolute()
+    data = replace(config.data_config, dataparser=parser, data=parser.data)
+    if not options.run_size:
+        parser.downscale_factor, data.camera_res_scale_factor = 1.0, 1.0
+    manager = data.setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
+    return cast("BeagsDataManager", manager)
+
+
+def write_reprojection(found: ReprojectedRun, output: Path, min_confidence: float = 0.0, shown: int = 6) -> list[str]:
+    """Write refined masks, confidence maps, a report and a picture of the views that changed most; what was written.
+
+    All maps are of the size of the photographs, lens distortion included, so that ``beags-data --masks-path`` takes
+    them (at the run's own size if that was asked for). min_confidence: less certain pixels become IGNORE.
+    """
+    with writing(output):
+        return _write_reprojection(found, output, min_confidence, shown)
+
+
+def _write_reprojection(found: ReprojectedRun, output: Path, min_confidence: float, shown: int) -> list[str]:
+    from PIL import Image
+
+    changes = []
+    for index, path in enumerate(mask_paths(found.manager.train_dataset.image_filenames)):
+        voted = found.voted[index].numpy().astype(np.uint16)
+        confidence = found.confidence[index].numpy()
+        doubtful = (confidence < 255.0 * min_confidence) if min_confidence > 0 else np.zeros(voted.shape, bool)
+        final = np.where(doubtful, np.uint16(IGNORE), voted)
+        for folder in ("masks", "confidence"):
+            (output / folder / path).parent.mkdir(parents=True, exist_ok=True)
+        write_class_map(output / "masks" / path, found.manager.as_in_file(final, index))
+        Image.fromarray(found.manager.as_in_file(confidence, index, border=0)).save(output / "confidence" / path)
+        changes.append(_change(found, index, doubtful))
+    (output / "classes.json").write_text(json.dumps({str(i): name for i, name in found.classes.items()}, indent=1))
+    report = {"method": found.method, "seconds": found.seconds, "min_confidence": min_confidence, "views": changes}
+    (output / "report.json").write_text(json.dumps(report, indent=1))
+    order = sorted(range(len(changes)), key=lambda index: -changes[index]["changed"])[:shown]
+    before_and_after(output / "before_after.png", [found.changed(index) for index in order])
+    pixels, changed = (sum(view[key] for view in changes) for key in ("labelled", "changed"))
+    filled = sum(mask is None for mask in found.given.stored)
+    return [
+        *([found.why] if found.why else []),
+        f"{changed} of {pixels} labelled pixels changed ({100 * changed / max(pixels, 1):.2f} %), "
+        f"{filled} views without a mask got one, in {found.seconds:.1f} s",
+        *(f"{output / name}" for name in ("masks", "confidence", "classes.json", "report.json", "before_after.png")),
+    ]
+
+
+def _change(found: ReprojectedRun, index: int, doubtful: np.ndarray) -> dict[str, object]:
+    given, voted = found.given[index], found.voted[index]
+    known = None if given is None else given != IGNORE
+    confidence = found.confidence[index].float() / 255.0
+    return {
+        "view": found.names[index],
+        "labelled": 0 if known is None else int(known.sum()),
+        "changed": 0 if known is None else int((known & (given != voted)).sum()),
+        "mean_confidence": round(float(confidence.mean()), 4),
+        "doubtful": int(doubtful.sum()),
+    }
+
+
+def mask_paths(images: Sequence[Path]) -> list[Path]:
+    """Where the masks of images go below their folder, so that ``data.files.files_of_views`` finds them again."""
+    stems = Counter(image.stem for image in images)
+    if len(images) == 1 or max(stems.values()) == 1:
+        return [Path(f"{image.stem}.png") for image in images]
+    root = Path(os.path.commonpath([image.parent for image in images]))
+    return [image.relative_to(root).with_suffix(".png") for image in images]

@@ -1,0 +1,1 @@
+"""Options of ``ns-train beags``: fields and checks, no behaviour."""

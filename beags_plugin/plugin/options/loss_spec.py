@@ -1,0 +1,48 @@
+"""A term of the training loss as configs list it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from typing import Literal, get_args
+
+from beags_plugin.losses import LOSSES
+from beags_plugin.losses.base import Loss
+from beags_plugin.plugin.options.schedule import PhaseSchedule
+from beags_plugin.system.errors import UserError
+
+Phase = Literal["base", "refine", "both"]
+
+
+@dataclass
+class LossSpec:
+    """One term of the training loss, as a config lists it."""
+
+    weight: float = 1.0
+    """Factor in the sum; 0 switches the term off."""
+    phase: Phase = "both"
+    """Where the term may act."""
+    start: int = 0
+    """First step of the term: of the run, stated for a base of schedule_steps; or, for phase "refine", of the
+    refinement, as it is."""
+    options: dict[str, bool | int | float] = field(default_factory=dict)
+    """Options of the loss itself, e.g. ssim_weight or samples."""
+
+    def build(self, name: str, schedule: PhaseSchedule) -> Loss:
+        """The loss, with its steps made absolute; raises ``UserError`` for a value that it cannot have."""
+        kind = LOSSES.get(name)
+        if not 0.0 <= self.weight < math.inf:
+            raise UserError(f"the loss {name} has the weight {self.weight}: give 0 (off) or more.")
+        if self.phase not in (phases := get_args(Phase)):
+            raise UserError(f"the loss {name} has the phase {self.phase!r}: choose one of {', '.join(phases)}.")
+        if self.start < 0:
+            raise UserError(f"the loss {name} starts at step {self.start}: give 0 or more.")
+        known = [field.name for field in fields(kind) if field.name not in ("weight", "start", "stop")]
+        if unknown := sorted(set(self.options) - set(known)):
+            choice = f"choose of {', '.join(known)}" if known else "it has none"
+            raise UserError(f"the loss {name} has no option {unknown[0]!r}: {choice}.")
+        first = schedule.base_steps + self.start if self.phase == "refine" else schedule.scaled(self.start)
+        if self.phase != "refine" and (schedule.base_steps == 0 or schedule.warm):
+            first = 0  # the base was trained elsewhere: its terms have long started
+        last = schedule.base_steps if self.phase == "base" else None
+        return kind(weight=self.weight, start=first, stop=last, **self.options)

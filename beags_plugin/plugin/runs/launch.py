@@ -1,0 +1,93 @@
+"""Training from Python, exactly as ``ns-train`` does it, and going on with a run that was broken off."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from beags_plugin.plugin.runs.layout import CONFIG_FILE, EXTRACTION_FILE, REPORT_FILE
+from beags_plugin.system.errors import UserError
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.options.config import BeagsTrainerConfig
+
+
+def train(config: BeagsTrainerConfig) -> None:
+    """Run the training that ``config`` describes; its ``run_dir`` says where.
+
+    Raises ``UserError`` for a user's mistake, where ``ns-train`` would print it and end.
+    """
+    from nerfstudio.scripts.train import main
+
+    _complete(lambda: main(config), config)
+
+
+def resume(run: Path, device: Literal["cpu", "cuda"] | None = None, check_memory: bool = True) -> None:
+    """Train a run that was broken off to its end, in its own folder and with the config that it was started with.
+
+    run: its folder, or config.yml in there. device: "cpu" or "cuda" in place of the config's. check_memory: as in
+    ``BeagsTrainerConfig``. Without a checkpoint it starts from the beginning. Raises ``UserError`` for what is no such
+    run, and for one that is complete.
+    """
+    from nerfstudio.scripts.train import launch, train_loop
+
+    from beags_plugin.plugin.training.replicas import check_machine
+
+    config = resumed_config(run)
+    machine = config.machine
+    config.check_memory = config.check_memory and check_memory
+    if device is not None:
+        machine.device_type, machine.num_devices = device, machine.num_devices if device == "cuda" else 1
+    check_machine(machine)
+    _complete(
+        lambda: launch(
+            main_func=train_loop,
+            num_devices_per_machine=machine.num_devices,
+            device_type=machine.device_type,
+            num_machines=machine.num_machines,
+            machine_rank=machine.machine_rank,
+            dist_url=machine.dist_url,
+            config=config,
+        ),
+        config,
+    )
+
+
+def resumed_config(run: Path) -> BeagsTrainerConfig:
+    """The config with which ``resume`` trains."""
+    from nerfstudio.utils.rich_utils import CONSOLE
+
+    from beags_plugin.plugin.runs.layout import newest_checkpoint
+    from beags_plugin.plugin.runs.run_config import load_run_config
+    from beags_plugin.plugin.training.resumable import read_checkpoint, scene_alone
+
+    path = Path(run)
+    path = path / CONFIG_FILE if path.is_dir() else path
+    config = load_run_config(path)
+    folder = path.absolute().parent
+    config.run_dir = folder  # wherever it has been moved to
+    models = config.get_checkpoint_dir()
+    if not any(models.glob("step-*.ckpt")):
+        message = f"{folder} holds no checkpoint yet: it starts from the beginning."
+        CONSOLE.print(message, highlight=False, markup=False, soft_wrap=True)
+        return config
+    if (folder / EXTRACTION_FILE).exists() or scene_alone(read_checkpoint(newest_checkpoint(models))):
+        raise UserError(
+            f"{folder} holds a scene without the state of its training: resume the run that it comes from, or refine "
+            f"it: ns-train beags-refine --load-dir {models}."
+        )
+    config.load_dir, config.load_checkpoint, config.load_step = models, None, None
+    return config
+
+
+def _complete(run: Callable[[], None], config: BeagsTrainerConfig) -> None:
+    """Run a training; raises what ended it early."""
+    try:
+        run()
+    except SystemExit as end:
+        if isinstance(end.__cause__, (UserError, KeyboardInterrupt)):
+            raise end.__cause__ from None
+        raise
+    if not (config.get_base_dir() / REPORT_FILE).exists():
+        raise KeyboardInterrupt  # nerfstudio prints an interrupt and returns

@@ -1,0 +1,1 @@
+"""A run's life: the scene, its phases, checkpoints and curves."""

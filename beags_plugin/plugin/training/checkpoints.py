@@ -1,0 +1,160 @@
+"""The checkpoints of a run: what they hold, what a run goes on from, and what becomes of an earlier run's."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from beags_plugin.plugin.runs.checkpoint_file import check_state
+from beags_plugin.plugin.runs.layout import REPORT_FILE, newest_checkpoint, save_atomically
+from beags_plugin.plugin.training.resumable import STATE, VERSION, Part, read_checkpoint, training_state
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.text import reason
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.model import BeagsModel
+    from beags_plugin.plugin.options.config import BeagsTrainerConfig
+    from beags_plugin.plugin.trainer import BeagsTrainer
+
+REPLACED = "replaced_models"
+"""Folder of a run: checkpoints of an earlier one in the same place, until the new one has its own."""
+_MISFITS = (RuntimeError, LookupError, ValueError, TypeError, AttributeError)  # what loading a foreign state may raise
+
+
+class Checkpoints:
+    """Writes and reads those of one run.
+
+    loaded_run: the folder of the run whose training goes on here, None before ``restore`` has found one.
+    """
+
+    def __init__(self, config: BeagsTrainerConfig, base_dir: Path, folder: Path) -> None:
+        self.config, self.base_dir, self.folder = config, base_dir, folder
+        self.loaded_run: Path | None = None
+        self._parts: dict[str, Part] = {}
+        self._loaded_states: dict[str, Any] = {}
+        self._loaded_from: Path | None = None
+        self._saved_step: int | None = None
+
+    # -- what is loaded ------------------------------------------------------------------------------------------------
+
+    @property
+    def loads(self) -> bool:
+        """Whether a checkpoint is loaded: what it holds counts, not the scene that its run may have started from."""
+        return self.config.load_dir is not None or self.config.load_checkpoint is not None
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether this run goes on in its own folder."""
+        loaded = self.config.load_dir or (self.config.load_checkpoint and self.config.load_checkpoint.parent)
+        return loaded is not None and loaded.resolve().parent == self.base_dir.resolve()
+
+    @property
+    def path(self) -> Path | None:
+        """The file to load, as the config names it."""
+        config = self.config
+        if config.load_dir is None:
+            return config.load_checkpoint
+        if config.load_step is None:
+            return newest_checkpoint(config.load_dir)
+        return config.load_dir / f"step-{config.load_step:09d}.ckpt"
+
+    def restore(self, path: Path, trainer: BeagsTrainer) -> int:
+        """Bring the trainer's pipeline, optimizers and scaler to where the checkpoint was; returns the next step.
+
+        The parts that ``keep`` names later go on from there too. Raises ``UserError`` for a file that is no checkpoint,
+        does not fit this run, or was of other classes.
+        """
+        checkpoint = read_checkpoint(path)
+        states = training_state(checkpoint, path)
+        model = cast("BeagsModel", trainer.pipeline.model)
+        named = dict(model.classes)  # by the data
+        check_state(_of_model(checkpoint["pipeline"]), path)
+        try:
+            trainer.pipeline.load_pipeline(checkpoint["pipeline"], checkpoint["step"])
+            trainer.optimizers.load_optimizers(checkpoint["optimizers"])
+            trainer.grad_scaler.load_state_dict(checkpoint["scalers"])
+        except _MISFITS as error:
+            raise _misfit(path, error) from error
+        if self.goes_on and model.classes != named:
+            raise UserError(
+                f"the classes of {self.config.data_path} are not those with which training began "
+                f"({', '.join(model.classes.values())}): restore classes.json and the masks, or train again."
+            )
+        CONSOLE.print(f"Loaded {path}", highlight=False, markup=False, soft_wrap=True)
+        self.loaded_run = self.base_dir.absolute() if self.goes_on else path.absolute().parent.parent
+        if trainer.schedule.base_steps == 0 and int(model.refined_steps) == 0:
+            return 0  # a base that was loaded: refinement counts its own steps, and begins anew
+        self._loaded_states, self._loaded_from = states, path
+        return checkpoint["step"] + 1
+
+    # -- what is saved -------------------------------------------------------------------------------------------------
+
+    def keep(self, name: str, part: Part) -> None:
+        """Let checkpoints hold the state of ``part``; it goes on from what the loaded one holds, if that does."""
+        self._parts[name] = part
+        if name in self._loaded_states:
+            try:
+                part.restore(self._loaded_states[name])
+            except _MISFITS as error:
+                raise _misfit(self._loaded_from, error, name) from error
+
+    def all_are_kept(self) -> None:
+        """What was loaded for parts that nobody named is let go."""
+        self._loaded_states = {}
+
+    def save(self, step: int, trainer: BeagsTrainer) -> None:
+        """Save all that decides the rest of the run; the file appears whole or not at all, and only then are older
+        ones removed."""
+        path = self.folder / f"step-{step:09d}.ckpt"
+        content = {
+            "step": step,
+            "pipeline": trainer.pipeline.state_dict(),
+            "optimizers": {name: optimizer.state_dict() for name, optimizer in trainer.optimizers.optimizers.items()},
+            "schedulers": {},
+            "scalers": trainer.grad_scaler.state_dict(),
+            STATE: {"version": VERSION, "parts": {name: part.state() for name, part in self._parts.items()}},
+        }
+        save_atomically(content, path)
+        self._saved_step = step
+        if self.config.save_only_latest_checkpoint:
+            for old in self.folder.glob("*.ckpt"):
+                if old != path:
+                    old.unlink()
+        shutil.rmtree(self.base_dir / REPLACED, ignore_errors=True)
+
+    def holds(self, step: int) -> bool:
+        """Whether ``step`` was the last to be saved."""
+        return self._saved_step == step
+
+    def set_aside(self) -> None:
+        """Move away the checkpoints of an earlier run into this folder, and remove its report: a resume would take
+        them for this run's."""
+        if self.goes_on:
+            return
+        (self.base_dir / REPORT_FILE).unlink(missing_ok=True)
+        if any(self.folder.glob("*.ckpt")):
+            former = self.base_dir / REPLACED
+            shutil.rmtree(former, ignore_errors=True)
+            self.folder.rename(former)
+            CONSOLE.print(
+                f"{self.base_dir} holds an earlier run; its checkpoint is in {REPLACED} until this one saves its "
+                "first. (beags resume goes on with a run instead.)",
+                highlight=False, markup=False, soft_wrap=True,
+            )  # fmt: skip
+
+
+def _of_model(pipeline: dict[str, Any]) -> dict[str, Any]:
+    """The model's part of the state of a pipeline."""
+    return {name.removeprefix("_model."): value for name, value in pipeline.items() if name.startswith("_model.")}
+
+
+def _misfit(path: Path | None, error: Exception, part: str = "") -> UserError:
+    """The sentence for a checkpoint that is whole, but of another run than this one, or changed."""
+    state = f"the state of {part} in {path}" if part else f"{path}"
+    return UserError(
+        f"{state} does not fit this run ({reason(error)}): name an earlier checkpoint, or refine again from "
+        "base/nerfstudio_models."
+    )

@@ -1,0 +1,161 @@
+"""What a run writes for tensorboard and wandb besides nerfstudio's own: scalars and pictures, at intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from nerfstudio.utils import writer
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.evaluation.metrics import mask_metrics
+from beags_plugin.evaluation.protocol import Protocol
+from beags_plugin.evaluation.records import EvalView
+from beags_plugin.evaluation.run_metrics import extracted_mask, extracted_truth
+from beags_plugin.evaluation.violations import boundary_errors, occupancy_violations
+from beags_plugin.extraction.select import select_class
+from beags_plugin.labels.classes import BACKGROUND, colorize
+from beags_plugin.rasterizers.rendering import draw_class_map, surfel_inputs
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.memory import memory_mb, peak_memory_mb
+from beags_plugin.system.progress import progress_bar
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.model import BeagsModel
+
+MOST_CLASSES = 20  # with a curve and a picture each: the first ones by id; more could not be told apart
+VIEWS = 4  # held-out views that a measurement of masks looks at, spread over all
+
+
+class Curves:
+    """Writes through nerfstudio's writers, so that tensorboard, wandb and comet all get it.
+
+    views: held out. every: steps between two measurements of masks and pictures, besides the first and the last step
+    with classes; 0: never. last: number of steps of the run. log_every: steps between two other scalars.
+    """
+
+    def __init__(self, model: BeagsModel, views: Sequence[EvalView], every: int, last: int, log_every: int) -> None:
+        self.model = model
+        self.every = every
+        self.last = last
+        self.log_every = log_every
+        self._all_views = views
+        self._views: list[EvalView] | None = None
+        self._measured = False  # objects, at least once
+
+    def state(self) -> dict[str, Any]:
+        """Whether objects have been measured; see ``training_state.Part``."""
+        return {"measured": self._measured}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on with the measurements of the run that gave ``state``."""
+        self._measured = state["measured"]
+
+    def before_step(self, step: int) -> None:
+        """Measure what a run that was broken off in the preparation would have measured after the step before."""
+        model = self.model  # whose `assigned` may lie on a GPU: it is not asked before it may be True
+        asked = self.every > 0 and step > 0 and not self._measured and model.schedule.refining(step)
+        if asked and bool(model.assigned):
+            self._objects(step - 1)
+
+    def after_step(self, step: int) -> None:
+        """Write what is due after ``step`` (from 0); objects are measured once Gaussians have classes."""
+        model = self.model
+        if self.log_every > 0 and step % self.log_every == 0:
+            for part, seconds in model.clock.means().items():
+                writer.put_scalar(f"Seconds per step/{part}", seconds, step)
+            writer.put_scalar("Memory (MB)/now", memory_mb(), step)
+            writer.put_scalar("Memory (MB)/peak", peak_memory_mb(), step)
+            self._boundaries(step)
+        done = step + 1
+        due = self.every > 0 and (not self._measured or done % self.every == 0 or done == self.last)
+        if due and model.schedule.refining(done) and bool(model.assigned):
+            self._objects(step)
+
+    def _named(self, found: dict[int, float]) -> dict[str, float]:
+        names = dict(sorted(self.model.classes.items())[:MOST_CLASSES])
+        return {names[index]: value for index, value in found.items() if index in names}
+
+    def _boundaries(self, step: int) -> None:
+        """Of the training view that was just drawn."""
+        drawn = self.model.drawn
+        if drawn is not None and drawn.labels is not None and drawn.render.boundary is not None:
+            errors = boundary_errors(drawn.render.boundary.detach(), drawn.labels)
+            for name, error in self._named(errors).items():
+                writer.put_scalar(f"Boundary error/{name}", error, step)
+
+    @torch.no_grad()
+    def _objects(self, step: int) -> None:
+        """Extracted IoU on some held-out views, occupancy violations, pictures of one of the views."""
+        self._measured = True
+        with progress_bar("Measuring objects", passing=True) as progress:
+            self._measure(step, progress)
+
+    def _measure(self, step: int, progress: Callable[[int, int], None]) -> None:
+        """progress: is told (done, total) of the masks and of the pictures."""
+        model = self.model
+        surfels, class_ids = model.surfels().detach(), model.class_ids
+        if model.grid is not None:
+            found = occupancy_violations(surfels, class_ids, model.grid, model.seed, step)
+            for name, share in self._named(found).items():
+                writer.put_scalar(f"Occupancy violation/{name}", share, step)
+        views = self._looked_at()
+        objects = [index for index in sorted(model.classes)[:MOST_CLASSES] if index != BACKGROUND]
+        parts = {index: select_class(surfels, class_ids, index)[0] for index in objects}
+        settings = model.settings(geometry=False)
+        values: list[float] = []
+        done, total = 0, len(objects) * (len(views) + 1)
+        for index in objects:
+            scores = []
+            for view in views:
+                progress(done := done + 1, total)
+                if (truth := extracted_truth(view, index)) is not None:
+                    mask = extracted_mask(parts[index], view.camera, model.rasterizer, settings, Protocol().threshold)
+                    scores.append(mask_metrics(mask, truth[1], truth[2]).iou)
+            scores = [score for score in scores if score is not None]
+            if scores:
+                writer.put_scalar(f"Extracted IoU/{model.classes[index]}", float(np.mean(scores)), step)
+                values += scores
+        if values:
+            writer.put_scalar("Extracted IoU/mean", float(np.mean(values)), step)
+        if views:
+            self._pictures(step, views[0], parts, lambda drawn: progress(done + drawn, total))
+
+    def _looked_at(self) -> list[EvalView]:
+        """The held-out views, none if they cannot be read: no reason to end a training."""
+        if self._views is None:
+            try:
+                self._views = spread(self._all_views, VIEWS)
+            except UserError as error:
+                message = f"Extracted IoU and pictures are left out of the curves: {error}"
+                CONSOLE.print(message, style="yellow", markup=False, highlight=False, soft_wrap=True)
+                self._views = []
+        return self._views
+
+    def _pictures(
+        self, step: int, view: EvalView, parts: Mapping[int, Surfels], progress: Callable[[int], None]
+    ) -> None:
+        model, camera = self.model, view.camera
+        surfels, settings = model.surfels().detach(), model.settings(geometry=False)
+        classes, _ = draw_class_map(model.rasterizer, surfels, model.class_ids, camera, settings)
+        writer.put_image("Scene/class map", _colored(classes), step)
+        background = model.background_color.to(model.device)
+        for drawn_so_far, (index, part) in enumerate(parts.items(), start=1):
+            progress(drawn_so_far)
+            if len(part):
+                drawn = model.rasterizer.rasterize(surfel_inputs(part, camera), camera, settings, background)
+                writer.put_image(f"Objects/{model.classes[index]}", drawn.color.clamp(0.0, 1.0), step)
+
+
+def _colored(classes: Tensor) -> Tensor:
+    return torch.from_numpy(colorize(classes.cpu().numpy().astype(np.uint16))).float() / 255.0
+
+
+def spread(views: Sequence[EvalView], most: int) -> list[EvalView]:
+    """At most so many of the views, at even distances."""
+    count = min(most, len(views))
+    return [views[(2 * index + 1) * len(views) // (2 * count)] for index in range(count)]

@@ -1,0 +1,295 @@
+"""The switch from base training to refinement, and what of it is kept on disk for resuming."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from pathlib import Path
+from threading import Lock
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from beags_plugin.assignment.assignment import Assignment
+from beags_plugin.core.cameras import Camera
+from beags_plugin.labels.classes import read_class_map, write_class_map
+from beags_plugin.labels.label_maps import LabelMaps
+from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.plugin.runs.layout import (
+    BASE_SNAPSHOT,
+    PREPARED,
+    STAGES,
+    round_folder,
+    write_run,
+    write_text_atomically,
+)
+from beags_plugin.plugin.runs.prepared_grid import read_grid
+from beags_plugin.plugin.training.scene_edits import edit_scene
+from beags_plugin.preparation.pipeline import Preparation, prepare
+from beags_plugin.preparation.stages import StageStore
+from beags_plugin.refiners import REFINERS
+from beags_plugin.system import processes
+from beags_plugin.system.digests import code_digest
+from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.memory import peak_memory_mb
+from beags_plugin.system.progress import counted, progress_bar
+from beags_plugin.system.whole_files import write_whole
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.model import BeagsModel
+    from beags_plugin.plugin.views.datamanager import BeagsDataManager
+
+
+class RefinementSwitch:
+    """Prepares refinement once the base is trained, or takes it up again in a resumed run."""
+
+    def __init__(self, model: BeagsModel, trainer: Any, datamanager: BeagsDataManager) -> None:
+        self.model = model
+        self.trainer = trainer
+        self.datamanager = datamanager
+        self.refiner = REFINERS.get(model.config.refiner)()
+        self.ready = False
+        self._switching = False  # in the middle of the last base step, before nerfstudio evaluates and saves it
+        self._evaluation_due = False
+        self._done: int | None = None  # refined_steps, which lies on the GPU, as the host knows it
+        self.rounds = 0  # prepared so far, in this process and those that it goes on from
+
+    @property
+    def wanted(self) -> bool:
+        """Whether this run refines at all."""
+        return self.model.config.refine_steps > 0
+
+    def check_masks(self) -> None:
+        """Raise ``UserError`` at the start of a run that would find no mask when it comes to refine."""
+        masks = self.datamanager.train_dataset.metadata["class_map_filenames"]
+        if self.wanted and all(path is None for path in masks):
+            raise UserError(
+                "no training view has a mask: put id images into masks/<image name>.png, or train the preset "
+                "beags-base, which needs none."
+            )
+
+    def check_options(self) -> None:
+        """Raise ``UserError`` at the start of a run whose options would stop it when it comes to refine."""
+        if self.wanted:
+            rounds, steps = self.model.config.refine_rounds, self.model.config.refine_steps
+            if not 1 <= rounds <= steps:
+                raise UserError(f"refine_rounds is {rounds}: it must be 1 to refine_steps, which is {steps}.")
+            self.model.config.prepare.check()
+            self.model.config.split.check()
+
+    def state(self) -> dict[str, Any]:
+        """How many rounds have been prepared, and whether nerfstudio has evaluated the step; see ``Part``."""
+        return {"rounds": self.rounds, "evaluated": not self._switching}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on in the round in which the run that gave ``state`` was."""
+        self.rounds = state["rounds"]
+        self._evaluation_due = not state["evaluated"]
+
+    def before_step(self, step: int) -> None:
+        """Take up refinement that a checkpoint was in, or start it where no base step precedes it."""
+        model = self.model
+        if not self.wanted or not model.schedule.refining(step):
+            return
+        done = self._done = int(model.refined_steps) if self._done is None else self._done
+        if not self.ready:
+            self.rounds = max(self.rounds, sum(start < done for start in self._round_starts()))
+            if self.rounds > 0:
+                self._take_up()
+        if sum(start <= done for start in self._round_starts()) > self.rounds:
+            self._prepare(step - 1)
+        if self._evaluation_due:
+            self.trainer.eval_iteration(step - 1)
+            self._evaluation_due = False
+        model.refined_steps += 1
+        self._done += 1
+
+    def after_step(self, step: int) -> None:
+        """Switch right after the last base step, so that a run that ends there has its classes too."""
+        if self.wanted and not self.ready and step + 1 == self.model.schedule.base_steps:
+            self._switching = True
+            self._prepare(step)
+            self._switching = False
+
+    def _round_starts(self) -> list[int]:
+        return self.model.schedule.round_starts(self.model.config.refine_rounds)
+
+    def _prepare(self, step: int) -> None:
+        """Prepare a round from the scene as it is and the masks as the data has them. step: the last one done."""
+        model, first = self.model, self.rounds == 0
+        CONSOLE.rule("Preparing refinement" if first else "Preparing refinement again, with the refined depth")
+        start = time.perf_counter()
+        with self.trainer.long_stage(step):
+            views = self.datamanager.views("train", original=True)
+            with _bar("Reading masks", passing=True) as progress:
+                masks = LabelMaps(view.stored_labels for view in counted(views, len(views), progress))
+            with released(self.trainer.train_lock):  # minutes, which read the scene only: a viewer may draw it
+                prepared = prepare(
+                    model.surfels(),
+                    [view.camera for view in views],
+                    masks,
+                    model.classes,
+                    model.rasterizer,
+                    model.settings(),
+                    self.refiner,
+                    model.config.prepare,
+                    model.config.split,
+                    background_voxels=self._background_voxels(),
+                    seed=model.seed,
+                    stage=_bar,
+                    store=self._stage_store(),
+                    code=code_digest(),
+                )
+            for finding in prepared.findings:
+                CONSOLE.print(f"  {finding}", highlight=False, markup=False)
+            self._take_classes(prepared.assignment)
+            if first:  # the snapshot first: what save_prepared writes last says that everything is there
+                snapshot = self.trainer.base_dir / BASE_SNAPSHOT
+                write_run(self.trainer.config, snapshot, model.state_dict(), max(step, 0))
+                CONSOLE.print(f"  base kept in {snapshot}", highlight=False, markup=False, soft_wrap=True)
+            save_prepared(prepared, [view.name for view in views], round_folder(self.trainer.base_dir, self.rounds))
+            if prepared.edited is not None:
+                edit_scene(model, self.trainer.optimizers.optimizers, prepared.edited.edited)
+                self._take_classes(prepared.edited.assignment)
+            self.rounds += 1
+            self._start(prepared.grid, prepared.labels)
+        self._count(prepared.seconds, time.perf_counter() - start, first)
+
+    def _stage_store(self) -> StageStore:
+        """Where the stages of this round are kept; those of the run that this one goes on from are looked into too.
+
+        What an earlier run into the same folder kept of more rounds is removed.
+        """
+        own_run, rounds = self.trainer.run, self.model.config.refine_rounds
+        kept = own_run / PREPARED / STAGES
+        own = {f"round_{index + 1}" for index in range(rounds)}
+        for folder in kept.glob("round_*") if processes.is_first() else ():
+            if folder.name not in own:
+                shutil.rmtree(folder)
+        former = self.trainer.loaded_run
+        runs = [own_run] if former in (None, own_run.absolute()) else [own_run, former]
+        here, *others = (run / PREPARED / STAGES / f"round_{self.rounds + 1}" for run in runs)
+        return StageStore(here, others)
+
+    def _count(self, seconds: dict[str, float], spent: float, first: bool) -> None:
+        """Add the time of a preparation to that of the stages; it is none of the refinement's."""
+        model = self.model
+        model.preparing_seconds += spent
+        model.refining_since = time.perf_counter() if first else model.refining_since + spent
+        total = model.prepared_seconds
+        model.prepared_seconds = {name: total.get(name, 0.0) + seconds.get(name, 0.0) for name in {**total, **seconds}}
+
+    def _background_voxels(self) -> bool:
+        return any(loss.asks_grid_about_background for loss in self.model.losses.values())
+
+    def _take_classes(self, assignment: Assignment) -> None:
+        self.model.class_ids.copy_(assignment.class_ids)
+        self.model.class_margin.copy_(assignment.margin)
+        self.model.assigned.fill_(True)
+
+    def _start(self, grid: VisibilityGrid | None, labels: LabelMaps) -> None:
+        more_rounds = self.rounds < self.model.config.refine_rounds  # which need the masks as the data has them
+        self.datamanager.replace_class_maps(labels, keep=more_rounds)
+        self.model.grid = None if grid is None else grid.to(self.model.device)
+        self.model.frozen = not self.refiner.trains
+        self.ready = True
+
+    def _take_up(self) -> None:
+        """Go on with the masks and grids of the run that the checkpoint came from, and keep them with this one."""
+        folder = round_folder(self.trainer.base_dir, self.rounds - 1)
+        former = self.trainer.loaded_run
+        if former is not None and former != self.trainer.base_dir:
+            _clear(self.trainer.base_dir / PREPARED)
+            for name in (PREPARED, BASE_SNAPSHOT):
+                if (former / name).is_dir():
+                    skipped = shutil.ignore_patterns(STAGES)
+                    shutil.copytree(former / name, self.trainer.base_dir / name, dirs_exist_ok=True, ignore=skipped)
+        if not (folder / "grid.pt").exists():
+            raise UserError(
+                f"{former} was refining, but its folder {PREPARED} with masks and voxel grids is missing: restore it, "
+                f"or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
+            )
+        grid = read_grid(folder / "grid.pt")
+        if grid is not None and self._background_voxels() and not bool((grid.classes == 0).any()):
+            raise UserError(
+                f"{folder / 'grid.pt'} has no voxels of the background, which a loss now asks about: set background of "
+                f"the occupancy loss to False, or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
+            )
+        views = self.datamanager.views("train")
+        with _bar("Reading masks", passing=True) as progress:
+            labels = LabelMaps(
+                _prepared_labels(folder / "masks" / f"{view.name}.png", view.camera)
+                for view in counted(views, len(views), progress)
+            )
+        self._start(grid, labels)
+        self.model.refining_since = time.perf_counter()
+        CONSOLE.print(f"  refinement taken up from {folder}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _bar(name: str, passing: bool = False) -> AbstractContextManager[Callable[[int, int], None]]:
+    """A progress bar, in the first of several processes."""
+    return progress_bar(name, passing) if processes.rank() == 0 else nullcontext(lambda done, total: None)
+
+
+def _prepared_labels(path: Path, camera: Camera) -> torch.Tensor:
+    """[H, W] int32 of the mask that refinement was prepared with for a view of this camera."""
+    if not path.is_file():
+        raise UserError(
+            f"the prepared mask {path} is missing: restore it, or refine again from base/nerfstudio_models."
+        )
+    labels = torch.from_numpy(read_class_map(path).astype(np.int32))
+    if labels.shape != (camera.height, camera.width):
+        raise UserError(
+            f"the prepared mask {path} is {labels.shape[1]}x{labels.shape[0]} pixels but its view is "
+            f"{camera.width}x{camera.height}: restore the data, or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
+        )
+    return labels
+
+
+def save_prepared(prepared: Preparation, names: list[str], folder: Path) -> None:
+    """Keep what refinement needs; grid.pt is written last, so its presence says that all is there."""
+    with writing(folder):
+        (folder / "grid.pt").unlink(missing_ok=True)  # an earlier run's
+        if folder.name == PREPARED:
+            _clear(folder)
+        (folder / "masks").mkdir(parents=True, exist_ok=True)
+        (folder / "confidence").mkdir(exist_ok=True)
+    with _bar("Keeping masks", passing=True) as progress:
+        for index, name in enumerate(counted(names, len(names), progress)):
+            labels = prepared.labels[index]
+            write_class_map(folder / "masks" / f"{name}.png", labels.cpu().numpy().astype(np.uint16))
+            if prepared.confidence is not None:
+                _write_grey(folder / "confidence" / f"{name}.png", prepared.confidence[index])
+    report = {"findings": prepared.findings, "seconds": prepared.seconds, "peak_memory_mb": peak_memory_mb()}
+    write_text_atomically(json.dumps(report, indent=2), folder / "report.json")
+    state = {} if prepared.grid is None else prepared.grid.state_dict()
+    write_whole(folder / "grid.pt", lambda file: torch.save(state, file))
+
+
+def _clear(folder: Path) -> None:
+    """Remove what another run into the same folder prepared, later rounds too; its stages may serve again."""
+    for path in folder.glob("*"):
+        if path.name != STAGES:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+@contextmanager
+def released(lock: Lock) -> Iterator[None]:
+    """Let others have a lock that is held, and take it back."""
+    lock.release()
+    try:
+        yield
+    finally:
+        lock.acquire()
+
+
+def _write_grey(path: Path, values: torch.Tensor) -> None:
+    from PIL import Image
+
+    with writing(path):  # cv2 would say nothing of a full disk
+        Image.fromarray(values.cpu().numpy()).save(path)

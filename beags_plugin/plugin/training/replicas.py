@@ -1,0 +1,86 @@
+"""A training in several processes, each with a replica of the scene: see docs/cuda.md.
+
+Each step, every process draws a view of its own, and the gradients are averaged; whatever else changes the scene is
+computed alike in all of them. Only the first one writes: the others write into a folder that goes when they end.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from nerfstudio.configs.base_config import MachineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import nn
+
+from beags_plugin.ops import cuda_extension
+from beags_plugin.system import processes
+from beags_plugin.system.errors import UserError
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.options.config import BeagsTrainerConfig
+
+
+def default_device() -> str:
+    """Where a run trains unless it is told: "cuda" where there is a GPU that our kernels can use, else "cpu"."""
+    return "cpu" if cuda_extension.found()[1] else "cuda"
+
+
+def check_machine(machine: MachineConfig) -> None:
+    """Raise ``UserError`` for devices that are not there."""
+    for name in ("num_devices", "num_machines"):
+        if (count := getattr(machine, name)) < 1:
+            raise UserError(f"--machine.{name.replace('_', '-')} is {count}: give 1 or more.")
+    if machine.device_type == "cuda":
+        if reason := cuda_extension.found()[1]:
+            raise UserError(
+                f"--machine.device-type cuda: {reason} Or train with --machine.device-type cpu (beags resume: --device "
+                "cpu)."
+            )
+        there = torch.cuda.device_count()
+        if machine.num_devices > there:
+            raise UserError(f"--machine.num-devices is {machine.num_devices}, but this machine has {there} GPU(s).")
+    elif machine.num_devices * machine.num_machines > 1:
+        raise UserError(
+            f"--machine.num-devices is {machine.num_devices}, but nerfstudio starts several processes for GPUs only: "
+            "leave it at 1 on a CPU, where one process uses all cores."
+        )
+
+
+class Rank:
+    """One process of a training.
+
+    config: the run's; in processes other than the first it is changed to write elsewhere, to show nothing, and to
+    measure nothing. local_rank: number of this process, and of its GPU, on its machine.
+    run: the folder of the run, which the first process alone writes to.
+    """
+
+    def __init__(self, config: BeagsTrainerConfig, local_rank: int) -> None:
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self.run = config.get_base_dir()
+        if config.machine.device_type == "cuda" and cuda_extension.found()[1] is None:
+            torch.cuda.set_device(local_rank)  # else all processes would exchange objects through the first GPU
+        if processes.rank() > 0:
+            self._folder = tempfile.TemporaryDirectory(prefix="beags-rank-", ignore_cleanup_errors=True)
+            config.run_dir = Path(self._folder.name)
+            config.steps_per_eval_image = config.steps_per_eval_batch = config.steps_per_eval_all_images = 0
+            config.steps_per_held_out = config.steps_per_objects = 0
+            config.viewer.quit_on_train_completion = True
+            CONSOLE.quiet = True
+
+    def start_alike(self, scene: nn.Module) -> None:
+        """Let all processes begin with the scene of the first."""
+        processes.take_from_first(value.detach() for value in (*scene.parameters(), *scene.buffers()))
+
+    def end(self) -> None:
+        """Remove what another process than the first has written."""
+        if self._folder is not None:
+            self._folder.cleanup()
+
+
+def average_gradients(parameters: Iterable[torch.Tensor]) -> None:
+    """The mean over the views that the processes have drawn."""
+    processes.average(value.grad for value in parameters if value.grad is not None)

@@ -1,0 +1,291 @@
+"""The panel that nerfstudio's viewer shows for a scene: objects, legend, picking, export."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from nerfstudio.viewer.viewer_elements import (
+    ViewerButton,
+    ViewerButtonGroup,
+    ViewerCheckbox,
+    ViewerClick,
+    ViewerControl,
+    ViewerDropdown,
+    ViewerElement,
+    ViewerParameter,
+    ViewerSlider,
+)
+
+from beags_plugin.export import EXPORTERS
+from beags_plugin.plugin.viewer.export import ShownFiles
+from beags_plugin.plugin.viewer.legend import LegendRow, escaped, legend, unique_labels
+from beags_plugin.plugin.viewer.picking import pick
+from beags_plugin.plugin.viewer.viewed_run import ViewedRun
+from beags_plugin.plugin.viewer.viewing import NO_CLASSES, Viewing
+
+if TYPE_CHECKING:
+    from nerfstudio.data.scene_box import OrientedBox
+    from nerfstudio.viewer.viewer import Viewer
+    from viser import ViserServer
+
+NONE = "none yet"  # the drop-down's entry while no Gaussian has a class: it must have one
+REFRESH_SECONDS = 0.3  # how often the panel follows what the scene and the render threads have changed
+
+
+class ViewerLink(ViewerControl):
+    """Nerfstudio's viewer, once there is one: tells the panel of it, and of clicks on the picture."""
+
+    viewer: Viewer | None = None
+
+    def __init__(self, panel: ObjectPanel) -> None:
+        self.panel = panel
+
+    def _setup(self, viewer: Viewer) -> None:
+        super()._setup(viewer)
+        self.panel.attach(viewer, self)
+
+
+class ObjectPanel(ViewerElement[None]):
+    """All controls of ours, as one element, so that they stand in this order and not in that of their names.
+
+    They change ``plugin.viewer.choice``, never the scene. What takes time happens in threads of the panel's own: no control
+    waits for a training step but the click that picks, and none runs in a render thread.
+    """
+
+    def __init__(self, viewing: Viewing) -> None:
+        super().__init__("Objects")
+        self.viewing = viewing
+        self.labels: dict[str, int] = {}
+        self.counts: dict[int, int] = {}
+        self.notes: dict[str, str] = {}
+        self.viewer: Viewer | None = None
+        self._link: ViewerLink | None = None
+        self._listening = False
+        self._legend: Any = None
+        self._status: Any = None
+        self._counted: tuple | None = None
+        self._said = ["", ""]
+        self.object = ViewerDropdown("Object", NONE, [NONE], hint="Also chosen by a click on the picture")
+        # two rows: four buttons in one are cut off
+        self.look = ViewerButtonGroup("Look at it", "Isolate", ["Isolate", "Show"], cb_hook=self._act)
+        self.put_away = ViewerButtonGroup("Put it away", "Hide", ["Hide", "Remove"], cb_hook=self._act)
+        self.show_all = ViewerButton("Show all objects", lambda _: self.choose(self.viewing.choice.show_all()))
+        self.rest = ViewerSlider(
+            "Rest", 0.0, 0.0, 1.0, 0.05, cb_hook=lambda slider: self._slide(rest=slider.value),
+            hint="Opacity left to what is hidden, or not isolated; removed objects stay away",
+        )  # fmt: skip
+        self.min_opacity = ViewerSlider(
+            "Least opacity", 0.0, 0.0, 1.0, 0.01, cb_hook=lambda slider: self._slide(min_opacity=slider.value),
+            hint="Weaker Gaussians are left out",
+        )  # fmt: skip
+        self.clicks = ViewerCheckbox("Click picks an object", True, cb_hook=lambda box: self._listen(box.value))
+        self.files = ShownFiles(viewing, self.title, lambda: self.format.value, lambda said: self.note("export", said))
+        formats = EXPORTERS.names()
+        self.format = ViewerDropdown("Format", "ply" if "ply" in formats else formats[0], formats)
+        self.export = ViewerButton("Export what is shown", lambda _: self.files.start())
+
+    # -- nerfstudio's side -------------------------------------------------------------------------------------------
+
+    def install(self, viser_server: ViserServer) -> None:
+        """See ``ViewerElement.install``."""
+        self.refresh_objects()
+        for element in (
+            self.object,
+            self.look,
+            self.put_away,
+            self.show_all,
+            self.rest,
+            self.min_opacity,
+            self.clicks,
+        ):
+            element.install(viser_server)
+        self._legend = viser_server.gui.add_markdown("")
+        self.format.install(viser_server)
+        self.export.install(viser_server)
+        self._status = viser_server.gui.add_markdown("")
+        self._said = ["", ""]
+        self.look.value = self.put_away.value = ""
+
+    def _create_gui_handle(self, viser_server: ViserServer) -> None:
+        raise NotImplementedError("this element has no handle of its own")
+
+    def attach(self, viewer: Viewer, link: ViewerLink) -> None:
+        """Take up work with a viewer that has installed the panel."""
+        self.viewer, self._link = viewer, link
+        run = ViewedRun(Path(viewer.log_filename).parent.absolute(), viewer.pipeline.datamanager)  # type: ignore[arg-type]
+        self.viewing.attach(run, viewer.trainer is not None, viewer.train_lock)
+        self.viewing.wanted, self.viewing.crop_box = self._wanted, self._crop_box
+        if run.note is not None:
+            self.note("run", run.note)
+        _offer_whole_pictures(viewer.control_panel)
+        self._listen(self.clicks.value)
+        threading.Thread(target=self._follow, name="beags panel", daemon=True).start()
+
+    def _listen(self, wanted: bool) -> None:
+        if self._link is None or wanted == self._listening:
+            return
+        self._listening = wanted
+        if wanted:
+            self._link.register_pointer_cb("click", self.clicked)
+        else:
+            self._link.unregister_pointer_cb()
+
+    def _redraw(self) -> None:
+        if self.viewer is not None:
+            self.viewer._trigger_rerender()  # what its own controls call; takes no lock
+
+    # -- what is shown -----------------------------------------------------------------------------------------------
+
+    def choose(self, choice: Any) -> None:
+        """Show another choice."""
+        self.viewing.choice = choice
+        self._redraw()
+
+    def _act(self, group: ViewerParameter) -> None:
+        if action := group.value:
+            self.act(action)
+            group.value = ""  # viser tells of a button of a group only if it is not the one that was pressed last
+
+    def act(self, action: str) -> None:
+        """Do to the chosen object what a button says: "Isolate", "Show", "Hide" or "Remove"."""
+        class_id = self.labels.get(self.object.value)
+        if class_id is None:
+            self.note("object", f"Nothing to choose: {NO_CLASSES}")
+            return
+        choice = self.viewing.choice
+        change = {"Isolate": choice.isolate, "Hide": choice.hide, "Remove": choice.remove, "Show": choice.show}
+        self.choose(change[action](class_id))
+
+    def _slide(self, **values: float) -> None:
+        self.choose(replace(self.viewing.choice, **values))
+
+    def clicked(self, click: ViewerClick) -> None:
+        """Choose the object under the cursor."""
+        self.note("object", self._pick(click))
+
+    def _pick(self, click: ViewerClick) -> str:
+        viewing, model = self.viewing, self.viewing.model
+        if not viewing.lock.acquire(timeout=5.0):
+            return "The scene is busy: click again."
+        try:
+            scene = viewing.shown()
+            found = pick(
+                model.rasterizer, scene.surfels, scene.class_ids, model.settings(), click.origin, click.direction
+            )
+            if found is None:
+                return "Nothing is shown there."
+            index = found.index if scene.index is None else int(scene.index[found.index])
+            margin = float(model.class_margin[index])
+        finally:
+            viewing.lock.release()
+        if not bool(model.assigned):
+            return f"Gaussian {index}; {NO_CLASSES}"
+        label = next((label for label, class_id in self.labels.items() if class_id == found.class_id), None)
+        if label is None:
+            return f"Gaussian {index} of class {found.class_id}, which has no name."
+        self.object.value = label
+        what = "background, no object" if found.class_id == 0 else label
+        return f"Picked: {what} (Gaussian {index}, {margin:.0%} of its weight)."
+
+    def title(self) -> str:
+        """What is shown, in a few words for a file's name."""
+        names = {class_id: label for label, class_id in self.labels.items()}
+        choice = self.viewing.choice
+        if choice.isolated is not None:
+            return names.get(choice.isolated, f"class_{choice.isolated}")
+        away = [name for class_id, name in names.items() if not choice.in_full(class_id)]
+        return f"without_{'_'.join(away[:3])}" if away else "scene"
+
+    # -- following the scene -------------------------------------------------------------------------------------------
+
+    def _follow(self) -> None:
+        pause = threading.Event()
+        while not pause.wait(REFRESH_SECONDS):
+            try:
+                self.follow()
+            except Exception as error:  # the panel must not stay behind for good
+                self.note("panel", f"{type(error).__name__}: {error}")
+
+    def follow(self) -> None:
+        """Bring the panel up to date, and read or compute what the viewer is to show; redraws when that is there."""
+        self.refresh_objects()
+        self._say()
+        if self._load():
+            self._redraw()
+
+    def _wanted(self) -> frozenset[str]:
+        if self.viewer is None:
+            return frozenset()
+        controls = self.viewer.control_panel
+        return frozenset({controls.output_render} | ({controls.split_output_render} if controls.split else set()))
+
+    def _crop_box(self) -> OrientedBox | None:
+        assert self.viewer is not None  # it is there when this is asked for
+        controls = self.viewer.control_panel
+        return controls.crop_obb if controls.crop_viewport else None
+
+    def _load(self) -> bool:
+        wanted, run, changed = self._wanted(), self.viewing.run, False
+        if run is None:
+            return False
+        if "occupancy_violation" in wanted:
+            if self.viewing.model.grid is None:
+                run.load_grid()
+            changed |= self.viewing.refresh_shares()
+        return changed
+
+    def refresh_objects(self) -> None:
+        """List the classes that have Gaussians, under the names that the model now has."""
+        model = self.viewing.model
+        ids = model.class_ids
+        key = (bool(model.assigned), ids.data_ptr(), len(ids), ids._version, tuple(model.classes.items()))
+        if key == self._counted:
+            return
+        numbers, counts = torch.unique(ids, return_counts=True) if key[0] else (ids[:0], ids[:0])
+        self.counts = dict(zip(numbers.tolist(), counts.tolist(), strict=True))
+        self.labels = unique_labels({class_id: model.classes.get(class_id, "") for class_id in self.counts})
+        self._counted = key
+        self._offer(list(self.labels) or [NONE])
+
+    def _offer(self, options: list[str]) -> None:
+        if self.object.options == options:
+            return
+        former = self.object.value
+        self.object.set_options(options)
+        if former not in options:
+            self.object.value = next((label for label in options if self.labels.get(label)), options[0])  # an object
+
+    def note(self, about: str, said: str) -> None:
+        """Say something below the controls, in place of what was said last about the same."""
+        self.notes = {**self.notes, about: said}
+
+    def _say(self) -> None:
+        """Write legend and notes, if they have changed."""
+        choice = self.viewing.choice
+        rows = [
+            LegendRow(class_id, name, self.counts[class_id], choice.state(class_id))
+            for name, class_id in self.labels.items()
+        ]
+        lines = {**self.viewing.notes, **self.notes}
+        texts = [legend(rows) if rows else escaped(f"No objects: {NO_CLASSES}")]
+        texts.append("\n\n".join(escaped(line) for line in lines.values()))
+        for index, (handle, text) in enumerate(zip((self._legend, self._status), texts, strict=True)):
+            if handle is not None and text != self._said[index]:
+                with suppress(KeyError):  # the viewer is being closed
+                    handle.content = text
+                self._said[index] = text
+
+
+def _offer_whole_pictures(controls: Any) -> None:
+    """Leave nerfstudio's "gl_z_buf_depth" out of the lists of outputs.
+
+    It is made smaller than the picture. nerfstudio puts it into the split screen at first, and joining the two ends the
+    render thread.
+    """
+    offer = controls.update_output_options
+    controls.update_output_options = lambda names: offer([name for name in names if name != "gl_z_buf_depth"])

@@ -1,0 +1,57 @@
+"""Which Gaussian lies under the cursor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+from beags_plugin.rasterizers.rendering import geometry_inputs
+
+_FOCAL = 1000.0  # of the one pixel that is drawn: about that of a full-screen view, so that it is as sharp
+
+
+def camera_along(origin: Sequence[float], direction: Sequence[float]) -> Camera:
+    """A view of one pixel whose centre looks from ``origin`` along ``direction`` (world; of any length but 0)."""
+    position, along = (torch.tensor([float(x) for x in point], dtype=torch.float64) for point in (origin, direction))
+    forward = along / along.norm()
+    aside = torch.zeros(3, dtype=torch.float64)
+    aside[int(forward.abs().argmin())] = 1.0  # the axis that is least along the view
+    right = torch.linalg.cross(forward, aside)
+    right = right / right.norm()
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
+    K = torch.tensor([[_FOCAL, 0.0, 0.5], [0.0, _FOCAL, 0.5], [0.0, 0.0, 1.0]])
+    return Camera(viewmat.float(), K, 1, 1)
+
+
+@dataclass(frozen=True)
+class Picked:
+    """The heaviest Gaussian of a pixel: its index among those that were drawn, and its class."""
+
+    index: int
+    class_id: int
+
+
+@torch.no_grad()
+def pick(
+    rasterizer: Rasterizer,
+    surfels: Surfels,
+    class_ids: Tensor,
+    settings: RasterSettings,
+    origin: Sequence[float],
+    direction: Sequence[float],
+) -> Picked | None:
+    """The surfel with the largest w_i along a ray; None where nothing is.
+
+    surfels: N surfels, as they are drawn. class_ids: [N] int, phi. origin, direction: [3], world. Draws one pixel.
+    """
+    camera = camera_along(origin, direction).to(surfels.means.device)
+    index = int(rasterizer.heaviest(geometry_inputs(surfels), camera, settings)[0, 0])
+    return None if index < 0 else Picked(index, int(class_ids[index]))

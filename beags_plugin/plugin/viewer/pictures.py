@@ -1,0 +1,76 @@
+"""Pictures of what the losses see, for people."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.classes import colorize
+from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+from beags_plugin.rasterizers.rendering import geometry_inputs
+
+
+def class_picture(class_map: Tensor) -> Tensor:
+    """[H, W, 3] float32 in 0..1, the classes' colours. class_map: [H, W] integer ids or IGNORE."""
+    colors = colorize(class_map.cpu().numpy().astype(np.uint16))
+    return torch.from_numpy(colors).to(class_map.device).float() / 255.0
+
+
+@torch.no_grad()
+def boundary_picture(
+    rasterizer: Rasterizer, surfels: Surfels, class_ids: Tensor, camera: Camera, settings: RasterSettings, mask: Tensor
+) -> Tensor:
+    """[H, W, 1] in 0..1, B(u): the share of each pixel that shows another class than its mask does (E7).
+
+    surfels: N surfels. class_ids: [N] int32, phi. mask: [H, W] int32 ids of this view, or IGNORE, where it is 0.
+    """
+    inputs = geometry_inputs(surfels, class_ids)
+    bare = replace(settings, geometry=False, distortion=False)
+    boundary = rasterizer.rasterize(inputs, camera, bare, inputs.means.new_zeros(3), mask).boundary
+    assert boundary is not None  # there is a target
+    return boundary[..., None]
+
+
+@torch.no_grad()
+def value_picture(
+    rasterizer: Rasterizer, surfels: Surfels, values: Tensor, camera: Camera, settings: RasterSettings
+) -> Tensor:
+    """[H, W, 1], a value per surfel composited as a colour is: sum_i w_i value_i. values: [N] float."""
+    inputs = replace(geometry_inputs(surfels), colors=values[:, None].expand(-1, 3).to(surfels.means).contiguous())
+    bare = replace(settings, geometry=False, distortion=False)
+    return rasterizer.rasterize(inputs, camera, bare, inputs.means.new_zeros(3)).color[..., :1]
+
+
+def fitted_camera(camera: Camera, width: int, height: int) -> Camera:
+    """The same view at the largest size that fits into ``width`` x ``height`` pixels, each side at least 1."""
+    factor = min(width / camera.width, height / camera.height)
+    new_width = min(max(1, round(camera.width * factor)), width)
+    new_height = min(max(1, round(camera.height * factor)), height)
+    scale = camera.K.new_tensor([new_width / camera.width, new_height / camera.height, 1.0])
+    return Camera(camera.viewmat, camera.K * scale[:, None], new_width, new_height)
+
+
+def framed(picture: Tensor, width: int, height: int) -> Tensor:
+    """[height, width, C], ``picture`` [h, w, C] in the middle of a black one that is no smaller."""
+    frame = picture.new_zeros(height, width, picture.shape[2])
+    top, left = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
+    frame[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
+    return frame
+
+
+def nearest_view(camera: Camera, views: Sequence[Camera], extent: float) -> int:
+    """Index of the view that looks from nearest, and most the same way.
+
+    extent: size of the scene, world units: so far away counts as much as looking at a right angle.
+    """
+    centers = torch.stack([view.center for view in views]).double()
+    forwards = torch.stack([view.rotation[2] for view in views]).double()
+    apart = (centers - camera.center.double()).norm(dim=1) / extent
+    turned = 1.0 - forwards @ camera.rotation[2].double()
+    return int((apart + turned).argmin())

@@ -1,0 +1,119 @@
+"""What a viewer shows of a run besides its scene: the training views' masks, and the voxel grid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.evaluation.metrics import resize_nearest
+from beags_plugin.labels.classes import read_class_map
+from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, prepared_digests, preparing_run, round_digest, round_folder
+from beags_plugin.plugin.runs.prepared_grid import grid_state, read_grid
+from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
+from beags_plugin.plugin.views.views import unique_names
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.views.datamanager import BeagsDataManager
+
+_KEPT_MASKS = 8  # of the views that were looked at last
+
+
+class ViewedRun:
+    """A run on disk with its data manager; what takes time to read is read when ``load_`` is called, by the panel.
+
+    folder: of the run. names: of the training views. cameras: theirs, without lens distortion. grid: the voxel grid
+    of a finished run; None until ``load_grid``.
+    """
+
+    def __init__(self, folder: Path, datamanager: BeagsDataManager) -> None:
+        self.folder = folder
+        self.datamanager = datamanager
+        dataset = datamanager.train_dataset
+        self.names = unique_names(dataset.image_filenames)
+        self.has_masks = any(path is not None for path in dataset.metadata["class_map_filenames"])
+        cameras = dataset.cameras
+        self.cameras: list[Camera] = [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))]
+        self.grid: VisibilityGrid | None = None
+        self._before = lru_cache(_KEPT_MASKS)(datamanager.training_mask)
+        self.rounds: Callable[[], int] = lambda: 1  # see ``prepared``
+        self._after = lru_cache(_KEPT_MASKS)(_read_mask)
+        self._kept = prepared_digests(folder) if (folder / EXTRACTION_FILE).exists() else None
+        self._digest = lru_cache(1)(lambda folder, _changed: round_digest(folder))
+
+    @property
+    def prepared(self) -> Path | None:
+        """The folder of what refinement was prepared with: of this run, or of that which it was taken from.
+
+        None while the scene that is shown has been through no preparation; else that of the last round that it has been
+        through: a folder that is used again may hold those of a former run, and the run that this is an extract of may
+        have been prepared again.
+        """
+        folder = self._round()
+        return None if folder is None or self._replaced(folder) else folder
+
+    @property
+    def note(self) -> str | None:
+        """A sentence for the user where what lies on disk is no longer what this scene was prepared with."""
+        folder = self._round()
+        if folder is None or not self._replaced(folder):
+            return None
+        return (
+            f"No masks after reprojection and no voxel grid: {preparing_run(self.folder)} has been trained again since "
+            "this was extracted from it. Extract it again."
+        )
+
+    def _round(self) -> Path | None:
+        """The folder of the round, if something is there."""
+        rounds = self.rounds()
+        if rounds == 0:
+            return None
+        folder = round_folder(preparing_run(self.folder), rounds - 1)
+        return folder if (folder / "grid.pt").exists() else None
+
+    def _replaced(self, folder: Path) -> bool:
+        """Whether the round's folder holds something else than when this run was extracted, as far as that is known."""
+        if self._kept is None:
+            return False
+        try:
+            now = self._digest(folder, (folder / "grid.pt").stat().st_mtime_ns)
+        except OSError:  # it is being replaced
+            return True
+        return now != dict(enumerate(self._kept)).get(self.rounds() - 1)
+
+    @property
+    def has_grid(self) -> bool:
+        """Whether refinement was prepared with a voxel grid (some refiners need none, and keep an empty file)."""
+        return self.prepared is not None and bool(grid_state(self.prepared / "grid.pt", mmap=True))
+
+    def load_grid(self) -> bool:
+        """Read the voxel grid; tells whether there was one to read."""
+        prepared = self.prepared
+        if self.grid is not None or prepared is None:
+            return False
+        self.grid = read_grid(prepared / "grid.pt")
+        return self.grid is not None
+
+    def mask(self, view: int, kind: str, width: int, height: int) -> Tensor | None:
+        """[height, width] int32 ids or IGNORE of a training view, "before" reprojection or "after"; None without one.
+
+        Raises ``UserError`` for a file that cannot be read.
+        """
+        if kind == "before":
+            ids = self._before(view)
+        else:
+            path = None if self.prepared is None else self.prepared / "masks" / f"{self.names[view]}.png"
+            ids = self._after(path, path.stat().st_mtime_ns) if path is not None and path.exists() else None
+        return None if ids is None else torch.from_numpy(resize_nearest(ids, height, width).astype(np.int32))
+
+
+def _read_mask(path: Path, _changed: int) -> np.ndarray:
+    """_changed: time of the file's last change, so that what is kept in memory is read again after one."""
+    return read_class_map(path)

@@ -1,0 +1,255 @@
+"""The pictures that nerfstudio asks of a model, and those that its viewer asks for besides."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.occupancy.violation import violation_shares
+from beags_plugin.plugin.viewer.choice import Choice, Shown, shown
+from beags_plugin.plugin.viewer.pictures import (
+    boundary_picture,
+    class_picture,
+    fitted_camera,
+    framed,
+    nearest_view,
+    value_picture,
+)
+from beags_plugin.rasterizers.rendering import draw_class_map, surfel_inputs
+from beags_plugin.system.errors import UserError
+
+if TYPE_CHECKING:
+    from nerfstudio.data.scene_box import OrientedBox
+
+    from beags_plugin.plugin.model import BeagsModel
+    from beags_plugin.plugin.viewer.viewed_run import ViewedRun
+
+CHANNELS = {
+    "class_map": 3,
+    "class_confidence": 1,
+    "boundary_error": 1,
+    "occupancy_violation": 1,
+    "mask_before": 3,
+    "mask_after": 3,
+}
+"""What can be shown besides what every run has: name to number of channels."""
+OF_TRAINING_VIEWS = frozenset({"boundary_error", "mask_before", "mask_after"})
+NO_CLASSES = "the Gaussians have no classes yet: they get them between base training and refinement."
+
+
+def asked_by_viewer() -> bool:
+    """Whether nerfstudio's viewer asks, not evaluation or a renderer: what is hidden there must not change figures."""
+    return isinstance(threading.current_thread(), RenderStateMachine)
+
+
+def scene_outputs(model: BeagsModel, camera: Camera) -> dict[str, Tensor]:
+    """The whole scene (inside nerfstudio's crop box), as evaluation, ns-render and ns-export see it.
+
+    Each [H, W, 1 or 3] float32: rgb, depth (world units along z), normal, accumulation, background; with classes also
+    class_map (colours) and class_confidence (the winner's share).
+    """
+    scene = shown(model.surfels(), model.class_ids, Choice(), inside=within(model, model.crop_box))
+    outputs = plain_outputs(model, scene, camera, model.background_color)
+    if bool(model.assigned):
+        outputs.update(class_outputs(model, scene, camera))
+    return outputs
+
+
+def plain_outputs(model: BeagsModel, scene: Shown, camera: Camera, background: Tensor) -> dict[str, Tensor]:
+    """What every run can show: see ``scene_outputs``."""
+    background = background.to(model.device)
+    inputs = surfel_inputs(scene.surfels, camera, model.active_sh_degree())
+    render = model.rasterizer.rasterize(inputs, camera, model.settings(), background)
+    assert render.depth is not None and render.normal is not None  # the settings ask for geometry
+    return {
+        "rgb": render.color.clamp(0.0, 1.0),
+        "depth": render.depth[..., None],
+        "normal": 0.5 - 0.5 * render.normal,  # towards the camera looks bluish, as in other viewers
+        "accumulation": render.alpha[..., None],
+        "background": background.expand(camera.height, camera.width, 3),
+    }
+
+
+def class_outputs(model: BeagsModel, scene: Shown, camera: Camera) -> dict[str, Tensor]:
+    """The class that each pixel shows, in its colour, and the share that it has of the pixel."""
+    classes, share = draw_class_map(model.rasterizer, scene.surfels, scene.class_ids, camera, model.settings())
+    return {"class_map": class_picture(classes), "class_confidence": share[..., None].float()}
+
+
+def rounds_of(model: BeagsModel) -> int:
+    """How often refinement was prepared for a scene that is not being trained: what a checkpoint says of it."""
+    if not bool(model.assigned):
+        return 0
+    starts, done = model.schedule.round_starts(max(model.config.refine_rounds, 1)), int(model.refined_steps)
+    return max(1, sum(start < done for start in starts))
+
+
+def within(model: BeagsModel, box: OrientedBox | None) -> Tensor | None:
+    """[N] bool, the surfels in nerfstudio's crop box; None without one."""
+    return None if box is None else box.within(model.means).reshape(-1)
+
+
+@dataclass(frozen=True)
+class Shares:
+    """What ``violation_shares`` gave for the scene in the state that ``key`` names."""
+
+    key: tuple
+    values: Tensor
+
+
+class Viewing:
+    """What a viewer has been told to show of a model, and the drawing of it.
+
+    The panel's threads set ``choice`` and ``shares``; the viewer's render threads call ``outputs``. Nerfstudio raises
+    an exception between any two lines of a drawing that the user has made obsolete, and any other exception ends the
+    render thread for good: what a drawing changes is changed by one assignment, and what may fail becomes a note.
+
+    choice: what is shown. background: [3], the viewer's. listed: names of ``CHANNELS`` that this run may be asked for;
+    the same ones as long as a viewer runs. wanted: gives those that it shows now. crop_box: gives the viewer's.
+    run: what the run has on disk. rounds: how often refinement has been prepared for the scene as it now is; a training
+    in this process says it for itself. notes: what is to be said of the pictures of the last drawing.
+    """
+
+    def __init__(self, model: BeagsModel) -> None:
+        self.model = model
+        self.choice = Choice()
+        self.background: Tensor | None = None
+        self.listed: tuple[str, ...] = ()
+        self.wanted: Callable[[], frozenset[str]] = frozenset
+        self.crop_box: Callable[[], OrientedBox | None] = lambda: None
+        self.run: ViewedRun | None = None
+        self.rounds: Callable[[], int] = lambda: rounds_of(model)
+        self.shares: Shares | None = None
+        self.notes: dict[str, str] = {}
+        self.lock = threading.Lock()
+        self._rest_until = 0.0
+
+    def attach(self, run: ViewedRun, training: bool, lock: threading.Lock | None) -> None:
+        """A viewer is there.
+
+        run: what the run has besides its scene. training: whether it is being trained. lock: held by whoever changes
+        the scene, or draws it for the viewer.
+        """
+        self.lock = lock or self.lock
+        run.rounds = lambda: self.rounds()
+        classes = bool(self.model.assigned) or (training and self.model.schedule.refine_steps > 0)
+        prepares = training and classes
+        available = {
+            "class_map": classes,
+            "class_confidence": classes,
+            "boundary_error": classes and run.has_masks,
+            "occupancy_violation": prepares or run.has_grid,
+            "mask_before": run.has_masks,
+            "mask_after": prepares or run.prepared is not None,
+        }
+        self.run = run
+        self.listed = tuple(name for name in CHANNELS if available[name])
+
+    def shown(self, rest: bool = True) -> Shown:
+        """The surfels that the choice leaves. rest: whether what is only faded counts."""
+        model = self.model
+        choice = self.choice if bool(model.assigned) else Choice(min_opacity=self.choice.min_opacity)
+        return shown(model.surfels().detach(), model.class_ids, choice, rest, within(model, self.crop_box()))
+
+    def outputs(self, camera: Camera) -> dict[str, Tensor]:
+        """Every picture that the viewer lists; those that it does not show at present are left black."""
+        model, notes = self.model, {}
+        wanted = self.wanted() & frozenset(self.listed)
+        scene = self.shown()
+        background = model.background_color if self.background is None else self.background
+        outputs = plain_outputs(model, scene, camera, background)
+        del outputs["background"]
+        black = camera.K.new_zeros(1, 1, 1)
+        for name in self.listed:
+            outputs[name] = black.expand(camera.height, camera.width, CHANNELS[name])
+        if wanted & {"class_map", "class_confidence"}:
+            if bool(model.assigned):
+                outputs.update(class_outputs(model, scene, camera))
+            else:
+                notes["classes"] = f"No class map: {NO_CLASSES}"
+        if "occupancy_violation" in wanted:
+            outputs.update(self._violation(scene, camera, notes))
+        if names := wanted & OF_TRAINING_VIEWS:
+            outputs.update(self._of_training_view(names, scene, camera, notes))
+        self.notes = notes
+        return outputs
+
+    def _violation(self, scene: Shown, camera: Camera, notes: dict[str, str]) -> dict[str, Tensor]:
+        shares = self.shares
+        if shares is None or len(shares.values) != self.model.num_points:
+            notes["violation"] = "occupancy_violation: being computed, or there is no voxel grid yet."
+            return {}
+        values = shares.values if scene.index is None else shares.values[scene.index]
+        settings = self.model.settings()
+        return {"occupancy_violation": value_picture(self.model.rasterizer, scene.surfels, values, camera, settings)}
+
+    def _of_training_view(
+        self, names: frozenset[str], scene: Shown, camera: Camera, notes: dict[str, str]
+    ) -> dict[str, Tensor]:
+        """Pictures of the training view nearest to ``camera``, as large as fits into the viewer's picture."""
+        model, run = self.model, self.run
+        if run is None:
+            notes["view"] = "There are no training views: no run is shown."
+            return {}
+        index = nearest_view(camera, run.cameras, float(model.extent))
+        fitted = fitted_camera(run.cameras[index], camera.width, camera.height)
+        outputs = {}
+        try:
+            before, after = (run.mask(index, kind, fitted.width, fitted.height) for kind in ("before", "after"))
+        except (UserError, OSError) as error:
+            notes["view"] = f"The masks of {run.names[index]} cannot be read: {error}"
+            return {}
+        notes["view"] = f"{', '.join(sorted(names))}: of training view {run.names[index]}, the nearest."
+        for name, mask in (("mask_before", before), ("mask_after", after)):
+            if name in names and mask is not None:
+                outputs[name] = framed(class_picture(mask), camera.width, camera.height)
+            elif name in names:
+                notes[name] = f"{run.names[index]} has no {name.replace('_', ' ')} reprojection."
+        target = before if after is None else after
+        if "boundary_error" in names:
+            if target is None or not bool(model.assigned):
+                notes["boundary"] = (
+                    f"No boundary error: {NO_CLASSES if target is not None else 'the view has no mask.'}"
+                )
+            else:
+                error = boundary_picture(
+                    model.rasterizer, scene.surfels, scene.class_ids, fitted, model.settings(), target
+                )
+                outputs["boundary_error"] = framed(error, camera.width, camera.height)
+        return outputs
+
+    def copy(self, rest: bool = True) -> Shown:
+        """``shown``, in memory of its own; waits for the training step, if there is one."""
+        with self.lock:
+            scene = self.shown(rest)
+            return Shown(scene.surfels.clone(), scene.class_ids.clone(), scene.index)
+
+    def refresh_shares(self) -> bool:
+        """Compute what ``occupancy_violation`` shows, if the scene has changed; tells whether it did.
+
+        Outside the lock, so that neither training nor drawing waits, and at most a tenth of the time.
+        """
+        model = self.model
+        grid = model.grid or (None if self.run is None else self.run.grid)
+        started = time.perf_counter()
+        if grid is None or not bool(model.assigned) or started < self._rest_until:
+            return False
+        with self.lock:
+            key = (id(grid), model.num_points, model.step, int(model.refined_steps))
+            if self.shares is not None and self.shares.key == key:
+                return False
+            surfels, class_ids = model.surfels().clone(), model.class_ids.clone()
+        spec = model.config.losses.get("occupancy")
+        background = bool(spec.options.get("background", True)) if spec else True
+        background = background and bool((grid.classes == 0).any())
+        self.shares = Shares(key, violation_shares(surfels, class_ids, grid, background=background))
+        now = time.perf_counter()
+        self._rest_until = now + 9 * (now - started)
+        return True

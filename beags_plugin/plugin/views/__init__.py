@@ -1,0 +1,1 @@
+"""Photos and poses become nerfstudio's views."""

@@ -1,0 +1,54 @@
+"""Single files of a COLMAP model, for poses that come from elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from nerfstudio.data.utils import colmap_parsing_utils as colmap
+from nerfstudio.process_data.colmap_utils import parse_colmap_camera_params
+from torch import Tensor
+
+from beags_plugin.data.colmap_binary import check_colmap_binary
+from beags_plugin.system.errors import UserError
+
+
+def read_lens(file: Path, size: Sequence[int], focal: float) -> Tensor:
+    """[6] float32, the lens distortion k1, k2, k3, k4, p1, p2 of the only camera in cameras.bin or cameras.txt.
+
+    size, focal: width, height and focal length in pixels of the camera that is meant: zeros if the file's is another
+    one, if there are several, or if it has no such lens. Raises ``UserError`` if it cannot be read.
+    """
+    readers = {".bin": colmap.read_cameras_binary, ".txt": colmap.read_cameras_text}
+    cameras = _read(readers[file.suffix], file)
+    if len(cameras) != 1:
+        return torch.zeros(6)
+    try:
+        camera = parse_colmap_camera_params(next(iter(cameras.values())))
+    except NotImplementedError:
+        return torch.zeros(6)
+    same = (camera["w"], camera["h"]) == tuple(size) and abs(camera["fl_x"] - focal) < 1e-3 * focal
+    if not same or camera["camera_model"] != "OPENCV":
+        return torch.zeros(6)
+    return torch.tensor([float(camera.get(name, 0.0)) for name in ("k1", "k2", "k3", "k4", "p1", "p2")])
+
+
+def read_colmap_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [N, 3] float32 and colours [N, 3] uint8 of points3D.bin or points3D.txt."""
+    readers = {".bin": colmap.read_points3D_binary, ".txt": colmap.read_points3D_text}
+    points = _read(readers[file.suffix], file).values()
+    xyz = np.array([point.xyz for point in points], np.float32).reshape(-1, 3)
+    return xyz, np.array([point.rgb for point in points], np.uint8).reshape(-1, 3)
+
+
+def _read(reader: Callable[[Any], dict], file: Path) -> dict:
+    if file.suffix == ".bin":
+        check_colmap_binary(file)
+    try:
+        return reader(file)
+    # the readers let struct.error, IndexError and the like through
+    except Exception as error:
+        raise UserError(f"{file} cannot be read ({type(error).__name__}: {error}): export the model again.") from error

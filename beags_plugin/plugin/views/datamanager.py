@@ -1,0 +1,329 @@
+"""Data manager: full images, with the class map of each view undistorted like its image."""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from copy import deepcopy
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.progress import track
+from torch import Tensor
+
+import beags_plugin.plugin.nerfstudio_patches  # noqa: F401  (checkpoints load again)
+from beags_plugin.core.cameras import Camera
+from beags_plugin.labels.label_maps import PackedMap, narrowed, widened
+from beags_plugin.losses.class_members import objects_in
+from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
+from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig, absolute
+from beags_plugin.plugin.views.dataset import BeagsDataset
+from beags_plugin.plugin.views.streaming import Lazy, StreamedViews
+from beags_plugin.plugin.views.undistortion import (
+    has_lens,
+    redistort_class_map,
+    straighten,
+    undistort_alpha,
+    undistort_class_map,
+    undistort_image,
+)
+from beags_plugin.plugin.views.views import View, unique_names
+from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.system import processes
+from beags_plugin.system.errors import UserError
+
+OWN_KEYS = ("class_map", "alpha")
+
+
+@dataclass
+class BeagsDataManagerConfig(FullImageDatamanagerConfig):
+    """Options of the data manager."""
+
+    _target: type = field(default_factory=lambda: BeagsDataManager)
+    dataparser: AnnotatedDataParserUnion = field(default_factory=BeagsDataParserConfig)
+    stream: Literal["auto", "always", "never"] = "auto"
+    """Whether images are read from disk when they are needed instead of being kept in memory; auto: if the images of a
+    split would take more than stream_above_gb. Training gives the same, bit for bit."""
+    stream_above_gb: float = 0.5
+    """GB (10^9 bytes) that the images of a split may take in memory before they are streamed."""
+    stream_ahead: int = 8
+    """How many streamed images are read before their use."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        """Keep ``data`` absolute, so that a saved config.yml works from any folder."""
+        super().__setattr__(name, absolute(value) if name == "data" else value)
+
+
+class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
+    """nerfstudio's data manager of full images, for CPUs too, with class maps in every batch.
+
+    Batches hold ``image`` [H, W, 3], ``class_map`` [H, W] int32 and ``alpha`` [H, W] uint8 where the image has it, all
+    on the device, and, once ``replace_class_maps`` was called, ``present``, the objects of ``class_map``. A training
+    camera's metadata holds its ``class_map`` too. The cache holds class maps in the narrowest type. Training views come
+    in a random order without repetition within a round, given by ``train_cameras_sampling_seed`` alone.
+    """
+
+    config: BeagsDataManagerConfig
+    train_dataset: BeagsDataset
+    eval_dataset: BeagsDataset
+
+    def __init__(self, config: BeagsDataManagerConfig, *args, **kwargs) -> None:
+        super().__init__(config, *args, **kwargs)
+        self._distorted = {"train": deepcopy(self.train_dataset.cameras), "eval": deepcopy(self.eval_dataset.cameras)}
+        straighten(self.train_dataset.cameras)
+        straighten(self.eval_dataset.cameras)
+        self.train_cameras = self.train_dataset.cameras.to(self.device)
+        self._cameras: dict[int, Camera] = {}
+        self._present: list[list[int]] | None = None  # objects of each training view's class map, once replaced
+        self._replaced = False  # whether the training class maps are no longer those of the files
+        self._originals_kept = True
+        self._originals: list[Tensor] | None = None  # those of the files, where they are kept beside the ones in use
+        # nerfstudio draws evaluation views from Python's global generator, which others use too.
+        self._eval_order = random.Random(config.train_cameras_sampling_seed)
+
+    def _load_images(self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]) -> Any:
+        """The data of all views, in memory or streamed."""
+        dataset = self._dataset(split)
+        load = partial(self._load_view, split)
+        if self.streams(split):
+            CONSOLE.print(
+                f"{len(dataset)} {split} images would take {self._cache_gb(split):.1f} GB: they are read when needed.",
+                highlight=False,
+            )
+            workers = self.config.max_thread_workers or min(4, os.cpu_count() or 1)
+            return StreamedViews(load, len(dataset), self.config.stream_ahead, workers)
+        with ThreadPoolExecutor(max_workers=self.config.max_thread_workers or 2) as pool:
+            found = pool.map(load, range(len(dataset)))
+            cache = list(track(found, f"Reading {split} images", total=len(dataset), transient=True))
+        # "cpu" pins memory, which needs CUDA; "gpu" means self.device, whatever that is.
+        pinned = cache_images_device == "cpu" and torch.device(self.device).type != "cpu"
+        for data in cache:
+            data["image"] = data["image"].pin_memory() if pinned else data["image"].to(self.device)
+            if not pinned:
+                data.update({key: data[key].to(self.device) for key in OWN_KEYS if key in data})
+        return cache
+
+    def streams(self, split: Literal["train", "eval"]) -> bool:
+        """Whether the images of a split are read from disk whenever they are needed."""
+        if self.config.stream == "auto":
+            return self._cache_gb(split) > self.config.stream_above_gb
+        return self.config.stream == "always"
+
+    def _cache_gb(self, split: Literal["train", "eval"]) -> float:
+        bytes_of_pixel = 3 * (1 if self.config.cache_images_type == "uint8" else 4)
+        return sum(width * height for width, height in self._dataset(split).file_sizes) * bytes_of_pixel / 1e9
+
+    def _dataset(self, split: str) -> BeagsDataset:
+        return self.train_dataset if split == "train" else self.eval_dataset
+
+    def _load_view(self, split: Literal["train", "eval"], index: int) -> dict[str, Any]:
+        """Image, class map and alpha of one view from its files, without lens distortion."""
+        dataset, distorted = self._dataset(split), self._distorted[split]
+        data = dataset.get_data(index, image_type=self.config.cache_images_type)
+        if has_lens(distorted, index):
+            data["image"] = torch.from_numpy(undistort_image(data["image"].numpy(), distorted, index))
+        lens = (distorted, dataset.cameras, index)
+        class_map = undistort_class_map(data["class_map"].numpy(), *lens)
+        if class_map.shape != tuple(data["image"].shape[:2]):
+            raise RuntimeError(f"class map {class_map.shape} and image {data['image'].shape} differ in size")
+        data["class_map"] = narrowed(torch.from_numpy(class_map.astype(np.int32)))
+        if (alpha := dataset.get_alpha(index)) is not None:
+            data["alpha"] = torch.from_numpy(undistort_alpha(alpha, *lens))
+        return data
+
+    def _straight(self, split: Literal["train", "eval"], class_map: np.ndarray, index: int) -> np.ndarray:
+        """A class map [h, w] of a view, of any size, as it would be had the camera no lens distortion."""
+        return undistort_class_map(class_map, self._distorted[split], self._dataset(split).cameras, index)
+
+    def _labels_of_file(self, split: Literal["train", "eval"], index: int) -> Tensor:
+        """The labels of a view's mask file in the narrowest type, without its photo."""
+        class_map = self._dataset(split).get_metadata({"image_idx": index})["class_map"].numpy()
+        return narrowed(torch.from_numpy(self._straight(split, class_map, index).astype(np.int32)))
+
+    def undistort_eval_map(self, class_map: np.ndarray, index: int) -> np.ndarray:
+        """A class map [h, w] of an evaluation view, of any size, as it would be had the camera no lens distortion."""
+        return self._straight("eval", class_map, index)
+
+    def training_mask(self, index: int) -> np.ndarray | None:
+        """The class map [h, w] uint16 in a training view's mask file, without lens distortion; None without a file."""
+        if self.train_dataset.metadata["class_map_filenames"][index] is None:
+            return None
+        return self._straight(
+            "train", self.train_dataset.get_metadata({"image_idx": index})["class_map"].numpy(), index
+        )
+
+    def straight_train_map(self, class_map: np.ndarray, index: int) -> np.ndarray:
+        """A class map [h, w] of a training view's file without its lens distortion."""
+        return self._straight("train", class_map, index)
+
+    def as_in_file(
+        self, class_map: np.ndarray, index: int, border: int = IGNORE, split: Literal["train", "eval"] = "train"
+    ) -> np.ndarray:
+        """A class map [h', w'] of a view with the lens distortion of its file, at the size it was read at.
+
+        border: what is where the straight view does not reach.
+        """
+        width, height = self._dataset(split).file_sizes[index]
+        lens = (self._distorted[split], self._dataset(split).cameras, index)
+        return redistort_class_map(class_map, *lens, (height, width), border)
+
+    def next_train(self, step: int) -> tuple[Cameras, dict]:
+        own = processes.rank()  # each process draws a view of its own, from an order that all have
+        self._pass_over(own)
+        camera, data = super().next_train(step)
+        self._pass_over(processes.size() - own - 1)
+        if isinstance(self.cached_train, StreamedViews):
+            self.cached_train.expect(self.train_unseen_cameras)
+        data = self._on_device(data)
+        # the boundary is computed inside the rasterizer, which sees the camera only: the mask travels with it
+        metadata = camera.metadata or {}
+        camera.metadata = {**metadata, "class_map": data["class_map"], "camera": self._camera(metadata["cam_idx"])}
+        if self._present is not None:
+            data["present"] = self._present[metadata["cam_idx"]]
+        return camera, data
+
+    def _camera(self, index: int) -> Camera:
+        """A training view's camera on the device, which knows its numbers on the host: a step need not fetch them."""
+        if index not in self._cameras:
+            self._cameras[index] = camera_from_nerfstudio(self.train_dataset.cameras, index).to(self.device)
+        return self._cameras[index]
+
+    def _pass_over(self, count: int) -> None:
+        """Leave out training views, which other processes draw."""
+        for _ in range(count):
+            self.train_unseen_cameras.pop(0)
+            if not self.train_unseen_cameras:
+                self.train_unseen_cameras = self.sample_train_cameras()
+
+    def next_eval_image(self, step: int) -> tuple[Cameras, dict]:
+        index = self.eval_unseen_cameras.pop(self._eval_order.randrange(len(self.eval_unseen_cameras)))
+        if not self.eval_unseen_cameras:
+            self.eval_unseen_cameras = list(range(len(self.eval_dataset)))
+        data = self.cached_eval[index].copy()
+        data["image"] = data["image"].to(self.device)
+        return self.eval_dataset.cameras[index : index + 1].to(self.device), self._on_device(data)
+
+    def state(self) -> dict[str, Any]:
+        """Where the orders of the training and evaluation views are; see ``training_state.Part``."""
+        generator = getattr(self, "random_generator", None)  # nerfstudio's "fps" has none
+        epochs = getattr(self, "train_unsampled_epoch_count", None)
+        return {
+            "sizes": [len(self.train_dataset), len(self.eval_dataset)],
+            "train": [int(index) for index in self.train_unseen_cameras],
+            "eval": list(self.eval_unseen_cameras),
+            "train_generator": None if generator is None else generator.getstate(),
+            "train_epochs": None if epochs is None else epochs.tolist(),
+            "eval_generator": self._eval_order.getstate(),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on with the views in the order in which the run that gave ``state`` would have."""
+        now = [len(self.train_dataset), len(self.eval_dataset)]
+        if (began := list(state["sizes"])) != now:
+            raise UserError(
+                f"training began with {began[0]} views and {began[1]} held out, but {self.config.data} has {now[0]} "
+                f"and {now[1]} now: restore the data, or train again."
+            )
+        self.train_unseen_cameras = list(state["train"])
+        self.eval_unseen_cameras = list(state["eval"])
+        self._eval_order.setstate(state["eval_generator"])
+        if state["train_generator"] is not None and hasattr(self, "random_generator"):
+            self.random_generator.setstate(state["train_generator"])
+        if state["train_epochs"] is not None:
+            self.train_unsampled_epoch_count = np.array(state["train_epochs"])
+
+    @property
+    def fixed_indices_eval_dataloader(self) -> Any:
+        """All evaluation views in order, as nerfstudio's evaluation reads them, one at a time."""
+        cache = self.cached_eval
+
+        def batch(index: int) -> tuple[Cameras, dict]:
+            data = self._on_device(cache[index].copy())
+            data["image"] = data["image"].to(self.device)
+            return self.eval_dataset.cameras[index : index + 1].to(self.device), data
+
+        return Lazy(batch, len(cache))
+
+    def views(self, split: Literal["train", "val", "test", "eval"], original: bool = False) -> list[View]:
+        """All views of the training or (any other name) the evaluation split, in name order.
+
+        original: give the labels of the mask files also after ``replace_class_maps``, if it kept them.
+        """
+        if split not in ("train", "val", "test", "eval"):
+            raise ValueError(f"unknown split {split!r}")
+        whose: Literal["train", "eval"] = "train" if split == "train" else "eval"
+        cache = self.cached_train if whose == "train" else self.cached_eval
+        names = unique_names(self._dataset(whose).image_filenames)
+        return [self._view(whose, cache, index, name, original) for index, name in enumerate(names)]
+
+    def replace_class_maps(self, class_maps: Sequence[Tensor], keep: bool = True) -> None:
+        """Train on ``class_maps``, one [H, W] integer tensor per training view, instead of the mask files.
+
+        keep: whether ``views`` may be asked for the labels of the files later on.
+        Raises ``ValueError`` if their number, a size or an id (0..IGNORE) is wrong.
+        """
+        cache, cameras = self.cached_train, self.train_dataset.cameras
+        if len(class_maps) != len(cache):
+            raise ValueError(f"{len(class_maps)} class maps for {len(cache)} training views")
+        present = []
+        for index, labels in enumerate(class_maps):
+            shape = (int(cameras.height[index]), int(cameras.width[index]))
+            if labels.shape != shape:
+                raise ValueError(f"class map {tuple(labels.shape)} for a view of {shape}")
+            if labels.numel() and not 0 <= int(labels.min()) <= int(labels.max()) <= IGNORE:
+                raise ValueError(f"class ids must lie in 0..{IGNORE}")
+            present.append(objects_in(labels))
+        if isinstance(cache, StreamedViews):
+            cache.class_maps = [PackedMap(labels.int()) for labels in class_maps]
+        else:
+            if not self._replaced:
+                self._originals = [data["class_map"] for data in cache]
+            for data, labels in zip(cache, class_maps, strict=True):
+                data["class_map"] = narrowed(labels.detach().int()).to(data["class_map"].device)
+        self._originals = self._originals if keep else None
+        self._originals_kept = keep
+        self._present = present
+        self._replaced = True
+
+    def _view(self, split: Literal["train", "eval"], cache: Any, index: int, name: str, original: bool) -> View:
+        dataset = self._dataset(split)
+        replaced = self._replaced and split == "train"
+        if replaced and original:
+            if not self._originals_kept:
+                raise ValueError("the labels of the mask files were not kept")
+            replaced = False
+        labels: Callable[[], Tensor] | None = None
+        if replaced or dataset.metadata["class_map_filenames"][index] is not None:
+            labels = self._labels(split, cache, index, replaced)
+        camera = camera_from_nerfstudio(dataset.cameras, index).to(self.device)
+
+        def data() -> dict[str, Tensor]:
+            held = cache[index]
+            return {key: held[key].to(self.device) for key in ("image", "alpha") if key in held}
+
+        return View(camera, name, data, labels)
+
+    def _labels(self, split: Literal["train", "eval"], cache: Any, index: int, replaced: bool) -> Callable[[], Tensor]:
+        """What gives the labels that a view has now, also after they are replaced again."""
+        if isinstance(cache, StreamedViews):
+            packed = cache.class_maps[index] if replaced else None
+            if packed is None:
+                return lambda: self._labels_of_file(split, index).to(self.device)
+            return lambda: packed.unpacked().to(self.device)
+        original = self._replaced and split == "train" and not replaced
+        stored = self._originals[index] if original and self._originals is not None else cache[index]["class_map"]
+        return lambda: stored.to(self.device)
+
+    def _on_device(self, data: dict) -> dict:
+        """The view's data for use: class map and alpha on the device, the class map as int32."""
+        moved = {key: value.to(self.device) if key in OWN_KEYS else value for key, value in data.items()}
+        return {**moved, "class_map": widened(moved["class_map"])}

@@ -1,0 +1,295 @@
+"""Data parser ``beags-data``: the images, poses and class masks of a scene in any registered layout.
+
+Nothing here may import a data manager: nerfstudio loads this module while it is importing its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from beags_plugin.data.files import check_same_size, files_of_views, image_size
+from beags_plugin.data.ground_truth import find_ground_truth, of_views
+from beags_plugin.data.labels import read_class_names
+from beags_plugin.data.layout import read_scene
+from beags_plugin.data.scene import ColmapModel, MaskKind, Scene, TransformsFile
+from beags_plugin.data.split import split_views
+from beags_plugin.plugin.views.cameras import check_cameras, downscaled_size, resize_cameras
+from beags_plugin.plugin.views.poses import Normalization, PosedViews, read_poses
+from beags_plugin.plugin.views.seed_points import starting_points
+from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.system.errors import UserError
+
+LEAST_PIXELS = 2  # of a side that was scaled down; fewer show nothing
+
+
+@dataclass
+class BeagsDataParserConfig(DataParserConfig):
+    """Options of ``beags-data``."""
+
+    _target: type = field(default_factory=lambda: BeagsDataParser)
+    data: Path = Path()
+    """Folder of the scene; or a transforms .json itself."""
+    layout: str = "auto"
+    """How the data set lays out its files: nerfstudio, colmap, llff, ... (docs/data.md); auto recognises it."""
+    images_path: Path | None = None
+    """Folder of the images, if not the layout's own. transforms.json: replaces the folder its file_path names.
+    The images may be smaller than the poses say (images_4): the cameras follow the images."""
+    masks_path: Path | None = None
+    """Folder of the id images <stem>.png, if not the layout's own, mostly "masks"; some or all may be missing."""
+    classes_path: Path = Path("classes.json")
+    """File {"id": "name"} of the classes; without it they are called class_<id>."""
+    ground_truth_path: Path = Path("ground_truth")
+    """Folder with exact masks for evaluation: masks/<stem>.png, visible/<object>/<stem>.png,
+    silhouettes/<object>/<stem>.png; may be missing."""
+    ignore_ids: tuple[int, ...] = ()
+    """Ids in the masks that mean "not labelled"."""
+    downscale_factor: float = 1.0
+    """Divide the images' width and height by this when loading; nothing is written to disk."""
+    eval_interval: int = 8
+    """Every so many of the name-sorted views is held out for evaluation; 0: all views serve both.
+    Splits that the data or its protocol names come first."""
+    held_out: tuple[str, ...] = ()
+    """Stems of images to hold out for evaluation besides."""
+    orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
+    """How the world is turned."""
+    center_method: Literal["poses", "focus", "none"] = "poses"
+    """How the world is centred."""
+    auto_scale_poses: bool = True
+    """Scale the world so that the cameras fit in +/- 1."""
+    scale_factor: float = 1.0
+    """Scale the world by this besides."""
+    scene_scale: float = 1.0
+    """Half the side of the scene box."""
+    num_random_points: int = 50_000
+    """Number of points to start from where the data brings none."""
+    random_points_seed: int = 0
+    """Seed of these points."""
+
+    def check(self) -> None:
+        """Raise ``UserError`` for a value that nothing can be made of."""
+        if not 1.0 <= self.downscale_factor < math.inf:
+            raise UserError(f"downscale_factor is {self.downscale_factor}: give 1 (full size) or more.")
+        for name in ("scale_factor", "scene_scale"):
+            if not 0.0 < (value := getattr(self, name)) < math.inf:
+                raise UserError(f"{name} is {value}: give a number above 0.")
+        if self.eval_interval < 0:
+            raise UserError(f"eval_interval is {self.eval_interval}: give a number of views, or 0 to hold out none.")
+        if self.num_random_points < 4:
+            raise UserError(f"num_random_points is {self.num_random_points}: a scene starts from at least 4.")
+        if self.random_points_seed < 0:
+            raise UserError(f"random_points_seed is {self.random_points_seed}: give 0 or more.")
+        if wrong := [index for index in self.ignore_ids if not 0 <= index <= IGNORE]:
+            raise UserError(f"ignore_ids holds {wrong[0]}: ids are whole numbers in 0..{IGNORE}.")
+
+    def __setattr__(self, name: str, value: object) -> None:
+        """Keep ``data`` absolute, so that a saved config.yml works from any folder."""
+        super().__setattr__(name, absolute(value) if name == "data" else value)
+
+
+def absolute(path: object) -> object:
+    """A given path as an absolute one; None and the empty path (not given) stay."""
+    return Path(path).expanduser().absolute() if isinstance(path, (str, Path)) and Path(path) != Path() else path
+
+
+class BeagsDataParser(DataParser):
+    """Parser behind ``beags-data``; see ``BeagsDataParserConfig`` for its options.
+
+    Metadata of what it returns, per view of the split where it is a list: ``points3D_xyz`` [P, 3] float32 in the world
+    of the cameras, ``points3D_rgb`` [P, 3] uint8, ``points3D_random`` bool, ``classes`` dict id -> name,
+    ``class_map_filenames`` list of Path or None, ``mask_kind`` (see ``data.scene.MaskKind``), ``ignore_ids``,
+    ``ground_truth`` (see ``data.ground_truth.GroundTruth``) or None.
+    Every user's mistake is a ``UserError``.
+    """
+
+    config: BeagsDataParserConfig
+
+    def __init__(self, config: BeagsDataParserConfig) -> None:
+        super().__init__(config)
+        self._views: PosedViews | None = None
+        self._metadata: dict[str, Any] = {}
+
+    def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
+        if self._views is None:  # train and eval share one parser: the poses are read once
+            self._read()
+        views = self._views
+        assert views is not None
+        chosen = self._views_of_split(views, split)
+        metadata = dict(self._metadata)
+        metadata["class_map_filenames"] = [metadata["class_map_filenames"][i] for i in chosen]
+        if metadata["ground_truth"] is not None:
+            metadata["ground_truth"] = of_views(metadata["ground_truth"], chosen)
+        return DataparserOutputs(
+            image_filenames=[views.images[i] for i in chosen],
+            cameras=views.cameras[torch.tensor(chosen)],
+            scene_box=views.outputs.scene_box,
+            dataparser_transform=views.outputs.dataparser_transform,
+            dataparser_scale=views.outputs.dataparser_scale,
+            metadata=metadata,
+        )
+
+    def posed_views(self) -> tuple[Scene, PosedViews]:
+        """The scene and all its views, before anything is asked of masks."""
+        config = self.config
+        config.check()
+        self._scene = scene = read_scene(Path(config.data).absolute(), config.layout, config.images_path)
+        options = {name: getattr(config, name) for name in Normalization.__dataclass_fields__}
+        views = read_poses(scene.poses, scene.root, Normalization(**options))
+        check_cameras(views.cameras, views.images)
+        return scene, views
+
+    def mask_files(self, scene: Scene, views: PosedViews) -> tuple[list[Path | None], Path, MaskKind]:
+        """Of each view the file of its mask or None; the folder where masks are looked for; and what they are."""
+        folder, kind = self._masks(scene)
+        if self.config.masks_path is None and scene.mask_files is not None:
+            return [scene.mask_files.get(image.stem) for image in views.images], folder, kind
+        return files_of_views(folder, views.images, _images_root(scene)), folder, kind
+
+    def training_views(self, views: PosedViews) -> list[int]:
+        """Indices of the views that are trained on."""
+        return self._views_of_split(views, "train")
+
+    def _read(self) -> None:
+        scene, views = self.posed_views()
+        self._metadata = self._read_metadata(scene, views)
+        for line in self._recognised(scene, views):
+            CONSOLE.print(line, markup=False, highlight=False, soft_wrap=True)
+        self._views = views
+
+    def _read_metadata(self, scene: Scene, views: PosedViews) -> dict[str, Any]:
+        """Checks of files against each other, and what all splits share."""
+        config = self.config
+        sizes = [image_size(path) for path in views.images]
+        self.fit_cameras(views, sizes)
+        images_root = _images_root(scene)
+        masks, folder, kind = self.mask_files(scene, views)
+        if not any(masks) and any(folder.glob("**/*.png")):
+            raise UserError(
+                f"no mask in {folder} has the name of an image ({views.images[0].stem}.png, ...): "
+                f"rename the masks, or give another masks_path."
+            )
+        check_same_size(masks, sizes)
+        present = [mask for mask in masks if mask is not None and kind == "ids"]
+        classes_file = scene.root / config.classes_path
+        self._check_named(folder, classes_file)
+        known = (scene.class_names, scene.class_names_file)
+        return {
+            **starting_points(scene, views, config.num_random_points, config.random_points_seed),
+            "classes": read_class_names(classes_file, present, config.ignore_ids, *known),
+            "class_map_filenames": masks,
+            "mask_kind": kind,
+            "ignore_ids": tuple(config.ignore_ids),
+            "ground_truth": find_ground_truth(scene.root / config.ground_truth_path, scene, views.images, images_root),
+        }
+
+    def _check_named(self, masks: Path, classes: Path) -> None:
+        """Raise ``UserError`` where the user has named masks or classes that are not there."""
+        if self.config.masks_path is not None and not masks.is_dir():
+            raise UserError(f"the folder of masks {masks} does not exist: correct masks_path.")
+        usual = self.config.classes_path == Path("classes.json")
+        if classes.is_dir() or not (usual or classes.is_file()):
+            raise UserError(f"the class names {classes} are no file: correct classes_path.")
+
+    def _masks(self, scene: Scene) -> tuple[Path, MaskKind]:
+        """The folder of the masks, and what they are."""
+        if self.config.masks_path is not None:
+            return scene.root / self.config.masks_path, "ids"
+        return scene.root / scene.masks, scene.mask_kind
+
+    def fit_cameras(self, views: PosedViews, sizes: Sequence[tuple[int, int]]) -> None:
+        """Cameras of the size the images will have once loaded: that of the files, divided by the downscale factor."""
+        cameras = views.cameras
+        camera_sizes = torch.cat([cameras.width, cameras.height], 1).tolist()
+        for path, (width, height), (camera_width, camera_height) in zip(views.images, sizes, camera_sizes, strict=True):
+            # A smaller copy of the images rounds each side by up to a pixel; more is another picture.
+            expected = width * camera_height / camera_width
+            if abs(expected - height) > 1.0 + expected / width:
+                raise UserError(
+                    f"the image {path} is {width}x{height} pixels but its camera is {camera_width}x{camera_height}: "
+                    f"use the images that the poses were made from."
+                )
+        actual = torch.tensor(sizes).to(torch.int64)
+        size = downscaled_size(actual, self.config.downscale_factor)
+        if int(size.min()) < LEAST_PIXELS <= int(actual.min()):
+            raise UserError(
+                f"downscale_factor is {self.config.downscale_factor:g}, which leaves {int(size.min())} pixels of "
+                f"a side of {views.images[0]}: give less, so that {LEAST_PIXELS} or more are left."
+            )
+        resize_cameras(cameras, size[:, :1], size[:, 1:])
+
+    def _views_of_split(self, views: PosedViews, split: str) -> list[int]:
+        if split not in ("train", "val", "test"):
+            raise ValueError(f"unknown split {split!r}")
+        if views.members is not None:
+            # nerfstudio asks for val while training and for test in ns-eval; data often names one of them
+            for name in {"train": ("train",), "val": ("val", "test"), "test": ("test", "val")}[split]:
+                if views.members.get(name):
+                    return views.members[name]
+            raise UserError(f"the data in {self._scene.root} names splits but no views for {split}: name some.")
+        config = self.config
+        train, held_out = split_views(views.stems, self._scene.split, config.eval_interval, config.held_out)
+        return train if split == "train" else held_out
+
+    def _recognised(self, scene: Scene, views: PosedViews) -> list[str]:
+        """What the data was taken for, in a line, and what the user should know."""
+        stems = set().union(*views.stems)
+        absent = [name for name in scene.split.held_out if name not in stems]
+        notes = [
+            f"The protocol holds out {name}, which no image here is called: name that view with beags-data --held-out."
+            for name in absent
+        ]
+        if unknown := sorted(self._scored_names() - set(self._metadata["classes"].values())):
+            notes.append(
+                f"Exact masks of {', '.join(map(repr, unknown))} do not count, as no class is called so: "
+                f'name the classes in {scene.root / self.config.classes_path}, {{"id": "name"}}.'
+            )
+        masks = self._metadata["class_map_filenames"]
+        points = "random" if self._metadata["points3D_random"] else len(self._metadata["points3D_xyz"])
+        line = (
+            f"{scene.root}: {scene.layout} layout, poses of {_source(scene)}, {len(views.images)} images in "
+            f"{views.images[0].parent.name} ({self._split_in_words(views, scene)}), "
+            f"{sum(mask is not None for mask in masks) or 'no'} masks, {points} seed points."
+        )
+        return [line, *notes, *scene.notes]
+
+    def _scored_names(self) -> set[str]:
+        """Names of the objects that have exact masks of their own."""
+        truth = self._metadata["ground_truth"]
+        return set() if truth is None else {name for kind in ("visible", "silhouettes") for name in truth[kind]}
+
+    def _split_in_words(self, views: PosedViews, scene: Scene) -> str:
+        if views.members is not None:
+            return "splits named by the data"
+        train, out = (self._views_of_split(views, split) for split in ("train", "test"))
+        if train == out:
+            return "none held out"
+        named = [name for name in scene.split.held_out if any(name in views.stems[i] for i in out)]
+        also = f", {', '.join(named[:3])}{', ...' if len(named) > 3 else ''} by protocol" if named else ""
+        return f"{len(out)} held out{also}"
+
+
+def _images_root(scene: Scene) -> Path:
+    """The folder below which images and masks have the same paths."""
+    if isinstance(scene.poses, TransformsFile):
+        return scene.poses.images or scene.root / "images"
+    return scene.poses.images if isinstance(scene.poses, ColmapModel) else scene.poses.images[0].parent
+
+
+def _source(scene: Scene) -> str:
+    poses = scene.poses
+    file = poses.folder if isinstance(poses, ColmapModel) else poses.file
+    return f"{file.relative_to(scene.root) if file.is_relative_to(scene.root) else file}"
+
+
+beags_data = DataParserSpecification(
+    config=BeagsDataParserConfig(),
+    description="Scenes with class id images: nerfstudio, COLMAP, LLFF and other layouts (BEA-GS).",
+)

@@ -1,0 +1,92 @@
+"""Images and class maps at the size the cameras say."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from PIL import Image
+
+from beags_plugin.plugin.views.cameras import downscaled_size, resize_cameras
+from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.images import read_image
+
+
+class BeagsDataset(InputDataset):
+    """Views of one split: ``image`` [H, W, 3] and ``class_map`` [H, W] uint16, all IGNORE where a view has no mask.
+
+    Images with alpha are put on black; ``get_alpha`` gives the alpha. Images are averaged over the area of each new
+    pixel, class maps take the id at its centre; both cover the camera's image from edge to edge.
+
+    scale_factor: of the data manager's ``camera_res_scale_factor``, on top of the parser's downscale factor.
+    """
+
+    exclude_batch_keys_from_device = ["image", "mask", "class_map", "alpha"]
+
+    def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
+        super().__init__(dataparser_outputs)  # not the factor: nerfstudio rounds the size down but scales K exactly
+        if scale_factor != 1.0:
+            self.scale_factor = scale_factor
+            width, height = (
+                downscaled_size(side, 1.0 / scale_factor) for side in (self.cameras.width, self.cameras.height)
+            )
+            resize_cameras(self.cameras, width, height)
+        # The data manager crops the cameras when it undistorts; the files keep this size.
+        self.file_sizes = torch.cat([self.cameras.width, self.cameras.height], 1).tolist()
+
+    def get_numpy_image(self, image_idx: int) -> np.ndarray:
+        """The image [H, W, 3] uint8, sRGB, before undistortion."""
+        path = self._dataparser_outputs.image_filenames[image_idx]
+
+        def read(image: Image.Image) -> np.ndarray:
+            if image.mode.startswith(("I", "F")):
+                raise UserError(f"the image {path} has more than 8 bits per channel: convert it to 8 bits.")
+            if image.has_transparency_data:
+                image = image.convert("RGBA")
+                image = Image.alpha_composite(Image.new("RGBA", image.size, (0, 0, 0, 255)), image)
+            return np.array(image.convert("RGB"))
+
+        return resize_area(read_image(path, read), *self.file_sizes[image_idx])
+
+    def get_alpha(self, image_idx: int) -> np.ndarray | None:
+        """The image's alpha [H, W] uint8, before undistortion; None if it is opaque everywhere."""
+
+        def read(image: Image.Image) -> np.ndarray | None:
+            return np.array(image.convert("RGBA").getchannel("A")) if image.has_transparency_data else None
+
+        alpha = read_image(self._dataparser_outputs.image_filenames[image_idx], read)
+        return None if alpha is None or (alpha == 255).all() else resize_area(alpha, *self.file_sizes[image_idx])
+
+    def get_metadata(self, data: dict) -> dict:
+        """The class map that belongs to ``data["image_idx"]``."""
+        from beags_plugin.labels.classes import read_mask
+
+        index = data["image_idx"]
+        width, height = self.file_sizes[index]
+        path = self.metadata["class_map_filenames"][index]
+        if path is None:
+            class_map = np.full((height, width), IGNORE, np.uint16)
+        else:
+            ids = read_mask(path, self.metadata["mask_kind"], self.metadata["ignore_ids"])
+            class_map = resize_nearest(ids, width, height)
+        return {"class_map": torch.from_numpy(class_map)}
+
+
+def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Average an image [H, W, C] or [H, W] over the area of each of the ``width`` x ``height`` new pixels."""
+    if image.shape[:2] == (height, width):
+        return image
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def resize_nearest(class_map: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Take of a map [H, W] the pixel in which the centre of each of the ``width`` x ``height`` new pixels lies."""
+    rows, columns = (
+        # In integers: (i + 0.5) old / new, rounded down. (cv2's nearest takes i old / new, half a new pixel off.)
+        (2 * np.arange(new) + 1) * old // (2 * new)
+        for new, old in ((height, class_map.shape[0]), (width, class_map.shape[1]))
+    )
+    return np.ascontiguousarray(class_map[rows[:, None], columns])

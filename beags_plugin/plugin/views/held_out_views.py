@@ -1,0 +1,116 @@
+"""The held-out views of a run's data, with all that is known of them, as the nerfstudio-free evaluation wants them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, cast, overload
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.data.files import image_size
+from beags_plugin.data.ground_truth import GroundTruth
+from beags_plugin.evaluation.metrics import resize_nearest
+from beags_plugin.evaluation.records import EvalView
+from beags_plugin.labels.classes import read_binary_mask, read_mask
+from beags_plugin.plugin.model import fixed_background
+from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.system.errors import UserError
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.options.config import BeagsTrainerConfig
+    from beags_plugin.plugin.views.datamanager import BeagsDataManager
+
+
+_NO_TRUTH = GroundTruth(masks=[], visible={}, silhouettes={}, seen={})
+
+
+class HeldOutViews(Sequence[EvalView]):
+    """The test views of the data; masks and silhouettes are read when a view is asked for, at the size of their files.
+
+    Visible masks come from ``ground_truth/visible``, else from ``ground_truth/masks``, else from the data's own masks;
+    silhouettes from ``ground_truth/silhouettes``, and what training photos show of them from ``ground_truth/seen``;
+    or from where the data's layout has them. All are undistorted like the photographs. Photographs with alpha stand on
+    the background that the run was trained on.
+    Asking for a view raises ``UserError`` for a mask that cannot be read or has other proportions than its photograph.
+    """
+
+    def __init__(
+        self, config: BeagsTrainerConfig, classes: Mapping[int, str], manager: BeagsDataManager | None = None
+    ) -> None:
+        """manager: of the same config, if one is at hand."""
+        if manager is None:
+            made = config.data_config.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
+            manager = cast("BeagsDataManager", made)
+        self.manager = manager
+        self.classes = classes
+        self.background = fixed_background(config.model_config)
+        self._views = self.manager.views("test")
+        self._metadata = self.manager.eval_dataset.metadata
+        self._kind: str = self._metadata["mask_kind"]
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    @overload
+    def __getitem__(self, index: int) -> EvalView: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[EvalView]: ...
+    def __getitem__(self, index: int | slice) -> EvalView | list[EvalView]:
+        chosen = range(len(self))[index]
+        return self._view(chosen) if isinstance(chosen, int) else [self._view(i) for i in chosen]
+
+    def trained_on(self) -> int:
+        """How many of these views are training views too."""
+        trained = set(self.manager.train_dataset.image_filenames)
+        return sum(path in trained for path in self.manager.eval_dataset.image_filenames)
+
+    def _view(self, index: int) -> EvalView:
+        view = self._views[index]
+        truth = self._metadata["ground_truth"] or _NO_TRUTH
+        exact = truth["masks"][index] if truth["masks"] else None
+        file, kind = (exact, "ids") if exact else (self._metadata["class_map_filenames"][index], self._kind)
+        visible = None
+        if file is not None:
+            ids = read_mask(file, kind, self._metadata["ignore_ids"])
+            visible = torch.from_numpy(self._straight(file, ids, index).astype(np.int32))
+        silhouettes = self._per_object(truth["silhouettes"], index)
+        seen = self._per_object(truth["seen"], index)
+        seen = {c: _of_size(mask, silhouettes[c]) for c, mask in seen.items() if c in silhouettes}
+        return EvalView(
+            view.camera,
+            view.image_on(self.background),
+            visible,
+            silhouettes or None,
+            view.name,
+            seen or None,
+            self._per_object(truth["visible"], index) or None,
+        )
+
+    def _per_object(self, files: Mapping[str, Sequence[Path | None]], view: int) -> dict[int, Tensor]:
+        """Object id to its [h, w] bool mask in a view, for those that have one."""
+        masks = {}
+        for class_id, name in self.classes.items():
+            file = files[name][view] if name in files else None
+            if file is not None:
+                ids = self._straight(file, read_binary_mask(file).astype(np.uint16), view)
+                masks[class_id] = torch.from_numpy((ids != 0) & (ids != IGNORE))  # outside the lens is IGNORE
+        return masks
+
+    def _straight(self, file: Path, ids: np.ndarray, view: int) -> np.ndarray:
+        """Ids without lens distortion; raises ``UserError`` if they have other proportions than the photograph."""
+        photo = self.manager.eval_dataset.image_filenames[view]
+        (width, height), (mask_height, mask_width) = image_size(photo), ids.shape
+        expected = mask_width * height / width  # a smaller copy rounds each side by up to a pixel
+        if abs(expected - mask_height) > 1.0 + expected / mask_width:
+            raise UserError(
+                f"the mask {file} is {mask_width}x{mask_height} pixels but its image is {width}x{height}: "
+                f"make it in the proportions of the image."
+            )
+        return self.manager.undistort_eval_map(ids, view)
+
+
+def _of_size(mask: Tensor, other: Tensor) -> Tensor:
+    return mask if mask.shape == other.shape else torch.from_numpy(resize_nearest(mask.numpy(), *other.shape))

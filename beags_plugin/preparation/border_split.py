@@ -1,0 +1,122 @@
+"""Split the Gaussians at class borders before refinement, so that they can follow them (our extension of the method).
+
+The base places one Gaussian where a pixel or two of colour need no more; at a border of two classes each of its sides
+must then end in a straight edge, which one Gaussian cannot draw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from beags_plugin.assignment.assignment import assign_classes
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.densification import Densified
+from beags_plugin.core.splitting import split_in_two
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.label_maps import LabelMaps
+from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
+from beags_plugin.rasterizers.rendering import geometry_inputs
+from beags_plugin.refiners.base import EditedScene
+from beags_plugin.system.errors import UserError
+
+
+@dataclass(frozen=True)
+class BorderSplitConfig:
+    """Which Gaussians are split in two, along their longer axis, before refinement.
+
+    rounds: how often; classes are assigned again after the last. 0, as in the paper, never.
+    band: a pixel is at a border if another class lies within so many pixels of it.
+    min_share: a Gaussian is split if at least this share of its contributions to labelled pixels is at borders ...
+    min_sigma: ... and its longer scale covers more than so many pixels in the view nearest to it.
+    """
+
+    rounds: int = 0
+    band: int = 1
+    min_share: float = 0.2
+    min_sigma: float = 0.7
+
+    def check(self) -> None:
+        """Raise ``UserError`` for a value that makes no sense."""
+        if self.rounds < 0 or self.band < 1:
+            raise UserError(
+                f"the border split has rounds = {self.rounds} and band = {self.band}: rounds must be 0 or more, band "
+                "at least 1 pixel."
+            )
+        if not (0.0 <= self.min_share <= 1.0 and self.min_sigma >= 0.0):
+            raise UserError(
+                f"the border split has min_share = {self.min_share} and min_sigma = {self.min_sigma}: min_share must "
+                "lie in 0..1, min_sigma must be 0 or more pixels."
+            )
+
+
+def split_at_borders(
+    surfels: Surfels,
+    cameras: Sequence[Camera],
+    labels: Sequence[Tensor],
+    rasterizer: Rasterizer,
+    settings: RasterSettings,
+    num_classes: int,
+    config: BorderSplitConfig,
+    progress: Callable[[int, int], None] | None = None,
+) -> EditedScene:
+    """Split those at the borders of the masks ``config.rounds`` times and assign classes again.
+
+    surfels: N surfels without gradients. labels: per camera [H, W] int32 class ids below ``num_classes`` or IGNORE, M'.
+    """
+    total, done = (config.rounds + 1) * len(cameras), 0
+
+    def tick(*_: int) -> None:
+        nonlocal done
+        done += 1
+        if progress:
+            progress(done, total)
+
+    bands = LabelMaps(border_band(mask, config.band) for mask in labels)
+    edited = Densified.unchanged(surfels)
+    for _ in range(config.rounds):
+        share = _share_of_class(edited.surfels, cameras, bands, rasterizer, settings, tick)
+        sigma = largest_sigma(edited.surfels, cameras)
+        edited = edited.then(split_in_two(edited.surfels, (share >= config.min_share) & (sigma > config.min_sigma)))
+    assignment = assign_classes(edited.surfels, cameras, labels, rasterizer, settings, num_classes, tick)
+    return EditedScene(edited, assignment)
+
+
+def border_band(labels: Tensor, width: int) -> Tensor:
+    """[H, W] int32: 1 where a pixel of another class is at most ``width`` rows and columns away, else 0.
+
+    labels: [H, W] int32 class ids or IGNORE; unlabelled pixels stay IGNORE and border on nothing.
+    """
+    unlabelled = labels == IGNORE
+    size = 2 * width + 1
+    # IGNORE must be neither the smallest nor the largest of a window that it lies in
+    highest = labels.masked_fill(unlabelled, -1).float()[None, None]
+    lowest = -labels.float()[None, None]  # IGNORE is above all classes
+    largest = torch.nn.functional.max_pool2d(highest, size, stride=1, padding=width)[0, 0]
+    smallest = -torch.nn.functional.max_pool2d(lowest, size, stride=1, padding=width)[0, 0]
+    return (largest != smallest).int().masked_fill_(unlabelled, IGNORE)
+
+
+def _share_of_class(surfels, cameras, bands, rasterizer, settings, tick) -> Tensor:
+    """[N] share of each surfel's contributions that falls on pixels of value 1; 0 where there are none."""
+    inputs = geometry_inputs(surfels)
+    settings = replace(settings, geometry=False, distortion=False)
+    total = torch.zeros(len(surfels), 2, dtype=torch.float64, device=surfels.means.device)
+    for camera, band in zip(cameras, bands, strict=True):
+        total += rasterizer.class_contributions(inputs, camera, settings, band, 2).double()
+        tick()
+    everything = total.sum(dim=1)
+    return total[:, 1] / everything.masked_fill(everything <= 0, 1.0)
+
+
+def largest_sigma(surfels: Surfels, cameras: Sequence[Camera]) -> Tensor:
+    """[N] pixels that the longer scale covers, seen face on, in the view where it is largest; 0 behind all cameras."""
+    per_length = torch.zeros_like(surfels.opacity_logits)
+    for camera in cameras:
+        depth = (surfels.means @ camera.rotation.T + camera.translation)[:, 2]
+        pixels = camera.K[0, 0] / depth
+        per_length = torch.where(depth > 0, torch.maximum(per_length, pixels), per_length)
+    return surfels.log_scales.exp().amax(dim=1) * per_length

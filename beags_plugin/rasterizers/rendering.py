@@ -1,0 +1,68 @@
+"""From a scene to what a rasterizer draws."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.sh import sh_colors
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.class_ranks import ClassRanks
+from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings, SurfelInputs
+from beags_plugin.system.errors import UserError
+
+SURFACE_DEPTHS = ("median", "expected")
+"""Which of E4's depths stands for the surface where pixels are lifted into space."""
+
+
+def surfel_inputs(
+    surfels: Surfels, camera: Camera, sh_degree: int | None = None, class_ids: Tensor | None = None
+) -> SurfelInputs:
+    """The scene with its colours as ``camera`` sees them; differentiable.
+
+    surfels: N surfels. sh_degree: degrees to use, all if None. class_ids: [N] int32, phi, or None.
+    """
+    degree = surfels.sh_degree if sh_degree is None else sh_degree
+    colors = sh_colors(surfels.sh_dc, surfels.sh_rest, surfels.means, camera.host.center, degree)
+    return SurfelInputs(surfels.means, surfels.quats, surfels.log_scales, surfels.opacity_logits, colors, class_ids)
+
+
+def geometry_inputs(surfels: Surfels, class_ids: Tensor | None = None) -> SurfelInputs:
+    """The scene without colours and gradients: for depth and the gradient-free products."""
+    bare = surfels.detach()
+    colors = torch.zeros_like(bare.means)
+    return SurfelInputs(bare.means, bare.quats, bare.log_scales, bare.opacity_logits, colors, class_ids)
+
+
+def draw_class_map(
+    rasterizer: Rasterizer, surfels: Surfels, class_ids: Tensor, camera: Camera, settings: RasterSettings
+) -> tuple[Tensor, Tensor]:
+    """``Rasterizer.class_map`` of class ids that may lie far apart; the rasterizer is given their ranks.
+
+    surfels: N surfels. class_ids: [N] int32, phi. Returns ([H, W] int32 class ids, [H, W] float share), no gradient.
+    """
+    known = ClassRanks(class_ids)
+    inputs = geometry_inputs(surfels, known.ranks(class_ids))
+    classes, share = rasterizer.class_map(inputs, camera, settings, len(known))
+    return known.class_ids(classes), share
+
+
+def check_surface_depth(kind: str) -> None:
+    """Raise ``UserError`` unless ``kind`` is one of ``SURFACE_DEPTHS``."""
+    if kind not in SURFACE_DEPTHS:
+        raise UserError(f"there is no surface depth {kind!r}: choose one of {', '.join(SURFACE_DEPTHS)}.")
+
+
+def surface_depth(drawn: RasterOutputs, kind: str) -> Tensor:
+    """[H, W] depth of the surface that each pixel shows, world units; 0 where nothing (solid) is.
+
+    kind: "median", the hit at which half of the light is stopped: always on a surface; or "expected", the mean over
+    all hits (the D of E5): at an object's rim it lies in the air between the object and what is behind.
+    Raises ``UserError`` for another kind.
+    """
+    check_surface_depth(kind)
+    surface = drawn.median_depth if kind == "median" else drawn.depth
+    if surface is None:
+        raise ValueError("the settings must ask for geometry")
+    return surface

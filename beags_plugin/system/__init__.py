@@ -1,0 +1,1 @@
+"""Errors, files, processes and devices: what knows nothing of scenes."""

@@ -1,0 +1,85 @@
+"""Digests that tell whether something made earlier would come out the same again."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import inspect
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+_PACKAGE = Path(__file__).parents[1]
+_TELLING = ("commands", "bench")  # print and draw what the rest has computed
+
+
+def code_digest() -> str:
+    """Changes with every file of the package that can change a result, the compiled extension included."""
+    digest = hashlib.sha256()
+    for path in sorted([*_PACKAGE.rglob("*.py"), *_PACKAGE.glob("_native*"), *_PACKAGE.glob("native/**/*")]):
+        if path.is_file() and path.relative_to(_PACKAGE).parts[0] not in _TELLING:
+            digest.update(path.read_bytes())
+    digest.update((_PACKAGE / "bench" / "measure.py").read_bytes())
+    return digest.hexdigest()
+
+
+def folder_digest(folder: Path) -> str:
+    """Changes with any file of ``folder``, by path, size and time."""
+    digest = hashlib.sha256(str(folder.resolve()).encode())
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        stat = path.stat()
+        digest.update(f"{path.relative_to(folder)} {stat.st_size} {stat.st_mtime_ns}".encode())
+    return digest.hexdigest()
+
+
+def content_digest(files: Iterable[Path]) -> str:
+    """Changes with the name or the content of any of the files."""
+    digest = hashlib.sha256()
+    for path in files:
+        content = path.read_bytes()
+        digest.update(f"{path.name} {len(content)} ".encode() + content)
+    return digest.hexdigest()
+
+
+def value_digest(value: Any) -> str:
+    """Of plain values (JSON), whatever the order of a dict's keys."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def input_digest(*values: Any) -> str:
+    """Of tensors, plain values, and lists, dicts and dataclasses of them; equal for equal bits alone.
+
+    An object that says ``stored`` (``labels.label_maps.LabelMaps``) counts by what it stores; functions and classes by
+    their names and the text of the file that they come from.
+    """
+    digest = hashlib.sha256()
+    _add(digest, values)
+    return digest.hexdigest()
+
+
+def _add(digest: Any, value: Any) -> None:
+    from torch import Tensor, uint8
+
+    digest.update(f"<{type(value).__qualname__}>".encode())
+    if value is None or isinstance(value, (str, int, float)):
+        digest.update(repr(value).encode())
+    elif isinstance(value, Tensor):
+        digest.update(f"{value.dtype}{tuple(value.shape)}".encode())
+        digest.update(value.detach().cpu().contiguous().reshape(-1).view(uint8).numpy())
+    elif isinstance(value, dict):
+        _add(digest, list(value.items()))
+    elif isinstance(value, (list, tuple)):
+        digest.update(f"{len(value)}:".encode())
+        for item in value:
+            _add(digest, item)
+    elif (stored := getattr(value, "stored", None)) is not None:
+        _add(digest, stored)
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        _add(digest, [(field.name, getattr(value, field.name)) for field in dataclasses.fields(value)])
+    elif inspect.isfunction(value) or isinstance(value, type):
+        digest.update(f"{value.__module__}.{value.__qualname__}".encode())
+        if source := inspect.getsourcefile(value):
+            digest.update(Path(source).read_bytes())
+    else:
+        raise TypeError(f"no digest of {type(value).__name__}")

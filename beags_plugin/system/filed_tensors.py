@@ -1,0 +1,90 @@
+"""Tensors that lie in a file and are read back one at a time: they take no memory, however many there are."""
+
+from __future__ import annotations
+
+import errno
+import os
+import tempfile
+import weakref
+import zipfile
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.arrays import check_header, check_members
+
+
+class FiledTensors(Sequence[Tensor]):
+    """The tensors of a file that ``write_tensors`` wrote, in their order; each is read anew when it is asked for.
+
+    source: its path, or the file, open for reading, which is closed when this object goes.
+    device: where the tensors are put.
+    Raises ``OSError`` or ``ValueError`` for a file that is not there or not whole.
+    """
+
+    def __init__(self, source: Path | BinaryIO, device: torch.device | str = "cpu") -> None:
+        if not isinstance(source, Path):
+            weakref.finalize(self, source.close)
+        try:
+            self._held = zipfile.ZipFile(source)  # reads the list of what is there, and no more
+            size = source.stat().st_size if isinstance(source, Path) else os.fstat(source.fileno()).st_size
+            check_members(self._held, size)
+            self._count = len(self._held.namelist())
+        except (zipfile.BadZipFile, NotImplementedError) as error:
+            raise ValueError(f"{source} holds no tensors: {error}") from None
+        weakref.finalize(self, self._held.close)
+        self.device = torch.device(device)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index: int | slice) -> Any:
+        """One tensor; of a slice, a list."""
+        chosen = range(self._count)[index]
+        return self._read(chosen) if isinstance(chosen, int) else [self._read(each) for each in chosen]
+
+    def _read(self, index: int) -> Tensor:
+        member = f"{index}.npy"
+        try:
+            with self._held.open(member) as file:
+                check_header(file, self._held.getinfo(member).file_size)
+            with self._held.open(member) as file:
+                return torch.from_numpy(np.lib.format.read_array(file, allow_pickle=False)).to(self.device)
+        # what zipfile raises for members that are damaged, and torch for numbers that it does not know
+        except (zipfile.BadZipFile, NotImplementedError, RuntimeError, KeyError, TypeError, EOFError) as error:
+            raise ValueError(f"tensor {index} cannot be read: {error}") from None
+
+
+def write_tensors(file: BinaryIO, tensors: Iterable[Tensor]) -> None:
+    """Write tensors one by one, as they come, as an uncompressed .npz whose arrays are named 0, 1, 2, .."""
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        for index, values in enumerate(tensors):
+            array = values.detach().cpu().contiguous().numpy()
+            with archive.open(f"{index}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
+
+
+def filed(tensors: Iterable[Tensor], device: torch.device | str = "cpu") -> FiledTensors:
+    """Tensors moved to a temporary file as they come; it goes with the last reference to what is returned.
+
+    Raises ``UserError`` if the folder of temporary files is full.
+    """
+    file = tempfile.TemporaryFile(prefix="beags-")  # noqa: SIM115  (closed with what is returned)
+    try:
+        write_tensors(file, tensors)
+        file.flush()
+    except OSError as error:
+        with suppress(OSError):  # it writes what it still holds, which fails again
+            file.close()
+        if error.errno != errno.ENOSPC:
+            raise
+        folder = tempfile.gettempdir()
+        raise UserError(f"{folder} is full: free some space there, or name another folder with TMPDIR.") from None
+    file.seek(0)
+    return FiledTensors(file, device)

@@ -1,0 +1,51 @@
+"""Images: of a few kinds only, and of no more pixels than a large photograph."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.text import reason
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP")
+"""Of Pillow's, those that photos and masks have; some of the others start programs to be drawn."""
+MOST_PIXELS = 178_956_970
+"""Of an image; Pillow's own bound, of half a gigabyte of colours."""
+
+T = TypeVar("T")
+
+
+def read_image(path: Path | str, read: Callable[[Image], T], what: str = "the image", remedy: str = "replace it") -> T:
+    """What ``read`` makes of an open image.
+
+    what, remedy: what the sentence calls it, and what to do. Raises ``UserError`` if the file is missing, no such
+    image, cut off, or of too many pixels.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    def broken(told: str, error: Exception) -> UserError:
+        return UserError(f"{what} {path} cannot be read as an image ({told}): {remedy}.")
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # from half as many pixels on
+            image = Image.open(path, formats=FORMATS)
+        with image:
+            width, height = image.size
+            if width * height > MOST_PIXELS:
+                raise Image.DecompressionBombError
+            return read(image)
+    except (UserError, FileNotFoundError):
+        raise
+    except UnidentifiedImageError as error:
+        raise broken(f"it is none of {', '.join(FORMATS)}", error) from error
+    except Image.DecompressionBombError as error:
+        raise broken(f"it promises more than {MOST_PIXELS:,} pixels", error) from error
+    except Exception as error:  # Pillow lets through whatever the readers of single formats raise
+        raise broken(reason(error), error) from error

@@ -1,0 +1,56 @@
+"""Registries of lazy ``"module:Class"`` specs, open to other packages through entry points."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any
+
+from beags_plugin.system.errors import UserError
+
+
+class Registry:
+    """Names mapped to ``"module:attribute"`` specs; a spec is imported only when it is asked for.
+
+    Args:
+        kind: what is registered, as a user would call it ("rasterizer"); used in messages.
+        group: the entry-point group in which other packages add their own, e.g. ``beags.rasterizers``.
+        builtin: name to spec of what this package supplies; an entry point of the same name is refused.
+    """
+
+    def __init__(self, kind: str, group: str, builtin: dict[str, str]) -> None:
+        self.kind = kind
+        self.group = group
+        self._specs = dict(builtin)
+        self._discovered = False
+
+    def _discover(self) -> None:
+        if self._discovered:
+            return
+        self._discovered = True
+        for point in entry_points(group=self.group):
+            self.register(point.name, point.value)
+
+    def register(self, name: str, spec: str) -> None:
+        """Add ``name``; raises ``UserError`` if the name is taken by another spec."""
+        known = self._specs.setdefault(name, spec)
+        if known != spec:
+            raise UserError(
+                f"two {self.kind}s are called {name!r} ({known} and {spec}): rename or uninstall one of them."
+            )
+
+    def names(self) -> list[str]:
+        """The registered names, sorted; imports none of them."""
+        self._discover()
+        return sorted(self._specs)
+
+    def get(self, name: str) -> Any:
+        """Import and return what ``name`` stands for; raises ``UserError`` for an unknown name or a spec that fails."""
+        self._discover()
+        if name not in self._specs:
+            raise UserError(f"there is no {self.kind} {name!r}: choose one of {', '.join(self.names())}.")
+        module, _, attribute = self._specs[name].partition(":")
+        try:
+            return getattr(import_module(module), attribute)
+        except (ImportError, AttributeError) as error:
+            raise UserError(f"the {self.kind} {name!r} ({self._specs[name]}) cannot be loaded: {error}") from error

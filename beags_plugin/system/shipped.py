@@ -1,0 +1,28 @@
+"""The folders of TOML files that ship with the package, and reading such a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.text import load_toml, reason
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def shipped_folder(name: str) -> Path:
+    """Where ``name`` (method_configs, experiments) lies: in the installed package, or beside it in a checkout."""
+    installed = _PACKAGE / name
+    return installed if installed.is_dir() else _PACKAGE.parent / name
+
+
+def read_toml(path: Path, what: str) -> dict[str, Any]:
+    """The content of a TOML file; raises ``UserError`` if it cannot be read. what: for the sentence, e.g. "preset"."""
+    try:
+        return load_toml(path)
+    except OSError as error:
+        told = f"the {what} {path} cannot be read ({reason(error)}): name an existing file of that kind."
+        raise UserError(told) from error
+    except ValueError as error:
+        raise UserError(f"the {what} {path} is no TOML ({reason(error)}): correct the file.") from error

@@ -1,0 +1,68 @@
+"""Files that are there whole or not at all, whenever the program is killed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from beags_plugin.system.errors import writing
+
+PART = ".part"
+"""Ends the names of files that are being written; their names start with a dot."""
+
+
+def write_whole(path: Path, write: Callable[[BinaryIO], Any], beside: Path | None = None) -> None:
+    """Let ``write`` write a file that takes the place of ``path`` once it is safe on disk.
+
+    beside: folder of the unfinished file, on the same disk; that of ``path`` if None. Raises ``UserError`` if the
+    system does not let it: the disk is full, or nothing may be written there.
+    """
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = unfinished(path, beside)
+        try:
+            with open(part, "wb") as file:
+                write(file)
+            put_in_place(part, path)
+        except (Exception, KeyboardInterrupt):
+            with suppress(OSError):
+                part.unlink(missing_ok=True)  # it may be what fills the disk
+            raise
+
+
+def unfinished(path: Path, beside: Path | None = None) -> Path:
+    """Where what becomes ``path`` is written first; beside: see ``write_whole``."""
+    return (beside or path.parent) / f".{path.name}{PART}"
+
+
+def put_in_place(part: Path, path: Path) -> None:
+    """Bring a file that has been written safely to disk, and let it take the place of ``path``."""
+    with open(part, "rb+") as file:
+        os.fsync(file.fileno())
+    os.replace(part, path)
+    _sync_folder(path.parent)
+
+
+def remove_unfinished(folder: Path) -> list[Path]:
+    """Remove what a killed program left half written in ``folder`` and below; returns the files."""
+    found = sorted(path for path in folder.rglob(f".*{PART}") if path.is_file())
+    for path in found:
+        path.unlink()
+    return found
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a new name in ``folder`` survive a power cut; not every system can."""
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError:  # Windows opens no folders
+        return
+    try:
+        os.fsync(handle)
+    except OSError:
+        pass
+    finally:
+        os.close(handle)
