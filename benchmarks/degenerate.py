@@ -11,7 +11,8 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.rotations import rotation_from_quat
-from beags_plugin.rasterizers.interface import IGNORE, RasterSettings, SurfelInputs
+from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.rasterizers.interface import RasterSettings, SurfelInputs
 
 FLOATS = ("means", "quats", "log_scales", "opacity_logits", "colors")
 _SIZES = ((1, 1), (1, 7), (5, 1), (2, 3), (9, 8), (16, 16), (17, 15), (33, 5), (31, 33))  # width, height

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from beags_plugin.evaluation.metrics import resize_nearest
 from beags_plugin.export.frames import bounding_box
 from beags_plugin.extraction.select import select_class
+from beags_plugin.labels.class_ids import resize_nearest
 from beags_plugin.pictures.cells import GAP, below, beside, cell, write_picture
 from beags_plugin.pictures.contact_sheet import mask_overlay
 from beags_plugin.pictures.objects import draw_alone

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.rasterizers.interface import IGNORE, RasterSettings, SurfelInputs
+from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.rasterizers.interface import RasterSettings, SurfelInputs
 
 FLOATS = ("means", "quats", "log_scales", "opacity_logits", "colors")
 CLASSES = 4

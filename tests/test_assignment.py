@@ -10,8 +10,9 @@ from raster_scenes import CLASSES, make_scene
 
 from beags_plugin.assignment.assignment import assign_classes
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.rasterizers import RASTERIZERS, make_rasterizer
-from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
+from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.system.errors import UserError
 

@@ -11,12 +11,13 @@ import torch
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.splitting import split_in_two
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.preparation.border_split import BorderSplitConfig, border_band, largest_sigma, split_at_borders
 from beags_plugin.preparation.pipeline import PreparationConfig, prepare
+from beags_plugin.preparation.refiner import AssignedScene
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
+from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.rasterizers.rendering import surfel_inputs
-from beags_plugin.refiners.base import AssignedScene
 from beags_plugin.refiners.bea import BeaRefiner
 from beags_plugin.refiners.none import NoRefiner
 from beags_plugin.system.errors import UserError

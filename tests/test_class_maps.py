@@ -7,16 +7,16 @@ import pytest
 from PIL import Image
 
 from beags_plugin.data.files import image_size
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import (
     check_names,
-    colorize,
     read_binary_mask,
     read_class_map,
     read_classes,
     read_mask,
     write_class_map,
 )
-from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.labels.colors import colorize
 from beags_plugin.system.errors import UserError
 
 

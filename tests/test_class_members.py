@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from beags_plugin.losses.class_members import ClassMembers, objects_in
-from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.labels.class_ids import IGNORE, objects_in
+from beags_plugin.losses.class_members import ClassMembers
 
 
 def test_members_are_the_places_of_a_class_in_their_order():

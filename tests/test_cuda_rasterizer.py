@@ -10,9 +10,9 @@ from cuda_backends import BACKENDS, EmulatedAheadRasterizer, EmulatedCudaRasteri
 from raster_scenes import CLASSES, FLOATS, OUTPUTS, awkward, error, gradients, gradients_by_output, make_scene, poisoned
 from test_native import ALL_SCENES
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.cuda import CudaRasterizer
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 from beags_plugin.system.errors import UserError
 

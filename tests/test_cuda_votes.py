@@ -10,12 +10,12 @@ import torch
 from cuda_backends import cuda_device
 from test_reprojection_votes import METHODS, larger_scene, same
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.masks.reprojection import reproject_pairwise
 from beags_plugin.masks.voxel_reprojection import reproject_voxel
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.ops import cuda_extension, extension, voxel_bricks, voxel_tally
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.errors import UserError
 
 pytestmark = pytest.mark.skipif(extension.load() is None, reason="beags_plugin._native was not built")

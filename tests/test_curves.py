@@ -16,9 +16,9 @@ from run_folders import CLASSES, discs, write_scene
 
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.evaluation.violations import boundary_errors, occupancy_violations
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.training.step_clock import StepClock
-from beags_plugin.rasterizers.interface import IGNORE
 
 LAST = sum(STEPS) - 1
 TOLD: list[tuple[str, list[tuple[int, int]]]] = []  # what the bars of ``run`` were told

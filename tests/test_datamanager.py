@@ -10,11 +10,11 @@ import torch
 from data_folders import CX, CY, FX, FY, HEIGHT, WIDTH, noise, write_image, write_transforms
 from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.plugin.views.datamanager import BeagsDataManager, BeagsDataManagerConfig
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.plugin.views.undistortion import undistort_class_map
 from beags_plugin.plugin.views.views import unique_names
-from beags_plugin.rasterizers.interface import IGNORE
 
 LARGE_W, LARGE_H = 160, 120
 LENS = dict(w=LARGE_W, h=LARGE_H, fl_x=110.0, fl_y=118.0, cx=71.5, cy=66.25)

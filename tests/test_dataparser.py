@@ -23,10 +23,10 @@ from data_folders import (
 )
 from PIL import Image
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.plugin.views.dataset import BeagsDataset
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.errors import UserError
 
 AS_GIVEN = dict(orientation_method="none", center_method="none", auto_scale_poses=False)

@@ -19,11 +19,12 @@ from test_datamanager import BROWN, LARGE_H, LARGE_W, LENS, distort
 from beags_plugin.commands.cli import main
 from beags_plugin.evaluation.metrics import mask_metrics
 from beags_plugin.evaluation.protocol import Protocol
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.plugin.model import BeagsModel
 from beags_plugin.plugin.objects.evaluate import EvaluatedRun, evaluate_run
 from beags_plugin.plugin.objects.extract import extract_objects, load_run_config
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
+from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.system.errors import UserError
 

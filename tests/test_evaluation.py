@@ -20,6 +20,7 @@ from beags_plugin.evaluation.records import EvalView, ObjectMetrics, SceneMetric
 from beags_plugin.evaluation.report import RunMetrics
 from beags_plugin.evaluation.run_metrics import evaluate_scene
 from beags_plugin.evaluation.table import print_run, summary_json
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.pictures.contact_sheet import (
     SheetRow,
     contact_sheet,
@@ -28,7 +29,7 @@ from beags_plugin.pictures.contact_sheet import (
     novel_camera,
     write_contact_sheet,
 )
-from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterOutputs, RasterSettings
+from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
 from beags_plugin.system.errors import UserError
 
 SIZE = 24

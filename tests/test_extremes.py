@@ -11,8 +11,9 @@ from raster_scenes import CLASSES, FLOATS, OUTPUTS, make_scene
 from beags_plugin.assignment.assignment import assign_classes
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.interface import IGNORE, RasterSettings, SurfelInputs
+from beags_plugin.rasterizers.interface import RasterSettings, SurfelInputs
 
 MOST_CLASSES = 65_535  # ids 0 to 65,534; 65,535 is IGNORE
 

@@ -9,7 +9,7 @@ pytest.importorskip("nerfstudio")
 
 from resumed_runs import STEPS, run_to_end, short_config
 
-from beags_plugin.losses.class_members import objects_in
+from beags_plugin.labels.class_ids import objects_in
 from beags_plugin.losses.silhouette import SilhouetteLoss
 from beags_plugin.sample.writer import SampleConfig, write_sample
 

@@ -13,10 +13,11 @@ from raster_scenes import CLASSES, FLOATS, OUTPUTS, Scene, make_scene
 
 from beags_plugin.core.rotations import quat_product, rotation_from_quat
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.occupancy import OccupancyLoss
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
+from beags_plugin.rasterizers.interface import RasterSettings
 
 # The same examples in every run; a fixture that names a backend holds no state between examples.
 EXAMPLES = settings(

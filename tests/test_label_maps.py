@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_reprojection_votes import METHODS, larger_scene, same
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.label_maps import LabelMaps, narrowed, widened
-from beags_plugin.rasterizers.interface import IGNORE
 
 
 @given(st.lists(st.one_of(st.integers(0, 300), st.integers(65500, IGNORE)), min_size=1, max_size=12))

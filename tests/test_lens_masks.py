@@ -7,8 +7,8 @@ import pytest
 import torch
 from test_datamanager import LARGE_H, LARGE_W, distort, manager, write_distorted
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.plugin.views.lens import project_through_lens
-from beags_plugin.rasterizers.interface import IGNORE
 
 
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])

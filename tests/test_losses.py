@@ -11,13 +11,13 @@ import torch
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import opacities
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.boundary import BoundaryLoss
 from beags_plugin.losses.distortion import DistortionLoss
 from beags_plugin.losses.normal import NormalConsistencyLoss, depth_normals
 from beags_plugin.losses.photometric import PhotometricLoss, blur, ssim
 from beags_plugin.losses.reduction import ordered_mean, ordered_sum
-from beags_plugin.rasterizers.interface import IGNORE
 
 
 def _inputs(camera=None, image=None, labels=None, **render) -> LossInputs:

@@ -13,11 +13,11 @@ from run_folders import write_scene, write_trained
 from source_scenes import truth
 
 from beags_plugin.commands.cli import main
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import read_class_map
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Progress, SourceScene
 from beags_plugin.plugin.objects.make_masks import make_masks
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.errors import UserError
 
 

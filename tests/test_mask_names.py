@@ -12,6 +12,7 @@ from source_scenes import make, mask_at, scene_of, scene_of_folders, values_of
 
 from beags_plugin.commands.cli import main
 from beags_plugin.data.files import photo_names
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import read_class_map
 from beags_plugin.masks.sources.coco import CocoSource
 from beags_plugin.masks.sources.id_images import IdImagesSource
@@ -19,7 +20,6 @@ from beags_plugin.masks.sources.langsplat import LangSplatSource
 from beags_plugin.masks.sources.matching import PhotoNames
 from beags_plugin.masks.sources.object_images import ObjectImagesSource
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.errors import UserError
 
 

@@ -12,13 +12,13 @@ from data_folders import HEIGHT, WIDTH, write_image
 from PIL import Image
 from source_scenes import make, scene_of, truth
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.masks.sources import MASK_SOURCES
 from beags_plugin.masks.sources.coco import CocoSource, decoded
 from beags_plugin.masks.sources.id_images import GaussianGroupingSource, IdImagesSource
 from beags_plugin.masks.sources.langsplat import LangSplatSource
 from beags_plugin.masks.sources.object_images import ObjectImagesSource
 from beags_plugin.masks.sources.prompts import Prompt, read_prompts
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.errors import UserError
 
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from source_scenes import Wall, coloured, make
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.masks.rims import snap_to_edges
 from beags_plugin.masks.sources.base import SourceScene
 from beags_plugin.masks.sources.grabcut import GrabCutSource, carry, cut_by_box
 from beags_plugin.masks.sources.prompts import Prompt
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.errors import UserError
 
 

@@ -13,12 +13,12 @@ import torch
 from data_folders import look_at, write_image, write_transforms
 
 from beags_plugin.commands.cli import main
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import write_class_map
 from beags_plugin.masks.check.areas import contradicted
 from beags_plugin.masks.check.consistency import UNSEEN, Agreement, labels_at, ranks_of
 from beags_plugin.masks.check.issues import named, percent
 from beags_plugin.pictures.masks import coverage_picture
-from beags_plugin.rasterizers.interface import IGNORE
 
 VIEWS, SIDE = 12, 48
 BALLS = {1: ((-0.6, 0.0, 0.0), 0.4), 2: ((0.6, 0.1, 0.0), 0.4), 3: ((0.0, 0.7, 0.3), 0.3)}

@@ -8,15 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from beags_plugin.evaluation.metrics import (
-    MaskMetrics,
-    band_width,
-    boundary_band,
-    erode,
-    mask_metrics,
-    psnr,
-    resize_nearest,
-)
+from beags_plugin.evaluation.metrics import MaskMetrics, band_width, boundary_band, erode, mask_metrics, psnr
+from beags_plugin.labels.class_ids import resize_nearest
 
 
 def mask(*rows: str) -> np.ndarray:

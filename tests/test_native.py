@@ -18,9 +18,9 @@ from raster_scenes import (
     poisoned,
 )
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.ops import extension
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.rasterizers.native import NativeRasterizer
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 from beags_plugin.system.errors import UserError

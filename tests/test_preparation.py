@@ -11,13 +11,14 @@ from raster_scenes import CLASSES
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.preparation import consistent_masks
 from beags_plugin.preparation.consistent_masks import chosen_reprojection
 from beags_plugin.preparation.pipeline import PreparationConfig, prepare
 from beags_plugin.preparation.stages import StageStore
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
+from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.refiners.none import NoRefiner
 from beags_plugin.system.errors import UserError
 

@@ -11,7 +11,7 @@ import torch
 from raster_scenes import CLASSES, FLOATS, OUTPUTS, SCENES, make_scene
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.rasterizers.torch_reference import BLOCK, TorchRasterizer
 
 

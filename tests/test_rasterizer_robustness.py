@@ -11,7 +11,8 @@ from raster_scenes import CLASSES, FLOATS, OUTPUTS, SCENES, make_scene
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.rotations import rotation_from_quat
-from beags_plugin.rasterizers.interface import IGNORE, RasterSettings, SurfelInputs
+from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.rasterizers.interface import RasterSettings, SurfelInputs
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 
 

@@ -10,9 +10,9 @@ import torch
 
 import beags_plugin.masks.reprojection as reprojection
 from beags_plugin.core.cameras import Camera
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.masks.reprojection import reproject_pairwise
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.errors import UserError
 
 both = pytest.mark.usefixtures("ops")  # run with the torch versions and with the compiled ops

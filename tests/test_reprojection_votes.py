@@ -10,11 +10,11 @@ import torch
 from test_reprojection import SIZES, _cameras, _scene
 
 from beags_plugin.core.lifting import lift
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.masks import REPROJECTIONS, voxel_reprojection
 from beags_plugin.masks.reprojection import reproject_pairwise
 from beags_plugin.masks.voxel_reprojection import reproject_voxel
 from beags_plugin.ops import extension
-from beags_plugin.rasterizers.interface import IGNORE
 
 compiled = pytest.mark.skipif(extension.load() is None, reason="beags_plugin._native was not built")
 both = pytest.mark.usefixtures("ops")

@@ -10,12 +10,13 @@ import torch
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.lifting import lift
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.class_ids import IGNORE, objects_in
 from beags_plugin.losses.base import LossInputs
-from beags_plugin.losses.class_members import ClassMembers, objects_in
+from beags_plugin.losses.class_members import ClassMembers
 from beags_plugin.losses.silhouette import SilhouetteLoss
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
+from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.system.errors import UserError
 

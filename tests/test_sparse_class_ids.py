@@ -9,13 +9,14 @@ import torch
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.occupancy import OccupancyLoss
 from beags_plugin.masks import reprojection
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.preparation.pipeline import Preparation, PreparationConfig, prepare
-from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
+from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.rasterizers.rendering import draw_class_map
 from beags_plugin.refiners.bea import BeaRefiner
 from beags_plugin.system.errors import UserError

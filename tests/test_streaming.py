@@ -10,9 +10,9 @@ import torch
 from data_folders import HEIGHT, WIDTH, write_image, write_transforms
 from test_datamanager import manager, write_distorted
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.label_maps import PackedMap, widened
 from beags_plugin.plugin.views.streaming import Lazy, StreamedViews
-from beags_plugin.rasterizers.interface import IGNORE
 
 
 def both(root, **options):

@@ -17,7 +17,7 @@ from nerfstudio.viewer.viewer_elements import ViewerClick
 from viewer_windows import ALWAYS, Window, write_finished
 
 from beags_plugin.extraction.ply import read_ply
-from beags_plugin.labels.classes import colorize
+from beags_plugin.labels.colors import colorize
 from beags_plugin.plugin.viewer.choice import Choice
 from beags_plugin.plugin.viewer.viewed_run import ViewedRun
 from beags_plugin.plugin.viewer.viewing import CHANNELS

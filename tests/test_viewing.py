@@ -11,7 +11,8 @@ from run_folders import discs
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels, opacities
-from beags_plugin.labels.classes import colorize
+from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.labels.colors import colorize
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.occupancy.violation import violation_shares
 from beags_plugin.plugin.viewer.choice import Choice, shown
@@ -25,7 +26,7 @@ from beags_plugin.plugin.viewer.pictures import (
     nearest_view,
     value_picture,
 )
-from beags_plugin.rasterizers.interface import IGNORE, RasterSettings
+from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs
 
 SETTINGS = RasterSettings(0.01, 100.0)

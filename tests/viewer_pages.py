@@ -19,7 +19,7 @@ from browser import Page
 from PIL import Image
 from run_folders import CLASSES
 
-from beags_plugin.labels.classes import colorize
+from beags_plugin.labels.colors import colorize
 from beags_plugin.system.child_processes import bound
 
 WIDTH, HEIGHT = 640, 400

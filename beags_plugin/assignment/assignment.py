@@ -11,9 +11,10 @@ from torch import Tensor
 from beags_plugin.assignment.sparse_sums import TorchSparseSums, largest_in_rows
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.ops import extension
 from beags_plugin.ops.sparse_sums import SparseSums
-from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
+from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.processes import each_view

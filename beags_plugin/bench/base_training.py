@@ -35,7 +35,10 @@ Curve = Sequence[Mapping[str, float]]
 
 @dataclass(frozen=True)
 class Row:
-    """A variant's base on a scene. curve: records of ``plugin.training.held_out``; empty with the reason in ``failed``."""
+    """A variant's base on a scene.
+
+    curve: records of ``plugin.training.held_out``; empty with the reason in ``failed``.
+    """
 
     scene: str
     seed: int

@@ -13,8 +13,8 @@ import numpy as np
 from beags_plugin.bench.report import new_figure, save_figure
 from beags_plugin.bench.runner import Outcome
 from beags_plugin.bench.trials import Run
-from beags_plugin.labels.classes import colorize
-from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.labels.colors import colorize
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

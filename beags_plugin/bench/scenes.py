@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import read_mask, write_class_map
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.digests import folder_digest, value_digest
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.progress import progress_bar

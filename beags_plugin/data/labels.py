@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.system.errors import UserError
 
 
@@ -24,7 +24,8 @@ def read_class_names(
     masks: id images. known, known_file: names that the layout brings, and where they stand.
     Raises ``UserError`` if a mask holds an id without a name where names are given. Reads all masks once.
     """
-    from beags_plugin.labels.classes import BACKGROUND, read_classes
+    from beags_plugin.labels.class_ids import BACKGROUND
+    from beags_plugin.labels.classes import read_classes
 
     with ThreadPoolExecutor(max_workers=4) as pool:  # decoding a .png releases the interpreter
         ids_of_masks = list(pool.map(lambda mask: ids_in_mask(mask, ignore_ids), masks))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from beags_plugin.evaluation.protocol import Protocol
+from beags_plugin.labels.class_ids import resize_nearest
 
 METRICS = ("acc", "iou", "biou")
 
@@ -54,13 +55,6 @@ def erode(mask: np.ndarray, times: int) -> np.ndarray:
 def boundary_band(mask: np.ndarray, width: int) -> np.ndarray:
     """[H, W] bool: the pixels of ``mask`` [H, W] bool that ``width`` erosions take away."""
     return mask & ~erode(mask, width)
-
-
-def resize_nearest(mask: np.ndarray, height: int, width: int) -> np.ndarray:
-    """[H', W'] to [height, width], each new pixel taking the old one under its centre."""
-    rows = (2 * np.arange(height) + 1) * mask.shape[0] // (2 * height)
-    columns = (2 * np.arange(width) + 1) * mask.shape[1] // (2 * width)
-    return mask[rows[:, None], columns[None, :]]
 
 
 def compared_masks(

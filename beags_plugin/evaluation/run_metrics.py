@@ -14,8 +14,9 @@ from beags_plugin.evaluation.metrics import MaskMetrics, mask_metrics, mean, mea
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import KINDS, EvalView, Kind, MaskRecord, ObjectMetrics, SceneMetrics, ViewRecord
 from beags_plugin.extraction.select import select_class
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.losses.photometric import ssim
-from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
+from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs, surfel_inputs
 
 

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.surfels import Surfels, opacities
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.occupancy.violation import disc_sums
-from beags_plugin.rasterizers.interface import IGNORE
 
 
 @torch.no_grad()

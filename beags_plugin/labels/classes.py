@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import colorsys
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.reading.images import read_image
 from beags_plugin.system.reading.text import load_json, reason
 
-BACKGROUND = 0
 _ID_MODES = {"1", "L", "P", "I", "I;16", "I;16L", "I;16B"}  # Pillow's names of images with one integer per pixel
 _COLOR_MODES = {"RGB", "RGBA", "LA"}
 
@@ -152,24 +150,3 @@ def _read_names(path: Path) -> dict[int, str]:
             raise UserError(f"{path} names class {int(key)} twice: keep one of the lines.")
         names[int(key)] = name.strip()
     return names
-
-
-def colorize(class_map: np.ndarray) -> np.ndarray:
-    """Colours for looking at: an id has the same colour in every image and scene.
-
-    class_map: [H, W] integers. Returns [H, W, 3] uint8 RGB; background is black, IGNORE mid-grey.
-    """
-    ids, inverse = np.unique(np.asarray(class_map), return_inverse=True)
-    colors = np.array([_color(int(class_id)) for class_id in ids], dtype=np.uint8).reshape(-1, 3)
-    return colors[inverse.reshape(np.shape(class_map))]
-
-
-def _color(class_id: int) -> tuple[int, int, int]:
-    if class_id == BACKGROUND:
-        return 0, 0, 0
-    if class_id == IGNORE:
-        return 128, 128, 128
-    hue = class_id * 0.6180339887498949 % 1.0  # steps of the golden ratio keep neighbouring ids far apart
-    value = (1.0, 0.8, 0.9)[class_id % 3]
-    red, green, blue = colorsys.hsv_to_rgb(hue, 0.75, value)
-    return round(255 * red), round(255 * green), round(255 * blue)

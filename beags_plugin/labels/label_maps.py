@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.labels.class_ids import IGNORE
 
 NARROW_IGNORE = 255  # stands for IGNORE in a map of uint8, so that 255 classes fit
 

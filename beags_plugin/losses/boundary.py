@@ -7,9 +7,9 @@ from typing import ClassVar
 
 from torch import Tensor
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.reduction import ordered_sum
-from beags_plugin.rasterizers.interface import IGNORE
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from beags_plugin.rasterizers.interface import IGNORE
-
 
 class ClassMembers:
     """The Gaussians of every class.
@@ -35,9 +33,3 @@ class ClassMembers:
             self._spans = {found: (first, end) for found, first, end in spans}
         first, end = self._spans.get(class_id, (0, 0))
         return self._order[first:end]
-
-
-def objects_in(labels: Tensor) -> list[int]:
-    """The ids of the objects that a mask [H, W] int shows, ascending: all but background (0) and IGNORE."""
-    found = torch.bincount(labels.reshape(-1)).nonzero()[:, 0].tolist()
-    return [class_id for class_id in found if class_id not in (0, IGNORE)]

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.lifting import lift
+from beags_plugin.labels.class_ids import IGNORE, objects_in
 from beags_plugin.losses.base import Loss, LossInputs
-from beags_plugin.losses.class_members import ClassMembers, objects_in
+from beags_plugin.losses.class_members import ClassMembers
 from beags_plugin.losses.reduction import ordered_sum
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.system.errors import UserError
 

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.label_maps import LabelMaps, widened
 from beags_plugin.ops import cuda_extension, extension
 from beags_plugin.ops.reprojection_votes import reprojection_votes
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system import processes
 from beags_plugin.system.errors import UserError
 

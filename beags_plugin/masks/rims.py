@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.labels.class_ids import IGNORE
 
 EPSILON = 1e-2  # variance of colour (0..1) below which the guide counts as flat
 

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.masks.depth_agreement import disagreement
 from beags_plugin.masks.pooled_votes import LOOKS, TorchVotes
 from beags_plugin.masks.reprojection import ReprojectedMask, check_counts, check_view
 from beags_plugin.masks.spatial_chunks import Slabs, slabs_of
 from beags_plugin.ops.voxel_votes import votes_for
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.filed_tensors import filed
 from beags_plugin.system.processes import each_view
 
@@ -43,8 +43,8 @@ def reproject_voxel(
     The points are lifted from what each view sees, so no vote passes through a surface; ``tau`` tells only which points
     neighbouring views both see.
     Cost O(V pixels), whatever the number of classes. Depth and masks are asked for several times, one view at a time:
-    they may lie on disk (``system.filed_tensors``). Where the voxels would take more than about 0.4 GB, space is cut into
-    slabs (``masks.spatial_chunks``) and the views are gone through once more for each; results are the same bits.
+    they may lie on disk (``system.filed_tensors``). Where the voxels would take more than about 0.4 GB, space is cut
+    into slabs (``masks.spatial_chunks``) and the views are gone through once more for each; results are the same bits.
     """
     check_counts(depths, cameras, labels, tau)
     if not cameras:

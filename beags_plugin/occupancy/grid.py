@@ -8,11 +8,11 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.ops import cuda_extension, extension
 from beags_plugin.ops.voxel_lookup import VoxelLookup
 from beags_plugin.ops.voxel_tally import VoxelTally
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.errors import UserError
 
 DENSE_BYTES = 256 * 2**20  # up to this size, validity is kept as one byte per class and voxel

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.evaluation.metrics import resize_nearest
 from beags_plugin.evaluation.records import EvalView
 from beags_plugin.evaluation.run_metrics import extracted_truth
 from beags_plugin.extraction.select import select_class
-from beags_plugin.labels.classes import colorize
+from beags_plugin.labels.class_ids import IGNORE, resize_nearest
+from beags_plugin.labels.colors import colorize
 from beags_plugin.pictures.cells import Square, below, cell, crop, square_around, wrapped, write_picture
-from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
+from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import surfel_inputs
 
 _WIDTH = 1920  # pixels; a view of many objects goes on below

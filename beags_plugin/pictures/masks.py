@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from beags_plugin.labels.classes import colorize
+from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.labels.colors import colorize
 from beags_plugin.pictures.cells import below, beside, cell, write_picture
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.errors import writing
 
 _WIDTH = 300  # pixels of a cell

@@ -17,10 +17,11 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import Densified
 from beags_plugin.core.splitting import split_in_two
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.label_maps import LabelMaps
-from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
+from beags_plugin.preparation.refiner import EditedScene
+from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs
-from beags_plugin.refiners.base import EditedScene
 from beags_plugin.system.errors import UserError
 
 

@@ -11,12 +11,13 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.labels.label_maps import LabelMaps, PackedMaps
 from beags_plugin.masks import REPROJECTIONS
-from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
+from beags_plugin.preparation.refiner import Progress
+from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
-from beags_plugin.refiners.base import Progress
 from beags_plugin.system.processes import each_view
 
 AUTO = "auto"

@@ -14,6 +14,7 @@ from beags_plugin.assignment.assignment import Assignment, assign_classes, check
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import Densified
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.labels.label_maps import LabelMaps, PackedMaps
 from beags_plugin.masks import REPROJECTIONS
@@ -29,6 +30,7 @@ from beags_plugin.preparation.consistent_masks import (
     reprojected_masks,
 )
 from beags_plugin.preparation.fewer_bands import without_unneeded_bands
+from beags_plugin.preparation.refiner import AssignedScene, EditedScene, Refiner
 from beags_plugin.preparation.stage_forms import ASSIGNMENT, BANDS, EDITED, GRID, MASKS
 from beags_plugin.preparation.stages import Stages, StageStore
 from beags_plugin.preparation.summary import (
@@ -38,9 +40,8 @@ from beags_plugin.preparation.summary import (
     reprojection_finding,
     split_finding,
 )
-from beags_plugin.rasterizers.interface import IGNORE, Rasterizer, RasterSettings
+from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import check_surface_depth
-from beags_plugin.refiners.base import AssignedScene, EditedScene, Refiner
 from beags_plugin.system.errors import UserError
 
 LEAST_K = 10  # nearer neighbours tell the noise of the depth rather than the distance of points

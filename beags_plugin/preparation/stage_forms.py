@@ -14,8 +14,8 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.label_maps import LabelMaps, PackedMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.preparation.consistent_masks import ConsistentMasks
+from beags_plugin.preparation.refiner import EditedScene
 from beags_plugin.preparation.stages import Form
-from beags_plugin.refiners.base import EditedScene
 
 
 def _tensors(holder: Any) -> dict[str, Tensor]:

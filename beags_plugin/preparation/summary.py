@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.assignment.assignment import Assignment
-from beags_plugin.refiners.base import EditedScene
+from beags_plugin.preparation.refiner import EditedScene
 
 
 def reprojection_finding(before: Sequence[Tensor | None], after: Sequence[Tensor]) -> str:

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.ops import cuda_extension
 from beags_plugin.rasterizers.autograd import (
     Drawing,
@@ -27,7 +28,7 @@ from beags_plugin.rasterizers.autograd import (
     Needed,
     check_image,
 )
-from beags_plugin.rasterizers.interface import IGNORE, RasterSettings, SurfelInputs, map_ids
+from beags_plugin.rasterizers.interface import RasterSettings, SurfelInputs, map_ids
 from beags_plugin.rasterizers.pair_counts import PairCounts, capacity_for
 from beags_plugin.system.errors import UserError
 

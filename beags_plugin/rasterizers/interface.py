@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.labels.class_ids import IGNORE
 
-IGNORE = 65535  # class id of an unlabelled pixel: it neither votes nor is penalised
 MIN_ALPHA = 1.0 / 255.0  # weaker contributions are skipped: they are invisible in 8 bits
 LARGEST = 1e18  # world units: surfels larger, or further off in depth, count as broken; their squares overflow float32
 MAX_ALPHA = 0.99  # keeps 1 - alpha, a divisor in the backward, away from 0

@@ -10,9 +10,9 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.rasterizers.interface import (
-    IGNORE,
     MIN_TRANSMITTANCE,
     Rasterizer,
     RasterOutputs,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from beags_plugin.occupancy.build import build_visibility_grid
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.refiners.base import AssignedScene, Progress, Refiner
+from beags_plugin.preparation.refiner import AssignedScene, Progress, Refiner
 
 
 class BeaRefiner(Refiner):

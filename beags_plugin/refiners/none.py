@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from beags_plugin.refiners.base import AssignedScene, Progress, Refiner
+from beags_plugin.preparation.refiner import AssignedScene, Progress, Refiner
 
 
 class NoRefiner(Refiner):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.labels.class_ids import IGNORE
 
 SMALLEST = 0.0005  # share of the image that an area must cover
 RIM = 0.003  # of the image diagonal: contradiction this near an outline is that of any mask

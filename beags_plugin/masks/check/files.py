@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from beags_plugin.data.files import IMAGE_SUFFIXES, image_size
-from beags_plugin.labels.classes import BACKGROUND, read_mask
+from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
+from beags_plugin.labels.classes import read_mask
 from beags_plugin.masks.check.issues import STOPS, Finding, named, percent
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.errors import UserError
 
 FEW_VIEWS = 3  # an object needs two other views to outvote one

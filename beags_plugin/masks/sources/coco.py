@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo, stacked
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import MOST_BYTES_OF_MASKS, load_json, reason
 

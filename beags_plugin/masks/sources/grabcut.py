@@ -10,12 +10,12 @@ from typing import ClassVar
 import numpy as np
 import torch
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.masks.reprojection import reproject_pairwise
 from beags_plugin.masks.sources.base import Geometry, MadeMasks, MaskSource, Progress, SourceScene, stacked
 from beags_plugin.masks.sources.prompts import Prompt, PromptedObject, read_prompts
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.errors import UserError
 
 _ITERATIONS = 5

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import read_class_map, read_classes
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo
 from beags_plugin.masks.sources.matching import files_by_name
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.images import read_image
 

@@ -9,9 +9,9 @@ from typing import Literal
 
 import numpy as np
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo
 from beags_plugin.masks.sources.matching import files_by_name
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.arrays import load_array
 from beags_plugin.system.reading.text import reason

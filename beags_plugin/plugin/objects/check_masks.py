@@ -12,6 +12,7 @@ import numpy as np
 
 from beags_plugin.data.files import image_size, photo_names
 from beags_plugin.data.scene import Scene
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import read_classes
 from beags_plugin.masks.check.areas import Area, contradicted
 from beags_plugin.masks.check.consistency import Agreement, labels_at, ranks_of
@@ -25,7 +26,6 @@ from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParse
 from beags_plugin.plugin.views.lens import project_through_lens
 from beags_plugin.plugin.views.poses import PosedViews
 from beags_plugin.plugin.views.seed_points import random_points, starting_points
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.progress import progress_bar
 

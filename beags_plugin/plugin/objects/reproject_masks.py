@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import torch
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import write_class_map
 from beags_plugin.labels.label_maps import LabelMaps, PackedMaps
 from beags_plugin.pictures.masks import Changed, before_and_after
@@ -22,7 +23,6 @@ from beags_plugin.plugin.objects.extract import read_scene
 from beags_plugin.preparation.consistent_masks import chosen_reprojection, render_depths, reprojected_masks
 from beags_plugin.preparation.pipeline import known_classes
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.filed_tensors import filed
 from beags_plugin.system.progress import counted, progress_bar

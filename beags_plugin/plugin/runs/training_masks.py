@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from beags_plugin.evaluation.metrics import resize_nearest
+from beags_plugin.labels.class_ids import resize_nearest
 from beags_plugin.labels.classes import read_class_map, read_mask
 from beags_plugin.plugin.runs.layout import last_prepared
 from beags_plugin.plugin.views.views import unique_names

@@ -18,7 +18,8 @@ from beags_plugin.evaluation.records import EvalView
 from beags_plugin.evaluation.run_metrics import extracted_mask, extracted_truth
 from beags_plugin.evaluation.violations import boundary_errors, occupancy_violations
 from beags_plugin.extraction.select import select_class
-from beags_plugin.labels.classes import BACKGROUND, colorize
+from beags_plugin.labels.class_ids import BACKGROUND
+from beags_plugin.labels.colors import colorize
 from beags_plugin.rasterizers.rendering import draw_class_map, surfel_inputs
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.memory import memory_mb, peak_memory_mb

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beags_plugin.labels.classes import colorize
+from beags_plugin.labels.colors import colorize
 
 _LONGEST = 40  # characters of a name that the panel's width has room for
 
@@ -23,7 +23,7 @@ class LegendRow:
 
 
 def legend(rows: Iterable[LegendRow]) -> str:
-    """A table of classes in their colours: see ``labels.classes.colorize``, on which class maps depend too."""
+    """A table of classes in their colours: see ``labels.colors.colorize``, on which class maps depend too."""
     lines = ["| | object | Gaussians |", "|---|---|---:|"]
     for row in rows:
         name = escaped(shortened(row.name))

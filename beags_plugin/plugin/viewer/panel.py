@@ -53,8 +53,8 @@ class ViewerLink(ViewerControl):
 class ObjectPanel(ViewerElement[None]):
     """All controls of ours, as one element, so that they stand in this order and not in that of their names.
 
-    They change ``plugin.viewer.choice``, never the scene. What takes time happens in threads of the panel's own: no control
-    waits for a training step but the click that picks, and none runs in a render thread.
+    They change ``plugin.viewer.choice``, never the scene. What takes time happens in threads of the panel's own: no
+    control waits for a training step but the click that picks, and none runs in a render thread.
     """
 
     def __init__(self, viewing: Viewing) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.labels.classes import colorize
+from beags_plugin.labels.colors import colorize
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.evaluation.metrics import resize_nearest
+from beags_plugin.labels.class_ids import resize_nearest
 from beags_plugin.labels.classes import read_class_map
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, prepared_digests, preparing_run, round_digest, round_folder

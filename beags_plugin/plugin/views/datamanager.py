@@ -22,8 +22,8 @@ from torch import Tensor
 
 import beags_plugin.plugin.nerfstudio_patches  # noqa: F401  (checkpoints load again)
 from beags_plugin.core.cameras import Camera
+from beags_plugin.labels.class_ids import IGNORE, objects_in
 from beags_plugin.labels.label_maps import PackedMap, narrowed, widened
-from beags_plugin.losses.class_members import objects_in
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig, absolute
 from beags_plugin.plugin.views.dataset import BeagsDataset
@@ -37,7 +37,6 @@ from beags_plugin.plugin.views.undistortion import (
     undistort_image,
 )
 from beags_plugin.plugin.views.views import View, unique_names
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system import processes
 from beags_plugin.system.errors import UserError
 

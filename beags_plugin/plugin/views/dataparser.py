@@ -22,10 +22,10 @@ from beags_plugin.data.labels import read_class_names
 from beags_plugin.data.layout import read_scene
 from beags_plugin.data.scene import ColmapModel, MaskKind, Scene, TransformsFile
 from beags_plugin.data.split import split_views
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.plugin.views.cameras import check_cameras, downscaled_size, resize_cameras
 from beags_plugin.plugin.views.poses import Normalization, PosedViews, read_poses
 from beags_plugin.plugin.views.seed_points import starting_points
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.errors import UserError
 
 LEAST_PIXELS = 2  # of a side that was scaled down; fewer show nothing

@@ -9,8 +9,8 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 
+from beags_plugin.labels.class_ids import IGNORE, resize_nearest
 from beags_plugin.plugin.views.cameras import downscaled_size, resize_cameras
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.images import read_image
 
@@ -71,7 +71,7 @@ class BeagsDataset(InputDataset):
             class_map = np.full((height, width), IGNORE, np.uint16)
         else:
             ids = read_mask(path, self.metadata["mask_kind"], self.metadata["ignore_ids"])
-            class_map = resize_nearest(ids, width, height)
+            class_map = resize_nearest(ids, height, width)
         return {"class_map": torch.from_numpy(class_map)}
 
 
@@ -80,13 +80,3 @@ def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
     if image.shape[:2] == (height, width):
         return image
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-
-
-def resize_nearest(class_map: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Take of a map [H, W] the pixel in which the centre of each of the ``width`` x ``height`` new pixels lies."""
-    rows, columns = (
-        # In integers: (i + 0.5) old / new, rounded down. (cv2's nearest takes i old / new, half a new pixel off.)
-        (2 * np.arange(new) + 1) * old // (2 * new)
-        for new, old in ((height, class_map.shape[0]), (width, class_map.shape[1]))
-    )
-    return np.ascontiguousarray(class_map[rows[:, None], columns])

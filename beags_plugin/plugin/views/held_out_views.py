@@ -12,11 +12,10 @@ from torch import Tensor
 
 from beags_plugin.data.files import image_size
 from beags_plugin.data.ground_truth import GroundTruth
-from beags_plugin.evaluation.metrics import resize_nearest
 from beags_plugin.evaluation.records import EvalView
+from beags_plugin.labels.class_ids import IGNORE, resize_nearest
 from beags_plugin.labels.classes import read_binary_mask, read_mask
 from beags_plugin.plugin.model import fixed_background
-from beags_plugin.rasterizers.interface import IGNORE
 from beags_plugin.system.errors import UserError
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import numpy as np
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
 
-from beags_plugin.rasterizers.interface import IGNORE
+from beags_plugin.labels.class_ids import IGNORE
 
 
 def has_lens(cameras: Cameras, index: int) -> bool:
