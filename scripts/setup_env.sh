@@ -49,7 +49,8 @@ source_now="$(pwd) $({
   printf '%s\n' pyproject.toml CMakeLists.txt
   printf '%s\n' cmake/cuda.cmake
   find beags_plugin -type f -name '*.[ch]*' ! -name '*.pyc'
-} | digest)"
+} | digest) $(find beags_plugin -name '*.py' | sort | sha256sum | cut -c1-16)"
+# The editable install maps every module to its file, so a module that moved needs a new one.
 packages_before="$(cat "$env/.beags-packages" 2>/dev/null || true)"
 source_before="$(cat "$env/.beags-source" 2>/dev/null || true)"
 

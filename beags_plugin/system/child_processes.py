@@ -1,7 +1,8 @@
 """Processes that end with the one that started them, however that ends (Linux; elsewhere nothing is done).
 
-A training, a viewer or a browser that has lost who waits for it would go on by itself. ``python
-system/child_processes.py PARENT SIGNAL COMMAND...`` asks the kernel for the signal at the parent's end and becomes the command.
+A training, a viewer or a browser that has lost who waits for it would go on by itself.
+``python system/child_processes.py PARENT SIGNAL COMMAND...`` asks the kernel for the signal at the parent's end and
+becomes the command.
 """
 
 from __future__ import annotations
