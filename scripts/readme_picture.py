@@ -19,7 +19,7 @@ from beags_plugin.pictures.contact_sheet import mask_overlay
 from beags_plugin.pictures.objects import draw_alone
 from beags_plugin.pictures.orbit import orbit, orbit_settings, stand_of
 from beags_plugin.plugin.objects.evaluate import EvaluatedRun
-from beags_plugin.plugin.objects.export import training_viewpoints
+from beags_plugin.plugin.runs.read import training_viewpoints
 
 
 @dataclass

@@ -22,7 +22,7 @@ sys.path.append(str(Path(__file__).parents[1] / "tests"))
 from browser import Page  # noqa: E402
 from viewer_pages import viewed  # noqa: E402
 
-from beags_plugin.plugin.objects.extract import load_scene  # noqa: E402
+from beags_plugin.plugin.runs.read import load_scene  # noqa: E402
 from beags_plugin.system.errors import UserError  # noqa: E402
 
 

@@ -85,7 +85,7 @@ def write_trained(
     scale: of the world, with its cameras.
     """
     from beags_plugin.plugin.options.config import base_config
-    from beags_plugin.plugin.runs.layout import write_run
+    from beags_plugin.plugin.runs.write import write_run
 
     config = base_config()
     config.run_dir = folder

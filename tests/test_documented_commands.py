@@ -88,7 +88,8 @@ def folder(tmp_path_factory):
     write_scene(root / "my_scene")
     for name in ("run", "other"):
         config = write_trained(root / name, root / "my_scene")
-    from beags_plugin.plugin.objects.extract import extract_objects, load_scene
+    from beags_plugin.plugin.objects.extract import extract_objects
+    from beags_plugin.plugin.runs.read import load_scene
 
     extract_objects(config.parent.parent / "run/config.yml", ["cup"])
     write_ply(root / "scene.ply", load_scene(config).surfels())

@@ -75,7 +75,7 @@ def test_each_loss_has_its_own_curve(trained):
 
 
 def test_the_base_is_kept_apart_and_has_classes(trained):
-    from beags_plugin.plugin.objects.extract import load_scene
+    from beags_plugin.plugin.runs.read import load_scene
 
     folder, _ = trained
     base, refined = load_scene(folder / "base" / "config.yml"), load_scene(folder / "config.yml")
@@ -105,7 +105,7 @@ def extracted(trained):
 
 
 def test_extraction_writes_a_run_and_a_ply_per_object(trained, extracted):
-    from beags_plugin.plugin.objects.extract import load_scene
+    from beags_plugin.plugin.runs.read import load_scene
 
     folder, _ = trained
     whole = load_scene(folder / "config.yml")
@@ -168,7 +168,8 @@ def test_export_writes_every_object_and_the_background(trained, tmp_path):
 
 
 def test_removing_an_object_keeps_the_rest(trained):
-    from beags_plugin.plugin.objects.extract import extract_objects, load_scene
+    from beags_plugin.plugin.objects.extract import extract_objects
+    from beags_plugin.plugin.runs.read import load_scene
 
     folder, _ = trained
     whole = load_scene(folder / "config.yml")
@@ -203,7 +204,7 @@ def test_refine_starts_from_a_base_run(trained, data, tmp_path):
 
 
 def test_refiner_none_leaves_the_scene_as_it_is(trained, data, tmp_path):
-    from beags_plugin.plugin.objects.extract import load_scene
+    from beags_plugin.plugin.runs.read import load_scene
 
     folder, _ = trained
     code, text = run(
@@ -218,7 +219,7 @@ def test_refiner_none_leaves_the_scene_as_it_is(trained, data, tmp_path):
 
 
 def test_a_run_that_was_refining_is_resumed_with_its_classes_and_masks(trained, data, tmp_path):
-    from beags_plugin.plugin.objects.extract import load_scene
+    from beags_plugin.plugin.runs.read import load_scene
 
     folder, _ = trained
     code, text = run(
@@ -235,8 +236,8 @@ def test_a_run_that_was_refining_is_resumed_with_its_classes_and_masks(trained, 
 
 
 def test_a_second_round_makes_masks_again_also_after_a_resume(trained, data, tmp_path):
-    from beags_plugin.plugin.objects.extract import load_scene
     from beags_plugin.plugin.runs.layout import last_prepared
+    from beags_plugin.plugin.runs.read import load_scene
 
     folder, _ = trained
     options = (

@@ -22,7 +22,8 @@ from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.plugin.model import BeagsModel
 from beags_plugin.plugin.objects.evaluate import EvaluatedRun, evaluate_run
-from beags_plugin.plugin.objects.extract import extract_objects, load_run_config
+from beags_plugin.plugin.objects.extract import extract_objects
+from beags_plugin.plugin.runs.run_config import load_run_config
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.rasterizers.rendering import surfel_inputs

@@ -25,7 +25,8 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.extraction.select import select_class
 from beags_plugin.plugin.objects.evaluate import EvaluatedRun
 from beags_plugin.plugin.options.config import base_config
-from beags_plugin.plugin.runs.layout import TRANSFORM_FILE, write_run
+from beags_plugin.plugin.runs.layout import TRANSFORM_FILE
+from beags_plugin.plugin.runs.write import write_run
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.sample.views import View, make_views
 

@@ -13,7 +13,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.photometric import ssim
 from beags_plugin.plugin.options.schedule import PhaseSchedule
-from beags_plugin.plugin.training.held_out import HeldOutCurve
+from beags_plugin.plugin.training.monitor import HeldOutCurve
 from beags_plugin.plugin.views.views import View
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings

@@ -44,7 +44,7 @@ def test_the_papers_preset_changes_nothing_but_what_is_chosen_by_size():
     assert (model.prepare.reprojection, documented.prepare.reprojection) == ("pairwise", "auto")
     assert replace(model, prepare=replace(model.prepare, reprojection="auto")) == documented
     assert (model.split.rounds, model.losses["silhouette"].weight, model.prepare.min_confidence) == (0, 0.0, 0.0)
-    assert model.refine_position_lr_factor == model.refine_shape_lr_factor == 1.0
+    assert model.refine_position_lr_factor == 1.0
 
 
 @pytest.mark.parametrize("name", preset_names())

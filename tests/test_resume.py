@@ -29,7 +29,7 @@ from resumed_runs import (
 )
 from run_folders import write_scene
 
-from beags_plugin.plugin.objects.extract import read_scene
+from beags_plugin.plugin.runs.read import read_scene
 from beags_plugin.plugin.trainer import BeagsTrainer
 from beags_plugin.preparation import pipeline as preparation
 from beags_plugin.system.child_processes import bound

@@ -164,47 +164,9 @@ def test_official_learning_rates(model):
     assert rates(29_999) == pytest.approx({"means": 2.5 * 1.6e-6, **constant}, rel=1e-3)
     assert all(configs[name]["optimizer"].eps == 1e-15 for name in configs)
     model.config.refine_position_lr_factor = 10.0  # of refinement alone
-    model.config.refine_shape_lr_factor = 3.0
     assert rates(29_999)["means"] == pytest.approx(2.5 * 1.6e-6, rel=1e-3)
     model.schedule = PhaseSchedule(30_000, 3_000, 30_000)
-    assert rates(30_000) == pytest.approx(
-        {"means": 2.5 * 1.6e-4 * 100**-0.9 * 10, **constant, "scales": 0.015, "quats": 0.003}
-    )
-
-
-def test_a_short_base_starts_with_larger_rates_and_refinement_does_not(model):
-    from beags_plugin.plugin.options.config import base_config
-    from beags_plugin.plugin.training.callbacks import set_learning_rates
-
-    configs = base_config().optimizers
-    optimizers = {name: torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))]) for name in configs}
-    model.schedule = PhaseSchedule(3_000, 200, 30_000)
-
-    def rates(step, power):
-        model.config.base_lr_power = power
-        set_learning_rates(model, optimizers, configs, step)
-        return {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.items()}
-
-    for step, factor in ((0, 10**0.9), (1_500, 10**0.45), (3_000, 1.0), (3_100, 1.0)):  # log-linear in between
-        expected = {name: rate * factor for name, rate in rates(step, 0.0).items()}
-        assert rates(step, 0.9) == pytest.approx(expected)
-
-
-@pytest.mark.parametrize(
-    ("schedule", "factor"),
-    [
-        (PhaseSchedule(7_500, 0, 30_000), 4.0),
-        (PhaseSchedule(7_500, 0, 0), 4.0),  # whatever length the other steps are stated for
-        (PhaseSchedule(100, 0, 30_000), 16.0),  # bounded
-        (PhaseSchedule(30_000, 0, 30_000), 1.0),
-        (PhaseSchedule(60_000, 0, 30_000), 1.0),
-        (PhaseSchedule(0, 3_000, 30_000), 1.0),
-        (PhaseSchedule(3_000, 0, 30_000, warm=True), 1.0),
-    ],
-)
-def test_how_much_larger_the_rates_of_a_base_start(schedule, factor):
-    assert schedule.first_rate_factor(1.0) == factor
-    assert schedule.first_rate_factor(0.0) == 1.0
+    assert rates(30_000) == pytest.approx({"means": 2.5 * 1.6e-4 * 100**-0.9 * 10, **constant})
 
 
 def test_only_steps_of_growth_are_drawn_with_what_growth_looks_at(model):
@@ -232,7 +194,7 @@ def test_only_steps_of_growth_are_drawn_with_what_growth_looks_at(model):
 
     assert gathered(5_000) > 0  # no multiple of 100 steps is done: nothing grows
     assert float(densifier.statistics.views.max()) == 1
-    assert gathered(14_997) > 0 and model.drawn.screen_shift is not None
-    assert gathered(15_000) == 0 and model.drawn.screen_shift is None
+    assert gathered(14_997) > 0 and model.last_render.screen_shift is not None
+    assert gathered(15_000) == 0 and model.last_render.screen_shift is None
     densifier.config = SimpleNamespace(stop=10**9)
     assert gathered(29_999) == 0  # the last step of the base prepares for what follows

@@ -47,7 +47,7 @@ def test_masks_of_a_former_run_in_the_folder_are_not_shown_while_a_base_is_train
     run = window.model.viewing.run
     assert run.mask(0, "before", 20, 12) is not None and run.mask(0, "after", 20, 12) is None
     assert not run.has_grid and not run.load_grid()
-    window.model.viewing.rounds = lambda: 1  # as the switch to refinement says once it is done
+    window.model.prepared_rounds = 1  # as the switch to refinement says once it is done
     first = run.mask(0, "after", 20, 12)
     path = tmp_path / "run/prepared/masks" / f"{run.names[0]}.png"
     write_class_map(path, np.zeros((12, 20), np.uint8))  # prepared again

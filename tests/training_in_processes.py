@@ -37,7 +37,7 @@ def worker(local_rank: int, world_size: int, config, global_rank: int = 0) -> No
     def noted(self, step):
         found = iteration(self, step)
         counts.append(self._model.num_points)
-        views.append(int(self._model.drawn.camera.viewmat.sum() * 1e6))
+        views.append(int(self._model.last_render.camera.viewmat.sum() * 1e6))
         return found
 
     trainer.BeagsTrainer.train_iteration = noted

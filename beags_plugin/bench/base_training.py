@@ -24,7 +24,7 @@ from beags_plugin.bench.run import TABLE_WIDTH, Options, adapted, scenes_of
 from beags_plugin.bench.runner import Outcome, run_trials
 from beags_plugin.bench.scenes import Scene
 from beags_plugin.bench.trials import MODEL, Trial, steps_of
-from beags_plugin.plugin.training.held_out import CURVE
+from beags_plugin.plugin.training.monitor import CURVE
 from beags_plugin.system.digests import code_digest
 from beags_plugin.system.progress import progress_bar
 
@@ -37,7 +37,7 @@ Curve = Sequence[Mapping[str, float]]
 class Row:
     """A variant's base on a scene.
 
-    curve: records of ``plugin.training.held_out``; empty with the reason in ``failed``.
+    curve: records of ``plugin.training.monitor``; empty with the reason in ``failed``.
     """
 
     scene: str

@@ -131,8 +131,7 @@ def load_views(options: Options, views: int) -> Scene:
     from beags_plugin.bench.bases import trained_base
     from beags_plugin.commands.demo import make_sample
     from beags_plugin.labels.classes import read_class_map
-    from beags_plugin.plugin.objects.evaluate import raster_settings
-    from beags_plugin.plugin.objects.extract import read_scene, read_transform
+    from beags_plugin.plugin.runs.read import raster_settings, read_scene, read_transform
     from beags_plugin.rasterizers import make_rasterizer
     from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
 

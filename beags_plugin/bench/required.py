@@ -23,7 +23,7 @@ from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import progress_bar
 
 if TYPE_CHECKING:
-    from beags_plugin.plugin.objects.extract import SavedScene
+    from beags_plugin.plugin.runs.read import SavedScene
     from beags_plugin.plugin.views.datamanager import BeagsDataManager
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets

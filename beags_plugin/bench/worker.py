@@ -133,8 +133,8 @@ def trial_config(request: dict[str, Any], run_folder: Path) -> BeagsTrainerConfi
 
 
 def _gaussians(config: BeagsTrainerConfig) -> int:
+    from beags_plugin.plugin.runs.checkpoint_file import read_checkpoint
     from beags_plugin.plugin.runs.layout import newest_checkpoint
-    from beags_plugin.plugin.training.resumable import read_checkpoint
 
     checkpoint = read_checkpoint(newest_checkpoint(config.get_checkpoint_dir()))
     return len(checkpoint["pipeline"]["_model.class_ids"])

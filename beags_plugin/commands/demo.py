@@ -23,7 +23,7 @@ from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_whole
 
 if TYPE_CHECKING:
-    from beags_plugin.plugin.model import BeagsModelConfig
+    from beags_plugin.plugin.options.model_options import BeagsModelConfig
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 QUICK_PIXELS = 50_000  # a folder of the user's is scaled down to at most so many pixels a view, to end in minutes

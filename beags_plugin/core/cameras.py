@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+EXTENT_MARGIN = 1.1  # the scene's extent is 1.1 x the largest distance of a camera from their mean (method, section 1)
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -78,3 +80,10 @@ def viewmat_from_opengl(camera_to_world: Tensor) -> Tensor:
     viewmat[..., :3, 3:] = -world_to_camera @ camera_to_world[..., :3, 3:]
     viewmat[..., 3, 3] = 1.0
     return viewmat
+
+
+def camera_extent(camera_to_worlds: Tensor) -> Tensor:
+    """Size of the scene: 1.1 x the largest distance of a camera [V, 3, 4] from the mean of all; 1 for a single one."""
+    centers = camera_to_worlds[..., :3, 3].float()
+    extent = EXTENT_MARGIN * (centers - centers.mean(dim=0)).norm(dim=-1).max()
+    return extent if float(extent) > 0 else torch.ones(())

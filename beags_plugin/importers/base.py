@@ -46,8 +46,8 @@ class Importer(ABC):
         """The scene in ``path``; raises ``UserError`` if it cannot be read. Counts and sizes are not to be trusted."""
 
 
-def find_importer(path: Path, wanted: str = "auto") -> Importer:
-    """The importer called ``wanted``, or the one that ``path`` is for.
+def find_importer(path: Path) -> Importer:
+    """Return the importer that recognises ``path``.
 
     Raises ``UserError`` if there is no ``path``, no such importer, or none or several that take ``path``.
     """
@@ -55,13 +55,11 @@ def find_importer(path: Path, wanted: str = "auto") -> Importer:
 
     if not path.exists():
         raise UserError(f"{path} does not exist: name a .ply, a checkpoint or a run to start from.")
-    if wanted != "auto":
-        return IMPORTERS.get(wanted)()
     importers: dict[str, Importer] = {name: IMPORTERS.get(name)() for name in IMPORTERS.names()}
     fitting = [name for name, importer in importers.items() if importer.recognises(path)]
     if not fitting:
         known = "; ".join(importer.marks for importer in importers.values())
         raise UserError(f"{path} is nothing to start from: name one of these: {known}.")
     if len(fitting) > 1:
-        raise UserError(f"{path} can be read as {' or '.join(fitting)}: choose one with --pipeline.model.start-format.")
+        raise UserError(f"{path} can be read as {' or '.join(fitting)}: export it as a .ply and name that.")
     return importers[fitting[0]]

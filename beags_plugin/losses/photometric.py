@@ -129,3 +129,8 @@ def _band(dtype: torch.dtype, device: torch.device) -> Tensor:
     for output in range(_BLOCK):
         band[output : output + WINDOW, output] = window
     return band.to(device, dtype)
+
+
+def psnr(image: Tensor, other: Tensor) -> Tensor:
+    """Return the peak signal-to-noise ratio of two images with values in 0..1, [] in dB; at most 100."""
+    return -10.0 * torch.log10((image - other).square().mean().clamp_min(1e-10))

@@ -8,34 +8,33 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import gettempdir
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from beags_plugin.plugin.runs.layout import PREPARED, REPORT_FILE, STAGES, write_text_atomically
+from beags_plugin.plugin.options.config import BeagsTrainerConfig
+from beags_plugin.plugin.options.machine import check_machine
+from beags_plugin.plugin.runs.layout import PREPARED, REPORT_FILE, STAGES
 from beags_plugin.plugin.training.checkpoints import Checkpoints
-from beags_plugin.plugin.training.held_out import HeldOutCurve
 from beags_plugin.plugin.training.memory_guard import NO_MEMORY, MemoryWatch, check_memory, forecast, is_out_of_memory
+from beags_plugin.plugin.training.monitor import HeldOutCurve
 from beags_plugin.plugin.training.optimizers import JointOptimizers
-from beags_plugin.plugin.training.replicas import Rank, check_machine
-from beags_plugin.plugin.training.resumable import GlobalRandom, Part
-from beags_plugin.plugin.training.run_seconds import Estimate, StageSeconds
+from beags_plugin.plugin.training.replicas import Rank
+from beags_plugin.plugin.training.resumable import GlobalRandom, Resumable
+from beags_plugin.plugin.training.scene_model import SceneModel
+from beags_plugin.plugin.training.timing import Estimate, StageSeconds
 from beags_plugin.plugin.training.warm_start import check_start, start_from_scene
+from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system import processes
 from beags_plugin.system.errors import UserError, is_of_disk, refused
 from beags_plugin.system.interrupts import Interrupts, stop
 from beags_plugin.system.lock import RunLock, run_lock
 from beags_plugin.system.memory import memory_mb, peak_memory_mb
 from beags_plugin.system.reading.text import reason
-from beags_plugin.system.whole_files import remove_unfinished
-
-if TYPE_CHECKING:
-    from beags_plugin.plugin.model import BeagsModel
-    from beags_plugin.plugin.options.config import BeagsTrainerConfig
-    from beags_plugin.plugin.views.datamanager import BeagsDataManager
+from beags_plugin.system.whole_files import remove_unfinished, write_text_atomically
 
 
 class BeagsTrainer(Trainer):
@@ -48,6 +47,7 @@ class BeagsTrainer(Trainer):
         self.last_step = config.max_num_iterations or self.schedule.total
         config.max_num_iterations = self.last_step
         self.curve: HeldOutCurve | None = None
+        self.seconds = StageSeconds()
         self._interrupts = Interrupts(self._go_on)
         self._lock: RunLock | None = None
         self._watch = MemoryWatch(config.machine.device_type)
@@ -58,8 +58,8 @@ class BeagsTrainer(Trainer):
         self._checkpoints = Checkpoints(config, self.base_dir, self.checkpoint_dir)
 
     @property
-    def _model(self) -> BeagsModel:
-        return cast("BeagsModel", self.pipeline.model)
+    def _model(self) -> SceneModel:
+        return cast(SceneModel, self.pipeline.model)
 
     def setup(self, test_mode: Any = "val") -> None:
         """Load data, build the model, load a checkpoint; a user's mistake ends here, with one sentence."""
@@ -97,7 +97,7 @@ class BeagsTrainer(Trainer):
         """Stop where the run would not fit the machine, hours before it would be ended without a word."""
         if not self.config.check_memory or processes.rank() > 0:
             return
-        datamanager = cast("BeagsDataManager", self.pipeline.datamanager)
+        datamanager = cast(BeagsDataManager, self.pipeline.datamanager)
         sizes = datamanager.train_dataset.file_sizes, datamanager.eval_dataset.file_sizes
         points, program = self._model.num_points, memory_mb()
         grows = self.config.model_config.start_from is None and self._start_step < self.schedule.base_steps
@@ -145,7 +145,7 @@ class BeagsTrainer(Trainer):
         A scene to start from takes its place before: the optimizers hold what they are built with.
         """
         if self.config.model_config.start_from is not None and not self._checkpoints.loads:
-            start_from_scene(self._model, cast("BeagsDataManager", self.pipeline.datamanager), self.base_dir)
+            start_from_scene(self._model, cast(BeagsDataManager, self.pipeline.datamanager), self.base_dir)
         return JointOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups(), self._model.clock)
 
     def train(self) -> None:
@@ -157,8 +157,8 @@ class BeagsTrainer(Trainer):
 
     def _train(self) -> None:
         self.config.max_num_iterations = max(self.last_step - self._start_step, 0)
-        self._seconds = StageSeconds(self._model)
-        self.keep("seconds", self._seconds)
+        self.seconds.start()
+        self.keep("seconds", self.seconds)
         if self.config.max_num_iterations == 0:
             if self.loaded_run == self.base_dir.absolute() and not (self.base_dir / REPORT_FILE).exists():
                 return self._write_report()  # killed after its last checkpoint
@@ -174,7 +174,7 @@ class BeagsTrainer(Trainer):
         remove_unfinished(self.base_dir)
         (self.base_dir / REPORT_FILE).unlink(missing_ok=True)  # it says that the run is complete
         if self.config.steps_per_held_out > 0:
-            datamanager = cast("BeagsDataManager", self.pipeline.datamanager)
+            datamanager = cast(BeagsDataManager, self.pipeline.datamanager)
             self.curve = HeldOutCurve(
                 self.base_dir, self.config.steps_per_held_out, self.last_step, self._model, datamanager
             )
@@ -227,14 +227,14 @@ class BeagsTrainer(Trainer):
         """The folder of the run whose training goes on here; None where nothing was loaded."""
         return self._checkpoints.loaded_run
 
-    def keep(self, name: str, part: Part) -> None:
+    def keep(self, name: str, part: Resumable) -> None:
         """Let checkpoints hold the state of ``part``; it goes on from what the loaded one holds, if that does."""
         self._checkpoints.keep(name, part)
 
     def _load_checkpoint(self) -> None:
         path = self._checkpoints.path
         if path is not None:
-            self._start_step = self._checkpoints.restore(path, self)
+            self._start_step = self._checkpoints.restore(path, self.pipeline, self.optimizers, self.grad_scaler)
             return
         if self.schedule.base_steps == 0 and self.config.model_config.start_from is None:
             raise UserError(
@@ -248,7 +248,7 @@ class BeagsTrainer(Trainer):
     def save_checkpoint(self, step: int) -> None:
         """Save all that decides the rest of the run, whole or not at all."""
         if not self._complete:  # nerfstudio saves at the end too, under a number of its own
-            self._checkpoints.save(step, self)
+            self._checkpoints.save(step, self.pipeline, self.optimizers, self.grad_scaler)
 
     # -- breaks --------------------------------------------------------------------------------------------------------
 
@@ -297,7 +297,7 @@ class BeagsTrainer(Trainer):
         super()._after_train()
 
     def _write_report(self) -> None:
-        report = {"seconds": self._seconds.total(), "peak_memory_mb": peak_memory_mb()}
+        report = {"seconds": self.seconds.total(), "peak_memory_mb": peak_memory_mb()}
         write_text_atomically(json.dumps(report, indent=2), self.base_dir / REPORT_FILE)
         if not self.config.keep_stages:  # a complete run asks for them no more
             shutil.rmtree(self.base_dir / PREPARED / STAGES, ignore_errors=True)

@@ -9,6 +9,12 @@ from typing import Any
 from beags_plugin.system.errors import UserError
 
 
+def load(spec: str) -> Any:
+    """Import what a ``"module:attribute"`` spec names."""
+    module, _, attribute = spec.partition(":")
+    return getattr(import_module(module), attribute)
+
+
 class Registry:
     """Names mapped to ``"module:attribute"`` specs; a spec is imported only when it is asked for.
 
@@ -49,8 +55,7 @@ class Registry:
         self._discover()
         if name not in self._specs:
             raise UserError(f"there is no {self.kind} {name!r}: choose one of {', '.join(self.names())}.")
-        module, _, attribute = self._specs[name].partition(":")
         try:
-            return getattr(import_module(module), attribute)
+            return load(self._specs[name])
         except (ImportError, AttributeError) as error:
             raise UserError(f"the {self.kind} {name!r} ({self._specs[name]}) cannot be loaded: {error}") from error

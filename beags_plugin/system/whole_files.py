@@ -33,6 +33,11 @@ def write_whole(path: Path, write: Callable[[BinaryIO], Any], beside: Path | Non
             raise
 
 
+def write_text_atomically(text: str, path: Path) -> None:
+    """Write UTF-8 text as ``write_whole`` does."""
+    write_whole(path, lambda file: file.write(text.encode("utf8")))
+
+
 def unfinished(path: Path, beside: Path | None = None) -> Path:
     """Where what becomes ``path`` is written first; beside: see ``write_whole``."""
     return (beside or path.parent) / f".{path.name}{PART}"

@@ -16,8 +16,8 @@ from parser_targets.target import Target
 
 def _checkpoint(path: Path) -> None:
     from beags_plugin.importers.checkpoint import _gaussians
-    from beags_plugin.plugin.runs.checkpoint_file import check_state
-    from beags_plugin.plugin.training.resumable import read_checkpoint, training_state
+    from beags_plugin.plugin.runs.checkpoint_file import check_state, read_checkpoint
+    from beags_plugin.plugin.training.resumable import training_state
 
     try:
         state = read_checkpoint(path)

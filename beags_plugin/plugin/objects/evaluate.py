@@ -15,12 +15,13 @@ from beags_plugin.evaluation.records import SceneMetrics
 from beags_plugin.evaluation.report import RunMetrics, Stage
 from beags_plugin.evaluation.run_metrics import evaluate_scene
 from beags_plugin.pictures.worst_views import By, WorstMask, draw_worst
-from beags_plugin.plugin.objects.extract import SavedScene, read_scene
+from beags_plugin.plugin.options.config import BeagsTrainerConfig
+from beags_plugin.plugin.options.model_options import fixed_background
 from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, EXTRACTION_FILE
+from beags_plugin.plugin.runs.read import SavedScene, data_of_run, raster_settings, read_scene
 from beags_plugin.plugin.views.held_out_views import HeldOutViews
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
-from beags_plugin.system.errors import UserError
+from beags_plugin.rasterizers.interface import Rasterizer
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.options.config import BeagsTrainerConfig
@@ -64,12 +65,8 @@ class EvaluatedRun:
     def views(self) -> HeldOutViews:
         """The held-out views; raises ``UserError`` if the run's data cannot be read."""
         config = self.stages["after"].config
-        if not (data := config.data_path).exists():
-            raise UserError(f"{self.config_path} was trained on {data}, which is gone: put it back.")
-        try:
-            return HeldOutViews(config, self.classes)
-        except UserError as error:
-            raise UserError(f"the data of {self.config_path} cannot be read: {error}") from error
+        manager = data_of_run(config, self.config_path, split="test")
+        return HeldOutViews(manager, self.classes, fixed_background(config.model_config))
 
     def metrics(self, protocol: Protocol | None = None, progress: Progress | None = None) -> RunMetrics:
         """The figures of all stages; arguments as of ``evaluate_run``."""
@@ -137,9 +134,3 @@ def scene_name(config: BeagsTrainerConfig) -> str:
     """The name of the run's data folder."""
     data = config.data_path
     return data.stem if data.suffix == ".json" else data.name
-
-
-def raster_settings(scene: SavedScene) -> RasterSettings:
-    """Depth range of a saved scene."""
-    extent, model = float(scene.state["extent"]), scene.config.model_config
-    return RasterSettings(model.near * extent, model.far * extent)

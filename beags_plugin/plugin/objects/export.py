@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,22 +17,21 @@ from beags_plugin.export.base import Exporter, NothingToExport, Piece, Viewpoint
 from beags_plugin.export.frames import Frame, bounding_box, check_placement
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.select import select_class
-from beags_plugin.plugin.objects.extract import (
+from beags_plugin.plugin.objects.extract import file_name, folder_names, objects_with_gaussians
+from beags_plugin.plugin.runs.read import (
     SavedScene,
-    file_name,
-    folder_names,
     load_scene,
-    objects_with_gaussians,
+    raster_settings,
     read_scene,
     read_transform,
+    training_viewpoints,
 )
 from beags_plugin.plugin.runs.run_config import load_run_config
-from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.system.errors import UserError
 
 if TYPE_CHECKING:
-    from beags_plugin.plugin.options.config import BeagsTrainerConfig
+    pass
 
 MANIFEST = "manifest.json"
 WHOLE = "whole scene"  # what stands for a class where all Gaussians go into one file
@@ -107,8 +106,6 @@ def export_run(
     views drawn for the meshes among them.
     Raises ``UserError`` for a mistake, before anything is written.
     """
-    from beags_plugin.plugin.objects.evaluate import raster_settings
-
     run, folder = config_path.parent, output or config_path.parent / "exports"
     check_placement(placement)
     exporters = {name: make_exporter(name, **(options or {}).get(name, {})) for name in formats}
@@ -254,28 +251,6 @@ def _free_path(folder: Path, title: str, suffix: str) -> Path:
     stem = file_name(title)
     names = chain([stem], (f"{stem}_{number}" for number in count(2)))
     return next(path for name in names if not (path := folder / f"{name}.{suffix}").exists())
-
-
-def training_viewpoints(config: BeagsTrainerConfig, settings: RasterSettings, config_path: Path) -> Viewpoints:
-    """The training views of a run, in its own frame; raises ``UserError`` if its data cannot be read.
-
-    settings: depth range of the scene. config_path: of the run, for messages.
-    """
-    from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
-
-    if not (data := config.data_path).exists():
-        raise UserError(f"{config_path} was trained on {data}, which is gone: put it back.")
-    try:
-        # Poses alone: no photo is read, and lens distortion does not matter to where one looks from.
-        parser = replace(config.data_config.dataparser, data=data).setup()
-        cameras = parser.get_dataparser_outputs(split="train").cameras
-    except UserError as error:
-        raise UserError(f"the data of {config_path} cannot be read: {error}") from error
-    return Viewpoints(
-        [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))],
-        make_rasterizer(config.model_config.rasterizer),
-        settings,
-    )
 
 
 def _write_manifest(folder: Path, origin: dict[str, str], exported: Sequence[Exported]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -11,28 +10,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
 from torch import Tensor
 
-from beags_plugin.core.surfels import Surfels
 from beags_plugin.extraction.ply import write_ply
 from beags_plugin.extraction.select import remove_class, select_class
-from beags_plugin.plugin.runs.checkpoint_file import check_state
-from beags_plugin.plugin.runs.layout import (
-    EXTRACTION_FILE,
-    TRANSFORM_FILE,
-    newest_checkpoint,
-    prepared_digests,
-    write_run,
-    write_text_atomically,
+from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, prepared_digests
+from beags_plugin.plugin.runs.read import (
+    SavedScene,
+    load_scene,
+    read_transform,
 )
-from beags_plugin.plugin.runs.run_config import load_run_config
-from beags_plugin.plugin.training.resumable import read_checkpoint
+from beags_plugin.plugin.runs.write import write_run
 from beags_plugin.system.errors import UserError, writing
-from beags_plugin.system.reading.text import load_json, reason
+from beags_plugin.system.whole_files import write_text_atomically
 
 if TYPE_CHECKING:
-    from beags_plugin.plugin.options.config import BeagsTrainerConfig
+    pass
 
 
 @dataclass(frozen=True)
@@ -43,54 +36,6 @@ class Extracted:
     config: Path
     ply: Path
     gaussians: int
-
-
-@dataclass(frozen=True)
-class SavedScene:
-    """A trained run as it lies on disk: config, model state (tensors by name), step and class names."""
-
-    config: BeagsTrainerConfig
-    state: dict[str, Any]
-    step: int
-    classes: dict[int, str]
-
-    def surfels(self) -> Surfels:
-        """The scene's N surfels."""
-        state = {name: self.state[f"gauss_params.{name}"] for name in ("means", "quats", "scales", "opacities")}
-        dc, rest = self.state["gauss_params.features_dc"], self.state["gauss_params.features_rest"]
-        return Surfels(state["means"], state["quats"], state["scales"], state["opacities"][:, 0], dc, rest)
-
-    @property
-    def assigned(self) -> bool:
-        """Whether the Gaussians have classes."""
-        return bool(self.state["assigned"])
-
-    @property
-    def class_ids(self) -> Tensor | None:
-        """[N] int32, phi; None before the Gaussians have classes."""
-        return self.state["class_ids"] if self.assigned else None
-
-
-def read_scene(config_path: Path) -> SavedScene:
-    """Read a run's newest checkpoint; raises ``UserError`` if the run is incomplete or the file is damaged."""
-    config = load_run_config(config_path)
-    path = newest_checkpoint(config.get_checkpoint_dir())
-    checkpoint = read_checkpoint(path)
-    prefix = "_model."
-    state = {name[len(prefix) :]: value for name, value in checkpoint["pipeline"].items() if name.startswith(prefix)}
-    check_state(state, path)
-    return SavedScene(config, state, checkpoint["step"], state["_extra_state"]["classes"])
-
-
-def load_scene(config_path: Path) -> SavedScene:
-    """Read a run's newest checkpoint; raises ``UserError`` if the run is incomplete or no class was assigned."""
-    scene = read_scene(config_path)
-    if not scene.assigned:
-        raise UserError(
-            f"{config_path.parent} is a base without classes: refine it first "
-            f"(ns-train beags-refine --load-dir {scene.config.get_checkpoint_dir()})."
-        )
-    return scene
 
 
 def extract_objects(
@@ -152,26 +97,6 @@ def _rows(state: dict[str, Any], index: Tensor) -> dict[str, Any]:
         name: value[index] if name in per_surfel or name.startswith("gauss_params.") else value
         for name, value in state.items()
     }
-
-
-def read_transform(run: Path) -> tuple[Tensor, float] | None:
-    """The data parser's transform ([3, 4], scale) that a run was trained in; None if the run has not kept it.
-
-    Raises ``UserError`` if the file is damaged.
-    """
-    path = run / TRANSFORM_FILE
-    if not path.exists():
-        return None
-    try:
-        content = load_json(path)
-        transform, scale = torch.tensor(content["transform"], dtype=torch.float64), float(content["scale"])
-        if transform.shape != (3, 4):
-            raise ValueError(f"its transform is {list(transform.shape)}, not [3, 4]")
-        if not (bool(transform.isfinite().all()) and math.isfinite(scale) and scale > 0):
-            raise ValueError("it holds what is no number, or a scale that is not above 0")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path} cannot be read ({reason(error)}): restore it.") from error
-    return transform, scale
 
 
 def folder_names(classes: dict[int, str]) -> dict[int, str]:

@@ -20,9 +20,8 @@ from beags_plugin.masks.rims import snap_to_edges
 from beags_plugin.masks.sources import MASK_SOURCES
 from beags_plugin.masks.sources.base import MaskSource, Photo, SourceScene
 from beags_plugin.pictures.masks import overlay
-from beags_plugin.plugin.objects.evaluate import raster_settings
-from beags_plugin.plugin.objects.extract import read_scene
-from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, data_of_run, mask_paths
+from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
+from beags_plugin.plugin.runs.read import raster_settings, read_scene
 from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParserConfig
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
@@ -36,7 +35,7 @@ class RunGeometry:
 
     def __init__(self, config_path: Path) -> None:
         self.scene = read_scene(config_path)
-        self.manager = data_of_run(self.scene, config_path, ReprojectionOptions())
+        self.manager = data_to_reproject(self.scene, config_path, ReprojectionOptions())
         self.images = list(self.manager.train_dataset.image_filenames)
         self.cameras = [view.camera for view in self.manager.views("train")]
         self._of_split: list[tuple[Literal["train", "eval"], int]] = [("train", i) for i in range(len(self.images))]

@@ -13,9 +13,10 @@ from beags_plugin.pictures.objects import Subject, comparison, film, sheet
 from beags_plugin.pictures.options import PictureFormat, RenderOptions
 from beags_plugin.pictures.orbit import orbit, orbit_settings, stand_of
 from beags_plugin.pictures.video import FILMS, check_film, encoder, write_film
-from beags_plugin.plugin.objects.export import Progress, training_viewpoints
-from beags_plugin.plugin.objects.extract import SavedScene, folder_names, load_scene, objects_with_gaussians
+from beags_plugin.plugin.objects.export import Progress
+from beags_plugin.plugin.objects.extract import folder_names, objects_with_gaussians
 from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT
+from beags_plugin.plugin.runs.read import SavedScene, load_scene, training_viewpoints
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.system.errors import UserError
 
@@ -99,7 +100,7 @@ def _subjects(
     moving: bool,
     options: RenderOptions,
 ) -> list[Subject]:
-    from beags_plugin.plugin.objects.evaluate import raster_settings
+    from beags_plugin.plugin.runs.read import raster_settings
 
     last = list(stages.values())[-1]
     try:

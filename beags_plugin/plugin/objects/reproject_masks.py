@@ -18,8 +18,7 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import write_class_map
 from beags_plugin.labels.label_maps import LabelMaps, PackedMaps
 from beags_plugin.pictures.masks import Changed, before_and_after
-from beags_plugin.plugin.objects.evaluate import raster_settings
-from beags_plugin.plugin.objects.extract import read_scene
+from beags_plugin.plugin.runs.read import check_data, raster_settings, read_scene
 from beags_plugin.preparation.consistent_masks import chosen_reprojection, render_depths, reprojected_masks
 from beags_plugin.preparation.pipeline import known_classes
 from beags_plugin.rasterizers import make_rasterizer
@@ -28,7 +27,7 @@ from beags_plugin.system.filed_tensors import filed
 from beags_plugin.system.progress import counted, progress_bar
 
 if TYPE_CHECKING:
-    from beags_plugin.plugin.objects.extract import SavedScene
+    from beags_plugin.plugin.runs.read import SavedScene
     from beags_plugin.plugin.views.datamanager import BeagsDataManager
     from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 
@@ -91,7 +90,7 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     view has a mask.
     """
     scene = read_scene(config_path)
-    manager = data_of_run(scene, config_path, options)
+    manager = data_to_reproject(scene, config_path, options)
     own = {"reprojection": options.method, "tau": options.tau, "voters": options.voters, "depth": options.depth}
     config = replace(scene.config.model_config.prepare, **{k: v for k, v in own.items() if v is not None})
     if config.reprojection == "none":
@@ -120,15 +119,14 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     return ReprojectedRun(scene, manager, names, classes, given, masks.labels, masks.confidence, seconds, method, why)
 
 
-def data_of_run(scene: SavedScene, config_path: Path, options: ReprojectionOptions) -> BeagsDataManager:
+def data_to_reproject(scene: SavedScene, config_path: Path, options: ReprojectionOptions) -> BeagsDataManager:
     """The data that a run was trained on, at the size and with the masks that ``options`` name."""
     config = scene.config
     if options.parser is not None:
         parser = replace(options.parser)
     else:
         parser = cast("BeagsDataParserConfig", replace(config.data_config.dataparser, data=config.data_path))
-    if not parser.data.exists():
-        raise UserError(f"{config_path} was trained on {parser.data}, which is gone: put it back.")
+    check_data(parser.data, config_path)
     if options.masks is not None:
         if not options.masks.is_dir():
             raise UserError(f"the folder of masks {options.masks} does not exist: correct --masks-path.")

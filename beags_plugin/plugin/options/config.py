@@ -13,18 +13,19 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 
-from beags_plugin.plugin import nerfstudio_patches  # noqa: F401  (lets torch load nerfstudio's own checkpoints)
-from beags_plugin.plugin.model import BeagsModelConfig
 from beags_plugin.plugin.options.loss_spec import LossSpec
-from beags_plugin.plugin.pipeline import BeagsPipeline
-from beags_plugin.plugin.runs.layout import CONFIG_FILE, write_text_atomically
-from beags_plugin.plugin.trainer import BeagsTrainer
-from beags_plugin.plugin.training.replicas import check_machine, default_device
+from beags_plugin.plugin.options.machine import check_machine, default_device
+from beags_plugin.plugin.options.model_options import BeagsModelConfig
 from beags_plugin.plugin.views.datamanager import BeagsDataManagerConfig
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.interrupts import stop
 from beags_plugin.system.lock import lock_ahead, run_lock
+from beags_plugin.system.registry import load
+from beags_plugin.system.whole_files import write_text_atomically
+
+CONFIG_FILE = "config.yml"
+"""File of a run: its config."""
 
 
 def _adam_fuses_on_cpus() -> bool:
@@ -44,7 +45,7 @@ class FusedAdamConfig(AdamOptimizerConfig):
 class BeagsTrainerConfig(TrainerConfig):
     """A nerfstudio trainer config whose paths are absolute once it is saved."""
 
-    _target: type = field(default_factory=lambda: BeagsTrainer)
+    _target: type = field(default_factory=lambda: load("beags_plugin.plugin.trainer:BeagsTrainer"))
     run_dir: Path | None = None
     """Folder of this run; None puts it where nerfstudio does (output_dir/experiment/method/timestamp)."""
     max_num_iterations: int = 0
@@ -136,7 +137,7 @@ def base_config() -> BeagsTrainerConfig:
         steps_per_eval_all_images=0,
         steps_per_save=2000,
         pipeline=VanillaPipelineConfig(
-            _target=BeagsPipeline,
+            _target=load("beags_plugin.plugin.pipeline:BeagsPipeline"),
             datamanager=BeagsDataManagerConfig(
                 dataparser=BeagsDataParserConfig(),
                 cache_images="gpu",  # nerfstudio's word for "on the model's device"; "cpu" would pin memory

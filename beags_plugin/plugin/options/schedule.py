@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass
 
 POLISH_SCHEDULE_FROM = 0.5  # a base that starts from a trained scene repeats the second half of the base schedule
-RATES_STATED_FOR = 30_000  # steps of the base for which the official learning rates are made
-MAX_RATE_FACTOR = 16.0  # of a short base's first steps; of 3,000 steps, 16 are worse than 8 (docs/measured_base.md)
 REFINE_SCHEDULE_FROM = 0.9  # refinement repeats the learning rates of the last tenth (27,000..30,000) of the base
 
 
@@ -53,15 +51,6 @@ class PhaseSchedule:
             return first + (1.0 - first) * step / max(self.base_steps, 1)
         done = (step - self.base_steps) / max(self.refine_steps, 1)
         return REFINE_SCHEDULE_FROM + (1.0 - REFINE_SCHEDULE_FROM) * min(done, 1.0)
-
-    def first_rate_factor(self, power: float) -> float:
-        """What learning rates are multiplied with at the first step of a base that learns more quickly, as it is short.
-
-        A scene that only gets its polish is not far from its end, so that its rates stay.
-        """
-        if self.warm or not 0 < self.base_steps < RATES_STATED_FOR:
-            return 1.0
-        return min((RATES_STATED_FOR / self.base_steps) ** power, MAX_RATE_FACTOR)
 
 
 def log_linear(first: float, last: float, progress: float) -> float:

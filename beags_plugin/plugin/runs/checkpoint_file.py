@@ -1,4 +1,4 @@
-"""What a checkpoint must hold of a scene, checked before anything is made of it."""
+"""Checkpoint files: read, and checked before anything is made of them."""
 
 from __future__ import annotations
 
@@ -10,9 +10,30 @@ import torch
 from torch import Tensor
 
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.tensors import load_tensors
 
 _WIDTHS = {"means": (3,), "quats": (4,), "scales": (2,), "opacities": (1,), "features_dc": (3,)}
 _FLOATS = [*(f"gauss_params.{name}" for name in (*_WIDTHS, "features_rest")), "class_margin", "extent"]
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """All that a checkpoint holds, on the CPU; raises ``UserError`` for a file that is none."""
+    try:
+        checkpoint = load_tensors(path)
+    except FileNotFoundError:
+        raise UserError(f"there is no checkpoint {path}: name one of an earlier run.") from None
+    except ValueError as error:
+        raise UserError(f"the checkpoint {path} is damaged ({error}): name an earlier one.") from error
+    if not isinstance(checkpoint, dict) or not {"step", "pipeline", "optimizers", "scalers"} <= set(checkpoint):
+        raise UserError(f"{path} is no checkpoint of ns-train: name a step-….ckpt of a run.")
+    if not isinstance(checkpoint["pipeline"], dict) or type(checkpoint["step"]) is not int:
+        raise UserError(f"{path} is no checkpoint of ns-train: name a step-….ckpt of a run.")
+    return checkpoint
+
+
+def scene_alone(checkpoint: dict[str, Any]) -> bool:
+    """Whether the checkpoint has no state to train on from: ``<run>/base`` and extracted runs are such."""
+    return not checkpoint["optimizers"]
 
 
 def check_state(state: Mapping[str, Any], path: Path) -> None:

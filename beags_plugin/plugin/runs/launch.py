@@ -6,7 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from beags_plugin.plugin.runs.layout import CONFIG_FILE, EXTRACTION_FILE, REPORT_FILE
+from beags_plugin.plugin.options.config import CONFIG_FILE
+from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, REPORT_FILE
 from beags_plugin.system.errors import UserError
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ def resume(run: Path, device: Literal["cpu", "cuda"] | None = None, check_memory
     """
     from nerfstudio.scripts.train import launch, train_loop
 
-    from beags_plugin.plugin.training.replicas import check_machine
+    from beags_plugin.plugin.options.machine import check_machine
 
     config = resumed_config(run)
     machine = config.machine
@@ -58,9 +59,9 @@ def resumed_config(run: Path) -> BeagsTrainerConfig:
     """The config with which ``resume`` trains."""
     from nerfstudio.utils.rich_utils import CONSOLE
 
+    from beags_plugin.plugin.runs.checkpoint_file import read_checkpoint, scene_alone
     from beags_plugin.plugin.runs.layout import newest_checkpoint
     from beags_plugin.plugin.runs.run_config import load_run_config
-    from beags_plugin.plugin.training.resumable import read_checkpoint, scene_alone
 
     path = Path(run)
     path = path / CONFIG_FILE if path.is_dir() else path

@@ -2,69 +2,23 @@
 
 from __future__ import annotations
 
-import shutil
-from copy import deepcopy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import torch
-import yaml
-from torch import Tensor
 
 from beags_plugin.system.digests import content_digest
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import load_json, reason
-from beags_plugin.system.whole_files import write_whole
 
 if TYPE_CHECKING:
-    from beags_plugin.plugin.options.config import BeagsTrainerConfig
+    pass
 
 
-CONFIG_FILE = "config.yml"
 BASE_SNAPSHOT = "base"  # folder of the run that keeps the scene as it was when refinement started
 PREPARED = "prepared"  # folder of the run that keeps masks, grids and what was found
 STAGES = "stages"  # in there: results of single stages, for a preparation that is broken off or made again
 EXTRACTION_FILE = "extraction.json"  # in a run that holds a part of another: of which, and what was taken
 REPORT_FILE = "training.json"  # seconds and memory of a run that is complete
 TRANSFORM_FILE = "dataparser_transforms.json"  # nerfstudio's name for how the poses were normalised
-
-
-def save_atomically(content: Any, path: Path) -> None:
-    """``torch.save`` that leaves either the old file or the whole new one, never half of one."""
-    # beside the folder, not in it: nerfstudio takes any file among the checkpoints for one
-    write_whole(path, lambda file: torch.save(content, file), path.parent.parent)
-
-
-def write_text_atomically(text: str, path: Path) -> None:
-    """``Path.write_text`` (UTF-8) that leaves either the old file or the whole new one."""
-    write_whole(path, lambda file: file.write(text.encode("utf8")))
-
-
-def write_run(config: BeagsTrainerConfig, folder: Path, model_state: dict[str, Tensor], step: int) -> Path:
-    """Write a run of its own that holds ``model_state``; returns the path of its config.yml.
-
-    config: of the run it comes from; model_state: of a ``BeagsModel``; step: as stored in the checkpoint.
-    """
-    folder = folder.absolute()
-    own = deepcopy(config)
-    own.run_dir = folder
-    own.load_dir = own.load_checkpoint = own.load_config = own.load_step = None
-    state = {
-        f"_model.{name}": value.detach().cpu() if isinstance(value, Tensor) else value
-        for name, value in model_state.items()
-    }
-    checkpoint = {"step": step, "pipeline": state, "optimizers": {}, "schedulers": {}, "scalers": {}}
-    path = folder / own.relative_model_dir / f"step-{step:09d}.ckpt"
-    save_atomically(checkpoint, path)
-    for old in path.parent.glob("*.ckpt"):  # of an earlier run into the same folder
-        if old != path:
-            old.unlink()
-    config_path = folder / CONFIG_FILE
-    write_text_atomically(yaml.dump(own), config_path)
-    transform = config.get_base_dir() / TRANSFORM_FILE
-    if transform.exists() and transform.parent != folder:
-        shutil.copyfile(transform, folder / TRANSFORM_FILE)
-    return config_path
 
 
 def newest_checkpoint(folder: Path) -> Path:

@@ -148,7 +148,7 @@ def _told(error: Exception) -> str:
 
 def _wrong(config: BeagsTrainerConfig) -> Iterator[str]:
     """What fields of a config, and of those in it, are missing, or are no numbers where they should be."""
-    from beags_plugin.plugin.model import BeagsModelConfig
+    from beags_plugin.plugin.options.model_options import BeagsModelConfig
     from beags_plugin.plugin.views.datamanager import BeagsDataManagerConfig
     from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
+from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.pipelines.base_pipeline import Pipeline
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch.cuda.amp.grad_scaler import GradScaler
 
-from beags_plugin.plugin.runs.checkpoint_file import check_state
-from beags_plugin.plugin.runs.layout import REPORT_FILE, newest_checkpoint, save_atomically
-from beags_plugin.plugin.training.resumable import STATE, VERSION, Part, read_checkpoint, training_state
+from beags_plugin.plugin.options.config import BeagsTrainerConfig
+from beags_plugin.plugin.runs.checkpoint_file import check_state, read_checkpoint
+from beags_plugin.plugin.runs.layout import REPORT_FILE, newest_checkpoint
+from beags_plugin.plugin.runs.write import save_atomically
+from beags_plugin.plugin.training.resumable import STATE, VERSION, Resumable, training_state
+from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import reason
-
-if TYPE_CHECKING:
-    from beags_plugin.plugin.model import BeagsModel
-    from beags_plugin.plugin.options.config import BeagsTrainerConfig
-    from beags_plugin.plugin.trainer import BeagsTrainer
 
 REPLACED = "replaced_models"
 """Folder of a run: checkpoints of an earlier one in the same place, until the new one has its own."""
@@ -33,7 +34,7 @@ class Checkpoints:
     def __init__(self, config: BeagsTrainerConfig, base_dir: Path, folder: Path) -> None:
         self.config, self.base_dir, self.folder = config, base_dir, folder
         self.loaded_run: Path | None = None
-        self._parts: dict[str, Part] = {}
+        self._parts: dict[str, Resumable] = {}
         self._loaded_states: dict[str, Any] = {}
         self._loaded_from: Path | None = None
         self._saved_step: int | None = None
@@ -61,21 +62,21 @@ class Checkpoints:
             return newest_checkpoint(config.load_dir)
         return config.load_dir / f"step-{config.load_step:09d}.ckpt"
 
-    def restore(self, path: Path, trainer: BeagsTrainer) -> int:
-        """Bring the trainer's pipeline, optimizers and scaler to where the checkpoint was; returns the next step.
+    def restore(self, path: Path, pipeline: Pipeline, optimizers: Optimizers, scaler: GradScaler) -> int:
+        """Bring pipeline, optimizers and scaler to where the checkpoint was; returns the next step.
 
         The parts that ``keep`` names later go on from there too. Raises ``UserError`` for a file that is no checkpoint,
         does not fit this run, or was of other classes.
         """
         checkpoint = read_checkpoint(path)
         states = training_state(checkpoint, path)
-        model = cast("BeagsModel", trainer.pipeline.model)
+        model = cast(SceneModel, pipeline.model)
         named = dict(model.classes)  # by the data
         check_state(_of_model(checkpoint["pipeline"]), path)
         try:
-            trainer.pipeline.load_pipeline(checkpoint["pipeline"], checkpoint["step"])
-            trainer.optimizers.load_optimizers(checkpoint["optimizers"])
-            trainer.grad_scaler.load_state_dict(checkpoint["scalers"])
+            pipeline.load_pipeline(checkpoint["pipeline"], checkpoint["step"])
+            optimizers.load_optimizers(checkpoint["optimizers"])
+            scaler.load_state_dict(checkpoint["scalers"])
         except _MISFITS as error:
             raise _misfit(path, error) from error
         if self.goes_on and model.classes != named:
@@ -85,14 +86,14 @@ class Checkpoints:
             )
         CONSOLE.print(f"Loaded {path}", highlight=False, markup=False, soft_wrap=True)
         self.loaded_run = self.base_dir.absolute() if self.goes_on else path.absolute().parent.parent
-        if trainer.schedule.base_steps == 0 and int(model.refined_steps) == 0:
+        if model.schedule.base_steps == 0 and int(model.refined_steps) == 0:
             return 0  # a base that was loaded: refinement counts its own steps, and begins anew
         self._loaded_states, self._loaded_from = states, path
         return checkpoint["step"] + 1
 
     # -- what is saved -------------------------------------------------------------------------------------------------
 
-    def keep(self, name: str, part: Part) -> None:
+    def keep(self, name: str, part: Resumable) -> None:
         """Let checkpoints hold the state of ``part``; it goes on from what the loaded one holds, if that does."""
         self._parts[name] = part
         if name in self._loaded_states:
@@ -105,16 +106,16 @@ class Checkpoints:
         """What was loaded for parts that nobody named is let go."""
         self._loaded_states = {}
 
-    def save(self, step: int, trainer: BeagsTrainer) -> None:
+    def save(self, step: int, pipeline: Pipeline, optimizers: Optimizers, scaler: GradScaler) -> None:
         """Save all that decides the rest of the run; the file appears whole or not at all, and only then are older
         ones removed."""
         path = self.folder / f"step-{step:09d}.ckpt"
         content = {
             "step": step,
-            "pipeline": trainer.pipeline.state_dict(),
-            "optimizers": {name: optimizer.state_dict() for name, optimizer in trainer.optimizers.optimizers.items()},
+            "pipeline": pipeline.state_dict(),
+            "optimizers": {name: optimizer.state_dict() for name, optimizer in optimizers.optimizers.items()},
             "schedulers": {},
-            "scalers": trainer.grad_scaler.state_dict(),
+            "scalers": scaler.state_dict(),
             STATE: {"version": VERSION, "parts": {name: part.state() for name, part in self._parts.items()}},
         }
         save_atomically(content, path)

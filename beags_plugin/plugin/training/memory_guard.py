@@ -231,7 +231,7 @@ def checks_of_run(data: Path, preset: str, downscale_factor: float = 1.0) -> lis
 
 def forecast_of_data(config: BeagsTrainerConfig, data: Path, downscale_factor: float = 1.0) -> Forecast:
     """What a training with ``config`` on ``data`` will need, before it is begun; raises ``UserError`` for bad data."""
-    from beags_plugin.plugin.training.replicas import default_device
+    from beags_plugin.plugin.options.machine import default_device
     from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 
     parser = BeagsDataParserConfig(data=data, downscale_factor=downscale_factor).setup()

@@ -9,7 +9,7 @@ from torch.cuda.amp.grad_scaler import GradScaler
 
 from beags_plugin.core.adam import clear_gradients, step_all
 from beags_plugin.plugin.training.replicas import average_gradients
-from beags_plugin.plugin.training.step_clock import StepClock
+from beags_plugin.plugin.training.timing import StepClock
 
 
 class JointOptimizers(Optimizers):

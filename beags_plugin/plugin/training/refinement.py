@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,16 +20,13 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.classes import read_class_map, write_class_map
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.plugin.runs.layout import (
-    BASE_SNAPSHOT,
-    PREPARED,
-    STAGES,
-    round_folder,
-    write_run,
-    write_text_atomically,
-)
+from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED, STAGES, round_folder
 from beags_plugin.plugin.runs.prepared_grid import read_grid
+from beags_plugin.plugin.runs.write import write_run
+from beags_plugin.plugin.training.resumable import TrainingRun
 from beags_plugin.plugin.training.scene_edits import edit_scene
+from beags_plugin.plugin.training.scene_model import SceneModel
+from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.preparation.pipeline import Preparation, prepare
 from beags_plugin.preparation.stages import StageStore
 from beags_plugin.refiners import REFINERS
@@ -38,17 +35,13 @@ from beags_plugin.system.digests import code_digest
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.memory import peak_memory_mb
 from beags_plugin.system.progress import counted, progress_bar
-from beags_plugin.system.whole_files import write_whole
-
-if TYPE_CHECKING:
-    from beags_plugin.plugin.model import BeagsModel
-    from beags_plugin.plugin.views.datamanager import BeagsDataManager
+from beags_plugin.system.whole_files import write_text_atomically, write_whole
 
 
 class RefinementSwitch:
     """Prepares refinement once the base is trained, or takes it up again in a resumed run."""
 
-    def __init__(self, model: BeagsModel, trainer: Any, datamanager: BeagsDataManager) -> None:
+    def __init__(self, model: SceneModel, trainer: TrainingRun, datamanager: BeagsDataManager) -> None:
         self.model = model
         self.trainer = trainer
         self.datamanager = datamanager
@@ -58,6 +51,7 @@ class RefinementSwitch:
         self._evaluation_due = False
         self._done: int | None = None  # refined_steps, which lies on the GPU, as the host knows it
         self.rounds = 0  # prepared so far, in this process and those that it goes on from
+        model.prepared_rounds = 0
 
     @property
     def wanted(self) -> bool:
@@ -83,7 +77,7 @@ class RefinementSwitch:
             self.model.config.split.check()
 
     def state(self) -> dict[str, Any]:
-        """How many rounds have been prepared, and whether nerfstudio has evaluated the step; see ``Part``."""
+        """How many rounds have been prepared, and whether nerfstudio has evaluated the step; see ``Resumable``."""
         return {"rounds": self.rounds, "evaluated": not self._switching}
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -158,7 +152,7 @@ class RefinementSwitch:
                 self._take_classes(prepared.edited.assignment)
             self.rounds += 1
             self._start(prepared.grid, prepared.labels)
-        self._count(prepared.seconds, time.perf_counter() - start, first)
+        self.trainer.seconds.prepared(prepared.seconds, time.perf_counter() - start, first)
 
     def _stage_store(self) -> StageStore:
         """Where the stages of this round are kept; those of the run that this one goes on from are looked into too.
@@ -176,14 +170,6 @@ class RefinementSwitch:
         here, *others = (run / PREPARED / STAGES / f"round_{self.rounds + 1}" for run in runs)
         return StageStore(here, others)
 
-    def _count(self, seconds: dict[str, float], spent: float, first: bool) -> None:
-        """Add the time of a preparation to that of the stages; it is none of the refinement's."""
-        model = self.model
-        model.preparing_seconds += spent
-        model.refining_since = time.perf_counter() if first else model.refining_since + spent
-        total = model.prepared_seconds
-        model.prepared_seconds = {name: total.get(name, 0.0) + seconds.get(name, 0.0) for name in {**total, **seconds}}
-
     def _background_voxels(self) -> bool:
         return any(loss.asks_grid_about_background for loss in self.model.losses.values())
 
@@ -197,6 +183,7 @@ class RefinementSwitch:
         self.datamanager.replace_class_maps(labels, keep=more_rounds)
         self.model.grid = None if grid is None else grid.to(self.model.device)
         self.model.frozen = not self.refiner.trains
+        self.model.prepared_rounds = self.rounds
         self.ready = True
 
     def _take_up(self) -> None:
@@ -227,7 +214,7 @@ class RefinementSwitch:
                 for view in counted(views, len(views), progress)
             )
         self._start(grid, labels)
-        self.model.refining_since = time.perf_counter()
+        self.trainer.seconds.refining()
         CONSOLE.print(f"  refinement taken up from {folder}", highlight=False, markup=False, soft_wrap=True)
 
 

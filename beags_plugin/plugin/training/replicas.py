@@ -9,45 +9,14 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
-from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import nn
 
 from beags_plugin.ops import cuda_extension
+from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.system import processes
-from beags_plugin.system.errors import UserError
-
-if TYPE_CHECKING:
-    from beags_plugin.plugin.options.config import BeagsTrainerConfig
-
-
-def default_device() -> str:
-    """Where a run trains unless it is told: "cuda" where there is a GPU that our kernels can use, else "cpu"."""
-    return "cpu" if cuda_extension.found()[1] else "cuda"
-
-
-def check_machine(machine: MachineConfig) -> None:
-    """Raise ``UserError`` for devices that are not there."""
-    for name in ("num_devices", "num_machines"):
-        if (count := getattr(machine, name)) < 1:
-            raise UserError(f"--machine.{name.replace('_', '-')} is {count}: give 1 or more.")
-    if machine.device_type == "cuda":
-        if reason := cuda_extension.found()[1]:
-            raise UserError(
-                f"--machine.device-type cuda: {reason} Or train with --machine.device-type cpu (beags resume: --device "
-                "cpu)."
-            )
-        there = torch.cuda.device_count()
-        if machine.num_devices > there:
-            raise UserError(f"--machine.num-devices is {machine.num_devices}, but this machine has {there} GPU(s).")
-    elif machine.num_devices * machine.num_machines > 1:
-        raise UserError(
-            f"--machine.num-devices is {machine.num_devices}, but nerfstudio starts several processes for GPUs only: "
-            "leave it at 1 on a CPU, where one process uses all cores."
-        )
 
 
 class Rank:

@@ -1,17 +1,22 @@
-"""What a checkpoint keeps besides the scene and its optimizers: all that decides the rest of a run."""
+"""State that a checkpoint keeps besides the scene and its optimizers: all that decides the rest of a run."""
 
 from __future__ import annotations
 
 import random
+from contextlib import AbstractContextManager
 from pathlib import Path
+from threading import Lock
 from typing import Any, Protocol
 
 import numpy as np
 import torch
+from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from beags_plugin.plugin.options.config import BeagsTrainerConfig
+from beags_plugin.plugin.runs.checkpoint_file import scene_alone
+from beags_plugin.plugin.training.timing import StageSeconds
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.reading.tensors import load_tensors
 
 STATE = "beags"
 """Key of a checkpoint, beside nerfstudio's own."""
@@ -19,7 +24,7 @@ VERSION = 1
 """Of what lies there; another version is not read."""
 
 
-class Part(Protocol):
+class Resumable(Protocol):
     """A part of the training whose state a checkpoint holds: tensors and plain values, as ``torch.load`` allows."""
 
     def state(self) -> dict[str, Any]:
@@ -31,41 +36,59 @@ class Part(Protocol):
         ...
 
 
+class TrainingRun(Protocol):
+    """The trainer as the parts of a training see it.
+
+    run: folder of the run, also in processes that write elsewhere; base_dir: folder that this process writes to.
+    loaded_run: folder of the run that this one resumes. last_step: number of steps of the run. seconds: of its stages.
+    optimizers: nerfstudio's. train_lock: nerfstudio's, held during a step, so that the viewer waits.
+    """
+
+    config: BeagsTrainerConfig
+    base_dir: Path
+    last_step: int
+    seconds: StageSeconds
+    optimizers: Optimizers
+    train_lock: Lock
+
+    @property
+    def run(self) -> Path: ...
+
+    @property
+    def loaded_run(self) -> Path | None: ...
+
+    def keep(self, name: str, part: Resumable) -> None:
+        """Let checkpoints hold the state of ``part``."""
+        ...
+
+    def stop_if_asked(self, step: int) -> None:
+        """End the training before ``step`` if a signal asked for that, or memory is running out."""
+        ...
+
+    def long_stage(self, step: int) -> AbstractContextManager[None]:
+        """Enclose a long stage after ``step``, which an interruption ends at once."""
+        ...
+
+    def eval_iteration(self, step: int) -> None:
+        """Evaluate as nerfstudio does after ``step``."""
+        ...
+
+
 class GlobalRandom:
     """The generators that programs share. This package draws from none of them; losses of other packages may."""
 
     def state(self) -> dict[str, Any]:
-        """See ``Part``."""
+        """See ``Resumable``."""
         numpy_state: Any = np.random.get_state()  # noqa: NPY002  (that of others, not one to draw from)
         name, keys, *rest = numpy_state
         return {"torch": torch.get_rng_state(), "python": random.getstate(), "numpy": (name, keys.tolist(), *rest)}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """See ``Part``."""
+        """See ``Resumable``."""
         torch.set_rng_state(state["torch"])
         random.setstate(state["python"])
         name, keys, *rest = state["numpy"]
         np.random.set_state((name, np.array(keys, dtype=np.uint32), *rest))  # noqa: NPY002
-
-
-def read_checkpoint(path: Path) -> dict[str, Any]:
-    """All that a checkpoint holds, on the CPU; raises ``UserError`` for a file that is none."""
-    try:
-        checkpoint = load_tensors(path)
-    except FileNotFoundError:
-        raise UserError(f"there is no checkpoint {path}: name one of an earlier run.") from None
-    except ValueError as error:
-        raise UserError(f"the checkpoint {path} is damaged ({error}): name an earlier one.") from error
-    if not isinstance(checkpoint, dict) or not {"step", "pipeline", "optimizers", "scalers"} <= set(checkpoint):
-        raise UserError(f"{path} is no checkpoint of ns-train: name a step-….ckpt of a run.")
-    if not isinstance(checkpoint["pipeline"], dict) or type(checkpoint["step"]) is not int:
-        raise UserError(f"{path} is no checkpoint of ns-train: name a step-….ckpt of a run.")
-    return checkpoint
-
-
-def scene_alone(checkpoint: dict[str, Any]) -> bool:
-    """Whether the checkpoint has no state to train on from: ``<run>/base`` and extracted runs are such."""
-    return not checkpoint["optimizers"]
 
 
 def training_state(checkpoint: dict[str, Any], path: Path) -> dict[str, Any]:

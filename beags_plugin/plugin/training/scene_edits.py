@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from beags_plugin.core.densification import Densified
-
-if TYPE_CHECKING:
-    from beags_plugin.plugin.model import BeagsModel
+from beags_plugin.plugin.training.scene_model import SceneModel
 
 
-def edit_scene(model: BeagsModel, optimizers: dict[str, torch.optim.Optimizer], edited: Densified) -> None:
+def edit_scene(model: SceneModel, optimizers: dict[str, torch.optim.Optimizer], edited: Densified) -> None:
     """Let the model and its optimizers go on with the edited surfels; their classes are reset."""
     former = dict(model.gauss_params.items())
     model.replace_surfels(edited.surfels)

@@ -1,34 +1,66 @@
-"""A scene of surfels with classes as nerfstudio's models hold one: parameters, buffers, checkpoints of any size."""
+"""The scene as nerfstudio's models hold one, and the state that a run changes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.splatfacto import SplatfactoModel
 from torch import Tensor, nn
 
+from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.losses.base import Loss
+from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.plugin.options.model_options import BeagsModelConfig, fixed_background
+from beags_plugin.plugin.training.timing import StepClock
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
 
 PARAMETER_GROUPS = ("means", "features_dc", "features_rest", "opacities", "scales", "quats")
 FLATNESS = 1e-3  # exported third scale, relative to the smaller of the two: flat, yet no viewer divides by 0
 
 
-class SurfelModel(SplatfactoModel):
-    """What a model holds of its scene: N surfels as parameters, their classes as buffers, the classes' names.
+@dataclass(frozen=True)
+class LastRender:
+    """The render of the last training step.
+
+    screen_shift: [N, 2] of ``SurfelInputs``, whose gradient densification reads. labels: [H, W] int32 M', against which
+    the boundary was rendered; None without a boundary.
+    """
+
+    camera: Camera
+    render: RasterOutputs
+    screen_shift: Tensor | None
+    labels: Tensor | None = None
+
+
+class SceneModel(SplatfactoModel):
+    """N surfels as parameters, their classes as buffers, and the state of the run that trains them.
 
     It derives from nerfstudio's ``SplatfactoModel`` because ns-export and the viewer ask for that type, but shares
     none of its training.
+
+    classes: id to name. step, seed: of the run. grid: voxels of the classes; None before refinement. growing: whether
+    this step gathers gradients for densification. frozen: whether the refiner leaves the scene as it is. last_render:
+    of the last training step. measuring: whether anyone reads this step's metrics. prepared_rounds: rounds of
+    refinement that this run has prepared; None for a scene that is only looked at. crop_box: nerfstudio's.
     """
 
+    config: BeagsModelConfig
     classes: dict[int, str]
     # buffers, for type checkers
     class_ids: Tensor  # [N] int32
     class_margin: Tensor  # [N] float32
+    assigned: Tensor  # [] bool
+    extent: Tensor  # [] float32, world units
+    refined_steps: Tensor  # [] int64, refinement steps that the scene has been through
 
-    def hold(self, surfels: Surfels) -> None:
-        """Make the parameters and buffers of a scene without classes; called once."""
+    def hold(self, surfels: Surfels, classes: Mapping[int, str]) -> None:
+        """Make the parameters and buffers of a scene whose Gaussians have no classes yet; called once."""
         self.gauss_params = nn.ParameterDict(
             {
                 "means": nn.Parameter(surfels.means),
@@ -41,6 +73,62 @@ class SurfelModel(SplatfactoModel):
         )
         self.register_buffer("class_ids", torch.zeros(len(surfels), dtype=torch.int32))
         self.register_buffer("class_margin", torch.zeros(len(surfels)))
+        self.register_buffer("assigned", torch.tensor(False))
+        self.register_buffer("extent", torch.tensor(1.0))
+        self.register_buffer("refined_steps", torch.tensor(0))
+        self.classes = dict(classes)
+        self.schedule = self.config.schedule()
+        self.losses: dict[str, Loss] = {
+            name: spec.build(name, self.schedule)
+            for name, spec in self.config.losses.items()
+            if spec.weight != 0.0 and (spec.phase != "refine" or self.schedule.refine_steps > 0)
+        }
+        self.rasterizer: Rasterizer = make_rasterizer(self.config.rasterizer)
+        self.background_color = fixed_background(self.config)
+        self.crop_box: OrientedBox | None = None
+        self.step = 0
+        self.seed = 0
+        self.grid: VisibilityGrid | None = None
+        self.growing = False
+        self.frozen = False
+        self.last_render: LastRender | None = None
+        self.clock = StepClock()
+        self.measuring = True
+        self.prepared_rounds: int | None = None
+        self._known_extent: tuple[Tensor, int, float] | None = None
+
+    # -- what is rendered, and how -----------------------------------------------------------------------------------
+
+    def extent_on_host(self) -> float:
+        """Return ``extent``, world units; it is fetched from a GPU once only, lest every step wait for it."""
+        known = self._known_extent
+        if known is None or known[0] is not self.extent or known[1] != self.extent._version:
+            self._known_extent = known = (self.extent, self.extent._version, float(self.extent))
+        return known[2]
+
+    def settings(self, geometry: bool = True, distortion: bool = False) -> RasterSettings:
+        """Return the scene's depth range and what to compute."""
+        extent = self.extent_on_host()
+        return RasterSettings(self.config.near * extent, self.config.far * extent, geometry, distortion)
+
+    def active_sh_degree(self) -> int:
+        """Return the degree to render: degrees grow one by one while the base trains; other scenes show them all."""
+        if not self.training or self.schedule.warm or self.schedule.refining(self.step):
+            return self.config.sh_degree
+        interval = max(self.schedule.scaled(self.config.sh_degree_interval), 1)
+        return min(self.step // interval, self.config.sh_degree)
+
+    def active_losses(self) -> dict[str, Loss]:
+        """Return the terms that count at the current step."""
+        if self.frozen:
+            return {}
+        return {name: loss for name, loss in self.losses.items() if loss.active(self.step)}
+
+    def generator(self, step: int) -> torch.Generator:
+        """Return a generator seeded by (seed, step), so that a resumed run draws what the uninterrupted one drew."""
+        return torch.Generator().manual_seed(self.seed * 1_000_003 + step)
+
+    # -- surfels -----------------------------------------------------------------------------------------------------
 
     @property
     def scales(self) -> Tensor:
@@ -50,7 +138,7 @@ class SurfelModel(SplatfactoModel):
         return torch.cat([flat, thin], dim=-1)
 
     def surfels(self) -> Surfels:
-        """The scene, sharing storage (and gradients) with the parameters."""
+        """Return the scene; it shares storage (and gradients) with the parameters."""
         return Surfels(
             means=self.gauss_params["means"],
             quats=self.gauss_params["quats"],
@@ -79,6 +167,8 @@ class SurfelModel(SplatfactoModel):
         self.class_ids = torch.zeros(len(surfels), dtype=torch.int32, device=self.device)
         self.class_margin = torch.zeros(len(surfels), device=self.device)
 
+    # -- checkpoints -------------------------------------------------------------------------------------------------
+
     def load_state_dict(self, state: Mapping[str, Any], **kwargs) -> Any:
         """Load a checkpoint of any number of surfels; parameters are resized in place (optimizers hold them)."""
         count = state["gauss_params.means"].shape[0]
@@ -91,7 +181,7 @@ class SurfelModel(SplatfactoModel):
         return nn.Module.load_state_dict(self, state, **kwargs)  # type: ignore[arg-type]
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What a checkpoint keeps besides tensors: the class names."""
+        """Return what a checkpoint keeps besides tensors: the class names."""
         return {"classes": dict(self.classes)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -99,5 +189,5 @@ class SurfelModel(SplatfactoModel):
         self.classes = {int(index): str(name) for index, name in state["classes"].items()}
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """One optimizer group per kind of parameter."""
+        """Return one optimizer group per kind of parameter."""
         return {name: [self.gauss_params[name]] for name in PARAMETER_GROUPS}

@@ -7,24 +7,26 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from beags_plugin.core.cameras import camera_extent
 from beags_plugin.core.flattening import Flattening, flatten, without_empty_bands
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.extraction.frames import from_input_frame, to_input_frame
 from beags_plugin.importers.base import ImportedScene, find_importer
-from beags_plugin.plugin.runs.layout import write_text_atomically
+from beags_plugin.losses.photometric import psnr
+from beags_plugin.plugin.options.model_options import BeagsModelConfig
+from beags_plugin.plugin.training.scene_model import SceneModel
+from beags_plugin.plugin.views.datamanager import BeagsDataManager
+from beags_plugin.plugin.views.views import View
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import progress_bar
-
-if TYPE_CHECKING:
-    from beags_plugin.plugin.model import BeagsModel, BeagsModelConfig
-    from beags_plugin.plugin.views.datamanager import BeagsDataManager, View
+from beags_plugin.system.whole_files import write_text_atomically
 
 START_REPORT = "start.json"  # in a run that started from a scene: what that was, and how well it fits
 StartFrame = Literal["auto", "world", "normalised"]
@@ -52,10 +54,10 @@ class Fit:
 def check_start(config: BeagsModelConfig) -> None:
     """Raise ``UserError`` for a start that cannot be read, before the data are."""
     if config.start_from is not None:
-        find_importer(Path(config.start_from), config.start_format)
+        find_importer(Path(config.start_from))
 
 
-def start_from_scene(model: BeagsModel, datamanager: BeagsDataManager, run: Path) -> None:
+def start_from_scene(model: SceneModel, datamanager: BeagsDataManager, run: Path) -> None:
     """Put the scene of ``start_from`` in place of the seed points; says what it was and how well it fits.
 
     run: folder of the run, where ``start.json`` keeps what was said. Raises ``UserError`` for a scene that cannot be
@@ -64,7 +66,7 @@ def start_from_scene(model: BeagsModel, datamanager: BeagsDataManager, run: Path
     config = model.config
     assert config.start_from is not None
     path = Path(config.start_from)
-    scene = find_importer(path, config.start_format).read(path)
+    scene = find_importer(path).read(path)
     usable = scene.gaussians.usable()
     if not bool(usable.any()):
         raise UserError(f"{path} holds no Gaussian that can be used: name another scene.")
@@ -129,10 +131,8 @@ def _same(theirs: Normalization | None, ours: Normalization) -> bool:
 
 
 @torch.no_grad()
-def _measure(model: BeagsModel, surfels: Surfels, views: Sequence[View], most: int = _MOST_VIEWS) -> Fit:
+def _measure(model: SceneModel, surfels: Surfels, views: Sequence[View], most: int = _MOST_VIEWS) -> Fit:
     """Draw training views of the surfels and compare them with the photos."""
-    from beags_plugin.plugin.training.callbacks import camera_extent
-
     device = model.device
     surfels = Surfels(**{field.name: getattr(surfels, field.name).to(device) for field in fields(surfels)})
     poses = torch.stack([torch.linalg.inv(view.camera.viewmat) for view in views])
@@ -149,14 +149,10 @@ def _measure(model: BeagsModel, surfels: Surfels, views: Sequence[View], most: i
                 surfel_inputs(surfels, view.camera), view.camera, settings, model.background_color.to(device)
             ).color.clamp(0.0, 1.0)
             flat = image.mean(dim=(0, 1))
-            found.append([_psnr(drawn, image), _psnr(flat, image)])
+            found.append([float(psnr(drawn, image)), float(psnr(flat, image))])
             progress(number + 1, len(chosen))
-    psnr, flat = (sum(values) / len(values) for values in zip(*found, strict=True))
-    return Fit(psnr, flat, len(chosen))
-
-
-def _psnr(drawn: Tensor, image: Tensor) -> float:
-    return float(-10.0 * torch.log10((drawn - image).square().mean().clamp_min(1e-10)))
+    scene_psnr, flat_psnr = (sum(values) / len(values) for values in zip(*found, strict=True))
+    return Fit(scene_psnr, flat_psnr, len(chosen))
 
 
 def _told(path: Path, scene: ImportedScene, report: dict[str, Any], lost: Flattening | None, fit: Fit) -> list[str]:
@@ -178,7 +174,7 @@ def _told(path: Path, scene: ImportedScene, report: dict[str, Any], lost: Flatte
 
 
 def _say_poor(
-    model: BeagsModel, path: Path, fit: Fit, candidates: dict[StartFrame, Surfels], views: Sequence[View]
+    model: SceneModel, path: Path, fit: Fit, candidates: dict[StartFrame, Surfels], views: Sequence[View]
 ) -> None:
     """Say that the frame or the scale probably does not fit, and which frame does, if one does."""
     sentence = (

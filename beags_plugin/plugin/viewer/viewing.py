@@ -13,6 +13,7 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.occupancy.violation import violation_shares
+from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.viewer.choice import Choice, Shown, shown
 from beags_plugin.plugin.viewer.pictures import (
     boundary_picture,
@@ -28,7 +29,6 @@ from beags_plugin.system.errors import UserError
 if TYPE_CHECKING:
     from nerfstudio.data.scene_box import OrientedBox
 
-    from beags_plugin.plugin.model import BeagsModel
     from beags_plugin.plugin.viewer.viewed_run import ViewedRun
 
 CHANNELS = {
@@ -49,7 +49,7 @@ def asked_by_viewer() -> bool:
     return isinstance(threading.current_thread(), RenderStateMachine)
 
 
-def scene_outputs(model: BeagsModel, camera: Camera) -> dict[str, Tensor]:
+def scene_outputs(model: SceneModel, camera: Camera) -> dict[str, Tensor]:
     """The whole scene (inside nerfstudio's crop box), as evaluation, ns-render and ns-export see it.
 
     Each [H, W, 1 or 3] float32: rgb, depth (world units along z), normal, accumulation, background; with classes also
@@ -62,7 +62,7 @@ def scene_outputs(model: BeagsModel, camera: Camera) -> dict[str, Tensor]:
     return outputs
 
 
-def plain_outputs(model: BeagsModel, scene: Shown, camera: Camera, background: Tensor) -> dict[str, Tensor]:
+def plain_outputs(model: SceneModel, scene: Shown, camera: Camera, background: Tensor) -> dict[str, Tensor]:
     """What every run can show: see ``scene_outputs``."""
     background = background.to(model.device)
     inputs = surfel_inputs(scene.surfels, camera, model.active_sh_degree())
@@ -77,21 +77,23 @@ def plain_outputs(model: BeagsModel, scene: Shown, camera: Camera, background: T
     }
 
 
-def class_outputs(model: BeagsModel, scene: Shown, camera: Camera) -> dict[str, Tensor]:
+def class_outputs(model: SceneModel, scene: Shown, camera: Camera) -> dict[str, Tensor]:
     """The class that each pixel shows, in its colour, and the share that it has of the pixel."""
     classes, share = draw_class_map(model.rasterizer, scene.surfels, scene.class_ids, camera, model.settings())
     return {"class_map": class_picture(classes), "class_confidence": share[..., None].float()}
 
 
-def rounds_of(model: BeagsModel) -> int:
-    """How often refinement was prepared for a scene that is not being trained: what a checkpoint says of it."""
+def rounds_of(model: SceneModel) -> int:
+    """Return how often refinement has been prepared for the scene as it now is; a checkpoint tells it by its steps."""
+    if model.prepared_rounds is not None:
+        return model.prepared_rounds
     if not bool(model.assigned):
         return 0
     starts, done = model.schedule.round_starts(max(model.config.refine_rounds, 1)), int(model.refined_steps)
     return max(1, sum(start < done for start in starts))
 
 
-def within(model: BeagsModel, box: OrientedBox | None) -> Tensor | None:
+def within(model: SceneModel, box: OrientedBox | None) -> Tensor | None:
     """[N] bool, the surfels in nerfstudio's crop box; None without one."""
     return None if box is None else box.within(model.means).reshape(-1)
 
@@ -113,11 +115,10 @@ class Viewing:
 
     choice: what is shown. background: [3], the viewer's. listed: names of ``CHANNELS`` that this run may be asked for;
     the same ones as long as a viewer runs. wanted: gives those that it shows now. crop_box: gives the viewer's.
-    run: what the run has on disk. rounds: how often refinement has been prepared for the scene as it now is; a training
-    in this process says it for itself. notes: what is to be said of the pictures of the last drawing.
+    run: what the run has on disk. notes: what is to be said of the pictures of the last drawing.
     """
 
-    def __init__(self, model: BeagsModel) -> None:
+    def __init__(self, model: SceneModel) -> None:
         self.model = model
         self.choice = Choice()
         self.background: Tensor | None = None
@@ -125,7 +126,6 @@ class Viewing:
         self.wanted: Callable[[], frozenset[str]] = frozenset
         self.crop_box: Callable[[], OrientedBox | None] = lambda: None
         self.run: ViewedRun | None = None
-        self.rounds: Callable[[], int] = lambda: rounds_of(model)
         self.shares: Shares | None = None
         self.notes: dict[str, str] = {}
         self.lock = threading.Lock()
@@ -138,7 +138,7 @@ class Viewing:
         the scene, or draws it for the viewer.
         """
         self.lock = lock or self.lock
-        run.rounds = lambda: self.rounds()
+        run.rounds = lambda: rounds_of(self.model)
         classes = bool(self.model.assigned) or (training and self.model.schedule.refine_steps > 0)
         prepares = training and classes
         available = {

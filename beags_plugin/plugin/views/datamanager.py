@@ -20,7 +20,6 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import track
 from torch import Tensor
 
-import beags_plugin.plugin.nerfstudio_patches  # noqa: F401  (checkpoints load again)
 from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE, objects_in
 from beags_plugin.labels.label_maps import PackedMap, narrowed, widened
@@ -212,7 +211,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         return self.eval_dataset.cameras[index : index + 1].to(self.device), self._on_device(data)
 
     def state(self) -> dict[str, Any]:
-        """Where the orders of the training and evaluation views are; see ``training_state.Part``."""
+        """Where the orders of the training and evaluation views are; see ``resumable.Resumable``."""
         generator = getattr(self, "random_generator", None)  # nerfstudio's "fps" has none
         epochs = getattr(self, "train_unsampled_epoch_count", None)
         return {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, cast, overload
+from typing import overload
 
 import numpy as np
 import torch
@@ -15,13 +15,8 @@ from beags_plugin.data.ground_truth import GroundTruth
 from beags_plugin.evaluation.records import EvalView
 from beags_plugin.labels.class_ids import IGNORE, resize_nearest
 from beags_plugin.labels.classes import read_binary_mask, read_mask
-from beags_plugin.plugin.model import fixed_background
+from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system.errors import UserError
-
-if TYPE_CHECKING:
-    from beags_plugin.plugin.options.config import BeagsTrainerConfig
-    from beags_plugin.plugin.views.datamanager import BeagsDataManager
-
 
 _NO_TRUTH = GroundTruth(masks=[], visible={}, silhouettes={}, seen={})
 
@@ -36,16 +31,11 @@ class HeldOutViews(Sequence[EvalView]):
     Asking for a view raises ``UserError`` for a mask that cannot be read or has other proportions than its photograph.
     """
 
-    def __init__(
-        self, config: BeagsTrainerConfig, classes: Mapping[int, str], manager: BeagsDataManager | None = None
-    ) -> None:
-        """manager: of the same config, if one is at hand."""
-        if manager is None:
-            made = config.data_config.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
-            manager = cast("BeagsDataManager", made)
+    def __init__(self, manager: BeagsDataManager, classes: Mapping[int, str], background: Tensor) -> None:
+        """manager: of the data. classes: id to name. background: [3], shown behind photographs with alpha."""
         self.manager = manager
         self.classes = classes
-        self.background = fixed_background(config.model_config)
+        self.background = background.cpu()
         self._views = self.manager.views("test")
         self._metadata = self.manager.eval_dataset.metadata
         self._kind: str = self._metadata["mask_kind"]

@@ -1,9 +1,12 @@
-"""What a run writes for tensorboard and wandb besides nerfstudio's own: scalars and pictures, at intervals."""
+"""Measurements while a run trains: curves for tensorboard and wandb, and the quality of held-out views."""
 
 from __future__ import annotations
 
+import json
+import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,15 +23,19 @@ from beags_plugin.evaluation.violations import boundary_errors, occupancy_violat
 from beags_plugin.extraction.select import select_class
 from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.labels.colors import colorize
+from beags_plugin.losses.photometric import psnr, ssim
+from beags_plugin.plugin.training.scene_model import SceneModel
+from beags_plugin.plugin.views.datamanager import BeagsDataManager
+from beags_plugin.plugin.views.views import View
 from beags_plugin.rasterizers.rendering import draw_class_map, surfel_inputs
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.memory import memory_mb, peak_memory_mb
-from beags_plugin.system.progress import progress_bar
-
-if TYPE_CHECKING:
-    from beags_plugin.plugin.model import BeagsModel
+from beags_plugin.system.progress import counted, progress_bar
+from beags_plugin.system.whole_files import write_text_atomically
 
 MOST_CLASSES = 20  # with a curve and a picture each: the first ones by id; more could not be told apart
+CURVE = "held_out.json"
+"""File of a run: one record per measurement, see ``HeldOutCurve``."""
 VIEWS = 4  # held-out views that a measurement of masks looks at, spread over all
 
 
@@ -39,7 +46,7 @@ class Curves:
     with classes; 0: never. last: number of steps of the run. log_every: steps between two other scalars.
     """
 
-    def __init__(self, model: BeagsModel, views: Sequence[EvalView], every: int, last: int, log_every: int) -> None:
+    def __init__(self, model: SceneModel, views: Sequence[EvalView], every: int, last: int, log_every: int) -> None:
         self.model = model
         self.every = every
         self.last = last
@@ -49,7 +56,7 @@ class Curves:
         self._measured = False  # objects, at least once
 
     def state(self) -> dict[str, Any]:
-        """Whether objects have been measured; see ``training_state.Part``."""
+        """Whether objects have been measured; see ``resumable.Resumable``."""
         return {"measured": self._measured}
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -82,10 +89,10 @@ class Curves:
         return {names[index]: value for index, value in found.items() if index in names}
 
     def _boundaries(self, step: int) -> None:
-        """Of the training view that was just drawn."""
-        drawn = self.model.drawn
-        if drawn is not None and drawn.labels is not None and drawn.render.boundary is not None:
-            errors = boundary_errors(drawn.render.boundary.detach(), drawn.labels)
+        """Write the boundary errors of the training view that was just rendered."""
+        last = self.model.last_render
+        if last is not None and last.labels is not None and last.render.boundary is not None:
+            errors = boundary_errors(last.render.boundary.detach(), last.labels)
             for name, error in self._named(errors).items():
                 writer.put_scalar(f"Boundary error/{name}", error, step)
 
@@ -160,3 +167,75 @@ def spread(views: Sequence[EvalView], most: int) -> list[EvalView]:
     """At most so many of the views, at even distances."""
     count = min(most, len(views))
     return [views[(2 * index + 1) * len(views) // (2 * count)] for index in range(count)]
+
+
+class HeldOutCurve:
+    """Quality against steps, kept in ``<run>/held_out.json``.
+
+    A record holds ``step`` (steps done), ``gaussians``, ``psnr`` (dB) and ``ssim`` of the held-out views (means over
+    them), ``train_psnr`` of as many training views spread over all, and ``seconds`` and ``cpu_seconds`` of training so
+    far, without what the measurements took. Only colours are drawn: a view costs a fraction of a step.
+    """
+
+    def __init__(self, folder: Path, every: int, last: int, model: SceneModel, datamanager: BeagsDataManager) -> None:
+        self.file = folder / CURVE
+        self.every = every
+        self.ends = {model.schedule.base_steps, last}
+        self.model = model
+        self.held_out = datamanager.views("eval")
+        train = datamanager.views("train")
+        count = min(len(self.held_out), len(train))
+        self.train = [train[index * len(train) // count] for index in range(count)]
+        self.records: list[dict[str, float]] = []
+        self._started = _clocks()
+
+    def state(self) -> dict[str, Any]:
+        """The curve so far, and the clocks; see ``resumable.Resumable``."""
+        now = _clocks()
+        return {"records": list(self.records), "clocks": {name: now[name] - self._started[name] for name in now}}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on with the curve of the run that gave ``state``."""
+        self.records = list(state["records"])
+        self._started = {name: now - state["clocks"][name] for name, now in _clocks().items()}
+
+    def after_step(self, step: int) -> None:
+        """Measure if the time has come: at every multiple of ``every`` steps, and where a phase ends."""
+        done = step + 1
+        if done % self.every == 0 or done in self.ends:
+            began = _clocks()
+            used = {name: began[name] - self._started[name] for name in began}
+            self.records.append({**self._measure(done), **used})
+            write_text_atomically(json.dumps(self.records, indent=1), self.file)
+            self._started = {name: self._started[name] + now - began[name] for name, now in _clocks().items()}
+
+    def _measure(self, done: int) -> dict[str, float]:
+        views = [*self.held_out, *self.train]
+        with progress_bar("Measuring held-out views", passing=True) as progress:
+            qualities = [self._quality(view) for view in counted(views, len(views), progress)]
+        psnr, similarity = zip(*qualities[: len(self.held_out)], strict=True)
+        train_psnr = [quality for quality, _ in qualities[len(self.held_out) :]]
+        return {
+            "step": done,
+            "gaussians": self.model.num_points,
+            "psnr": sum(psnr) / len(psnr),
+            "ssim": sum(similarity) / len(similarity),
+            "train_psnr": sum(train_psnr) / len(train_psnr),
+        }
+
+    @torch.no_grad()
+    def _quality(self, view: View) -> tuple[float, float]:
+        model = self.model
+        background = model.background_color.to(model.device)
+        image = view.image_on(background)
+        drawn = model.rasterizer.rasterize(
+            surfel_inputs(model.surfels(), view.camera, model.active_sh_degree()),
+            view.camera,
+            model.settings(geometry=False),
+            background,
+        ).color.clamp(0.0, 1.0)
+        return float(psnr(drawn, image)), float(ssim(drawn, image))
+
+
+def _clocks() -> dict[str, float]:
+    return {"seconds": time.perf_counter(), "cpu_seconds": time.process_time()}

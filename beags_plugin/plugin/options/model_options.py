@@ -1,0 +1,97 @@
+"""Options of the scene and of its two training phases."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import torch
+from nerfstudio.models.base_model import ModelConfig
+from torch import Tensor
+
+from beags_plugin.core.densification import DensifyConfig
+from beags_plugin.core.sh import MAX_DEGREE
+from beags_plugin.plugin.options.loss_spec import LossSpec
+from beags_plugin.plugin.options.schedule import PhaseSchedule
+from beags_plugin.preparation.border_split import BorderSplitConfig
+from beags_plugin.preparation.pipeline import PreparationConfig
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.registry import load
+
+
+@dataclass
+class BeagsModelConfig(ModelConfig):
+    """Options of the scene and of its two training phases."""
+
+    _target: type = field(default_factory=lambda: load("beags_plugin.plugin.model:BeagsModel"))
+    rasterizer: str = "auto"
+    """Backend: auto, native, torch, cuda, cuda-ahead (docs/cuda.md), or one that another package registers."""
+    sh_degree: int = 3
+    """Highest degree of the colour's spherical harmonics (0..3)."""
+    sh_degree_interval: int = 1000
+    """A degree is added every so many steps."""
+    background_color: Literal["black", "white", "random"] = "black"
+    """Background behind the scene, and behind images with alpha; "random" draws one per training step, and is black
+    elsewhere."""
+    start_from: Path | None = None
+    """A trained scene to start from instead of seed points: a 3DGS or 2DGS .ply, or a run of splatfacto or beags. 3D
+    Gaussians are flattened. base_steps then polish it, without growth."""
+    start_frame: Literal["auto", "world", "normalised"] = "auto"
+    """Frame of start_from: world, that of the input poses; normalised, that of this run; auto: world for a .ply, and
+    for a run what its dataparser_transforms.json says."""
+    base_steps: int = 30_000
+    """Steps of base training; 0 for a refinement that starts from a loaded base."""
+    refine_steps: int = 3_000
+    """Steps of refinement; 0 trains a base only."""
+    refine_rounds: int = 1
+    """How often masks, classes and voxel grids are made, at even distances of refinement: each round starts again from
+    the masks of the data, with the depth of the scene as it then is. 1, as in the paper: before refinement alone."""
+    schedule_steps: int = 30_000
+    """Length of base training for which all other steps and intervals of the base are stated; with another base_steps
+    they are scaled in proportion. 0: they are taken as they are."""
+    refiner: str = "bea"
+    """What happens after class assignment: bea (this method), none (assignment alone), or a registered one."""
+    losses: dict[str, LossSpec] = field(default_factory=dict)
+    """The terms of the training loss by name."""
+    densify: DensifyConfig = field(default_factory=DensifyConfig)
+    """When and how the base grows and prunes its Gaussians."""
+    prepare: PreparationConfig = field(default_factory=PreparationConfig)
+    """Options of mask reprojection and of the voxel grids."""
+    split: BorderSplitConfig = field(default_factory=BorderSplitConfig)
+    """Which Gaussians at class borders are split before refinement; none unless rounds is 1 or more."""
+    position_lr: tuple[float, float] = (1.6e-4, 1.6e-6)
+    """First and last learning rate of the positions, log-linear, times the scene's extent."""
+    refine_position_lr_factor: float = 1.0
+    """Factor of the positions' learning rate while refining; 1, as in the paper, is the end of the base schedule."""
+    near: float = 0.01
+    """Near plane in units of the scene's extent."""
+    far: float = 100.0
+    """Far plane in units of the scene's extent."""
+
+    def check(self) -> None:
+        """Raise ``UserError`` for a value that training could not work with, or would only end with."""
+        for name in ("base_steps", "refine_steps", "schedule_steps"):
+            if (steps := getattr(self, name)) < 0:
+                raise UserError(f"{name} is {steps}: give a number of steps, 0 or more.")
+        if not 0 <= self.sh_degree <= MAX_DEGREE:
+            raise UserError(f"sh_degree is {self.sh_degree}: choose 0 to {MAX_DEGREE}.")
+        for name, value in (("sh_degree_interval", self.sh_degree_interval), ("densify.every", self.densify.every)):
+            if value < 1:
+                raise UserError(f"{name} is {value}: give a number of steps, 1 or more.")
+        if not 0 < self.near < self.far < math.inf:
+            raise UserError(f"near is {self.near} and far {self.far}: near must lie above 0 and below far.")
+        if not all(0 < rate < math.inf for rate in self.position_lr):
+            raise UserError(f"position_lr is {self.position_lr}: give two learning rates above 0.")
+        if not 0 <= self.refine_position_lr_factor < math.inf:
+            raise UserError(f"refine_position_lr_factor is {self.refine_position_lr_factor}: give 0 or more.")
+
+    def schedule(self) -> PhaseSchedule:
+        """Steps of both phases."""
+        return PhaseSchedule(self.base_steps, self.refine_steps, self.schedule_steps, self.start_from is not None)
+
+
+def fixed_background(config: BeagsModelConfig, device: torch.device | str = "cpu") -> Tensor:
+    """[3], the colour behind a scene that is looked at or scored: the one that it was trained on, black for random."""
+    return torch.full((3,), 1.0 if config.background_color == "white" else 0.0, device=device)

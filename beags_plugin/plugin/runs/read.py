@@ -1,0 +1,143 @@
+"""Reading runs: the trained scene, the frame it was trained in, and the data it was trained on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.export.base import Viewpoints
+from beags_plugin.plugin.options.config import BeagsTrainerConfig
+from beags_plugin.plugin.runs.checkpoint_file import check_state, read_checkpoint
+from beags_plugin.plugin.runs.layout import TRANSFORM_FILE, newest_checkpoint
+from beags_plugin.plugin.runs.run_config import load_run_config
+from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
+from beags_plugin.plugin.views.datamanager import BeagsDataManager
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.interface import RasterSettings
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.text import load_json, reason
+
+
+@dataclass(frozen=True)
+class SavedScene:
+    """A trained run as it lies on disk: config, model state (tensors by name), step and class names."""
+
+    config: BeagsTrainerConfig
+    state: dict[str, Any]
+    step: int
+    classes: dict[int, str]
+
+    def surfels(self) -> Surfels:
+        """Return the scene's N surfels."""
+        state = {name: self.state[f"gauss_params.{name}"] for name in ("means", "quats", "scales", "opacities")}
+        dc, rest = self.state["gauss_params.features_dc"], self.state["gauss_params.features_rest"]
+        return Surfels(state["means"], state["quats"], state["scales"], state["opacities"][:, 0], dc, rest)
+
+    @property
+    def assigned(self) -> bool:
+        """Whether the Gaussians have classes."""
+        return bool(self.state["assigned"])
+
+    @property
+    def class_ids(self) -> Tensor | None:
+        """[N] int32, phi; None before the Gaussians have classes."""
+        return self.state["class_ids"] if self.assigned else None
+
+
+def read_scene(config_path: Path) -> SavedScene:
+    """Read a run's newest checkpoint; raises ``UserError`` if the run is incomplete or the file is damaged."""
+    config = load_run_config(config_path)
+    path = newest_checkpoint(config.get_checkpoint_dir())
+    checkpoint = read_checkpoint(path)
+    prefix = "_model."
+    state = {name[len(prefix) :]: value for name, value in checkpoint["pipeline"].items() if name.startswith(prefix)}
+    check_state(state, path)
+    return SavedScene(config, state, checkpoint["step"], state["_extra_state"]["classes"])
+
+
+def load_scene(config_path: Path) -> SavedScene:
+    """Read a run's newest checkpoint; raises ``UserError`` if the run is incomplete or no class was assigned."""
+    scene = read_scene(config_path)
+    if not scene.assigned:
+        raise UserError(
+            f"{config_path.parent} is a base without classes: refine it first "
+            f"(ns-train beags-refine --load-dir {scene.config.get_checkpoint_dir()})."
+        )
+    return scene
+
+
+def raster_settings(scene: SavedScene) -> RasterSettings:
+    """Return the depth range of a saved scene."""
+    extent, model = float(scene.state["extent"]), scene.config.model_config
+    return RasterSettings(model.near * extent, model.far * extent)
+
+
+def read_transform(run: Path) -> tuple[Tensor, float] | None:
+    """The data parser's transform ([3, 4], scale) that a run was trained in; None if the run has not kept it.
+
+    Raises ``UserError`` if the file is damaged.
+    """
+    path = run / TRANSFORM_FILE
+    if not path.exists():
+        return None
+    try:
+        content = load_json(path)
+        transform, scale = torch.tensor(content["transform"], dtype=torch.float64), float(content["scale"])
+        if transform.shape != (3, 4):
+            raise ValueError(f"its transform is {list(transform.shape)}, not [3, 4]")
+        if not (bool(transform.isfinite().all()) and math.isfinite(scale) and scale > 0):
+            raise ValueError("it holds what is no number, or a scale that is not above 0")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path} cannot be read ({reason(error)}): restore it.") from error
+    return transform, scale
+
+
+def check_data(data: Path, config_path: Path) -> None:
+    """Raise ``UserError`` for data of a run that are gone. config_path: of the run."""
+    if not data.exists():
+        raise UserError(f"{config_path} was trained on {data}, which is gone: put it back.")
+
+
+@contextmanager
+def _data(config: BeagsTrainerConfig, config_path: Path) -> Iterator[None]:
+    """Name the run in errors about its data, and refuse data that are gone."""
+    check_data(config.data_path, config_path)
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"the data of {config_path} cannot be read: {error}") from error
+
+
+def data_of_run(config: BeagsTrainerConfig, config_path: Path, split: Literal["val", "test"]) -> BeagsDataManager:
+    """Open the data that a run was trained on.
+
+    split: which held-out views to prepare. config_path: of the run, for messages. Raises ``UserError`` for data that
+    are gone or cannot be read.
+    """
+    with _data(config, config_path):
+        made = config.data_config.setup(device="cpu", test_mode=split, world_size=1, local_rank=0)
+        return cast(BeagsDataManager, made)
+
+
+def training_viewpoints(config: BeagsTrainerConfig, settings: RasterSettings, config_path: Path) -> Viewpoints:
+    """Return the training views of a run, in its own frame; raises ``UserError`` if its data cannot be read.
+
+    settings: depth range of the scene. config_path: of the run, for messages.
+    """
+    with _data(config, config_path):
+        # Poses alone: no photo is read, and lens distortion does not matter to where one looks from.
+        parser = replace(config.data_config.dataparser, data=config.data_path).setup()
+        cameras = parser.get_dataparser_outputs(split="train").cameras
+    return Viewpoints(
+        [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))],
+        make_rasterizer(config.model_config.rasterizer),
+        settings,
+    )

@@ -1,0 +1,49 @@
+"""Writing runs: checkpoints, and run folders on which every ns-* command works."""
+
+from __future__ import annotations
+
+import shutil
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from torch import Tensor
+
+from beags_plugin.plugin.options.config import CONFIG_FILE, BeagsTrainerConfig
+from beags_plugin.plugin.runs.layout import TRANSFORM_FILE
+from beags_plugin.system.whole_files import write_text_atomically, write_whole
+
+
+def save_atomically(content: Any, path: Path) -> None:
+    """``torch.save`` that leaves either the old file or the whole new one, never half of one."""
+    # beside the folder, not in it: nerfstudio takes any file among the checkpoints for one
+    write_whole(path, lambda file: torch.save(content, file), path.parent.parent)
+
+
+def write_run(config: BeagsTrainerConfig, folder: Path, model_state: dict[str, Tensor], step: int) -> Path:
+    """Write a run of its own that holds ``model_state``; returns the path of its config.yml.
+
+    config: of the run it comes from; model_state: of a ``BeagsModel``; step: as stored in the checkpoint.
+    """
+    folder = folder.absolute()
+    own = deepcopy(config)
+    own.run_dir = folder
+    own.load_dir = own.load_checkpoint = own.load_config = own.load_step = None
+    state = {
+        f"_model.{name}": value.detach().cpu() if isinstance(value, Tensor) else value
+        for name, value in model_state.items()
+    }
+    checkpoint = {"step": step, "pipeline": state, "optimizers": {}, "schedulers": {}, "scalers": {}}
+    path = folder / own.relative_model_dir / f"step-{step:09d}.ckpt"
+    save_atomically(checkpoint, path)
+    for old in path.parent.glob("*.ckpt"):  # of an earlier run into the same folder
+        if old != path:
+            old.unlink()
+    config_path = folder / CONFIG_FILE
+    write_text_atomically(yaml.dump(own), config_path)
+    transform = config.get_base_dir() / TRANSFORM_FILE
+    if transform.exists() and transform.parent != folder:
+        shutil.copyfile(transform, folder / TRANSFORM_FILE)
+    return config_path

@@ -1,0 +1,75 @@
+"""Growth of the base while it trains: densification and opacity resets (method, section 1)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.densification import GradientStatistics, densify, length_units, reset_opacity
+from beags_plugin.plugin.training.scene_edits import edit_scene, move_adam_state
+from beags_plugin.plugin.training.scene_model import SceneModel
+from beags_plugin.system import processes
+
+
+class Densifier:
+    """Grows and prunes the base by the screen gradients that it gathers.
+
+    pixels: of all training images. camera_centers: [V, 3] world.
+    """
+
+    def __init__(self, model: SceneModel, optimizers: dict, pixels: int, camera_centers: Tensor) -> None:
+        self.model = model
+        self.camera_centers = camera_centers
+        self.config = model.config.densify.scaled(model.schedule.scale).bounded(pixels)
+        self.optimizers = optimizers
+        self.statistics = GradientStatistics(model.num_points, model.device)
+
+    def state(self) -> dict[str, Any]:
+        """What was gathered since the scene last grew, as long as it grows; see ``resumable.Resumable``."""
+        found = self.statistics if self.model.growing else GradientStatistics(0)
+        return {"total": found.total, "views": found.views}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on gathering, in the first process alone: what the others had gathered is not in a checkpoint."""
+        if processes.rank() == 0 and len(state["total"]) == self.model.num_points:
+            kept = self.statistics
+            kept.total, kept.views = state["total"].clone().to(kept.total), state["views"].clone().to(kept.views)
+
+    def before_step(self, step: int) -> None:
+        """Let the step be drawn with what is gathered, as long as the scene still grows; a trained one does not."""
+        schedule = self.model.schedule
+        self.model.growing = not schedule.warm and step + 1 < min(self.config.stop, schedule.base_steps)
+
+    def after_step(self, step: int) -> None:
+        """Gather; densify and reset opacities when their step has come."""
+        config, last = self.config, self.model.last_render
+        done = step + 1
+        if not self.model.growing or last is None:
+            return
+        if last.screen_shift is not None and last.screen_shift.grad is not None:
+            self.statistics.add(last.screen_shift.grad.norm(dim=-1), last.render.visible)
+        if config.grows_at(done):
+            self._densify(done)
+        if config.resets_at(done):
+            self._reset_opacity()
+
+    def _densify(self, step: int) -> None:
+        model = self.model
+        surfels = model.surfels().detach()
+        processes.add_up([self.statistics.total, self.statistics.views])
+        units = length_units(surfels.means, self.camera_centers, float(model.extent), self.config)
+        edited = densify(surfels, self.statistics.mean(), units, self.config, step, model.generator(step))
+        edit_scene(model, self.optimizers, edited)
+        self.statistics = GradientStatistics(model.num_points, model.device)
+        model.last_render = None
+
+    def _reset_opacity(self) -> None:
+        model = self.model
+        logits = reset_opacity(model.surfels().detach(), self.config)
+        parameter = model.gauss_params["opacities"]
+        parameter.data = logits[:, None].contiguous()
+        everyone = torch.arange(logits.shape[0])
+        start_anew = torch.ones_like(everyone, dtype=torch.bool)
+        move_adam_state(self.optimizers["opacities"], parameter, parameter, everyone, start_anew)

@@ -1,0 +1,124 @@
+"""Time of a run: the parts of a step, the stages of the run, and an estimate of how long it takes."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from nerfstudio.utils.rich_utils import CONSOLE
+
+QUICKER = "Quicker: ns-train beags-tiny, or end the command with: beags-data --downscale-factor 2."
+LONG_RUN_SECONDS = 20 * 60  # a run that is expected to take longer says which preset is quicker
+ESTIMATE_STEPS = (20, 120)  # the estimate is the mean step between these: after warm-up, soon enough to matter
+
+
+class Estimate:
+    """Print once how long ``steps`` steps of a method will take."""
+
+    def __init__(self, method: str, steps: int) -> None:
+        self._steps = steps
+        self._from = 0.0
+        CONSOLE.print(
+            f"{method}: {steps} steps; how long they take is said after {ESTIMATE_STEPS[1]} of them. {QUICKER}",
+            highlight=False,
+        )
+
+    def before_step(self, done: int) -> None:
+        """Take, before every step, how many steps this process has done."""
+        first, last = ESTIMATE_STEPS
+        if done == first:
+            self._from = time.perf_counter()
+        if done == last:
+            self._say((time.perf_counter() - self._from) / (last - first))
+
+    def _say(self, seconds_per_step: float) -> None:
+        left = self._steps * seconds_per_step
+        message = (
+            f"About {_duration(left)} for {self._steps} steps at the present speed "
+            f"({1000 * seconds_per_step:.0f} ms a step; it slows down as Gaussians are added)."
+        )
+        if left > LONG_RUN_SECONDS:
+            message += f" {QUICKER}"
+        CONSOLE.print(message, highlight=False)
+
+
+class StageSeconds:
+    """Measure the wall time of base training, each preparation stage and refinement; a resumed run counts on."""
+
+    def __init__(self) -> None:
+        self._started = time.perf_counter()
+        self._former: dict[str, float] = {}
+        self._stages: dict[str, float] = {}
+        self._preparing = 0.0
+        self._refining_since = 0.0
+
+    def start(self) -> None:
+        """Begin to count: the run trains from here on."""
+        self._started = time.perf_counter()
+
+    def prepared(self, stages: dict[str, float], seconds: float, first: bool) -> None:
+        """Add a preparation of ``seconds``, with those of its stages; they do not count as refinement.
+
+        first: whether refinement begins here.
+        """
+        self._preparing += seconds
+        self._refining_since = time.perf_counter() if first else self._refining_since + seconds
+        names = {**self._stages, **stages}
+        self._stages = {name: self._stages.get(name, 0.0) + stages.get(name, 0.0) for name in names}
+
+    def refining(self) -> None:
+        """Begin to count refinement that another process has prepared."""
+        self._refining_since = time.perf_counter()
+
+    def total(self) -> dict[str, float]:
+        """Return seconds by name."""
+        now = time.perf_counter()
+        refining = now - self._refining_since if self._refining_since > 0 else 0.0
+        base = now - self._started - self._preparing - refining
+        own = {"base training": base, **self._stages, "refinement": refining}
+        names = [name for name in {**self._former, **own} if name != "refinement"]
+        return {name: self._former.get(name, 0.0) + own.get(name, 0.0) for name in [*names, "refinement"]}
+
+    def state(self) -> dict[str, Any]:
+        """See ``resumable.Resumable``."""
+        return self.total()
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """See ``resumable.Resumable``."""
+        self._former = dict(state)
+
+
+class StepClock:
+    """Measure the seconds per part of a step: each lasts from the mark before to its own."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+        self._seconds: dict[str, float] = {}
+        self._steps = 0
+
+    def start(self) -> None:
+        """Begin a step."""
+        self._steps += 1
+        self._last = time.perf_counter()
+
+    def mark(self, part: str) -> None:
+        """End ``part`` here."""
+        now = time.perf_counter()
+        self._seconds[part] = self._seconds.get(part, 0.0) + now - self._last
+        self._last = now
+
+    def skip(self) -> None:
+        """Count the time since the last mark to no part."""
+        self._last = time.perf_counter()
+
+    def means(self) -> dict[str, float]:
+        """Return the seconds per step of each part, since the last call."""
+        steps, self._steps = max(self._steps, 1), 0
+        found, self._seconds = {part: seconds / steps for part, seconds in self._seconds.items()}, {}
+        return found
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
