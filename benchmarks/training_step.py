@@ -8,7 +8,6 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from beags_plugin.core.adam import clear_gradients, step_all
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.boundary import BoundaryLoss
@@ -57,22 +56,21 @@ class TrainingStep:
             name: torch.nn.Parameter(value.clone().contiguous()) for name, value in self.parameters.items()
         }
         # A rate of 0: all the work of a step, and every step the same.
-        self.optimizers = [
-            torch.optim.Adam([value], lr=0.0, eps=1e-15, fused=True) for value in self.parameters.values()
-        ]
+        groups = [{"params": [value]} for value in self.parameters.values()]
+        self.adam = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
         self.step = 0
 
     def run(self) -> Seconds:
         """One step; how long it takes."""
         start = Seconds.now()
-        clear_gradients(self.optimizers)
+        self.adam.zero_grad()
         surfels = self._surfels()
         class_ids = self.scene.class_ids if self.refining else None
         render = self._rasterize(surfel_inputs(surfels, self.scene.camera, class_ids=class_ids))
         inputs = self._loss_inputs(surfels, render)
         # as nerfstudio adds them up
         reduce(torch.add, [loss.weighted(inputs) for loss in self.losses.values()]).backward()
-        step_all(self.optimizers)
+        self.adam.step()
         self.step += 1
         return Seconds.now() - start
 
@@ -86,7 +84,7 @@ class TrainingStep:
             seconds[part] = Seconds.now() - clock
             clock = Seconds.now()
 
-        clear_gradients(self.optimizers)
+        self.adam.zero_grad()
         surfels = self._surfels()
         class_ids = self.scene.class_ids if self.refining else None
         inputs = surfel_inputs(surfels, self.scene.camera, class_ids=class_ids)
@@ -109,7 +107,7 @@ class TrainingStep:
         stop("rasterizer backward")
         torch.autograd.backward([getattr(inputs, name) for name in names], [getattr(cut, name).grad for name in names])
         stop("rest of the backward")
-        step_all(self.optimizers)
+        self.adam.step()
         stop("Adam")
         self.step += 1
         return seconds

@@ -12,7 +12,6 @@ import torch
 import torch.distributed as dist
 from labelled_views import labelled_views
 
-from beags_plugin.core.adam import clear_gradients, step_all
 from beags_plugin.core.densification import GradientStatistics
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.photometric import ssim
@@ -26,10 +25,10 @@ def trained(rank: int, processes: int) -> list[torch.Tensor]:
     """The parameters, Adam's moments and the statistics of growth after some steps."""
     start, cameras, _, rasterizer, settings = labelled_views(STEPS * VIEWS, 0.15)
     leaves = [getattr(start, field.name).clone().requires_grad_() for field in fields(Surfels)]
-    optimizers = [torch.optim.Adam([leaf], lr=0.01, eps=1e-15, fused=True) for leaf in leaves]
+    adam = torch.optim.Adam(leaves, lr=0.01, eps=1e-15, fused=True)
     statistics = GradientStatistics(len(start.means))
     for step in range(STEPS):
-        clear_gradients(optimizers)
+        adam.zero_grad()
         for view in range(VIEWS):
             if processes > 1 and view != rank:
                 continue
@@ -45,10 +44,9 @@ def trained(rank: int, processes: int) -> list[torch.Tensor]:
         if processes == 1:
             for gradient in gradients:
                 gradient /= VIEWS
-        step_all(optimizers)
+        adam.step()
     add_up([statistics.total, statistics.views])
-    moments = [optimizer.state[leaf][name] for optimizer, leaf in zip(optimizers, leaves, strict=True)
-               for name in ("exp_avg", "exp_avg_sq") if leaf.grad is not None]  # fmt: skip
+    moments = [adam.state[leaf][name] for leaf in leaves if leaf.grad is not None for name in ("exp_avg", "exp_avg_sq")]
     return [*(leaf.detach() for leaf in leaves), *moments, statistics.views, statistics.total]
 
 

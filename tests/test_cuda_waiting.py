@@ -9,7 +9,6 @@ import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from beags_plugin.core.adam import clear_gradients, step_all
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import GradientStatistics
 from beags_plugin.core.surfels import Surfels
@@ -132,14 +131,14 @@ def test_a_loss_waits_for_nothing(loss, gpu):
 def test_growth_and_adam_wait_for_nothing(gpu):
     leaves = parameters()
     surfels = Surfels(*leaves)
-    optimizers = [torch.optim.Adam([leaf], lr=0.1, fused=True) for leaf in leaves]
+    adam = torch.optim.Adam(leaves, lr=0.1, fused=True)
     statistics = GradientStatistics(N, "cuda")
-    clear_gradients(optimizers)
+    adam.zero_grad()
     for leaf in leaves:
         leaf.grad = torch.ones_like(leaf)
     statistics.add(surfels.means.grad.norm(dim=-1), rand(N) > 0.5)
     assert statistics.mean().device.type == "cuda"
-    step_all(optimizers)
+    adam.step()
     assert gpu.found == []
 
 

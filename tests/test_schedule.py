@@ -151,12 +151,12 @@ def test_official_learning_rates(model):
     from beags_plugin.plugin.training.callbacks import set_learning_rates
 
     configs = base_config().optimizers
-    optimizers = {name: torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))]) for name in configs}
+    adam = torch.optim.Adam([{"params": [torch.nn.Parameter(torch.zeros(1))], "name": name} for name in configs])
     model.extent, model.schedule = torch.tensor(2.5), PhaseSchedule(30_000, 0, 30_000)
 
     def rates(step):
-        set_learning_rates(model, optimizers, configs, step)
-        return {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.items()}
+        set_learning_rates(model, adam, configs, step)
+        return {group["name"]: group["lr"] for group in adam.param_groups}
 
     constant = {"features_dc": 2.5e-3, "features_rest": 1.25e-4, "opacities": 0.05, "scales": 0.005, "quats": 0.001}
     assert rates(0) == pytest.approx({"means": 2.5 * 1.6e-4, **constant})

@@ -11,7 +11,6 @@ from torch.optim import Adam
 
 from beags_plugin.assignment.assignment import assign_classes
 from beags_plugin.bench.scaling_scene import SETTINGS, SyntheticScene
-from beags_plugin.core.adam import clear_gradients, step_all
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.boundary import BoundaryLoss
@@ -76,7 +75,7 @@ class _Training:
         self.scene, self.rasterizer = scene, rasterizer
         values = {field.name: getattr(scene.surfels, field.name) for field in fields(Surfels)}
         self.parameters = {name: value.clone().requires_grad_() for name, value in values.items()}
-        self.optimizers = [Adam([value], lr=_RATE, eps=1e-15, fused=True) for value in self.parameters.values()]
+        self.adam = Adam(self.parameters.values(), lr=_RATE, eps=1e-15, fused=True)
         self.step = 0
 
     def loss(self, view: int) -> Tensor:
@@ -85,8 +84,8 @@ class _Training:
     def __call__(self) -> float:
         loss = self.loss(self.step % len(self.scene.cameras))
         loss.backward()
-        step_all(self.optimizers)
-        clear_gradients(self.optimizers)
+        self.adam.step()
+        self.adam.zero_grad()
         self.step += 1
         return float(loss.detach())
 
@@ -124,7 +123,7 @@ class _ChannelStep(_Training):
         super().__init__(scene, rasterizer)
         self.renders = -(-scene.num_classes // 3)
         self.scores = torch.zeros(self.renders, len(scene.surfels), 3, requires_grad=True)
-        self.optimizers.append(Adam([self.scores], lr=_RATE, eps=1e-15, fused=True))
+        self.adam.add_param_group({"params": [self.scores]})
 
     def loss(self, view: int) -> Tensor:
         scene = self.scene

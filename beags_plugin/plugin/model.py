@@ -14,7 +14,7 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import initial_surfels
 from beags_plugin.labels.class_ids import BACKGROUND
-from beags_plugin.losses.base import Loss, LossInputs
+from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.class_members import ClassMembers
 from beags_plugin.losses.photometric import psnr, ssim
 from beags_plugin.plugin.options.model_options import fixed_background

@@ -10,8 +10,8 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 class BeagsPipeline(VanillaPipeline):
     """``VanillaPipeline`` without torch's ``DistributedDataParallel``, which keeps to the parameters it was made with.
 
-    Ours change in number as the scene grows: ``optimizers.JointOptimizers`` averages their gradients, and ``several``
-    does the rest.
+    Ours change in number as the scene grows: ``training.optimizers`` averages their gradients, and
+    ``training.replicas`` does the rest.
     """
 
     def __init__(self, *args: Any, world_size: int = 1, local_rank: int = 0, **kwargs: Any) -> None:

@@ -21,7 +21,7 @@ from beags_plugin.plugin.runs.layout import PREPARED, REPORT_FILE, STAGES
 from beags_plugin.plugin.training.checkpoints import Checkpoints
 from beags_plugin.plugin.training.memory_guard import NO_MEMORY, MemoryWatch, check_memory, forecast, is_out_of_memory
 from beags_plugin.plugin.training.monitor import HeldOutCurve
-from beags_plugin.plugin.training.optimizers import JointOptimizers
+from beags_plugin.plugin.training.optimizers import SceneOptimizer
 from beags_plugin.plugin.training.replicas import Rank
 from beags_plugin.plugin.training.resumable import GlobalRandom, Resumable
 from beags_plugin.plugin.training.scene_model import SceneModel
@@ -139,14 +139,14 @@ class BeagsTrainer(Trainer):
                 each.tb_writer.close()
                 each.tb_writer = type(each.tb_writer)(log_dir=folder, purge_step=self._start_step if own else 0)
 
-    def setup_optimizers(self) -> JointOptimizers:
-        """The optimizers that the config lists, one for each group of parameters.
+    def setup_optimizers(self) -> SceneOptimizer:
+        """Build the scene's optimizer.
 
-        A scene to start from takes its place before: the optimizers hold what they are built with.
+        A scene to start from takes its place before: the optimizer holds the parameters it is built with.
         """
         if self.config.model_config.start_from is not None and not self._checkpoints.loads:
             start_from_scene(self._model, cast(BeagsDataManager, self.pipeline.datamanager), self.base_dir)
-        return JointOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups(), self._model.clock)
+        return SceneOptimizer(self.config.optimizers.copy(), self.pipeline.get_param_groups(), self._model.clock)
 
     def train(self) -> None:
         """Train to the end of the schedule, also after a resume (nerfstudio would train that many steps more)."""

@@ -244,7 +244,7 @@ mistake("resuming", "a state of training of wrong content")(
     resumed(lambda at, run: content(lambda found: found["beags"]["parts"].update(views={"a": 1}))(at.checkpoint))
 )
 mistake("resuming", "an optimizer is missing")(
-    resumed(lambda at, run: content(lambda found: found["optimizers"].pop("means"))(at.checkpoint))
+    resumed(lambda at, run: content(lambda found: found["optimizers"].pop("scene"))(at.checkpoint))
 )
 mistake("resuming", "a tensor is missing")(
     resumed(lambda at, run: content(lambda found: [found["pipeline"].pop(NAMES)].clear())(at.checkpoint))

@@ -36,7 +36,7 @@ def _adam_fuses_on_cpus() -> bool:
 
 @dataclass
 class FusedAdamConfig(AdamOptimizerConfig):
-    """Adam in one pass over each parameter: a third of the time at 50,000 Gaussians."""
+    """Options of one group of parameters in the scene's Adam, which goes over each parameter in one pass."""
 
     fused: bool = field(default_factory=_adam_fuses_on_cpus)
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Any, cast
 
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from torch.optim import Adam
 
 from beags_plugin.core.cameras import camera_extent
 from beags_plugin.plugin.options.schedule import log_linear
 from beags_plugin.plugin.training.densifier import Densifier
 from beags_plugin.plugin.training.monitor import Curves
+from beags_plugin.plugin.training.optimizers import SceneOptimizer
 from beags_plugin.plugin.training.refinement import RefinementSwitch
 from beags_plugin.plugin.training.resumable import TrainingRun
 from beags_plugin.plugin.training.scene_model import SceneModel
@@ -22,12 +24,12 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
     trainer, pipeline = cast(TrainingRun, attributes.trainer), attributes.pipeline
     assert pipeline is not None and attributes.optimizers is not None
     datamanager = cast(BeagsDataManager, pipeline.datamanager)
-    optimizers = attributes.optimizers.optimizers
+    adam = cast(SceneOptimizer, attributes.optimizers).adam
     model.seed = trainer.config.machine.seed
     model.extent = camera_extent(datamanager.train_dataset.cameras.camera_to_worlds).to(model.device)
     cameras = datamanager.train_dataset.cameras
     pixels = int((cameras.height * cameras.width).sum())
-    densifier = Densifier(model, optimizers, pixels, cameras.camera_to_worlds[:, :3, 3])
+    densifier = Densifier(model, adam, pixels, cameras.camera_to_worlds[:, :3, 3])
     switch = RefinementSwitch(model, trainer, datamanager)
     switch.check_options()
     switch.check_masks()
@@ -48,7 +50,7 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
         if curves is not None:
             curves.before_step(step)
         model.clock.start()
-        set_learning_rates(model, optimizers, trainer.config.optimizers, step)
+        set_learning_rates(model, adam, trainer.config.optimizers, step)
 
     def after(step: int) -> None:
         densifier.after_step(step)
@@ -72,13 +74,12 @@ def _curves(model: SceneModel, trainer: TrainingRun, datamanager: BeagsDataManag
     return Curves(model, views, config.steps_per_objects, trainer.last_step, config.logging.steps_per_log)
 
 
-def set_learning_rates(model: SceneModel, optimizers: dict, configs: dict, step: int) -> None:
+def set_learning_rates(model: SceneModel, adam: Adam, configs: dict[str, Any], step: int) -> None:
     """Set every group's rate for this step, so that nothing depends on what a checkpoint last held."""
     progress, refining = model.schedule.progress(step), model.schedule.refining(step)
-    for name, optimizer in optimizers.items():
-        rate = configs[name]["optimizer"].lr
-        if name == "means":
+    for group in adam.param_groups:
+        rate = configs[group["name"]]["optimizer"].lr
+        if group["name"] == "means":
             rate = log_linear(*model.config.position_lr, progress) * model.extent_on_host()
             rate *= model.config.refine_position_lr_factor if refining else 1.0
-        for group in optimizer.param_groups:
-            group["lr"] = rate
+        group["lr"] = rate

@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.optim import Adam
 
 from beags_plugin.core.densification import GradientStatistics, densify, length_units, reset_opacity
 from beags_plugin.plugin.training.scene_edits import edit_scene, move_adam_state
@@ -19,11 +20,11 @@ class Densifier:
     pixels: of all training images. camera_centers: [V, 3] world.
     """
 
-    def __init__(self, model: SceneModel, optimizers: dict, pixels: int, camera_centers: Tensor) -> None:
+    def __init__(self, model: SceneModel, adam: Adam, pixels: int, camera_centers: Tensor) -> None:
         self.model = model
         self.camera_centers = camera_centers
         self.config = model.config.densify.scaled(model.schedule.scale).bounded(pixels)
-        self.optimizers = optimizers
+        self.adam = adam
         self.statistics = GradientStatistics(model.num_points, model.device)
 
     def state(self) -> dict[str, Any]:
@@ -61,7 +62,7 @@ class Densifier:
         processes.add_up([self.statistics.total, self.statistics.views])
         units = length_units(surfels.means, self.camera_centers, float(model.extent), self.config)
         edited = densify(surfels, self.statistics.mean(), units, self.config, step, model.generator(step))
-        edit_scene(model, self.optimizers, edited)
+        edit_scene(model, self.adam, edited)
         self.statistics = GradientStatistics(model.num_points, model.device)
         model.last_render = None
 
@@ -72,4 +73,4 @@ class Densifier:
         parameter.data = logits[:, None].contiguous()
         everyone = torch.arange(logits.shape[0])
         start_anew = torch.ones_like(everyone, dtype=torch.bool)
-        move_adam_state(self.optimizers["opacities"], parameter, parameter, everyone, start_anew)
+        move_adam_state(self.adam, parameter, parameter, everyone, start_anew)

@@ -1,41 +1,53 @@
-"""nerfstudio's optimizers, one for each group of parameters, stepped together."""
+"""One Adam for the whole scene, with a group for each kind of parameter, as in the official 2DGS code."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import torch
 from nerfstudio.engine.optimizers import Optimizers
 from torch.cuda.amp.grad_scaler import GradScaler
+from torch.nn import Parameter
 
-from beags_plugin.core.adam import clear_gradients, step_all
 from beags_plugin.plugin.training.replicas import average_gradients
 from beags_plugin.plugin.training.timing import StepClock
 
+SCENE = "scene"
+"""Name of the one optimizer, for nerfstudio and in checkpoints."""
 
-class JointOptimizers(Optimizers):
-    """``Optimizers`` whose groups are cleared and stepped in one go; optimizers, states and files are nerfstudio's."""
 
-    def __init__(self, config: dict[str, Any], param_groups: dict[str, Any], clock: StepClock | None = None) -> None:
-        super().__init__(config, param_groups)
+class SceneOptimizer(Optimizers):
+    """Step all parameters of the scene in one Adam; its groups have the names and the rates of the config.
+
+    adam: its ``param_groups`` carry a ``name`` each.
+    """
+
+    def __init__(
+        self, config: dict[str, Any], param_groups: dict[str, list[Parameter]], clock: StepClock | None = None
+    ) -> None:
+        groups = []
+        for name, parameters in param_groups.items():
+            options = config[name]["optimizer"]
+            groups.append({"params": parameters, "name": name, "lr": options.lr, "eps": options.eps})
+            groups[-1] |= {"weight_decay": options.weight_decay, "fused": options.fused}
+        self.config = config
         self.clock = clock or StepClock()
-
-    def zero_grad_some(self, param_groups: list[str]) -> None:
-        """See ``Optimizers.zero_grad_some``."""
-        clear_gradients(self.optimizers[name] for name in param_groups)
+        self.adam = torch.optim.Adam(groups)
+        self.optimizers = {SCENE: self.adam}
+        self.schedulers = {}
+        self.parameters = {SCENE: [value for parameters in param_groups.values() for value in parameters]}
 
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
-        """See ``Optimizers.optimizer_scaler_step_some``; scaled or clipped gradients go nerfstudio's way."""
+        """Average the gradients of all processes, clip those of groups whose config asks for it, and step."""
         self.clock.mark("backward")
-        groups = [group for name in param_groups for group in self.optimizers[name].param_groups]
-        # not `self.parameters`: those are the ones that training began with
+        groups = self.adam.param_groups  # not `self.parameters`: those are the ones that training began with
         average_gradients(value for group in groups for value in group["params"])
-        if grad_scaler.is_enabled():
-            super().optimizer_scaler_step_some(grad_scaler, param_groups)
-        else:
-            self._step_together(grad_scaler, param_groups)
+        norms = {group["name"]: self.config[group["name"]]["optimizer"].max_norm for group in groups}
+        if any(norm is not None for norm in norms.values()):
+            grad_scaler.unscale_(self.adam)
+            for group in groups:
+                if (norm := norms[group["name"]]) is not None:
+                    torch.nn.utils.clip_grad_norm_(group["params"], norm)
+        if any(value.grad is not None for group in groups for value in group["params"]):
+            grad_scaler.step(self.adam)
         self.clock.mark("optimizer")
-
-    def _step_together(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
-        clipped = [name for name in param_groups if self.config[name]["optimizer"].max_norm is not None]
-        super().optimizer_scaler_step_some(grad_scaler, clipped)
-        step_all(self.optimizers[name] for name in param_groups if name not in clipped)

@@ -148,7 +148,7 @@ class RefinementSwitch:
                 CONSOLE.print(f"  base kept in {snapshot}", highlight=False, markup=False, soft_wrap=True)
             save_prepared(prepared, [view.name for view in views], round_folder(self.trainer.base_dir, self.rounds))
             if prepared.edited is not None:
-                edit_scene(model, self.trainer.optimizers.optimizers, prepared.edited.edited)
+                edit_scene(model, self.trainer.optimizers.adam, prepared.edited.edited)
                 self._take_classes(prepared.edited.assignment)
             self.rounds += 1
             self._start(prepared.grid, prepared.labels)

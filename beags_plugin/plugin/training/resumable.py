@@ -10,11 +10,11 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.runs.checkpoint_file import scene_alone
+from beags_plugin.plugin.training.optimizers import SceneOptimizer
 from beags_plugin.plugin.training.timing import StageSeconds
 from beags_plugin.system.errors import UserError
 
@@ -41,14 +41,14 @@ class TrainingRun(Protocol):
 
     run: folder of the run, also in processes that write elsewhere; base_dir: folder that this process writes to.
     loaded_run: folder of the run that this one resumes. last_step: number of steps of the run. seconds: of its stages.
-    optimizers: nerfstudio's. train_lock: nerfstudio's, held during a step, so that the viewer waits.
+    optimizers: of the scene. train_lock: nerfstudio's, held during a step, so that the viewer waits.
     """
 
     config: BeagsTrainerConfig
     base_dir: Path
     last_step: int
     seconds: StageSeconds
-    optimizers: Optimizers
+    optimizers: SceneOptimizer
     train_lock: Lock
 
     @property
