@@ -32,7 +32,7 @@ from beags_plugin.rasterizers.interface import IGNORE, RasterSettings, SurfelInp
 from beags_plugin.rasterizers.pair_counts import PairCounts, capacity_for
 
 _FLOATS = ("means", "quats", "log_scales", "opacity_logits", "colors")
-_GEOMETRY, _DISTORTION, _BOUNDARY = 1, 2, 4  # Parts of native/types.h
+_GEOMETRY, _DISTORTION, _BOUNDARY = 1, 2, 4  # Parts of native/rasterizer/types.h
 _TILE = 16
 _AHEAD = 4  # drawings whose numbers of pairs the host need not know yet
 UNKNOWN = -1

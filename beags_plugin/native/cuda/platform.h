@@ -7,7 +7,7 @@
 
 #if defined(BEAGS_CUDA_EMULATION)
 
-#include "host_emulation.h"
+#include "cuda/emulation/host_emulation.h"
 
 namespace beags {
 namespace cuda {
