@@ -104,7 +104,7 @@ void bind(nb::module_& m, const char* name) {
           "contributing_classes",
           [](const Frame<T>& self, Ids labels, int num_classes, int threads) {
             nb::gil_scoped_release release;
-            return self.contributing_classes(labels.data(), num_classes, threads);
+            return self.sparse_class_contributions(labels.data(), num_classes, threads);
           },
           "labels"_a, "num_classes"_a, "threads"_a)
       .def(
@@ -118,7 +118,7 @@ void bind(nb::module_& m, const char* name) {
           "heaviest",
           [](const Frame<T>& self, Array<int32_t> indices, int threads) {
             nb::gil_scoped_release release;
-            self.heaviest(indices.data(), threads);
+            self.dominant_gaussian(indices.data(), threads);
           },
           "indices"_a, "threads"_a)
       .def(

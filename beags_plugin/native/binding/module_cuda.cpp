@@ -170,7 +170,7 @@ void bind_frame(nb::module_& m, const char* name) {
   frame.def(
       "heaviest",
       [](const Frame<T>& self, Ints indices, uintptr_t stream) {
-        heaviest(self.job(), indices.data(), stream_of(stream));
+        dominant_gaussian(self.job(), indices.data(), stream_of(stream));
       },
       "indices"_a, "stream"_a);
   frame.def_prop_ro_static("splat_bytes", [](nb::handle) { return sizeof(Splat<T>); });

@@ -11,7 +11,7 @@ namespace BEAGS_ISA {
 // What the pixels from `at` = (x, y) on add to the error; leaves their gradients by the drawn normal, and by their four
 // neighbours' depths in `shares`. x: one number in each lane.
 template <class T, class Where>
-BEAGS_OPS_INLINE RealOf<T> normal_error(const NormalJob<T>& job, int64_t at, RealOf<T> x, int y, Where lanes) {
+BEAGS_INLINE RealOf<T> normal_error(const NormalJob<T>& job, int64_t at, RealOf<T> x, int y, Where lanes) {
   using R = RealOf<T>;
   const T* d = job.depth + at;
   const Depths<R> depths = {lanes.load(d), lanes.load(d + 1), lanes.load(d - 1), lanes.load(d + job.width),
@@ -38,7 +38,7 @@ BEAGS_OPS_INLINE RealOf<T> normal_error(const NormalJob<T>& job, int64_t at, Rea
 
 // At the image's border there is no error.
 template <class T>
-BEAGS_OPS_INLINE void normal_border(const NormalJob<T>& job, int64_t at) {
+BEAGS_INLINE void normal_border(const NormalJob<T>& job, int64_t at) {
   if (!job.shares) return;
   const int64_t map = static_cast<int64_t>(job.height) * job.width;
   for (int i = 0; i < 4; ++i) job.shares[i * map + at] = T(0);

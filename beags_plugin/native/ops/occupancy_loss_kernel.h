@@ -31,14 +31,14 @@ struct OccupancyBatch {
 };
 
 template <class T>
-BEAGS_OPS_INLINE typename Lanes<T>::Real load(const T* from) {
+BEAGS_INLINE typename Lanes<T>::Real load(const T* from) {
   typename Lanes<T>::Real vector;
   __builtin_memcpy(&vector, from, sizeof vector);
   return vector;
 }
 
 template <class T>
-BEAGS_OPS_INLINE void store(T* to, typename Lanes<T>::Real vector) {
+BEAGS_INLINE void store(T* to, typename Lanes<T>::Real vector) {
   __builtin_memcpy(to, &vector, sizeof vector);
 }
 
@@ -51,7 +51,7 @@ struct Boxes {
 
 // from[kStride * lane].
 template <int kStride, class T>
-BEAGS_OPS_INLINE typename Lanes<T>::Real strided(const T* from) {
+BEAGS_INLINE typename Lanes<T>::Real strided(const T* from) {
   typename Lanes<T>::Real out;
   for (int lane = 0; lane < Lanes<T>::kCount; ++lane) out[lane] = from[kStride * lane];
   return out;
@@ -63,14 +63,14 @@ struct Parameters {
   typename Lanes<T>::Real mean[3], quat[4], log_scale[2], logit;
 
   // Of neighbours, from `first` on.
-  BEAGS_OPS_INLINE Parameters(const OccupancyJob<T>& job, int64_t first) {
+  BEAGS_INLINE Parameters(const OccupancyJob<T>& job, int64_t first) {
     for (int axis = 0; axis < 3; ++axis) mean[axis] = strided<3>(job.means + 3 * first + axis);
     for (int part = 0; part < 4; ++part) quat[part] = strided<4>(job.quats + 4 * first + part);
     for (int axis = 0; axis < 2; ++axis) log_scale[axis] = strided<2>(job.log_scales + 2 * first + axis);
     logit = load(job.opacity_logits + first);
   }
   // Of any Gaussians.
-  BEAGS_OPS_INLINE Parameters(const OccupancyJob<T>& job, const int64_t* gaussian) {
+  BEAGS_INLINE Parameters(const OccupancyJob<T>& job, const int64_t* gaussian) {
     for (int lane = 0; lane < Lanes<T>::kCount; ++lane) {
       const int64_t i = gaussian[lane];
       for (int axis = 0; axis < 3; ++axis) mean[axis][lane] = job.means[3 * i + axis];
@@ -83,7 +83,7 @@ struct Parameters {
 
 // Those of the Gaussians first .. first + count - 1; the last one's in the lanes that are left over.
 template <class T>
-BEAGS_OPS_INLINE Parameters<T> parameters(const OccupancyJob<T>& job, int64_t first, int count) {
+BEAGS_INLINE Parameters<T> parameters(const OccupancyJob<T>& job, int64_t first, int count) {
   constexpr int kCount = Lanes<T>::kCount;
   if (count == kCount) return {job, first};
   int64_t gaussian[kCount];
@@ -98,13 +98,13 @@ struct Discs : DiscFrame<typename Lanes<T>::Real> {
   using Frame = DiscFrame<R>;
   using Frame::inverse_length, Frame::r0, Frame::r1, Frame::scale;
 
-  BEAGS_OPS_INLINE Discs(const OccupancyJob<T>& job, const Parameters<T>& raw) {
+  BEAGS_INLINE Discs(const OccupancyJob<T>& job, const Parameters<T>& raw) {
     for (int axis = 0; axis < 2; ++axis) scale[axis] = exponential(raw.log_scale[axis]);
     fill_frame(job, raw.mean, raw.quat, static_cast<Frame&>(*this));
   }
 
   // NaN for those that count as nothing: a number is not finite, a scale is 0 or a quaternion cannot be used.
-  BEAGS_OPS_INLINE R nan_if_broken(const Parameters<T>& raw) const {
+  BEAGS_INLINE R nan_if_broken(const Parameters<T>& raw) const {
     const R zero = {}, one = zero + T(1), infinite = zero + static_cast<T>(INFINITY);
     const R long_enough = select(inverse_length <= zero + static_cast<T>(kLongestQuat), zero, infinite);
     const R short_enough = select(inverse_length >= zero + static_cast<T>(1 / kLongestQuat), zero, infinite);
@@ -121,7 +121,7 @@ struct Discs : DiscFrame<typename Lanes<T>::Real> {
 };
 
 template <class T>
-BEAGS_OPS_INLINE Boxes<T> boxes_around(const Discs<T>& discs) {
+BEAGS_INLINE Boxes<T> boxes_around(const Discs<T>& discs) {
   using R = typename Lanes<T>::Real;
   const R zero = {};
   Boxes<T> boxes;
@@ -141,8 +141,8 @@ BEAGS_OPS_INLINE Boxes<T> boxes_around(const Discs<T>& discs) {
 
 // Writes the gradients of a batch from its six sums; returns the sum of its losses.
 template <class T>
-BEAGS_OPS_INLINE double finish(const OccupancyJob<T>& job, const OccupancyBatch<T>& batch, const Discs<T>& discs,
-                               typename Lanes<T>::Real opacity, const typename Lanes<T>::Real* sums) {
+BEAGS_INLINE double finish(const OccupancyJob<T>& job, const OccupancyBatch<T>& batch, const Discs<T>& discs,
+                           typename Lanes<T>::Real opacity, const typename Lanes<T>::Real* sums) {
   using R = typename Lanes<T>::Real;
   constexpr int kCount = Lanes<T>::kCount;
   T value[kCount];
@@ -167,7 +167,7 @@ BEAGS_OPS_INLINE double finish(const OccupancyJob<T>& job, const OccupancyBatch<
 
 // Draws the samples of a batch and sums G Q times 1, u, v, u^2, v^2, u v.
 template <Reach kReach, class T>
-BEAGS_OPS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& batch) {
+BEAGS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& batch) {
   using R = typename Lanes<T>::Real;
   using I = typename Lanes<T>::Int;
   constexpr int kCount = Lanes<T>::kCount;
@@ -246,18 +246,18 @@ struct Waiting {
   int64_t active = 0;
   double total = 0;
 
-  BEAGS_OPS_INLINE explicit Waiting(const OccupancyJob<T>& whole) : job(whole) {
+  BEAGS_INLINE explicit Waiting(const OccupancyJob<T>& whole) : job(whole) {
     near.count = window.count = far.count = 0;
   }
 
   template <Reach kReach>
-  BEAGS_OPS_INLINE OccupancyBatch<T>& batch() {
+  BEAGS_INLINE OccupancyBatch<T>& batch() {
     return kReach == Reach::kNear ? near : kReach == Reach::kWindow ? window : far;
   }
 
   // Takes over one Gaussian, and draws samples when a batch is full.
   template <Reach kReach>
-  BEAGS_OPS_INLINE void add(int64_t gaussian, const int64_t* low, uint64_t valid) {
+  BEAGS_INLINE void add(int64_t gaussian, const int64_t* low, uint64_t valid) {
     OccupancyBatch<T>& to = batch<kReach>();
     const int at = to.count++;
     for (int axis = 0; axis < 3; ++axis) to.low[axis][at] = static_cast<typename Lanes<T>::Whole>(low[axis]);
@@ -277,7 +277,7 @@ struct Waiting {
 // Bit l: the box of lane l lies in a cube of 1, 2 or 3 valid voxels along each side, of which one look tells. Without
 // branches, so that the looks of all lanes are under way at once. All tables must be arrays.
 template <class T>
-BEAGS_OPS_INLINE unsigned in_cubes(const VoxelTable* cubes, const Boxes<T>& boxes, const int32_t* class_ids) {
+BEAGS_INLINE unsigned in_cubes(const VoxelTable* cubes, const Boxes<T>& boxes, const int32_t* class_ids) {
   using I = typename Lanes<T>::Int;
   using Whole = typename Lanes<T>::Whole;
   constexpr int kCount = Lanes<T>::kCount;

@@ -11,7 +11,7 @@ namespace BEAGS_ISA {
 
 // The SplitMix64 finaliser, as occupancy/sampling.py.
 template <class W>
-BEAGS_OPS_INLINE W mix(W word) {
+BEAGS_INLINE W mix(W word) {
   word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9u;
   word = (word ^ word >> 27) * 0x94D049BB133111EBu;
   return word ^ word >> 31;
@@ -30,7 +30,7 @@ struct Counter<float> {
       odd[i] = state[2 * i + 1];
     }
   }
-  BEAGS_OPS_INLINE void next(IntF& radial, IntF& angle) {
+  BEAGS_INLINE void next(IntF& radial, IntF& angle) {
     typedef uint32_t Halves __attribute__((vector_size(32)));
     const Words a = mix(even), b = mix(odd);
     radial = (IntF)((Halves)(a >> 32 | (b >> 32 << 32)) >> 8);
@@ -46,7 +46,7 @@ struct Counter<double> {
   explicit Counter(const uint64_t* state) {
     for (int i = 0; i < 4; ++i) words[i] = state[i];
   }
-  BEAGS_OPS_INLINE void next(IntD& radial, IntD& angle) {
+  BEAGS_INLINE void next(IntD& radial, IntD& angle) {
     const Words word = mix(words);
     radial = (IntD)(word >> 40);
     angle = (IntD)(word << 32 >> 40);

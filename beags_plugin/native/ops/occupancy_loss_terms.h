@@ -4,7 +4,11 @@
 
 #include "ops/kernels.h"
 #include "simd/device.h"
+#if defined(__CUDACC__) || defined(BEAGS_CUDA_EMULATION)
 #include "simd/scalar_math.h"
+#else
+#include "simd/lanes.h"
+#endif
 
 namespace beags {
 namespace ops {

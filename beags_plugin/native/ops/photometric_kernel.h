@@ -14,7 +14,7 @@ constexpr int kPad = kSsimReach * kChannels;  // numbers beyond a row's ends tha
 
 // Numbers in one buffer of a row.
 template <class T>
-BEAGS_OPS_INLINE int64_t buffer_length(int width) {
+BEAGS_INLINE int64_t buffer_length(int width) {
   return static_cast<int64_t>(width) * kChannels + 2 * kPad + 2 * Lanes<T>::kCount;
 }
 template <class T>
@@ -23,7 +23,7 @@ int64_t photometric_scratch(int width) {
 }
 
 template <class T>
-BEAGS_OPS_INLINE void clear_pads(T* scratch, int width, int buffers) {
+BEAGS_INLINE void clear_pads(T* scratch, int width, int buffers) {
   const int64_t length = buffer_length<T>(width), end = kPad + static_cast<int64_t>(width) * kChannels;
   for (int b = 0; b < buffers; ++b) {
     for (int i = 0; i < kPad; ++i) scratch[b * length + i] = T(0);
@@ -33,7 +33,7 @@ BEAGS_OPS_INLINE void clear_pads(T* scratch, int width, int buffers) {
 
 // The window along a row; `from` points at the buffer's number of the first lane.
 template <class T>
-BEAGS_OPS_INLINE RealOf<T> blur_row(const PhotometricJob<T>& job, const T* from) {
+BEAGS_INLINE RealOf<T> blur_row(const PhotometricJob<T>& job, const T* from) {
   RealOf<T> sum = {};
   for (int k = 0; k < kSsimWindow; ++k) {
     RealOf<T> value;

@@ -3,7 +3,11 @@
 #pragma once
 
 #include "simd/device.h"
+#if defined(__CUDACC__) || defined(BEAGS_CUDA_EMULATION)
 #include "simd/scalar_math.h"
+#else
+#include "simd/lanes.h"
+#endif
 
 namespace beags {
 namespace ops {

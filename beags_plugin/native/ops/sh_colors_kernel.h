@@ -12,7 +12,7 @@ template <class T>
 struct Directions {
   T x[kColorBlock], y[kColorBlock], z[kColorBlock], inverse[kColorBlock];
 
-  BEAGS_OPS_INLINE Direction<T> operator[](int i) const { return {x[i], y[i], z[i], inverse[i]}; }
+  BEAGS_INLINE Direction<T> operator[](int i) const { return {x[i], y[i], z[i], inverse[i]}; }
 };
 
 template <class T>

@@ -2,9 +2,10 @@
 // Normalisation, signs and order as core/sh.py.
 #pragma once
 
+#include <math.h>
+
 #include "ops/kernels.h"
 #include "simd/device.h"
-#include "simd/scalar_math.h"
 
 namespace beags {
 namespace ops {

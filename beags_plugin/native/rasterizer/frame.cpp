@@ -25,9 +25,9 @@ Frame<T>::Frame(const View& view, const Inputs<T>& inputs, bool* visible, int th
       const size_t before = reached[chunk].size();
       const Fate fate = place_surfel(view_, inputs, i, splats_[i]);
       nonfinite[chunk] += fate == Fate::kNonFinite;
-      visible[i] = fate == Fate::kDrawn && find_tiles(view_, splats_[i], reached[chunk]);
+      visible[i] = fate == Fate::kRendered && find_tiles(view_, splats_[i], reached[chunk]);
       record_start[i + 1] = static_cast<int64_t>(reached[chunk].size() - before);
-      if (fate == Fate::kDrawn) depths[i] = splats_[i].z;
+      if (fate == Fate::kRendered) depths[i] = splats_[i].z;
     }
   }
   for (int64_t i = 0; i < n; ++i) record_start[i + 1] += record_start[i];

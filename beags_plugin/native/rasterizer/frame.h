@@ -55,10 +55,10 @@ class Frame {
   // labels: [height, width]; out: [N, num_classes], zero on entry; labels outside 0 .. num_classes - 1 do not count.
   void class_contributions(const int32_t* labels, int num_classes, T* out, int threads) const;
   // The same as a list, whose size does not depend on the number of classes.
-  Contributions<T> contributing_classes(const int32_t* labels, int num_classes, int threads) const;
+  Contributions<T> sparse_class_contributions(const int32_t* labels, int num_classes, int threads) const;
   // classes, share: [height, width]. Class ids lie in 0 .. num_classes - 1.
   void class_map(int num_classes, int32_t* classes, T* share, int threads) const;
-  void heaviest(int32_t* indices, int threads) const;
+  void dominant_gaussian(int32_t* indices, int threads) const;
   WorkCounts work_counts(int threads) const;
 
  private:

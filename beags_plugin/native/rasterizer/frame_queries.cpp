@@ -34,14 +34,14 @@ typename Frame<T>::LabelSums Frame<T>::label_sums(const int32_t* labels, int num
     slot_start[tile + 1] = slot_start[tile] + (bins_.tile_start[tile + 1] - bins_.tile_start[tile]) * num_slots[tile];
   }
   found.sums.assign(slot_start[tiles()], T(0));
-  Product<T> product{};
-  product.slots = slots.data();
-  product.num_slots = num_slots.data();
-  product.slot_start = slot_start.data();
-  product.sums = found.sums.data();
+  Query<T> query{};
+  query.slots = slots.data();
+  query.num_slots = num_slots.data();
+  query.slot_start = slot_start.data();
+  query.sums = found.sums.data();
   const Job<T> job = this->job();
   const auto kernel = kernels<T>().class_contributions;
-  for_each_tile(threads, [&](int tile) { kernel(job, product, tile); });
+  for_each_tile(threads, [&](int tile) { kernel(job, query, tile); });
 
   found.row_of.resize(num_pairs());
   found.tile_of.resize(num_pairs());
@@ -70,7 +70,7 @@ void Frame<T>::class_contributions(const int32_t* labels, int num_classes, T* ou
 }
 
 template <class T>
-Contributions<T> Frame<T>::contributing_classes(const int32_t* labels, int num_classes, int threads) const {
+Contributions<T> Frame<T>::sparse_class_contributions(const int32_t* labels, int num_classes, int threads) const {
   const LabelSums found = label_sums(labels, num_classes, threads);
   const int64_t chunks = (num_surfels_ + kChunk - 1) / kChunk;
   std::vector<Contributions<T>> parts(chunks);
@@ -139,26 +139,26 @@ void Frame<T>::class_map(int num_classes, int32_t* classes, T* share, int thread
       const int32_t count = static_cast<int32_t>(present.size());
       for (int32_t i = 0; i < count; ++i) place_of[present[i]] = i;
       sums.assign(static_cast<size_t>(count) * kTilePixels, T(0));
-      Product<T> product{};
-      product.labels = present.data();
-      product.slots = place_of.data();
-      product.num_slots = &count;
-      product.sums = sums.data();
-      product.classes = classes;
-      product.share = share;
-      kernel(job, product, tile);
+      Query<T> query{};
+      query.labels = present.data();
+      query.slots = place_of.data();
+      query.num_slots = &count;
+      query.sums = sums.data();
+      query.classes = classes;
+      query.share = share;
+      kernel(job, query, tile);
       for (const int32_t id : present) place_of[id] = -1;
     }
   }
 }
 
 template <class T>
-void Frame<T>::heaviest(int32_t* indices, int threads) const {
+void Frame<T>::dominant_gaussian(int32_t* indices, int threads) const {
   const Job<T> job = this->job();
-  Product<T> product{};
-  product.classes = indices;
-  const auto kernel = kernels<T>().heaviest;
-  for_each_tile(threads, [&](int tile) { kernel(job, product, tile); });
+  Query<T> query{};
+  query.classes = indices;
+  const auto kernel = kernels<T>().dominant_gaussian;
+  for_each_tile(threads, [&](int tile) { kernel(job, query, tile); });
 }
 
 template <class T>

@@ -5,31 +5,7 @@
 #include "rasterizer/types.h"
 #include "simd/device.h"
 #if defined(__CUDACC__) || defined(BEAGS_CUDA_EMULATION)
-#include <math.h>  // fma and exp2, of float too
-
-namespace beags {
-namespace BEAGS_ISA {
-
-// As in simd.h, of single numbers.
-template <class T>
-BEAGS_HD_INLINE T all(T value) {
-  return value;
-}
-template <class T>
-BEAGS_HD_INLINE T min(T a, T b) {
-  return a < b ? a : b;
-}
-template <class T>
-BEAGS_HD_INLINE T select(bool mask, T yes, T no) {
-  return mask ? yes : no;
-}
-template <class T>
-BEAGS_HD_INLINE T keep(bool mask, T value) {
-  return mask ? value : T(0);
-}
-
-}  // namespace BEAGS_ISA
-}  // namespace beags
+#include "simd/scalar_math.h"
 #else
 #include "simd/simd.h"
 #endif

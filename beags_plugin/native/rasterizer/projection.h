@@ -32,7 +32,7 @@ struct ShapeGradients {
   double screen_shift[2];  // see rasterizers/interface.py
 };
 
-enum class Fate { kDrawn, kCulled, kNonFinite };
+enum class Fate { kRendered, kCulled, kNonFinite };
 
 // Parts of the functions below.
 BEAGS_HD inline double dot(const double* a, const double* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
@@ -146,7 +146,7 @@ BEAGS_HD inline Fate project(const View& view, const SurfelParameters& s, Splat<
     return Fate::kNonFinite;
   }
   splat.plain = is_plain(view, splat);
-  return Fate::kDrawn;
+  return Fate::kRendered;
 }
 
 // The gradient towards mean, quat, log_scale and screen shift, from that towards the splat's fields (`record`: kRecord

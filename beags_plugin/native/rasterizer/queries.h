@@ -31,15 +31,15 @@ struct FewLabels {
 
 // E6: for each pair, the sum of w over the tile's pixels of each label; the labels are numbered within the tile.
 template <class T>
-void class_contributions(const Job<T>& job, const Product<T>& product, int tile) {
-  const int num_slots = product.num_slots[tile];
+void class_contributions(const Job<T>& job, const Query<T>& query, int tile) {
+  const int num_slots = query.num_slots[tile];
   if (num_slots == 0) return;
-  T* sums = product.sums + product.slot_start[tile];
+  T* sums = query.sums + query.slot_start[tile];
   Walk<T> walk(job, tile);
   if (num_slots <= FewLabels<T>::kMost) {
     FewLabels<T> labels;
     for_each_pixel(job, tile, [&](int64_t at, int pack, int lane) {
-      if (product.slots[at] >= 0) labels.member[product.slots[at]][pack * kLanes<T> + lane] = T(1);
+      if (query.slots[at] >= 0) labels.member[query.slots[at]][pack * kLanes<T> + lane] = T(1);
     });
     composite<0>(job, tile, walk, [&](int k, const Splat<T>&, const Hits<T>& hits, int i, Real<T> w, Real<T>) {
       labels.add_hit(k, hits.pack[i], w, sums, num_slots);
@@ -49,8 +49,7 @@ void class_contributions(const Job<T>& job, const Product<T>& product, int tile)
   }
   int32_t slots[kTilePixels];
   for (int32_t& slot : slots) slot = -1;
-  for_each_pixel(job, tile,
-                 [&](int64_t at, int pack, int lane) { slots[pack * kLanes<T> + lane] = product.slots[at]; });
+  for_each_pixel(job, tile, [&](int64_t at, int pack, int lane) { slots[pack * kLanes<T> + lane] = query.slots[at]; });
   composite<0>(job, tile, walk, [&](int k, const Splat<T>&, const Hits<T>& hits, int i, Real<T> w, Real<T>) {
     T* row = sums + static_cast<int64_t>(k) * num_slots;
     T lanes[kLanes<T>];
@@ -62,15 +61,15 @@ void class_contributions(const Job<T>& job, const Product<T>& product, int tile)
   });
 }
 
-// Each pixel's class: the largest sum of w; of equal ones the lowest. `product.sums` holds, for each class of the tile
-// in rising order, 256 pixels; `product.slots` maps a class to its place, `product.labels` a place to its class.
+// Each pixel's class: the largest sum of w; of equal ones the lowest. `query.sums` holds, for each class of the tile
+// in rising order, 256 pixels; `query.slots` maps a class to its place, `query.labels` a place to its class.
 template <class T>
-void class_map(const Job<T>& job, const Product<T>& product, int tile) {
-  const int classes = product.num_slots[0];
-  T* sums = product.sums;
+void class_map(const Job<T>& job, const Query<T>& query, int tile) {
+  const int classes = query.num_slots[0];
+  T* sums = query.sums;
   Walk<T> walk(job, tile);
   composite<0>(job, tile, walk, [&](int, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> w, Real<T>) {
-    T* row = sums + static_cast<int64_t>(product.slots[s.class_id]) * kTilePixels + hits.pack[i] * kLanes<T>;
+    T* row = sums + static_cast<int64_t>(query.slots[s.class_id]) * kTilePixels + hits.pack[i] * kLanes<T>;
     store(row, load(row) + w);
   });
   for_each_pixel(job, tile, [&](int64_t at, int pack, int lane) {
@@ -81,17 +80,17 @@ void class_map(const Job<T>& job, const Product<T>& product, int tile) {
       const T sum = sums[static_cast<int64_t>(c) * kTilePixels + pixel];
       if (sum > best) {
         best = sum;
-        winner = product.labels[c];
+        winner = query.labels[c];
       }
     }
-    product.classes[at] = winner;
-    product.share[at] = best > T(0) ? best / (T(1) - walk.transmittance[pixel]) : T(0);
+    query.classes[at] = winner;
+    query.share[at] = best > T(0) ? best / (T(1) - walk.transmittance[pixel]) : T(0);
   });
 }
 
 // The surfel with the largest w; of equal ones the nearer.
 template <class T>
-void heaviest(const Job<T>& job, const Product<T>& product, int tile) {
+void dominant_gaussian(const Job<T>& job, const Query<T>& query, int tile) {
   T best[kTilePixels] = {}, pair[kTilePixels];
   for (T& at : pair) at = T(-1);
   Walk<T> walk(job, tile);
@@ -104,7 +103,7 @@ void heaviest(const Job<T>& job, const Product<T>& product, int tile) {
   });
   for_each_pixel(job, tile, [&](int64_t at, int pack, int lane) {
     const int64_t k = static_cast<int64_t>(pair[pack * kLanes<T> + lane]);
-    product.classes[at] = k < 0 ? -1 : job.pairs[job.tile_start[tile] + k].splat;
+    query.classes[at] = k < 0 ? -1 : job.pairs[job.tile_start[tile] + k].splat;
   });
 }
 

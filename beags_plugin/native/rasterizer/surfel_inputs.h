@@ -80,10 +80,10 @@ BEAGS_HD Fate place_surfel(const View& view, const Inputs<T>& inputs, int64_t i,
   }
   Splat<double> exact;
   const Fate fate = project(view, parameters(inputs, i), exact);
-  if (fate != Fate::kDrawn) return fate;
+  if (fate != Fate::kRendered) return fate;
   for (int c = 0; c < 3; ++c) splat.color[c] = inputs.colors[3 * i + c];
   splat.class_id = inputs.class_ids ? inputs.class_ids[i] : 0;
-  return narrow(exact, splat) ? Fate::kDrawn : Fate::kNonFinite;
+  return narrow(exact, splat) ? Fate::kRendered : Fate::kNonFinite;
 }
 
 }  // namespace beags

@@ -21,8 +21,8 @@ constexpr Parts variant([[maybe_unused]] Parts parts) {
 
 template <Parts kWanted, class T>
 constexpr Variant<T> make_variant() {
-  constexpr Parts kDrawn = variant<T>(kWanted);
-  return {forward<kDrawn, T>, backward<kDrawn, T>, record_size(kDrawn)};
+  constexpr Parts kComputed = variant<T>(kWanted);
+  return {forward<kComputed, T>, backward<kComputed, T>, record_size(kComputed)};
 }
 
 template <class T>
@@ -32,7 +32,7 @@ constexpr Kernels<T> make_kernels() {
           backward_colors<T>,
           class_contributions<T>,
           class_map<T>,
-          heaviest<T>,
+          dominant_gaussian<T>,
           count<T>};
 }
 

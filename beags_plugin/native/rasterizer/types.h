@@ -20,7 +20,7 @@ constexpr int64_t kMostTilePairs = 1 << 24;  // the kernels count a tile's pairs
 constexpr int kPrefetched = 4;               // pairs ahead whose splats are fetched; so many unused pairs end the list
 
 // One surfel as one view sees it (E1, E2). M is divided by the centre's depth and recentred on the projected centre c,
-// so that with (dx, dy) = pixel - c the cross product is affine, q = dx A + dy B + C, and free of the scene's unit:
+// so that with (dx, dy) = pixel - c the cross query is affine, q = dx A + dy B + C, and free of the scene's unit:
 //   q0 = u_x dx + u_y dy,  q1 = v_x dx + v_y dy,  q2 = w_x dx + w_y dy + w_0,  depth = det / q2.
 // What every pixel needs fills the first cache line of a float32 splat.
 template <class T>
@@ -117,13 +117,13 @@ struct Job {
 
 // The products without gradients (sections 3 and 5).
 template <class T>
-struct Product {
+struct Query {
   const int32_t* labels;      // class_map: the class of a place
   const int32_t* slots;       // class_contributions: [height, width] index of the pixel's label in its tile, or -1
   const int32_t* num_slots;   // [tiles]
   const int64_t* slot_start;  // [tiles] into sums
   T* sums;                    // of tile t: [pairs of t, num_slots[t]]
-  int32_t* classes;           // class_map, heaviest: [height, width]
+  int32_t* classes;           // class_map, dominant_gaussian: [height, width]
   T* share;                   // class_map: [height, width]
 };
 
@@ -143,9 +143,9 @@ template <class T>
 struct Kernels {
   Variant<T> variants[kAllParts + 1];                // by Parts
   void (*backward_colors)(const Job<T>&, int tile);  // towards colours and background alone
-  void (*class_contributions)(const Job<T>&, const Product<T>&, int tile);
-  void (*class_map)(const Job<T>&, const Product<T>&, int tile);
-  void (*heaviest)(const Job<T>&, const Product<T>&, int tile);
+  void (*class_contributions)(const Job<T>&, const Query<T>&, int tile);
+  void (*class_map)(const Job<T>&, const Query<T>&, int tile);
+  void (*dominant_gaussian)(const Job<T>&, const Query<T>&, int tile);
   Work (*count)(const Job<T>&, int tile);
 };
 

@@ -9,7 +9,7 @@
 #include <immintrin.h>
 #endif
 
-#define BEAGS_OPS_INLINE inline __attribute__((always_inline))
+#include "simd/device.h"
 
 namespace beags {
 namespace ops {
@@ -43,14 +43,14 @@ using IntF = Lanes<float>::Int;
 using RealD = Lanes<double>::Real;
 using IntD = Lanes<double>::Int;
 
-BEAGS_OPS_INLINE RealF fma(RealF a, RealF b, RealF c) {
+BEAGS_INLINE RealF fma(RealF a, RealF b, RealF c) {
 #if defined(__FMA__)
   return _mm256_fmadd_ps(a, b, c);
 #else
   return a * b + c;
 #endif
 }
-BEAGS_OPS_INLINE RealD fma(RealD a, RealD b, RealD c) {
+BEAGS_INLINE RealD fma(RealD a, RealD b, RealD c) {
 #if defined(__FMA__)
   return _mm256_fmadd_pd(a, b, c);
 #else
@@ -58,7 +58,7 @@ BEAGS_OPS_INLINE RealD fma(RealD a, RealD b, RealD c) {
 #endif
 }
 
-BEAGS_OPS_INLINE RealF sqrt(RealF x) {
+BEAGS_INLINE RealF sqrt(RealF x) {
 #if defined(__AVX__)
   return _mm256_sqrt_ps(x);
 #else
@@ -66,7 +66,7 @@ BEAGS_OPS_INLINE RealF sqrt(RealF x) {
   return x;
 #endif
 }
-BEAGS_OPS_INLINE RealD sqrt(RealD x) {
+BEAGS_INLINE RealD sqrt(RealD x) {
 #if defined(__AVX__)
   return _mm256_sqrt_pd(x);
 #else
@@ -76,33 +76,33 @@ BEAGS_OPS_INLINE RealD sqrt(RealD x) {
 }
 
 template <class R, class I>
-BEAGS_OPS_INLINE R select(I mask, R yes, R no) {
+BEAGS_INLINE R select(I mask, R yes, R no) {
   return (R)(((I)yes & mask) | ((I)no & ~mask));
 }
 
 // NaN where it is not finite.
 template <class R>
-BEAGS_OPS_INLINE R nan_unless_finite(R x) {
+BEAGS_INLINE R nan_unless_finite(R x) {
   return x - x;
 }
 
 // Towards 0; lanes that do not fit hold any number.
-BEAGS_OPS_INLINE IntF to_int(RealF x) { return __builtin_convertvector(x, IntF); }
-BEAGS_OPS_INLINE IntD to_int(RealD x) { return __builtin_convertvector(x, IntD); }
-BEAGS_OPS_INLINE RealF to_real(IntF x) { return __builtin_convertvector(x, RealF); }
-BEAGS_OPS_INLINE RealD to_real(IntD x) { return __builtin_convertvector(x, RealD); }
+BEAGS_INLINE IntF to_int(RealF x) { return __builtin_convertvector(x, IntF); }
+BEAGS_INLINE IntD to_int(RealD x) { return __builtin_convertvector(x, IntD); }
+BEAGS_INLINE RealF to_real(IntF x) { return __builtin_convertvector(x, RealF); }
+BEAGS_INLINE RealD to_real(IntD x) { return __builtin_convertvector(x, RealD); }
 
 // For |x| < 2^31; other lanes hold any number, of which wrapping sums are taken.
-BEAGS_OPS_INLINE IntF wrapping_sum(IntF a, IntF b) { return (IntF)((Lanes<float>::Bits)a + (Lanes<float>::Bits)b); }
-BEAGS_OPS_INLINE IntD wrapping_sum(IntD a, IntD b) { return (IntD)((Lanes<double>::Bits)a + (Lanes<double>::Bits)b); }
+BEAGS_INLINE IntF wrapping_sum(IntF a, IntF b) { return (IntF)((Lanes<float>::Bits)a + (Lanes<float>::Bits)b); }
+BEAGS_INLINE IntD wrapping_sum(IntD a, IntD b) { return (IntD)((Lanes<double>::Bits)a + (Lanes<double>::Bits)b); }
 template <class R>
-BEAGS_OPS_INLINE auto floor_to_int(R x) {
+BEAGS_INLINE auto floor_to_int(R x) {
   const auto whole = to_int(x);
   return wrapping_sum(whole, to_real(whole) > x);
 }
 
 // e^x to 2 units in the last place; 0 below -87, infinity above 88.
-BEAGS_OPS_INLINE RealF exponential(RealF x) {
+BEAGS_INLINE RealF exponential(RealF x) {
   const RealF zero = {};
   const IntF tiny = x < -87.0f, huge = x > 88.0f;
   x = select(tiny | huge, zero, x);
@@ -120,13 +120,13 @@ BEAGS_OPS_INLINE RealF exponential(RealF x) {
   p = fma(p, r, zero + 1.0f);
   return select(huge, zero + __builtin_inff(), select(tiny, zero, (RealF)((IntF)p + ((IntF)shifted << 23))));
 }
-BEAGS_OPS_INLINE RealD exponential(RealD x) {
+BEAGS_INLINE RealD exponential(RealD x) {
   for (int i = 0; i < 4; ++i) x[i] = exp(x[i]);
   return x;
 }
 
 // Cosine and sine of angle / 2^24 turns, 0 <= angle < 2^24: quarter turns are taken off exactly, in integers.
-BEAGS_OPS_INLINE void cos_sin(IntF angle, RealF& cosine, RealF& sine) {
+BEAGS_INLINE void cos_sin(IntF angle, RealF& cosine, RealF& sine) {
   const RealF zero = {};
   const IntF quarter = (angle + (1 << 21)) >> 22;
   const RealF x = to_real(angle - (quarter << 22)) * 3.74507029e-7f;  // 2 pi / 2^24; |x| <= pi / 4
@@ -146,7 +146,7 @@ BEAGS_OPS_INLINE void cos_sin(IntF angle, RealF& cosine, RealF& sine) {
   cosine = (RealF)((IntF)select(odd, s, c) ^ sign_c);
   sine = (RealF)((IntF)select(odd, c, s) ^ sign_s);
 }
-BEAGS_OPS_INLINE void cos_sin(IntD angle, RealD& cosine, RealD& sine) {
+BEAGS_INLINE void cos_sin(IntD angle, RealD& cosine, RealD& sine) {
   for (int i = 0; i < 4; ++i) {
     const double x = static_cast<double>(angle[i]) * 3.745070282923929e-07;
     cosine[i] = cos(x);

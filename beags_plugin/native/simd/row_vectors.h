@@ -13,41 +13,41 @@ using RealOf = typename Lanes<T>::Real;
 // The lanes of a vector that lie in the row: all of them, or `count`; zeros in the others.
 struct Whole {
   template <class T>
-  BEAGS_OPS_INLINE static int size() {
+  BEAGS_INLINE static int size() {
     return Lanes<T>::kCount;
   }
   template <class T>
-  BEAGS_OPS_INLINE static RealOf<T> load(const T* from) {
+  BEAGS_INLINE static RealOf<T> load(const T* from) {
     RealOf<T> value;
     __builtin_memcpy(&value, from, sizeof value);
     return value;
   }
   template <class T>
-  BEAGS_OPS_INLINE static void store(T* to, RealOf<T> value) {
+  BEAGS_INLINE static void store(T* to, RealOf<T> value) {
     __builtin_memcpy(to, &value, sizeof value);
   }
 };
 struct Part {
   int64_t count;
   template <class T>
-  BEAGS_OPS_INLINE int size() const {
+  BEAGS_INLINE int size() const {
     return static_cast<int>(count);
   }
   template <class T>
-  BEAGS_OPS_INLINE RealOf<T> load(const T* from) const {
+  BEAGS_INLINE RealOf<T> load(const T* from) const {
     RealOf<T> value = {};
     for (int64_t i = 0; i < count; ++i) value[i] = from[i];
     return value;
   }
   template <class T>
-  BEAGS_OPS_INLINE void store(T* to, RealOf<T> value) const {
+  BEAGS_INLINE void store(T* to, RealOf<T> value) const {
     for (int64_t i = 0; i < count; ++i) to[i] = value[i];
   }
 };
 
 // Calls visit(first number, lanes) for every vector of a row of `line` numbers.
 template <class T, class Visit>
-BEAGS_OPS_INLINE void for_each_vector(int64_t line, Visit visit) {
+BEAGS_INLINE void for_each_vector(int64_t line, Visit visit) {
   int64_t i = 0;
   for (; i + Lanes<T>::kCount <= line; i += Lanes<T>::kCount) visit(i, Whole{});
   if (i < line) visit(i, Part{line - i});

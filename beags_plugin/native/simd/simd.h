@@ -11,7 +11,8 @@
 #include <arm_neon.h>
 #endif
 
-#define BEAGS_INLINE inline __attribute__((always_inline))
+#include "simd/device.h"
+
 #define BEAGS_UNROLL _Pragma("GCC unroll 4")
 
 #if defined(BEAGS_SCALAR)

@@ -100,7 +100,7 @@ template <class T>
 void class_map(const TileJob<T>& job, int num_classes, int32_t* classes, T* share, Stream stream);
 // indices: [height, width].
 template <class T>
-void heaviest(const TileJob<T>& job, int32_t* indices, Stream stream);
+void dominant_gaussian(const TileJob<T>& job, int32_t* indices, Stream stream);
 
 }  // namespace cuda
 }  // namespace beags

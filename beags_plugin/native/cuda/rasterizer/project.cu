@@ -54,7 +54,7 @@ __global__ void project_kernel(View view, Inputs<T> inputs, Bins<T> bins, bool* 
   int32_t count = 0;
   bool seen = false;
   uint32_t high_key = kLastKey, low_key = kLastKey;
-  if (fate == Fate::kDrawn) {
+  if (fate == Fate::kRendered) {
     const Extent extent(view, splat);
     seen = extent.on_screen();
     if (seen) for_each_tile(extent, tiles_along(view.width), [&](int, unsigned) { ++count; });

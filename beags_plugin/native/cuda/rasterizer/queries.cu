@@ -89,7 +89,7 @@ __global__ void __launch_bounds__(kTilePixels)
 
 // The surfel with the largest w; of equal ones the nearer.
 template <class T>
-__global__ void __launch_bounds__(kTilePixels) heaviest_kernel(TileJob<T> job, int32_t* indices) {
+__global__ void __launch_bounds__(kTilePixels) dominant_gaussian_kernel(TileJob<T> job, int32_t* indices) {
   const Place<T> place(job);
   Walk<T> walk;
   T best = 0;
@@ -121,15 +121,15 @@ void class_map(const TileJob<T>& job, int num_classes, int32_t* classes, T* shar
 }
 
 template <class T>
-void heaviest(const TileJob<T>& job, int32_t* indices, Stream stream) {
-  const auto kernel = heaviest_kernel<T>;
+void dominant_gaussian(const TileJob<T>& job, int32_t* indices, Stream stream) {
+  const auto kernel = dominant_gaussian_kernel<T>;
   BEAGS_LAUNCH(kernel, job.tiles_x * job.tiles_y, kTilePixels, stream, job, indices);
 }
 
 #define BEAGS_INSTANTIATE(T)                                                                   \
   template void class_contributions(const TileJob<T>&, const int32_t*, int, int64_t*, Stream); \
   template void class_map(const TileJob<T>&, int, int32_t*, T*, Stream);                       \
-  template void heaviest(const TileJob<T>&, int32_t*, Stream);
+  template void dominant_gaussian(const TileJob<T>&, int32_t*, Stream);
 BEAGS_INSTANTIATE(float)
 BEAGS_INSTANTIATE(double)
 #undef BEAGS_INSTANTIATE
