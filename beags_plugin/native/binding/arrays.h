@@ -1,4 +1,4 @@
-// What the files that bind the module share: tensors as Python hands them over.
+// Converts Python's tensors to plain pointers, for the files that bind the module.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -8,11 +8,11 @@
 
 namespace beags {
 
-// Where a tensor lies.
+// The memory that holds a tensor.
 enum class Memory { kCpu, kCuda };
 
-// A contiguous torch tensor, read through its own methods: a tenth of the time of the DLPack protocol, which
-// counts where a call has tens of tensors and next to nothing to do. It holds no reference: the caller's lasts.
+// A contiguous torch tensor. Its own methods are asked, which takes a tenth of the time of the DLPack protocol; this
+// counts where a call has tens of tensors and little to do. It holds no reference: the caller keeps the tensor alive.
 template <class T, Memory kMemory = Memory::kCpu>
 class Array {
  public:
@@ -28,7 +28,7 @@ class Array {
 
 using Ids = Array<const int32_t>;  // of classes
 
-// What is asked of a tensor; made at the first call, kept to the end of the process.
+// The attributes that are asked of a tensor; made at the first call, kept to the end of the process.
 struct TensorNames {
   PyObject *tensor, *data_ptr, *dtype, *is_cpu, *is_cuda, *is_contiguous,
       *shape;  // tensor: the class; the others: attributes
@@ -73,8 +73,8 @@ constexpr auto dtype_name() {
 namespace nanobind {
 namespace detail {
 
-// Refuses, with nanobind's TypeError, what is no contiguous tensor of T there; None is for the argument to allow. The
-// emulated GPU's memory is the CPU's.
+// Accepts contiguous tensors of T in that memory; nanobind raises TypeError for others. An argument decides by itself
+// whether None is allowed. The emulated GPU uses the CPU's memory.
 template <class T, beags::Memory kMemory>
 struct type_caster<beags::Array<T, kMemory>> {
 #if defined(BEAGS_CUDA_EMULATION)

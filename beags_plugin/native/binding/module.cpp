@@ -1,4 +1,5 @@
-// The Python module: plain arrays in and out. Arguments are checked once, in rasterizers/native.py and interface.py.
+// Binds the rasterizer and defines the module _native: plain arrays in and out. rasterizers/native.py and interface.py
+// check all arguments, once.
 #include <nanobind/nanobind.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>

@@ -1,4 +1,4 @@
-// The CUDA backend as Python sees it: the caller allocates, checks once (rasterizers/cuda.py), and names its stream.
+// Binds the CUDA rasterizer. rasterizers/cuda.py allocates all memory, checks all arguments once, and names the stream.
 #include "binding/module_cuda.h"
 
 #include <nanobind/stl/string.h>
@@ -25,7 +25,7 @@ using Device = Array<T, Memory::kCuda>;
 
 Stream stream_of(uintptr_t stream) { return reinterpret_cast<Stream>(stream); }
 
-// One view's surfels and their tiles: what cuda/frame.h's functions work on. Holds no memory of its own.
+// One view's Gaussians and their tiles, for the functions of cuda/rasterizer/frame.h. It owns no memory.
 template <class T>
 struct Frame {
   View view;
@@ -187,7 +187,7 @@ void bind_cuda(nb::module_& m) {
   m.attr("EMULATED") = true;
 #else
   m.attr("EMULATED") = false;
-  // As CUDA counts, 1000 major + 10 minor; asking takes no context on a GPU.
+  // In CUDA's numbering, 1000 major + 10 minor. Asking creates no context on a GPU.
   m.def("driver_version", [] {
     int version = 0;
     check(cudaDriverGetVersion(&version), "asking for the driver's version");

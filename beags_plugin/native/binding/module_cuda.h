@@ -3,6 +3,6 @@
 #include <nanobind/nanobind.h>
 
 namespace beags {
-// Adds what the CUDA backend is made of; see rasterizers/cuda.py.
+// Binds the CUDA rasterizer and the CUDA ops; see rasterizers/cuda.py.
 void bind_cuda(nanobind::module_& m);
 }  // namespace beags

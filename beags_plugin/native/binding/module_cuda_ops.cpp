@@ -1,4 +1,4 @@
-// The ops of the CUDA backend as Python sees them. Arguments are checked once, in beags_plugin/ops.
+// Binds the CUDA ops. beags_plugin/ops checks all arguments, once.
 #include "binding/module_cuda_ops.h"
 
 #include <nanobind/stl/optional.h>

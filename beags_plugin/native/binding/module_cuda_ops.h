@@ -3,6 +3,6 @@
 #include <nanobind/nanobind.h>
 
 namespace beags {
-// Adds the ops of the CUDA backend; see beags_plugin/ops/cuda.py.
+// Binds the CUDA ops; see beags_plugin/ops.
 void bind_cuda_ops(nanobind::module_& m);
 }  // namespace beags

@@ -1,4 +1,4 @@
-// The CUDA backend's kernels on the CPU, for tests: the module beags_plugin._cuda_emulation.
+// Defines the module beags_plugin._cuda_emulation, which runs the CUDA kernels on the CPU, for tests.
 #include "binding/module_cuda.h"
 
 NB_MODULE(_cuda_emulation, m) {

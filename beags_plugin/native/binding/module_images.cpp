@@ -1,4 +1,4 @@
-// The image losses as Python sees them: plain arrays in and out. Arguments are checked once, in beags_plugin/ops.
+// Binds the image losses: plain arrays in and out. beags_plugin/ops checks all arguments, once.
 #include "binding/module_images.h"
 
 #include <string>

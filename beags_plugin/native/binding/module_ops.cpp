@@ -1,4 +1,4 @@
-// The ops as Python sees them: plain arrays in and out. Arguments are checked once, in beags_plugin/ops.
+// Binds the ops: plain arrays in and out. beags_plugin/ops checks all arguments, once.
 #include "binding/module_ops.h"
 
 #include <nanobind/stl/optional.h>

@@ -1,4 +1,4 @@
-// Jobs of the ops from the arrays that Python hands over: the same for CPUs and for GPUs.
+// Makes the ops' jobs from Python's arrays, for CPUs and GPUs alike.
 #pragma once
 
 #include <algorithm>
@@ -14,7 +14,7 @@
 namespace beags {
 namespace ops {
 
-// The job but for the voxels' table. origin: its three coordinates.
+// Makes the job without the voxels' table. origin: three coordinates.
 template <class T, Memory kMemory, class Origin>
 OccupancyJob<T> occupancy_job(const Array<const T, kMemory>& means, const Array<const T, kMemory>& quats,
                               const Array<const T, kMemory>& log_scales, const Array<const T, kMemory>& opacity_logits,
@@ -43,7 +43,7 @@ OccupancyJob<T> occupancy_job(const Array<const T, kMemory>& means, const Array<
   return job;
 }
 
-// The job but for the slopes' and the sums' memory.
+// Makes the job without the memory for slopes and sums.
 template <class T, Memory kMemory>
 PhotometricJob<T> photometric_job(const Array<const T, kMemory>& image, const Array<const T, kMemory>& reference,
                                   double c1, double c2, double l1_scale, double ssim_scale,
@@ -62,7 +62,7 @@ PhotometricJob<T> photometric_job(const Array<const T, kMemory>& image, const Ar
   return job;
 }
 
-// The job but for the shares' and the sums' memory.
+// Makes the job without the memory for shares and sums.
 template <class T, Memory kMemory>
 NormalJob<T> normal_job(const Array<const T, kMemory>& depth, const Array<const T, kMemory>& normal,
                         const Array<const T, kMemory>& alpha, double fx, double fy, double skew, double cx, double cy,
@@ -84,7 +84,7 @@ NormalJob<T> normal_job(const Array<const T, kMemory>& depth, const Array<const 
   return job;
 }
 
-// What forward and backward share. center: three coordinates.
+// Makes the part of the job that forward and backward share. center: three coordinates.
 template <class T, Memory kMemory, class Center>
 ColorJob<T> color_job(const Array<const T, kMemory>& sh_dc, const Array<const T, kMemory>& sh_rest,
                       const Array<const T, kMemory>& means, const Center& center, int degree,
@@ -100,7 +100,7 @@ ColorJob<T> color_job(const Array<const T, kMemory>& sh_dc, const Array<const T,
   return job;
 }
 
-// The backward's gradients into a job of ``color_job``.
+// Adds the backward's gradients to a job of `color_job`.
 template <class T, Memory kMemory>
 void add_gradients(ColorJob<T>& job, const Array<const T, kMemory>& g_colors, const Array<T, kMemory>& g_dc,
                    const Array<T, kMemory>& g_rest, const Array<T, kMemory>& g_means) {
@@ -110,7 +110,7 @@ void add_gradients(ColorJob<T>& job, const Array<const T, kMemory>& g_colors, co
   job.g_means = g_means.data();
 }
 
-// to_voxels: [13], a row by row, b, the side of a voxel.
+// Makes the view from its depth. to_voxels: [13], a row by row, b, the side of a voxel.
 template <class T, Memory kMemory>
 LiftedView<T> lifted_view(const Array<const T, kMemory>& depth, const Array<const T>& to_voxels) {
   const int height = static_cast<int>(depth.shape(0)), width = static_cast<int>(depth.shape(1));
@@ -120,7 +120,7 @@ LiftedView<T> lifted_view(const Array<const T, kMemory>& depth, const Array<cons
   return view;
 }
 
-// The views of the pairwise votes; a view without labels of either type does not vote.
+// Makes the views of the pairwise votes. A view without labels of either type does not vote.
 template <class T, Memory kMemory>
 std::vector<VotingView<T>> voting_views(const std::vector<Array<const T, kMemory>>& depths,
                                         const std::vector<std::optional<Array<const int32_t, kMemory>>>& labels,
@@ -133,7 +133,7 @@ std::vector<VotingView<T>> voting_views(const std::vector<Array<const T, kMemory
   return views;
 }
 
-// The views first, first + 1, .. as targets. maps: [targets, views, 12].
+// Makes the targets: views first, first + 1, .. maps: [targets, views, 12].
 template <class T, Memory kMemory>
 std::vector<VotedView<T>> voted_views(int first, const Array<const T>& maps, size_t views,
                                       const std::vector<Array<int32_t, kMemory>>& voted,

@@ -1,4 +1,4 @@
-// A camera, as Python hands it over.
+// Makes a View from Python's camera.
 #pragma once
 
 #include <algorithm>

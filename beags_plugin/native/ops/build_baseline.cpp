@@ -1,3 +1,3 @@
-// The ops' kernels for any processor.
+// Compiles the ops' kernels for any processor.
 #define BEAGS_ISA baseline
 #include "ops/tables.h"

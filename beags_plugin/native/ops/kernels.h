@@ -12,7 +12,7 @@ namespace ops {
 
 struct VoxelTable;
 
-// What the occupancy loss (E9) is made of; see ops/occupancy_loss.py.
+// The inputs and outputs of the occupancy loss (E9); see ops/occupancy_loss.py.
 template <class T>
 struct OccupancyJob {
   const T *means, *quats, *log_scales, *opacity_logits;  // [N, 3], [N, 4], [N, 2], [N]
@@ -41,9 +41,9 @@ struct ColorJob {
   T *g_dc, *g_rest, *g_means;  // null: not wanted
 };
 
-constexpr int kColorBlock = 64;  // surfels of one call
+constexpr int kColorBlock = 64;  // Gaussians of one call
 
-// One row of pixels of one view, cast into another; see ops/reprojection_votes.py.
+// One row of pixels of one view, projected into another; see ops/reprojection_votes.py.
 template <class T>
 struct CastJob {
   T a[9], b[3];  // a source pixel (x, y) at depth d projects to d A (x, y, 1) + b = z (x', y', 1)
@@ -70,7 +70,7 @@ struct PhotometricJob {
   double* sums;            // [H, 2] sum of |x - y| and of the index, by row
 };
 
-// The window: Gaussian, sigma 1.5 pixels, of sum 1.
+// Sets the window: a Gaussian, sigma 1.5 pixels, of sum 1.
 template <class T>
 void set_window(PhotometricJob<T>& job) {
   double window[kSsimWindow], total = 0;
@@ -79,7 +79,7 @@ void set_window(PhotometricJob<T>& job) {
   for (int k = 0; k < kSsimWindow; ++k) job.window[k] = static_cast<T>(window[k] / total);
 }
 
-// Normal consistency of a drawn view; see ops/normal_consistency.py. Images are [H, W] or [H, W, 3].
+// Normal consistency of a rendered view; see ops/normal_consistency.py. Images are [H, W] or [H, W, 3].
 template <class T>
 struct NormalJob {
   int width, height;
@@ -94,9 +94,9 @@ struct NormalJob {
 template <class T>
 struct OpKernels {
   // Gaussians first .. last - 1, at most kOccupancyBlock. Returns the sum of their losses, times `factor`; adds the
-  // number of those that had to be sampled to `active`.
+  // number of sampled Gaussians to `active`.
   double (*occupancy)(const OccupancyJob<T>& job, int64_t first, int64_t last, int64_t* active);
-  // Surfels first .. last - 1, at most kColorBlock.
+  // Gaussians first .. last - 1, at most kColorBlock.
   void (*colors)(const ColorJob<T>& job, int64_t first, int64_t last);
   void (*colors_backward)(const ColorJob<T>& job, int64_t first, int64_t last);
   // Row y of the source: depth and labels [source_width].

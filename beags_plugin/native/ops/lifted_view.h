@@ -1,5 +1,5 @@
-// Pixels of a view as points among voxels, shared by CPUs and GPUs. Each operation is rounded as in
-// masks/pooled_votes.py, so that all see the same points.
+// Lifts pixels of a view to points among voxels, on CPUs and GPUs. Each operation is rounded as in
+// masks/pooled_votes.py, so that all get the same points.
 #pragma once
 
 #include <math.h>
@@ -29,14 +29,14 @@ BEAGS_HD inline uint64_t hash_of(uint64_t key) {
   return key ^ key >> 29;
 }
 
-// Largest whole number that is not above x; |x| is small.
+// Returns the largest whole number that is not above x; |x| is small.
 template <class T>
 BEAGS_HD inline int32_t floor_of(T x) {
   const int32_t whole = static_cast<int32_t>(x);
   return whole - (static_cast<T>(whole) > x);
 }
 
-// The way along the ray of (px, py), in pixels, for one unit of depth, along one axis, in voxels.
+// Returns the step along the ray of (px, py), in pixels, for one unit of depth; along one axis, in voxels.
 template <class T>
 BEAGS_HD inline T ray_of(const LiftedView<T>& view, int axis, T px, T py) {
   const T* a = view.a + 3 * axis;
@@ -48,8 +48,8 @@ BEAGS_HD inline bool in_reach(T coordinate) {
   return fabs(coordinate) < static_cast<T>(kHalf - kMargin);  // false for NaN
 }
 
-// A pixel's point and the way along its ray, for GPUs; `LiftedTile` is the CPU's. False without a depth, or too far
-// away.
+// Computes a pixel's point and the step along its ray, on GPUs; the CPU has `LiftedTile`. Returns false without a
+// depth, or too far away.
 template <class T>
 BEAGS_HD inline bool lift(const LiftedView<T>& view, int x, int y, T* point, T* ray) {
   const T d = view.depth[static_cast<int64_t>(y) * view.width + x];
@@ -63,7 +63,7 @@ BEAGS_HD inline bool lift(const LiftedView<T>& view, int x, int y, T* point, T* 
   return near;
 }
 
-// The eight voxels about a point: from `corner` on; `fraction` of kParts from the middle of the first to the second.
+// The eight voxels about a point, from `corner`. fraction: of kParts, from the middle of the first to the second.
 struct NearVoxels {
   int32_t corner[3], fraction[3];
 };

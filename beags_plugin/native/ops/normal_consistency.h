@@ -1,4 +1,4 @@
-// Normal consistency of a rendered view (method, section 1).
+// Computes normal consistency of a rendered view on the CPU (method, section 1).
 #pragma once
 
 #include "ops/kernels.h"

@@ -1,4 +1,5 @@
-// Normal consistency and its gradient, one row at a time (method, section 1). Included once for each instruction set.
+// Computes normal consistency and its gradient, one row at a time (method, section 1). Included once for each
+// instruction set.
 #pragma once
 
 #include "ops/normal_consistency_terms.h"
@@ -8,8 +9,8 @@ namespace beags {
 namespace ops {
 namespace BEAGS_ISA {
 
-// What the pixels from `at` = (x, y) on add to the error; leaves their gradients by the drawn normal, and by their four
-// neighbours' depths in `shares`. x: one number in each lane.
+// Returns the error of the pixels from `at` = (x, y) on. Writes their gradients by the rendered normal, and by their
+// four neighbours' depths into `shares`. x: one number in each lane.
 template <class T, class Where>
 BEAGS_INLINE RealOf<T> normal_error(const NormalJob<T>& job, int64_t at, RealOf<T> x, int y, Where lanes) {
   using R = RealOf<T>;
@@ -36,7 +37,7 @@ BEAGS_INLINE RealOf<T> normal_error(const NormalJob<T>& job, int64_t at, RealOf<
   return terms.error;
 }
 
-// At the image's border there is no error.
+// Writes the zeros of a pixel on the image's border, which has no error.
 template <class T>
 BEAGS_INLINE void normal_border(const NormalJob<T>& job, int64_t at) {
   if (!job.shares) return;
@@ -45,12 +46,12 @@ BEAGS_INLINE void normal_border(const NormalJob<T>& job, int64_t at) {
   for (int c = 0; c < 3; ++c) job.g_normal[3 * at + c] = T(0);
 }
 
-// Row `y` of the error.
+// Sums the error of row `y`.
 template <class T>
 void normal(const NormalJob<T>& job, int y) {
   using R = RealOf<T>;
   const int64_t start = static_cast<int64_t>(y) * job.width;
-  R sum = {};  // Determinism: summed lane by lane along the row, whoever draws it
+  R sum = {};  // Determinism: summed lane by lane along the row, on any thread
   if (y == 0 || y + 1 >= job.height || job.width < 3) {
     for (int x = 0; x < job.width; ++x) normal_border(job, start + x);
   } else {
@@ -67,7 +68,7 @@ void normal(const NormalJob<T>& job, int y) {
   job.sums[y] = total;
 }
 
-// Row `y` of the gradient by depth.
+// Computes row `y` of the gradient by depth.
 template <class T>
 void normal_gradient(const NormalJob<T>& job, int y) {
   const int64_t start = static_cast<int64_t>(y) * job.width;

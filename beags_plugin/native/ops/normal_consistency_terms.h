@@ -1,4 +1,4 @@
-// What one pixel adds to normal consistency, and its gradients (method, section 1): shared by the vectors of CPUs and
+// Computes one pixel's part of normal consistency, and its gradients (method, section 1), for the vectors of CPUs and
 // the threads of GPUs. R: T, or a vector of T.
 #pragma once
 
@@ -39,7 +39,7 @@ BEAGS_HD_INLINE Triple<R> minus(Triple<R> a, Triple<R> b) {
   return {a.x - b.x, a.y - b.y, a.z - b.z};
 }
 
-// The point at depth 1 under the centre of a pixel (x, y).
+// Returns the point at depth 1 under the centre of a pixel (x, y).
 template <class T, class R>
 BEAGS_HD_INLINE Triple<R> ray(const NormalJob<T>& job, R x, int y) {
   const R zero = {};
@@ -53,21 +53,21 @@ struct Depths {
   R center, right, left, lower, upper;
 };
 
-// Gradients are by the depth of the right, left, lower and upper neighbour (that by the pixel's own is 0) and by the
-// drawn normal, times job.scale.
+// The error and its gradients, times job.scale: by the depth of the right, left, lower and upper neighbour (that by the
+// pixel's own depth is 0), and by the rendered normal.
 template <class R>
 struct NormalTerms {
   R error, shares[4];
   Triple<R> g_normal;
 };
 
-// At a pixel (x, y) with the drawn normal n.
+// Computes the terms of a pixel (x, y) with the rendered normal n.
 template <class T, class R>
 BEAGS_HD_INLINE NormalTerms<R> normal_terms(const NormalJob<T>& job, R x, int y, const Depths<R>& d, Triple<R> n,
                                             R alpha) {
   const R zero = {}, one = zero + T(1);
   auto known = (d.center > zero) & (d.right > zero) & (d.left > zero) & (d.lower > zero) & (d.upper > zero);
-  // Divided by the depth, the product does not depend on the scene's scale; the direction stays the same.
+  // Dividing by the depth frees the product from the scene's scale; the direction stays the same.
   const R inverse = one / select(known, d.center, one);
   const auto to_right = ray(job, x + T(1), y), to_left = ray(job, x - T(1), y);
   const auto to_lower = ray(job, x, y + 1), to_upper = ray(job, x, y - 1);
@@ -90,7 +90,8 @@ BEAGS_HD_INLINE NormalTerms<R> normal_terms(const NormalJob<T>& job, R x, int y,
            select(known, -weight * slope.z, zero)}};
 }
 
-// The gradient by the depth of the pixel number `at`. Determinism: gathered from its neighbours, in a fixed order.
+// Returns the gradient by the depth of pixel number `at`. Determinism: it is gathered from the neighbours, in a fixed
+// order.
 template <class T>
 BEAGS_HD_INLINE T gathered_shares(const NormalJob<T>& job, int64_t at) {
   const int64_t line = job.width, map = static_cast<int64_t>(job.height) * line, x = at % line, y = at / line;

@@ -12,7 +12,7 @@ template <class T>
 OccupancyResult occupancy_loss(const OccupancyJob<T>& job, int64_t count, int threads) {
   const int64_t blocks = (count + kOccupancyBlock - 1) / kOccupancyBlock;
   std::vector<OccupancyResult> results(blocks, OccupancyResult{0, 0});
-  // A sample takes a few nanoseconds, and a team tens of microseconds.
+  // A sample takes a few nanoseconds, a team tens of microseconds.
   const int team = count * (job.samples + 20) < 50000 ? 1 : threads;
 #pragma omp parallel for num_threads(team) schedule(dynamic, 1)
   for (int64_t block = 0; block < blocks; ++block) {

@@ -1,4 +1,4 @@
-// The occupancy loss (method, section 6; E9) with its gradients, in one pass over the Gaussians.
+// Computes the occupancy loss (method, section 6; E9) with its gradients, in one pass over the Gaussians.
 #pragma once
 
 #include "ops/kernels.h"

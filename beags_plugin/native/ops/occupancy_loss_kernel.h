@@ -1,6 +1,6 @@
-// The occupancy loss of one block of Gaussians (method, section 6; E9): values and closed-form gradients in one pass.
-// A lane is a Gaussian, so that sums over samples need no exchange between lanes, and a Gaussian's result does not
-// depend on its neighbours. Included by the files that are compiled for one instruction set.
+// Computes the occupancy loss of one block of Gaussians (method, section 6; E9): values and closed-form gradients in
+// one pass. A lane is a Gaussian: sums over samples need no exchange between lanes, and a Gaussian's result does not
+// depend on its neighbours. Included once for each instruction set.
 #pragma once
 
 #include "ops/kernels.h"
@@ -15,11 +15,11 @@ namespace ops {
 namespace BEAGS_ISA {
 
 constexpr int kFarOff = 1 << 20;  // size of a box that cannot be looked up
-// Where the samples of a batch are looked up: in registers, for discs within 4 x 4 x 4 voxels; in windows of bricks,
-// one for each disc; in the table, for large discs and for those far from all voxels.
+// The memory in which a batch's samples are looked up: registers, for discs within 4 x 4 x 4 voxels; a window of bricks
+// for each disc; the table, for large discs and for those far from all voxels.
 enum class Reach { kNear, kWindow, kFar };
 
-// One batch of as many Gaussians as there are lanes, ready to be sampled.
+// A batch: one Gaussian a lane, ready to be sampled.
 template <class T>
 struct OccupancyBatch {
   // Corner of the voxels around the disc, and which of them are valid: two words of 32 bits, or 3 x 3 x 3 bricks.
@@ -42,14 +42,14 @@ BEAGS_INLINE void store(T* to, typename Lanes<T>::Real vector) {
   __builtin_memcpy(to, &vector, sizeof vector);
 }
 
-// The voxels that a batch's discs reach: `size` of them along each axis from `low` on, at most `largest`, which is more
-// than all windows hold where they lie too far off to be looked up.
+// The voxels that a batch's discs reach: `size` voxels along each axis, from `low`; at most `largest`, which is more
+// than any window holds if a disc is too far away to be looked up.
 template <class T>
 struct Boxes {
   typename Lanes<T>::Int low[3], size[3], largest;
 };
 
-// from[kStride * lane].
+// Gathers from[kStride * lane].
 template <int kStride, class T>
 BEAGS_INLINE typename Lanes<T>::Real strided(const T* from) {
   typename Lanes<T>::Real out;
@@ -57,19 +57,19 @@ BEAGS_INLINE typename Lanes<T>::Real strided(const T* from) {
   return out;
 }
 
-// The parameters of as many Gaussians as there are lanes.
+// The parameters of one Gaussian a lane.
 template <class T>
 struct Parameters {
   typename Lanes<T>::Real mean[3], quat[4], log_scale[2], logit;
 
-  // Of neighbours, from `first` on.
+  // Reads neighbours, from `first`.
   BEAGS_INLINE Parameters(const OccupancyJob<T>& job, int64_t first) {
     for (int axis = 0; axis < 3; ++axis) mean[axis] = strided<3>(job.means + 3 * first + axis);
     for (int part = 0; part < 4; ++part) quat[part] = strided<4>(job.quats + 4 * first + part);
     for (int axis = 0; axis < 2; ++axis) log_scale[axis] = strided<2>(job.log_scales + 2 * first + axis);
     logit = load(job.opacity_logits + first);
   }
-  // Of any Gaussians.
+  // Reads any Gaussians.
   BEAGS_INLINE Parameters(const OccupancyJob<T>& job, const int64_t* gaussian) {
     for (int lane = 0; lane < Lanes<T>::kCount; ++lane) {
       const int64_t i = gaussian[lane];
@@ -81,7 +81,7 @@ struct Parameters {
   }
 };
 
-// Those of the Gaussians first .. first + count - 1; the last one's in the lanes that are left over.
+// Reads the Gaussians first .. first + count - 1; spare lanes get the last one.
 template <class T>
 BEAGS_INLINE Parameters<T> parameters(const OccupancyJob<T>& job, int64_t first, int count) {
   constexpr int kCount = Lanes<T>::kCount;
@@ -91,7 +91,7 @@ BEAGS_INLINE Parameters<T> parameters(const OccupancyJob<T>& job, int64_t first,
   return {job, gaussian};
 }
 
-// Discs. What is not used costs nothing: all is inlined.
+// The discs of one Gaussian a lane. All is inlined, so that unused results cost nothing.
 template <class T>
 struct Discs : DiscFrame<typename Lanes<T>::Real> {
   using R = typename Lanes<T>::Real;
@@ -103,7 +103,7 @@ struct Discs : DiscFrame<typename Lanes<T>::Real> {
     fill_frame(job, raw.mean, raw.quat, static_cast<Frame&>(*this));
   }
 
-  // NaN for those that count as nothing: a number is not finite, a scale is 0 or a quaternion cannot be used.
+  // Returns NaN for broken Gaussians: a number is not finite, a scale is 0 or a quaternion is unusable.
   BEAGS_INLINE R nan_if_broken(const Parameters<T>& raw) const {
     const R zero = {}, one = zero + T(1), infinite = zero + static_cast<T>(INFINITY);
     const R long_enough = select(inverse_length <= zero + static_cast<T>(kLongestQuat), zero, infinite);
@@ -165,7 +165,7 @@ BEAGS_INLINE double finish(const OccupancyJob<T>& job, const OccupancyBatch<T>& 
   return total * job.factor;
 }
 
-// Draws the samples of a batch and sums G Q times 1, u, v, u^2, v^2, u v.
+// Samples a batch and sums G Q times 1, u, v, u^2, v^2, u v.
 template <Reach kReach, class T>
 BEAGS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& batch) {
   using R = typename Lanes<T>::Real;
@@ -238,7 +238,7 @@ BEAGS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& batch)
   return total;
 }
 
-// The Gaussians of a block that wait to be sampled, by how they are looked up.
+// The Gaussians of a block that wait to be sampled, sorted by their Reach.
 template <class T>
 struct Waiting {
   const OccupancyJob<T>& job;
@@ -255,7 +255,7 @@ struct Waiting {
     return kReach == Reach::kNear ? near : kReach == Reach::kWindow ? window : far;
   }
 
-  // Takes over one Gaussian, and draws samples when a batch is full.
+  // Adds one Gaussian; samples a full batch.
   template <Reach kReach>
   BEAGS_INLINE void add(int64_t gaussian, const int64_t* low, uint64_t valid) {
     OccupancyBatch<T>& to = batch<kReach>();
@@ -274,8 +274,8 @@ struct Waiting {
   }
 };
 
-// Bit l: the box of lane l lies in a cube of 1, 2 or 3 valid voxels along each side, of which one look tells. Without
-// branches, so that the looks of all lanes are under way at once. All tables must be arrays.
+// Returns a bit for each lane: whether its box lies in a cube of 1, 2 or 3 valid voxels along each side, by one lookup.
+// It has no branches, so that the lookups of all lanes run at once. All tables must be arrays.
 template <class T>
 BEAGS_INLINE unsigned in_cubes(const VoxelTable* cubes, const Boxes<T>& boxes, const int32_t* class_ids) {
   using I = typename Lanes<T>::Int;
@@ -338,7 +338,7 @@ double occupancy_block(const OccupancyJob<T>& job, int64_t first, int64_t last, 
     } else {
       for (int lane = 0; lane < here; ++lane) class_ids[lane] = job.class_ids[start + lane];
     }
-    // Where a disc is wholly inside, its loss is exactly 0. Most lie in a cube.
+    // The loss of a disc that lies wholly inside is exactly 0. Most lie in a cube.
     const unsigned inside = job.skip && arrays ? in_cubes(job.valid, boxes, class_ids) : 0;
     unsigned left = ~inside & ((1u << here) - 1);
     if (!left) continue;

@@ -1,5 +1,5 @@
-// Random bits that depend on their counters alone, as occupancy/sampling.py. Included by the files that are compiled
-// for one instruction set.
+// Makes random bits that depend on their counters alone, as occupancy/sampling.py. Included once for each instruction
+// set.
 #pragma once
 
 #include "simd/hash.h"
@@ -9,7 +9,7 @@ namespace beags {
 namespace ops {
 namespace BEAGS_ISA {
 
-// The SplitMix64 finaliser, as occupancy/sampling.py.
+// Applies the SplitMix64 finaliser, as occupancy/sampling.py.
 template <class W>
 BEAGS_INLINE W mix(W word) {
   word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9u;

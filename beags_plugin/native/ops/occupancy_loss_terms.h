@@ -1,5 +1,5 @@
-// A Gaussian's disc in voxels, and what turns the sums over its samples into gradients (method, section 6; E9): shared
-// by the vectors of CPUs and the threads of GPUs. R: T, or a vector of T.
+// Computes a Gaussian's disc in voxels, and turns the sums over its samples into gradients (method, section 6; E9), for
+// the vectors of CPUs and the threads of GPUs. R: T, or a vector of T.
 #pragma once
 
 #include "ops/kernels.h"
@@ -44,8 +44,8 @@ BEAGS_HD_INLINE void fill_frame(const OccupancyJob<T>& job, const R* mean, const
   }
 }
 
-// How far the disc reaches along an axis, voxels; distance: |center|. The samples and this box round differently, by a
-// few units in the last place.
+// Returns how far the disc reaches along an axis, in voxels, with a margin of a few units in the last place: the
+// samples are rounded differently. distance: |center|.
 template <class T, class R>
 BEAGS_HD_INLINE R reach_along(R u, R v, R distance) {
   constexpr T kEpsilon = sizeof(T) == 4 ? T(1.1920929e-7) : T(2.220446049250313e-16);
@@ -64,8 +64,8 @@ BEAGS_HD_INLINE void add_sample(R weight, R u, R v, R* sums) {
   sums[5] = fma(wu, v, sums[5]);
 }
 
-// Gradients by mean [3], quaternion [4], log scales [2] and opacity logit, in that order. sums: of G Q times 1, u, v,
-// u^2, v^2, u v.
+// Computes the gradients by mean [3], quaternion [4], log scales [2] and opacity logit, in that order. sums: of G Q
+// times 1, u, v, u^2, v^2, u v.
 template <class T, class R>
 BEAGS_HD_INLINE void disc_gradients(const OccupancyJob<T>& job, const DiscFrame<R>& f, R opacity, const R* sums,
                                     R* out) {

@@ -1,4 +1,4 @@
-// L1 and SSIM of an image against a reference (method, section 1).
+// Computes L1 and SSIM of an image against a reference on the CPU (method, section 1).
 #pragma once
 
 #include "ops/kernels.h"
@@ -10,7 +10,7 @@ struct PhotometricSums {
   double absolute, similar;  // sum of |x - y|, sum of the SSIM index
 };
 
-// Fills job.gradient if it is not null; allocates job.slopes and job.sums itself.
+// Sums L1 and SSIM. Fills job.gradient if it is not null; allocates job.slopes and job.sums itself.
 template <class T>
 PhotometricSums photometric(PhotometricJob<T> job, int threads);
 

@@ -1,6 +1,6 @@
-// L1 and SSIM, and their gradient in closed form, one row at a time (method, section 1). Included once for each
-// instruction set. A row is blurred down the columns first, for which the products are made anew, into a few
-// buffers that stay in the cache, then along the row, where the window steps over the interleaved channels.
+// Computes L1 and SSIM, and their gradient in closed form, one row at a time (method, section 1). Included once for
+// each instruction set. A row is blurred down the columns first (its products are computed again for each row) into a
+// few buffers that stay in the cache, then along the row, where the window steps over the interleaved channels.
 #pragma once
 
 #include "ops/photometric_terms.h"
@@ -12,7 +12,7 @@ namespace BEAGS_ISA {
 
 constexpr int kPad = kSsimReach * kChannels;  // numbers beyond a row's ends that the window reaches, held at 0
 
-// Numbers in one buffer of a row.
+// Returns how many numbers one buffer of a row has.
 template <class T>
 BEAGS_INLINE int64_t buffer_length(int width) {
   return static_cast<int64_t>(width) * kChannels + 2 * kPad + 2 * Lanes<T>::kCount;
@@ -31,7 +31,7 @@ BEAGS_INLINE void clear_pads(T* scratch, int width, int buffers) {
   }
 }
 
-// The window along a row; `from` points at the buffer's number of the first lane.
+// Blurs along a row. `from` points at the buffer's number of the first lane.
 template <class T>
 BEAGS_INLINE RealOf<T> blur_row(const PhotometricJob<T>& job, const T* from) {
   RealOf<T> sum = {};
@@ -69,7 +69,7 @@ void photometric(const PhotometricJob<T>& job, int row, T* scratch) {
     lanes.store(to + 3 * length, product);
   });
   const int64_t map = static_cast<int64_t>(job.height) * line;
-  R absolute = {}, similar = {};  // Determinism: summed lane by lane along the row, whoever draws it
+  R absolute = {}, similar = {};  // Determinism: summed lane by lane along the row, on any thread
   for_each_vector<T>(line, [&](int64_t i, auto lanes) {
     const T* from = scratch + kPad + i;
     const R m_x = blur_row(job, from), m_y = blur_row(job, from + length);
@@ -96,7 +96,8 @@ void photometric(const PhotometricJob<T>& job, int row, T* scratch) {
   job.sums[2 * row + 1] = sums[1];
 }
 
-// A symmetric window with zeros outside is its own adjoint, so the way back is the same blur.
+// Computes a row of the gradient. A symmetric window with zeros outside is its own adjoint, so the backward is the same
+// blur.
 template <class T>
 void photometric_gradient(const PhotometricJob<T>& job, int row, T* scratch) {
   using R = RealOf<T>;

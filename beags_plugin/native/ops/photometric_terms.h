@@ -1,4 +1,4 @@
-// The SSIM index of one number and its slopes (method, section 1): shared by the vectors of CPUs and the threads of
+// Computes the SSIM index of one number and its slopes (method, section 1), for the vectors of CPUs and the threads of
 // GPUs. R: T, or a vector of T.
 #pragma once
 

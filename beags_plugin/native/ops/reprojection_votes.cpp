@@ -10,7 +10,7 @@ namespace beags {
 namespace ops {
 namespace {
 
-// Row y of a view's labels, as the kernels read them; `wide` is where a row of bytes is widened.
+// Returns row y of a view's labels as the kernels read them; `wide` stores a widened row of bytes.
 template <class T>
 const int32_t* row_labels(const VotingView<T>& view, int y, std::vector<int32_t>* wide) {
   const int64_t row = static_cast<int64_t>(y) * view.width;
@@ -31,7 +31,7 @@ void reprojection_votes(const std::vector<VotingView<T>>& views, const std::vect
   {
     std::vector<uint32_t> votes;
     std::vector<int32_t> wide;
-    // Determinism: a target's votes are counted by one thread; sums of integers have no order anyway.
+    // Determinism: one thread counts a target's votes, and sums of integers do not depend on their order.
 #pragma omp for schedule(dynamic, 1)
     for (int64_t t = 0; t < count; ++t) {
       const VotedView<T>& target = targets[t];

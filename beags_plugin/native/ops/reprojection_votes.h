@@ -1,4 +1,4 @@
-// Labels of some views, voted by the lifted pixels of all (method, section 2; E5).
+// Votes on the labels of some views by the lifted pixels of all (method, section 2; E5).
 #pragma once
 
 #include <algorithm>
@@ -23,7 +23,7 @@ struct VotingView {
 
 constexpr uint8_t kShortIgnore = 255;
 
-// What a pixel of a view with a mask votes for; -1: for nothing.
+// Returns the label that a pixel of a view with a mask votes for; -1: none.
 template <class T>
 BEAGS_HD inline int32_t label_of(const VotingView<T>& view, int64_t pixel) {
   if (view.labels) return view.labels[pixel];
@@ -39,7 +39,7 @@ struct VotedView {
   float* confidence;  // [height, width]
 };
 
-// What all votes for a target share; votes: its counters.
+// Makes the part of a job that all votes for a target share. votes: its counters.
 template <class T>
 CastJob<T> cast_job(const VotingView<T>& target, int num_classes, double tau, uint32_t* votes) {
   CastJob<T> job{};
@@ -52,7 +52,7 @@ CastJob<T> cast_job(const VotingView<T>& target, int num_classes, double tau, ui
   return job;
 }
 
-// The next view that votes; map: from it to the target.
+// Sets the next view that votes. map: from it to the target.
 template <class T>
 void set_source(CastJob<T>& job, const VotingView<T>& source, const T* map) {
   std::copy_n(map, 9, job.a);
@@ -60,7 +60,7 @@ void set_source(CastJob<T>& job, const VotingView<T>& source, const T* map) {
   job.source_width = source.width;
 }
 
-// Targets are shared among the threads, so each thread keeps one view's counters.
+// Votes on all targets. Threads share the targets; each thread keeps one view's counters.
 template <class T>
 void reprojection_votes(const std::vector<VotingView<T>>& views, const std::vector<VotedView<T>>& targets,
                         int num_classes, double tau, int threads);

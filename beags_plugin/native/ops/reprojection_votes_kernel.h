@@ -1,5 +1,5 @@
-// One row of labelled pixels cast into another view (method, section 2; E5). Included by the files that are compiled
-// for one instruction set, with -ffp-contract=off.
+// Projects one row of labelled pixels into another view (method, section 2; E5). Included once for each instruction
+// set, with -ffp-contract=off.
 #pragma once
 
 #include "ops/reprojection_votes_terms.h"

@@ -1,6 +1,6 @@
-// A pixel's vote in another view, and what the votes for a pixel say (method, section 2; E5): shared by the vectors of
-// CPUs and the threads of GPUs. Each operation is rounded as in masks/reprojection.py (no fused operations), so that
-// all give the same votes. Included by the files that are compiled for one instruction set, or for GPUs.
+// Computes a pixel's vote in another view, and the winner of the votes for a pixel (method, section 2; E5), for the
+// vectors of CPUs and the threads of GPUs. Each operation is rounded as in masks/reprojection.py (no fused operations),
+// so that all give the same votes. Included once for each instruction set, or for GPUs.
 #pragma once
 
 #include "ops/kernels.h"
@@ -10,7 +10,8 @@ namespace beags {
 namespace ops {
 namespace BEAGS_ISA {
 
-// Where a pixel at x (its middle) of row y's middle and depth d projects to: z (x', y', 1). R: T, or a vector of T.
+// The projection z (x', y', 1) of a pixel, whose middle is x and the middle of its row, at depth d. R: T, or a vector
+// of T.
 template <class R>
 struct Projected {
   R hx, hy, z;
@@ -23,7 +24,8 @@ BEAGS_HD_INLINE Projected<R> project_pixel(const CastJob<T>& job, R x, T y, R d)
           d * (a[6] * x + (a[7] * y + a[8])) + job.b[2]};
 }
 
-// Whether that is a pixel of the target. Written as products so that z = 0, infinite and NaN points simply fail.
+// Returns whether that is a pixel of the target. Products instead of quotients: z = 0, infinite and NaN points simply
+// fail.
 template <class T, class R>
 BEAGS_HD_INLINE auto lands_in_target(const CastJob<T>& job, const Projected<R>& at, R d) {
   const R zero = {}, width = zero + static_cast<T>(job.target_width), height = zero + static_cast<T>(job.target_height);
@@ -31,7 +33,7 @@ BEAGS_HD_INLINE auto lands_in_target(const CastJob<T>& job, const Projected<R>& 
          (d > zero);
 }
 
-// Whether a point at depth z is seen at that pixel of the target.
+// Returns whether a point at depth z is seen at that pixel of the target.
 template <class T>
 BEAGS_HD_INLINE bool seen_in_target(const CastJob<T>& job, int64_t pixel, T z) {
   if (!job.target_depth) return true;
@@ -39,7 +41,7 @@ BEAGS_HD_INLINE bool seen_in_target(const CastJob<T>& job, int64_t pixel, T z) {
   return (gap < 0 ? -gap : gap) <= job.tau * z;
 }
 
-// The class with most votes and the share of its votes; a tie or no vote leaves the label. votes: [num_classes].
+// Sets the class with most votes and its share; a tie or no vote keeps the label. votes: [num_classes].
 BEAGS_HD inline void decide_by_votes(const uint32_t* votes, int num_classes, int32_t* label, float* confidence) {
   uint32_t most = 0, total = 0;
   int winner = 0, leaders = 0;

@@ -1,4 +1,4 @@
-// Colours from spherical harmonics, and the way back (method, section 1).
+// Computes colours from spherical harmonics, and their gradients (method, section 1).
 #pragma once
 
 #include "ops/kernels.h"

@@ -1,5 +1,5 @@
-// Colours from spherical harmonics of degree 0 to 3 (method, section 1), a block of surfels at a time: first the basis
-// of all of them, then their sums. Included by the files that are compiled for one instruction set.
+// Computes colours from spherical harmonics of degree 0 to 3 (method, section 1), a block of Gaussians at a time: first
+// the basis of all of them, then their sums. Included once for each instruction set.
 #pragma once
 
 #include "ops/sh_colors_terms.h"
@@ -31,7 +31,7 @@ void basis_of_block(int count, const Directions<T>& d, T (*b)[kColorBlock]) {
   for (int i = 0; i < count; ++i) basis<kDegree>(d[i], [&](int k, T value) { b[k][i] = value; });
 }
 
-// Degree by degree: compilers make vectors of loops as short as these.
+// Goes degree by degree: compilers vectorise loops as short as these.
 template <int kDegree, class T>
 void add_backward(int count, const Directions<T>& d, const T (*g)[kColorBlock], T (*out)[kColorBlock]) {
   for (int i = 0; i < count; ++i) {

@@ -1,5 +1,5 @@
-// The basis of spherical harmonics of one surfel, and its way back (method, section 1): shared by CPUs and GPUs.
-// Normalisation, signs and order as core/sh.py.
+// Computes the basis of spherical harmonics of one Gaussian, and its backward (method, section 1), on CPUs and GPUs.
+// Normalisation, signs and order are those of core/sh.py.
 #pragma once
 
 #include <math.h>
@@ -15,7 +15,7 @@ constexpr double kC0 = 0.28209479177387814, kC1 = 0.4886025119029199;
 constexpr double kC20 = 1.0925484305920792, kC21 = 0.31539156525252005, kC22 = 0.5462742152960396;
 constexpr double kC30 = 0.5900435899266435, kC31 = 2.890611442640554, kC32 = 0.4570457994644658,
                  kC33 = 0.3731763325901154, kC34 = 1.445305721320277;
-constexpr double kLeastDistance = 1e-12;  // a surfel at the camera
+constexpr double kLeastDistance = 1e-12;  // a Gaussian at the camera
 
 template <class T>
 struct Direction {
@@ -31,7 +31,7 @@ BEAGS_HD_INLINE Direction<T> direction(const ColorJob<T>& job, int64_t i) {
   return {x * inverse, y * inverse, z * inverse, inverse};
 }
 
-// put(k, value) for each function k of the basis.
+// Calls put(k, value) for each function k of the basis.
 template <int kDegree, class T, class Put>
 BEAGS_HD_INLINE void basis(const Direction<T>& d, Put put) {
   const T x = d.x, y = d.y, z = d.z;
@@ -64,7 +64,7 @@ struct DirectionGradient {
   T x, y, z;
 };
 
-// What degree kDegree (from 1 on) adds to the gradient towards the direction; g(k): that towards function k of the
+// Adds the part of degree kDegree (1 or more) to the gradient by the direction. g(k): the gradient by function k of the
 // basis.
 template <int kDegree, class T, class Get>
 BEAGS_HD_INLINE DirectionGradient<T> basis_backward(const Direction<T>& d, Get g) {
@@ -84,7 +84,7 @@ BEAGS_HD_INLINE DirectionGradient<T> basis_backward(const Direction<T>& d, Get g
               T(kC34) * (xx - yy) * g(14)};
 }
 
-// The gradient towards a mean, to[3]: d = p / |p|; at the camera |p| is held at its least.
+// Computes the gradient by a mean, to[3]: d = p / |p|; at the camera |p| is held at its least.
 template <class T>
 BEAGS_HD_INLINE void to_mean(const Direction<T>& d, const DirectionGradient<T>& g, T* to) {
   T along = g.x * d.x + g.y * d.y + g.z * d.z;

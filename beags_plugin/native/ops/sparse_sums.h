@@ -1,4 +1,4 @@
-// Sums for the keys that occur.
+// Sums values for the keys that occur.
 #pragma once
 
 #include <cstdint>
@@ -9,7 +9,7 @@ namespace ops {
 
 class SparseSums {
  public:
-  // keys: [count], ascending, each once. A key's values are added in the order of the calls.
+  // Adds values. keys: [count], ascending, each once. A key's values are added in the order of the calls.
   template <class T>
   void add(const int64_t* keys, const T* values, int64_t count);
   const std::vector<int64_t>& keys() const { return keys_; }  // ascending

@@ -9,7 +9,8 @@ namespace ops {
 using namespace BEAGS_ISA;
 namespace {
 
-// An array of bricks may take this many cells, or so many for each brick that is not empty; a hash table takes 4 to 8.
+// An array of bricks has at most kMostDense cells, or kDensePerBrick for each brick that is not empty if that is more.
+// A hash table has 4 to 8 a brick.
 constexpr double kMostDense = 1 << 16, kDensePerBrick = 16;
 constexpr int64_t kLeastForTeam = 4000;  // queries take tens of nanoseconds; a team takes microseconds to start
 
@@ -27,7 +28,7 @@ void unite(std::vector<Brick>& bricks) {
   if (!bricks.empty()) bricks.resize(last + 1);
 }
 
-// The bricks of the box of 3 x 3 x 3 voxels around a voxel; `voxel` already has kVoxelShift added.
+// Appends the bricks of the box of 3 x 3 x 3 voxels around a voxel; `voxel` already includes kVoxelShift.
 void add_neighbours(const int64_t* voxel, std::vector<Brick>& bricks) {
   int64_t brick[3][2];
   int count[3], first[3];
@@ -37,7 +38,7 @@ void add_neighbours(const int64_t* voxel, std::vector<Brick>& bricks) {
     first[axis] = static_cast<int>((voxel[axis] - 1) & 3);
     count[axis] = brick[axis][1] > brick[axis][0] ? 2 : 1;
   }
-  // Bits of one axis that lie in its first or second brick.
+  // Returns the bits of one axis that lie in its first or second brick.
   const auto span = [&](int axis, int which) {
     const unsigned bits = 7u << first[axis];
     return which == 0 ? bits & 0xF : bits >> 4;
@@ -60,7 +61,7 @@ void add_neighbours(const int64_t* voxel, std::vector<Brick>& bricks) {
 
 int64_t coordinate(uint64_t key, int axis) { return static_cast<int64_t>(key >> (40 - 20 * axis) & 0xFFFFF); }
 
-// Of the voxels of `table`, whose bricks are `bricks`, those that are the corner of 2 x 2 x 2 of them.
+// Returns the voxels of `table`, whose bricks are `bricks`, that are the corner of 2 x 2 x 2 of them.
 std::vector<std::vector<Brick>> corners(const VoxelTable& table, const std::vector<std::vector<Brick>>& bricks) {
   std::vector<std::vector<Brick>> out(bricks.size());
   const int sizes[3] = {4, 4, 4};

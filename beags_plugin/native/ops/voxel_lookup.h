@@ -1,5 +1,5 @@
-// The visibility voxel grids as two hash tables of bricks: the occupied voxels, and the valid ones, i.e. those next to
-// an occupied one (method, section 5). Built once; queries are safe from any thread.
+// Looks up points in the visibility voxel grids: two sets of bricks, of the occupied voxels and of the valid ones, next
+// to an occupied one (method, section 5). Built once; queries are safe from any thread.
 #pragma once
 
 #include <array>
@@ -22,7 +22,7 @@ class VoxelLookup {
     std::vector<Brick> slots;
     std::vector<BrickRange> ranges;
     int32_t num_classes;
-    // bricks: of each class, no two alike.
+    // bricks: those of each class, all different.
     void store(const std::vector<std::vector<Brick>>& bricks);
     void hash(const std::vector<std::vector<Brick>>& bricks);
     VoxelTable table() const;
@@ -35,9 +35,10 @@ class VoxelLookup {
 
   VoxelTable occupied() const { return occupied_.table(); }
   VoxelTable valid() const { return cubes_[0].table(); }
-  // The corners (of lowest indices) of cubes of valid voxels, 1, 2 and 3 along each side: one look tells of a cube.
+  // Returns the corners (of lowest indices) of cubes of valid voxels, 1, 2 and 3 along each side: one lookup
+  // answers for a whole cube.
   std::array<VoxelTable, kLargestCube> valid_cubes() const;
-  // All tables: that of the occupied voxels, then those of `valid_cubes`.
+  // Returns all tables: that of the occupied voxels, then those of `valid_cubes`.
   std::array<const Bricks*, 1 + kLargestCube> stored() const {
     return {&occupied_, &cubes_[0], &cubes_[1], &cubes_[2]};
   }

@@ -1,4 +1,4 @@
-// How voxels are numbered, and the tiles of pixels. Private to the voxel votes.
+// Numbers voxels and cuts images into tiles of pixels. Private to the voxel votes.
 #pragma once
 
 #include <algorithm>
@@ -15,18 +15,18 @@ constexpr int kTile = 8;  // pixels are taken in tiles: neighbours mostly need t
 inline uint64_t brick_key(int32_t x, int32_t y, int32_t z) {
   return static_cast<uint64_t>(x) << 38 | static_cast<uint64_t>(y) << 19 | static_cast<uint64_t>(z);
 }
-// Where a brick's slot is looked for: the eight bricks of a cube have places side by side, as they are needed together.
-// The first bits tell shares apart.
+// Returns the place at which the search for a brick's slot begins. The eight bricks of a cube, needed together, have
+// neighbouring places. The first bits number the share.
 inline uint64_t place_of(uint64_t key) {
   constexpr uint64_t odd = uint64_t(1) << 38 | uint64_t(1) << 19 | 1;
   const uint64_t within = (key >> 36 & 4) | (key >> 18 & 2) | (key & 1);
   return (hash_of(key & ~odd) & ~uint64_t(7)) | within;
 }
 constexpr uint64_t kNextPlace = 9;  // odd: all slots are reached
-// Bricks that were needed last are kept at hand: those of a cube of 16 bricks' side have places of their own.
+// The cache of bricks needed last. Those of a cube of 16 bricks' side have places of their own.
 constexpr int kKept = 1 << 12;
 inline int kept_at(uint64_t key) { return static_cast<int>((key & 15) | (key >> 15 & 0xf0) | (key >> 30 & 0xf00)); }
-// A voxel's place in its brick.
+// Returns a voxel's place in its brick.
 inline int cell_of(int32_t x, int32_t y, int32_t z) { return (x & 3) << 4 | (y & 3) << 2 | (z & 3); }
 
 // The voxels of a brick, a bit each, whose place along an axis (0: x) is 0; one step along it is a shift by `kShift`.
@@ -38,15 +38,15 @@ int tile_rows(const LiftedView<T>& view) {
   return (view.height + kTile - 1) / kTile;
 }
 
-// do_tile(left, right, top, bottom) for the tiles of one row.
+// Calls do_tile(left, right, top, bottom) for the tiles of one row.
 template <class T, class DoTile>
 void each_tile(const LiftedView<T>& view, int row, DoTile do_tile) {
   const int top = row * kTile, bottom = std::min(top + kTile, view.height);
   for (int left = 0; left < view.width; left += kTile) do_tile(left, std::min(left + kTile, view.width), top, bottom);
 }
 
-// What `lift` tells of a tile's pixels, and the voxels of their points, at 8 (y - top) + x - left: plain arithmetic on
-// whole arrays, of which the compiler takes several places at a time. What lies outside the image is not near.
+// The results of `lift` for a tile's pixels, and the voxels of their points, at 8 (y - top) + x - left. Plain loops
+// over whole arrays let the compiler vectorise. Pixels outside the image are not near.
 template <class T>
 struct LiftedTile {
   static constexpr int kPlaces = kTile * kTile;

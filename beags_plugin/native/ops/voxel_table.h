@@ -1,7 +1,6 @@
-// Sets of voxels, one for each class, as bricks of 4 x 4 x 4 voxels with a bit for each: one read tells about 64
-// voxels. The bricks lie in an array over their bounding box where that is small, else in a hash table, whose memory is
-// linear in the occupied voxels. Plain data and inlined queries, which kernels of every instruction set and of GPUs
-// share: hence the namespace BEAGS_ISA.
+// Stores a set of voxels for each class, as bricks of 4 x 4 x 4 voxels with a bit for each: one read covers 64 voxels.
+// A small bounding box becomes an array of bricks, a large one a hash table, whose memory is linear in the occupied
+// voxels. Kernels of every instruction set and of GPUs share the inlined queries; hence the namespace BEAGS_ISA.
 #pragma once
 
 #include <math.h>
@@ -56,7 +55,7 @@ BEAGS_HD inline uint64_t hashed_bits(const VoxelTable& table, int32_t class_id, 
   }
 }
 
-// Place of a brick along one axis of the array; `last`: the largest that is allowed.
+// Returns the place of a brick along one axis of the array. last: the largest that is allowed.
 BEAGS_HD inline int64_t dense_place(const VoxelTable& table, int axis, int64_t brick, int64_t last) {
   const int64_t at = brick - table.base[axis];
   return at < 0 ? 0 : at > last ? last : at;
@@ -69,18 +68,18 @@ BEAGS_HD inline uint64_t brick_bits(const VoxelTable& table, int32_t class_id, i
   return table.dense[((class_id * static_cast<int64_t>(table.size[0]) + i) * table.size[1] + j) * table.size[2] + k];
 }
 
-// The same four bits in every one of 16 rows; the same 16 bits in every one of 4 slices.
+// Repeat four bits in each of 16 rows, or 16 bits in each of 4 slices.
 BEAGS_HD inline uint64_t in_rows(uint64_t bits) { return bits * 0x1111111111111111u; }
 BEAGS_HD inline uint64_t in_slices(uint64_t bits) { return bits * 0x0001000100010001u; }
 
-// Bits of the box of sizes 1..4 whose corner is voxel 0.
+// Returns the bits of the box of sizes 1..4 whose corner is voxel 0.
 BEAGS_HD inline uint64_t box_bits(int nx, int ny, int nz) {
   const uint64_t row = (1u << nz) - 1, slice = row * 0x1111u & ((uint64_t(1) << 4 * ny) - 1);
   return nx == 4 ? in_slices(slice) : in_slices(slice) & ((uint64_t(1) << 16 * nx) - 1);
 }
 
-// The voxels of the box of sizes n[] in 1..4 whose corner is voxel low[], |low| <= kVoxelHalf + 2: bit 16 x + 4 y + z
-// is the voxel low + (x, y, z). Other bits may be set.
+// Returns the voxels of the box of sizes n[] in 1..4 whose corner is voxel low[], |low| <= kVoxelHalf + 2: bit 16 x + 4
+// y + z is the voxel low + (x, y, z). Other bits may be set.
 BEAGS_HD inline uint64_t voxel_box(const VoxelTable& table, int32_t class_id, const int64_t* low, const int* n) {
   if (class_id < 0 || class_id >= table.num_classes) return 0;
   int64_t brick[3];
@@ -126,7 +125,7 @@ BEAGS_HD inline uint64_t voxel_box(const VoxelTable& table, int32_t class_id, co
 }
 
 constexpr int kWindow = 3;                      // bricks along each side of a window
-constexpr int kWindowVoxels = 4 * kWindow - 3;  // boxes over so many voxels lie in a window, wherever they start
+constexpr int kWindowVoxels = 4 * kWindow - 3;  // a box of that side lies in a window, wherever it starts
 
 // Copies the bricks that the box of sizes n[] in 1 .. kWindowVoxels from voxel low[] on reaches, and moves low[] to the
 // first voxel of the first one. Returns whether the box wholly lies in the set.
@@ -184,7 +183,7 @@ BEAGS_HD inline bool fill_window(const VoxelTable& table, int32_t class_id, int6
   return missing == 0;
 }
 
-// Membership of a voxel, |voxel| <= kVoxelHalf + 2.
+// Returns whether a voxel is a member, |voxel| <= kVoxelHalf + 2.
 BEAGS_HD inline bool voxel_bit(const VoxelTable& table, int32_t class_id, const int64_t* voxel) {
   if (class_id < 0 || class_id >= table.num_classes) return false;
   int64_t index[3];
@@ -193,7 +192,7 @@ BEAGS_HD inline bool voxel_bit(const VoxelTable& table, int32_t class_id, const 
   return bits >> (16 * (index[0] & 3) + 4 * (index[1] & 3) + (index[2] & 3)) & 1;
 }
 
-// Membership of the voxel that is given as whole numbers in floating point, which need not be finite.
+// Returns whether a voxel is a member. It is given as whole numbers in floating point, which need not be finite.
 template <class T>
 BEAGS_HD inline bool voxel_member(const VoxelTable& table, int32_t class_id, const T* voxel) {
   const T limit = static_cast<T>(kVoxelHalf + 1);
@@ -203,8 +202,8 @@ BEAGS_HD inline bool voxel_member(const VoxelTable& table, int32_t class_id, con
   return voxel_bit(table, class_id, index);
 }
 
-// The voxels that a box reaches, from floats `low` to `high`. Returns whether they are at most 4 along each axis and
-// near enough to be looked up; else `from` and `n` are not set.
+// Finds the voxels that a box reaches, from floats `low` to `high`. Returns whether they are at most 4 along each axis
+// and near enough to be looked up; else `from` and `n` are not set.
 template <class T>
 BEAGS_HD inline bool small_box(const T* low, const T* high, int64_t* from, int* n) {
   const T limit = static_cast<T>(kVoxelHalf + 1);

@@ -14,7 +14,8 @@ constexpr int kShares = 64;
 constexpr int kBlock = 64;                                       // voxels that are fetched at a time
 constexpr uint32_t kPrimes[3] = {73856093, 19349663, 83492791};  // as in masks/slabs.py
 
-// Of three bricks in a row along an axis, bits of the middle one: set there or in the next voxel below, or above.
+// Combines three bricks in a row along an axis into bits of the middle one: set there or in the next voxel below, or
+// above.
 void with_next(int axis, const uint64_t* bricks, uint64_t* below, uint64_t* above) {
   const uint64_t first = kPlane[axis], last = first << 3 * kShift[axis], own = bricks[1];
   const int shift = kShift[axis];
@@ -53,7 +54,7 @@ void VoxelVotes::add(const LiftedView<T>& view, const int32_t* labels, int32_t i
       }
     });
   }
-  // Every thread reads all keys and counts those of its own shares: no two write to one table.
+  // Every thread reads all keys and counts those of its own shares: no two threads write to one table.
 #pragma omp parallel for num_threads(team) schedule(static, 1)
   for (int part = 0; part < team; ++part) {
     const uint64_t first = kShares * part / team, last = kShares * (part + 1) / team;
@@ -243,14 +244,14 @@ void VoxelVotes::settle(uint64_t key, Brick& brick) const {
       if (step[axis]) touched &= step[axis] > 0 ? kPlane[axis] << 3 * kShift[axis] : kPlane[axis];
     }
     if (!touched) continue;
-    // Keys are sums: no coordinate is so near its end that it would carry.
+    // Adding to a key is safe: no coordinate is near enough to its end to carry.
     const Brick* other = side == 13 ? &brick
                                     : find(key + (static_cast<uint64_t>(static_cast<int64_t>(step[0])) << 38) +
                                            (static_cast<uint64_t>(static_cast<int64_t>(step[1])) << 19) +
                                            static_cast<uint64_t>(static_cast<int64_t>(step[2])));
     if (other) against[side] = other->label == brick.label ? other->voted & ~other->led : other->voted;
   }
-  // Axis by axis: those of the voxel or of the next one, below ([0]) and above ([1]).
+  // Axis by axis: the bits of the voxel or of the next one, below ([0]) and above ([1]).
   uint64_t by_z[2][9], by_yz[2][2][3];
   for (int i = 0; i < 9; ++i) with_next(2, against + 3 * i, &by_z[0][i], &by_z[1][i]);
   for (int z = 0; z < 2; ++z) {

@@ -1,4 +1,4 @@
-// Votes for classes, pooled per voxel of the points that cast them and read back softly (method, section 2).
+// Pools votes for classes per voxel of the points that cast them, and reads them back interpolated (method, section 2).
 #pragma once
 
 #include <cstdint>
@@ -15,13 +15,13 @@ class VoxelVotes {
   explicit VoxelVotes(int threads);
   VoxelVotes(const VoxelVotes&) = delete;
 
-  // One vote of each pixel with a depth, for its label [height, width], 0 or more, unless that is `ignore`.
+  // Adds one vote for each pixel with a depth, for its label [height, width], 0 or more, unless that is `ignore`.
   template <class T>
   void add(const LiftedView<T>& view, const int32_t* labels, int32_t ignore);
-  // Counts are complete.
+  // Ends the counting.
   void decide();
-  // Per pixel with a depth, after `decide`: the winner of the votes about it (its label stays where several lead or
-  // nobody voted) and its share of them.
+  // Sets, after `decide`, the winner of the votes about each pixel with a depth, and its share; a tie or no vote keeps
+  // the label.
   template <class T>
   void read(const LiftedView<T>& view, int32_t* labels, float* confidence) const;
 
@@ -29,9 +29,9 @@ class VoxelVotes {
   static constexpr int kCells = 64;                   // a brick is 4 x 4 x 4 voxels
   static constexpr int32_t kNobody = -2, kMany = -1;  // instead of a leading class
 
-  // While counting: one class and its votes; 0 votes: an empty voxel. Further classes are among the `Extra`. After
-  // `decide`: label has more than half of the votes, or is -1; where there are several classes, votes is kSeveral and
-  // the place of their `Pair`s.
+  // While counting: one class and its votes; 0 votes: an empty voxel. Further classes are `Extra`s. After `decide`:
+  // label has more than half of the votes, or is -1; with several classes, votes is kSeveral and the place of their
+  // `Pair`s.
   struct Voxel {
     int32_t label;
     uint32_t votes;
@@ -89,8 +89,8 @@ class VoxelVotes {
   std::vector<int32_t> labels_;
 };
 
-// Of the bricks of 4 x 4 x 4 voxels that hold the view's points about one in `part`, a power of two, the same in every
-// view: x, y, z of each, sorted.
+// Returns about one in `part`, a power of two, of the bricks of 4 x 4 x 4 voxels that hold the view's points, the same
+// in every view: x, y, z of each, sorted.
 template <class T>
 std::vector<int32_t> brick_sample(const LiftedView<T>& view, uint32_t part);
 

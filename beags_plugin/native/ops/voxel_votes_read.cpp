@@ -11,7 +11,8 @@ class VoxelVotes::Reader {
  public:
   explicit Reader(const VoxelVotes& votes) : votes_(votes), kept_(kKept) {}
 
-  // Sets labels and confidence. What all pixels of a tile will look at is fetched first, so that no pixel waits alone.
+  // Sets labels and confidence. All memory that the pixels of a tile will read is fetched first, so that no pixel waits
+  // alone.
   template <class T>
   void read(const LiftedView<T>& view, int left, int right, int top, int bottom, int32_t* labels, float* confidence) {
     const LiftedTile<T> tile(view, left, right, top, bottom);
@@ -38,7 +39,7 @@ class VoxelVotes::Reader {
     for (int i = 0; i < count; ++i) {
       const Query<T>& query = queries[i];
       const Brick& at = *query.brick;
-      // More than half of the votes of each voxel are more than half of any weighted sum.
+      // A class with more than half of the votes of each voxel has more than half of any weighted sum.
       if (at.agreed[query.eighth] & at.pure & uint64_t(1) << query.cell) {
         labels[query.pixel] = at.label;
         confidence[query.pixel] = 1.0f;
@@ -54,7 +55,7 @@ class VoxelVotes::Reader {
   }
 
  private:
-  // A pixel's point, and the voxel and the eighth of it that hold the point.
+  // A pixel's point, and the voxel and its eighth that hold the point.
   template <class T>
   struct Query {
     T point[3];
@@ -78,7 +79,7 @@ class VoxelVotes::Reader {
     query.cell = cell_of(own[0], own[1], own[2]);
   }
 
-  // The pixel's confidence; sets its label.
+  // Returns the pixel's confidence; sets its label.
   template <class T>
   float answer(const LiftedView<T>& view, const Query<T>& query, int32_t* label) {
     const Brick& at = *query.brick;
@@ -118,7 +119,7 @@ class VoxelVotes::Reader {
   };
 
   // Eight voxels about a point, and their bricks, one to eight of them, by bits 4, 2, 1 for one step along x, y, z; the
-  // others are not asked for.
+  // other bricks are not read.
   struct Look {
     NearVoxels place;
     const Brick* bricks[8];
@@ -141,7 +142,7 @@ class VoxelVotes::Reader {
     }
   }
 
-  // So many steps along the pixel's ray. Its voxels are fetched, as others are looked at first.
+  // Moves that many steps along the pixel's ray. Its voxels are fetched now and read after others.
   template <class T>
   void look_along(const LiftedView<T>& view, const Query<T>& query, int steps, Look& look) {
     const T px = static_cast<T>(query.pixel % view.width) + T(0.5);
@@ -162,7 +163,7 @@ class VoxelVotes::Reader {
     return kept.brick;
   }
 
-  // do_voxel(brick, voxel, weight) for those of the eight voxels that have votes.
+  // Calls do_voxel(brick, voxel, weight) for those of the eight voxels that have votes.
   template <class DoVoxel>
   static void each_voxel(const Look& look, DoVoxel do_voxel) {
     const NearVoxels& place = look.place;
@@ -184,7 +185,7 @@ class VoxelVotes::Reader {
     }
   }
 
-  // The class with more than half of the votes of each of the eight voxels that has any, or kMany or kNobody.
+  // Returns the class with more than half of the votes of each of the eight voxels that has any, or kMany or kNobody.
   static int32_t agreed(const Look& look) {
     int32_t least = INT32_MAX, most = kNobody;
     each_voxel(look, [&](const Brick&, const Voxel& voxel, uint32_t) {
@@ -203,7 +204,7 @@ class VoxelVotes::Reader {
     });
   }
 
-  // Determinism: whole numbers, whose sums have no order.
+  // Determinism: sums of whole numbers do not depend on their order.
   void add(int32_t label, uint64_t votes) {
     for (Entry& entry : poll_) {
       if (entry.label == label) {
@@ -214,7 +215,7 @@ class VoxelVotes::Reader {
     poll_.push_back({label, votes});
   }
 
-  // The winner's share; 0 if nobody voted. Several that lead leave the label.
+  // Returns the winner's share, 0 without votes. A tie keeps the label.
   float decide(int32_t* label) const {
     uint64_t most = 0, total = 0;
     int32_t winner = 0, leaders = 0;
@@ -232,7 +233,7 @@ class VoxelVotes::Reader {
     return total ? static_cast<float>(most) / static_cast<float>(total) : 0.0f;
   }
 
-  // The label's share of the votes of a voxel that has some.
+  // Returns the label's share of the votes of a voxel that has some.
   static float share_in(const Voxel& voxel, const Pair* pairs, int32_t label) {
     if (!(voxel.votes & kSeveral)) return voxel.label == label ? 1.0f : 0.0f;
     const Pair* pair = pairs + (voxel.votes & ~kSeveral);

@@ -1,4 +1,4 @@
-// The gradients of one tile, back to front (E2 to E4, E7). Included once for each instruction set.
+// Computes the gradients of one tile, back to front (E2 to E4, E7). Included once for each instruction set.
 #pragma once
 
 #include "rasterizer/composite.h"
@@ -7,7 +7,7 @@
 namespace beags {
 namespace BEAGS_ISA {
 
-// What the backward knows of a pack of pixels; g_ are gradients of the loss.
+// The backward's state of a pack of pixels; g_ marks gradients of the loss.
 template <class T>
 struct alignas(64) PixelGradients {
   T transmittance[kLanes<T>], behind[kLanes<T>];  // behind: the part of dL/dT of what lies behind, times T
@@ -33,7 +33,7 @@ BEAGS_INLINE void load_saved(const Job<T>& job, int tile, PixelGradients<T>* pix
   }
 }
 
-// The gradients towards the images, as they are. Returns the label of the whole tile, see load_labels.
+// Reads the gradients by the images. Returns the label of the whole tile, see load_labels.
 template <Parts kWanted, class T>
 BEAGS_INLINE int32_t read_gradients(const Job<T>& job, int tile, PixelGradients<T>* pixels) {
   const Images<const T>& g = job.gradients;
@@ -61,8 +61,8 @@ BEAGS_INLINE int32_t read_gradients(const Job<T>& job, int tile, PixelGradients<
   return Labels<T>::kMixed;
 }
 
-// Towards the sums that the images were made of: A is 1 - T at the end, which every surfel changes. Returns the label
-// of the whole tile.
+// Reads the gradients by the images and turns them into gradients by the sums that the images were made of: A is 1 - T
+// at the end, which every Gaussian changes. Returns the label of the whole tile.
 template <Parts kWanted, class T>
 BEAGS_INLINE int32_t load_gradients(const Job<T>& job, int tile, PixelGradients<T>* pixels) {
   load_saved<kWanted>(job, tile, pixels);
@@ -100,7 +100,7 @@ BEAGS_INLINE int32_t load_gradients(const Job<T>& job, int tile, PixelGradients<
   return everywhere;
 }
 
-// dL/dw of a hit, but for what lies behind it; sets `g_hit`, the gradient towards its depth.
+// Returns dL/dw of a hit, without the part of what lies behind it; sets `g_hit`, the gradient by its depth.
 template <Parts kWanted, class T>
 BEAGS_INLINE Real<T> weight_gradient(const Job<T>& job, int k, const Splat<T>& s, const Hits<T>& hits, int i,
                                      int32_t everywhere, const PixelGradients<T>& p, Real<T> w, Vector<T>* sums,
@@ -131,7 +131,7 @@ BEAGS_INLINE Real<T> weight_gradient(const Job<T>& job, int k, const Splat<T>& s
   return g_w;
 }
 
-// Adds one surfel's part at one pack of pixels, back to front.
+// Adds one Gaussian's part at one pack of pixels, back to front.
 template <Parts kWanted, bool kPlain, class T>
 BEAGS_INLINE void add_gradients(const Job<T>& job, int k, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> dx,
                                 Real<T> dy, int32_t everywhere, PixelGradients<T>& p, Vector<T>* sums) {
@@ -168,7 +168,7 @@ BEAGS_INLINE void add_gradients(const Job<T>& job, int k, const Splat<T>& s, con
   if (kDepths) add(sums[kZ], keep(disc, g_hit));
 }
 
-// Which groups of pixels are not yet past their end, going back to front.
+// Tracks, back to front, which groups of pixels have a pixel that is before its end.
 template <class T>
 struct Waking {
   int end[kGroupPixels] = {};  // of the pixel of a group that stopped last
@@ -194,8 +194,8 @@ struct Waking {
   }
 };
 
-// Calls visit(plain, k, splat, hits, i, dx, dy, pixels of the pack, sums) for what the forward composited, back to
-// front, and writes each pair's record: kSize sums over the tile's pixels.
+// Calls visit(plain, k, splat, hits, i, dx, dy, pixels of the pack, sums) for each hit that the forward composited,
+// back to front, and writes each pair's record: kSize sums over the tile's pixels.
 template <int kSize, unsigned kNeeds, class T, class Visit>
 BEAGS_INLINE void walk_back(const Job<T>& job, int tile, PixelGradients<T>* pixels, Visit visit) {
   const Centres<T> centre(job, tile);
@@ -246,7 +246,7 @@ void backward(const Job<T>& job, int tile) {
   walk_back<record_size(kWanted), kNeeds>(job, tile, pixels, add);
 }
 
-// Towards the colours and the background alone: dC/dc is w, and nothing behind a hit matters.
+// Computes the gradients by the colours and the background alone: dC/dc is w, and nothing behind a hit matters.
 template <class T>
 void backward_colors(const Job<T>& job, int tile) {
   PixelGradients<T> pixels[kTilePacks<T>] = {};

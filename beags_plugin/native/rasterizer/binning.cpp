@@ -20,7 +20,7 @@ struct BitsOf<double> {
   using type = uint64_t;
 };
 
-// Stable radix sort by depth. Depths are positive, so their bits rise as they do.
+// Sorts stably by depth (radix sort). Depths are positive, so their bits rise as they do.
 template <class T>
 void sort_by_depth(const T* depths, std::vector<int32_t>& indices) {
   using Bits = typename BitsOf<T>::type;

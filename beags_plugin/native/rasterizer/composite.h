@@ -1,5 +1,5 @@
-// One surfel at a few pixels, and the walk through a tile front to back (E2, E3). Included once for each instruction
-// set.
+// Evaluates one Gaussian at a few pixels, and walks through a tile front to back (E2, E3). Included once for each
+// instruction set.
 #pragma once
 
 #include "rasterizer/pixel_terms.h"
@@ -14,14 +14,14 @@ constexpr int kPacks = kGroupPixels / kLanes<T>;  // packs of pixels, one lane e
 template <class T>
 constexpr int kTilePacks = kGroupPixels * kPacks<T>;
 
-// A number that is known when the program is compiled.
+// A compile-time number.
 template <int kValue>
 struct Number {
   BEAGS_INLINE constexpr operator int() const { return kValue; }
 };
 
 // Calls visit(index into the image, pixel of the tile, columns) for the first pixel of every row of every group of the
-// tile, as far as they lie inside the image, in a fixed order; most rows have all of a group's columns.
+// tile inside the image, in a fixed order; most rows have all of a group's columns.
 template <class T, class Visit>
 BEAGS_INLINE void for_each_row(const Job<T>& job, int tile, Visit visit) {
   const int x0 = tile % job.tiles_x * kTile, y0 = tile / job.tiles_x * kTile;
@@ -41,7 +41,7 @@ BEAGS_INLINE void for_each_row(const Job<T>& job, int tile, Visit visit) {
   }
 }
 
-// Calls visit(index into the image, pack, lane) for the pixels of a tile that lie inside the image, in a fixed order.
+// Calls visit(index into the image, pack, lane) for the pixels of a tile inside the image, in a fixed order.
 template <class T, class Visit>
 BEAGS_INLINE void for_each_pixel(const Job<T>& job, int tile, Visit visit) {
   for_each_row(job, tile, [&](int64_t at, int pixel, auto columns) __attribute__((always_inline)) {
@@ -49,7 +49,7 @@ BEAGS_INLINE void for_each_pixel(const Job<T>& job, int tile, Visit visit) {
   });
 }
 
-// Copies a tile from an image, [height, width, kChannels]: lanes(channel, pack) is where a pack's values go.
+// Copies a tile from an image, [height, width, kChannels]. lanes(channel, pack) returns the place of a pack's values.
 template <int kChannels, class T, class Lanes>
 BEAGS_INLINE void read_image(const Job<T>& job, int tile, const T* image, Lanes lanes) {
   for_each_pixel(job, tile, [&](int64_t at, int pack, int lane) __attribute__((always_inline)) {
@@ -65,7 +65,7 @@ BEAGS_INLINE void write_image(const Job<T>& job, int tile, T* image, Lanes lanes
   });
 }
 
-// Where a pack's values lie among the 256 of a tile.
+// Returns the place of a pack's values among the 256 of a tile.
 template <class T>
 BEAGS_INLINE int64_t saved_at(int tile, int pack) {
   return static_cast<int64_t>(tile) * kTilePixels + pack * kLanes<T>;
@@ -86,7 +86,7 @@ struct Centres {
     }
   }
 
-  // Registers of whole rows of a group are equal in x: what is computed from x alone is then computed once.
+  // Registers of whole rows of a group are equal in x: the compiler then computes once what depends on x alone.
   BEAGS_INLINE Real<T> pack_x(int pack) const {
     Real<T> out = load(x + pack * kLanes<T>);
     if constexpr (kRegister<T> % kGroup == 0) {
@@ -97,10 +97,10 @@ struct Centres {
   BEAGS_INLINE Real<T> pack_y(int pack) const { return load(y + pack * kLanes<T>); }
 };
 
-// What later steps need of a hit beside alpha.
+// The fields of a hit, beside alpha, that later steps need.
 constexpr unsigned kNeedDepth = 1, kNeedNearness = 2, kNeedShape = 4;
 
-// One surfel at the packs of a tile where it contributes. In lanes where it does not, all is 0.
+// One Gaussian at the packs of a tile where it contributes. Other lanes hold 0.
 template <class T>
 struct Hits {
   int count;
@@ -113,7 +113,7 @@ struct Hits {
   BEAGS_INLINE Real<T> get(const T* field, int i) const { return load(field + i * kLanes<T>); }
 };
 
-// Adds the pack to `hits` if the surfel contributes to one of its lanes that are `wanted`.
+// Adds the pack to `hits` if the Gaussian contributes to one of its `wanted` lanes.
 template <bool kPlain, unsigned kNeeds, class T>
 BEAGS_INLINE void evaluate(const Job<T>& job, const Splat<T>& s, int pack, Real<T> dx, Real<T> dy, Mask<T> wanted,
                            Hits<T>& hits) {
@@ -143,7 +143,7 @@ BEAGS_INLINE void prefetch(const Job<T>& job, const Pair& pair) {
   for (unsigned line = 0; line < sizeof(Splat<T>); line += 64) __builtin_prefetch(splat + line);
 }
 
-// A tile on its way front to back.
+// The state of a tile on its way front to back.
 template <class T>
 struct Walk {
   Centres<T> centre;
@@ -179,8 +179,8 @@ struct Walk {
   }
 };
 
-// Evaluates a surfel at the groups of pixels in `groups`; wanted(pack) are the lanes that count. That this comes before
-// anything is done with the hits keeps the chains of dependent operations short.
+// Evaluates a Gaussian at the groups of pixels in `groups`; wanted(pack) are the lanes that count. To do this before
+// the hits are used keeps the chains of dependent operations short.
 template <unsigned kNeeds, class T, class Wanted>
 BEAGS_INLINE void collect(const Job<T>& job, const Splat<T>& splat, unsigned groups, const Centres<T>& centre,
                           Hits<T>& hits, Wanted wanted) {
@@ -201,8 +201,8 @@ BEAGS_INLINE void collect(const Job<T>& job, const Splat<T>& splat, unsigned gro
   }
 }
 
-// Composites a tile front to back: calls visit(k, splat, hits, i, w, before) for each surfel and each i of its hits; k
-// counts pairs within the tile, w is 0 in lanes where nothing is added, `before` is T.
+// Composites a tile front to back: calls visit(k, splat, hits, i, w, before) for each Gaussian and each i of its hits.
+// k counts pairs within the tile, w is 0 in lanes where nothing is added, `before` is T.
 template <unsigned kNeeds, class T, class Visit>
 BEAGS_INLINE void composite(const Job<T>& job, int tile, Walk<T>& walk, Visit visit) {
   const Pair* pairs = job.pairs + job.tile_start[tile];

@@ -11,7 +11,7 @@ Bands Extent::bands(int tile_row) const {
     }
     return out;
   }
-  // Four rows of groups at a time.
+  // Takes four rows of groups at a time.
   typedef float Four __attribute__((vector_size(16)));
   const auto min = [](Four a, Four b) { return a < b ? a : b; };
   const auto max = [](Four a, Four b) { return a > b ? a : b; };
@@ -23,7 +23,7 @@ Bands Extent::bands(int tile_row) const {
   const Four y0 = Four{0, 1, 2, 3} * float(kGroup) + (static_cast<float>(tile_row * kTile) + 0.5f - cy_);
   const Four y1 = y0 + float(kGroup - 1);
   const Four low = y0 - (y_ + margin_), high = y1 - (y_ - margin_);  // the rows' centres, from the ellipse's
-  // Where the ellipse reaches furthest to either side: at its extreme point, or as near to it as the rows come.
+  // The ellipse reaches furthest to either side at its extreme point, or as near to it as the rows come.
   const auto nearest = [&](float y) {
     return min(max(min(max(zero + y, low), high), zero - half_height_), zero + half_height_);
   };

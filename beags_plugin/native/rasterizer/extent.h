@@ -1,4 +1,4 @@
-// Which pixels a surfel can reach; but for `bands`, on the CPU and on GPUs.
+// Bounds the pixels that a Gaussian reaches, on the CPU and on GPUs (`bands` on the CPU only).
 #pragma once
 
 #include <algorithm>
@@ -10,7 +10,7 @@
 
 namespace beags {
 
-// A tile's four rows of groups, and the columns of groups that a surfel reaches in each; first > last: none.
+// For each of a tile's four rows of groups, the columns of groups that a Gaussian reaches; first > last: none.
 struct Bands {
   int first[kGroup], last[kGroup];
 };
@@ -30,32 +30,32 @@ struct DualConic {
     yw = r2 * (mv[0] * tilt[0] + mv[1] * tilt[1]);
     ww = r2 * (tilt[0] * tilt[0] + tilt[1] * tilt[1]) - 1;
   }
-  // Of the ellipse that it is where ww < 0: half the box's sides, and the covariance of which they are the diagonal.
+  // For ww < 0 it is an ellipse: half the box's sides, and the covariance of which they are the diagonal.
   BEAGS_HD double half_width() const { return std::sqrt(std::max(0.0, xw * xw - xx * ww)) / -ww; }
   BEAGS_HD double half_height() const { return std::sqrt(std::max(0.0, yw * yw - yy * ww)) / -ww; }
   BEAGS_HD double covariance() const { return (xw * yw - xy * ww) / (ww * ww); }
 };
 
-// Where alpha can reach 1/255: the projected conic rho3d <= 2 ln(255 o), united with the low-pass disc.
+// The region where alpha can reach 1/255: the projected conic rho3d <= 2 ln(255 o), united with the low-pass disc.
 class Extent {
  public:
   template <class T>
   BEAGS_HD Extent(const View& view, const Splat<T>& splat);
 
-  // Whether its box touches the image; a surfel may do so and yet reach no pixel's centre.
+  // Returns whether its box touches the image; a Gaussian may do so and yet reach no pixel's centre.
   BEAGS_HD bool on_screen() const { return on_screen_; }
-  // First and last row of pixels (inside the image; first > last: none).
+  // Return the first and last row of pixels inside the image; first > last: none.
   BEAGS_HD int first_row() const { return first_row_; }
   BEAGS_HD int last_row() const { return last_row_; }
-  // A superset of what is reached in one row of tiles, as tight as one interval per row of groups can be.
+  // Returns a superset of what is reached in one row of tiles, as tight as one interval per row of groups can be.
   Bands bands(int tile_row) const;
-  // The same of one row of groups, counted from the image's top; first > last: none.
+  // Sets the same for one row of groups, counted from the image's top; first > last: none.
   BEAGS_HD void band(int group_row, int& first_group, int& last_group) const;
 
  private:
   int width_, first_row_ = 0, last_row_;
   bool on_screen_ = true;
-  bool everywhere_ = true;     // the surfel's disc crosses the camera plane, or nearly so
+  bool everywhere_ = true;     // the Gaussian's disc crosses the camera plane, or nearly so
   float cx_, cy_, disc_;       // pixels; the disc's radius
   float margin_;               // pixels; what rounding may hide
   float x_, y_, half_height_;  // the conic, an ellipse: its centre, from (cx, cy), and half its box's height
@@ -88,7 +88,7 @@ BEAGS_HD Extent::Extent(const View& view, const Splat<T>& s)
     const double covariance = conic.covariance();
     slope_ = static_cast<float>(covariance / (half_height * half_height));
     y_right_ = half_width > 0 ? static_cast<float>(covariance / half_width) : 0.0f;
-    // The root of the covariance matrix's determinant over that of its yy entry: det D = -(r2 det M)^2 gives it without
+    // The root of the covariance matrix's determinant over that of its yy entry. det D = -(r2 det M)^2 gives it without
     // cancellation, however thin the ellipse is.
     const double width = r2 * std::abs(s.w_0) / (-conic.ww * std::sqrt(-conic.ww) * half_height);
     width_at_centre_ = static_cast<float>(std::min(width, half_width));
@@ -112,7 +112,7 @@ BEAGS_HD inline void Extent::band(int group_row, int& first_group, int& last_gro
   const float low = y0 - (y_ + margin_), high = y1 - (y_ - margin_);  // the rows' centres, from the ellipse's
   float left = limit, right = -limit;
   if (low <= half_height_ && high >= -half_height_) {
-    // Where the ellipse reaches furthest to either side: at its extreme point, or as near to it as the rows come.
+    // The ellipse reaches furthest to either side at its extreme point, or as near to it as the rows come.
     const auto side = [&](float y, float sign) {
       const float at = std::min(std::max(std::min(std::max(y, low), high), -half_height_), half_height_);
       const float t = at / half_height_, square = 1 + 4e-7f - t * t;  // rounded up: the root is steep at 0
@@ -131,7 +131,7 @@ BEAGS_HD inline void Extent::band(int group_row, int& first_group, int& last_gro
   last_group = end_pixel > first_pixel ? (end_pixel - 1) / kGroup : -1;
 }
 
-// How many tiles the usual bound meets: a box of 3.33 standard deviations around the projected disc.
+// Counts the tiles of the usual bound: a box of 3.33 standard deviations around the projected disc.
 template <class T>
 int64_t tiles_of_usual_box(const View& view, const Splat<T>& splat);
 

@@ -1,4 +1,4 @@
-// The images of one tile (E4, E7). Included once for each instruction set.
+// Computes the images of one tile (E4, E7). Included once for each instruction set.
 #pragma once
 
 #include "rasterizer/composite.h"
@@ -22,7 +22,8 @@ BEAGS_INLINE void accumulate(T* sum, Real<T> w, T value) {
   store(sum, fma(w, all(value), load(sum)));
 }
 
-// `everywhere`: the label of the whole tile, see load_labels; it spares most hits a look at their pack's labels.
+// Adds a hit to the sums. everywhere: the label of the whole tile, see load_labels; with it, most hits skip their
+// pack's labels.
 template <Parts kWanted, class T>
 BEAGS_INLINE void add_hit(int k, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> w, Real<T> before,
                           int32_t everywhere, Pixels<T>& p) {
@@ -70,7 +71,7 @@ BEAGS_INLINE void save(const Job<T>& job, int tile, const Walk<T>& walk, const P
   }
 }
 
-// Where T stays above 0.5 there is no median.
+// Clears the median where T stays above 0.5.
 template <class T>
 BEAGS_INLINE void finish_median(const Walk<T>& walk, Pixels<T>* pixels) {
   for (int pack = 0; pack < kTilePacks<T>; ++pack) {
@@ -81,7 +82,7 @@ BEAGS_INLINE void finish_median(const Walk<T>& walk, Pixels<T>* pixels) {
   }
 }
 
-// From a pack's sums to the values of its pixels, in their place; `end`: T behind the last surfel.
+// Turns a pack's sums into the values of its pixels, in place. end: T behind the last Gaussian.
 template <Parts kWanted, class T>
 BEAGS_INLINE void finish(const Job<T>& job, Real<T> end, Pixels<T>& p) {
   const Real<T> alpha = all(T(1)) - end;  // E4: A = sum w = 1 - T

@@ -17,7 +17,7 @@ Frame<T>::Frame(const View& view, const Inputs<T>& inputs, bool* visible, int th
   std::vector<int64_t> record_start(n + 1, 0), nonfinite(chunks, 0);
   std::vector<T> depths(n);
   const int team = n < kTeamSurfels ? 1 : threads;
-  // Determinism: chunks are of a fixed size and share nothing.
+  // Determinism: chunks have a fixed size and share nothing.
 #pragma omp parallel for num_threads(team) schedule(dynamic, 1)
   for (int64_t chunk = 0; chunk < chunks; ++chunk) {
     reached[chunk].reserve(4 * kChunk);
@@ -106,7 +106,7 @@ void Frame<T>::backward(const Inputs<T>& inputs, const int32_t* target, const Im
   for (int c = 0; c < 3; ++c) to.background[c] = static_cast<T>(background[c]);
 }
 
-// Adds up each surfel's records and carries them on to its parameters.
+// Adds up each Gaussian's records and carries them on to its parameters.
 template <class T>
 void Frame<T>::reduce(const Inputs<T>& inputs, const T* records, int size, const InputGradients<T>& to,
                       int threads) const {
@@ -115,7 +115,7 @@ void Frame<T>::reduce(const Inputs<T>& inputs, const T* records, int size, const
   };
   const bool shape = to.means || to.quats || to.log_scales || to.screen_shift;
   const int team = num_surfels_ < kTeamSurfels ? 1 : threads;
-  // Determinism: each surfel's records are summed by one thread, in the order of their tiles.
+  // Determinism: one thread sums each Gaussian's records, in the order of their tiles.
 #pragma omp parallel for num_threads(team) schedule(dynamic, kChunk)
   for (int64_t i = 0; i < num_surfels_; ++i) {
     double sums[kRecord] = {};

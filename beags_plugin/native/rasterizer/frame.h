@@ -1,4 +1,4 @@
-// One view of one set of surfels: projected and binned once, then drawn, differentiated or asked for its products.
+// Holds one view of one set of Gaussians: projected and binned once, then rendered, differentiated or queried.
 #pragma once
 
 #include <vector>
@@ -11,24 +11,24 @@
 
 namespace beags {
 
-// A team of threads costs more than it brings below about 0.3 ms of work.
+// Below about 0.3 ms of work, a team of threads costs more than it saves.
 constexpr int64_t kTeamSurfels = 2000;  // projecting one takes a tenth of a microsecond
-constexpr int64_t kTeamPairs = 500;     // drawing one takes most of a microsecond
+constexpr int64_t kTeamPairs = 500;     // rendering one takes most of a microsecond
 
-// Null: not wanted. The others are zero on entry: surfels that were not drawn are left alone.
+// Null: not wanted. The others are zero on entry: Gaussians that were not rendered are left alone.
 template <class T>
 struct InputGradients {
   T *means, *quats, *log_scales, *opacity_logits, *colors, *screen_shift, *background;
 };
 
-// How much there is to do; see Work.
+// The amount of work; see Work.
 struct WorkCounts {
   int64_t lanes, contributing;
-  int64_t tile_pairs;  // (tile, surfel) pairs that are kept
+  int64_t tile_pairs;  // (tile, Gaussian) pairs that are kept
   int64_t box_pairs;   // those that the usual bounds, boxes of 3.33 standard deviations, would give
 };
 
-// What surfels contribute to classes, where it is not zero: key = surfel * num_classes + class, ascending.
+// The contributions of Gaussians to classes that are not zero: key = Gaussian * num_classes + class, ascending.
 template <class T>
 struct Contributions {
   std::vector<int64_t> keys;
@@ -38,7 +38,7 @@ struct Contributions {
 template <class T>
 class Frame {
  public:
-  // visible: [N], set to whether a surfel was drawn and its box touches the image.
+  // visible: [N], set to whether a Gaussian is rendered and its box touches the image.
   Frame(const View& view, const Inputs<T>& inputs, bool* visible, int threads);
 
   int64_t num_nonfinite() const { return num_nonfinite_; }
@@ -46,23 +46,24 @@ class Frame {
   int64_t num_surfels() const { return num_surfels_; }
   const View& view() const { return view_; }
 
-  // background: [3]; target: [height, width] or null. keep: for a `backward` to come.
+  // Renders. background: [3]; target: [height, width] or null. keep: for a later `backward`.
   void forward(const Images<T>& images, const T* background, const int32_t* target, bool keep, int threads);
-  // Once after `forward`, with the same inputs and target.
+  // Computes the gradients, once after `forward`, with the same inputs and target.
   void backward(const Inputs<T>& inputs, const int32_t* target, const Images<const T>& from,
                 const InputGradients<T>& to, int threads) const;
 
-  // labels: [height, width]; out: [N, num_classes], zero on entry; labels outside 0 .. num_classes - 1 do not count.
+  // Sums w by Gaussian and label. labels: [height, width]; out: [N, num_classes], zero on entry. Labels outside 0 ..
+  // num_classes - 1 do not count.
   void class_contributions(const int32_t* labels, int num_classes, T* out, int threads) const;
-  // The same as a list, whose size does not depend on the number of classes.
+  // Returns the same as a list, whose size does not depend on the number of classes.
   Contributions<T> sparse_class_contributions(const int32_t* labels, int num_classes, int threads) const;
-  // classes, share: [height, width]. Class ids lie in 0 .. num_classes - 1.
+  // Finds each pixel's class. classes, share: [height, width]. Class ids lie in 0 .. num_classes - 1.
   void class_map(int num_classes, int32_t* classes, T* share, int threads) const;
   void dominant_gaussian(int32_t* indices, int threads) const;
   WorkCounts work_counts(int threads) const;
 
  private:
-  // What each record of a tile contributes to each label that the tile holds.
+  // The contribution of each record to each label that its tile holds.
   struct LabelSums {
     std::vector<std::vector<int32_t>> tile_labels;
     std::vector<T> sums;
@@ -72,7 +73,7 @@ class Frame {
   LabelSums label_sums(const int32_t* labels, int num_classes, int threads) const;
   Job<T> job() const;
   int tiles() const { return tiles_x_ * tiles_y_; }
-  // Calls work(tile) for every tile, on threads that share them out as they come.
+  // Calls work(tile) for every tile; idle threads take the next one.
   template <class Work>
   void for_each_tile(int threads, Work work) const {
     const int team = num_pairs() < kTeamPairs ? 1 : threads;

@@ -1,4 +1,4 @@
-// The products of a frame that have no gradient (sections 3 and 5).
+// Answers a frame's queries, which have no gradient (sections 3 and 5).
 #include <algorithm>
 
 #include "rasterizer/extent.h"
@@ -10,7 +10,7 @@ namespace beags {
 template <class T>
 typename Frame<T>::LabelSums Frame<T>::label_sums(const int32_t* labels, int num_classes, int threads) const {
   LabelSums found;
-  // Number each tile's labels 0, 1, ..: a tile rarely has more than a few.
+  // Numbers each tile's labels 0, 1, ..: a tile rarely has more than a few.
   std::vector<int32_t> slots(static_cast<size_t>(view_.width) * view_.height, -1), num_slots(tiles(), 0);
   std::vector<std::vector<int32_t>>& tile_labels = found.tile_labels;
   tile_labels.resize(tiles());
@@ -59,7 +59,7 @@ template <class T>
 void Frame<T>::class_contributions(const int32_t* labels, int num_classes, T* out, int threads) const {
   const LabelSums found = label_sums(labels, num_classes, threads);
   const int team = num_surfels_ < kTeamSurfels ? 1 : threads;
-  // Determinism: each surfel's records are summed by one thread, in the order of their tiles.
+  // Determinism: one thread sums each Gaussian's records, in the order of their tiles.
 #pragma omp parallel for num_threads(team) schedule(dynamic, kChunk)
   for (int64_t i = 0; i < num_surfels_; ++i) {
     for (int64_t record = bins_.record_start[i]; record < bins_.record_start[i + 1]; ++record) {
@@ -80,7 +80,7 @@ Contributions<T> Frame<T>::sparse_class_contributions(const int32_t* labels, int
     std::vector<T> sum_of(num_classes, T(0));
     std::vector<char> is_present(num_classes, 0);
     std::vector<int32_t> present;
-    // Determinism: as in class_contributions; the parts are put together in the order of the surfels.
+    // Determinism: as in class_contributions; the parts are joined in the order of the Gaussians.
 #pragma omp for schedule(dynamic, 1)
     for (int64_t chunk = 0; chunk < chunks; ++chunk) {
       for (int64_t i = chunk * kChunk; i < std::min<int64_t>((chunk + 1) * kChunk, num_surfels_); ++i) {

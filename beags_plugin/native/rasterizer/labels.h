@@ -1,4 +1,4 @@
-// The labels of a tile's pixels (E7). Included once for each instruction set.
+// Holds the labels of a tile's pixels (E7). Included once for each instruction set.
 #pragma once
 
 #include "rasterizer/composite.h"
@@ -6,7 +6,7 @@
 namespace beags {
 namespace BEAGS_ISA {
 
-// Of one pack of pixels.
+// The labels of one pack of pixels.
 template <class T>
 struct Labels {
   T target[kLanes<T>];
@@ -14,13 +14,13 @@ struct Labels {
 
   static constexpr int32_t kMixed = -1;
 
-  // Whether a surfel of that class is right at every labelled pixel: it then adds nothing, as most surfels do.
+  // Returns whether a Gaussian of that class is right at every labelled pixel: it then adds nothing, as most do.
   BEAGS_INLINE bool all_right(int32_t class_id) const { return only == class_id; }
   BEAGS_INLINE Mask<T> right(int32_t class_id) const { return load(target) == all(static_cast<T>(class_id)); }
   BEAGS_INLINE Mask<T> ignored() const { return load(target) == all(static_cast<T>(kIgnore)); }
 };
 
-// The label that all pixels of a tile have, as those of most tiles do; kMixed with several.
+// Returns the label of all pixels of a tile, which most tiles have; kMixed with several.
 template <class T>
 BEAGS_INLINE int32_t label_everywhere(const Job<T>& job, int tile) {
   const int x0 = tile % job.tiles_x * kTile, y0 = tile / job.tiles_x * kTile;

@@ -1,5 +1,5 @@
-// A surfel at a pixel, and its slopes (E2 to E4): shared by the vectors of CPUs and the threads of GPUs, so that both
-// round alike. R, M: numbers and masks; on a CPU vectors of a pack of pixels, on a GPU one pixel's.
+// Evaluates a Gaussian at a pixel, and its slopes (E2 to E4), for the vectors of CPUs and the threads of GPUs, so that
+// both round alike. R, M: numbers and masks; on a CPU vectors of a pack of pixels, on a GPU one pixel's.
 #pragma once
 
 #include "rasterizer/types.h"
@@ -13,7 +13,7 @@
 namespace beags {
 namespace BEAGS_ISA {
 
-// `on`: where it contributes; elsewhere the numbers mean nothing.
+// on: the lanes where it contributes; elsewhere the numbers mean nothing.
 template <class R, class M>
 struct SurfelHit {
   M on;
@@ -22,8 +22,9 @@ struct SurfelHit {
   R rho;
 };
 
-// plain: s.plain; such a splat needs neither the low-pass nor the near plane nor alpha's maximum. The forward and the
-// backward must agree in every bit: fused operations are explicit, and compilers are told to make no others.
+// Evaluates a splat. plain: s.plain; such a splat needs neither the low-pass nor the near plane nor alpha's maximum.
+// The forward and the backward must agree in every bit: fused operations are explicit, and compilers may make no
+// others.
 template <class T, class R, class M, class Plain>
 BEAGS_HD_INLINE SurfelHit<R, M> surfel_hit(const Splat<T>& s, T near_plane, R dx, R dy, M wanted, Plain plain) {
   const R q0 = fma(all(s.u_y), dy, all(s.u_x) * dx);  // E2
@@ -34,7 +35,7 @@ BEAGS_HD_INLINE SurfelHit<R, M> surfel_hit(const Splat<T>& s, T near_plane, R dx
   R rho = fma(u, u, v * v), depth = all(s.det) * inverse, nearness = all(s.nearness_det) * q2;
   if (!plain) {
     const R half = fma(dy, dy, dx * dx), rho2d = half + half;
-    const M plane = rho <= rho2d;  // false for NaN: an edge-on surfel at its centre
+    const M plane = rho <= rho2d;  // false for NaN: an edge-on Gaussian at its centre
     rho = min(rho, rho2d);
     inverse = keep(plane, inverse);
     depth = select(plane, depth, all(s.z));
@@ -48,9 +49,9 @@ BEAGS_HD_INLINE SurfelHit<R, M> surfel_hit(const Splat<T>& s, T near_plane, R dx
   return {on, alpha, depth, nearness, inverse, rho};
 }
 
-// The distortion, sum over pairs w_i w_j (m_i - m_j)^2: by w_i it is m (m A - 2 sum w m) + sum w m^2, of which g_alpha
-// has the last term, and by m_i 2 w_i (m A - sum w m); dm/dd = k / d^2. m: from the first hit's. Adds to dL/dw and to
-// the gradient towards the hit's depth.
+// Adds the distortion's slopes to dL/dw and to the gradient by the hit's depth. The distortion is the sum over pairs
+// w_i w_j (m_i - m_j)^2: by w_i it is m (m A - 2 sum w m) + sum w m^2, of which g_alpha has the last term, and by m_i 2
+// w_i (m A - sum w m); dm/dd = k / d^2. m is measured from the first hit's.
 template <class T, class R>
 BEAGS_HD_INLINE void add_distortion(T mapping, R first, R nearness, R g_alpha_m, R g_moment, R w, R& g_w, R& g_hit) {
   const R m = first - nearness, slope = m * g_alpha_m - g_moment;
@@ -58,13 +59,14 @@ BEAGS_HD_INLINE void add_distortion(T mapping, R first, R nearness, R g_alpha_m,
   g_hit = fma(w * slope, all(T(2) / mapping) * (nearness * nearness), g_hit);
 }
 
-// Towards log alpha: alpha dL/dalpha = w g_w - (what lies behind) alpha / (1 - alpha). inverse_left: 1 / (1 - alpha).
+// Returns the slope by log alpha: alpha dL/dalpha = w g_w - (what lies behind) alpha / (1 - alpha). inverse_left: 1 /
+// (1 - alpha).
 template <class R>
 BEAGS_HD_INLINE R log_alpha_slope(R w, R g_w, R behind, R alpha, R inverse_left) {
   return w * g_w - behind * (alpha * inverse_left);
 }
 
-// Of the plane's hit, by q: d rho / dq = 2 (u, v, -rho) / q2 and dL/d rho = -g_log / 2; depth = det / q2.
+// The slopes of the plane's hit by q: d rho / dq = 2 (u, v, -rho) / q2 and dL/d rho = -g_log / 2; depth = det / q2.
 template <class R>
 struct PlaneSlopes {
   R s_0, h;  // by the first two of q over (u, v), by the third

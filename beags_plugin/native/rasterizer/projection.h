@@ -1,5 +1,5 @@
-// One surfel into one view, and the way back for its gradient, on the CPU and on GPUs. Everything here is float64: it
-// costs little beside the tiles, and leaves float32 images with the tiles' rounding only.
+// Projects one Gaussian into one view, and its gradient back, on the CPU and on GPUs. All is float64: that costs little
+// beside the tiles, and leaves float32 images with the tiles' rounding only.
 #pragma once
 
 #include <algorithm>
@@ -18,7 +18,7 @@ struct View {
   int width, height;    // pixels
   double near_plane, far_plane;
 
-  // k in the distortion's m(d) = far / (far - near) - k / d: far near / (far - near).
+  // Returns k of the distortion's m(d) = far / (far - near) - k / d: far near / (far - near).
   BEAGS_HD double mapping() const { return near_plane / (1 - near_plane / far_plane); }
 };
 
@@ -50,7 +50,7 @@ BEAGS_HD bool finite(Numbers... numbers) {
   return ((0 * numbers) + ...) == 0;  // one comparison for all
 }
 
-// The surfel in camera space (E1), its centre's depth divided out: a, b, p over p_z.
+// The Gaussian in camera space (E1), divided by its centre's depth: a, b, p over p_z.
 struct Placement {
   double inverse_length, unit[4];          // of the quaternion
   double axis_u[3], axis_v[3], axis_n[3];  // columns of R
@@ -97,26 +97,26 @@ BEAGS_HD inline void place(const View& view, const SurfelParameters& s, Placemen
   at.mv[1] = dot(view.ky, at.b) - at.cy * at.b[2];
 }
 
-// Whether rho3d <= rho2d wherever it is drawn, it lies wholly beyond the near plane and its alpha stays below the
-// maximum: most surfels, which the kernels then draw without these distinctions.
+// Returns whether rho3d <= rho2d wherever it is rendered, it lies wholly beyond the near plane and its alpha stays
+// below the maximum. Most Gaussians are so; the kernels then skip these distinctions.
 BEAGS_HD inline bool is_plain(const View& view, const Splat<double>& s) {
   constexpr double kMargin = 1e-4;  // float32's rounding
   constexpr double kLog2MaxAlpha = -0.0144995696951151;
   const double squared_disc = kLn2 * (s.log2_opacity - kLog2MinAlpha);  // of the low-pass's radius
-  // |q2| at most that far off the centre, and a bound of |(q0, q1)| there: rho3d <= rho2d all over the disc. Beyond it,
-  // the low-pass is too faint to be drawn.
+  // The least |q2| at most that far off the centre, and a bound of |(q0, q1)| there: rho3d <= rho2d all over the disc.
+  // Beyond it, the low-pass is too faint to be rendered.
   const double least = std::abs(s.w_0) - std::sqrt(squared_disc * (s.w_x * s.w_x + s.w_y * s.w_y));
   const double squares = s.u_x * s.u_x + s.u_y * s.u_y + s.v_x * s.v_x + s.v_y * s.v_y;
   const double area = s.u_x * s.v_y - s.u_y * s.v_x;
   const double stretch = (squares + std::sqrt(std::max(0.0, squares * squares - 4 * area * area))) / 2;
   if (!(least > 0) || !(stretch * (1 + kMargin) < 2 * least * least)) return false;
-  // The nearest point of the surfel's own disc, which is sqrt(2) times as many standard deviations wide.
+  // The nearest point of the Gaussian's own disc, which is sqrt(2) times as many standard deviations wide.
   const double nearest = 1 - std::sqrt(2 * squared_disc * (s.tilt_u * s.tilt_u + s.tilt_v * s.tilt_v));
   if (!(s.z * nearest > view.near_plane * (1 + kMargin))) return false;
   return s.log2_opacity < kLog2MaxAlpha - kMargin && finite(s.nearness_det);
 }
 
-// Fills `splat` (but for colour and class) if the surfel is drawn.
+// Fills `splat`, except for colour and class, if the Gaussian is rendered.
 BEAGS_HD inline Fate project(const View& view, const SurfelParameters& s, Splat<double>& splat) {
   Placement at;
   place(view, s, at);
@@ -149,7 +149,7 @@ BEAGS_HD inline Fate project(const View& view, const SurfelParameters& s, Splat<
   return Fate::kRendered;
 }
 
-// The gradient towards mean, quat, log_scale and screen shift, from that towards the splat's fields (`record`: kRecord
+// Returns the gradient by mean, quat, log_scale and screen shift, from that by the splat's fields (`record`: kRecord
 // sums).
 BEAGS_HD inline ShapeGradients project_backward(const View& view, const SurfelParameters& s, const double* record) {
   Placement at;
@@ -159,7 +159,7 @@ BEAGS_HD inline ShapeGradients project_backward(const View& view, const SurfelPa
   const double w_y = at.a[2] * mu[1] - at.b[2] * mu[0];
   const double w_0 = mu[0] * mv[1] - mu[1] * mv[0];
 
-  // Gradients towards q0, q1 and q2 (sums over pixels, times 1, dx, dy): -s (q0, q1) and h, with q0 = mv1 dx - mu1 dy
+  // The gradients by q0, q1 and q2 (sums over pixels, times 1, dx, dy): -s (q0, q1) and h, with q0 = mv1 dx - mu1 dy
   // and q1 = -mv0 dx + mu0 dy.
   const double* g = record;
   const double q0[3] = {mu[1] * g[kSy] - mv[1] * g[kSx], mu[1] * g[kSxy] - mv[1] * g[kSxx],

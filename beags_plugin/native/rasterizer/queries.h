@@ -1,4 +1,4 @@
-// The products of one tile that need no gradient (sections 3 and 5). Included once for each instruction set.
+// Answers queries of one tile, which have no gradient (sections 3 and 5). Included once for each instruction set.
 #pragma once
 
 #include "rasterizer/composite.h"
@@ -29,7 +29,7 @@ struct FewLabels {
   }
 };
 
-// E6: for each pair, the sum of w over the tile's pixels of each label; the labels are numbered within the tile.
+// Sums w for each pair over the tile's pixels of each label (E6); the labels are numbered within the tile.
 template <class T>
 void class_contributions(const Job<T>& job, const Query<T>& query, int tile) {
   const int num_slots = query.num_slots[tile];
@@ -61,8 +61,8 @@ void class_contributions(const Job<T>& job, const Query<T>& query, int tile) {
   });
 }
 
-// Each pixel's class: the largest sum of w; of equal ones the lowest. `query.sums` holds, for each class of the tile
-// in rising order, 256 pixels; `query.slots` maps a class to its place, `query.labels` a place to its class.
+// Finds each pixel's class: the largest sum of w; of equal ones the lowest. `query.sums` holds, for each class of the
+// tile in rising order, 256 pixels; `query.slots` maps a class to its place, `query.labels` a place to its class.
 template <class T>
 void class_map(const Job<T>& job, const Query<T>& query, int tile) {
   const int classes = query.num_slots[0];
@@ -88,7 +88,7 @@ void class_map(const Job<T>& job, const Query<T>& query, int tile) {
   });
 }
 
-// The surfel with the largest w; of equal ones the nearer.
+// Finds each pixel's Gaussian with the largest w; of equal ones the nearer.
 template <class T>
 void dominant_gaussian(const Job<T>& job, const Query<T>& query, int tile) {
   T best[kTilePixels] = {}, pair[kTilePixels];
@@ -107,7 +107,7 @@ void dominant_gaussian(const Job<T>& job, const Query<T>& query, int tile) {
   });
 }
 
-// What the forward does.
+// Counts the work of the forward.
 template <class T>
 Work count(const Job<T>& job, int tile) {
   Work work{};

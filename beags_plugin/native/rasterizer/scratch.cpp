@@ -32,7 +32,7 @@ struct Kept {
 };
 
 Kept& kept() {
-  static Kept* const all = new Kept;  // never destroyed: drawings may outlive everything else
+  static Kept* const all = new Kept;  // never destroyed: frames may outlive everything else
   return *all;
 }
 
@@ -54,7 +54,7 @@ void* take_scratch(size_t& bytes) {
       return block.memory;
     }
   }
-  bytes += bytes / 8 + 64;  // so that the next drawing, a little larger, still fits
+  bytes += bytes / 8 + 64;  // so that the next render, a little larger, still fits
   return ::operator new(bytes, kAlignment);
 }
 

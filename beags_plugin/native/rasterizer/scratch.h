@@ -1,5 +1,5 @@
-// Memory of one drawing that the next one takes over: getting fresh pages from the system costs a tenth of a drawing,
-// and on several threads more.
+// Hands the memory of one render to the next: fresh pages from the system cost a tenth of a render, and more on several
+// threads.
 #pragma once
 
 #include <cstddef>
@@ -8,9 +8,9 @@
 
 namespace beags {
 
-// Gives blocks of at least `bytes`, aligned to cache lines; `bytes` becomes the block's size. Throws std::bad_alloc.
+// Returns a block of at least `bytes`, aligned to cache lines; `bytes` becomes its size. Throws std::bad_alloc.
 void* take_scratch(size_t& bytes);
-// Takes one back. At most 64 MiB of blocks that nobody uses are kept.
+// Takes a block back. At most 64 MiB of unused blocks are kept.
 void give_scratch(void* block, size_t bytes);
 
 // `count` numbers or plain structures, uninitialised.

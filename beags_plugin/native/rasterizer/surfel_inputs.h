@@ -1,4 +1,4 @@
-// From a surfel's parameters to its splat, on the CPU and on GPUs.
+// Turns a Gaussian's parameters into its splat, on the CPU and on GPUs.
 #pragma once
 
 #include <algorithm>
@@ -10,7 +10,7 @@
 
 namespace beags {
 
-// N surfels, contiguous, as rasterizers/interface.py's SurfelInputs; class_ids may be null.
+// N Gaussians, contiguous, as SurfelInputs of rasterizers/interface.py; class_ids may be null.
 template <class T>
 struct Inputs {
   int64_t count;
@@ -25,7 +25,7 @@ BEAGS_HD bool all_finite(const T* numbers, int count) {
   return zero == 0;
 }
 
-// The transcendental functions are taken in T.
+// Reads Gaussian i; its transcendental functions are computed in T.
 template <class T>
 BEAGS_HD SurfelParameters parameters(const Inputs<T>& inputs, int64_t i) {
   SurfelParameters s;
@@ -38,7 +38,7 @@ BEAGS_HD SurfelParameters parameters(const Inputs<T>& inputs, int64_t i) {
   return s;
 }
 
-// Rounds all but colour and class to T; false if that overflows.
+// Rounds all but colour and class to T; returns false if that overflows.
 template <class T>
 BEAGS_HD bool narrow(const Splat<double>& from, Splat<T>& to) {
   T zero = 0;
@@ -62,7 +62,7 @@ BEAGS_HD bool narrow(const Splat<double>& from, Splat<T>& to) {
   to.log2_opacity = round(from.log2_opacity);
   to.tilt_u = round(from.tilt_u);
   to.tilt_v = round(from.tilt_v);
-  // Edge-on, det = 0: no hit reads this, which must only not be NaN.
+  // Edge-on, det = 0: no hit reads this number, but it must not be NaN.
   constexpr double kLargest = std::numeric_limits<T>::max();
   to.nearness_det = static_cast<T>(std::clamp(from.nearness_det, -kLargest, kLargest));
   for (int i = 0; i < 3; ++i) to.normal[i] = static_cast<T>(from.normal[i]);
@@ -70,7 +70,7 @@ BEAGS_HD bool narrow(const Splat<double>& from, Splat<T>& to) {
   return zero == 0;
 }
 
-// Projects surfel i.
+// Projects Gaussian i.
 template <class T>
 BEAGS_HD Fate place_surfel(const View& view, const Inputs<T>& inputs, int64_t i, Splat<T>& splat) {
   if (!all_finite(inputs.means + 3 * i, 3) || !all_finite(inputs.quats + 4 * i, 4) ||

@@ -1,5 +1,5 @@
-// All kernels of one tile. Included once for each instruction set: nothing here may need code when the program starts,
-// or lie outside the namespace BEAGS_ISA, where the linker would merge it with the copies for other processors.
+// Lists all kernels of one tile. Included once for each instruction set: nothing here may run code when the program
+// starts, or lie outside the namespace BEAGS_ISA, where the linker would merge it with the copies for other processors.
 #pragma once
 
 #include "rasterizer/backward.h"
@@ -9,7 +9,8 @@
 namespace beags {
 namespace BEAGS_ISA {
 
-// Which variant draws `parts`. In float64 and without SIMD, which are there to check and to compare, always the whole.
+// Returns the variant that renders `parts`: in float64 and without SIMD, which are for checks and comparisons, always
+// the whole.
 template <class T>
 constexpr Parts variant([[maybe_unused]] Parts parts) {
 #if defined(BEAGS_SCALAR)

@@ -1,3 +1,3 @@
-// The tile kernels for any processor.
+// Compiles the tile kernels for any processor.
 #define BEAGS_ISA baseline
 #include "rasterizer/tiles.h"

@@ -1,4 +1,4 @@
-// The tile kernels for any processor, without SIMD: what the others are measured against.
+// Compiles the tile kernels for any processor, without SIMD: the base of comparisons.
 #define BEAGS_ISA scalar
 #define BEAGS_SCALAR
 #include "rasterizer/tiles.h"

@@ -1,4 +1,4 @@
-// What the parts of the compiled rasterizer share: constants, one projected surfel, one job. Plain data only.
+// Declares the plain data that the parts of the compiled rasterizer share: constants, one projected Gaussian, one job.
 #pragma once
 
 #include <cstdint>
@@ -11,18 +11,18 @@ constexpr int kTilePixels = kTile * kTile;
 constexpr int kGroupPixels = kGroup * kGroup;
 constexpr int tiles_along(int pixels) { return (pixels + kTile - 1) / kTile; }
 constexpr double kLog2MinAlpha = -7.994353436858858;  // log2(1 / 255); this and the next two: rasterizers/interface.py
-constexpr double kLargest = 1e18;  // world units: larger surfels, and those further off in depth, count as broken
+constexpr double kLargest = 1e18;  // world units: larger Gaussians, and those further off in depth, count as broken
 constexpr double kMaxAlpha = 0.99;
 constexpr double kMinTransmittance = 1e-4;
 constexpr double kLn2 = 0.6931471805599453;
 constexpr int kIgnore = 65535;
 constexpr int64_t kMostTilePairs = 1 << 24;  // the kernels count a tile's pairs in T, exact up to here in float32
-constexpr int kPrefetched = 4;               // pairs ahead whose splats are fetched; so many unused pairs end the list
+constexpr int kPrefetched = 4;               // pairs ahead whose splats are fetched; as many unused pairs end the list
 
-// One surfel as one view sees it (E1, E2). M is divided by the centre's depth and recentred on the projected centre c,
-// so that with (dx, dy) = pixel - c the cross query is affine, q = dx A + dy B + C, and free of the scene's unit:
+// One Gaussian as one view sees it (E1, E2). M is divided by the centre's depth and recentred on the projected centre
+// c, so that with (dx, dy) = pixel - c the cross product is affine, q = dx A + dy B + C, and free of the scene's unit:
 //   q0 = u_x dx + u_y dy,  q1 = v_x dx + v_y dy,  q2 = w_x dx + w_y dy + w_0,  depth = det / q2.
-// What every pixel needs fills the first cache line of a float32 splat.
+// The fields that every pixel needs fill the first cache line of a float32 splat.
 template <class T>
 struct alignas(32) Splat {
   T cx, cy;  // c, pixels
@@ -39,7 +39,7 @@ struct alignas(32) Splat {
 };
 static_assert(sizeof(Splat<float>) == 96, "one and a half cache lines");
 
-// A surfel that reaches a tile.
+// A Gaussian that reaches a tile.
 struct Pair {
   int32_t splat;
   int32_t record;  // where its gradient record of this tile goes
@@ -68,24 +68,24 @@ enum Record {
   kRecordEnd = kNormal + 3
 };
 constexpr int kColorRecord = 4;   // numbers in a record where only colours are wanted; a multiple of 4
-constexpr int kShapeRecord = 16;  // where no geometry was drawn
+constexpr int kShapeRecord = 16;  // where no geometry was rendered
 constexpr int kRecord = 20;
 static_assert(kShapeEnd <= kShapeRecord && kRecordEnd <= kRecord, "records hold their sums");
 
-// What a variant of the kernels computes beside colour and alpha.
+// The parts that a variant of the kernels computes beside colour and alpha.
 using Parts = unsigned;
 constexpr Parts kGeometry = 1, kDistortion = 2, kBoundary = 4;
 constexpr Parts kAllParts = kGeometry | kDistortion | kBoundary;
 constexpr int record_size(Parts parts) { return parts & (kGeometry | kDistortion) ? kRecord : kShapeRecord; }
 
-// The images, [height, width, channels], or the gradients towards them; null: not wanted.
+// The images, [height, width, channels], or the gradients by them; null: not wanted.
 template <class T>
 struct Images {
   T *color, *alpha, *depth, *median_depth, *normal, *distortion, *boundary;
 };
 
-// What the forward keeps for the backward: [tiles, 256] each, in groups of 16 pixels; all null without a backward.
-// Counts of pairs are kept as numbers of T, which are exact up to 2^24.
+// The forward's results for the backward: [tiles, 256] each, in groups of 16 pixels; all null without a backward.
+// Counts of pairs are numbers of T, which are exact up to 2^24.
 template <class T>
 struct Saved {
   T* end_transmittance;
@@ -115,7 +115,7 @@ struct Job {
   T* g_background;  // [tiles, 3]
 };
 
-// The products without gradients (sections 3 and 5).
+// A query, which has no gradient (sections 3 and 5).
 template <class T>
 struct Query {
   const int32_t* labels;      // class_map: the class of a place
@@ -127,7 +127,7 @@ struct Query {
   T* share;                   // class_map: [height, width]
 };
 
-// What the forward does: pixel lanes that it evaluates, and (pixel, surfel) pairs that contribute.
+// The work of the forward: pixel lanes that it evaluates, and (pixel, Gaussian) pairs that contribute.
 struct Work {
   int64_t lanes, contributing;
 };

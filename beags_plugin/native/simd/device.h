@@ -1,4 +1,4 @@
-// Functions that the CPU and GPUs share.
+// Marks functions that the CPU and GPUs share.
 #pragma once
 
 #if !defined(BEAGS_ISA) && (defined(__CUDACC__) || defined(BEAGS_CUDA_EMULATION))

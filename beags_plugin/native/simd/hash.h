@@ -1,4 +1,4 @@
-// The multiplier of the hashes and random streams.
+// Defines the multiplier of the hashes and random streams.
 #pragma once
 
 #include <stdint.h>

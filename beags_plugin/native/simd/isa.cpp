@@ -28,7 +28,7 @@ struct InstructionSet {
 };
 #define BEAGS_SET(name, runs) {#name, runs, &name::kKernelsF32, &name::kKernelsF64}
 
-// What this build holds, best first. The scalar kernels are there to be measured against, never the best.
+// Returns the sets of this build, best first. The scalar kernels are the base of comparisons, never the best.
 std::vector<InstructionSet> built() {
   return {
 #if defined(BEAGS_HAS_AVX512)

@@ -1,6 +1,6 @@
-// Vectors of 32 bytes for the ops: 8 float32 or 4 float64 lanes, as GCC's and clang's vector extensions, which any
-// instruction set can lower. Included by files that are compiled for one instruction set each, so everything lies in
-// the namespace BEAGS_ISA, lest the linker merge the copies.
+// Defines vectors of 32 bytes for the ops: 8 float32 or 4 float64 lanes, as GCC's and clang's vector extensions, which
+// any instruction set can lower. Files that include it are compiled for one instruction set each, so everything lies in
+// the namespace BEAGS_ISA; otherwise the linker would merge the copies.
 #pragma once
 
 #include <math.h>
@@ -80,19 +80,19 @@ BEAGS_INLINE R select(I mask, R yes, R no) {
   return (R)(((I)yes & mask) | ((I)no & ~mask));
 }
 
-// NaN where it is not finite.
+// Returns NaN where x is not finite, else 0.
 template <class R>
 BEAGS_INLINE R nan_unless_finite(R x) {
   return x - x;
 }
 
-// Towards 0; lanes that do not fit hold any number.
+// Rounds towards 0; lanes that do not fit hold any number.
 BEAGS_INLINE IntF to_int(RealF x) { return __builtin_convertvector(x, IntF); }
 BEAGS_INLINE IntD to_int(RealD x) { return __builtin_convertvector(x, IntD); }
 BEAGS_INLINE RealF to_real(IntF x) { return __builtin_convertvector(x, RealF); }
 BEAGS_INLINE RealD to_real(IntD x) { return __builtin_convertvector(x, RealD); }
 
-// For |x| < 2^31; other lanes hold any number, of which wrapping sums are taken.
+// Floors, for |x| < 2^31; other lanes hold any number, so that their sums must wrap.
 BEAGS_INLINE IntF wrapping_sum(IntF a, IntF b) { return (IntF)((Lanes<float>::Bits)a + (Lanes<float>::Bits)b); }
 BEAGS_INLINE IntD wrapping_sum(IntD a, IntD b) { return (IntD)((Lanes<double>::Bits)a + (Lanes<double>::Bits)b); }
 template <class R>
@@ -101,7 +101,8 @@ BEAGS_INLINE auto floor_to_int(R x) {
   return wrapping_sum(whole, to_real(whole) > x);
 }
 
-// e^x to 2 units in the last place; 0 below -87, infinity above 88.
+// Returns e^x to 2 units in the last place; 0 below -87, infinity above 88. simd.h's exp2 is another polynomial, less
+// accurate and faster.
 BEAGS_INLINE RealF exponential(RealF x) {
   const RealF zero = {};
   const IntF tiny = x < -87.0f, huge = x > 88.0f;
@@ -125,7 +126,7 @@ BEAGS_INLINE RealD exponential(RealD x) {
   return x;
 }
 
-// Cosine and sine of angle / 2^24 turns, 0 <= angle < 2^24: quarter turns are taken off exactly, in integers.
+// Computes cosine and sine of angle / 2^24 turns, 0 <= angle < 2^24. Quarter turns are taken off exactly, in integers.
 BEAGS_INLINE void cos_sin(IntF angle, RealF& cosine, RealF& sine) {
   const RealF zero = {};
   const IntF quarter = (angle + (1 << 21)) >> 22;

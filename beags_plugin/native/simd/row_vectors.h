@@ -1,4 +1,4 @@
-// A row of numbers, vector by vector. Included once for each instruction set.
+// Walks a row of numbers, vector by vector. Included once for each instruction set.
 #pragma once
 
 #include "simd/lanes.h"
@@ -10,7 +10,7 @@ namespace BEAGS_ISA {
 template <class T>
 using RealOf = typename Lanes<T>::Real;
 
-// The lanes of a vector that lie in the row: all of them, or `count`; zeros in the others.
+// The lanes of a vector inside the row: all of them, or `count`; others hold zeros.
 struct Whole {
   template <class T>
   BEAGS_INLINE static int size() {

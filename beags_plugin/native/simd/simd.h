@@ -1,6 +1,7 @@
-// Vectors of the instruction set that the including file is compiled for. A Real holds kParts<T> registers that run in
-// step: that hides latencies and shares what is the same for all of them. Included by the files of tile kernels only,
-// and everything lies in the namespace BEAGS_ISA, lest the linker merge the copies.
+// Defines vectors of the instruction set that the including file is compiled for, for the rasterizer. A Real holds
+// kParts<T> registers that run in step: that hides latencies and shares what is the same for all of them. Only the
+// files of tile kernels include it, and everything lies in the namespace BEAGS_ISA; otherwise the linker would merge
+// the copies.
 #pragma once
 
 #include <math.h>
@@ -83,13 +84,13 @@ BEAGS_OPERATOR(*)
 BEAGS_OPERATOR(/)
 #undef BEAGS_OPERATOR
 
-// a b + c, in one rounding where the instruction set has it.
+// Returns a b + c, with one rounding where the instruction set has it.
 template <class T>
 BEAGS_INLINE Real<T> fma(Real<T> a, Real<T> b, Real<T> c) {
   Real<T> out;
   BEAGS_EACH(Register<T>::fma(a.part[i], b.part[i], c.part[i]));
 }
-// b if either is NaN.
+// Returns the smaller; b if either is NaN.
 template <class T>
 BEAGS_INLINE Real<T> min(Real<T> a, Real<T> b) {
   Real<T> out;
@@ -120,7 +121,7 @@ BEAGS_INLINE Real<T> select(Mask<T> mask, Real<T> yes, Real<T> no) {
   Real<T> out;
   BEAGS_EACH(Register<T>::select(mask.part[i], yes.part[i], no.part[i]));
 }
-// `value` in the lanes of the mask, 0 elsewhere (where it may be infinite or NaN).
+// Returns `value` in the lanes of the mask, 0 elsewhere (where it may be infinite or NaN).
 template <class T>
 BEAGS_INLINE Real<T> keep(Mask<T> mask, Real<T> value) {
   Real<T> out;
@@ -132,8 +133,8 @@ BEAGS_INLINE Real<T> drop(Mask<T> mask, Real<T> value) {  // the other lanes
   BEAGS_EACH(Register<T>::drop(mask.part[i], value.part[i]));
 }
 
-// 2^x for -126 < x <= 0 (lanes outside hold garbage); float32 to 2e-7: x = i + f with |f| <= 1/2, and a minimax
-// polynomial for 2^f, in Estrin's order.
+// Returns 2^x for -126 < x <= 0 (lanes outside hold garbage); float32 to 2e-7: x = i + f with |f| <= 1/2, and a minimax
+// polynomial for 2^f.
 BEAGS_INLINE Real<float> exp2(Real<float> x) {
   using T = float;
   const Real<T> magic = all(12582912.0f);  // 1.5 * 2^23: the lowest bits of the sum hold x, rounded
@@ -155,7 +156,7 @@ BEAGS_INLINE Real<double> exp2(Real<double> x) {
 }
 #undef BEAGS_EACH
 
-// A sum over pixels that is added up in one register.
+// Adds to a sum over pixels, kept in one register.
 template <class T>
 BEAGS_INLINE void add(Vector<T>& sum, Real<T> value) {
   BEAGS_UNROLL for (int i = 0; i < kParts<T>; ++i) sum = sum + value.part[i];

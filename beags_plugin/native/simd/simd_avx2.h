@@ -27,12 +27,12 @@ struct Register<float> {
   static BEAGS_INLINE Vector select(Mask mask, Vector yes, Vector no) { return _mm256_blendv_ps(no, yes, mask); }
   static BEAGS_INLINE Vector keep(Mask mask, Vector value) { return _mm256_and_ps(mask, value); }
   static BEAGS_INLINE Vector drop(Mask mask, Vector value) { return _mm256_andnot_ps(mask, value); }
-  // value 2^i, where i lies in the lowest bits of `shifted`.
+  // Returns value 2^i; i lies in the lowest bits of `shifted`.
   static BEAGS_INLINE Vector scale(Vector value, Vector shifted) {
     const __m256i i = _mm256_slli_epi32(_mm256_castps_si256(shifted), 23);
     return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(value), i));
   }
-  // out[i] = sum of the lanes of v[i], i = 0..3; always in the same order.
+  // Sets out[i] to the sum of the lanes of v[i], i = 0..3; always in the same order.
   static BEAGS_INLINE void sum4(const Vector* v, float* out) {
     const Vector low = add_pairs(v[0], v[1]), high = add_pairs(v[2], v[3]), sums = add_pairs(low, high);
     _mm_storeu_ps(out, _mm_add_ps(_mm256_castps256_ps128(sums), _mm256_extractf128_ps(sums, 1)));

@@ -29,12 +29,12 @@ struct Register<float> {
   static BEAGS_INLINE Vector drop(Mask mask, Vector value) {
     return _mm512_maskz_mov_ps(static_cast<Mask>(~mask), value);
   }
-  // value 2^i, where i lies in the lowest bits of `shifted`.
+  // Returns value 2^i; i lies in the lowest bits of `shifted`.
   static BEAGS_INLINE Vector scale(Vector value, Vector shifted) {
     const __m512i i = _mm512_slli_epi32(_mm512_castps_si512(shifted), 23);
     return _mm512_castsi512_ps(_mm512_add_epi32(_mm512_castps_si512(value), i));
   }
-  // out[i] = sum of the lanes of v[i], i = 0..3; always in the same order.
+  // Sets out[i] to the sum of the lanes of v[i], i = 0..3; always in the same order.
   static BEAGS_INLINE void sum4(const Vector* v, float* out) {
     const Vector low = add_pairs(v[0], v[1]), high = add_pairs(v[2], v[3]), sums = add_pairs(low, high);
     const __m256 half = _mm256_add_ps(_mm512_castps512_ps256(sums), _mm512_extractf32x8_ps(sums, 1));

@@ -60,11 +60,11 @@ struct Register<float> : GenericRegister<float, int32_t> {
     return Vector{a[0] + a[1], a[2] + a[3], b[0] + b[1], b[2] + b[3]};
   }
 #endif
-  // value 2^i, where i lies in the lowest bits of `shifted`.
+  // Returns value 2^i; i lies in the lowest bits of `shifted`.
   static BEAGS_INLINE Vector scale(Vector value, Vector shifted) {
     return (Vector)((Mask)value + ((Mask)shifted << 23));
   }
-  // out[i] = sum of the lanes of v[i], i = 0..3; always in the same order.
+  // Sets out[i] to the sum of the lanes of v[i], i = 0..3; always in the same order.
   static BEAGS_INLINE void sum4(const Vector* v, float* out) {
     const Vector sums = add_pairs(add_pairs(v[0], v[1]), add_pairs(v[2], v[3]));
     __builtin_memcpy(out, &sums, sizeof sums);

@@ -1,4 +1,4 @@
-// One lane: the same kernels without SIMD, to measure it against. See simd.h.
+// One lane: the same kernels without SIMD, the base of comparisons. See simd.h.
 #pragma once
 
 namespace beags {
@@ -24,7 +24,7 @@ struct Register {
   static BEAGS_INLINE T select(Mask mask, T yes, T no) { return mask ? yes : no; }
   static BEAGS_INLINE T keep(Mask mask, T value) { return mask ? value : T(0); }
   static BEAGS_INLINE T drop(Mask mask, T value) { return mask ? T(0) : value; }
-  // value 2^i, where i lies in the lowest bits of `shifted`.
+  // Returns value 2^i; i lies in the lowest bits of `shifted`.
   static BEAGS_INLINE float scale(float value, float shifted) {
     uint32_t bits, i;
     __builtin_memcpy(&bits, &value, sizeof bits);

@@ -1,4 +1,4 @@
-// Tables of kernels that are built twice: for any processor, and for AVX2 with FMA.
+// Chooses between the two builds of the ops' kernels: for any processor, and for AVX2 with FMA.
 #pragma once
 
 namespace beags {
@@ -7,7 +7,7 @@ bool uses_avx2();  // isa.h
 
 namespace ops {
 
-// The table of one build: a file compiled for it defines this for Kernels of float and double.
+// Returns the table of one build; a file compiled for it defines this for Kernels of float and double.
 namespace baseline {
 template <class Kernels>
 const Kernels& table();
@@ -17,7 +17,7 @@ template <class Kernels>
 const Kernels& table();
 }  // namespace avx2
 
-// The table to use in this process.
+// Returns the table to use in this process.
 template <class Kernels>
 const Kernels& best_table() {
 #if defined(BEAGS_HAS_AVX2)

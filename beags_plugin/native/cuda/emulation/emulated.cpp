@@ -1,4 +1,4 @@
-// All kernels, compiled for the emulation of CUDA on the CPU.
+// Compiles all kernels for the emulation of CUDA on the CPU.
 #if !defined(BEAGS_CUDA_EMULATION)
 #error "for the target _cuda_emulation only"
 #endif

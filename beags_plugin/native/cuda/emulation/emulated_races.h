@@ -1,11 +1,11 @@
-// What tells GCC's thread sanitizer how the emulated threads of a kernel are ordered, so that it finds what
-// compute-sanitizer's racecheck would look for, and races in global memory besides: each thread is a fiber of the
-// sanitizer's, and only launches and barriers order them. Operations of a warp order nothing in memory, nor do atomic
-// ones. Without the sanitizer it is all empty.
+// Reports to GCC's thread sanitizer how the emulated threads of a kernel are ordered. The sanitizer then finds what
+// compute-sanitizer's racecheck looks for, and races in global memory besides. Each thread is a fiber of the
+// sanitizer's, and only launches and barriers order fibers; operations of a warp and atomic ones do not. Without the
+// sanitizer, all of this is empty.
 //
-// Shared memory is one place for all blocks here, so that blocks must be ordered lest they race for it: then races
-// between blocks go unseen. BEAGS_EMULATION_UNORDERED=1 in the environment leaves a block and the two before it
-// unordered; what is said of shared memory is then to be passed over.
+// All blocks share one shared memory here, so they must be ordered to not race for it, which hides races between
+// blocks. BEAGS_EMULATION_UNORDERED=1 in the environment leaves a block and the two before it unordered; ignore then
+// what is reported of shared memory.
 #pragma once
 
 #if defined(__SANITIZE_THREAD__)

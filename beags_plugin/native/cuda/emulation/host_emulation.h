@@ -1,7 +1,7 @@
-// CUDA's execution model on one CPU thread, for tests of the kernels' logic where there is no GPU: the same sources are
-// compiled by the C++ compiler. The threads of a block are fibers, which run in turn until they meet at a barrier or in
-// an operation of their warp. It shows wrong indices, wrong sums, and barriers that not all threads reach, and, where
-// it is built for GCC's thread sanitizer, data races (emulated_races.h); nothing of the GPU's rounding, and no speed.
+// Runs CUDA kernels on one CPU thread, to test their logic without a GPU: the C++ compiler compiles the same sources.
+// The threads of a block are fibers, which run in turn until they meet at a barrier or in an operation of their warp.
+// This finds wrong indices, wrong sums and barriers that not all threads reach, and data races in a build for GCC's
+// thread sanitizer (emulated_races.h). It shows neither a GPU's rounding nor its speed.
 #pragma once
 
 #include <cstddef>
@@ -32,7 +32,7 @@ struct uint4 {
 };
 
 #if defined(__x86_64__)
-// Keeps what a call must preserve on this stack, and goes on with another one.
+// Saves the registers that a call must preserve on this stack, then continues on another stack.
 extern "C" void beags_switch_stack(void** from, void* to);
 asm(R"(
 .text
@@ -88,7 +88,7 @@ struct Warp {
   alignas(16) unsigned char values[2][kWarp][16];  // of this operation and of the one before
 };
 
-// One block at a time.
+// The block that runs; there is one at a time.
 struct Block {
   Fiber fibers[kMostThreads];
   Warp warps[kMostThreads / kWarp];
@@ -216,7 +216,7 @@ BEAGS_UNSEEN inline void launch(int64_t blocks, unsigned threads, const std::fun
   block().grid.finish();
 }
 
-// Meets the other threads of the warp; returns what each of them brought.
+// Waits for the other threads of the warp; returns the value of each.
 template <class V>
 BEAGS_UNSEEN const V (*exchange(const char* operation, V value))[1] {
   static_assert(sizeof(V) <= 16, "fits a slot");
@@ -238,7 +238,7 @@ BEAGS_UNSEEN const V (*exchange(const char* operation, V value))[1] {
   return reinterpret_cast<const V(*)[1]>(values);
 }
 
-// One lane's value of what `exchange` returned.
+// Returns one lane's value from the result of `exchange`.
 template <class V>
 BEAGS_UNSEEN V lane_value(const V (*values)[1], int lane) {
   V value;
@@ -310,7 +310,7 @@ V atomicExch(V* at, V value) {
 template <class V>
 V atomicMax(V* at, V value) {
   V before = __atomic_load_n(at, __ATOMIC_RELAXED);
-  // Writes even what is there already, as a GPU may: the thread sanitizer shall see a write.
+  // Writes an equal value too, as a GPU may, so that the thread sanitizer sees a write.
   while (!__atomic_compare_exchange_n(at, &before, before < value ? value : before, false, __ATOMIC_RELAXED,
                                       __ATOMIC_RELAXED)) {
   }

@@ -1,4 +1,4 @@
-// Sums in double precision and in a fixed order: over a block's threads, then over the blocks.
+// Sums in float64 and in a fixed order: over a block's threads, then over the blocks.
 #pragma once
 
 #include "cuda/platform.h"
@@ -8,7 +8,7 @@ namespace cuda {
 
 constexpr int kSumThreads = 1024;
 
-// Each of the values summed over the block's threads, for all of them. Once in a kernel.
+// Replaces each value by its sum over the block's threads. Call it once in a kernel.
 template <int kThreads, int kEach>
 BEAGS_DEVICE void block_sums(double (&values)[kEach]) {
   constexpr int kWarps = kThreads / kWarpThreads;
@@ -25,7 +25,7 @@ BEAGS_DEVICE void block_sums(double (&values)[kEach]) {
   }
 }
 
-// What the blocks of a kernel left in partial [blocks, kEach], summed by one block of kSumThreads, for all its threads.
+// Sums the blocks' results, partial [blocks, kEach], in one block of kSumThreads; all its threads get the sums.
 template <int kEach>
 BEAGS_DEVICE void sum_of_blocks(int64_t blocks, const double* partial, double (&sums)[kEach]) {
   for (int k = 0; k < kEach; ++k) sums[k] = 0;

@@ -1,4 +1,4 @@
-// Normal consistency on a GPU: one pass over the image for the value and the slopes, one for the gradient.
+// Computes normal consistency on a GPU: one pass over the image for the value and the slopes, one for the gradient.
 #include "cuda/ops/block_sums.h"
 #include "cuda/ops/ops.h"
 #include "ops/normal_consistency_terms.h"

@@ -1,7 +1,6 @@
-// The occupancy loss (method, section 6; E9): values and closed-form gradients in one pass, whose memory does not
-// depend on the number of samples. A block looks at its Gaussians, passes over those whose disc wholly lies in valid
-// voxels, and gives the others to its first threads, so that warps are full. What is computed is as in
-// ops/occupancy_loss_kernel.h.
+// Computes the occupancy loss (method, section 6; E9) on a GPU: values and closed-form gradients in one pass, whose
+// memory does not depend on the number of samples. A block skips the Gaussians whose disc lies wholly in valid voxels
+// and gives the others to its first threads, so that warps are full. The maths is that of ops/occupancy_loss_kernel.h.
 #include "cuda/ops/block_sums.h"
 #include "cuda/ops/ops.h"
 #include "ops/occupancy_loss_terms.h"
@@ -14,14 +13,14 @@ namespace {
 using namespace ops;
 using namespace ops::BEAGS_ISA;
 
-// The SplitMix64 finaliser, as occupancy/sampling.py.
+// Applies the SplitMix64 finaliser, as occupancy/sampling.py.
 BEAGS_DEVICE uint64_t mix(uint64_t word) {
   word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9u;
   word = (word ^ word >> 27) * 0x94D049BB133111EBu;
   return word ^ word >> 31;
 }
 
-// Cosine and sine of angle / 2^24 turns.
+// Computes cosine and sine of angle / 2^24 turns.
 BEAGS_DEVICE void cos_sin(uint32_t angle, float& cosine, float& sine) {
 #if defined(BEAGS_CUDA_EMULATION)
   cosine = static_cast<float>(std::cos(angle * 3.745070282923929e-07));
@@ -60,8 +59,8 @@ struct Disc : DiscFrame<T> {
     }
   }
 
-  // The voxels that it reaches: `size` of them along each axis from `low` on. Returns the largest size; more than
-  // all windows hold where they lie too far off to be looked up.
+  // Sets the box of voxels that the disc reaches: `size` voxels along each axis, from `low`. Returns the largest size,
+  // or more than any window holds if the disc is too far away to be looked up.
   BEAGS_DEVICE int box(int64_t* low, int* size) const {
     constexpr int kFarOff = 1 << 20;
     int largest = 0;
@@ -80,7 +79,7 @@ struct Disc : DiscFrame<T> {
   }
 };
 
-// Whether a disc surely lies in valid voxels.
+// Returns whether a disc surely lies in valid voxels.
 BEAGS_DEVICE bool wholly_inside(const VoxelTable* cubes, int32_t class_id, const int64_t* low, const int* size,
                                 int largest) {
   if (largest <= kLargestCube) {
@@ -96,7 +95,7 @@ BEAGS_DEVICE bool wholly_inside(const VoxelTable* cubes, int32_t class_id, const
   return fill_window(cubes[0], class_id, corner, size, window);
 }
 
-// Draws the samples of one Gaussian, writes its gradients, returns its loss.
+// Samples one Gaussian, writes its gradients, returns its loss.
 template <class T>
 BEAGS_DEVICE double sample(const OccupancyJob<T>& job, const VoxelTable& valid, int64_t i) {
   const Disc<T> disc(job, i);

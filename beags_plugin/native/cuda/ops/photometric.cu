@@ -1,4 +1,4 @@
-// L1 and SSIM on a GPU: one pass over the image for the value and the slopes, one for the gradient.
+// Computes L1 and SSIM on a GPU: one pass over the image for the value and the slopes, one for the gradient.
 #include "cuda/ops/block_sums.h"
 #include "cuda/ops/ops.h"
 #include "ops/photometric_terms.h"
@@ -13,7 +13,7 @@ using namespace ops::BEAGS_ISA;
 constexpr int kSide = kPhotometricTile, kHalo = kSide + 2 * kSsimReach;  // pixels; with those that the window reaches
 constexpr int kSideThreads = kSide * kSide;
 
-// A block's tile of the image: its first pixel, and this thread's.
+// The tile of a block: its first pixel, and this thread's pixel.
 struct PhotometricTile {
   int left, top, column, row, x, y;
   bool inside;
@@ -30,7 +30,7 @@ struct PhotometricTile {
   }
 };
 
-// The window along the rows of maps that were blurred down the columns.
+// Blurs along the rows of maps that are already blurred down the columns.
 template <class T, int kMaps>
 BEAGS_DEVICE void blur_across(const T (&window)[kSsimWindow], const T (&maps)[kMaps][kSide][kHalo],
                               const PhotometricTile& tile, T (&sums)[kMaps]) {
@@ -96,7 +96,7 @@ __global__ void __launch_bounds__(kSideThreads) photometric_kernel(PhotometricJo
   }
 }
 
-// As in the CPU's kernel, the way back is the same blur.
+// As in the CPU's kernel, the backward is the same blur.
 template <class T>
 __global__ void __launch_bounds__(kSideThreads) photometric_gradient_kernel(PhotometricJob<T> job) {
   __shared__ T slopes[3][kHalo][kHalo];
@@ -130,7 +130,7 @@ __global__ void __launch_bounds__(kSideThreads) photometric_gradient_kernel(Phot
       const T similar = blurred[0] + T(2) * x * blurred[1] + y * blurred[2];
       job.gradient[at] = job.l1_scale * sign + job.ssim_scale * similar;
     }
-    // The next channel's slopes may be loaded meanwhile; `down` is written after the barrier that follows.
+    // No barrier here: the next channel's slopes may be loaded meanwhile, and `down` is written after the next barrier.
   }
 }
 

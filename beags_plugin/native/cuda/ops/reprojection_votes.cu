@@ -1,5 +1,5 @@
-// Pairwise votes (method, section 2; E5), a thread a source pixel, then a thread a target pixel. Votes are whole
-// numbers, whose sums have no order: the result is the CPU's, bit for bit.
+// Counts pairwise votes (method, section 2; E5): one thread a source pixel, then one thread a target pixel. Votes are
+// whole numbers, whose sums do not depend on their order: the result equals the CPU's bit for bit.
 #include "cuda/ops/ops.h"
 
 namespace beags {

@@ -1,4 +1,4 @@
-// Colours from spherical harmonics, a thread a surfel (method, section 1).
+// Computes colours from spherical harmonics, one thread a Gaussian (method, section 1).
 #include "cuda/ops/ops.h"
 #include "ops/sh_colors_terms.h"
 

@@ -1,4 +1,4 @@
-// Membership in the visibility voxel grids, a thread a query; see ops/voxel_lookup.cpp.
+// Looks up points in the visibility voxel grids, one thread a query; see ops/voxel_lookup.cpp.
 #include "cuda/ops/ops.h"
 
 namespace beags {

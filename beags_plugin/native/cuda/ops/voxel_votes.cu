@@ -10,7 +10,7 @@ BEAGS_DEVICE uint64_t voxel_key(int64_t x, int64_t y, int64_t z) {
   return static_cast<uint64_t>(x) << 42 | static_cast<uint64_t>(y) << 21 | static_cast<uint64_t>(z);
 }
 
-// The slot of a key, which is put there if it is new (then *fresh).
+// Returns the slot of a key; inserts a new key (then *fresh).
 BEAGS_DEVICE int64_t claim(uint64_t* keys, int64_t slots, uint64_t key, bool* fresh) {
   *fresh = false;
   for (int64_t at = static_cast<int64_t>(hash_of(key) & (slots - 1));; at = (at + 1) & (slots - 1)) {
@@ -24,7 +24,7 @@ BEAGS_DEVICE int64_t claim(uint64_t* keys, int64_t slots, uint64_t key, bool* fr
   }
 }
 
-// The slot of a voxel, or -1.
+// Returns the slot of a voxel, or -1.
 BEAGS_DEVICE int64_t find(const VoxelTally& tally, uint64_t key) {
   for (int64_t at = static_cast<int64_t>(hash_of(key) & (tally.slots - 1));; at = (at + 1) & (tally.slots - 1)) {
     if (tally.keys[at] == key) return at;
@@ -50,7 +50,7 @@ BEAGS_DEVICE void vote(const VoxelTally& tally, uint64_t key, int32_t label, uin
   atomicAdd(tally.more_votes + more, votes);
 }
 
-// do_class(class, votes) for each class of a voxel.
+// Calls do_class(class, votes) for each class of a voxel.
 template <class DoClass>
 BEAGS_DEVICE void each_class(const VoxelTally& tally, int64_t slot, DoClass do_class) {
   do_class(tally.labels[slot], tally.votes[slot]);
@@ -118,8 +118,8 @@ struct Poll {
   uint32_t weights[24];
   int count;
 
-  // Adds the eight voxels about a point. Returns the class that leads in all of them that have votes, kMixed where they
-  // do not agree or nobody voted. *own: the slot of the voxel that holds the point, or -1.
+  // Adds the eight voxels about a point. Returns the class that leads in all of them that have votes; kMixed if they
+  // disagree or have none. *own: the slot of the voxel that holds the point, or -1.
   template <class T>
   BEAGS_DEVICE int32_t add(const VoxelTally& tally, const T* point, int64_t* own) {
     const NearVoxels near = about(point);
@@ -159,7 +159,7 @@ struct Poll {
     return sum;
   }
 
-  // The winner's share; 0 if nobody voted. Several that lead leave the label.
+  // Returns the winner's share, 0 without votes. A tie keeps the label.
   BEAGS_DEVICE float decide(const VoxelTally& tally, int32_t* label) const {
     uint64_t most = 0, total = 0;
     int32_t winner = kNoLabel;
@@ -183,7 +183,7 @@ struct Poll {
   }
 };
 
-// The label's share of the votes of a voxel.
+// Returns the label's share of the votes of a voxel.
 BEAGS_DEVICE float share_in(const VoxelTally& tally, int64_t slot, int32_t label) {
   float share = 0.0f;
   each_class(tally, slot, [&](int32_t other, uint32_t votes) {

@@ -1,6 +1,6 @@
-// Votes per voxel and class in device memory: an open hash table of voxels, each with one class and its votes, and one
-// of the further classes of voxels, which hang on their voxel as a list. Which class of a voxel comes first depends on
-// chance; what is read never does, as it is made of whole numbers whose sums have no order.
+// Counts votes per voxel and class in device memory. One open hash table holds the voxels, each with one class and its
+// votes; another holds further classes, as a list for each voxel. Which class comes first in a voxel is random. The
+// result is not: it is made of whole numbers, whose sums do not depend on their order.
 #pragma once
 
 #include "cuda/platform.h"
@@ -9,7 +9,7 @@
 namespace beags {
 namespace cuda {
 
-// All memory is the caller's. Slots are powers of two; a table is never more than half full.
+// The caller owns all memory. The number of slots is a power of two; a table is at most half full.
 struct VoxelTally {
   int64_t slots, more_slots;
   uint64_t* keys;        // [slots] 21 bits for each axis, or kEmptyKey
@@ -28,20 +28,20 @@ struct VoxelTally {
 constexpr uint64_t kEmptyKey = ~uint64_t(0);  // as fill_bytes makes it with 0xFF, and so kNoLabel
 constexpr int32_t kNoLabel = -1, kMixed = -1;
 
-// One vote of each pixel with a depth, for its label, 0 or more, unless that is `ignore`.
+// Adds one vote for each pixel with a depth, for its label, 0 or more, unless that is `ignore`.
 template <class T>
 void vote_pixels(const VoxelTally& tally, const ops::LiftedView<T>& view, const int32_t* labels, int32_t ignore,
                  Stream stream);
-// Where voxels lie: a point's is floor((point - origin) / size), as VisibilityGrid.
+// The grid of voxels: a point lies in voxel floor((point - origin) / size), as in VisibilityGrid.
 template <class T>
 struct VoxelFrame {
   T origin[3], size;
 };
-// One vote of each point [count, 3] for its class [count].
+// Adds one vote for each point [count, 3], for its class [count].
 template <class T>
 void vote_points(const VoxelTally& tally, const T* points, const int32_t* class_ids, int64_t count,
                  const VoxelFrame<T>& frame, Stream stream);
-// All votes of `from` into an empty tally.
+// Moves all votes of `from` into an empty tally.
 void move_votes(const VoxelTally& from, const VoxelTally& to, Stream stream);
 void decide(const VoxelTally& tally, Stream stream);
 // See VoxelVotes::read.

@@ -1,6 +1,6 @@
-// The gradients, back to front (E2 to E4, E7); what is computed, and how, is as in rasterizer/backward.h. Every sum is
-// taken in an order of its own: over a warp by exchanges, over the warps of a tile and over the tiles of a surfel one
-// after the other. There are no atomic additions of floats, so all gradients are the same bits in every run.
+// Computes the gradients, back to front (E2 to E4, E7), with the maths of rasterizer/backward.h. Every sum has a fixed
+// order: over a warp by exchanges, then over the warps of a tile, then over the tiles of a Gaussian. There are no
+// atomic additions of floats, so every run gives the same bits.
 #include "cuda/rasterizer/hits.h"
 
 namespace beags {
@@ -33,13 +33,13 @@ BEAGS_DEVICE T warp_sum_4(T n0, T n1, T n2, T n3, int lane) {
   return sum;
 }
 
-// A drawing with more pairs than memory, which only happens where the host does not wait, has no gradients.
+// A render with more pairs than memory has no gradients. It only happens where the host does not wait, in a CUDA graph.
 template <class T>
 BEAGS_DEVICE bool fits(const Bins<T>& bins) {
   return bins.totals[0] <= bins.capacity;
 }
 
-// What the backward knows of a pixel; g_ are gradients of the loss.
+// The backward's state of a pixel; g_ marks gradients of the loss.
 template <class T>
 struct PixelGradients {
   T transmittance, behind;  // behind: the part of dL/dT of what lies behind, times T
@@ -91,8 +91,8 @@ BEAGS_DEVICE PixelGradients<T> load_pixel(const TileJob<T>& job, const Place<T>&
   return p;
 }
 
-// One surfel's part at one pixel, back to front: fills `sums`, the first 16 numbers of Record, and `normals`, the
-// others.
+// Computes one Gaussian's part at one pixel, back to front: fills `sums`, the first 16 numbers of Record, and
+// `normals`, the others.
 static_assert(kNormal == 16 && kRecordEnd <= kRecord, "one array each: larger ones would lie in memory");
 template <Parts kWanted, class T>
 BEAGS_DEVICE void pixel_gradients(T mapping, int k, const Splat<T>& s, const Hit<T>& hit, T dx, T dy,
@@ -206,18 +206,18 @@ __global__ void __launch_bounds__(kTilePixels) backward_kernel(TileJob<T> job) {
       for (int warp = 0; warp < kTileWarps; ++warp) sum += sums[j][warp][number];
       job.records[static_cast<int64_t>(job.bins.pairs[start + first + j]) * kSize + number] = sum;
     }
-    // The next batch may be loaded meanwhile; its sums are written after the barrier that follows.
+    // No barrier here: the next batch may be loaded meanwhile, and its sums are written after the next barrier.
   }
 }
 
-// A warp adds up the records of one surfel, in the order of its tiles.
+// Adds up the records of one Gaussian with one warp, in the order of its tiles.
 template <int kSize, class T>
 __global__ void sum_records_kernel(int64_t count, Bins<T> bins, const T* records, double* sums) {
   constexpr int kTogether = kWarpThreads / kSize;  // records
   const int64_t r = (static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x) / kWarpThreads;
   if (r >= count) return;
   const int lane = threadIdx.x % kWarpThreads, number = lane % kSize, which = lane / kSize;
-  // In a CUDA graph, a replay may have more pairs than there is memory for.
+  // In a CUDA graph, a replay may have more pairs than memory.
   const int64_t stop = bins.pair_start[r + 1] < bins.capacity ? bins.pair_start[r + 1] : bins.capacity;
   double sum = 0;
   if (which < kTogether) {

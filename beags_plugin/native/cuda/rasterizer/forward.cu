@@ -1,4 +1,4 @@
-// The images (E4, E7); what is computed, and how, is as in rasterizer/forward.h.
+// Computes the images (E4, E7), with the maths of rasterizer/forward.h.
 #include "cuda/rasterizer/hits.h"
 
 namespace beags {
@@ -75,7 +75,7 @@ void draw_forward(const TileJob<T>& job, Stream stream) {
   const int tiles = job.tiles_x * job.tiles_y;
   const Parts parts = (job.images.depth ? kGeometry : 0) | (job.images.distortion ? kDistortion : 0) |
                       (job.images.boundary ? kBoundary : 0);
-  // float64 is there to check, and has one variant.
+  // float64, which checks float32, has one variant.
   constexpr bool kOne = sizeof(T) == sizeof(double);
   auto kernel = forward_kernel<kAllParts, T>;
   if (!kOne && parts == 0) kernel = forward_kernel < kOne ? kAllParts : 0, T > ;

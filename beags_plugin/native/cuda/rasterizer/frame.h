@@ -1,5 +1,5 @@
-// One view of one set of surfels on a GPU. All memory is the caller's (torch's), all work goes to its stream, and
-// nothing here waits for the GPU.
+// Declares the steps of a render on a GPU: one view of one set of Gaussians. The caller (torch) owns all memory, all
+// work goes to its stream, and nothing here waits for the GPU.
 #pragma once
 
 #include "cuda/platform.h"
@@ -12,22 +12,22 @@ namespace cuda {
 constexpr int kMaskBits = 16;
 constexpr int kMostTiles = 0xFFFF;  // a pair's key holds the tile above the mask of Pair (types.h)
 
-// Surfels projected and sorted into tiles.
+// Gaussians, projected and sorted into tiles.
 template <class T>
 struct Bins {
   Splat<T>* splats;      // [N]
-  int32_t* counts;       // [N] how many tiles a surfel reaches
-  int32_t* order;        // [N] surfels by rising depth, equal ones by index; those that reach no tile come last
+  int32_t* counts;       // [N] how many tiles a Gaussian reaches
+  int32_t* order;        // [N] Gaussians by rising depth, equal ones by index; those that reach no tile come last
   int64_t* pair_start;   // [N + 1] the pairs of order[r] are pair_start[r] .. pair_start[r + 1] - 1
-  int64_t* totals;       // [2] pairs; surfels with numbers that are not finite
-  int64_t capacity;      // of pairs that there is memory for; if there are more, what is drawn is wrong
+  int64_t* totals;       // [2] pairs; Gaussians with numbers that are not finite
+  int64_t capacity;      // of pairs that there is memory for; if there are more, the images are wrong
   int32_t* pair_surfel;  // [capacity]
   uint32_t* keys;        // [capacity] tile << kMaskBits | mask, by tile, then by depth
   int32_t* pairs;        // [capacity] in the order of `keys`
   int32_t* tile_start;   // [tiles + 1] into keys and pairs
 };
 
-// Device memory that is free again when the kernels are done.
+// Device memory that is free again when the kernels end.
 struct Scratch {
   void* temporary;  // see primitives.h
   size_t temporary_bytes;
@@ -35,16 +35,16 @@ struct Scratch {
   int32_t* values;    // as one of `keys`
 };
 
-// visible: [N], whether a surfel was drawn and its box touches the image. Fills what of `bins` does not depend on the
-// capacity.
+// Projects the Gaussians; fills the part of `bins` that does not depend on the capacity. visible: [N], whether a
+// Gaussian is rendered and its box touches the image.
 template <class T>
 void project_surfels(const View& view, const Inputs<T>& inputs, const Bins<T>& bins, bool* visible,
                      const Scratch& scratch, Stream stream);
-// The rest of `bins`.
+// Fills the rest of `bins`.
 template <class T>
 void bin_surfels(const View& view, int64_t count, const Bins<T>& bins, const Scratch& scratch, Stream stream);
 
-// What the forward keeps for the backward: [height, width] each; null: not drawn, or no backward.
+// The forward's results for the backward: [height, width] each; null: not rendered, or no backward.
 template <class T>
 struct Kept {
   T* end_transmittance;
@@ -54,7 +54,7 @@ struct Kept {
   T *first, *moment1, *moment2;  // see Saved
 };
 
-// Everything that the tiles' kernels read and write.
+// Everything that the kernels of the tiles read and write.
 template <class T>
 struct TileJob {
   int width, height, tiles_x, tiles_y;
@@ -71,11 +71,11 @@ struct TileJob {
 
 template <class T>
 void draw_forward(const TileJob<T>& job, Stream stream);
-// parts: of the images that have a gradient.
+// parts: those of the images that have a gradient.
 template <class T>
 void draw_backward(const TileJob<T>& job, Parts parts, Stream stream);
 
-// Numbers in a record of a backward of these parts.
+// Returns how many numbers a record has in a backward of these parts.
 template <class T>
 int backward_record(Parts parts);
 
@@ -89,7 +89,7 @@ template <class T>
 void reduce_records(const View& view, const Inputs<T>& inputs, const Bins<T>& bins, const T* records, int size,
                     const SurfelGradients<T>& to, Stream stream);
 
-// A weight w as a whole number, so that the order of a sum does not matter.
+// The unit of a weight w as a whole number: sums then do not depend on their order.
 constexpr int kWeightBits = 38;
 
 // labels: [height, width]; sums: [N, num_classes] in units of 2^-kWeightBits, zero on entry (E6).

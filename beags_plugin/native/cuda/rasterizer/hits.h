@@ -1,5 +1,5 @@
-// One surfel at one pixel, and the walk of a block through its tile, front to back (E2, E3). A thread is a pixel; a
-// warp has two neighbouring groups of the tile, so that a bit of a pair's mask tells whether half a warp is concerned.
+// Evaluates one Gaussian at one pixel, and walks through a tile front to back (E2, E3). A thread is a pixel. A warp has
+// two neighbouring groups of the tile, so that a bit of a pair's mask says whether half a warp takes part.
 #pragma once
 
 #include "cuda/rasterizer/frame.h"
@@ -17,7 +17,7 @@ static_assert(kTilePixels == kBlockThreads && kWarpThreads == 2 * kGroupPixels, 
 template <class T>
 using Hit = SurfelHit<T, bool>;
 
-// Where it does not contribute, all is 0.
+// Returns zeros where the Gaussian does not contribute.
 template <class T>
 BEAGS_DEVICE Hit<T> evaluate(T near_plane, const Splat<T>& s, T dx, T dy, bool wanted) {
   Hit<T> hit = surfel_hit(s, near_plane, dx, dy, wanted, s.plain);  // plain: the same for the whole warp
@@ -32,7 +32,7 @@ struct alignas(32) Batch {
   uint32_t masks[kBatch];
 };
 
-// Copies the splats of `count` pairs from `first` on; barriers around it are the caller's.
+// Copies the splats of `count` pairs, from `first`. The caller sets the barriers around it.
 template <class T>
 BEAGS_DEVICE void load_batch(const Bins<T>& bins, int64_t first, int count, Batch<T>& batch) {
   constexpr int kWords = sizeof(Splat<T>) / sizeof(uint4);

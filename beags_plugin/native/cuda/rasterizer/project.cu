@@ -1,4 +1,4 @@
-// Surfels to splats, splats to tiles (E1, E2; the extent of E3).
+// Projects Gaussians to splats and sorts splats into tiles (E1, E2; the extent of E3).
 #include <cstring>
 
 #include "cuda/rasterizer/frame.h"
@@ -9,9 +9,10 @@ namespace beags {
 namespace cuda {
 namespace {
 
-constexpr uint32_t kLastKey = 0xFFFFFFFFu;  // of surfels that reach no tile, and of pairs that are not there
+constexpr uint32_t kLastKey = 0xFFFFFFFFu;  // of Gaussians that reach no tile, and of pairs that are not there
 
-// Calls visit(tile, mask) for the tiles that a surfel reaches, rising; see find_tiles in binning.cpp.
+// Calls visit(tile, mask) for each tile that a Gaussian reaches, in rising order; see find_tiles in
+// rasterizer/binning.cpp.
 template <class Visit>
 BEAGS_DEVICE void for_each_tile(const Extent& extent, int tiles_x, Visit visit) {
   if (extent.first_row() > extent.last_row()) return;
@@ -82,7 +83,7 @@ __global__ void copy_kernel(int64_t count, const int32_t* from, int32_t* to) {
   if (r < count) to[r] = from[r];
 }
 
-// pair_start[r]: the number of pairs of order[r]; they are then added up.
+// Sets pair_start[r] to the number of pairs of order[r]; a prefix sum follows.
 __global__ void gather_counts_kernel(int64_t count, const int32_t* counts, const int32_t* order, int64_t* pair_start) {
   const int64_t r = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
   if (r <= count) pair_start[r] = r < count ? counts[order[r]] : 0;
@@ -168,8 +169,8 @@ void bin_surfels(const View& view, int64_t count, const Bins<T>& bins, const Scr
   const auto emit = emit_kernel<T>;
   BEAGS_LAUNCH(emit, blocks_for(count, 128), 128, stream, view, count, bins, scratch.keys[0], scratch.values);
   if (!bins.capacity) return;
-  // Pairs come by depth, and the sort is stable; its bits reach to the tile's top, where pairs that are not there have
-  // ones.
+  // Pairs come by depth, and the sort is stable. Its bits reach to the top of the tile's number, where unused pairs
+  // have ones.
   sort_pairs(scratch.temporary, scratch.temporary_bytes, scratch.keys[0], bins.keys, scratch.values, bins.pairs,
              bins.capacity, kMaskBits, kMaskBits + bits_for(tiles), stream);
   BEAGS_LAUNCH(tile_start_kernel, blocks_for(bins.capacity), kBlockThreads, stream, tiles, bins.capacity, bins.totals,

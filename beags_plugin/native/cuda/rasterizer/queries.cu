@@ -1,11 +1,12 @@
-// The products without gradients (sections 3 and 5).
+// Answers queries without gradients (sections 3 and 5).
 #include "cuda/rasterizer/hits.h"
 
 namespace beags {
 namespace cuda {
 namespace {
 
-// E6. Weights are added as whole numbers: the order in which atomic additions come then changes nothing.
+// Sums class contributions (E6). Weights are added as whole numbers, so that the order of atomic additions changes
+// nothing.
 template <class T>
 __global__ void __launch_bounds__(kTilePixels)
     class_contributions_kernel(TileJob<T> job, const int32_t* labels, int num_classes, unsigned long long* sums) {
@@ -34,8 +35,8 @@ __global__ void __launch_bounds__(kTilePixels)
 constexpr int kClassesAtOnce = 8;
 constexpr int kClassWords = (kIgnore + 31) / 32;
 
-// Each pixel's class: the largest sum of w; of equal ones the lowest. The tile is walked once for every eight of the
-// classes that it holds.
+// Finds each pixel's class: the largest sum of w; of equal ones the lowest. The tile is walked once for every eight of
+// its classes.
 template <class T>
 __global__ void __launch_bounds__(kTilePixels)
     class_map_kernel(TileJob<T> job, int num_classes, int32_t* classes, T* share) {
@@ -87,7 +88,7 @@ __global__ void __launch_bounds__(kTilePixels)
   share[place.at] = best > T(0) ? best / (T(1) - walk.transmittance) : T(0);
 }
 
-// The surfel with the largest w; of equal ones the nearer.
+// Finds each pixel's Gaussian with the largest w; of equal ones the nearer.
 template <class T>
 __global__ void __launch_bounds__(kTilePixels) dominant_gaussian_kernel(TileJob<T> job, int32_t* indices) {
   const Place<T> place(job);
