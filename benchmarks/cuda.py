@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from beags_plugin.rasterizers.cuda import CudaAheadRasterizer, CudaRasterizer
+from beags_plugin.rasterizers.cuda import CudaRasterizer
 from beags_plugin.rasterizers.interface import SurfelInputs
 from benchmarks.cuda_smoke import LEAVES, smoke
 from benchmarks.machine import commit, describe_machine
@@ -70,9 +70,9 @@ def peak_mb(call: Callable[[], Any]) -> float:
     return (torch.cuda.max_memory_allocated() - before) / 2**20
 
 
-def make_cuda(ahead: bool = False) -> CudaRasterizer:
-    """The backend that is measured; ahead: the one that does not wait for the number of pairs."""
-    return CudaAheadRasterizer() if ahead else CudaRasterizer()
+def make_cuda() -> CudaRasterizer:
+    """Return the backend that is measured."""
+    return CudaRasterizer()
 
 
 class Drawing:
@@ -185,17 +185,14 @@ def copy_rate() -> float:
 
 
 def step_rows(size: Size, repeats: int) -> list[dict[str, Any]]:
-    """A training step without and with the two losses; Z from 1 to 1000. A row that fails holds the reason.
-
-    The last row is a base step whose host does not wait for the number of pairs.
-    """
+    """A training step without and with the two losses; Z from 1 to 1000. A row that fails holds the reason."""
     rows: list[dict[str, Any]] = []
     scene: Scene | None = None
-    for samples, ahead in ((None, False), *((z, False) for z in SAMPLES), (None, True)):
-        row: dict[str, Any] = {**size_of(size), "samples": samples, "ahead": ahead}
+    for samples in (None, *SAMPLES):
+        row: dict[str, Any] = {**size_of(size), "samples": samples}
         try:
             scene = scene or on_device(make_scene(size), DEVICE)
-            step = TrainingStep(scene, samples, make_cuda(ahead=True) if ahead else None)
+            step = TrainingStep(scene, samples)
             row = {**row, "step_ms": milliseconds(step.run, repeats), "peak_mb": peak_mb(step.run)}
             if rows and "step_ms" in rows[0]:
                 row["ratio_to_base"] = row["step_ms"] / rows[0]["step_ms"]
@@ -305,7 +302,7 @@ def table(out: dict[str, Any]) -> str:
         lines.append(f"{name} {row['forward_ms']:7.2f} {row['both_ms']:9.2f} {row['peak_mb']:6.0f}  {share}")
     lines.append("step       Z        ms     MB   times the base step")
     for row in out["steps"]:
-        name = f"{row['n']:<10} {row['samples'] or ('ahead' if row['ahead'] else 'base')!s:<5}"
+        name = f"{row['n']:<10} {row['samples'] or 'base'!s:<5}"
         if "failed" in row:
             lines.append(f"{name} failed: {row['failed']}")
             continue

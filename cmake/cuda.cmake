@@ -5,10 +5,12 @@ set(BEAGS_CUDA_ARCHITECTURES "75-real;80-real;86-real;89-real;90" CACHE STRING
 option(BEAGS_CUDA_EMULATION "Build beags_plugin/_cuda_emulation, which runs the CUDA kernels on the CPU: for tests." OFF)
 
 set(cuda ${sources}/cuda)
-set(cuda_bindings ${cuda}/module_cuda.cpp ${cuda}/module_cuda_ops.cpp)
+set(cuda_bindings ${sources}/binding/module_cuda.cpp ${sources}/binding/module_cuda_ops.cpp)
 
 if(BEAGS_CUDA_EMULATION) # in a domain of its own, as its types have the names of those of _native
-  nanobind_add_module(_cuda_emulation NB_STATIC NB_DOMAIN beags_emulation ${cuda}/emulated.cpp ${cuda}/module_emulation.cpp ${cuda_bindings})
+  nanobind_add_module(_cuda_emulation NB_STATIC NB_DOMAIN beags_emulation ${cuda}/emulation/emulated.cpp
+                      ${sources}/binding/module_emulation.cpp ${cuda_bindings})
+  target_include_directories(_cuda_emulation PRIVATE ${sources})
   target_compile_definitions(_cuda_emulation PRIVATE BEAGS_CUDA_EMULATION)
   target_compile_options(_cuda_emulation PRIVATE -O1 -ffp-contract=off -Wall -Wextra -Wno-unknown-pragmas)
   install(TARGETS _cuda_emulation LIBRARY DESTINATION beags_plugin)
@@ -44,11 +46,14 @@ if(NOT CMAKE_CUDA_COMPILER OR NOT BEAGS_CUDART)
 endif()
 message(STATUS "Kernels for GPUs: ${CMAKE_CUDA_COMPILER} ${CMAKE_CUDA_COMPILER_VERSION}, for ${CMAKE_CUDA_ARCHITECTURES}")
 
-set(kernels project forward backward products primitives sh_colors voxel_lookup voxel_tally
-    reprojection_votes occupancy_loss image_losses)
+set(kernels
+    rasterizer/backward rasterizer/forward rasterizer/primitives rasterizer/project rasterizer/queries
+    ops/normal_consistency ops/occupancy_loss ops/photometric ops/reprojection_votes ops/sh_colors ops/voxel_lookup
+    ops/voxel_votes)
 list(TRANSFORM kernels PREPEND ${cuda}/)
 list(TRANSFORM kernels APPEND .cu)
 add_library(beags_cuda STATIC ${kernels})
+target_include_directories(beags_cuda PRIVATE ${sources})
 set_target_properties(beags_cuda PROPERTIES CUDA_STANDARD 17 CUDA_STANDARD_REQUIRED ON POSITION_INDEPENDENT_CODE ON
                                             CUDA_VISIBILITY_PRESET hidden CUDA_RUNTIME_LIBRARY Static)
 # No fused operations but explicit ones: the forward and the backward must evaluate a hit alike, to the last bit.

@@ -55,7 +55,8 @@ race_is_seen() { # that the thread sanitizer finds one in a parallel loop, or it
 races_in_kernels_are_seen() { # and only those that are there
   local folder="$root/build/sanitize/kernels" what wanted unordered status
   mkdir -p "$folder"
-  c++ -std=c++17 -O1 -g -DBEAGS_CUDA_EMULATION -fsanitize=thread tests/native/race_in_kernel.cpp -o "$folder/race"
+  c++ -std=c++17 -O1 -g -DBEAGS_CUDA_EMULATION -Ibeags_plugin/native -fsanitize=thread tests/native/race_in_kernel.cpp \
+    -o "$folder/race"
   for what in "barrier 0" "none 66" "atomic 0 1" "blocks 66 1"; do
     read -r what wanted unordered <<<"$what"
     status=0

@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from importlib import import_module
 from types import ModuleType
-from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 from beags_plugin.ops import cuda_extension
-from beags_plugin.rasterizers.cuda import CudaAheadRasterizer, CudaRasterizer
+from beags_plugin.rasterizers.cuda import CudaRasterizer
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, SurfelInputs
-from beags_plugin.rasterizers.pair_counts import PairCounts
 
 
 def emulation() -> ModuleType | None:
@@ -52,35 +50,6 @@ class EmulatedCudaRasterizer(CudaRasterizer):
     @classmethod
     def unavailable(cls) -> str | None:
         return None if emulation() else "beags_plugin._cuda_emulation was not built (BEAGS_CUDA_EMULATION=ON)"
-
-
-class Watched(PairCounts):
-    """Notes of which drawings the host asked for the number of pairs."""
-
-    def __init__(self, fading: float) -> None:
-        super().__init__(fading)
-        self.sent: list[Any] = []
-        self.asked: list[int] = []
-
-    def send(self, totals):
-        self.sent.append(super().send(totals))
-        return self.sent[-1]
-
-    def receive(self, sent):
-        self.asked.append(next(i for i, one in enumerate(self.sent) if one is sent))
-        return super().receive(sent)
-
-
-class EmulatedAheadRasterizer(CudaAheadRasterizer):
-    """The one that does not wait, likewise."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._module, self._counts = emulation(), Watched(self._fading)
-
-    @property
-    def asked(self) -> list[int]:
-        return self._counts.asked
 
 
 class CudaOnCpuTensors(Rasterizer):

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from cuda_backends import EmulatedAheadRasterizer, EmulatedCudaRasterizer
+from cuda_backends import EmulatedCudaRasterizer
 
 from beags_plugin.ops import extension
 from benchmarks import cuda
@@ -27,8 +27,7 @@ def dry(monkeypatch):
     if (reason := EmulatedCudaRasterizer.unavailable()) or (reason := extension.found()[1]):
         pytest.skip(reason)
     monkeypatch.setattr(cuda, "DEVICE", "cpu")
-    backends = {False: EmulatedCudaRasterizer, True: EmulatedAheadRasterizer}
-    monkeypatch.setattr(cuda, "make_cuda", lambda ahead=False: backends[ahead]())
+    monkeypatch.setattr(cuda, "make_cuda", EmulatedCudaRasterizer)
     monkeypatch.setattr(cuda, "milliseconds", lambda call, repeats: call() and None or 4.0)
     monkeypatch.setattr(cuda, "peak_mb", lambda call: call() and None or 2.0)
     monkeypatch.setattr(cuda, "copy_rate", lambda: 1000.0)
@@ -54,8 +53,7 @@ def test_rows_of_drawings_and_steps(dry, tmp_path, capsys):
         least = 3 * 52 * row["n"] + 2 * 36 * row["width"] * 32 + 200 * row["pairs"]  # bytes
         assert row["least_ms"] == pytest.approx(least / 1000e9 * 1e3)
         assert row["share_of_copy_rate"] == pytest.approx(row["least_ms"] / 4.0)
-    assert [row["samples"] for row in found["steps"]] == [None, 1, 20, None]
-    assert [row["ahead"] for row in found["steps"]] == [False, False, False, True]
+    assert [row["samples"] for row in found["steps"]] == [None, 1, 20]
     assert all(row["ratio_to_base"] == 1.0 and row["extra_ms"] == 0.0 for row in found["steps"][1:])
     told = capsys.readouterr().out
     assert "none, a copy moves 1000 GB/s" in told and "48x32" in told

@@ -12,7 +12,7 @@ import pytest
 
 from beags_plugin.ops import extension
 
-KERNELS = Path(__file__).parents[1] / "beags_plugin/native/cuda"
+KERNELS = Path(__file__).parents[1] / "beags_plugin/native"
 
 
 def nvcc() -> str | None:
@@ -37,7 +37,7 @@ def resources(source: Path, architecture: int, folder: Path) -> dict[str, dict[s
     """What each kernel of a file takes: bytes that registers spill, registers a thread, shared bytes a block."""
     done = subprocess.run(
         [str(nvcc()), "-std=c++17", "-O3", "--fmad=false", "--expt-relaxed-constexpr", f"-arch=sm_{architecture}"]
-        + ["-cubin", "-Xptxas", "-v", "-o", str(folder / "kernels.cubin"), str(source)],
+        + ["-cubin", "-Xptxas", "-v", "-I", str(KERNELS), "-o", str(folder / "kernels.cubin"), str(source)],
         capture_output=True,
         text=True,
         check=True,
@@ -55,7 +55,7 @@ def resources(source: Path, architecture: int, folder: Path) -> dict[str, dict[s
 
 
 @needs_nvcc
-@pytest.mark.parametrize("source", ["forward.cu", "backward.cu"])
+@pytest.mark.parametrize("source", ["cuda/rasterizer/forward.cu", "cuda/rasterizer/backward.cu"])
 def test_kernels_that_draw_in_float32_fit_into_registers(source, tmp_path):
     # Of the supported GPUs, sm_75 has the least shared memory; a multiprocessor shall hold two blocks of 256 threads.
     in_float32 = re.compile(r"kernelI(L[ij]\d+E)?fE")

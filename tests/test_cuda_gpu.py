@@ -10,7 +10,7 @@ from raster_scenes import make_scene
 
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.by_device import ByDevice
-from beags_plugin.rasterizers.cuda import UNKNOWN, CudaAheadRasterizer, CudaRasterizer
+from beags_plugin.rasterizers.cuda import UNKNOWN, CudaRasterizer
 from beags_plugin.rasterizers.interface import SurfelInputs
 
 pytestmark = pytest.mark.skipif(CudaRasterizer.unavailable() is not None, reason=str(CudaRasterizer.unavailable()))
@@ -74,13 +74,12 @@ def test_a_graph_of_forward_and_backward_replays_cuda():
     assert not rasterizer.overflowed()
 
 
-@pytest.mark.parametrize("backend", [CudaRasterizer, CudaAheadRasterizer])
-def test_a_training_step_makes_the_host_wait_for_no_copy_cuda(backend):
-    """In this mode torch raises where it waits itself; what ``backend`` waits for is an event."""
+def test_a_training_step_makes_the_host_wait_for_no_copy_cuda():
+    """In this mode torch raises where it waits itself; what ``CudaRasterizer`` waits for is an event."""
     from benchmarks.scenes import Size, make_scene, on_device
     from benchmarks.training_step import TrainingStep
 
-    step = TrainingStep(on_device(make_scene(Size(2_000, 130, 100)), "cuda"), 20, backend())
+    step = TrainingStep(on_device(make_scene(Size(2_000, 130, 100)), "cuda"), 20, CudaRasterizer())
     for _ in range(3):
         step.run()
     torch.cuda.set_sync_debug_mode("error")
@@ -89,18 +88,6 @@ def test_a_training_step_makes_the_host_wait_for_no_copy_cuda(backend):
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert step.step == 4 and all(value.grad.isfinite().all() for value in step.parameters.values())
-
-
-def test_ahead_draws_the_same_bits_cuda():
-    ahead, waiting = CudaAheadRasterizer(), CudaRasterizer()
-    for seed in range(7):
-        scene = on_gpu(make_scene(count=300, seed=seed))
-        found, expected = (
-            torch.autograd.grad(scene.draw(rasterizer, means=means).color.sum(), means)[0]
-            for rasterizer, means in ((r, scene.inputs.means.clone().requires_grad_()) for r in (ahead, waiting))
-        )
-        assert torch.equal(found, expected)
-    assert ahead.lost == 0
 
 
 def test_tensors_on_the_cpu_are_refused_cuda():

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from cuda_backends import BACKENDS, EmulatedAheadRasterizer, EmulatedCudaRasterizer
+from cuda_backends import BACKENDS, EmulatedCudaRasterizer
 from raster_scenes import CLASSES, FLOATS, OUTPUTS, awkward, error, gradients, gradients_by_output, make_scene, poisoned
 from test_native import ALL_SCENES
 
@@ -197,42 +197,6 @@ def test_the_backward_of_a_drawing_larger_than_its_memory_stays_in_its_memory(em
     monkeypatch.setattr(emulated, "forward_kernel", guarded)
     found = gradients(emulated, large)
     assert told and all(float(gradient.abs().max()) == 0.0 for gradient in found.values())
-
-
-def test_the_host_runs_ahead_with_the_same_results(emulated):
-    ahead = EmulatedAheadRasterizer()
-    scenes = [make_scene(count=150, seed=seed) for seed in range(7)]
-    for scene in scenes:
-        found, expected = gradients(ahead, scene), gradients(emulated, scene)
-        assert all(torch.equal(found[name], expected[name]) for name in expected)
-    drawn, expected = scenes[0].draw(ahead), scenes[0].draw(emulated)  # without gradients: it waits
-    assert torch.equal(drawn.color, expected.color) and drawn.num_nonfinite == 0
-    # The first drawing of all, then always the fourth before; at last what was left, and the drawing itself.
-    assert ahead.asked == [0, 0, 1, 2, 3, 4, 5, 6, 7] and ahead.lost == 0
-
-
-def test_a_drawing_ahead_that_was_larger_than_the_guess_has_no_gradients(emulated, monkeypatch):
-    monkeypatch.setattr("beags_plugin.rasterizers.pair_counts._STEP", 16)
-    ahead, small, large = EmulatedAheadRasterizer(), make_scene(count=2, size=-5.0), make_scene(count=200)
-    small.draw(ahead)
-    lost = [gradients(ahead, large) for _ in range(4)]  # until the host knows
-    assert all(float(gradient.abs().max()) == 0.0 for found in lost for gradient in found.values())
-    found, expected = gradients(ahead, large), gradients(emulated, large)
-    assert all(torch.equal(found[name], expected[name]) for name in expected)
-    large.draw(ahead)
-    assert ahead.lost == 4
-
-
-def test_a_large_view_among_small_ones_is_lost_but_once(emulated, monkeypatch):
-    monkeypatch.setattr("beags_plugin.rasterizers.pair_counts._STEP", 16)
-    ahead, small, large = EmulatedAheadRasterizer(), make_scene(count=20), make_scene(count=200)
-    small.draw(ahead)
-    for _ in range(4):
-        gradients(ahead, large)
-        for _ in range(12):
-            gradients(ahead, small)
-    large.draw(ahead)
-    assert ahead.lost == 1
 
 
 def test_images_of_more_tiles_than_a_key_holds_are_refused(emulated):

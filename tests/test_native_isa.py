@@ -23,8 +23,7 @@ NAMES = ("avx512", "avx2", "neon", "baseline", "scalar")
 HERE = Path(__file__).parent
 OBJECTS = {  # files compiled for one instruction set: their namespace and a symbol that each must define
     **{f"tiles_{name}": (f"beags::{name}::", "kKernelsF32") for name in NAMES},
-    "ops_avx2": ("beags::ops::avx2::", "table<beags::ops::OpKernels<float> >()::all"),
-    "image_avx2": ("beags::ops::avx2::", "table<beags::ops::ImageKernels<float> >()::all"),
+    "build_avx2": ("beags::ops::avx2::", "table<beags::ops::OpKernels<float> >()::all"),
 }
 DRAW = """
 import sys; sys.path.insert(0, sys.argv[1])

@@ -17,7 +17,7 @@ from beags_plugin.ops.voxel_votes import brick_sample
 MOST_BRICKS = 1 << 19  # bricks of 4 x 4 x 4 voxels that may be in memory: about 0.4 GB
 _BRICK = 4
 _PART = 64  # one brick of about so many is counted
-_PRIMES = (73856093, 19349663, 83492791)  # as in native/voxel_votes.cpp
+_PRIMES = (73856093, 19349663, 83492791)  # as in native/ops/voxel_votes.cpp
 
 
 @dataclass(frozen=True)

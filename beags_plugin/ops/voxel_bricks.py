@@ -1,4 +1,4 @@
-"""Tables of ``native/voxel_table.h``, made where the voxels lie: on a GPU without a way over the CPU."""
+"""Tables of ``native/ops/voxel_table.h``, made where the voxels lie: on a GPU without a way over the CPU."""
 
 from __future__ import annotations
 

@@ -13,7 +13,6 @@ RASTERIZERS = Registry(
         "torch": "beags_plugin.rasterizers.torch_reference:TorchRasterizer",
         "native": "beags_plugin.rasterizers.native:NativeRasterizer",
         "cuda": "beags_plugin.rasterizers.cuda:CudaRasterizer",
-        "cuda-ahead": "beags_plugin.rasterizers.cuda:CudaAheadRasterizer",
     },
 )
 _PREFERENCE = ("native", "torch")  # what "auto" tries, best first; on a GPU first "cuda"

@@ -3,8 +3,8 @@
 All memory is torch's, all kernels run on torch's current stream. The number of pairs (of a tile and a surfel that
 reaches it) is known on the GPU only, so that their memory is guessed from the drawings before. All kernels of a drawing
 are launched on that guess; then the host waits for the number, which the GPU knew long before the image, and launches
-the last ones again in the rare case that the guess was too small. The GPU never waits for the host. Where the host
-shall not wait either (``CudaAheadRasterizer``, CUDA graphs), such a drawing has no gradients.
+the last ones again in the rare case that the guess was too small. The GPU never waits for the host. In a CUDA graph the
+host does not wait either: there, such a drawing has no gradients.
 """
 
 from __future__ import annotations
@@ -33,11 +33,10 @@ from beags_plugin.rasterizers.pair_counts import PairCounts, capacity_for
 from beags_plugin.system.errors import UserError
 
 _FLOATS = ("means", "quats", "log_scales", "opacity_logits", "colors")
-_GEOMETRY, _DISTORTION, _BOUNDARY = 1, 2, 4  # Parts of native/types.h
+_GEOMETRY, _DISTORTION, _BOUNDARY = 1, 2, 4  # Parts of native/rasterizer/types.h
 _TILE = 16
-_AHEAD = 4  # drawings whose numbers of pairs the host need not know yet
 UNKNOWN = -1
-"""``num_nonfinite`` of a drawing that the host does not wait for."""
+"""``num_nonfinite`` of a drawing in a CUDA graph, which the host does not wait for."""
 
 
 @dataclass
@@ -63,12 +62,9 @@ class CudaRasterizer(KernelRasterizer):
     the memory for its pairs is known, and ask ``overflowed`` after replays.
     """
 
-    _waits = True  # for the number of pairs of a drawing that wants gradients
-    _fading = 0.98  # of the largest number of pairs so far, a drawing
-
     def __init__(self) -> None:
         self._module: ModuleType | None = None
-        self._counts = PairCounts(self._fading)
+        self._counts = PairCounts()
         self._captured: list[tuple[Tensor, int]] = []
 
     @classmethod
@@ -116,7 +112,7 @@ class CudaRasterizer(KernelRasterizer):
         def draw(frame: _Frame) -> None:
             frame.native.forward(drawing.background, drawing.target, *images, *kept, self._stream(like))
 
-        frame = self._frame(inputs, camera, settings, draw, waits=self._waits or not keep)
+        frame = self._frame(inputs, camera, settings, draw)
         frame.kept = kept
         return Forward(images, frame.visible, frame.num_nonfinite, frame)
 
@@ -197,13 +193,8 @@ class CudaRasterizer(KernelRasterizer):
     def _stream(like: Tensor) -> int:
         return cuda_extension.stream(like.device)
 
-    def _frame(
-        self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, draw: Any, waits: bool = True
-    ) -> _Frame:
-        """Project, sort into tiles and draw with ``draw(frame)``, which may be called twice.
-
-        waits: for the number of pairs; else what is drawn may be wrong, and then has no gradients.
-        """
+    def _frame(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, draw: Any) -> _Frame:
+        """Project, sort into tiles and draw with ``draw(frame)``, which may be called twice."""
         module, means = self._native(), inputs.means
         device, n = means.device, len(means)
         if device.type != ("cpu" if module.EMULATED else "cuda"):
@@ -218,8 +209,6 @@ class CudaRasterizer(KernelRasterizer):
             capturing = device.type == "cuda" and torch.cuda.is_current_stream_capturing()
             counts, place = self._counts, self._counts.place(device)
             sent = None if capturing else counts.send(totals)
-            if not capturing:
-                counts.settle(place, remaining=0 if waits else _AHEAD - 1)
             guess = counts.guess(place)
             if guess is None:
                 if sent is None:
@@ -231,9 +220,6 @@ class CudaRasterizer(KernelRasterizer):
             draw(frame)
             if sent is None:
                 self._captured.append((totals, capacity))
-                frame.num_nonfinite = UNKNOWN
-            elif not waits:
-                counts.leave(place, sent, capacity)
                 frame.num_nonfinite = UNKNOWN
             else:
                 pairs, frame.num_nonfinite = counts.receive(sent)
@@ -282,23 +268,6 @@ class CudaRasterizer(KernelRasterizer):
         frame.native.bin(*lasting, temporary, memory(capacity), memory(capacity), cuda_extension.stream(device))
         frame.pairs = lasting
         return capacity
-
-
-class CudaAheadRasterizer(CudaRasterizer):
-    """Does not wait for the number of pairs of a drawing that wants gradients, but for that of the fourth before it.
-
-    Where a drawing has more pairs than there is memory for, its farthest surfels are missing and all its gradients are
-    0 (``lost`` counts those). The largest number of pairs so far is never forgotten, lest a view
-    that is larger than the others be lost again and again. Other drawings are as ``CudaRasterizer``'s.
-    """
-
-    _waits = False
-    _fading = 1.0
-
-    @property
-    def lost(self) -> int:
-        """How many drawings had more pairs than memory, as far as it is known by now."""
-        return self._counts.lost
 
 
 def _tiles(camera: Camera) -> int:

@@ -5,7 +5,6 @@ Only the GPU knows; the host guesses from the drawings before, so that there is 
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 from threading import get_ident
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+_FADING = 0.98  # of the largest number of pairs so far, a drawing
 _SPARE = 1.25  # memory for so many times as many pairs as the largest drawing so far had
 _STEP = 1 << 14  # pairs, or an eighth of the power of two below: few different sizes leave torch's allocator no holes
 
@@ -21,27 +21,17 @@ Place = tuple[torch.device, int]  # a GPU and a thread: what a viewer draws mean
 
 @dataclass
 class Sent:
-    """A drawing's numbers on their way to the host: of pairs, and of surfels that are not finite.
-
-    capacity: for how many pairs there was memory, if the host did not wait to know whether that is enough.
-    """
+    """A drawing's numbers on their way to the host: of pairs, and of surfels that are not finite."""
 
     numbers: Tensor
     event: Any
-    capacity: int = 0
 
 
 class PairCounts:
-    """The largest number of pairs so far, and numbers that the host has not waited for.
+    """Remembers the largest number of pairs so far, which fades with each drawing."""
 
-    fading: what becomes of that largest number with each drawing, as a factor.
-    """
-
-    def __init__(self, fading: float) -> None:
-        self.fading = fading
-        self.lost = 0  # drawings that there was too little memory for, of those not waited for
+    def __init__(self) -> None:
         self._largest: dict[Place, float] = {}
-        self._pending: dict[Place, deque[Sent]] = {}
 
     def largest(self) -> int:
         """Of any GPU and thread; 0 before the first drawing."""
@@ -58,7 +48,7 @@ class PairCounts:
 
     def learn(self, place: Place, pairs: int) -> None:
         """How many pairs a drawing had."""
-        self._largest[place] = max(self._largest.get(place, 0.0) * self.fading, float(pairs))
+        self._largest[place] = max(self._largest.get(place, 0.0) * _FADING, float(pairs))
 
     def send(self, totals: Tensor) -> Sent:
         """Start to copy the two numbers of a drawing to the host."""
@@ -76,20 +66,6 @@ class PairCounts:
             sent.event.synchronize()
         pairs, nonfinite = sent.numbers.tolist()
         return pairs, nonfinite
-
-    def leave(self, place: Place, sent: Sent, capacity: int) -> None:
-        """Do not wait for a drawing that there was so much memory for; ``settle`` will."""
-        sent.capacity = capacity
-        self._pending.setdefault(place, deque()).append(sent)
-
-    def settle(self, place: Place, remaining: int = 0) -> None:
-        """Learn from the drawings that were left there, but for the last ``remaining`` ones."""
-        pending = self._pending.get(place, ())
-        while len(pending) > remaining:
-            sent = pending.popleft()  # type: ignore[union-attr]
-            pairs, _ = self.receive(sent)
-            self.learn(place, pairs)
-            self.lost += pairs > sent.capacity
 
 
 def capacity_for(pairs: float) -> int:

@@ -2,7 +2,7 @@
 // race_in_kernel barrier|none|blocks|atomic
 #include <cstring>
 
-#include "../../beags_plugin/native/cuda/platform.h"
+#include "cuda/platform.h"
 
 namespace {
 

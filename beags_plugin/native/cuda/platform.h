@@ -1,4 +1,4 @@
-// What the kernels need of CUDA, or of its emulation on the CPU (BEAGS_CUDA_EMULATION).
+// Provides what the kernels need of CUDA, or of its emulation on the CPU (BEAGS_CUDA_EMULATION).
 #pragma once
 
 #include <algorithm>
@@ -7,7 +7,7 @@
 
 #if defined(BEAGS_CUDA_EMULATION)
 
-#include "host_emulation.h"
+#include "cuda/emulation/host_emulation.h"
 
 namespace beags {
 namespace cuda {
@@ -21,7 +21,7 @@ V load_now(const V* at) {
 }
 }  // namespace cuda
 }  // namespace beags
-// Runs `kernel`, a plain name, on `blocks` blocks (none is allowed).
+// Launches `kernel`, a plain name, on `blocks` blocks (0 is allowed).
 #define BEAGS_LAUNCH(kernel, blocks, threads, stream, ...) \
   ((void)(stream), ::beags::emulation::launch((blocks), (threads), [&] { kernel(__VA_ARGS__); }))
 
@@ -41,7 +41,7 @@ inline void check(cudaError_t status, const char* what) {
 inline void fill_bytes(void* to, int value, size_t bytes, Stream stream) {
   if (bytes) check(cudaMemsetAsync(to, value, bytes, stream), "filling memory");
 }
-// What other threads may be changing by atomic operations.
+// Reads a value that other threads may be changing by atomic operations.
 template <class V>
 __device__ __forceinline__ V load_now(const V* at) {
   return *static_cast<const volatile V*>(at);
@@ -77,7 +77,7 @@ BEAGS_DEVICE T least(T a, T b) {
   return b < a ? b : a;
 }
 
-// The sum over a warp, in every lane.
+// Returns the sum over a warp, to every lane.
 template <class V>
 BEAGS_DEVICE V warp_sum(V value) {
   for (int step = kWarpThreads / 2; step > 0; step /= 2) value += __shfl_xor_sync(kWholeWarp, value, step);

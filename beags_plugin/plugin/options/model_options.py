@@ -27,7 +27,7 @@ class BeagsModelConfig(ModelConfig):
 
     _target: type = field(default_factory=lambda: load("beags_plugin.plugin.model:BeagsModel"))
     rasterizer: str = "auto"
-    """Backend: auto, native, torch, cuda, cuda-ahead (docs/cuda.md), or one that another package registers."""
+    """Backend: auto, native, torch, cuda (docs/cuda.md), or one that another package registers."""
     sh_degree: int = 3
     """Highest degree of the colour's spherical harmonics (0..3)."""
     sh_degree_interval: int = 1000

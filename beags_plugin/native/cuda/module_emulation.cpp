@@ -1,8 +1,0 @@
-// The CUDA backend's kernels on the CPU, for tests: the module beags_plugin._cuda_emulation.
-#include "module_cuda.h"
-
-NB_MODULE(_cuda_emulation, m) {
-  nanobind::set_leak_warnings(false);
-  m.doc() = "The CUDA kernels run by an emulation of CUDA on the CPU: for tests, not for use.";
-  beags::bind_cuda(m);
-}

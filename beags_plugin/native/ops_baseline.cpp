@@ -1,3 +1,0 @@
-// The ops' kernels for any processor.
-#define BEAGS_ISA baseline
-#include "op_tables.h"

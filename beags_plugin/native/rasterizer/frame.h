@@ -1,0 +1,95 @@
+// Holds one view of one set of Gaussians: projected and binned once, then rendered, differentiated or queried.
+#pragma once
+
+#include <vector>
+
+#include "rasterizer/binning.h"
+#include "rasterizer/projection.h"
+#include "rasterizer/scratch.h"
+#include "rasterizer/surfel_inputs.h"
+#include "rasterizer/types.h"
+
+namespace beags {
+
+// Below about 0.3 ms of work, a team of threads costs more than it saves.
+constexpr int64_t kTeamSurfels = 2000;  // projecting one takes a tenth of a microsecond
+constexpr int64_t kTeamPairs = 500;     // rendering one takes most of a microsecond
+
+// Null: not wanted. The others are zero on entry: Gaussians that were not rendered are left alone.
+template <class T>
+struct InputGradients {
+  T *means, *quats, *log_scales, *opacity_logits, *colors, *screen_shift, *background;
+};
+
+// The amount of work; see Work.
+struct WorkCounts {
+  int64_t lanes, contributing;
+  int64_t tile_pairs;  // (tile, Gaussian) pairs that are kept
+  int64_t box_pairs;   // those that the usual bounds, boxes of 3.33 standard deviations, would give
+};
+
+// The contributions of Gaussians to classes that are not zero: key = Gaussian * num_classes + class, ascending.
+template <class T>
+struct Contributions {
+  std::vector<int64_t> keys;
+  std::vector<T> values;
+};
+
+template <class T>
+class Frame {
+ public:
+  // visible: [N], set to whether a Gaussian is rendered and its box touches the image.
+  Frame(const View& view, const Inputs<T>& inputs, bool* visible, int threads);
+
+  int64_t num_nonfinite() const { return num_nonfinite_; }
+  int64_t num_pairs() const { return bins_.tile_start.back(); }
+  int64_t num_surfels() const { return num_surfels_; }
+  const View& view() const { return view_; }
+
+  // Renders. background: [3]; target: [height, width] or null. keep: for a later `backward`.
+  void forward(const Images<T>& images, const T* background, const int32_t* target, bool keep, int threads);
+  // Computes the gradients, once after `forward`, with the same inputs and target.
+  void backward(const Inputs<T>& inputs, const int32_t* target, const Images<const T>& from,
+                const InputGradients<T>& to, int threads) const;
+
+  // Sums w by Gaussian and label. labels: [height, width]; out: [N, num_classes], zero on entry. Labels outside 0 ..
+  // num_classes - 1 do not count.
+  void class_contributions(const int32_t* labels, int num_classes, T* out, int threads) const;
+  // Returns the same as a list, whose size does not depend on the number of classes.
+  Contributions<T> sparse_class_contributions(const int32_t* labels, int num_classes, int threads) const;
+  // Finds each pixel's class. classes, share: [height, width]. Class ids lie in 0 .. num_classes - 1.
+  void class_map(int num_classes, int32_t* classes, T* share, int threads) const;
+  void dominant_gaussian(int32_t* indices, int threads) const;
+  WorkCounts work_counts(int threads) const;
+
+ private:
+  // The contribution of each record to each label that its tile holds.
+  struct LabelSums {
+    std::vector<std::vector<int32_t>> tile_labels;
+    std::vector<T> sums;
+    std::vector<int64_t> row_of;   // [records], where the sums of a record start, in the order of its tile's labels
+    std::vector<int32_t> tile_of;  // [records]
+  };
+  LabelSums label_sums(const int32_t* labels, int num_classes, int threads) const;
+  Job<T> job() const;
+  int tiles() const { return tiles_x_ * tiles_y_; }
+  // Calls work(tile) for every tile; idle threads take the next one.
+  template <class Work>
+  void for_each_tile(int threads, Work work) const {
+    const int team = num_pairs() < kTeamPairs ? 1 : threads;
+#pragma omp parallel for num_threads(team) schedule(dynamic, 1)
+    for (int tile = 0; tile < tiles(); ++tile) work(tile);
+  }
+  void reduce(const Inputs<T>& inputs, const T* records, int size, const InputGradients<T>& to, int threads) const;
+
+  View view_;
+  int tiles_x_, tiles_y_;
+  int64_t num_surfels_, num_nonfinite_ = 0;
+  Scratch<Splat<T>> splats_;
+  Bins bins_;
+  T background_[3] = {};
+  Scratch<T> kept_;  // what `saved_` points to
+  Saved<T> saved_ = {};
+};
+
+}  // namespace beags

@@ -1,0 +1,3 @@
+// Compiles the tile kernels for any processor.
+#define BEAGS_ISA baseline
+#include "rasterizer/tiles.h"

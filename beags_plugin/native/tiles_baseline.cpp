@@ -1,3 +1,0 @@
-// The tile kernels for any processor.
-#define BEAGS_ISA baseline
-#include "tiles.h"

@@ -1,5 +1,0 @@
-// The tile kernels for 64-bit Arm processors; empty elsewhere.
-#define BEAGS_ISA neon
-#if defined(__aarch64__)
-#include "tiles.h"
-#endif

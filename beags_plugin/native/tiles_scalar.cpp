@@ -1,4 +1,0 @@
-// The tile kernels for any processor, without SIMD: what the others are measured against.
-#define BEAGS_ISA scalar
-#define BEAGS_SCALAR
-#include "tiles.h"
