@@ -10,6 +10,7 @@ from pathlib import Path
 from tempfile import gettempdir
 from typing import TYPE_CHECKING, Any, cast
 
+from filelock import BaseFileLock
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
@@ -27,7 +28,7 @@ from beags_plugin.plugin.training.warm_start import check_start, start_from_scen
 from beags_plugin.system import processes
 from beags_plugin.system.errors import UserError, is_of_disk, refused
 from beags_plugin.system.interrupts import Interrupts, stop
-from beags_plugin.system.lock import RunLock, run_lock
+from beags_plugin.system.lock import run_lock
 from beags_plugin.system.memory import memory_mb, peak_memory_mb
 from beags_plugin.system.reading.text import reason
 from beags_plugin.system.whole_files import remove_unfinished
@@ -49,7 +50,7 @@ class BeagsTrainer(Trainer):
         config.max_num_iterations = self.last_step
         self.curve: HeldOutCurve | None = None
         self._interrupts = Interrupts(self._go_on)
-        self._lock: RunLock | None = None
+        self._lock: BaseFileLock | None = None
         self._watch = MemoryWatch(config.machine.device_type)
         self._done = 0  # the last step that was trained
         self._complete = False
