@@ -1,4 +1,4 @@
-"""Whether the rasterizers draw."""
+"""Checks that the rasterizers render."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ REBUILD = "pip install --force-reinstall --no-deps ."
 
 
 def rasterizers() -> list[Callable[[], Check]]:
-    """A check of every backend that is registered."""
+    """Return a check of every backend that is registered."""
     try:
         from beags_plugin.rasterizers import RASTERIZERS
 
@@ -28,7 +28,7 @@ def rasterizers() -> list[Callable[[], Check]]:
 
 
 def rasterizer(name: str) -> Check:
-    """Whether a backend can run; all but the torch one are tried."""
+    """Check whether a backend can run; all but the torch one are tried."""
     from beags_plugin.rasterizers import RASTERIZERS
 
     title, required = f"rasterizer {name}", name == "torch"
