@@ -28,7 +28,7 @@ from beags_plugin.plugin.runs.layout import (
     write_run,
     write_text_atomically,
 )
-from beags_plugin.plugin.runs.prepared_grid import read_grid
+from beags_plugin.plugin.runs.prepared import read_grid
 from beags_plugin.plugin.training.scene_edits import edit_scene
 from beags_plugin.preparation.pipeline import Preparation, prepare
 from beags_plugin.preparation.stages import StageStore

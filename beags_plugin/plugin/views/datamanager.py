@@ -20,7 +20,6 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import track
 from torch import Tensor
 
-import beags_plugin.plugin.nerfstudio_patches  # noqa: F401  (checkpoints load again)
 from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE, objects_in
 from beags_plugin.labels.label_maps import PackedMap, narrowed, widened
