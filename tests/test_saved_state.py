@@ -37,7 +37,7 @@ def test_a_whole_scene_passes():
         ({"gauss_params__means": torch.ones(2, 3, dtype=torch.complex64)}, "means holds torch.complex64"),
         ({"gauss_params__features_rest": torch.zeros(2, 3, 3, dtype=torch.int32)}, "features_rest holds torch.int32"),
         ({"gauss_params__features_rest": torch.zeros(2, 4, 3)}, "4 colour bands"),
-        ({"gauss_params__quats": torch.ones(3, 4)}, r"quats is \[3, 4\]"),
+        ({"gauss_params__quats": torch.ones(3, 4)}, r"quats is \[3, 4\], not \[2, 4\]"),
         ({"gauss_params__scales": None}, "scales is missing"),
         ({"extent": torch.tensor(1 + 2j)}, "extent holds torch.complex64"),
         ({"class_margin": torch.ones(2, dtype=torch.complex64)}, "class_margin holds"),

@@ -33,7 +33,7 @@ def _wrong(state: Mapping[str, Any]) -> str | None:
         if not isinstance(value, Tensor):
             return f"{name} is missing"
         if value.dim() != len(shape) or any(a not in (b, None) for a, b in zip(shape, value.shape, strict=True)):
-            return f"{name} is {list(value.shape)}"
+            return f"{name} is {list(value.shape)}, not {list(shape)}"
         if value.is_complex() or value.is_floating_point() == (name in _NOT_FLOATS):
             return f"{name} holds {value.dtype}"
     if (bands := state["gauss_params.features_rest"].shape[1]) not in (0, 3, 8, 15):
