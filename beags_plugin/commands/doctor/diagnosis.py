@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import shutil
 import sys
@@ -23,7 +22,7 @@ _REPAIRS = {  # by the name of what cannot even be looked at
 
 def diagnose() -> list[Check]:
     """Look at everything beags uses; never fails, whatever is missing or broken."""
-    checks = [_python, _torch, _nerfstudio, _presets, _opencv, _open3d, _cpu, _cuda, _nvcc, *rasterizers()]
+    checks = [_python, _torch, _nerfstudio, _presets, _opencv, _open3d, _cuda, _nvcc, *rasterizers()]
     return [_safely(check) for check in checks]
 
 
@@ -84,11 +83,9 @@ def _nerfstudio() -> Check:
 
     import nerfstudio  # noqa: F401
 
-    found = version("nerfstudio")
-    if found != "1.1.5":
-        sentence = f"{found}, but the plugin is made for 1.1.5: run make setup"
-        return Check("nerfstudio", False, sentence, repair=_REPAIRS["nerfstudio"])
-    return Check("nerfstudio", True, found)
+    ok = (found := version("nerfstudio")) == "1.1.5"
+    sentence = found if ok else f"{found}, but the plugin is made for 1.1.5"
+    return Check("nerfstudio", ok, sentence, repair="" if ok else _REPAIRS["nerfstudio"])
 
 
 def _presets() -> Check:
@@ -104,28 +101,19 @@ def _opencv() -> Check:
     import cv2
 
     # Plain opencv installed over contrib leaves an empty ximgproc, so look for the function itself.
-    if not hasattr(getattr(cv2, "ximgproc", None), "guidedFilter"):
-        advice = "reinstall opencv-contrib-python-headless==4.10.0.84 last"
-        sentence = f"{cv2.__version__} without cv2.ximgproc.guidedFilter: {advice}"
-        return Check("opencv contrib", False, sentence, repair=_OPENCV)
-    return Check("opencv contrib", True, f"{cv2.__version__} with cv2.ximgproc.guidedFilter")
+    ok = hasattr(getattr(cv2, "ximgproc", None), "guidedFilter")
+    sentence = f"{cv2.__version__} {'with' if ok else 'without'} cv2.ximgproc.guidedFilter"
+    return Check("opencv contrib", ok, sentence, repair="" if ok else _OPENCV)
 
 
 def _open3d() -> Check:
     try:
         import open3d
     except Exception as error:
-        advice = "ns-export and exported meshes need it; version 0.19.0 needs the system libraries libX11 and libGL"
         absent = isinstance(error, ModuleNotFoundError)
         repair = "pip install open3d==0.19.0" if absent else "apt install libx11-6 libgl1"
-        return Check("open3d", False, f"{first_line(error)}; {advice}", False, repair)
+        return Check("open3d", False, f"{first_line(error)}; exported meshes need it", False, repair)
     return Check("open3d", True, open3d.__version__, False)
-
-
-def _cpu() -> Check:
-    cores = os.cpu_count() or 1
-    waiting = os.environ.get("OMP_WAIT_POLICY", "unset")
-    return Check("CPU", True, f"{cores} cores; OMP_WAIT_POLICY is {waiting} (PASSIVE is best where others compute too)")
 
 
 def _cuda() -> Check:

@@ -49,12 +49,12 @@ def grid_state(path: Path, mmap: bool = False) -> dict[str, Any]:
 
 
 def _is_grid(state: dict[str, Any]) -> bool:
-    size, origin, count, keys, classes = (
-        state.get(name) for name in ("voxel_size", "origin", "num_classes", "keys", "classes")
-    )
+    found = [state.get(name) for name in ("voxel_size", "origin", "num_classes", "keys", "classes")]
+    if len(parts := [part for part in found if isinstance(part, Tensor)]) < len(found):
+        return False
+    size, origin, count, keys, classes = parts
     return (
-        all(isinstance(part, Tensor) for part in (size, origin, count, keys, classes))
-        and (size.numel(), count.numel(), *origin.shape) == (1, 1, 3)
+        (size.numel(), count.numel(), *origin.shape) == (1, 1, 3)
         and size.is_floating_point()
         and 0 < float(size) < math.inf
         and (count.dtype, keys.dtype, classes.dtype) == (torch.int64, torch.int64, torch.int32)
