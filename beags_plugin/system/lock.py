@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from weakref import WeakValueDictionary
 
 from filelock import BaseFileLock, FileLock, Timeout
 
@@ -11,15 +12,17 @@ from beags_plugin.system.errors import UserError, writing
 LOCK = ".lock"
 """File of a run's folder, locked by the process that trains there; the file alone means nothing."""
 
+_held: WeakValueDictionary[Path, BaseFileLock] = WeakValueDictionary()  # by this process
 _ahead: dict[Path, BaseFileLock] = {}
 
 
 def lock_ahead(run: Path) -> None:
-    """Hold ``run`` for a training that this process has yet to begin; ``run_lock`` takes the lock over.
+    """Hold ``run`` for a training of this process, which may have yet to begin; ``run_lock`` takes the lock over.
 
     Raises ``UserError`` if another process holds it.
     """
-    if run.absolute() not in _ahead:
+    held = _held.get(run.absolute())
+    if held is None or not held.is_locked:
         _ahead[run.absolute()] = run_lock(run)
 
 
@@ -40,4 +43,5 @@ def run_lock(run: Path) -> BaseFileLock:
         except OSError as error:
             if error.filename is not None:  # the file cannot be opened; without a name: some network disks
                 raise
+    _held[run.absolute()] = lock
     return lock
