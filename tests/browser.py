@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import shutil
 import signal
 import subprocess
 import tempfile
@@ -15,13 +16,17 @@ from pathlib import Path
 import pytest
 from websockets.sync.client import connect
 
-from beags_plugin.commands.doctor.diagnosis import browser
 from beags_plugin.system.child_processes import bound
 
 _FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-gpu-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist", "--hide-scrollbars", "--no-first-run", "--mute-audio", "--remote-debugging-port=0",
 )  # fmt: skip
+
+
+def browser() -> str | None:
+    """Return the program of a Chromium, or None."""
+    return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 
 NEEDED = pytest.mark.skipif(

@@ -130,12 +130,12 @@ def test_a_demo_that_was_killed_goes_on(tmp_path, monkeypatch):
 
 
 def test_a_demo_that_is_under_way_is_left_alone(tmp_path, monkeypatch):
-    from beags_plugin.system.lock import RunLock
+    from beags_plugin.system.lock import run_lock
 
     data, run = write_scene(tmp_path / "data"), tmp_path / "out/run"
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / STAMP).write_text("{}")
-    lock = RunLock(run)
+    lock = run_lock(run)
     with pytest.raises(UserError, match="being trained by another process"):
         demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, True)
     assert run.is_dir()

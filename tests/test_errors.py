@@ -13,7 +13,6 @@ import torch
 from beags_plugin.system.errors import UserError, writing
 
 PROGRAM = """
-import beags_plugin.plugin
 from beags_plugin.system.errors import UserError, print_user_errors_plainly
 print_user_errors_plainly()
 raise {error}
@@ -38,9 +37,11 @@ def test_other_errors_keep_their_traceback():
 
 CURVES = """
 import errno, sys, threading
-import beags_plugin.plugin
+from beags_plugin.system.errors import print_user_errors_plainly
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 from tensorboard.summary.writer.record_writer import RecordWriter
+
+print_user_errors_plainly()
 
 def refuse(*_):
     raise {error}

@@ -12,7 +12,7 @@ from plyfile import PlyData, PlyElement
 from start_scenes import a_frame, in_frame, write_splatfacto
 from test_extraction import a_rotation, random_surfels
 
-import beags_plugin.plugin.nerfstudio_patches  # noqa: F401  (checkpoints hold numpy scalars)
+import beags_plugin.plugin  # noqa: F401  (checkpoints hold numpy scalars)
 from beags_plugin.core.flattening import Gaussians, flatten, flattening, without_empty_bands
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.sh import sh_colors

@@ -8,7 +8,7 @@ import torch
 pytest.importorskip("nerfstudio")
 
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.plugin.runs.prepared_grid import read_grid
+from beags_plugin.plugin.runs.prepared import read_grid
 from beags_plugin.system.errors import UserError
 
 
@@ -28,28 +28,24 @@ def test_a_grid_and_no_grid_are_read_as_they_were_written(tmp_path):
 @pytest.mark.parametrize("content", [torch.zeros(2), torch.zeros(()), None, 0, [], "grid"], ids=repr)
 def test_what_is_no_table_is_refused(tmp_path, content):
     torch.save(content, tmp_path / "grid.pt")
-    with pytest.raises(UserError, match=r"grid.pt is damaged \(it is no table\): restore it"):
+    with pytest.raises(UserError, match="grid.pt is damaged: restore it"):
         read_grid(tmp_path / "grid.pt")
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "words"),
+    ("name", "value"),
     [
-        ("voxel_size", torch.tensor(1 + 2j), "no length"),
-        ("voxel_size", torch.tensor(float("nan")), "no length"),
-        ("voxel_size", torch.tensor(0.0), "no length"),
-        ("origin", torch.zeros(3, dtype=torch.complex64), "no point"),
-        ("origin", torch.full((3,), float("inf")), "no point"),
-        ("num_classes", torch.tensor(2.5), "no number of classes"),
-        ("num_classes", torch.tensor(1 + 0j), "no number of classes"),
-        ("num_classes", torch.tensor(70_000), "no number of classes"),
-        ("keys", torch.zeros(2), "do not fit together"),
-        ("classes", torch.zeros(3, dtype=torch.int32), "do not fit together"),
-        ("classes", torch.tensor([1, -1], dtype=torch.int32), "classes are none"),
-        ("classes", None, "has no classes"),
+        ("voxel_size", torch.tensor(1 + 2j)),
+        ("voxel_size", torch.tensor(float("nan"))),
+        ("voxel_size", torch.tensor(0.0)),
+        ("origin", torch.zeros(2)),
+        ("num_classes", torch.tensor(2.5)),
+        ("keys", torch.zeros(2)),
+        ("classes", torch.zeros(3, dtype=torch.int32)),
+        ("classes", None),
     ],
 )
-def test_a_damaged_part_is_named(tmp_path, name, value, words):
+def test_a_damaged_grid_is_refused(tmp_path, name, value):
     torch.save({**grid().state_dict(), name: value}, tmp_path / "grid.pt")
-    with pytest.raises(UserError, match=words):
+    with pytest.raises(UserError, match="grid.pt is damaged: restore it"):
         read_grid(tmp_path / "grid.pt")

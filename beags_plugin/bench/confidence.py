@@ -19,7 +19,7 @@ from beags_plugin.labels.colors import colorize
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from beags_plugin.plugin.runs.training_masks import TrainingMasks
+    from beags_plugin.plugin.runs.prepared import TrainingMasks
 
 SHOWN_DAMAGE = 2.0  # the degree that is shown, or the one nearest to it
 VIEWS = 2  # of each scene: the one that changed most, and one that had no mask
@@ -54,8 +54,8 @@ def _distance(run: Run) -> float:
 
 
 def _views(run: Run, outcomes: Mapping[str, Outcome]) -> list[TrainingMasks]:
+    from beags_plugin.plugin.runs.prepared import training_masks
     from beags_plugin.plugin.runs.run_config import load_run_config
-    from beags_plugin.plugin.runs.training_masks import training_masks
 
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
         views = training_masks(load_run_config(outcomes[run.trial.digest].folder / "run/config.yml"))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from beags_plugin.labels.class_ids import IGNORE
 
 if TYPE_CHECKING:
-    from beags_plugin.plugin.runs.training_masks import TrainingMasks
+    from beags_plugin.plugin.runs.prepared import TrainingMasks
 
 
 def measure_run(config_path: Path) -> dict[str, Any]:
@@ -19,8 +19,8 @@ def measure_run(config_path: Path) -> dict[str, Any]:
     this very run, which is what assignment alone gives. mask_error_...: see ``mask_errors``.
     """
     from beags_plugin.plugin.objects.evaluate import evaluate_run
+    from beags_plugin.plugin.runs.prepared import training_masks
     from beags_plugin.plugin.runs.run_config import load_run_config
-    from beags_plugin.plugin.runs.training_masks import training_masks
 
     found = evaluate_run(config_path).to_json()
     evaluation = {name: value for name, value in found.items() if name not in ("masks", "views")}

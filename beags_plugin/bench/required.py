@@ -67,7 +67,7 @@ def load(config: Path) -> Scene:
     """Read the run, its data and what its preparation kept."""
     from beags_plugin.plugin.objects.evaluate import EvaluatedRun
     from beags_plugin.plugin.runs.layout import last_prepared
-    from beags_plugin.plugin.runs.prepared_grid import grid_state
+    from beags_plugin.plugin.runs.prepared import grid_state
 
     run = EvaluatedRun(config)
     after: SavedScene = run.stages["after"]

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import json
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from filelock import AcquireReturnProxy, FileLock
 
 from beags_plugin.bench.trials import Trial
 from beags_plugin.system.errors import writing
@@ -55,7 +55,7 @@ def run_trials(
 def _run(trial: Trial, folder: Path, base: Outcome | None, worker: Worker) -> Outcome:
     if base is not None and base.failed is not None:
         return Outcome(folder, None, f"its base failed: {base.failed}")
-    with _locked(folder):
+    with _lock(folder):
         if (result := _read(folder / "result.json")) is not None:
             return Outcome(folder, result)
         if folder.exists():
@@ -129,15 +129,11 @@ def _environment() -> dict[str, str]:
     return {"OMP_WAIT_POLICY": "PASSIVE", **os.environ, "PYTHONPATH": os.pathsep.join(paths), "COLUMNS": "160"}
 
 
-@contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Two programs that want the same trial: the second waits, and finds it done."""
+def _lock(folder: Path) -> AcquireReturnProxy:
+    """Make the second of two programs that want the same trial wait, and find it done."""
     with writing(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
-        file = open(folder.parent / f".{folder.name}.lock", "w")  # noqa: SIM115  (closed below)
-    with file as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
+        return FileLock(folder.parent / f".{folder.name}.lock").acquire()
 
 
 def _read(path: Path) -> dict[str, Any] | None:

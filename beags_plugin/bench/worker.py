@@ -141,7 +141,7 @@ def _gaussians(config: BeagsTrainerConfig) -> int:
 
 
 def _voxel_size(grid: Path) -> float | None:
-    from beags_plugin.plugin.runs.prepared_grid import grid_state
+    from beags_plugin.plugin.runs.prepared import grid_state
 
     state = grid_state(grid)
     return float(state["voxel_size"]) if state else None

@@ -56,7 +56,7 @@ class Resume:
     """Go on here instead of where it was begun; the result is then no longer the same in every bit."""
 
     check_memory: bool = True
-    """Stop where memory or disk will not do."""
+    """Do not begin where hardly any memory or disk is free; save and stop when memory runs out."""
 
     def run(self) -> None:
         from beags_plugin.plugin.runs.launch import resume
@@ -231,30 +231,20 @@ class Bench:
 class Doctor:
     """Say what this installation can do, what is missing, and the one command that repairs each.
 
-    With --data: how much memory and disk a training on it will take, and whether they are there.
+    With --data: whether the scene can be read too, and how much memory and disk are free to train on it.
     """
 
     data: Path | None = None
     """Folder of a scene (or a transforms .json)."""
-
-    preset: str = "beags"
-    """Preset that it would be trained with."""
-
-    downscale_factor: float = 1.0
-    """Divide the images' width and height by this."""
 
     json: Path | None = None
     """File for the same."""
 
     def run(self) -> None:
         from beags_plugin.commands.doctor.check import print_report
-        from beags_plugin.commands.doctor.diagnosis import diagnose
+        from beags_plugin.commands.doctor.diagnosis import checks_of_data, diagnose
 
-        checks = diagnose()
-        if self.data is not None:
-            from beags_plugin.plugin.training.memory_guard import checks_of_run
-
-            checks += checks_of_run(self.data, self.preset, self.downscale_factor)
+        checks = diagnose() + (checks_of_data(self.data) if self.data is not None else [])
         write_json(self.json, [check.to_json() for check in checks])
         print_report(checks)
 

@@ -18,7 +18,7 @@ from rich.console import Console
 from beags_plugin.system.child_processes import bound
 from beags_plugin.system.digests import code_digest, folder_digest, value_digest
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.lock import RunLock
+from beags_plugin.system.lock import run_lock
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_whole
 
@@ -70,7 +70,7 @@ def run_demo(
     else:
         if run.is_dir():
             _check_own(output)  # before anything is written there
-            RunLock(run).release()  # says so if the same demo is being trained
+            run_lock(run).release()  # says so if the same demo is being trained
         if not fresh and _broken_off(output, request):
             resume(run)
         else:

@@ -1,17 +1,9 @@
-"""What is changed in nerfstudio 1.1.5: its own checkpoints load again, and its viewer listens on this machine alone.
-
-Importing this module applies it.
-"""
+"""Lets torch load the checkpoints that nerfstudio 1.1.5 writes; importing this module applies it."""
 
 from __future__ import annotations
 
-import inspect
-
 import numpy as np
 import torch
-from nerfstudio.configs.base_config import ViewerConfig
-
-LOCAL = "127.0.0.1"
 
 
 def allow_numpy_scalars_in_checkpoints() -> None:
@@ -27,19 +19,4 @@ def allow_numpy_scalars_in_checkpoints() -> None:
     add([scalar, np.dtype, type(np.dtype("float64")), type(np.dtype("float32"))])
 
 
-def listen_on_this_machine() -> None:
-    """Let ``ns-viewer`` listen on 127.0.0.1 unless it is told ``--viewer.websocket-host``: nerfstudio's 0.0.0.0 lets
-    everyone on the network look, and press the viewer's buttons.
-
-    ``ns-train`` follows the configs of methods, and nerfstudio has made those of its own before.
-    """
-    fields = getattr(ViewerConfig, "__dataclass_fields__")  # noqa: B009  (type checkers do not know it)
-    fields["websocket_host"].default = ViewerConfig.websocket_host = LOCAL
-    start = ViewerConfig.__init__
-    names = [name for name, each in inspect.signature(start).parameters.items() if each.default is not each.empty]
-    defaults = dict(zip(names, start.__defaults__ or (), strict=True))
-    start.__defaults__ = tuple({**defaults, "websocket_host": LOCAL}.values())
-
-
 allow_numpy_scalars_in_checkpoints()
-listen_on_this_machine()

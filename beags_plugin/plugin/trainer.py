@@ -10,6 +10,7 @@ from pathlib import Path
 from tempfile import gettempdir
 from typing import Any, cast
 
+from filelock import BaseFileLock
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
@@ -19,7 +20,7 @@ from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.options.machine import check_machine
 from beags_plugin.plugin.runs.layout import PREPARED, REPORT_FILE, STAGES
 from beags_plugin.plugin.training.checkpoints import Checkpoints
-from beags_plugin.plugin.training.memory_guard import NO_MEMORY, MemoryWatch, check_memory, forecast, is_out_of_memory
+from beags_plugin.plugin.training.memory_guard import NO_MEMORY, MemoryWatch, check_room, is_out_of_memory
 from beags_plugin.plugin.training.monitor import HeldOutCurve
 from beags_plugin.plugin.training.optimizers import SceneOptimizer
 from beags_plugin.plugin.training.replicas import Rank
@@ -31,8 +32,8 @@ from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system import processes
 from beags_plugin.system.errors import UserError, is_of_disk, refused
 from beags_plugin.system.interrupts import Interrupts, stop
-from beags_plugin.system.lock import RunLock, run_lock
-from beags_plugin.system.memory import memory_mb, peak_memory_mb
+from beags_plugin.system.lock import run_lock
+from beags_plugin.system.memory import peak_memory_mb
 from beags_plugin.system.reading.text import reason
 from beags_plugin.system.whole_files import remove_unfinished, write_text_atomically
 
@@ -49,7 +50,7 @@ class BeagsTrainer(Trainer):
         self.curve: HeldOutCurve | None = None
         self.seconds = StageSeconds()
         self._interrupts = Interrupts(self._go_on)
-        self._lock: RunLock | None = None
+        self._lock: BaseFileLock | None = None
         self._watch = MemoryWatch(config.machine.device_type)
         self._done = 0  # the last step that was trained
         self._complete = False
@@ -75,7 +76,8 @@ class BeagsTrainer(Trainer):
             used = any((self.base_dir / self.config.logging.relative_log_dir).glob("events.out.tfevents.*"))
             super().setup(test_mode)
             self._rank.start_alike(self._model)
-            self._check_memory()
+            if self.config.check_memory and processes.rank() == 0:
+                check_room(self.base_dir, self.config.machine.device_type)
             if used:
                 self._forget_events()
         except UserError as error:
@@ -92,16 +94,6 @@ class BeagsTrainer(Trainer):
         except BaseException:
             self._release()
             raise
-
-    def _check_memory(self) -> None:
-        """Stop where the run would not fit the machine, hours before it would be ended without a word."""
-        if not self.config.check_memory or processes.rank() > 0:
-            return
-        datamanager = cast(BeagsDataManager, self.pipeline.datamanager)
-        sizes = datamanager.train_dataset.file_sizes, datamanager.eval_dataset.file_sizes
-        points, program = self._model.num_points, memory_mb()
-        grows = self.config.model_config.start_from is None and self._start_step < self.schedule.base_steps
-        check_memory(forecast(self.config, *sizes, points, grows, device=self.device, program=program))
 
     def _told(self, error: OSError) -> UserError:
         """What the system refused where nothing else has told it, as to nerfstudio's own writers; other errors pass."""

@@ -1,4 +1,4 @@
-"""Errors that a user can mend."""
+"""Errors that a user can repair, and errors of the system that become such."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from pathlib import Path
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _OF_DISKS = (*_FULL, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENODEV, errno.ENXIO, errno.ESTALE)
-"""What a disk answers to what is written into an open file; such an error names no file."""
+"""Errors that a disk returns for a write into an open file; such an error names no file."""
 
 
 class UserError(Exception):
-    """A mistake in the input, told in one sentence: which file or value, what is wrong, what to do.
+    """An error in the input, in one sentence: which file or value, what is wrong, what to do.
 
     Command lines print the sentence alone, without a traceback, and end with exit code 2.
 
-    told: whether it has been printed already, by the trainer for the command that started it.
+    told: whether the trainer has printed it already, for the command that started it.
     """
 
     told = False
 
 
 def system_error(error: BaseException) -> OSError | None:
-    """What the operating system refused, if that is why ``error`` was raised.
+    """Return the operating system's error that caused ``error``, if there is one.
 
-    An error that was only raised while another one was handled is a mistake of its own. torch's writer of files is the
-    exception: it cannot close a file whose disk is full, and says that instead.
+    An error that was only raised while another one was handled has no such cause. torch's writer of files is the
+    exception: it cannot close a file whose disk is full, and reports that instead.
     """
     at: BaseException | None = error
     seen: set[int] = set()
@@ -42,12 +42,12 @@ def system_error(error: BaseException) -> OSError | None:
 
 
 def is_of_disk(error: OSError) -> bool:
-    """Whether a disk refused what was written into an open file; other errors without a file are no user's mistake."""
+    """Return whether a disk refused a write into an open file; other errors without a file are defects."""
     return error.errno in _OF_DISKS
 
 
 def unwritable(path: str | Path, error: OSError) -> UserError:
-    """The sentence for a file or folder that the system does not let us write."""
+    """Return the error for a file or folder that the system does not let us write."""
     reason = error.strerror or error
     remedy = "free some space, or choose another place" if error.errno in _FULL else "choose another place"
     return UserError(f"{path} cannot be written ({reason}): {remedy}.")
@@ -55,10 +55,10 @@ def unwritable(path: str | Path, error: OSError) -> UserError:
 
 @contextmanager
 def writing(path: str | Path, what: str = "") -> Iterator[None]:
-    """Tell what the system refuses in the block as a ``UserError`` about ``path``, a file or the folder of many.
+    """Turn the system's errors in the block into a ``UserError`` about ``path``, a file or the folder of many.
 
     what: stands before the path in the sentence. Other errors pass: those of files elsewhere, as when one is read, and
-    those of no file, as of a closed pipe.
+    those without a file, as of a closed pipe.
     """
     try:
         yield
@@ -72,14 +72,14 @@ def writing(path: str | Path, what: str = "") -> Iterator[None]:
 
 
 def _is_below(folder: Path, error: OSError) -> bool:
-    """Whether an error is of a file in ``folder``, as far as it tells."""
+    """Return whether an error is of a file in ``folder``, or names no file and is of a disk."""
     if isinstance(error.filename, (str, os.PathLike)):
         return Path(error.filename).absolute().is_relative_to(folder)
     return is_of_disk(error)
 
 
 def refused(error: OSError) -> UserError | None:
-    """The sentence for what no other place has told; None for an error that names no file and is of no full disk."""
+    """Return the error to print for one that no other handler caught; None if it names no file and no disk is full."""
     if error.filename is not None:
         return UserError(f"{error.filename} cannot be used ({error.strerror}): check that it is there and permitted.")
     if error.errno in _FULL:
@@ -88,12 +88,12 @@ def refused(error: OSError) -> UserError | None:
 
 
 def print_user_errors_plainly() -> None:
-    """Let a ``UserError`` that nobody catches print its sentence instead of a traceback, in programs that are not ours.
+    """Print the sentence of an uncaught ``UserError`` instead of a traceback, in nerfstudio's programs.
 
-    The program then ends with exit code 2. A full disk under tensorboard's files prints nothing in the thread that
-    writes them, which hands the error on to whoever adds the next curve.
+    The program then ends with exit code 2. The thread that writes tensorboard's files prints nothing about a full
+    disk: it hands the error to whoever adds the next curve. Other exceptions are printed as before.
 
-    Calling it again changes nothing; other exceptions go where they went before.
+    Call this when something of ours is set up, not on import: it changes the process. A second call does nothing.
     """
     former = sys.excepthook
     if getattr(former, "prints_user_errors", False):
@@ -102,7 +102,7 @@ def print_user_errors_plainly() -> None:
     def hook(kind, error, traceback) -> None:
         if isinstance(error, UserError):
             print(f"beags: {error}", file=sys.stderr)
-            raise SystemExit(2)  # the interpreter, which would end with 1, takes the code of this
+            raise SystemExit(2)  # the interpreter would end with 1
         else:
             former(kind, error, traceback)
 

@@ -1,4 +1,4 @@
-"""What ends a training before its time: Ctrl-C and SIGTERM, after the step is finished and saved; a user's mistake."""
+"""Early ends of a training: Ctrl-C and SIGTERM, after the step is finished and saved; an error of the user's."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any, NoReturn
 
-from nerfstudio.utils.rich_utils import CONSOLE
+from rich import get_console
 from rich.markup import escape
 
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.processes import is_first
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -19,8 +20,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 class Interrupts:
     """Notes the first signal for the training loop to ask about; a second one ends the program at once.
 
-    at_once: whether the first does so too, as where no step is under way that could be finished. wake: called at the
-    first signal, so that a loop that waits comes to ask.
+    at_once: let the first signal end the program too, as where no step could be finished. wake: called at the first
+    signal, so that a loop that waits looks at ``asked``.
     """
 
     def __init__(self, wake: Callable[[], None] = lambda: None) -> None:
@@ -43,18 +44,18 @@ class Interrupts:
         again, self.asked = self.asked is not None, number
         if again or self.at_once:
             raise KeyboardInterrupt
-        CONSOLE.print("Stopping after this step, and saving it. Once more ends at once.", highlight=False)
+        if is_first():
+            get_console().print("Stopping after this step, and saving it. Once more ends at once.", highlight=False)
         self._wake()
 
     @property
     def exit_code(self) -> int:
-        """What a shell expects of a program that a signal ended."""
+        """Return the exit code that a shell expects of a program that a signal ended."""
         return 128 + (self.asked or signal.SIGINT)
 
 
 def stop(error: UserError) -> NoReturn:
-    """End the program with the sentence of a user's mistake, and exit code 2."""
-    CONSOLE.quiet = False  # as it is in other processes than the first
-    CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}", highlight=False, soft_wrap=True)
+    """End the program with the sentence of a user's error, and exit code 2."""
+    get_console().print(f"[bold red]beags:[/bold red] {escape(str(error))}", highlight=False, soft_wrap=True)
     error.told = True
     raise SystemExit(2) from error  # the cause is for callers from Python

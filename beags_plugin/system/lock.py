@@ -3,69 +3,45 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import IO
+from weakref import WeakValueDictionary
+
+from filelock import BaseFileLock, FileLock, Timeout
 
 from beags_plugin.system.errors import UserError, writing
 
 LOCK = ".lock"
-"""File of a run's folder, locked by the process that trains there; without one it means nothing."""
+"""File of a run's folder, locked by the process that trains there; the file alone means nothing."""
 
-
-class RunLock:
-    """Holds a run's folder until it is released or the process ends, however that happens.
-
-    Raises ``UserError`` if another training holds it. Where the system or the disk knows no such locks, nothing is
-    held.
-    """
-
-    def __init__(self, run: Path) -> None:
-        self._file = _locked(run)
-        self._run = run.absolute()
-        _held.add(self._run)
-
-    def release(self) -> None:
-        """Let others train there."""
-        if self._file is not None:
-            import fcntl
-
-            fcntl.flock(self._file, fcntl.LOCK_UN)  # also where a forked process still has the file open
-            self._file.close()
-            self._file = None
-        _held.discard(self._run)
-
-
-_held: set[Path] = set()  # by this process
-_ahead: dict[Path, RunLock] = {}
+_held: WeakValueDictionary[Path, BaseFileLock] = WeakValueDictionary()  # by this process
+_ahead: dict[Path, BaseFileLock] = {}
 
 
 def lock_ahead(run: Path) -> None:
-    """Hold ``run`` for a training of this process, which may have yet to begin: see ``run_lock``.
+    """Hold ``run`` for a training of this process, which may have yet to begin; ``run_lock`` takes the lock over.
 
     Raises ``UserError`` if another process holds it.
     """
-    if run.absolute() not in _held:
-        _ahead[run.absolute()] = RunLock(run)
+    held = _held.get(run.absolute())
+    if held is None or not held.is_locked:
+        _ahead[run.absolute()] = run_lock(run)
 
 
-def run_lock(run: Path) -> RunLock:
-    """The lock of ``run``, which this process may hold ahead of its training. Raises ``UserError``."""
-    return _ahead.pop(run.absolute(), None) or RunLock(run)
+def run_lock(run: Path) -> BaseFileLock:
+    """Hold a run's folder until ``release()`` is called or the process ends, however it ends.
 
-
-def _locked(run: Path) -> IO[bytes] | None:
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        return None
+    Raises ``UserError`` if another training holds it. Holds nothing where the system or the disk has no such locks.
+    """
+    if (lock := _ahead.pop(run.absolute(), None)) is not None:
+        return lock
+    lock = FileLock(run / LOCK, thread_local=False)
     with writing(run):
         run.mkdir(parents=True, exist_ok=True)
-        file = open(run / LOCK, "ab")  # noqa: SIM115  (open as long as the lock is held)
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        file.close()
-        raise UserError(f"{run} is being trained by another process: wait for it, or end it first.") from None
-    except OSError:  # some network disks
-        file.close()
-        return None
-    return file
+        try:
+            lock.acquire(blocking=False)
+        except Timeout:
+            raise UserError(f"{run} is being trained by another process: wait for it, or end it first.") from None
+        except OSError as error:
+            if error.filename is not None:  # the file cannot be opened; without a name: some network disks
+                raise
+    _held[run.absolute()] = lock
+    return lock

@@ -1,38 +1,33 @@
-"""Memory of this process."""
+"""Memory of this process, and of the machine or container that it runs in; all in MB of 10^6 bytes."""
 
 from __future__ import annotations
 
-import resource
 from contextlib import suppress
 from pathlib import Path
 
-
-def peak_memory_mb() -> float:
-    """Largest resident memory of this process so far, MB of 10^6 bytes."""
-    found = _status("VmHWM:")  # getrusage's would count what the parent process once held
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6 if found is None else found
+import psutil
 
 
 def memory_mb() -> float:
-    """Resident memory of this process now, MB of 10^6 bytes; the largest so far where the system does not say."""
-    found = _status("VmRSS:")
-    return peak_memory_mb() if found is None else found
+    """Return the resident memory of this process."""
+    return psutil.Process().memory_info().rss / 1e6
 
 
-def available_mb() -> float | None:
-    """Memory that this process may still take, MB of 10^6 bytes, here and in the control groups that it is in.
+def peak_memory_mb() -> float:
+    """Return the largest resident memory of this process so far; the present one where the system is not Linux."""
+    with suppress(OSError, StopIteration):  # psutil has no such figure; getrusage's counts the parent process too
+        status = Path("/proc/self/status").read_text().splitlines()
+        return int(next(line for line in status if line.startswith("VmHWM:")).split()[1]) * 1024 / 1e6
+    return memory_mb()
 
-    None where the system does not say (it is not Linux).
-    """
-    with suppress(OSError, StopIteration, ValueError):
-        info = Path("/proc/meminfo").read_text().splitlines()
-        free = int(next(line for line in info if line.startswith("MemAvailable:")).split()[1]) * 1024 / 1e6
-        return max(min([free, *_free_in_groups()]), 0.0)
-    return None
+
+def available_mb() -> float:
+    """Return the memory that this process may still take: of the machine, and of its container's limits."""
+    return max(min([psutil.virtual_memory().available / 1e6, *_free_in_groups()]), 0.0)
 
 
 def _free_in_groups() -> list[float]:
-    """What the limits of the control groups (version 2) of this process leave, MB; pages that can be dropped count."""
+    """Return what the limits of this process's control groups (version 2) leave; droppable pages count as free."""
     found = []
     with suppress(OSError):
         own = Path("/proc/self/cgroup").read_text().strip().rpartition("::")[2].lstrip("/")
@@ -44,10 +39,3 @@ def _free_in_groups() -> list[float]:
                 stat = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
                 found.append((limit - used + int(stat.get("inactive_file", 0))) / 1e6)
     return found
-
-
-def _status(name: str) -> float | None:
-    with suppress(OSError, StopIteration):  # Linux only
-        status = Path("/proc/self/status").read_text().splitlines()
-        return int(next(line for line in status if line.startswith(name)).split()[1]) * 1024 / 1e6
-    return None

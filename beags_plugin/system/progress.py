@@ -16,9 +16,9 @@ Item = TypeVar("Item")
 
 @contextmanager
 def progress_bar(name: str, passing: bool = False) -> Iterator[Callable[[int, int], None]]:
-    """Draw a bar called ``name``; the callback that it yields takes (done, total).
+    """Show a bar called ``name``; yields a callback that takes (done, total).
 
-    passing: for what happens often, and mostly takes no time: draw it only after a moment, and remove it at the end.
+    passing: show the bar only if the work takes longer than a moment, and remove it at the end.
     """
     columns = (
         TextColumn("  {task.description:<22}"),
@@ -33,14 +33,14 @@ def progress_bar(name: str, passing: bool = False) -> Iterator[Callable[[int, in
     def update(done: int, total: int) -> None:
         progress.update(task, completed=done, total=total)
         if passing and monotonic() - began > A_MOMENT:
-            progress.start()  # nothing, if it is drawn already
+            progress.start()  # does nothing if it is shown already
 
     if not passing:
         progress.start()
     try:
         yield update
     except BaseException:
-        progress.live.transient = True  # what stopped it says more than half a bar
+        progress.live.transient = True  # an error's message is enough
         raise
     finally:
         if progress.live.transient:
@@ -50,7 +50,7 @@ def progress_bar(name: str, passing: bool = False) -> Iterator[Callable[[int, in
 
 
 def counted(items: Iterable[Item], total: int, progress: Callable[[int, int], None]) -> Iterator[Item]:
-    """The items, one by one; progress: is told (done, total) when the next one is asked for."""
+    """Yield the items; call ``progress`` with (done, total) when the next one is asked for."""
     for done, item in enumerate(items, start=1):
         yield item
         progress(done, total)

@@ -29,7 +29,7 @@ def _checkpoint(path: Path) -> None:
 
 
 def _grid(path: Path) -> None:
-    from beags_plugin.plugin.runs.prepared_grid import read_grid
+    from beags_plugin.plugin.runs.prepared import read_grid
 
     read_grid(path)
 

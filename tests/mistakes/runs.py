@@ -64,11 +64,10 @@ mistake("configs", "a class that has been renamed")(
 mistake("configs", "a module that has been renamed")(
     config(lambda text: text.replace("plugin.model.", "plugin.scene."))
 )
-mistake("configs", "a key that is missing")(config(lambda text: text.replace("    densify:", "    densifying:")))
+mistake("configs", "of an older version")(config(lambda text: text.replace("run_format: 2\n", "")))
 mistake("configs", "a part of another kind")(
     config(lambda text: re.sub(r"prepare: !!python/object:\S+", "prepare: !!python/object:builtins.dict", text))
 )
-mistake("configs", "a word for a number")(config(lambda text: text.replace("    near: 0.01", "    near: close")))
 mistake("configs", "YAML broken")(config(lambda text: "\t{\n" + text))
 mistake("configs", "cut off")(config(lambda text: text[: text.index("\npipeline:") + 1]))
 mistake("configs", "empty")(config(lambda text: ""))

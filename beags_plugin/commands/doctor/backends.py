@@ -1,4 +1,4 @@
-"""Whether the rasterizers draw."""
+"""Checks that the rasterizers render."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 
 from beags_plugin.commands.doctor.check import Check, first_line
 
@@ -16,32 +15,40 @@ REBUILD = "pip install --force-reinstall --no-deps ."
 
 
 def rasterizers() -> list[Callable[[], Check]]:
-    """A check of every backend that is registered."""
+    """Return a check of every backend that is registered."""
     try:
         from beags_plugin.rasterizers import RASTERIZERS
-
-        names = RASTERIZERS.names()
     except Exception as error:
         sentence = f"cannot be listed: {first_line(error)}"
         return [lambda: Check("rasterizers", False, sentence)]
-    return [lambda name=name: rasterizer(name) for name in names]
+    return [lambda name=name: rasterizer(name) for name in RASTERIZERS.names()]
 
 
 def rasterizer(name: str) -> Check:
-    """Whether a backend can run; all but the torch one are tried."""
-    from beags_plugin.rasterizers import RASTERIZERS
-
+    """Render with a backend in a process of its own, which may die without ending the doctor."""
     title, required = f"rasterizer {name}", name == "torch"
-    try:
-        if not required:
-            return replace(_try_in_process(name), name=title, required=False)
-        reason = RASTERIZERS.get(name).unavailable()
-    except Exception as error:
-        return Check(title, False, first_line(error), required)
-    return Check(title, reason is None, reason or "can run here", required)
+    done = subprocess.run(
+        [sys.executable, "-c", TRIAL, json.dumps(sys.path), name], capture_output=True, text=True, timeout=120
+    )
+    if done.returncode < 0:
+        sentence = f"it ends with {signal.Signals(-done.returncode).name}: it is damaged, or made for another machine"
+    elif done.returncode != 0 or not done.stdout.strip():
+        sentence = f"it fails when it renders: {(done.stderr.strip().splitlines() or ['no message'])[-1]}"
+    else:
+        ok, sentence, absent = json.loads(done.stdout.strip().splitlines()[-1])
+        if absent and name == "native":
+            sentence = f"{sentence.rstrip('.')}; until then the torch reference renders, some hundred times slower"
+        return Check(title, ok, sentence, required, REBUILD if absent and name == "native" else "")
+    avoided = "" if required else f"; {_AVOIDED.get(name, '--pipeline.model.rasterizer torch avoids it')}"
+    return Check(title, False, sentence + avoided, required, REBUILD)
 
 
-# Draws one surfel, there and back: code for another processor is found only when it runs.
+_AVOIDED = {  # how to do without a backend that fails
+    "native": "BEAGS_NATIVE=0 in the environment avoids it",
+    "cuda": "training with --machine.device-type cpu avoids it",
+}
+
+# Renders one Gaussian, forward and backward: code for another processor is found only when it runs.
 TRIAL = """
 import json, sys
 sys.path[:] = json.loads(sys.argv[1])
@@ -70,31 +77,3 @@ except UserError as error:
     # with a reason "auto" draws with another backend; an instruction set that was asked for in vain stops everything
     print(json.dumps([False, reason or str(error), reason is not None]))
 """
-
-
-_AVOIDED = {  # how to do without a backend that fails
-    "native": "BEAGS_NATIVE=0 in the environment avoids it",
-    "cuda": "training with --machine.device-type cpu avoids it",
-}
-
-
-def _try_in_process(name: str) -> Check:
-    """Draw with the backend in a process of its own, which may die without taking the doctor along."""
-    avoided = _AVOIDED.get(name, "--pipeline.model.rasterizer torch avoids it")
-    done = subprocess.run(
-        [sys.executable, "-c", TRIAL, json.dumps(sys.path), name], capture_output=True, text=True, timeout=120
-    )
-    if done.returncode < 0:
-        processor, killer = "GPU" if name.startswith("cuda") else "processor", signal.Signals(-done.returncode).name
-        cause = f"it ends with {killer}, so it is damaged or made for another {processor}"
-        sentence = f"{cause}: reinstall beags from source; {avoided}"
-        return Check(name, False, sentence, repair=REBUILD)
-    lines = done.stdout.strip().splitlines()
-    if done.returncode != 0 or not lines:
-        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        sentence = f"it fails when it draws: {last}; {avoided}"
-        return Check(name, False, sentence, repair=REBUILD)
-    ok, sentence, replaced = json.loads(lines[-1])
-    if replaced and name == "native":
-        sentence = f"{sentence.rstrip('.')}; until then the torch reference draws, some hundred times slower"
-    return Check(name, ok, sentence, repair=REBUILD if replaced and name == "native" else "")

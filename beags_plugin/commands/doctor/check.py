@@ -1,4 +1,4 @@
-"""One thing that the doctor looks at, and all of them as a table."""
+"""The result of one check of the doctor, and the table of all of them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Check:
 
 
 def first_line(error: BaseException) -> str:
-    """What kind of error it is, and the first line of what it says."""
+    """Return the kind of an error and the first line of its message."""
     text = str(error).strip()
     return f"{type(error).__name__}: {text.splitlines()[0]}" if text else type(error).__name__
 

@@ -1,15 +1,14 @@
-"""What works here and what is missing."""
+"""Checks of what works here and what is missing."""
 
 from __future__ import annotations
 
-import os
 import platform
 import shutil
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 from beags_plugin.commands.doctor.backends import rasterizers
-from beags_plugin.commands.doctor.building import compiler
 from beags_plugin.commands.doctor.check import Check, first_line
 
 _OPENCV = "pip install --force-reinstall --no-deps opencv-contrib-python-headless==4.10.0.84"
@@ -23,24 +22,36 @@ _REPAIRS = {  # by the name of what cannot even be looked at
 
 def diagnose() -> list[Check]:
     """Look at everything beags uses; never fails, whatever is missing or broken."""
-    checks: list[Callable[[], Check]] = [
-        _python,
-        _torch,
-        _nerfstudio,
-        _presets,
-        _opencv,
-        _open3d,
-        _cpu,
-        _cuda,
-        *rasterizers(),
-        compiler,
-        _pictures,
-        _films,
-        _formats,
-        _ffmpeg,
-        _browser,
-    ]
+    checks = [_python, _torch, _nerfstudio, _presets, _opencv, _open3d, _cuda, _nvcc, *rasterizers()]
     return [_safely(check) for check in checks]
+
+
+def checks_of_data(data: Path) -> list[Check]:
+    """Check that a scene can be read, and that memory and disk are free for a training on it.
+
+    Raises ``UserError`` for bad data.
+    """
+    import tempfile
+
+    from beags_plugin.plugin.options.config import base_config
+    from beags_plugin.plugin.training.memory_guard import LEAST_FREE_MB, free_disk_mb
+    from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+    from beags_plugin.system.memory import available_mb
+
+    parser = BeagsDataParserConfig(data=data).setup()
+    train, held_out = (len(parser.get_dataparser_outputs(split).cameras) for split in ("train", "val"))
+    free = {
+        "memory": (available_mb(), "beside this program"),
+        "disk": (free_disk_mb(output := base_config().output_dir), f"for {output}"),
+        "temporary disk": (free_disk_mb(temporary := Path(tempfile.gettempdir())), f"for {temporary}"),
+    }
+    return [
+        Check("data", True, f"{train} views to train on, {held_out} held out"),
+        *(
+            Check(name, amount >= LEAST_FREE_MB, f"{amount / 1000:.1f} GB are free {place}", False)
+            for name, (amount, place) in free.items()
+        ),
+    ]
 
 
 def _safely(check: Callable[[], Check]) -> Check:
@@ -67,19 +78,14 @@ def _torch() -> Check:
     return Check("torch", True, f"{torch.__version__}, {torch.get_num_threads()} threads")
 
 
-def _cuda() -> Check:
-    import torch
+def _nerfstudio() -> Check:
+    from importlib.metadata import version
 
-    if torch.cuda.is_available():
-        major, minor = torch.cuda.get_device_capability(0)
-        return Check("CUDA device", True, f"{torch.cuda.get_device_name(0)}, sm_{major}{minor}", False)
-    return Check("CUDA device", False, "none; not needed: the rasterizers run on the CPU", False)
+    import nerfstudio  # noqa: F401
 
-
-def _cpu() -> Check:
-    cores = os.cpu_count() or 1
-    waiting = os.environ.get("OMP_WAIT_POLICY", "unset")
-    return Check("CPU", True, f"{cores} cores; OMP_WAIT_POLICY is {waiting} (PASSIVE is best where others compute too)")
+    ok = (found := version("nerfstudio")) == "1.1.5"
+    sentence = found if ok else f"{found}, but the plugin is made for 1.1.5"
+    return Check("nerfstudio", ok, sentence, repair="" if ok else _REPAIRS["nerfstudio"])
 
 
 def _presets() -> Check:
@@ -91,89 +97,34 @@ def _presets() -> Check:
     return Check("presets", True, f"ns-train knows {', '.join(sorted(found))}")
 
 
-def _pictures() -> Check:
-    """Photos and masks: PNG must come back exactly."""
-    import cv2
-    import numpy as np
-
-    image = np.arange(8 * 8 * 3, dtype=np.uint8).reshape(8, 8, 3)
-    for suffix, exact in ((".png", True), (".jpg", False)):
-        done, content = cv2.imencode(suffix, image)
-        back = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if done else None
-        if back is None or back.shape != image.shape or (exact and not np.array_equal(back, image)):
-            return Check("codecs png, jpg", False, f"{suffix} images do not come back", repair=_OPENCV)
-    return Check("codecs png, jpg", True, "read and written")
-
-
-def _films() -> Check:
-    from beags_plugin.pictures.video import REPAIR, encoder
-
-    name = encoder()
-    if name is None:
-        return Check("codec mp4", False, "beags render can write .gif only", False, REPAIR)
-    browsers = "" if name != "mpeg4" else "; browsers do not show it, players do"
-    return Check("codec mp4", True, f"{name}{browsers}", False)
-
-
-def _formats() -> Check:
-    from beags_plugin.export import EXPORTERS
-
-    reasons = {name: EXPORTERS.get(name).unavailable() for name in EXPORTERS.names()}
-    ready = ", ".join(name for name, reason in reasons.items() if reason is None)
-    if missing := {name: reason for name, reason in reasons.items() if reason is not None}:
-        sentence = f"{ready}; not {', '.join(missing)}: {next(iter(missing.values()))}"
-        return Check("export formats", False, sentence, False, "pip install open3d==0.19.0")
-    return Check("export formats", True, ready, False)
-
-
-def _nerfstudio() -> Check:
-    from importlib.metadata import version
-
-    import nerfstudio  # noqa: F401
-
-    found = version("nerfstudio")
-    if found != "1.1.5":
-        sentence = f"{found}, but the plugin is made for 1.1.5: run make setup"
-        return Check("nerfstudio", False, sentence, repair=_REPAIRS["nerfstudio"])
-    return Check("nerfstudio", True, found)
-
-
 def _opencv() -> Check:
     import cv2
 
     # Plain opencv installed over contrib leaves an empty ximgproc, so look for the function itself.
-    if not hasattr(getattr(cv2, "ximgproc", None), "guidedFilter"):
-        advice = "reinstall opencv-contrib-python-headless==4.10.0.84 last"
-        sentence = f"{cv2.__version__} without cv2.ximgproc.guidedFilter: {advice}"
-        return Check("opencv contrib", False, sentence, repair=_OPENCV)
-    return Check("opencv contrib", True, f"{cv2.__version__} with cv2.ximgproc.guidedFilter")
+    ok = hasattr(getattr(cv2, "ximgproc", None), "guidedFilter")
+    sentence = f"{cv2.__version__} {'with' if ok else 'without'} cv2.ximgproc.guidedFilter"
+    return Check("opencv contrib", ok, sentence, repair="" if ok else _OPENCV)
 
 
 def _open3d() -> Check:
     try:
         import open3d
     except Exception as error:
-        advice = "ns-export and exported meshes need it; version 0.19.0 needs the system libraries libX11 and libGL"
         absent = isinstance(error, ModuleNotFoundError)
         repair = "pip install open3d==0.19.0" if absent else "apt install libx11-6 libgl1"
-        return Check("open3d", False, f"{first_line(error)}; {advice}", False, repair)
+        return Check("open3d", False, f"{first_line(error)}; exported meshes need it", False, repair)
     return Check("open3d", True, open3d.__version__, False)
 
 
-def _ffmpeg() -> Check:
-    if path := shutil.which("ffmpeg"):
-        return Check("ffmpeg", True, path, False)
-    sentence = "not on PATH: ns-render cannot write videos (Debian: apt install ffmpeg); beags render can"
-    return Check("ffmpeg", False, sentence, False, "apt install ffmpeg")
+def _cuda() -> Check:
+    import torch
+
+    if torch.cuda.is_available():
+        major, minor = torch.cuda.get_device_capability(0)
+        return Check("CUDA device", True, f"{torch.cuda.get_device_name(0)}, sm_{major}{minor}", False)
+    return Check("CUDA device", False, "none; not needed: the rasterizers run on the CPU", False)
 
 
-def browser() -> str | None:
-    """The program of a Chromium, or None; only the tests of the viewer and the picture of its page need one."""
-    return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-
-
-def _browser() -> Check:
-    if path := browser():
-        return Check("Chromium", True, f"{path}, for the tests of the viewer", False)
-    sentence = "none: tests that look at the viewer in a browser are skipped (Debian: apt install chromium)"
-    return Check("Chromium", False, sentence, False, "apt install chromium")
+def _nvcc() -> Check:
+    path = shutil.which("nvcc")
+    return Check("nvcc", path is not None, path or "none on PATH; only building the CUDA rasterizer needs it", False)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
+import tyro
 import yaml
 from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
@@ -16,9 +17,10 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from beags_plugin.plugin.options.loss_spec import LossSpec
 from beags_plugin.plugin.options.machine import check_machine, default_device
 from beags_plugin.plugin.options.model_options import BeagsModelConfig
+from beags_plugin.plugin.options.run_format import RUN_FORMAT, other_format
 from beags_plugin.plugin.views.datamanager import BeagsDataManagerConfig
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
-from beags_plugin.system.errors import UserError
+from beags_plugin.system.errors import UserError, print_user_errors_plainly
 from beags_plugin.system.interrupts import stop
 from beags_plugin.system.lock import lock_ahead, run_lock
 from beags_plugin.system.registry import load
@@ -58,11 +60,21 @@ class BeagsTrainerConfig(TrainerConfig):
     same folder, or one that loads this run."""
 
     check_memory: bool = True
-    """Stop before a run that memory or disk cannot hold, and save and stop when memory runs out (on a CPU)."""
+    """Do not begin where hardly any memory or disk is free; save and stop when memory runs out (on a CPU)."""
 
     steps_per_objects: int = 500
     """Once Gaussians have classes: measure extracted masks on four held-out views and draw every object alone, for
     tensorboard or wandb, every so many steps, and first and last; 0: never."""
+
+    run_format: tyro.conf.Suppress[int] = RUN_FORMAT
+    """Version of the files of a run that is trained with this config."""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Refuse a run of another format where nerfstudio's own loader reads its config.yml."""
+        if state.get("run_format") != RUN_FORMAT:
+            print_user_errors_plainly()
+            raise other_format("this run", state.get("run_format"))
+        self.__dict__.update(state)
 
     @property
     def model_config(self) -> BeagsModelConfig:

@@ -6,14 +6,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.tensors import load_tensors
 
-_WIDTHS = {"means": (3,), "quats": (4,), "scales": (2,), "opacities": (1,), "features_dc": (3,)}
-_FLOATS = [*(f"gauss_params.{name}" for name in (*_WIDTHS, "features_rest")), "class_margin", "extent"]
+_OF_GAUSSIAN: dict[str, tuple[int | None, ...]] = {
+    "gauss_params.means": (3,), "gauss_params.quats": (4,), "gauss_params.scales": (2,), "gauss_params.opacities": (1,),
+    "gauss_params.features_dc": (3,), "gauss_params.features_rest": (None, 3), "class_ids": (), "class_margin": (),
+}  # fmt: skip
+"""Shapes of the values of one Gaussian; None: any size."""
+_NOT_FLOATS = ("class_ids", "assigned")
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
@@ -37,49 +40,28 @@ def scene_alone(checkpoint: dict[str, Any]) -> bool:
 
 
 def check_state(state: Mapping[str, Any], path: Path) -> None:
-    """Raise ``UserError`` unless ``state`` is that of a ``BeagsModel`` with classes. path: where it is from."""
+    """Raise ``UserError`` unless ``state`` is that of a ``BeagsModel`` with classes. path: the file it comes from."""
     if wrong := _wrong(state):
         raise UserError(f"the checkpoint {path} holds no scene of beags ({wrong}): name another, or train again.")
 
 
 def _wrong(state: Mapping[str, Any]) -> str | None:
     means = state.get("gauss_params.means")
-    count = len(means) if isinstance(means, Tensor) and means.dim() == 2 else -1
-    for name, width in _WIDTHS.items():
-        if wrong := _wrong_shape(state, f"gauss_params.{name}", (count, *width)):
-            return wrong
-    for name in ("class_ids", "class_margin"):
-        if wrong := _wrong_shape(state, name, (count,)):
-            return wrong
-    for name in ("assigned", "extent"):
-        if wrong := _wrong_shape(state, name, ()):
-            return wrong
-    rest = state.get("gauss_params.features_rest")
-    if not isinstance(rest, Tensor) or rest.dim() != 3 or (len(rest), *rest.shape[2:]) != (count, 3):
-        return "gauss_params.features_rest is missing or of another shape"
-    if wrong := next((name for name in _FLOATS if not state[name].is_floating_point()), None):
-        return f"{wrong} holds {state[wrong].dtype}"
-    if rest.shape[1] not in (0, 3, 8, 15):
-        return f"gauss_params.features_rest has {rest.shape[1]} colour bands"
-    if not (bool(torch.isfinite(state["extent"])) and float(state["extent"]) > 0):
-        return f"extent is {float(state['extent'])}"
-    return _wrong_classes(state)
-
-
-def _wrong_shape(state: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> str | None:
-    value = state.get(name)
-    if not isinstance(value, Tensor):
-        return f"{name} is missing"
-    return None if tuple(value.shape) == shape else f"{name} is {list(value.shape)}, not {list(shape)}"
-
-
-def _wrong_classes(state: Mapping[str, Any]) -> str | None:
+    count = len(means) if isinstance(means, Tensor) and means.dim() else -1
+    shapes = {name: (count, *shape) for name, shape in _OF_GAUSSIAN.items()}
+    for name, shape in {**shapes, "assigned": (), "extent": ()}.items():
+        value = state.get(name)
+        if not isinstance(value, Tensor):
+            return f"{name} is missing"
+        if value.dim() != len(shape) or any(a not in (b, None) for a, b in zip(shape, value.shape, strict=True)):
+            return f"{name} is {list(value.shape)}, not {list(shape)}"
+        if value.is_complex() or value.is_floating_point() == (name in _NOT_FLOATS):
+            return f"{name} holds {value.dtype}"
+    if (bands := state["gauss_params.features_rest"].shape[1]) not in (0, 3, 8, 15):
+        return f"gauss_params.features_rest has {bands} colour bands"
     extra = state.get("_extra_state")
     names = extra.get("classes") if isinstance(extra, dict) else None
-    if not isinstance(names, dict) or not all(type(i) is int and isinstance(name, str) for i, name in names.items()):
+    if not isinstance(names, dict):
         return "the names of its classes are missing"
-    ids = state["class_ids"]
-    if ids.dtype not in (torch.int32, torch.int64):
-        return "class_ids are no whole numbers"
-    unnamed = sorted(set(ids.unique().tolist()) - set(names)) if bool(state["assigned"]) else []
+    unnamed = sorted(set(state["class_ids"].unique().tolist()) - set(names)) if bool(state["assigned"]) else []
     return f"it gives Gaussians the class {unnamed[0]}, which has no name" if unnamed else None

@@ -21,7 +21,7 @@ from beags_plugin.labels.classes import read_class_map, write_class_map
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED, STAGES, round_folder
-from beags_plugin.plugin.runs.prepared_grid import read_grid
+from beags_plugin.plugin.runs.prepared import read_grid
 from beags_plugin.plugin.runs.write import write_run
 from beags_plugin.plugin.training.resumable import TrainingRun
 from beags_plugin.plugin.training.scene_edits import edit_scene

@@ -16,7 +16,7 @@ from beags_plugin.labels.class_ids import resize_nearest
 from beags_plugin.labels.classes import read_class_map
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, prepared_digests, preparing_run, round_digest, round_folder
-from beags_plugin.plugin.runs.prepared_grid import grid_state, read_grid
+from beags_plugin.plugin.runs.prepared import grid_state, read_grid
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.views import unique_names
 

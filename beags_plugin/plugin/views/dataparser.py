@@ -26,7 +26,7 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.plugin.views.cameras import check_cameras, downscaled_size, resize_cameras
 from beags_plugin.plugin.views.poses import Normalization, PosedViews, read_poses
 from beags_plugin.plugin.views.seed_points import starting_points
-from beags_plugin.system.errors import UserError
+from beags_plugin.system.errors import UserError, print_user_errors_plainly
 
 LEAST_PIXELS = 2  # of a side that was scaled down; fewer show nothing
 
@@ -113,6 +113,7 @@ class BeagsDataParser(DataParser):
     config: BeagsDataParserConfig
 
     def __init__(self, config: BeagsDataParserConfig) -> None:
+        print_user_errors_plainly()  # under other methods too
         super().__init__(config)
         self._views: PosedViews | None = None
         self._metadata: dict[str, Any] = {}

@@ -1,22 +1,65 @@
-"""The masks of a run's training views, as they came and as reprojection left them."""
+"""Files that refinement was prepared with: voxel grids, and masks as they came and as reprojection left them."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from beags_plugin.labels.class_ids import resize_nearest
 from beags_plugin.labels.classes import read_class_map, read_mask
+from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.runs.layout import last_prepared
 from beags_plugin.plugin.views.views import unique_names
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.tensors import load_tensors
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
     from beags_plugin.plugin.options.config import BeagsTrainerConfig
+
+_REMEDY = "restore it, or refine again from base/nerfstudio_models"
+
+
+def read_grid(path: Path) -> VisibilityGrid | None:
+    """Read the grid in a file that ``refinement.save_prepared`` wrote; None where the refiner needed none.
+
+    Raises ``UserError`` if the file is damaged.
+    """
+    state = grid_state(path)
+    return VisibilityGrid.from_state_dict(state) if state else None
+
+
+def grid_state(path: Path, mmap: bool = False) -> dict[str, Any]:
+    """Read the tensors of a grid; empty without one. mmap: leave them in the file until they are used."""
+    try:
+        state = load_tensors(path, mmap=mmap)
+    except (OSError, ValueError) as error:
+        told = getattr(error, "strerror", None) or error
+        raise UserError(f"the voxel grid {path} cannot be read ({told}): {_REMEDY}.") from error
+    if not isinstance(state, dict) or (state and not _is_grid(state)):
+        raise UserError(f"the voxel grid {path} is damaged: {_REMEDY}.")
+    return state
+
+
+def _is_grid(state: dict[str, Any]) -> bool:
+    found = [state.get(name) for name in ("voxel_size", "origin", "num_classes", "keys", "classes")]
+    if len(parts := [part for part in found if isinstance(part, Tensor)]) < len(found):
+        return False
+    size, origin, count, keys, classes = parts
+    return (
+        (size.numel(), count.numel(), *origin.shape) == (1, 1, 3)
+        and size.is_floating_point()
+        and 0 < float(size) < math.inf
+        and (count.dtype, keys.dtype, classes.dtype) == (torch.int64, torch.int64, torch.int32)
+        and (keys.dim(), classes.shape) == (1, keys.shape)
+    )
 
 
 @dataclass(frozen=True)
@@ -36,7 +79,7 @@ class TrainingMasks:
 
 
 def training_masks(config: BeagsTrainerConfig) -> list[TrainingMasks]:
-    """The masks of every training view of a run that refined, before and after reprojection.
+    """Read the masks of every training view of a run that refined, before and after reprojection.
 
     Masks and truth are compared as the files have them: for photos without lens distortion.
     """

@@ -1,0 +1,13 @@
+"""Refuses runs of the first format, whose config.yml names this module, in nerfstudio's own programs too."""
+
+from __future__ import annotations
+
+from beags_plugin.plugin.options.run_format import other_format
+from beags_plugin.system.errors import print_user_errors_plainly
+
+
+def __getattr__(name: str) -> None:
+    if name == "BeagsTrainerConfig":
+        print_user_errors_plainly()
+        raise other_format("this run")
+    raise AttributeError(name)
