@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from cuda_backends import EmulatedAheadRasterizer, EmulatedCudaRasterizer
+from cuda_backends import EmulatedCudaRasterizer
 
 from beags_plugin.ops import extension
 from benchmarks import cuda
@@ -24,8 +24,7 @@ def test_rows_of_drawings_and_steps(monkeypatch, tmp_path, capsys):
     if (reason := EmulatedCudaRasterizer.unavailable()) or (reason := extension.found()[1]):
         pytest.skip(reason)
     monkeypatch.setattr(cuda, "DEVICE", "cpu")
-    backends = {False: EmulatedCudaRasterizer, True: EmulatedAheadRasterizer}
-    monkeypatch.setattr(cuda, "make_cuda", lambda ahead=False: backends[ahead]())
+    monkeypatch.setattr(cuda, "make_cuda", EmulatedCudaRasterizer)
     monkeypatch.setattr(cuda, "milliseconds", lambda call, repeats: call() and None or 4.0)
     monkeypatch.setattr(cuda, "peak_mb", lambda call: call() and None or 2.0)
     monkeypatch.setattr(cuda, "copy_rate", lambda: 1000.0)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from nerfstudio.configs import base_config  # noqa: F401  (the writer, which it imports, cannot come first)
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
