@@ -26,8 +26,8 @@ from beags_plugin.data.scene import ColmapModel, Poses, PoseTable, TransformsFil
 from beags_plugin.data.transforms_file import read_transforms
 from beags_plugin.plugin.views.cameras import concatenate_cameras
 from beags_plugin.plugin.views.colmap_files import read_lens
-from beags_plugin.plugin.views.seed_points import read_ply_points
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.ply import read_ply_points
 
 SPLITS = ("train", "val", "test")
 

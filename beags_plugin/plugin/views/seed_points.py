@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,11 +11,9 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.data.scene import PoseTable, Scene
-from beags_plugin.extraction.splat_file import check_ply_size
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.colmap_files import read_colmap_points
-from beags_plugin.system.errors import UserError
-from beags_plugin.system.reading.text import reason
+from beags_plugin.system.reading.ply import read_ply_points
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.views.poses import PosedViews
@@ -50,35 +47,6 @@ def starting_points(scene: Scene, views: PosedViews, count: int, seed: int) -> d
     else:
         xyz, rgb = points_between(cameras, scale * bounds, count, seed)
     return {"points3D_xyz": torch.from_numpy(xyz), "points3D_rgb": torch.from_numpy(rgb), "points3D_random": True}
-
-
-def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [N, 3] float32 and colours [N, 3] uint8 (mid-grey where the file has none) of a .ply's vertices.
-
-    Raises ``UserError`` if the file is absent or has no vertices with x, y, z.
-    """
-    from plyfile import PlyData, PlyParseError
-
-    if not path.is_file():
-        raise UserError(f"the seed points {path} (ply_file_path) do not exist: restore the file or remove the key.")
-    try:
-        check_ply_size(path)
-        vertices = PlyData.read(str(path))["vertex"].data
-        points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
-    except OSError as error:
-        raise UserError(f"the seed points {path} cannot be read ({error.strerror}): restore the file.") from error
-    # plyfile lets through what numpy and the text of a header raise
-    except (PlyParseError, LookupError, ValueError, TypeError, MemoryError, OverflowError, RecursionError) as error:
-        told = f"the seed points {path} cannot be read as a .ply with x, y, z ({reason(error)}): export them again."
-        raise UserError(told) from error
-    if points.ndim != 2 or not np.isfinite(points).all():
-        raise UserError(f"the seed points {path} are not all numbers: export them again, or remove the key.")
-    if not all(name in vertices.dtype.names for name in ("red", "green", "blue")):
-        return points, np.full(points.shape, 128, np.uint8)
-    colors = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1)
-    if np.issubdtype(colors.dtype, np.floating):  # floats are shares of 1, integers are bytes
-        colors = np.clip(colors * 255.0 + 0.5, 0, 255)
-    return points, colors.astype(np.uint8)
 
 
 def random_points(cameras: Sequence[Camera], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
