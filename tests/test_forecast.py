@@ -54,9 +54,9 @@ def test_disk_holds_the_base_the_prepared_masks_and_temporary_files_too():
     run, base = of("beags-tiny"), of("beags-tiny", **{"pipeline.model.refine_steps": 0})
     pixels = 75.0  # MB at a byte each
     assert base.temporary == 0 and base.disk == pytest.approx(forecasts.RUN_MB + 0.01 * base.disk_bytes_of_surfel)
-    assert run.temporary == pytest.approx(forecasts.TEMPORARY_BYTES_OF_PIXEL * pixels)
-    kept = forecasts.PREPARED_BYTES_OF_PIXEL + forecasts.DEPTH_BYTES_OF_PIXEL
-    assert run.run_disk - base.run_disk == pytest.approx(kept * pixels)
+    temporary = forecasts.TEMPORARY_BYTES_OF_PIXEL + forecasts.DEPTH_BYTES_OF_PIXEL
+    assert run.temporary == pytest.approx(temporary * pixels)
+    assert run.run_disk - base.run_disk == pytest.approx(forecasts.PREPARED_BYTES_OF_PIXEL * pixels)
     assert run.disk_bytes_of_surfel > base.disk_bytes_of_surfel > 2 * 3 * 4 * 23
     unbounded = of("beags")
     assert unbounded.disk == pytest.approx(unbounded.run_disk + 0.005 * unbounded.disk_bytes_of_surfel)

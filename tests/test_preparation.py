@@ -16,7 +16,6 @@ from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.preparation import consistent_masks
 from beags_plugin.preparation.consistent_masks import chosen_reprojection
 from beags_plugin.preparation.pipeline import PreparationConfig, prepare
-from beags_plugin.preparation.stages import StageStore
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.refiners.none import NoRefiner
@@ -87,24 +86,20 @@ def test_auto_is_pairwise_where_its_time_and_memory_are_small(views, side, masks
         assert chosen_reprojection(stated, voters, cameras, labels) == (stated, None)
 
 
-def test_what_auto_chose_is_what_the_stages_are_kept_for(tmp_path, monkeypatch):
+def test_auto_gives_what_the_method_that_it_chose_gives(monkeypatch):
     surfels, cameras, masks, rasterizer, settings = labelled_views(5, 0.1)
     names = {index: str(index) for index in range(CLASSES)}
 
     def of(name):
         config = PreparationConfig(reprojection=name, k=20)
-        refiner, store = NoRefiner(), StageStore(tmp_path)
-        return prepare(surfels, cameras, masks, names, rasterizer, settings, refiner, config, store=store)
+        return prepare(surfels, cameras, masks, names, rasterizer, settings, NoRefiner(), config)
 
     stated = {name: of(name) for name in ("voxel", "pairwise")}
     few = of("auto")
     assert any(line.startswith("reprojection pairwise: 5 views") for line in few.findings)
-    assert any("labelled pixels changed" in line and "kept from before" in line for line in few.findings)
     monkeypatch.setattr(consistent_masks, "PAIRWISE_PIXELS", 1)
     many = of("auto")
     assert any(line.startswith("reprojection voxel: 5 views") for line in many.findings)
-    assert not any("labelled pixels changed" in line and "kept from before" in line for line in many.findings)
-    assert any("labelled pixels changed" in line and "kept from before" in line for line in of("voxel").findings)
     assert not any(line.startswith("reprojection voxel") for line in stated["voxel"].findings)
     for found, name in ((few, "pairwise"), (many, "voxel")):
         assert all(torch.equal(a, b) for a, b in zip(found.labels, stated[name].labels, strict=True))

@@ -51,13 +51,13 @@ def test_tensors_of_a_gpu_travel_over_the_cpu():
         assert isinstance(sent, processes._FromGpu) and sent.values.is_cpu and torch.equal(sent.values, values)
 
 
-def in_two_processes(program: Path, folder: Path, *more: Path) -> list:
-    """What each of two processes finds; ``more`` arguments of theirs."""
+def in_two_processes(program: Path, folder: Path) -> list:
+    """What each of two processes finds."""
     root = str(PROGRAM.parents[1])
     folder.mkdir()
 
     def start(rank):
-        files = [str(path) for path in (folder / "meeting", folder / str(rank), *more)]
+        files = [str(path) for path in (folder / "meeting", folder / str(rank))]
         command = [sys.executable, str(program), str(rank), "2", *files]
         return subprocess.Popen(bound(command, signal.SIGKILL), cwd=root, env=environment(root))
 
@@ -82,25 +82,17 @@ def test_steps_of_two_processes_are_those_of_one_that_sees_both_views(tmp_path):
 
 
 @needs_gloo
-def test_two_processes_find_what_one_finds_and_reuse_it_together(tmp_path):
-    fresh = in_two_processes(PROGRAM, tmp_path / "first", tmp_path / "kept")
-    for file in (tmp_path / "kept/voxel").glob("voxel grids-*"):
-        file.unlink()  # done again, by both
-    again = in_two_processes(PROGRAM, tmp_path / "again", tmp_path / "kept")
-    for mean, total in (result["exchanged"] for result in (*fresh, *again)):
+def test_two_processes_find_what_one_finds(tmp_path):
+    results = in_two_processes(PROGRAM, tmp_path / "first")
+    for mean, total in (result["exchanged"] for result in results):
         assert mean.tolist() == [0.0, 1.5, 3.0] and total.tolist() == [3]
     for method in preparation_in_processes.METHODS:
         alone, told = preparation_in_processes.found(method)
         assert len(alone[-3]) > 10  # voxels
-        for found, findings in (result[method] for result in (*fresh, *again)):
+        for found, findings in (result[method] for result in results):
             assert len(found) == len(alone)
             assert all(torch.equal(a, b) for a, b in zip(found, alone, strict=True))
-            assert [line.removesuffix(" (kept from before)") for line in findings] == told
-        assert not any("kept from before" in line for result in fresh for line in result[method][1])
-        for result in again:
-            kept = [line for line in result[method][1] if "kept from before" in line]
-            assert len(kept) == len(told) - (method == "voxel")
-    assert sorted(path.name for path in (tmp_path / "kept").iterdir()) == ["pairwise", "voxel"]
+            assert findings == told
 
 
 def environment(root: str) -> dict[str, str]:

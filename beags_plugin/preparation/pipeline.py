@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -31,8 +31,6 @@ from beags_plugin.preparation.consistent_masks import (
 )
 from beags_plugin.preparation.fewer_bands import without_unneeded_bands
 from beags_plugin.preparation.refiner import AssignedScene, EditedScene, Refiner
-from beags_plugin.preparation.stage_forms import ASSIGNMENT, BANDS, EDITED, GRID, MASKS
-from beags_plugin.preparation.stages import Stages, StageStore
 from beags_plugin.preparation.summary import (
     assignment_finding,
     bands_finding,
@@ -43,6 +41,7 @@ from beags_plugin.preparation.summary import (
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import check_surface_depth
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.filed_tensors import filed
 
 LEAST_K = 10  # nearer neighbours tell the noise of the depth rather than the distance of points
 
@@ -145,8 +144,6 @@ def prepare(
     background_voxels: bool = True,
     seed: int = 0,
     stage: Stage = lambda name: nullcontext(),
-    store: StageStore | None = None,
-    code: str = "",
 ) -> Preparation:
     """Make masks consistent, assign classes, split at borders if the refiner trains, build the voxel grids.
 
@@ -155,8 +152,6 @@ def prepare(
         the narrowest type and compressed, as ``LabelMaps`` already are.
     class_names: id to name, background (0) included; ids may lie far apart: the stages work on their ranks.
     background_voxels: whether a loss will ask the grid about the background; if none will, those voxels are not kept.
-    store: where finished stages are kept, and taken from if nothing that they depend on has changed; code: a digest of
-        the program, on which all of them depend.
     What is as large as the photos lies in temporary files: memory grows with the views by compressed masks, and by
     what the voxels of the scene take. "pairwise" alone reads depth and masks of all views into memory.
     Raises ``UserError`` if no view has a mask or no mask names an object.
@@ -169,53 +164,40 @@ def prepare(
         )
     surfels = surfels.detach()
     known = known_classes(maps, class_names)
-    inputs = (code, surfels, list(cameras), settings, type(rasterizer), maps, known.ids, seed)
-    stages = Stages(store, *inputs, device=surfels.means.device)
+    findings: list[str] = []
+    seconds: dict[str, float] = {}
 
-    masks = _consistent_masks(stages, surfels, cameras, maps, known, rasterizer, settings, config, stage)
+    with _timed("reprojection", seconds):
+        masks = _consistent_masks(surfels, cameras, maps, known, rasterizer, settings, config, stage, findings)
     ranked = masks.ranked
 
-    def assigned() -> Assignment:
-        with stage("Assigning classes") as progress:
-            found = assign_classes(surfels, cameras, ranked, rasterizer, settings, len(known), progress=progress)
-        return replace(found, class_ids=known.class_ids(found.class_ids))
-
-    assignment = stages.run("assignment", stages.key("assignment"), assigned, ASSIGNMENT)
-    stages.found("assignment", assignment_finding(assignment, class_names))
+    with _timed("assignment", seconds), stage("Assigning classes") as progress:
+        assignment = assign_classes(surfels, cameras, ranked, rasterizer, settings, len(known), progress=progress)
+        assignment = replace(assignment, class_ids=known.class_ids(assignment.class_ids))
+    findings.append(assignment_finding(assignment, class_names))
 
     edited = None
     if config.min_contribution > 0 and refiner.trains:
-        start = time.perf_counter()
-        edited = _without_unneeded(surfels, assignment, config.min_contribution)
-        stages.seconds["removal"] = time.perf_counter() - start
-        stages.key("removal", config.min_contribution)
-        stages.found("removal", removal_finding(len(surfels), edited, config.min_contribution))
+        with _timed("removal", seconds):
+            edited = _without_unneeded(surfels, assignment, config.min_contribution)
+        findings.append(removal_finding(len(surfels), edited, config.min_contribution))
         surfels = edited.edited.surfels
     if split is not None and split.rounds > 0 and refiner.trains:
-
-        def divided_scene() -> EditedScene:
-            with stage("Splitting Gaussians at borders") as progress:
-                return split_at_borders(surfels, cameras, ranked, rasterizer, settings, len(known), split, progress)
-
-        divided = stages.run("border split", stages.key("border split", split), divided_scene, EDITED)
-        stages.found("border split", split_finding(len(surfels), divided))
+        with _timed("border split", seconds), stage("Splitting Gaussians at borders") as progress:
+            divided = split_at_borders(surfels, cameras, ranked, rasterizer, settings, len(known), split, progress)
+        findings.append(split_finding(len(surfels), divided))
         classes = replace(divided.assignment, class_ids=known.class_ids(divided.assignment.class_ids))
         whole = divided.edited if edited is None else edited.edited.then(divided.edited)
         edited, surfels = EditedScene(whole, classes), divided.edited.surfels
 
     if config.trim_sh > 0 and refiner.trains:
-
-        def trimmed() -> tuple[Surfels | None, float]:
-            with stage("Leaving out bands of the colour") as progress:
-                fewer, change = without_unneeded_bands(surfels, cameras, rasterizer, settings, config.trim_sh, progress)
-            return None if fewer is surfels else fewer, change
-
-        fewer, change = stages.run("bands", stages.key("bands", config.trim_sh), trimmed, BANDS)
+        with _timed("bands", seconds), stage("Leaving out bands of the colour") as progress:
+            fewer, change = without_unneeded_bands(surfels, cameras, rasterizer, settings, config.trim_sh, progress)
         degree = surfels.sh_degree
-        if fewer is not None:
+        if fewer is not surfels:
             edited = edited or EditedScene(Densified.unchanged(surfels), assignment)
             edited, surfels = replace(edited, edited=replace(edited.edited, surfels=fewer)), fewer
-        stages.found("bands", bands_finding(degree, surfels.sh_degree, change))
+        findings.append(bands_finding(degree, surfels.sh_degree, change))
 
     class_ids = (assignment if edited is None else edited.assignment).class_ids
     scene = AssignedScene(
@@ -223,55 +205,49 @@ def prepare(
     )
     k = config.neighbours(cameras)
 
-    def built() -> VisibilityGrid | None:
-        with stage("Building voxel grids") as progress:
-            grid = refiner.build_grid(scene, k, progress)
-        if grid is None:
-            return None
+    start = time.perf_counter()
+    with stage("Building voxel grids") as progress:
+        grid = refiner.build_grid(scene, k, progress)
+    if grid is not None:
         asked = torch.unique(class_ids)  # classes are fixed: no loss can ask about one that has no Gaussians
-        return grid.only(asked if background_voxels else asked[asked != 0])
+        grid = grid.only(asked if background_voxels else asked[asked != 0])
+        seconds["voxel grids"] = time.perf_counter() - start
+        findings.append(f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {k})")
+    return Preparation(masks.labels, masks.confidence, assignment, grid, edited, findings, seconds)
 
-    key = stages.key("voxel grids", k, config.depth, type(refiner), max(class_names), background_voxels)
-    grid = stages.run("voxel grids", key, built, GRID)
-    if grid is None:
-        stages.drop("voxel grids")
-    else:
-        stages.found("voxel grids", f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {k})")
-    return Preparation(masks.labels, masks.confidence, assignment, grid, edited, stages.findings, stages.seconds)
+
+@contextmanager
+def _timed(name: str, seconds: dict[str, float]) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    seconds[name] = time.perf_counter() - start
 
 
 def _consistent_masks(
-    stages: Stages, surfels, cameras, maps: LabelMaps, known: ClassRanks, rasterizer, settings, config, stage: Stage
+    surfels,
+    cameras,
+    maps: LabelMaps,
+    known: ClassRanks,
+    rasterizer,
+    settings,
+    config,
+    stage: Stage,
+    findings: list[str],
 ) -> ConsistentMasks:
     """The masks of all views, reprojected if that is asked for."""
     if config.reprojection == "none":
-        start = time.perf_counter()
-        masks = masks_as_they_are(maps, cameras, known)
-        stages.seconds["reprojection"] = time.perf_counter() - start
-        stages.key("reprojection", "none")
-        stages.found("reprojection", "reprojection: off, masks used as they are")
-        return masks
+        findings.append("reprojection: off, masks used as they are")
+        return masks_as_they_are(maps, cameras, known)
     method, why = chosen_reprojection(config.reprojection, config.voters, cameras, maps)
-    config = replace(config, reprojection=method)  # stages depend on what is really done
-    reproject = REPROJECTIONS.get(method)
-    options = (config.reprojection, config.voters, config.min_confidence, config.tau)
-    depth_key = stages.key("depth", config.depth)
-    key = stages.key("reprojection", *options, reproject)
-
-    def rendered() -> Iterator[Tensor]:
-        with stage("Rendering depth") as progress:
-            yield from render_depths(surfels, cameras, rasterizer, settings, config.depth, progress)
-
-    def reprojected() -> ConsistentMasks:
-        depths = stages.run_filed("depth", depth_key, rendered, surfels.means.device)
-        with stage("Reprojecting masks") as progress:
-            return reprojected_masks(depths, cameras, maps, known, config, progress)
-
-    masks = stages.run("reprojection", key, reprojected, MASKS)
-    stages.drop("depth")  # as large as all photos in float, and quickly drawn
+    with stage("Rendering depth") as progress:  # as large as all photos in float: it lies in a temporary file
+        depths = filed(
+            render_depths(surfels, cameras, rasterizer, settings, config.depth, progress), surfels.means.device
+        )
+    with stage("Reprojecting masks") as progress:
+        masks = reprojected_masks(depths, cameras, maps, known, replace(config, reprojection=method), progress)
     if why is not None:
-        stages.findings.append(why)
-    stages.found("reprojection", reprojection_finding(maps, masks.labels))
+        findings.append(why)
+    findings.append(reprojection_finding(maps, masks.labels))
     return masks
 
 

@@ -52,10 +52,6 @@ class BeagsTrainerConfig(TrainerConfig):
     steps_per_held_out: int = 0
     """Measure all held-out views every so many steps, into held_out.json of the run; 0: never."""
 
-    keep_stages: bool = False
-    """Keep the finished stages of the preparation (prepared/stages) when the run is complete, for another run into the
-    same folder, or one that loads this run."""
-
     check_memory: bool = True
     """Stop before a run that memory or disk cannot hold, and save and stop when memory runs out (on a CPU)."""
 

@@ -37,7 +37,7 @@ GROWTH_OF_SPLIT = 1.6
 RUN_MB = 2.0
 """A run's config, curves and pictures on disk."""
 PREPARED_BYTES_OF_PIXEL, DEPTH_BYTES_OF_PIXEL = 1.0, 4.0
-"""On disk, of the pixels of all views: in each round masks with their confidence, twice; depth of one round."""
+"""Of the pixels of all views: in each round masks with their confidence, on disk; depth, in temporary files."""
 TEMPORARY_BYTES_OF_PIXEL = 8.0
 """In the folder of temporary files: what all views show, or votes that are counted slab by slab."""
 LEAST_FREE_MB = 200.0
@@ -103,7 +103,7 @@ class Forecast:
 
     @property
     def disk(self) -> float:
-        """Of the run's folder: two checkpoints, as the new one is written before the old one goes, the base, stages.
+        """Of the run's folder: two checkpoints, as the new one is written before the old one goes, the base, masks.
 
         With as many surfels as there are at the start where nothing bounds them.
         """
@@ -183,7 +183,7 @@ def forecast(
         preparation += everywhere * PAIRWISE_BYTES_OF_PIXEL
     scene_bytes = 4 * floats + 8  # with class and margin
     run, temporary = config.get_base_dir(), Path(tempfile.gettempdir())
-    depth = DEPTH_BYTES_OF_PIXEL * (reprojection != "none" and rounds > 0)
+    depth = DEPTH_BYTES_OF_PIXEL * (reprojection != "none")
     return Forecast(
         program=program,
         views=sum(sum(split) for split in kept) * (photo + 1) / 1e6,
@@ -196,10 +196,10 @@ def forecast(
         + 3 * 4 * floats
         + SURFEL_SCRATCH,  # with gradients, two moments; copies in growth
         available=available_mb() if device == "cpu" else None,
-        run_disk=RUN_MB + everywhere * (PREPARED_BYTES_OF_PIXEL * rounds + depth),
+        run_disk=RUN_MB + everywhere * PREPARED_BYTES_OF_PIXEL * rounds,
         # two checkpoints with two moments of each number, the base, and each round's split scene
         disk_bytes_of_surfel=2 * (scene_bytes + 2 * 4 * floats) + (1 + rounds) * scene_bytes,
-        temporary=everywhere * TEMPORARY_BYTES_OF_PIXEL * (rounds > 0),
+        temporary=everywhere * (TEMPORARY_BYTES_OF_PIXEL + depth) * (rounds > 0),
         free_disk=_free_disk(run) + _size(run),  # a run that goes on writes over what it has
         free_temporary=_free_disk(temporary),
         one_disk=_existing(run).stat().st_dev == _existing(temporary).stat().st_dev,
