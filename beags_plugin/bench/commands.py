@@ -164,23 +164,6 @@ class Reprojection:
 
 
 @dataclass
-class Required:
-    """What a refined run stores and computes for nothing, and what leaving it out saves."""
-
-    load_config: Path
-    """config.yml of the run."""
-    json: Path | None = None
-    """File for all figures."""
-    csv: Path | None = None
-    """File for all figures as a table."""
-
-    def run(self) -> None:
-        from beags_plugin.bench.required import run_required
-
-        run_required(self.load_config, self.json, self.csv)
-
-
-@dataclass
 class Scaling:
     """Time and memory of a refinement step and of each stage before it against classes, views, Gaussians and pixels."""
 
@@ -224,7 +207,6 @@ Measurement = (
     | Annotated[Base, tyro.conf.subcommand(name="base")]
     | Annotated[BaseLimits, tyro.conf.subcommand(name="base-limits")]
     | Annotated[Reprojection, tyro.conf.subcommand(name="reprojection")]
-    | Annotated[Required, tyro.conf.subcommand(name="required")]
     | Annotated[Scaling, tyro.conf.subcommand(name="scaling")]
     | Annotated[ExperimentFile, tyro.conf.subcommand(name="file")]
 )

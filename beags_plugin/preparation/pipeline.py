@@ -29,11 +29,9 @@ from beags_plugin.preparation.consistent_masks import (
     render_depths,
     reprojected_masks,
 )
-from beags_plugin.preparation.fewer_bands import without_unneeded_bands
 from beags_plugin.preparation.refiner import AssignedScene, EditedScene, Refiner
 from beags_plugin.preparation.summary import (
     assignment_finding,
-    bands_finding,
     removal_finding,
     reprojection_finding,
     split_finding,
@@ -60,8 +58,6 @@ class PreparationConfig:
     k: neighbours that set the voxel size (E8).
     k_pixels: training pixels for which k is stated; fewer of them lift a thinner cloud and take k in proportion, so
         that voxels keep their size. 0, as in the paper, takes k as it is.
-    trim_sh: the highest bands of the colour are left out before refinement if that changes the training views by at
-        most so much (root mean square, colours in 0..1). 0, as in the paper, keeps all.
     min_contribution: Gaussians that fill less than so many pixels in every training view are removed before
         refinement: no view tells what they should be. 0, as in the paper, keeps all.
     """
@@ -74,7 +70,6 @@ class PreparationConfig:
     k: int = 2000
     k_pixels: int = 0
     min_contribution: float = 0.0
-    trim_sh: float = 0.0
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that no stage can work with: hours before the stages would say so."""
@@ -96,8 +91,6 @@ class PreparationConfig:
             raise UserError(f"k_pixels is {self.k_pixels}: it must be a number of pixels, or 0 to take k as it is.")
         if not self.min_contribution >= 0:
             raise UserError(f"min_contribution is {self.min_contribution}: it must be 0 or more pixels.")
-        if not self.trim_sh >= 0:
-            raise UserError(f"trim_sh is {self.trim_sh}: it must be 0 or more, a difference of colours in 0..1.")
 
     def neighbours(self, cameras: Sequence[Camera]) -> int:
         """The k of a scene with these training views, at least ``LEAST_K`` where it was made smaller."""
@@ -189,15 +182,6 @@ def prepare(
         classes = replace(divided.assignment, class_ids=known.class_ids(divided.assignment.class_ids))
         whole = divided.edited if edited is None else edited.edited.then(divided.edited)
         edited, surfels = EditedScene(whole, classes), divided.edited.surfels
-
-    if config.trim_sh > 0 and refiner.trains:
-        with _timed("bands", seconds), stage("Leaving out bands of the colour") as progress:
-            fewer, change = without_unneeded_bands(surfels, cameras, rasterizer, settings, config.trim_sh, progress)
-        degree = surfels.sh_degree
-        if fewer is not surfels:
-            edited = edited or EditedScene(Densified.unchanged(surfels), assignment)
-            edited, surfels = replace(edited, edited=replace(edited.edited, surfels=fewer)), fewer
-        findings.append(bands_finding(degree, surfels.sh_degree, change))
 
     class_ids = (assignment if edited is None else edited.assignment).class_ids
     scene = AssignedScene(

@@ -38,13 +38,6 @@ def split_finding(before: int, divided: EditedScene) -> str:
     return f"border split: {int(divided.edited.fresh.sum())} halves, {before} Gaussians became {after}"
 
 
-def bands_finding(before: int, after: int, change: float) -> str:
-    """What became of the bands of the colour."""
-    if after == before:
-        return f"bands: degree {before} stays, fewer would change the training views by more than is allowed"
-    return f"bands: degree {before} became {after}, which changes the training views by {change:.5f}"
-
-
 def assignment_finding(assignment: Assignment, class_names: dict[int, str]) -> str:
     """How many Gaussians each class has."""
     counts = torch.bincount(assignment.class_ids.long(), minlength=max(class_names) + 1)
