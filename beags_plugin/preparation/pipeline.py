@@ -51,7 +51,6 @@ class PreparationConfig:
     reprojection: how masks are made consistent: "pairwise", "voxel" or another name of ``masks.REPROJECTIONS``; "auto"
         chooses of these two by the number of views and pixels (``consistent_masks.chosen_reprojection``); "none" keeps
         the masks.
-    voters: how many views vote, evenly spread among those with a mask; 0: all of them. Every view is voted on.
     min_confidence: reprojected pixels whose winner has a smaller share of the votes are IGNORE to the losses.
     tau: pairwise: a vote counts if its point is visible: |z - D| <= tau z; infinity counts every vote (E5).
     depth: which depth is lifted into space, "median" or "expected": see ``rasterizers.rendering.surface_depth``.
@@ -63,7 +62,6 @@ class PreparationConfig:
     """
 
     reprojection: str = AUTO
-    voters: int = 0
     min_confidence: float = 0.0
     tau: float = 0.02
     depth: str = "median"
@@ -78,8 +76,6 @@ class PreparationConfig:
             raise UserError(f"there is no reprojection {self.reprojection!r}: choose one of {', '.join(choices)}.")
         if self.reprojection not in (AUTO, "none"):
             REPROJECTIONS.get(self.reprojection)  # one of another package may not load
-        if self.voters < 0:
-            raise UserError(f"voters is {self.voters}: it must be a number of views, or 0 for all of them.")
         if not 0.0 <= self.min_confidence <= 1.0:
             raise UserError(f"min_confidence is {self.min_confidence}: it must be a share of the votes, 0 to 1.")
         check_surface_depth(self.depth)
@@ -222,7 +218,7 @@ def _consistent_masks(
     if config.reprojection == "none":
         findings.append("reprojection: off, masks used as they are")
         return masks_as_they_are(maps, cameras, known)
-    method, why = chosen_reprojection(config.reprojection, config.voters, cameras, maps)
+    method, why = chosen_reprojection(config.reprojection, cameras, maps)
     with stage("Rendering depth") as progress:  # as large as all photos in float: it lies in a temporary file
         depths = filed(
             render_depths(surfels, cameras, rasterizer, settings, config.depth, progress), surfels.means.device
