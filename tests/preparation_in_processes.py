@@ -27,7 +27,7 @@ def found(reprojection: str) -> tuple[list[torch.Tensor], list[str]]:
     prepared = prepare(surfels, cameras, masks, names, rasterizer, settings, REFINERS.get("bea")(), config)
     assigned, grid = prepared.assignment, prepared.grid
     return [
-        *prepared.labels, *prepared.confidence, assigned.class_ids, assigned.margin, assigned.strongest,
+        *prepared.labels, *prepared.confidence, assigned.class_ids, assigned.margin,
         grid.keys, grid.classes, torch.tensor(grid.voxel_size, dtype=torch.float64),
     ], prepared.findings  # fmt: skip
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import pytest
@@ -140,27 +139,6 @@ def test_prepare_splits_only_for_refiners_that_train():
     assert torch.equal(seen[0].class_ids, divided.edited.assignment.class_ids)
     assert any("became 4" in finding for finding in divided.findings) and "border split" in divided.seconds
     assert prepare(*arguments, Recorder(), config, BorderSplitConfig()).edited is None
-
-
-def test_what_no_view_shows_is_removed_before_it_is_split():
-    """The tiny disc fills less than ten pixels; with a bound that none reaches, the strongest remains."""
-    surfels, labels = two_halves()
-    arguments = (surfels, [camera()], [labels], {0: "background", 1: "thing"}, make_rasterizer("torch"), SETTINGS)
-    config, split = PreparationConfig(reprojection="none", k=5, min_contribution=10.0), BorderSplitConfig()
-    assert prepare(*arguments, NoRefiner(), config, split).edited is None
-    removed = prepare(*arguments, BeaRefiner(), config, split)
-    assert removed.assignment.strongest[2] < 10.0 < removed.assignment.strongest[:2].min()
-    assert removed.edited.edited.source.tolist() == [0, 1]
-    assert torch.equal(removed.edited.edited.surfels.means, surfels.means[:2])
-    assert removed.edited.assignment.class_ids.tolist() == removed.assignment.class_ids[:2].tolist()
-    assert any("1 of 3 Gaussians" in finding for finding in removed.findings)
-
-    divided = prepare(*arguments, BeaRefiner(), config, BorderSplitConfig(rounds=1, min_share=0.1)).edited
-    assert divided.edited.source.tolist() == [1, 0, 0] and divided.edited.fresh.tolist() == [False, True, True]
-    least = prepare(*arguments, BeaRefiner(), dataclasses.replace(config, min_contribution=1e6), split).edited
-    assert least.edited.source.tolist() == [0]
-    with pytest.raises(UserError, match="min_contribution is nan"):
-        PreparationConfig(min_contribution=math.nan).check()
 
 
 @pytest.mark.parametrize(

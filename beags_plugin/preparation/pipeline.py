@@ -12,7 +12,6 @@ from torch import Tensor
 
 from beags_plugin.assignment.assignment import Assignment, assign_classes, check_class_ids
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.densification import Densified
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
@@ -32,7 +31,6 @@ from beags_plugin.preparation.consistent_masks import (
 from beags_plugin.preparation.refiner import AssignedScene, EditedScene, Refiner
 from beags_plugin.preparation.summary import (
     assignment_finding,
-    removal_finding,
     reprojection_finding,
     split_finding,
 )
@@ -57,8 +55,6 @@ class PreparationConfig:
     k: neighbours that set the voxel size (E8).
     k_pixels: training pixels for which k is stated; fewer of them lift a thinner cloud and take k in proportion, so
         that voxels keep their size. 0, as in the paper, takes k as it is.
-    min_contribution: Gaussians that fill less than so many pixels in every training view are removed before
-        refinement: no view tells what they should be. 0, as in the paper, keeps all.
     """
 
     reprojection: str = AUTO
@@ -67,7 +63,6 @@ class PreparationConfig:
     depth: str = "median"
     k: int = 2000
     k_pixels: int = 0
-    min_contribution: float = 0.0
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that no stage can work with: hours before the stages would say so."""
@@ -85,8 +80,6 @@ class PreparationConfig:
             raise UserError(f"k is {self.k}: the voxel size needs at least 1 neighbour.")
         if not self.k_pixels >= 0:
             raise UserError(f"k_pixels is {self.k_pixels}: it must be a number of pixels, or 0 to take k as it is.")
-        if not self.min_contribution >= 0:
-            raise UserError(f"min_contribution is {self.min_contribution}: it must be 0 or more pixels.")
 
     def neighbours(self, cameras: Sequence[Camera]) -> int:
         """The k of a scene with these training views, at least ``LEAST_K`` where it was made smaller."""
@@ -104,7 +97,7 @@ class Preparation:
     confidence: per training view [H, W] uint8, share of the winning votes times 255, held compressed; None where
         nothing was reprojected.
     assignment: the class of every surfel and its margin.
-    edited: the scene and the classes that refinement starts from, where surfels were removed or split; None where it
+    edited: the scene and the classes that refinement starts from, where surfels were split; None where it
         starts from the base.
     grid: the visibility voxel grids, or None if the refiner needs none.
     findings: one line for a reader per stage.
@@ -166,18 +159,12 @@ def prepare(
     findings.append(assignment_finding(assignment, class_names))
 
     edited = None
-    if config.min_contribution > 0 and refiner.trains:
-        with _timed("removal", seconds):
-            edited = _without_unneeded(surfels, assignment, config.min_contribution)
-        findings.append(removal_finding(len(surfels), edited, config.min_contribution))
-        surfels = edited.edited.surfels
     if split is not None and split.rounds > 0 and refiner.trains:
         with _timed("border split", seconds), stage("Splitting Gaussians at borders") as progress:
             divided = split_at_borders(surfels, cameras, ranked, rasterizer, settings, len(known), split, progress)
         findings.append(split_finding(len(surfels), divided))
         classes = replace(divided.assignment, class_ids=known.class_ids(divided.assignment.class_ids))
-        whole = divided.edited if edited is None else edited.edited.then(divided.edited)
-        edited, surfels = EditedScene(whole, classes), divided.edited.surfels
+        edited, surfels = replace(divided, assignment=classes), divided.edited.surfels
 
     class_ids = (assignment if edited is None else edited.assignment).class_ids
     scene = AssignedScene(
@@ -243,11 +230,3 @@ def known_classes(labels: Sequence[Tensor | None], class_names: dict[int, str]) 
             check_class_ids(mask, index, last + 1)
             present[mask[mask != IGNORE].long().to(present.device)] = True
     return ClassRanks(torch.cat([named.ids, present.nonzero()[:, 0]]))
-
-
-def _without_unneeded(surfels: Surfels, assignment: Assignment, least: float) -> EditedScene:
-    """The scene without surfels that fill less than ``least`` pixels in every view; at least one remains."""
-    kept = assignment.strongest >= least
-    kept[assignment.strongest.argmax()] = True
-    source = torch.nonzero(kept)[:, 0]
-    return EditedScene(Densified(surfels[kept], source, torch.zeros_like(source, dtype=torch.bool)), assignment[kept])

@@ -25,13 +25,6 @@ def reprojection_finding(before: Sequence[Tensor | None], after: Sequence[Tensor
     )
 
 
-def removal_finding(before: int, edited: EditedScene, least: float) -> str:
-    """How many Gaussians were removed."""
-    removed = before - len(edited.edited.surfels)
-    share = f"{removed} of {before} Gaussians ({100 * removed / before:.1f} %)"
-    return f"removal: {share} fill less than {least:g} pixels in every view"
-
-
 def split_finding(before: int, divided: EditedScene) -> str:
     """How many Gaussians were split."""
     after = len(divided.edited.surfels)
