@@ -25,7 +25,7 @@ class _Stub:
     def contributing_classes(self, inputs, camera, settings, labels, num_classes):
         assert not settings.geometry and not settings.distortion
         assert inputs.means.requires_grad is False
-        table = torch.nn.functional.pad(torch.tensor(camera.table, dtype=torch.float32), (0, 1))
+        table = torch.tensor(camera.table, dtype=torch.float32)
         assert table.shape[1] == num_classes
         surfel, class_id = torch.nonzero(table, as_tuple=True)
         return surfel * num_classes + class_id, table[surfel, class_id]

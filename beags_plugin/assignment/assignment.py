@@ -63,16 +63,13 @@ def assign_classes(
         if mask is None:
             return inputs.means.new_zeros(0, dtype=torch.int64), inputs.means.new_zeros(0)
         check_class_ids(mask, index, num_classes)
-        every = mask.masked_fill(mask == IGNORE, num_classes)  # what is not labelled counts as one more class
         with torch.no_grad():
-            return rasterizer.contributing_classes(inputs, camera, settings, every, num_classes + 1)
+            return rasterizer.contributing_classes(inputs, camera, settings, mask, num_classes)
 
     if len(cameras) != len(labels):
         raise ValueError(f"{len(cameras)} cameras and {len(labels)} masks do not belong together")
     for keys, values in each_view(len(cameras), contributions, progress):
-        surfel, class_id = keys // (num_classes + 1), keys % (num_classes + 1)
-        labelled = class_id < num_classes
-        total.add((surfel * num_classes + class_id)[labelled], values[labelled])
+        total.add(keys, values)
     class_ids, top, everything = largest_in_rows(*total.found(), len(surfels), num_classes)
     never_seen = everything <= 0
     margin = torch.where(never_seen, 0.0, top / everything.masked_fill(never_seen, 1.0))
