@@ -84,7 +84,7 @@ def test_what_lies_behind_another_surface_may_be_covered(monkeypatch):
     loss = SilhouetteLoss()
     assert float(loss.value(hidden)) < float(loss.value(front))
     monkeypatch.setattr(silhouette, "TAU", 1e9)  # nothing is ever taken for hidden
-    assert float(loss.value(hidden)) == pytest.approx(float(everything.value(front)), rel=1e-4)
+    assert float(loss.value(hidden)) == pytest.approx(float(loss.value(front)), rel=1e-4)
 
 
 def test_surface_that_was_seen_as_the_objects_does_not_count_where_another_object_covers_it():
