@@ -18,8 +18,11 @@ from beags_plugin.system.reading.ply import read_ply_points
 if TYPE_CHECKING:
     from beags_plugin.plugin.views.poses import PosedViews
 
+SEED = 0
+"""Of the points that are drawn where the data brings none."""
 
-def starting_points(scene: Scene, views: PosedViews, count: int, seed: int) -> dict[str, Any]:
+
+def starting_points(scene: Scene, views: PosedViews, count: int) -> dict[str, Any]:
     """The seed points of a scene in the world of its cameras, or ``count`` drawn ones where it has none.
 
     Returns ``points3D_xyz`` [P, 3] float32, ``points3D_rgb`` [P, 3] uint8 and ``points3D_random``, whether they are
@@ -43,26 +46,26 @@ def starting_points(scene: Scene, views: PosedViews, count: int, seed: int) -> d
     if found["points3D_xyz"] is not None and len(found["points3D_xyz"]) > 0:
         return {**found, "points3D_random": False}
     if bounds is None:
-        xyz, rgb = random_points(cameras, count, seed)
+        xyz, rgb = random_points(cameras, count)
     else:
-        xyz, rgb = points_between(cameras, scale * bounds, count, seed)
+        xyz, rgb = points_between(cameras, scale * bounds, count)
     return {"points3D_xyz": torch.from_numpy(xyz), "points3D_rgb": torch.from_numpy(rgb), "points3D_random": True}
 
 
-def random_points(cameras: Sequence[Camera], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def random_points(cameras: Sequence[Camera], count: int) -> tuple[np.ndarray, np.ndarray]:
     """Points in the cameras' common view, for scenes without seed points.
 
     Drawn uniformly in the ball around the cameras' point of interest (see ``_point_of_interest``) whose radius is half
     the cameras' median distance from it, and kept where at least half of the views see them (or as many views as
     see the best tenth, where frusta overlap less than that).
 
-    Returns positions [count, 3] float32 and colours [count, 3] uint8, mid-grey. The same seed gives the same points.
+    Returns positions [count, 3] float32 and colours [count, 3] uint8, mid-grey.
     """
     rotations = np.stack([camera.rotation.double().numpy() for camera in cameras])
     centers = np.stack([camera.center.double().numpy() for camera in cameras])
     focus = _point_of_interest(rotations, centers)
     radius = 0.5 * float(np.median(np.linalg.norm(centers - focus, axis=1)))
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(SEED)
     batch = 1 << 14
 
     def draw() -> tuple[np.ndarray, np.ndarray]:
@@ -74,20 +77,17 @@ def random_points(cameras: Sequence[Camera], count: int, seed: int) -> tuple[np.
     return _seen_by_many(draw, count)
 
 
-def points_between(
-    cameras: Sequence[Camera], bounds: np.ndarray, count: int, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
+def points_between(cameras: Sequence[Camera], bounds: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Points in the cameras' common view and within their depths, uniform in each image and in inverse depth.
 
     bounds: [V, 2] nearest and farthest depth of each view. Kept are points that at least half of the views see (or as
-    many as see the best tenth). Returns positions [count, 3] float32 and colours [count, 3] uint8, mid-grey. The same
-    seed gives the same points.
+    many as see the best tenth). Returns positions [count, 3] float32 and colours [count, 3] uint8, mid-grey.
     """
     rotations = np.stack([camera.rotation.double().numpy() for camera in cameras])
     centers = np.stack([camera.center.double().numpy() for camera in cameras])
     to_rays = np.stack([np.linalg.inv(camera.K.double().numpy()) for camera in cameras])
     sizes = np.array([(camera.width, camera.height) for camera in cameras], float)
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(SEED)
 
     def draw() -> tuple[np.ndarray, np.ndarray]:
         view = generator.integers(len(cameras), size=1 << 14)
