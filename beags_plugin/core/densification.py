@@ -33,8 +33,9 @@ class DensifyConfig:
 
     every, start, stop: densify at multiples of ``every`` between ``start`` and ``stop``, both excluded (as officially).
     prune_scale_after: surfels larger than ``PRUNE_SCALE`` go after this step.
-    far_limits: ``CLONE_SCALE`` and ``PRUNE_SCALE`` are relative to the distance of the nearest camera where that exceeds the scene's extent;
-        False, as officially: to the extent alone, which far backgrounds and forward-facing captures do not fit.
+    far_limits: ``CLONE_SCALE`` and ``PRUNE_SCALE`` are relative to the distance of the nearest camera where that
+        exceeds the scene's extent; False, as officially: to the extent alone, which far backgrounds and forward-facing
+        captures do not fit.
     reset_every: opacities are set to at most ``RESET_OPACITY`` so often; 0 never.
     max_surfels: the scene grows no further than this; 0 sets no bound.
     pixels_per_surfel: nor further than one surfel for so many pixels of all training images, so that what few images
