@@ -21,8 +21,6 @@ WIDTH, HEIGHT = 1000, 750
 
 def measure(reprojection: str, views: int) -> None:
     """Print one JSON line."""
-    from beags_plugin.bench.memory import peak_of
-    from beags_plugin.bench.scaling_scene import SETTINGS, Sizes, make_scene
     from beags_plugin.core.cameras import Camera
     from beags_plugin.labels.label_maps import LabelMaps
     from beags_plugin.preparation.pipeline import Preparation, PreparationConfig, prepare
@@ -30,6 +28,8 @@ def measure(reprojection: str, views: int) -> None:
     from beags_plugin.rasterizers.rendering import draw_class_map
     from beags_plugin.refiners import REFINERS
     from beags_plugin.system.memory import peak_memory_mb
+    from benchmarks.peak_memory import peak_mb_of
+    from benchmarks.scaling_scene import SETTINGS, Sizes, make_scene
 
     rasterizer = make_rasterizer("auto")
     scene = make_scene(Sizes(views=views, gaussians=5000, pixels=48), rasterizer)  # its own pictures are not used
@@ -45,7 +45,7 @@ def measure(reprojection: str, views: int) -> None:
     config = PreparationConfig(reprojection=reprojection)
     found: list[Preparation] = []
     start, refiner = time.perf_counter(), REFINERS.get("bea")()
-    added = peak_of(
+    added = peak_mb_of(
         lambda: found.append(prepare(scene.surfels, cameras, labels, names, rasterizer, SETTINGS, refiner, config))
     )
     seconds = time.perf_counter() - start
