@@ -85,10 +85,10 @@ def test_what_does_not_fit_is_refused_with_a_remedy():
     with pytest.raises(UserError, match=told):
         check_memory(replace(found, available=1000.0))
     with pytest.raises(
-        UserError, match=r"the run needs about 4.06 GB at most .*; 0.5 GB are free: free some space, or"
+        UserError, match=r"the run needs about 3.76 GB at most .*; 0.5 GB are free: free some space, or"
     ):
         check_memory(replace(found, free_disk=500.0))
-    with pytest.raises(UserError, match=r"temporary files need 0.60 GB and 0.10 GB are free there: .* TMPDIR"):
+    with pytest.raises(UserError, match=r"temporary files need 0.90 GB and 0.10 GB are free there: .* TMPDIR"):
         check_memory(replace(found, free_temporary=100.0))
     enough = found.run_disk + 750_000 * found.disk_bytes_of_surfel / 1e6 + 1.0
     check_memory(replace(found, free_disk=enough, one_disk=False))
