@@ -31,7 +31,7 @@ def folder_of(scene: str) -> Iterator[Path]:
     if scene not in SAMPLES:
         yield Path(scene).absolute()
         return
-    from beags_plugin.commands.demo import make_sample
+    from beags_plugin.sample.writer import make_sample
 
     with tempfile.TemporaryDirectory() as folder:
         make_sample(Path(folder) / scene, 0, 256, 192, scene.removeprefix("sample-"), 60)

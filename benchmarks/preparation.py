@@ -12,9 +12,7 @@ import hashlib
 import json
 import subprocess
 import sys
-import tempfile
 import time
-from pathlib import Path
 
 import torch
 
@@ -23,16 +21,15 @@ WIDTH, HEIGHT = 1000, 750
 
 def measure(reprojection: str, views: int) -> None:
     """Print one JSON line."""
-    from beags_plugin.bench.memory import peak_of
-    from beags_plugin.bench.scaling_scene import SETTINGS, Sizes, make_scene
     from beags_plugin.core.cameras import Camera
     from beags_plugin.labels.label_maps import LabelMaps
     from beags_plugin.preparation.pipeline import Preparation, PreparationConfig, prepare
-    from beags_plugin.preparation.stages import StageStore
     from beags_plugin.rasterizers import make_rasterizer
     from beags_plugin.rasterizers.rendering import draw_class_map
     from beags_plugin.refiners import REFINERS
     from beags_plugin.system.memory import peak_memory_mb
+    from benchmarks.peak_memory import peak_mb_of
+    from benchmarks.scaling_scene import SETTINGS, Sizes, make_scene
 
     rasterizer = make_rasterizer("auto")
     scene = make_scene(Sizes(views=views, gaussians=5000, pixels=48), rasterizer)  # its own pictures are not used
@@ -47,17 +44,11 @@ def measure(reprojection: str, views: int) -> None:
     names = {index: str(index) for index in range(scene.num_classes)}
     config = PreparationConfig(reprojection=reprojection)
     found: list[Preparation] = []
-    with tempfile.TemporaryDirectory() as folder:
-        store, start = StageStore(Path(folder)), time.perf_counter()
-        added = peak_of(
-            lambda: found.append(
-                prepare(
-                    scene.surfels, cameras, labels, names, rasterizer, SETTINGS, REFINERS.get("bea")(), config,
-                    store=store,
-                )
-            )
-        )  # fmt: skip
-        seconds = time.perf_counter() - start
+    start, refiner = time.perf_counter(), REFINERS.get("bea")()
+    added = peak_mb_of(
+        lambda: found.append(prepare(scene.surfels, cameras, labels, names, rasterizer, SETTINGS, refiner, config))
+    )
+    seconds = time.perf_counter() - start
     peak, digest, (prepared,) = peak_memory_mb(), hashlib.sha256(), found
     grid, confidence = prepared.grid, prepared.confidence
     assert grid is not None and confidence is not None

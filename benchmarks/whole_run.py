@@ -29,11 +29,11 @@ def write_data(root: Path, views: int) -> None:
     """<root>/data with photos, masks and poses, and <root>/scene.ply, what the photos show."""
     import cv2
 
-    from beags_plugin.bench.scaling_scene import SETTINGS, Sizes, make_scene
     from beags_plugin.core.cameras import Camera
     from beags_plugin.extraction.ply import write_ply
     from beags_plugin.rasterizers import make_rasterizer
     from beags_plugin.rasterizers.rendering import draw_class_map, surfel_inputs
+    from benchmarks.scaling_scene import SETTINGS, Sizes, make_scene
 
     rasterizer = make_rasterizer("auto")
     scene = make_scene(Sizes(views=views, gaussians=5000, pixels=48), rasterizer)  # its own pictures are not used

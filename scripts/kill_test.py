@@ -75,14 +75,15 @@ class Tester:
             raise RuntimeError(f"the sample could not be written: {log}")
         seen: dict[str, float] = {}
         child = forked.forked(lambda: train(self.data, self.whole), log)
-        marks = {"stages": self.whole / "prepared/stages", "grid": self.whole / "prepared/grid.pt"}
+        before = f"nerfstudio_models/step-{OPTIONS['pipeline.model.base_steps'] - 1:09d}.ckpt"  # saved as it begins
+        marks = {"begin": self.whole / before, "grid": self.whole / "prepared/grid.pt"}
         while (code := forked.ended(child)) is None:
             self.run_seconds = max(self.run_seconds, forked.cpu_time(child))
             for name, path in marks.items():
                 if name not in seen and path.exists():
                     seen[name] = self.run_seconds
             time.sleep(0.005)
-        self.preparation = seen["stages"], seen["grid"]
+        self.preparation = seen["begin"], seen["grid"]
         exporting = forked.kill_after(lambda: export(self.whole, self.exported), log, float("inf"))
         export_code, self.export_seconds = exporting
         if code != 0 or export_code != 0:
@@ -268,12 +269,9 @@ def state_of(run: Path) -> str:
         return "before the run began"
     saved = sorted(path.stem for path in run.glob("nerfstudio_models/*.ckpt"))
     unfinished = sorted(path.name for path in run.rglob(".*.part"))
-    stages = sorted(path.name.split("-")[0] for path in run.glob("prepared/stages/*/*.pt"))
     words = [saved[-1] if saved else "no checkpoint yet"]
     if unfinished:
         words.append(f"while {unfinished[0]} was written")
-    if stages:
-        words.append(f"{len(stages)} stages kept")
     return ", ".join(words)
 
 

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+from contextlib import contextmanager
 from pathlib import Path
+from unittest import mock
 
 import torch
+
+from beags_plugin.preparation import border_split
 
 STEPS = 45, 12  # of base and refinement
 
@@ -27,8 +31,6 @@ def short_config(data: Path, run: Path, **overrides):
         "pipeline.model.densify.stop": 40,
         "pipeline.model.densify.reset_every": 15,
         "pipeline.datamanager.dataparser.num_random_points": 300,
-        "pipeline.model.split.min_share": 0.05,
-        "pipeline.model.split.min_sigma": 0.1,
         "optimizers.opacities.optimizer.lr": 0.5,  # opaque after so few steps
         "pipeline.model.losses.normal.start": 12,
         "pipeline.model.sh_degree_interval": 15,
@@ -51,14 +53,23 @@ def run_to_end(config):
     """Train as ns-train does."""
     from beags_plugin.plugin.runs.launch import train
 
-    train(config)
+    with splits():
+        train(config)
 
 
 def resume_to_end(run: Path, device: str | None = None):
     """What ``beags resume`` does."""
     from beags_plugin.plugin.runs.launch import resume
 
-    resume(run, device)
+    with splits():
+        resume(run, device)
+
+
+@contextmanager
+def splits():
+    """Let the border split find Gaussians in a scene as small as this."""
+    with mock.patch.object(border_split, "MIN_SHARE", 0.05), mock.patch.object(border_split, "MIN_SIGMA", 0.1):
+        yield
 
 
 def checkpoint_of(run: Path) -> dict:

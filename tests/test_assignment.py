@@ -25,7 +25,7 @@ class _Stub:
     def contributing_classes(self, inputs, camera, settings, labels, num_classes):
         assert not settings.geometry and not settings.distortion
         assert inputs.means.requires_grad is False
-        table = torch.nn.functional.pad(torch.tensor(camera.table, dtype=torch.float32), (0, 1))
+        table = torch.tensor(camera.table, dtype=torch.float32)
         assert table.shape[1] == num_classes
         surfel, class_id = torch.nonzero(table, as_tuple=True)
         return surfel * num_classes + class_id, table[surfel, class_id]
@@ -55,7 +55,6 @@ def test_sums_over_views_with_ties_to_the_lower_id():
     assert result.class_ids.tolist() == [2, 0, 1, 2]
     assert result.margin.tolist() == pytest.approx([5 / 8, 0.0, 0.5, 0.75])
     assert result.never_seen.tolist() == [False, True, False, False]
-    assert result.strongest.tolist() == [4.0, 0.0, 4.0, 3.0]
     assert result[torch.tensor([True, False, False, True])].class_ids.tolist() == [2, 2]
     assert calls == [(1, 3), (2, 3), (3, 3)]
 
@@ -106,23 +105,6 @@ def test_ids_out_of_range_are_told():
     mask = torch.tensor([[0, IGNORE, 5]], dtype=torch.int32)
     with pytest.raises(UserError, match="view 0 holds class ids 0..5"):
         assign_classes(_surfels(1), [SimpleNamespace(table=[[1.0]])], [mask], _Stub(), SETTINGS, 3)
-
-
-def test_strongest_counts_pixels_without_a_label_too():
-    scene = make_scene()
-    inputs = scene.inputs
-    sh = torch.zeros(len(inputs.means), 1, 3).double()
-    surfels = Surfels.of(inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits, sh)
-    rasterizer = make_rasterizer("torch")
-    unlabelled = scene.target.clone()
-    unlabelled[::2] = IGNORE
-    everything = rasterizer.class_contributions(
-        geometry_inputs(surfels), scene.camera, scene.settings, torch.zeros_like(scene.target), 1
-    )[:, 0]
-    assert (everything > 0).any() and (everything == 0).any()
-    for labels in ([unlabelled, None], [None, scene.target]):
-        found = assign_classes(surfels, [scene.camera] * 2, labels, rasterizer, scene.settings, CLASSES)
-        torch.testing.assert_close(found.strongest, everything.float(), rtol=1e-5, atol=0)
 
 
 @pytest.mark.parametrize("backend", ["torch", "native"])

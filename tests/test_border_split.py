@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
-
 import pytest
 import torch
 
@@ -12,6 +9,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.splitting import split_in_two
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.preparation import border_split
 from beags_plugin.preparation.border_split import BorderSplitConfig, border_band, largest_sigma, split_at_borders
 from beags_plugin.preparation.pipeline import PreparationConfig, prepare
 from beags_plugin.preparation.refiner import AssignedScene
@@ -98,6 +96,11 @@ def test_largest_sigma_is_that_of_the_nearest_view():
     assert largest_sigma(surfels, [beyond]).item() == 0.0
 
 
+@pytest.fixture(autouse=True)
+def split_sooner(monkeypatch):
+    monkeypatch.setattr(border_split, "MIN_SHARE", 0.1)
+
+
 def two_halves() -> tuple[Surfels, torch.Tensor]:
     """A large disc across the border of two classes, one far from it, and a tiny one at it."""
     labels = torch.zeros(SIZE, SIZE, dtype=torch.int32)
@@ -107,14 +110,14 @@ def two_halves() -> tuple[Surfels, torch.Tensor]:
 
 def test_only_large_ones_at_a_border_are_split_and_classes_follow():
     surfels, labels = two_halves()
-    config = BorderSplitConfig(rounds=1, min_share=0.1)
+    config = BorderSplitConfig(rounds=1)
     scene = split_at_borders(surfels, [camera()], [labels], make_rasterizer("torch"), SETTINGS, 2, config)
     assert scene.edited.source.tolist() == [1, 2, 0, 0]
     right, left = scene.edited.surfels.means[2, 0], scene.edited.surfels.means[3, 0]
     assert right > left
     assert scene.assignment.class_ids[[0, 2, 3]].tolist() == [0, 1, 0]  # the disc was wholly of class 1
     again = split_at_borders(
-        surfels, [camera()], [labels], make_rasterizer("torch"), SETTINGS, 2, BorderSplitConfig(rounds=2, min_share=0.1)
+        surfels, [camera()], [labels], make_rasterizer("torch"), SETTINGS, 2, BorderSplitConfig(rounds=2)
     )
     assert set(again.edited.source.tolist()) == {0, 1, 2}
     assert len(again.edited.surfels) > len(scene.edited.surfels)
@@ -124,7 +127,7 @@ def test_only_large_ones_at_a_border_are_split_and_classes_follow():
 def test_prepare_splits_only_for_refiners_that_train():
     surfels, labels = two_halves()
     arguments = (surfels, [camera()], [labels], {0: "background", 1: "thing"}, make_rasterizer("torch"), SETTINGS)
-    config, split = PreparationConfig(reprojection="none", k=5), BorderSplitConfig(rounds=1, min_share=0.1)
+    config, split = PreparationConfig(reprojection="none", k=5), BorderSplitConfig(rounds=1)
     kept = prepare(*arguments, NoRefiner(), config, split)
     assert kept.edited is None and len(kept.assignment.class_ids) == 3
 
@@ -142,31 +145,6 @@ def test_prepare_splits_only_for_refiners_that_train():
     assert prepare(*arguments, Recorder(), config, BorderSplitConfig()).edited is None
 
 
-def test_what_no_view_shows_is_removed_before_it_is_split():
-    """The tiny disc fills less than ten pixels; with a bound that none reaches, the strongest remains."""
-    surfels, labels = two_halves()
-    arguments = (surfels, [camera()], [labels], {0: "background", 1: "thing"}, make_rasterizer("torch"), SETTINGS)
-    config, split = PreparationConfig(reprojection="none", k=5, min_contribution=10.0), BorderSplitConfig()
-    assert prepare(*arguments, NoRefiner(), config, split).edited is None
-    removed = prepare(*arguments, BeaRefiner(), config, split)
-    assert removed.assignment.strongest[2] < 10.0 < removed.assignment.strongest[:2].min()
-    assert removed.edited.edited.source.tolist() == [0, 1]
-    assert torch.equal(removed.edited.edited.surfels.means, surfels.means[:2])
-    assert removed.edited.assignment.class_ids.tolist() == removed.assignment.class_ids[:2].tolist()
-    assert any("1 of 3 Gaussians" in finding for finding in removed.findings)
-
-    divided = prepare(*arguments, BeaRefiner(), config, BorderSplitConfig(rounds=1, min_share=0.1)).edited
-    assert divided.edited.source.tolist() == [1, 0, 0] and divided.edited.fresh.tolist() == [False, True, True]
-    least = prepare(*arguments, BeaRefiner(), dataclasses.replace(config, min_contribution=1e6), split).edited
-    assert least.edited.source.tolist() == [0]
-    with pytest.raises(UserError, match="min_contribution is nan"):
-        PreparationConfig(min_contribution=math.nan).check()
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [({"rounds": -1}, "rounds"), ({"band": 0}, "band"), ({"min_share": 1.5}, "0..1"), ({"min_sigma": math.nan}, "pix")],
-)
-def test_wrong_options_are_refused(options, words):
-    with pytest.raises(UserError, match=words):
-        BorderSplitConfig(**options).check()
+def test_a_negative_number_of_rounds_is_refused():
+    with pytest.raises(UserError, match="rounds = -1"):
+        BorderSplitConfig(rounds=-1).check()

@@ -102,7 +102,6 @@ SENTENCES = {
     f"one of {PRESETS}.",
     "bench file {tmp}/absent.toml --output {tmp}/bench": "the experiment {tmp}/absent.toml cannot be read (No such "
     "file or directory): name an existing file of that kind.",
-    "bench required --load-config {tmp}/absent.yml": NO_FILE,
     # doctor
     "doctor --json {tmp}/file/x.json": "{tmp}/file/x.json cannot be written (File exists): choose another place.",
 }

@@ -20,7 +20,6 @@ from beags_plugin.losses.class_members import ClassMembers
 from beags_plugin.losses.distortion import DistortionLoss
 from beags_plugin.losses.normal import NormalConsistencyLoss
 from beags_plugin.losses.occupancy import OccupancyLoss
-from beags_plugin.losses.opacity import OpacityLoss
 from beags_plugin.losses.photometric import PhotometricLoss
 from beags_plugin.losses.silhouette import SilhouetteLoss
 from beags_plugin.ops import cuda_extension
@@ -35,7 +34,6 @@ LOSSES = [
     BoundaryLoss(),
     OccupancyLoss(samples=20),
     DistortionLoss(weight=1.0),
-    OpacityLoss(weight=1.0),
     SilhouetteLoss(objects=2),
     SilhouetteLoss(objects=1, seen=9),
 ]

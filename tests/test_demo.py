@@ -15,7 +15,8 @@ from data_folders import write_image
 from run_folders import write_scene
 
 from beags_plugin.commands import demo
-from beags_plugin.commands.demo import STAMP, _clear, _trained, check_preset, quick_downscale
+from beags_plugin.commands.demo import STAMP, _clear, _trained, check_preset
+from beags_plugin.data.quick import quick_downscale
 from beags_plugin.plugin.objects.extract import folder_names
 from beags_plugin.plugin.options.config import base_config
 from beags_plugin.system.errors import UserError

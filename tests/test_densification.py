@@ -10,6 +10,8 @@ import pytest
 import torch
 
 from beags_plugin.core.densification import (
+    GRADIENT_THRESHOLD,
+    RESET_OPACITY,
     DensifyConfig,
     GradientStatistics,
     densify,
@@ -23,7 +25,7 @@ from beags_plugin.core.surfels import Surfels
 
 EXTENT = 2.0
 CONFIG = DensifyConfig()
-LOW, HIGH = CONFIG.grad_threshold * 0.99, CONFIG.grad_threshold * 1.01
+LOW, HIGH = GRADIENT_THRESHOLD * 0.99, GRADIENT_THRESHOLD * 1.01
 SMALL, MIDDLE, HUGE = 0.5 * 0.01 * EXTENT, 3 * 0.01 * EXTENT, 2 * 0.1 * EXTENT
 
 
@@ -143,8 +145,8 @@ def test_statistics_average_over_the_views_that_saw_a_surfel():
 
 
 def test_reset_only_lowers_opacity():
-    logits = reset_opacity(scene([SMALL] * 2, [0.9, 0.001]), CONFIG)
-    torch.testing.assert_close(torch.sigmoid(logits), torch.tensor([CONFIG.reset_opacity, 0.001]))
+    logits = reset_opacity(scene([SMALL] * 2, [0.9, 0.001]))
+    torch.testing.assert_close(torch.sigmoid(logits), torch.tensor([RESET_OPACITY, 0.001]))
 
 
 @pytest.mark.parametrize("factor", [1e-4, 1.0, 1e6])

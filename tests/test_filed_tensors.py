@@ -18,7 +18,6 @@ from beags_plugin.masks.reprojection import check_views
 from beags_plugin.masks.voxel_reprojection import reproject_voxel
 from beags_plugin.preparation import consistent_masks
 from beags_plugin.preparation.pipeline import PreparationConfig, prepare
-from beags_plugin.preparation.stages import Stages, StageStore
 from beags_plugin.refiners import REFINERS
 from beags_plugin.system import filed_tensors
 from beags_plugin.system.errors import UserError
@@ -115,29 +114,6 @@ def test_what_could_not_be_written_leaves_nothing_behind(tmp_path):
     assert [other.name for other in tmp_path.iterdir()] == ["some.npz"] and path.read_bytes() == b"former"
 
 
-def test_a_filed_stage_is_reused_and_forgotten(tmp_path):
-    calls = []
-
-    def compute():
-        calls.append(1)
-        yield from VALUES
-
-    for folder in (tmp_path, tmp_path, None):
-        stages = Stages(None if folder is None else StageStore(folder), "inputs")
-        found = stages.run_filed("depth", stages.key("depth", 1), compute, "cpu")
-        assert len(found) == 5 and all(same_bits(a, b) for a, b in zip(found, VALUES, strict=True))
-        assert stages.seconds["depth"] >= 0 and found[-1].shape == () and len(found[3:]) == 2
-    assert len(calls) == 2 and len(list(tmp_path.iterdir())) == 1
-    next(tmp_path.iterdir()).write_bytes(b"half")  # damaged: made again
-    stages = Stages(StageStore(tmp_path), "inputs")
-    stages.run_filed("depth", stages.key("depth", 1), compute, "cpu")
-    assert len(calls) == 3
-    stages.run_filed("depth", stages.key("depth", 2), compute, "cpu")
-    assert len(calls) == 4 and len(list(tmp_path.iterdir())) == 1
-    stages.drop("depth")
-    assert not list(tmp_path.iterdir())
-
-
 class Counting:
     """Views of which no more than a few may be held at a time."""
 
@@ -172,14 +148,14 @@ def test_the_voxel_form_holds_one_view_at_a_time():
     assert maps.most <= 3
 
 
-def test_what_is_prepared_from_files_is_what_is_prepared_from_memory(monkeypatch, tmp_path):
+def test_what_is_prepared_from_files_is_what_is_prepared_from_memory():
     surfels, cameras, masks, rasterizer, settings = labelled_views(9, 0.1)
     names = {index: str(index) for index in range(CLASSES)}
 
-    def prepared(name, store=None):
+    def prepared(name):
         config = PreparationConfig(reprojection=name, k=20)
         refiner = REFINERS.get("bea")()
-        found = prepare(surfels, cameras, masks, names, rasterizer, settings, refiner, config, store=store)
+        found = prepare(surfels, cameras, masks, names, rasterizer, settings, refiner, config)
         assert isinstance(found.labels, LabelMaps) and isinstance(found.confidence, PackedMaps)
         return [*found.labels, *found.confidence, found.assignment.margin, found.grid.keys, found.grid.classes]
 
@@ -189,9 +165,3 @@ def test_what_is_prepared_from_files_is_what_is_prepared_from_memory(monkeypatch
         direct = [each.labels for each in REPROJECTIONS.get(name)(depths, cameras, masks, CLASSES)]
         found = prepared(name)
         assert all(torch.equal(a, b) for a, b in zip(direct, found[: len(cameras)], strict=True))
-        for store in (StageStore(tmp_path / name), StageStore(tmp_path / name)):  # made, then taken from there
-            again = prepared(name, store)
-            assert all(torch.equal(a, b) for a, b in zip(found, again, strict=True))
-        assert sorted(path.name.split("-")[0] for path in (tmp_path / name).iterdir()) == [
-            "assignment", "reprojection", "voxel grids",
-        ]  # fmt: skip

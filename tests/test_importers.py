@@ -8,7 +8,6 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from plyfile import PlyData, PlyElement
 from start_scenes import a_frame, in_frame, write_splatfacto
 from test_extraction import a_rotation, random_surfels
 
@@ -25,6 +24,7 @@ from beags_plugin.importers.base import find_importer
 from beags_plugin.importers.checkpoint import CheckpointImporter
 from beags_plugin.importers.ply import PlyImporter
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.ply import read_vertices, write_vertices
 
 
 def gaussians(count: int = 40, seed: int = 0) -> Gaussians:
@@ -161,10 +161,13 @@ def test_a_damaged_ply_is_refused_in_one_sentence(tmp_path, content, words):
 def test_text_and_doubles_are_read_too(tmp_path):
     surfels = random_surfels(degree=1)
     write_ply(tmp_path / "binary.ply", surfels)
-    data = PlyData.read(str(tmp_path / "binary.ply"), mmap=False)["vertex"].data
-    for name, text in (("text", True), ("double", False)):
-        table = data if text else data.astype([(column, "<f8") for column in data.dtype.names])
-        PlyData([PlyElement.describe(table, "vertex")], text=text).write(str(tmp_path / f"{name}.ply"))
+    data = read_vertices(tmp_path / "binary.ply")
+    with open(tmp_path / "double.ply", "wb") as file:
+        write_vertices(file, data.astype([(column, "<f8") for column in data.dtype.names]))
+    header = (tmp_path / "binary.ply").read_bytes().partition(b"end_header\n")[0].decode("ascii")
+    rows = "\n".join(" ".join(repr(float(value)) for value in row) for row in data.tolist())
+    (tmp_path / "text.ply").write_text(header.replace("binary_little_endian", "ascii") + "end_header\n" + rows)
+    for name in ("text", "double"):
         read = read_splat_file(tmp_path / f"{name}.ply").gaussians
         assert torch.allclose(read.means, surfels.means) and torch.allclose(read.sh_rest, surfels.sh_rest)
         assert read.log_scales.shape == (7, 3)

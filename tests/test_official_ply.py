@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 from test_extraction import random_surfels
@@ -26,6 +25,7 @@ from beags_plugin.importers.ply import PlyImporter
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.rasterizers.rendering import surfel_inputs
+from beags_plugin.system.reading.ply import read_vertices
 
 SIZE, FOCAL, DEPTH = 31, 40.0, 2.0  # pixels; the ray of the middle pixel meets the first disc's centre
 TURN = Rotation.from_euler("xyz", (0.4, -0.7, 1.1))  # of the camera in the world
@@ -147,7 +147,7 @@ def test_what_is_exported_for_2dgs_has_its_columns_in_its_order(tmp_path, classe
     assert expit(row[54]) == pytest.approx(float(surfels.opacity_logits[0].sigmoid()))
     assert np.array_equal(row[55:57], surfels.log_scales[0].numpy())
     assert np.allclose(row[57:], torch.nn.functional.normalize(surfels.quats[0], dim=0).numpy(), atol=1e-7)
-    vertex = PlyData.read(str(path))["vertex"]
+    vertex = read_vertices(path)
     normals = np.stack([vertex[f"n{axis}"] for axis in "xyz"], axis=1)
     turned = Rotation.from_quat(surfels.quats[:, [1, 2, 3, 0]].numpy()).as_matrix()[:, :, 2]
     assert np.allclose(normals, turned, atol=1e-6)

@@ -51,7 +51,6 @@ RUN = {  # in this order; the command in README.md: what is appended
     f"beags extract {CONFIG} --object cup": "",
     f"beags render {CONFIG} --object cup --format before-after": "--size 48 --views 2",
     "ns-export gaussian-splat --load-config outputs/.../extracted/cup/config.yml --output-dir exports/": "",
-    "beags bench required --load-config C": "",
     "beags demo [--data X]": "--data my_scene --downscale 2",
 }
 ELSEWHERE = {

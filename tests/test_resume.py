@@ -116,32 +116,19 @@ def stage_module(name):
 
 
 @pytest.mark.parametrize(("name", "round_"), [*((name, 1) for name in STAGES), ("assign_classes", 2)])
-def test_a_kill_in_the_preparation_leaves_the_finished_stages(data, whole, tmp_path, monkeypatch, name, round_):
-    run, calls = tmp_path / "run", {stage: 0 for stage in STAGES}
+def test_a_kill_in_the_preparation_ends_as_the_whole_one(data, whole, tmp_path, monkeypatch, name, round_):
+    """The preparation that was interrupted is made again, from the scene that was saved before it."""
+    run, calls = tmp_path / "run", []
+    compute = getattr(stage_module(name), name)
 
-    def count(patch, killed):
-        for stage in STAGES:
-            module = stage_module(stage)
-            compute = getattr(module, stage)
+    def killed(*args, **options):
+        calls.append(name)
+        if len(calls) == round_:
+            raise Killed
+        return compute(*args, **options)
 
-            def counted(*args, stage=stage, compute=compute, **options):
-                calls[stage] += 1
-                if killed and stage == name and calls[stage] == round_:
-                    raise Killed
-                return compute(*args, **options)
-
-            patch.setattr(module, stage, counted)
-
-    broken_off(data, run, monkeypatch, lambda patch: count(patch, True))
-    assert calls == {stage: round_ if STAGES.index(stage) <= STAGES.index(name) else round_ - 1 for stage in STAGES}
-    before = dict(calls)
-    with monkeypatch.context() as patch:
-        count(patch, False)
-        resume_to_end(run)
-    finished = STAGES[: STAGES.index(name)]
-    rounds_left = 2 - round_
-    done = {stage: calls[stage] - before[stage] - rounds_left for stage in STAGES}
-    assert done == {stage: 0 if stage in finished else 1 for stage in STAGES}
+    broken_off(data, run, monkeypatch, lambda patch: patch.setattr(stage_module(name), name, killed))
+    resume_to_end(run)
     assert_same_run(run, whole)
 
 
@@ -211,35 +198,12 @@ def test_refinement_of_a_loaded_base_is_resumed(data, whole, tmp_path, monkeypat
     assert differences(*(without_clocks(checkpoint_of(run)) for run in runs)) == []
 
 
-def test_stages_are_done_again_when_their_inputs_have_changed(data, whole, tmp_path, monkeypatch):
-    """A second run into the same folder that differs in k builds its grids anew, and nothing else."""
-    run, done = tmp_path / "run", []
-    run_to_end(short_config(data, run, keep_stages=True))
-    for stage in STAGES:
-        module = stage_module(stage)
-        compute = getattr(module, stage)
-
-        def counted(*args, stage=stage, compute=compute, **options):
-            done.append(stage)
-            return compute(*args, **options)
-
-        monkeypatch.setattr(module, stage, counted)
-    run_to_end(short_config(data, run, keep_stages=True))
-    assert done == []
-    assert_same_run(run, whole)
-    run_to_end(short_config(data, run, keep_stages=True, **{"pipeline.model.prepare.k": 15}))
-    assert done[0] == "build_visibility_grid"  # of the first round; the second starts from another scene
-    done.clear()
-    run_to_end(
-        short_config(data, run, keep_stages=True, **{"pipeline.model.prepare.tau": 0.5, "pipeline.model.prepare.k": 15})
-    )
-    assert done[:5] == ["render_depths", "reprojected_masks", "assign_classes", "split_at_borders", STAGES[-1]]
-    kept = run / "prepared" / "stages"
-    assert sorted(folder.name for folder in kept.iterdir()) == ["round_1", "round_2"]
-    run_to_end(short_config(data, run, keep_stages=True, **{"pipeline.model.refine_rounds": 1}))
-    assert [folder.name for folder in kept.iterdir()] == ["round_1"] and not (run / "prepared" / "round_2").exists()
+def test_another_run_into_the_folder_leaves_no_round_of_the_former(data, tmp_path):
+    run = tmp_path / "run"
     run_to_end(short_config(data, run))
-    assert (run / "prepared" / "masks").is_dir() and not kept.exists()
+    assert (run / "prepared" / "round_2").is_dir()
+    run_to_end(short_config(data, run, **{"pipeline.model.refine_rounds": 1}))
+    assert (run / "prepared" / "masks").is_dir() and not (run / "prepared" / "round_2").exists()
 
 
 def test_ctrl_c_saves_the_step_and_a_resume_goes_on(data, whole, tmp_path, monkeypatch):

@@ -96,15 +96,15 @@ def test_the_official_steps_of_growth_and_resets():
 def test_a_shorter_run_has_the_same_proportions_but_no_shorter_intervals_than_it_can_bear():
     half = DensifyConfig().scaled(0.5)
     assert (half.every, half.start, half.stop, half.reset_every, half.prune_scale_after) == (50, 250, 7500, 1500, 1500)
-    tenth = DensifyConfig(min_every=40, min_reset_every=900).scaled(0.1)
+    tenth = DensifyConfig().scaled(0.1)
     assert (tenth.every, tenth.start, tenth.stop, tenth.reset_every, tenth.prune_scale_after) == (
-        40,
+        50,
         50,
         1500,
-        900,
+        1000,
         300,
     )
-    never = DensifyConfig(reset_every=0, every=30, min_every=40).scaled(0.1)
+    never = DensifyConfig(reset_every=0, every=30).scaled(0.1)
     assert (never.reset_every, never.every) == (0, 30)  # what is stated shorter than the bound stays as stated
 
 

@@ -123,7 +123,7 @@ def test_only_the_first_process_writes_into_the_run(two):
     out, (first, second) = two
     run = out / "run"
     assert first["end"]["folder"] == str(run) and second["end"]["folder"] != str(run)
-    assert first["end"]["run"] == second["end"]["run"] == str(run)  # both take finished stages from there
+    assert first["end"]["run"] == second["end"]["run"] == str(run)
     assert not Path(second["end"]["folder"]).exists()
     assert (run / "training.json").exists() and (run / "prepared" / "grid.pt").exists()
     (checkpoint,) = (run / "nerfstudio_models").iterdir()

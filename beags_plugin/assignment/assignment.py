@@ -19,8 +19,6 @@ from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.processes import each_view
 
-_UNITS = float(1 << 38)  # of a pixel, in the sums of contributions on a GPU, which come in such units
-
 
 @dataclass(frozen=True)
 class Assignment:
@@ -29,20 +27,15 @@ class Assignment:
     class_ids: [N] int32, phi; background (0) where never seen.
     margin: [N] float32 in 0..1, the class's share of the Gaussian's contributions; 0 where never seen.
     never_seen: [N] bool, contributes to no labelled pixel of any view.
-    strongest: [N] float32, the sum of its contributions to all pixels, labelled or not, of the view where that is
-        largest; in pixels that it covers alone.
     """
 
     class_ids: Tensor
     margin: Tensor
     never_seen: Tensor
-    strongest: Tensor
 
     def __getitem__(self, selection: Tensor) -> Assignment:
         """Those of a part of the Gaussians; selection: [N] bool or [M] int64."""
-        return Assignment(
-            self.class_ids[selection], self.margin[selection], self.never_seen[selection], self.strongest[selection]
-        )
+        return Assignment(self.class_ids[selection], self.margin[selection], self.never_seen[selection])
 
 
 def assign_classes(
@@ -64,39 +57,23 @@ def assign_classes(
     inputs = geometry_inputs(surfels)
     # float64: thousands of small weights of many views are added up. A table of all classes would be mostly zeros.
     total = SparseSums() if extension.can_take(surfels.means) else TorchSparseSums(surfels.means.device)
-    strongest = torch.zeros_like(surfels.opacity_logits, dtype=torch.float64)
 
     def contributions(index: int) -> tuple[Tensor, Tensor]:
         camera, mask = cameras[index], labels[index]
         if mask is None:
-            mask = torch.full((camera.height, camera.width), IGNORE, dtype=torch.int32, device=surfels.means.device)
+            return inputs.means.new_zeros(0, dtype=torch.int64), inputs.means.new_zeros(0)
         check_class_ids(mask, index, num_classes)
-        every = mask.masked_fill(mask == IGNORE, num_classes)  # what is not labelled counts as one more class
         with torch.no_grad():
-            return rasterizer.contributing_classes(inputs, camera, settings, every, num_classes + 1)
+            return rasterizer.contributing_classes(inputs, camera, settings, mask, num_classes)
 
     if len(cameras) != len(labels):
         raise ValueError(f"{len(cameras)} cameras and {len(labels)} masks do not belong together")
     for keys, values in each_view(len(cameras), contributions, progress):
-        surfel, class_id = keys // (num_classes + 1), keys % (num_classes + 1)
-        strongest = torch.maximum(strongest, _added_up(surfel, values, len(strongest)))
-        labelled = class_id < num_classes
-        total.add((surfel * num_classes + class_id)[labelled], values[labelled])
+        total.add(keys, values)
     class_ids, top, everything = largest_in_rows(*total.found(), len(surfels), num_classes)
     never_seen = everything <= 0
     margin = torch.where(never_seen, 0.0, top / everything.masked_fill(never_seen, 1.0))
-    return Assignment(class_ids.int(), margin.float(), never_seen, strongest.float())
-
-
-def _added_up(surfel: Tensor, values: Tensor, count: int) -> Tensor:
-    """[count] float64, the sum of each surfel's values.
-
-    A GPU adds in any order: there, in whole numbers, whose sums have none.
-    """
-    if values.is_cuda:
-        zeros = torch.zeros(count, dtype=torch.int64, device=values.device)
-        return zeros.index_add_(0, surfel, (values.double() * _UNITS).round().long()).double() / _UNITS
-    return torch.zeros(count, dtype=torch.float64).index_add_(0, surfel, values.double())
+    return Assignment(class_ids.int(), margin.float(), never_seen)
 
 
 def check_class_ids(mask: Tensor, index: int, num_classes: int) -> None:

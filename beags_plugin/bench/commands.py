@@ -98,26 +98,6 @@ class Improvements(Trainings):
 
 
 @dataclass
-class Base(Trainings):
-    """How well bases of different lengths draw held-out views, against steps and number of Gaussians."""
-
-    EXPERIMENT: ClassVar[str] = "base"
-
-    def run(self) -> None:
-        from beags_plugin.bench.base_training import run_base
-        from beags_plugin.bench.run import Options
-
-        run_base(self.experiment(), Options(**vars(self)))
-
-
-@dataclass
-class BaseLimits(Base):
-    """What limits held-out quality of a short base: the same with one part of the schedule changed."""
-
-    EXPERIMENT: ClassVar[str] = "base-limits"
-
-
-@dataclass
 class ExperimentFile(Trainings):
     """An experiment of your own, described by a TOML file like those of experiments/."""
 
@@ -128,91 +108,6 @@ class ExperimentFile(Trainings):
         return str(self.file)
 
 
-@dataclass
-class Reprojection:
-    """Time and accuracy of the mask reprojections against the number of views, on the sample."""
-
-    views: tuple[int, ...] = (30, 60, 120, 240)
-    """Numbers of training views; a base is trained for each."""
-    depths: tuple[str, ...] = ("trained", "exact")
-    """What is lifted: the trained base's depth, the sample's exact depth."""
-    methods: tuple[str, ...] = ("pairwise", "voxel")
-    """Names of reprojections; the others are compared with pairwise."""
-    preset: str = "beags-tiny"
-    """Preset whose base phase is trained."""
-    seed: int = 0
-    """Seed of the sample."""
-    width: int = 256
-    """Pixels."""
-    height: int = 192
-    """Pixels."""
-    calls: int = 3
-    """How often each is timed; the least time counts."""
-    output: Path = Path("outputs/bench")
-    """Folder of scenes, bases and results."""
-    json: Path | None = None
-    """File for all figures; <output>/reprojection.json if left out."""
-    csv: Path | None = None
-    """File for all figures as a table; <output>/reprojection.csv if left out."""
-    picture: Path | None = None
-    """File for the picture; <output>/reprojection.png if left out."""
-
-    def run(self) -> None:
-        from beags_plugin.bench.reprojection import Options, run_reprojection
-
-        run_reprojection(Options(**vars(self)))
-
-
-@dataclass
-class Required:
-    """What a refined run stores and computes for nothing, and what leaving it out saves."""
-
-    load_config: Path
-    """config.yml of the run."""
-    json: Path | None = None
-    """File for all figures."""
-    csv: Path | None = None
-    """File for all figures as a table."""
-
-    def run(self) -> None:
-        from beags_plugin.bench.required import run_required
-
-        run_required(self.load_config, self.json, self.csv)
-
-
-@dataclass
-class Scaling:
-    """Time and memory of a refinement step and of each stage before it against classes, views, Gaussians and pixels."""
-
-    classes: tuple[int, ...] = (1, 4, 16, 64, 256)
-    """Numbers of object classes."""
-    views: tuple[int, ...] = (4, 8, 16, 32)
-    """Numbers of training views."""
-    gaussians: tuple[int, ...] = (2_500, 5_000, 10_000, 20_000)
-    """Numbers of Gaussians."""
-    pixels: tuple[int, ...] = (4_800, 10_800, 19_200, 43_200)
-    """Pixels of a view."""
-    channels: int = 16
-    """Up to so many classes, the step of methods that draw a channel per class is measured beside ours."""
-    calls: int = 3
-    """How often each is timed, in turn; the median counts."""
-    quick: bool = False
-    """Try it out in seconds: tiny sizes, figures that mean nothing."""
-    output: Path = Path("outputs/bench")
-    """Folder of results."""
-    json: Path | None = None
-    """File for all figures; <output>/scaling.json if left out."""
-    csv: Path | None = None
-    """File for all figures as a table; <output>/scaling.csv if left out."""
-    picture: Path | None = None
-    """File for the picture; <output>/scaling.png if left out."""
-
-    def run(self) -> None:
-        from beags_plugin.bench.scaling import Options, run_scaling
-
-        run_scaling(Options(**vars(self)))
-
-
 Measurement = (
     Annotated[Ablation, tyro.conf.subcommand(name="ablation")]
     | Annotated[Sensitivity, tyro.conf.subcommand(name="sensitivity")]
@@ -221,10 +116,5 @@ Measurement = (
     | Annotated[Tradeoff, tyro.conf.subcommand(name="tradeoff")]
     | Annotated[Presets, tyro.conf.subcommand(name="presets")]
     | Annotated[Improvements, tyro.conf.subcommand(name="improvements")]
-    | Annotated[Base, tyro.conf.subcommand(name="base")]
-    | Annotated[BaseLimits, tyro.conf.subcommand(name="base-limits")]
-    | Annotated[Reprojection, tyro.conf.subcommand(name="reprojection")]
-    | Annotated[Required, tyro.conf.subcommand(name="required")]
-    | Annotated[Scaling, tyro.conf.subcommand(name="scaling")]
     | Annotated[ExperimentFile, tyro.conf.subcommand(name="file")]
 )

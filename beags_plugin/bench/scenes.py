@@ -49,7 +49,7 @@ def given_scenes(folders: Sequence[Path], downscale: float | None) -> list[Scene
 
     Raises ``UserError`` for a folder that does not exist, and for two of one name.
     """
-    from beags_plugin.commands.demo import quick_downscale
+    from beags_plugin.data.quick import quick_downscale
 
     scenes = []
     for folder in folders:

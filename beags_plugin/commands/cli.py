@@ -85,7 +85,7 @@ class Sample:
     """Views to train on; 12 more are held out."""
 
     def run(self) -> None:
-        from beags_plugin.commands.demo import make_sample
+        from beags_plugin.sample.writer import make_sample
 
         make_sample(self.output, self.seed, self.width, self.height, self.degradation, self.views)
         CONSOLE.print(f"sample: {self.output}", markup=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import shutil
@@ -26,19 +25,9 @@ if TYPE_CHECKING:
     from beags_plugin.plugin.options.model_options import BeagsModelConfig
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
-QUICK_PIXELS = 50_000  # a folder of the user's is scaled down to at most so many pixels a view, to end in minutes
 STAMP = "trained.json"  # beside the run: what it was made from
 STARTED = "started"  # in there, as long as that is not done
 SHEET_VIEWS = 3  # held-out views in the picture
-
-
-def make_sample(folder: Path, seed: int, width: int, height: int, degradation: str, views: int = 60) -> None:
-    """Generate the sample with ``views`` training views in ``folder`` unless the same one lies there already."""
-    from beags_plugin.sample.writer import SampleConfig, write_sample
-
-    config = SampleConfig(seed=seed, width=width, height=height, degradation=degradation, num_train=views)
-    with progress_bar("Tracing the sample") as progress:
-        write_sample(folder, config, progress)
 
 
 def run_demo(
@@ -46,6 +35,8 @@ def run_demo(
 ) -> None:
     """Do the whole job in ``output`` and print the table; see ``cli.Demo`` for the arguments."""
     from beags_plugin.data.layout import read_scene
+    from beags_plugin.data.quick import quick_downscale
+    from beags_plugin.sample.writer import make_sample
 
     check_preset(preset)
     if downscale is not None and not 1.0 <= downscale < math.inf:
@@ -79,43 +70,6 @@ def run_demo(
             train(data, run, preset, downscale)
         write_stamp(output, request)
     measure(run, output, seconds)
-
-
-def quick_downscale(data: Path) -> float:
-    """Whole factor that brings the images of ``data`` to ``QUICK_PIXELS`` or less."""
-    from beags_plugin.data.files import image_size
-
-    images = _images(data) or _first_frame(data)
-    if not images:
-        return 1.0  # the data parser names what is missing
-    width, height = image_size(images[0])
-    factor = 1
-    while width * height / factor**2 > QUICK_PIXELS:
-        factor += 1
-    return float(factor)
-
-
-def _images(data: Path) -> list[Path]:
-    """The images that the layout of ``data`` takes, or where it is not known, those in images/."""
-    from beags_plugin.data.layout import read_scene
-    from beags_plugin.data.scene import ColmapModel, PoseTable
-
-    folder, pattern = data, "images*/**/*"
-    with contextlib.suppress(UserError):  # the data parser names what is missing
-        poses = read_scene(data).poses
-        if isinstance(poses, PoseTable):
-            return list(poses.images)
-        if isinstance(poses, ColmapModel):
-            folder, pattern = poses.images, "**/*"
-    return sorted(path for path in folder.glob(pattern) if path.suffix.lower() in {".jpg", ".jpeg", ".png"})
-
-
-def _first_frame(data: Path) -> list[Path]:
-    """The first image that transforms.json names; none where there is no such file, or it is damaged."""
-    try:
-        return [data / json.loads((data / "transforms.json").read_text(encoding="utf-8"))["frames"][0]["file_path"]]
-    except (OSError, ValueError, LookupError, TypeError):
-        return []
 
 
 def check_preset(preset: str) -> None:

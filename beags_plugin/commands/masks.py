@@ -82,8 +82,6 @@ class Reproject:
     if left out."""
     tau: float | None = None
     """pairwise: a vote counts if |z - depth| <= tau z; inf counts all."""
-    voters: int | None = None
-    """How many views vote; 0: all with a mask."""
     depth: str | None = None
     """Which depth is lifted: median or expected."""
     min_confidence: float = 0.0
@@ -99,7 +97,7 @@ class Reproject:
         if not 0.0 <= self.min_confidence <= 1.0:
             raise UserError(f"min_confidence is {self.min_confidence}: it must be a share of the votes, 0 to 1.")
         options = ReprojectionOptions(
-            self.masks_path, self.classes_path, self.method, self.tau, self.voters, self.depth, self.run_size
+            self.masks_path, self.classes_path, self.method, self.tau, self.depth, self.run_size
         )
         found = reproject_run(self.load_config, options)
         output = self.output or self.load_config.parent / "reprojected"

@@ -12,8 +12,17 @@ from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.sh import num_sh_bases
 from beags_plugin.core.surfels import Surfels, opacities
 
-SPLIT_SHRINK = 1.6  # both halves of a split surfel are this much smaller (official value)
+# As the official code of 2DGS (Huang et al., SIGGRAPH 2024) has them; scales are relative to the scene's extent.
+GRADIENT_THRESHOLD = 2e-4  # mean screen gradient from which a surfel is cloned or split
+CLONE_SCALE = 0.01  # a larger surfel is split, a smaller one cloned
+SPLIT_SHRINK = 1.6  # both halves of a split surfel are this much smaller
+PRUNE_OPACITY = 0.05  # fainter surfels go
+PRUNE_SCALE = 0.1  # larger surfels go
+RESET_OPACITY = 0.01
 INITIAL_OPACITY = 0.1
+# Ours, for runs that are shorter than the official ones: ``DensifyConfig.scaled`` makes no interval shorter than these.
+LEAST_EVERY = 50  # an interval must show the surfels to many views
+LEAST_RESET_EVERY = 1_000  # opacities need time to recover
 SH_C0 = 0.28209479177387814  # value of the constant basis function
 COINCIDENT = 1e-7  # smallest initial scale relative to the cloud's size: coincident points have no neighbour distance
 
@@ -23,14 +32,11 @@ class DensifyConfig:
     """When and how the scene grows; scales are relative to the scene's extent.
 
     every, start, stop: densify at multiples of ``every`` between ``start`` and ``stop``, both excluded (as officially).
-    min_every: ``scaled`` makes ``every`` no shorter: an interval must show the surfels to many views.
-    min_reset_every: likewise of ``reset_every``: opacities need time to recover.
-    grad_threshold: mean screen gradient from which a surfel is cloned or split.
-    clone_scale: a larger surfel is split, a smaller one cloned.
-    prune_opacity: fainter surfels go. prune_scale: larger ones go, after step ``prune_scale_after``.
-    far_limits: both scales are relative to the distance of the nearest camera where that exceeds the scene's extent;
-        False, as officially: to the extent alone, which far backgrounds and forward-facing captures do not fit.
-    reset_every: opacities are set to at most ``reset_opacity`` so often; 0 never.
+    prune_scale_after: surfels larger than ``PRUNE_SCALE`` go after this step.
+    far_limits: ``CLONE_SCALE`` and ``PRUNE_SCALE`` are relative to the distance of the nearest camera where that
+        exceeds the scene's extent; False, as officially: to the extent alone, which far backgrounds and forward-facing
+        captures do not fit.
+    reset_every: opacities are set to at most ``RESET_OPACITY`` so often; 0 never.
     max_surfels: the scene grows no further than this; 0 sets no bound.
     pixels_per_surfel: nor further than one surfel for so many pixels of all training images, so that what few images
         show is not learned by heart; 0, as officially, sets no bound.
@@ -39,18 +45,11 @@ class DensifyConfig:
     every: int = 100
     start: int = 500
     stop: int = 15_000
-    grad_threshold: float = 2e-4
-    clone_scale: float = 0.01
-    prune_opacity: float = 0.05
-    prune_scale: float = 0.1
     prune_scale_after: int = 3_000
     reset_every: int = 3_000
-    reset_opacity: float = 0.01
     far_limits: bool = False
     max_surfels: int = 0
     pixels_per_surfel: float = 0.0
-    min_every: int = 50
-    min_reset_every: int = 1_000
 
     def scaled(self, factor: float) -> DensifyConfig:
         """The same for a run ``factor`` times as long: its steps are scaled, within the smallest intervals."""
@@ -60,11 +59,11 @@ class DensifyConfig:
 
         return replace(
             self,
-            every=max(steps(self.every, self.min_every), 1),
+            every=max(steps(self.every, LEAST_EVERY), 1),
             start=steps(self.start),
             stop=steps(self.stop),
             prune_scale_after=steps(self.prune_scale_after),
-            reset_every=steps(self.reset_every, self.min_reset_every),
+            reset_every=steps(self.reset_every, LEAST_RESET_EVERY),
         )
 
     def bounded(self, pixels: int) -> DensifyConfig:
@@ -121,7 +120,7 @@ class GradientStatistics:
 
 
 def length_units(means: Tensor, camera_centers: Tensor, extent: float, config: DensifyConfig) -> Tensor:
-    """[N] world units in which ``clone_scale`` and ``prune_scale`` of surfels at ``means`` [N, 3] are stated.
+    """[N] world units in which ``CLONE_SCALE`` and ``PRUNE_SCALE`` of surfels at ``means`` [N, 3] are stated.
 
     camera_centers: [V, 3]. The scene's extent, or with ``far_limits`` the distance of the nearest camera if larger.
     """
@@ -144,8 +143,8 @@ def densify(
     ``prune_scale_after``. At least one surfel always remains.
     """
     size = surfels.log_scales.exp().amax(dim=-1)
-    chosen = _within_budget(mean_gradient >= config.grad_threshold, mean_gradient, config.max_surfels)
-    small = size <= config.clone_scale * units
+    chosen = _within_budget(mean_gradient >= GRADIENT_THRESHOLD, mean_gradient, config.max_surfels)
+    small = size <= CLONE_SCALE * units
     clones = (chosen & small).nonzero()[:, 0]
     splits = (chosen & ~small).nonzero()[:, 0]
     kept = (~(chosen & ~small)).nonzero()[:, 0]
@@ -159,9 +158,9 @@ def densify(
     grown.means[halves] += _offsets(grown[halves], generator)
     grown.log_scales[halves] -= math.log(SPLIT_SHRINK)
 
-    keep = opacities(grown.opacity_logits) >= config.prune_opacity
+    keep = opacities(grown.opacity_logits) >= PRUNE_OPACITY
     if step > config.prune_scale_after:
-        keep &= grown.log_scales.exp().amax(dim=-1) <= config.prune_scale * units[source]
+        keep &= grown.log_scales.exp().amax(dim=-1) <= PRUNE_SCALE * units[source]
     if not bool(keep.any()):
         keep[grown.opacity_logits.argmax()] = True
     return Densified(grown[keep], source[keep], fresh[keep])
@@ -186,9 +185,9 @@ def _offsets(surfels: Surfels, generator: torch.Generator) -> Tensor:
     return (axes @ local[:, :, None])[:, :, 0]
 
 
-def reset_opacity(surfels: Surfels, config: DensifyConfig) -> Tensor:
-    """[N] opacity logits, lowered to at most ``reset_opacity``."""
-    ceiling = math.log(config.reset_opacity / (1.0 - config.reset_opacity))
+def reset_opacity(surfels: Surfels) -> Tensor:
+    """[N] opacity logits, lowered to at most ``RESET_OPACITY``."""
+    ceiling = math.log(RESET_OPACITY / (1.0 - RESET_OPACITY))
     return surfels.opacity_logits.clamp_max(ceiling)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.reading.text import MOST_BYTES_OF_POSES, load_json, reason
+from beags_plugin.system.reading.text import load_json, reason
 
 _FOCAL = ("fl_x", "fl_y")
 _SIZE = ("w", "h")
@@ -21,7 +21,7 @@ def read_transforms(file: Path) -> dict[str, Any]:
     Raises ``UserError`` that names the frame and the entry for the first that is missing or wrong.
     """
     try:
-        meta = load_json(file, most_bytes=MOST_BYTES_OF_POSES)
+        meta = load_json(file)
         if not isinstance(meta, dict) or not isinstance(meta["frames"], list):
             raise ValueError('it has no list "frames"')
     except (OSError, ValueError, KeyError) as error:

@@ -16,6 +16,7 @@ from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.frames import to_input_frame
 from beags_plugin.extraction.splat_file import read_splat_file
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.ply import write_vertices
 
 THICKNESS = 1e-3
 """Written third scale, relative to the smaller of the two: flat, yet no viewer divides by 0."""
@@ -39,8 +40,6 @@ def write_ply(
     file is in the frame of the input poses, without it in the surfels' own. Raises ``UserError`` if the file cannot be
     written.
     """
-    from plyfile import PlyData, PlyElement
-
     if transform is not None:
         surfels = to_input_frame(surfels, *transform)
     columns = _columns(surfels, layout)
@@ -51,8 +50,8 @@ def write_ply(
     table = np.empty(len(surfels), dtype=[(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():
         table[name] = values
-    with whole_file(path) as part:
-        PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(str(part))
+    with whole_file(path) as part, open(part, "wb") as file:
+        write_vertices(file, table)
 
 
 def _columns(surfels: Surfels, layout: str) -> dict[str, np.ndarray]:

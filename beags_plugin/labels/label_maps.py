@@ -57,11 +57,6 @@ class PackedMap:
         """How many pixels the map has."""
         return int(np.prod(self.shape))
 
-    @property
-    def stored(self) -> Tensor:
-        """What the map holds, for ``digests.input_digest``: other libraries may compress it to other bytes."""
-        return self.unpacked()
-
 
 class PackedMaps(Sequence[Tensor]):
     """One uint8 image [H, W] per view, held compressed and read one view at a time."""

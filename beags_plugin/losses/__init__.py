@@ -9,7 +9,6 @@ LOSSES = Registry(
         "photometric": "beags_plugin.losses.photometric:PhotometricLoss",
         "normal": "beags_plugin.losses.normal:NormalConsistencyLoss",
         "distortion": "beags_plugin.losses.distortion:DistortionLoss",
-        "opacity": "beags_plugin.losses.opacity:OpacityLoss",
         "boundary": "beags_plugin.losses.boundary:BoundaryLoss",
         "silhouette": "beags_plugin.losses.silhouette:SilhouetteLoss",
         "occupancy": "beags_plugin.losses.occupancy:OccupancyLoss",

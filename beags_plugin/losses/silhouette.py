@@ -20,6 +20,9 @@ from beags_plugin.losses.reduction import ordered_sum
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.system.errors import UserError
 
+TAU = 0.02
+"""The object is hidden where its depth z and the scene's D have z > (1 + TAU) D; as in reprojection (E5)."""
+
 
 @dataclass(frozen=True)
 class SilhouetteLoss(Loss):
@@ -30,11 +33,10 @@ class SilhouetteLoss(Loss):
 
     objects: how many objects of the view are drawn each step, chosen at random and counted in proportion; each costs
         a drawing of its Gaussians.
-    seen: near a contact the surface of what stands below goes on close behind the other object's, too close for tau to
+    seen: near a contact the surface of what stands below goes on close behind the other object's, too close for TAU to
         tell. Pixels of other objects do not count where the drawn surface lies behind what the scene shows, and so many
         of the 27 voxels around it were seen as this object's (D_occ >= seen, section 5); a plane fills 9 of them. 0:
         they all count.
-    tau: the object is hidden where its depth z and the scene's D have z > (1 + tau) D; as in reprojection (E5).
     """
 
     needs: ClassVar[frozenset[str]] = frozenset({"geometry"})
@@ -43,15 +45,12 @@ class SilhouetteLoss(Loss):
 
     objects: int = 1
     seen: int = 0
-    tau: float = 0.02
 
     def __post_init__(self) -> None:
         if not (self.objects >= 1 and float(self.objects).is_integer()):
             raise UserError(f"the silhouette loss has objects = {self.objects}: it must be a whole number, 1 or more.")
         if not (0 <= self.seen <= 27 and float(self.seen).is_integer()):
             raise UserError(f"the silhouette loss has seen = {self.seen}: it must be a whole number from 0 to 27.")
-        if not self.tau >= 0:
-            raise UserError(f"the silhouette loss has tau = {self.tau}: it must be 0 or more.")
 
     def value(self, inputs: LossInputs) -> Tensor:
         nothing = inputs.render.color.new_zeros(())
@@ -83,7 +82,7 @@ class SilhouetteLoss(Loss):
         # thin parts have no median: their expected depth tells where they are
         depth = torch.where(alone.median_depth > 0, alone.median_depth, alone.depth).detach()
         shown = inputs.render.median_depth.detach()
-        hidden = (shown > 0) & (depth > (1.0 + self.tau) * shown)
+        hidden = (shown > 0) & (depth > (1.0 + TAU) * shown)
         outside = known & ~inside & ~hidden
         if self.seen > 0:
             of_others = outside & (inputs.labels != 0) & (alone.alpha.detach() > 0) & (depth > shown)

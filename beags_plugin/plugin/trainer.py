@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -18,7 +17,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.options.machine import check_machine
-from beags_plugin.plugin.runs.layout import PREPARED, REPORT_FILE, STAGES
+from beags_plugin.plugin.runs.layout import REPORT_FILE
 from beags_plugin.plugin.training.checkpoints import Checkpoints
 from beags_plugin.plugin.training.memory_guard import NO_MEMORY, MemoryWatch, check_room, is_out_of_memory
 from beags_plugin.plugin.training.monitor import HeldOutCurve
@@ -264,7 +263,7 @@ class BeagsTrainer(Trainer):
 
     @contextmanager
     def long_stage(self, step: int) -> Iterator[None]:
-        """What takes long and keeps its own results, after ``step``: a signal ends it at once, for that is saved."""
+        """Save ``step`` and open a long block, which a signal ends at once; a resumed run makes it again."""
         if step >= 0:
             self._save_once(step)
         self._interrupts.at_once = True
@@ -291,5 +290,3 @@ class BeagsTrainer(Trainer):
     def _write_report(self) -> None:
         report = {"seconds": self.seconds.total(), "peak_memory_mb": peak_memory_mb()}
         write_text_atomically(json.dumps(report, indent=2), self.base_dir / REPORT_FILE)
-        if not self.config.keep_stages:  # a complete run asks for them no more
-            shutil.rmtree(self.base_dir / PREPARED / STAGES, ignore_errors=True)

@@ -24,34 +24,27 @@ from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.system.errors import UserError
 
+BAND = 1
+"""A pixel is at a border if another class lies within so many pixels of it."""
+MIN_SHARE = 0.2
+"""A Gaussian is split if at least this share of its contributions to labelled pixels is at borders ..."""
+MIN_SIGMA = 0.7
+"""... and its longer scale covers more than so many pixels in the view nearest to it."""
+
 
 @dataclass(frozen=True)
 class BorderSplitConfig:
     """Which Gaussians are split in two, along their longer axis, before refinement.
 
     rounds: how often; classes are assigned again after the last. 0, as in the paper, never.
-    band: a pixel is at a border if another class lies within so many pixels of it.
-    min_share: a Gaussian is split if at least this share of its contributions to labelled pixels is at borders ...
-    min_sigma: ... and its longer scale covers more than so many pixels in the view nearest to it.
     """
 
     rounds: int = 0
-    band: int = 1
-    min_share: float = 0.2
-    min_sigma: float = 0.7
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that makes no sense."""
-        if self.rounds < 0 or self.band < 1:
-            raise UserError(
-                f"the border split has rounds = {self.rounds} and band = {self.band}: rounds must be 0 or more, band "
-                "at least 1 pixel."
-            )
-        if not (0.0 <= self.min_share <= 1.0 and self.min_sigma >= 0.0):
-            raise UserError(
-                f"the border split has min_share = {self.min_share} and min_sigma = {self.min_sigma}: min_share must "
-                "lie in 0..1, min_sigma must be 0 or more pixels."
-            )
+        if self.rounds < 0:
+            raise UserError(f"the border split has rounds = {self.rounds}: it must be 0 or more.")
 
 
 def split_at_borders(
@@ -76,12 +69,12 @@ def split_at_borders(
         if progress:
             progress(done, total)
 
-    bands = LabelMaps(border_band(mask, config.band) for mask in labels)
+    bands = LabelMaps(border_band(mask, BAND) for mask in labels)
     edited = Densified.unchanged(surfels)
     for _ in range(config.rounds):
         share = _share_of_class(edited.surfels, cameras, bands, rasterizer, settings, tick)
         sigma = largest_sigma(edited.surfels, cameras)
-        edited = edited.then(split_in_two(edited.surfels, (share >= config.min_share) & (sigma > config.min_sigma)))
+        edited = edited.then(split_in_two(edited.surfels, (share >= MIN_SHARE) & (sigma > MIN_SIGMA)))
     assignment = assign_classes(edited.surfels, cameras, labels, rasterizer, settings, num_classes, tick)
     return EditedScene(edited, assignment)
 

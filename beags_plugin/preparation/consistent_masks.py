@@ -44,7 +44,7 @@ class ConsistentMasks:
     confidence: PackedMaps | None
 
 
-def chosen_reprojection(name: str, voters: int, cameras: Sequence[Camera], labels: LabelMaps) -> tuple[str, str | None]:
+def chosen_reprojection(name: str, cameras: Sequence[Camera], labels: LabelMaps) -> tuple[str, str | None]:
     """The reprojection that ``name`` means for these views, and where that was chosen here, why: a line for a reader.
 
     "auto" is pairwise, which is a little more exact, where its memory (pixels) and its time (pairs) are small; else
@@ -53,7 +53,7 @@ def chosen_reprojection(name: str, voters: int, cameras: Sequence[Camera], label
     if name != AUTO:
         return name, None
     sizes = [camera.height * camera.width for camera in cameras]
-    voting = [size for size, mask in zip(sizes, votes_of(labels, voters).stored, strict=True) if mask is not None]
+    voting = [size for size, mask in zip(sizes, labels.stored, strict=True) if mask is not None]
     pixels, pairs = sum(sizes), sum(voting) * len(cameras)
     few = pixels <= PAIRWISE_PIXELS and pairs <= PAIRWISE_PAIRS
     return "pairwise" if few else "voxel", (
@@ -77,26 +77,22 @@ def reprojected_masks(
     config,
     progress: Progress | None = None,
 ) -> ConsistentMasks:
-    """The masks of all views, voted by those that vote.
+    """The masks of all views, voted by those that have one.
 
     depths: per view [H, W], of the surface; they may lie on disk. config: a ``preparation.PreparationConfig`` whose
     reprojection is a registered one. Of what the votes give, one view is held at a time.
     """
     given = translated(labels, known, known.ranks)
-    votes = votes_of(given, config.voters)
     ranked, consistent, confidence = LabelMaps(), LabelMaps(), PackedMaps()
     reproject = REPROJECTIONS.get(config.reprojection)
-    found = reproject(depths, cameras, votes, len(known), tau=config.tau, progress=progress)
-    for index, mask in enumerate(found):
-        own = given[index] if votes.stored[index] is None else None
-        # without a vote, a view that does not vote keeps its label too
-        voted = mask.labels if own is None else torch.where(mask.labels == IGNORE, own, mask.labels)
-        ranked.append(voted)
+    found = reproject(depths, cameras, given, len(known), tau=config.tau, progress=progress)
+    for mask in found:
+        ranked.append(mask.labels)
         confidence.append((mask.confidence * 255.0 + 0.5).to(torch.uint8))
         if config.min_confidence > 0.0:
             # for the losses alone: the border split looks for the very rims that are doubtful
             doubtful = mask.confidence < config.min_confidence
-            consistent.append(_translated(voted, known.class_ids).masked_fill_(doubtful, IGNORE))
+            consistent.append(_translated(mask.labels, known.class_ids).masked_fill_(doubtful, IGNORE))
     if len(ranked) != len(cameras):
         raise ValueError(f"the reprojection {config.reprojection!r} gave {len(ranked)} masks for {len(cameras)} views")
     if config.min_confidence == 0.0:
@@ -107,15 +103,6 @@ def reprojected_masks(
 def translated(labels: LabelMaps, known: ClassRanks, table: Callable[[Tensor], Tensor]) -> LabelMaps:
     """The maps with ``table`` of their values, IGNORE as it is; the same maps where ranks are ids."""
     return labels if known.trivial else LabelMaps(None if mask is None else _translated(mask, table) for mask in labels)
-
-
-def votes_of(labels: LabelMaps, voters: int) -> LabelMaps:
-    """The masks that vote: all, or ``voters`` of them at even distances; None in place of the others."""
-    having = [index for index, mask in enumerate(labels.stored) if mask is not None]
-    if voters == 0 or voters >= len(having):
-        return labels
-    chosen = {having[(2 * rank + 1) * len(having) // (2 * voters)] for rank in range(voters)}
-    return LabelMaps(mask if index in chosen else None for index, mask in enumerate(labels.stored))
 
 
 def _translated(mask: Tensor, table: Callable[[Tensor], Tensor]) -> Tensor:

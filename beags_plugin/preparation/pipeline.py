@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -12,7 +12,6 @@ from torch import Tensor
 
 from beags_plugin.assignment.assignment import Assignment, assign_classes, check_class_ids
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.densification import Densified
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
@@ -29,20 +28,16 @@ from beags_plugin.preparation.consistent_masks import (
     render_depths,
     reprojected_masks,
 )
-from beags_plugin.preparation.fewer_bands import without_unneeded_bands
 from beags_plugin.preparation.refiner import AssignedScene, EditedScene, Refiner
-from beags_plugin.preparation.stage_forms import ASSIGNMENT, BANDS, EDITED, GRID, MASKS
-from beags_plugin.preparation.stages import Stages, StageStore
 from beags_plugin.preparation.summary import (
     assignment_finding,
-    bands_finding,
-    removal_finding,
     reprojection_finding,
     split_finding,
 )
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import check_surface_depth
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.filed_tensors import filed
 
 LEAST_K = 10  # nearer neighbours tell the noise of the depth rather than the distance of points
 
@@ -54,28 +49,20 @@ class PreparationConfig:
     reprojection: how masks are made consistent: "pairwise", "voxel" or another name of ``masks.REPROJECTIONS``; "auto"
         chooses of these two by the number of views and pixels (``consistent_masks.chosen_reprojection``); "none" keeps
         the masks.
-    voters: how many views vote, evenly spread among those with a mask; 0: all of them. Every view is voted on.
     min_confidence: reprojected pixels whose winner has a smaller share of the votes are IGNORE to the losses.
     tau: pairwise: a vote counts if its point is visible: |z - D| <= tau z; infinity counts every vote (E5).
     depth: which depth is lifted into space, "median" or "expected": see ``rasterizers.rendering.surface_depth``.
     k: neighbours that set the voxel size (E8).
     k_pixels: training pixels for which k is stated; fewer of them lift a thinner cloud and take k in proportion, so
         that voxels keep their size. 0, as in the paper, takes k as it is.
-    trim_sh: the highest bands of the colour are left out before refinement if that changes the training views by at
-        most so much (root mean square, colours in 0..1). 0, as in the paper, keeps all.
-    min_contribution: Gaussians that fill less than so many pixels in every training view are removed before
-        refinement: no view tells what they should be. 0, as in the paper, keeps all.
     """
 
     reprojection: str = AUTO
-    voters: int = 0
     min_confidence: float = 0.0
     tau: float = 0.02
     depth: str = "median"
     k: int = 2000
     k_pixels: int = 0
-    min_contribution: float = 0.0
-    trim_sh: float = 0.0
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that no stage can work with: hours before the stages would say so."""
@@ -84,8 +71,6 @@ class PreparationConfig:
             raise UserError(f"there is no reprojection {self.reprojection!r}: choose one of {', '.join(choices)}.")
         if self.reprojection not in (AUTO, "none"):
             REPROJECTIONS.get(self.reprojection)  # one of another package may not load
-        if self.voters < 0:
-            raise UserError(f"voters is {self.voters}: it must be a number of views, or 0 for all of them.")
         if not 0.0 <= self.min_confidence <= 1.0:
             raise UserError(f"min_confidence is {self.min_confidence}: it must be a share of the votes, 0 to 1.")
         check_surface_depth(self.depth)
@@ -95,10 +80,6 @@ class PreparationConfig:
             raise UserError(f"k is {self.k}: the voxel size needs at least 1 neighbour.")
         if not self.k_pixels >= 0:
             raise UserError(f"k_pixels is {self.k_pixels}: it must be a number of pixels, or 0 to take k as it is.")
-        if not self.min_contribution >= 0:
-            raise UserError(f"min_contribution is {self.min_contribution}: it must be 0 or more pixels.")
-        if not self.trim_sh >= 0:
-            raise UserError(f"trim_sh is {self.trim_sh}: it must be 0 or more, a difference of colours in 0..1.")
 
     def neighbours(self, cameras: Sequence[Camera]) -> int:
         """The k of a scene with these training views, at least ``LEAST_K`` where it was made smaller."""
@@ -116,7 +97,7 @@ class Preparation:
     confidence: per training view [H, W] uint8, share of the winning votes times 255, held compressed; None where
         nothing was reprojected.
     assignment: the class of every surfel and its margin.
-    edited: the scene and the classes that refinement starts from, where surfels were removed or split; None where it
+    edited: the scene and the classes that refinement starts from, where surfels were split; None where it
         starts from the base.
     grid: the visibility voxel grids, or None if the refiner needs none.
     findings: one line for a reader per stage.
@@ -145,8 +126,6 @@ def prepare(
     background_voxels: bool = True,
     seed: int = 0,
     stage: Stage = lambda name: nullcontext(),
-    store: StageStore | None = None,
-    code: str = "",
 ) -> Preparation:
     """Make masks consistent, assign classes, split at borders if the refiner trains, build the voxel grids.
 
@@ -155,8 +134,6 @@ def prepare(
         the narrowest type and compressed, as ``LabelMaps`` already are.
     class_names: id to name, background (0) included; ids may lie far apart: the stages work on their ranks.
     background_voxels: whether a loss will ask the grid about the background; if none will, those voxels are not kept.
-    store: where finished stages are kept, and taken from if nothing that they depend on has changed; code: a digest of
-        the program, on which all of them depend.
     What is as large as the photos lies in temporary files: memory grows with the views by compressed masks, and by
     what the voxels of the scene take. "pairwise" alone reads depth and masks of all views into memory.
     Raises ``UserError`` if no view has a mask or no mask names an object.
@@ -169,53 +146,25 @@ def prepare(
         )
     surfels = surfels.detach()
     known = known_classes(maps, class_names)
-    inputs = (code, surfels, list(cameras), settings, type(rasterizer), maps, known.ids, seed)
-    stages = Stages(store, *inputs, device=surfels.means.device)
+    findings: list[str] = []
+    seconds: dict[str, float] = {}
 
-    masks = _consistent_masks(stages, surfels, cameras, maps, known, rasterizer, settings, config, stage)
+    with _timed("reprojection", seconds):
+        masks = _consistent_masks(surfels, cameras, maps, known, rasterizer, settings, config, stage, findings)
     ranked = masks.ranked
 
-    def assigned() -> Assignment:
-        with stage("Assigning classes") as progress:
-            found = assign_classes(surfels, cameras, ranked, rasterizer, settings, len(known), progress=progress)
-        return replace(found, class_ids=known.class_ids(found.class_ids))
-
-    assignment = stages.run("assignment", stages.key("assignment"), assigned, ASSIGNMENT)
-    stages.found("assignment", assignment_finding(assignment, class_names))
+    with _timed("assignment", seconds), stage("Assigning classes") as progress:
+        assignment = assign_classes(surfels, cameras, ranked, rasterizer, settings, len(known), progress=progress)
+        assignment = replace(assignment, class_ids=known.class_ids(assignment.class_ids))
+    findings.append(assignment_finding(assignment, class_names))
 
     edited = None
-    if config.min_contribution > 0 and refiner.trains:
-        start = time.perf_counter()
-        edited = _without_unneeded(surfels, assignment, config.min_contribution)
-        stages.seconds["removal"] = time.perf_counter() - start
-        stages.key("removal", config.min_contribution)
-        stages.found("removal", removal_finding(len(surfels), edited, config.min_contribution))
-        surfels = edited.edited.surfels
     if split is not None and split.rounds > 0 and refiner.trains:
-
-        def divided_scene() -> EditedScene:
-            with stage("Splitting Gaussians at borders") as progress:
-                return split_at_borders(surfels, cameras, ranked, rasterizer, settings, len(known), split, progress)
-
-        divided = stages.run("border split", stages.key("border split", split), divided_scene, EDITED)
-        stages.found("border split", split_finding(len(surfels), divided))
+        with _timed("border split", seconds), stage("Splitting Gaussians at borders") as progress:
+            divided = split_at_borders(surfels, cameras, ranked, rasterizer, settings, len(known), split, progress)
+        findings.append(split_finding(len(surfels), divided))
         classes = replace(divided.assignment, class_ids=known.class_ids(divided.assignment.class_ids))
-        whole = divided.edited if edited is None else edited.edited.then(divided.edited)
-        edited, surfels = EditedScene(whole, classes), divided.edited.surfels
-
-    if config.trim_sh > 0 and refiner.trains:
-
-        def trimmed() -> tuple[Surfels | None, float]:
-            with stage("Leaving out bands of the colour") as progress:
-                fewer, change = without_unneeded_bands(surfels, cameras, rasterizer, settings, config.trim_sh, progress)
-            return None if fewer is surfels else fewer, change
-
-        fewer, change = stages.run("bands", stages.key("bands", config.trim_sh), trimmed, BANDS)
-        degree = surfels.sh_degree
-        if fewer is not None:
-            edited = edited or EditedScene(Densified.unchanged(surfels), assignment)
-            edited, surfels = replace(edited, edited=replace(edited.edited, surfels=fewer)), fewer
-        stages.found("bands", bands_finding(degree, surfels.sh_degree, change))
+        edited, surfels = replace(divided, assignment=classes), divided.edited.surfels
 
     class_ids = (assignment if edited is None else edited.assignment).class_ids
     scene = AssignedScene(
@@ -223,55 +172,49 @@ def prepare(
     )
     k = config.neighbours(cameras)
 
-    def built() -> VisibilityGrid | None:
-        with stage("Building voxel grids") as progress:
-            grid = refiner.build_grid(scene, k, progress)
-        if grid is None:
-            return None
+    start = time.perf_counter()
+    with stage("Building voxel grids") as progress:
+        grid = refiner.build_grid(scene, k, progress)
+    if grid is not None:
         asked = torch.unique(class_ids)  # classes are fixed: no loss can ask about one that has no Gaussians
-        return grid.only(asked if background_voxels else asked[asked != 0])
+        grid = grid.only(asked if background_voxels else asked[asked != 0])
+        seconds["voxel grids"] = time.perf_counter() - start
+        findings.append(f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {k})")
+    return Preparation(masks.labels, masks.confidence, assignment, grid, edited, findings, seconds)
 
-    key = stages.key("voxel grids", k, config.depth, type(refiner), max(class_names), background_voxels)
-    grid = stages.run("voxel grids", key, built, GRID)
-    if grid is None:
-        stages.drop("voxel grids")
-    else:
-        stages.found("voxel grids", f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {k})")
-    return Preparation(masks.labels, masks.confidence, assignment, grid, edited, stages.findings, stages.seconds)
+
+@contextmanager
+def _timed(name: str, seconds: dict[str, float]) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    seconds[name] = time.perf_counter() - start
 
 
 def _consistent_masks(
-    stages: Stages, surfels, cameras, maps: LabelMaps, known: ClassRanks, rasterizer, settings, config, stage: Stage
+    surfels,
+    cameras,
+    maps: LabelMaps,
+    known: ClassRanks,
+    rasterizer,
+    settings,
+    config,
+    stage: Stage,
+    findings: list[str],
 ) -> ConsistentMasks:
     """The masks of all views, reprojected if that is asked for."""
     if config.reprojection == "none":
-        start = time.perf_counter()
-        masks = masks_as_they_are(maps, cameras, known)
-        stages.seconds["reprojection"] = time.perf_counter() - start
-        stages.key("reprojection", "none")
-        stages.found("reprojection", "reprojection: off, masks used as they are")
-        return masks
-    method, why = chosen_reprojection(config.reprojection, config.voters, cameras, maps)
-    config = replace(config, reprojection=method)  # stages depend on what is really done
-    reproject = REPROJECTIONS.get(method)
-    options = (config.reprojection, config.voters, config.min_confidence, config.tau)
-    depth_key = stages.key("depth", config.depth)
-    key = stages.key("reprojection", *options, reproject)
-
-    def rendered() -> Iterator[Tensor]:
-        with stage("Rendering depth") as progress:
-            yield from render_depths(surfels, cameras, rasterizer, settings, config.depth, progress)
-
-    def reprojected() -> ConsistentMasks:
-        depths = stages.run_filed("depth", depth_key, rendered, surfels.means.device)
-        with stage("Reprojecting masks") as progress:
-            return reprojected_masks(depths, cameras, maps, known, config, progress)
-
-    masks = stages.run("reprojection", key, reprojected, MASKS)
-    stages.drop("depth")  # as large as all photos in float, and quickly drawn
+        findings.append("reprojection: off, masks used as they are")
+        return masks_as_they_are(maps, cameras, known)
+    method, why = chosen_reprojection(config.reprojection, cameras, maps)
+    with stage("Rendering depth") as progress:  # as large as all photos in float: it lies in a temporary file
+        depths = filed(
+            render_depths(surfels, cameras, rasterizer, settings, config.depth, progress), surfels.means.device
+        )
+    with stage("Reprojecting masks") as progress:
+        masks = reprojected_masks(depths, cameras, maps, known, replace(config, reprojection=method), progress)
     if why is not None:
-        stages.findings.append(why)
-    stages.found("reprojection", reprojection_finding(maps, masks.labels))
+        findings.append(why)
+    findings.append(reprojection_finding(maps, masks.labels))
     return masks
 
 
@@ -287,11 +230,3 @@ def known_classes(labels: Sequence[Tensor | None], class_names: dict[int, str]) 
             check_class_ids(mask, index, last + 1)
             present[mask[mask != IGNORE].long().to(present.device)] = True
     return ClassRanks(torch.cat([named.ids, present.nonzero()[:, 0]]))
-
-
-def _without_unneeded(surfels: Surfels, assignment: Assignment, least: float) -> EditedScene:
-    """The scene without surfels that fill less than ``least`` pixels in every view; at least one remains."""
-    kept = assignment.strongest >= least
-    kept[assignment.strongest.argmax()] = True
-    source = torch.nonzero(kept)[:, 0]
-    return EditedScene(Densified(surfels[kept], source, torch.zeros_like(source, dtype=torch.bool)), assignment[kept])

@@ -43,7 +43,7 @@ class AssignedScene:
 
 @dataclass(frozen=True)
 class EditedScene:
-    """A scene of M surfels that were removed or split before refinement, with classes of its own.
+    """A scene of M surfels, some of them split before refinement, with classes of its own.
 
     edited: the surfels, for each the index [M] of the one that it came from, and whether it is new [M] bool.
     assignment: their classes.

@@ -25,24 +25,10 @@ def reprojection_finding(before: Sequence[Tensor | None], after: Sequence[Tensor
     )
 
 
-def removal_finding(before: int, edited: EditedScene, least: float) -> str:
-    """How many Gaussians were removed."""
-    removed = before - len(edited.edited.surfels)
-    share = f"{removed} of {before} Gaussians ({100 * removed / before:.1f} %)"
-    return f"removal: {share} fill less than {least:g} pixels in every view"
-
-
 def split_finding(before: int, divided: EditedScene) -> str:
     """How many Gaussians were split."""
     after = len(divided.edited.surfels)
     return f"border split: {int(divided.edited.fresh.sum())} halves, {before} Gaussians became {after}"
-
-
-def bands_finding(before: int, after: int, change: float) -> str:
-    """What became of the bands of the colour."""
-    if after == before:
-        return f"bands: degree {before} stays, fewer would change the training views by more than is allowed"
-    return f"bands: degree {before} became {after}, which changes the training views by {change:.5f}"
 
 
 def assignment_finding(assignment: Assignment, class_names: dict[int, str]) -> str:

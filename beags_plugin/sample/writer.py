@@ -20,6 +20,7 @@ from beags_plugin.sample.points import seed_points, write_ply
 from beags_plugin.sample.seen import seen_part, visible_surface, well_seen
 from beags_plugin.sample.views import Picture, View, make_views, render_view
 from beags_plugin.system.errors import UserError, unwritable, writing
+from beags_plugin.system.progress import progress_bar
 
 VERSION = 8
 """Raise it whenever the same config would give other files: older samples are then rebuilt."""
@@ -225,3 +226,10 @@ def _write_png(path: Path, pixels: np.ndarray) -> None:
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def make_sample(folder: Path, seed: int, width: int, height: int, degradation: str, views: int = 60) -> None:
+    """Generate the sample with ``views`` training views in ``folder`` unless the same one lies there already."""
+    config = SampleConfig(seed=seed, width=width, height=height, degradation=degradation, num_train=views)
+    with progress_bar("Tracing the sample") as progress:
+        write_sample(folder, config, progress)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
-import inspect
 import json
 from collections.abc import Iterable
 from pathlib import Path
@@ -45,41 +43,3 @@ def content_digest(files: Iterable[Path]) -> str:
 def value_digest(value: Any) -> str:
     """Of plain values (JSON), whatever the order of a dict's keys."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
-
-
-def input_digest(*values: Any) -> str:
-    """Of tensors, plain values, and lists, dicts and dataclasses of them; equal for equal bits alone.
-
-    An object that says ``stored`` (``labels.label_maps.LabelMaps``) counts by what it stores; functions and classes by
-    their names and the text of the file that they come from.
-    """
-    digest = hashlib.sha256()
-    _add(digest, values)
-    return digest.hexdigest()
-
-
-def _add(digest: Any, value: Any) -> None:
-    from torch import Tensor, uint8
-
-    digest.update(f"<{type(value).__qualname__}>".encode())
-    if value is None or isinstance(value, (str, int, float)):
-        digest.update(repr(value).encode())
-    elif isinstance(value, Tensor):
-        digest.update(f"{value.dtype}{tuple(value.shape)}".encode())
-        digest.update(value.detach().cpu().contiguous().reshape(-1).view(uint8).numpy())
-    elif isinstance(value, dict):
-        _add(digest, list(value.items()))
-    elif isinstance(value, (list, tuple)):
-        digest.update(f"{len(value)}:".encode())
-        for item in value:
-            _add(digest, item)
-    elif (stored := getattr(value, "stored", None)) is not None:
-        _add(digest, stored)
-    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-        _add(digest, [(field.name, getattr(value, field.name)) for field in dataclasses.fields(value)])
-    elif inspect.isfunction(value) or isinstance(value, type):
-        digest.update(f"{value.__module__}.{value.__qualname__}".encode())
-        if source := inspect.getsourcefile(value):
-            digest.update(Path(source).read_bytes())
-    else:
-        raise TypeError(f"no digest of {type(value).__name__}")

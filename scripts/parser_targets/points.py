@@ -21,7 +21,7 @@ def _splats(path: Path) -> None:
 
 
 def _points(path: Path) -> None:
-    from beags_plugin.plugin.views.seed_points import read_ply_points
+    from beags_plugin.system.reading.ply import read_ply_points
 
     read_ply_points(path)
 

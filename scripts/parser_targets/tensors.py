@@ -39,7 +39,7 @@ def _filed(path: Path) -> None:
 
     try:
         list(FiledTensors(path))
-    except (OSError, ValueError, EOFError):  # what the store of stages takes for a damaged file
+    except (OSError, ValueError, EOFError):  # a file that is damaged
         return
 
 

@@ -130,7 +130,6 @@ mistake("mask checks", "no scene")(beags("masks check"))
 mistake("mask checks", "a folder that does not exist")(lambda at: at.beags("masks check --data", at.root / "nowhere"))
 mistake("mask checks", "a number of views below 1")(lambda at: at.beags("masks check --min-views 0 --data", at.data))
 mistake("mask checks", "an unknown way to reproject")(beags("masks reproject --load-config {run} --method guess"))
-mistake("mask checks", "a negative number of voters")(beags("masks reproject --load-config {run} --voters -1"))
 mistake("mask checks", "a share above 1")(beags("masks reproject --load-config {run} --min-confidence 2"))
 mistake("mask checks", "a folder of masks that does not exist")(
     beags("masks reproject --load-config {run} --masks-path nowhere")

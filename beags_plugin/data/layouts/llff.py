@@ -10,7 +10,7 @@ from beags_plugin.data.layouts.colmap import complete_model
 from beags_plugin.data.poses_bounds import FILE, read_poses_bounds, seed_points
 from beags_plugin.data.scene import ColmapModel, PoseTable, Scene, Split
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.reading.text import load_text, reason
+from beags_plugin.system.reading.text import reason
 
 NVOS_TARGETS = {
     "fern": "IMG_4027",
@@ -75,7 +75,7 @@ def nvos_target(root: Path, folder: Path) -> tuple[str, ...]:
     pairs = dict(zip((path.stem for path in _originals(root, len(stems))), stems, strict=False))
     if (root / ORIGINAL_NAMES).is_file():
         try:
-            lines = [line.split() for line in load_text(root / ORIGINAL_NAMES).splitlines()]
+            lines = [line.split() for line in (root / ORIGINAL_NAMES).read_text("utf8").splitlines()]
         except (OSError, ValueError) as error:
             told = f"{root / ORIGINAL_NAMES} cannot be read ({reason(error)}): restore or remove it."
             raise UserError(told) from error

@@ -9,7 +9,7 @@ from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.llff import lacks_poses, model_or_bounds
 from beags_plugin.data.scene import Scene, Split
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.reading.text import load_text, reason
+from beags_plugin.system.reading.text import reason
 
 CLASSES = "segmentations/classes.txt"
 
@@ -57,7 +57,7 @@ class ThreeDOvs(Layout):
 
 def _class_names(file: Path) -> list[str]:
     try:
-        names = [line.strip() for line in load_text(file).splitlines() if line.strip()]
+        names = [line.strip() for line in file.read_text("utf8").splitlines() if line.strip()]
     except (OSError, ValueError) as error:
         raise UserError(f"{file} cannot be read ({reason(error)}): write one class name on each line.") from error
     if not names or len(set(names)) < len(names):

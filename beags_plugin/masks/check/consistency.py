@@ -12,9 +12,6 @@ AGREEMENT = 0.6  # share of the other views' labels that must be one class for a
 LEAST_OTHERS = 3  # other views that must see the point
 LEAST_POINTS = 8  # points of an object in a view that say anything about it
 MOST = 0.5  # share of an object's points that must carry another label
-WHOLE, PARTLY = 0.75, 0.2  # the same of two exchanged objects the first of which hides the second in part
-GONE = 0.02  # share of an object's points that may carry its own label where it counts as absent
-ONE_OBJECT = 0.8  # share of the views of an id that must show it at a point
 
 
 @dataclass(frozen=True)
@@ -27,24 +24,6 @@ class Renamed:
     view: int
     instead: dict[int, int]
     points: int
-
-
-@dataclass(frozen=True)
-class Lost:
-    """A view without an object where ``points`` of it should show; all views but few of the others have it there."""
-
-    view: int
-    class_rank: int
-    points: int
-
-
-@dataclass(frozen=True)
-class Twins:
-    """Two ids that are never in one view, but in the same place: likely one object. share: of its points."""
-
-    first: int
-    second: int
-    share: float
 
 
 def labels_at(
@@ -109,7 +88,7 @@ class Agreement:
         exchanged: list[dict[int, int]] = []
         for start in said:
             if not any(start in pairs for pairs in exchanged):
-                exchanged += self._cycle(said, start) or self._half_hidden(view, said, start)
+                exchanged += self._cycle(said, start)
         shares = {rank: confusion[rank, new] / points[rank] for rank, new in said.items()}
         for new in sorted(set(said.values()) - {0}):
             # an id of which no view tells where it is: the object was called anew; what it hides has its label too
@@ -124,51 +103,6 @@ class Agreement:
         while (following := said.get(path[-1])) is not None and following not in path:
             path.append(following)
         return [{rank: said[rank] for rank in path}] if following == start and len(path) > 1 else []
-
-    def _half_hidden(self, view: int, said: dict[int, int], start: int) -> list[dict[int, int]]:
-        """Two exchanged objects one of which hides a part of the other: that part has the label of what hides it."""
-        other = said[start]
-        if self.confusion[view, start, other] < WHOLE * self.confusion[view, start].sum():
-            return []
-        back, points = int(self.confusion[view, other, start]), int(self.confusion[view, other].sum())
-        if 0 in (start, other) or other == start or back < max(LEAST_POINTS, PARTLY * points):
-            return []
-        return [{start: other, other: start}]
-
-    def lost(self) -> list[Lost]:
-        """Objects that a view does not show at all where the others say that they are: mask lost, or object hidden."""
-        found = []
-        for view, confusion in enumerate(self.confusion):
-            for rank in range(1, self.classes):
-                points = int(confusion[rank].sum())
-                gone = confusion[rank, rank] <= GONE * points and confusion[rank, 0] > MOST * points
-                if points >= LEAST_POINTS and gone and not (self.labels[:, view] == rank).any():
-                    found.append(Lost(view, rank, points))
-        return found
-
-    def twins(self, present: np.ndarray) -> list[Twins]:
-        """Objects that never meet in a view, but lie in the same place; present: [V, C] bool, which views show which.
-
-        Each must be in at least ``LEAST_OTHERS`` views.
-        """
-        enough = [rank for rank in range(1, self.classes) if present[:, rank].sum() >= LEAST_OTHERS]
-        where = {rank: self._place(rank, present[:, rank]) for rank in enough}
-        found = []
-        for index, first in enumerate(enough):
-            for second in enough[index + 1 :]:
-                smaller = min(where[first].sum(), where[second].sum())
-                if smaller < LEAST_POINTS or (present[:, first] & present[:, second]).any():
-                    continue
-                share = float((where[first] & where[second]).sum() / smaller)
-                if share > MOST:
-                    found.append(Twins(first, second, share))
-        return found
-
-    def _place(self, rank: int, views: np.ndarray) -> np.ndarray:
-        """[P] bool, the points at which nearly all views that show the class at all show it."""
-        labels = self.labels[:, views]
-        seen = (labels != UNSEEN).sum(1)
-        return (seen >= LEAST_OTHERS) & ((labels == rank).sum(1) >= ONE_OBJECT * seen)
 
 
 def ranks_of(class_map: np.ndarray, ids: Sequence[int], ignore: int) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo, stacked
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.reading.text import MOST_BYTES_OF_MASKS, load_json, reason
+from beags_plugin.system.reading.text import load_json, reason
 
 FARTHEST = 1e5  # pixels of a polygon's points from the image's corner; the library rasterizes every one
 INSTANCE_KEYS = ("instance_id", "track_id", "object_id")
@@ -33,7 +33,7 @@ class CocoSource(MaskSource):
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
         path = scene.below(self.file)
         try:
-            content = load_json(path, most_bytes=MOST_BYTES_OF_MASKS)
+            content = load_json(path)
             views = {image["id"]: str(image["file_name"]) for image in content["images"]}
             categories = {entry["id"]: str(entry["name"]) for entry in content.get("categories", [])}
             annotations = [(views[entry["image_id"]], self._key(entry), entry) for entry in content["annotations"]]

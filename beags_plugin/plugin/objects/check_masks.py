@@ -135,11 +135,11 @@ def _files(config: BeagsDataParserConfig) -> tuple[Scene, PosedViews, MaskFiles]
 
 def _points(scene: Scene, views: PosedViews, config: BeagsDataParserConfig) -> np.ndarray:
     """[P, 3] float64 in the cameras' world: seed points and points drawn where the cameras look."""
-    found = starting_points(scene, views, config.num_random_points, config.random_points_seed)
+    found = starting_points(scene, views, config.num_random_points)
     seeds = found["points3D_xyz"].double().numpy()
     step = -(-len(seeds) // MOST_SEED_POINTS)
     cameras = [camera_from_nerfstudio(views.cameras, index) for index in range(len(views.images))]
-    drawn, _ = random_points(cameras, RANDOM_POINTS, config.random_points_seed)
+    drawn, _ = random_points(cameras, RANDOM_POINTS)
     return np.concatenate([seeds[::step], drawn.astype(np.float64)])
 
 

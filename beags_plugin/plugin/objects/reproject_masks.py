@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 class ReprojectionOptions:
     """What may differ from how the run itself prepares masks; None keeps its choice.
 
-    masks: folder of other id images. classes: their classes.json. method, tau, voters, depth: see
+    masks: folder of other id images. classes: their classes.json. method, tau, depth: see
     ``preparation.pipeline.PreparationConfig``. run_size: reproject at the size that was trained on, not at that of the
     photographs. parser: the options of ``beags-data``, if not the run's own.
     """
@@ -45,7 +45,6 @@ class ReprojectionOptions:
     classes: Path | None = None
     method: str | None = None
     tau: float | None = None
-    voters: int | None = None
     depth: str | None = None
     run_size: bool = False
     parser: BeagsDataParserConfig | None = None
@@ -91,7 +90,7 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     """
     scene = read_scene(config_path)
     manager = data_to_reproject(scene, config_path, options)
-    own = {"reprojection": options.method, "tau": options.tau, "voters": options.voters, "depth": options.depth}
+    own = {"reprojection": options.method, "tau": options.tau, "depth": options.depth}
     config = replace(scene.config.model_config.prepare, **{k: v for k, v in own.items() if v is not None})
     if config.reprojection == "none":
         config = replace(config, reprojection="voxel")
@@ -105,7 +104,7 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
         raise UserError(f"no training view of {scene.config.data_path} has a mask: give --masks-path, or make some.")
     classes = manager.train_dataset.metadata["classes"]
     cameras, rasterizer = [view.camera for view in views], make_rasterizer(scene.config.model_config.rasterizer)
-    method, why = chosen_reprojection(config.reprojection, config.voters, cameras, given)
+    method, why = chosen_reprojection(config.reprojection, cameras, given)
     config = replace(config, reprojection=method)
     with progress_bar("Rendering depth") as progress:
         surfels = scene.surfels().detach()

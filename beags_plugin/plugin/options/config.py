@@ -55,10 +55,6 @@ class BeagsTrainerConfig(TrainerConfig):
     steps_per_held_out: int = 0
     """Measure all held-out views every so many steps, into held_out.json of the run; 0: never."""
 
-    keep_stages: bool = False
-    """Keep the finished stages of the preparation (prepared/stages) when the run is complete, for another run into the
-    same folder, or one that loads this run."""
-
     check_memory: bool = True
     """Do not begin where hardly any memory or disk is free; save and stop when memory runs out (on a CPU)."""
 
@@ -160,9 +156,8 @@ def base_config() -> BeagsTrainerConfig:
                     "photometric": LossSpec(options={"ssim_weight": 0.2}),
                     "distortion": LossSpec(weight=0.0, start=3_000),
                     "normal": LossSpec(weight=0.05, start=7_000),
-                    "opacity": LossSpec(weight=0.0, phase="base"),
                     "boundary": LossSpec(weight=0.5, phase="refine"),
-                    "silhouette": LossSpec(weight=0.0, phase="refine", options={"objects": 1, "seen": 0, "tau": 0.02}),
+                    "silhouette": LossSpec(weight=0.0, phase="refine", options={"objects": 1, "seen": 0}),
                     "occupancy": LossSpec(weight=10.0, phase="refine", options={"samples": 20, "background": True}),
                 },
             ),

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 BASE_SNAPSHOT = "base"  # folder of the run that keeps the scene as it was when refinement started
 PREPARED = "prepared"  # folder of the run that keeps masks, grids and what was found
-STAGES = "stages"  # in there: results of single stages, for a preparation that is broken off or made again
 EXTRACTION_FILE = "extraction.json"  # in a run that holds a part of another: of which, and what was taken
 REPORT_FILE = "training.json"  # seconds and memory of a run that is complete
 TRANSFORM_FILE = "dataparser_transforms.json"  # nerfstudio's name for how the poses were normalised

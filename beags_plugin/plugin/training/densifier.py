@@ -68,7 +68,7 @@ class Densifier:
 
     def _reset_opacity(self) -> None:
         model = self.model
-        logits = reset_opacity(model.surfels().detach(), self.config)
+        logits = reset_opacity(model.surfels().detach())
         parameter = model.gauss_params["opacities"]
         parameter.data = logits[:, None].contiguous()
         everyone = torch.arange(logits.shape[0])

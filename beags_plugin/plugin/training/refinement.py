@@ -20,7 +20,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.classes import read_class_map, write_class_map
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED, STAGES, round_folder
+from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED, round_folder
 from beags_plugin.plugin.runs.prepared import read_grid
 from beags_plugin.plugin.runs.write import write_run
 from beags_plugin.plugin.training.resumable import TrainingRun
@@ -28,10 +28,8 @@ from beags_plugin.plugin.training.scene_edits import edit_scene
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.preparation.pipeline import Preparation, prepare
-from beags_plugin.preparation.stages import StageStore
 from beags_plugin.refiners import REFINERS
 from beags_plugin.system import processes
-from beags_plugin.system.digests import code_digest
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.memory import peak_memory_mb
 from beags_plugin.system.progress import counted, progress_bar
@@ -136,8 +134,6 @@ class RefinementSwitch:
                     background_voxels=self._background_voxels(),
                     seed=model.seed,
                     stage=_bar,
-                    store=self._stage_store(),
-                    code=code_digest(),
                 )
             for finding in prepared.findings:
                 CONSOLE.print(f"  {finding}", highlight=False, markup=False)
@@ -153,22 +149,6 @@ class RefinementSwitch:
             self.rounds += 1
             self._start(prepared.grid, prepared.labels)
         self.trainer.seconds.prepared(prepared.seconds, time.perf_counter() - start, first)
-
-    def _stage_store(self) -> StageStore:
-        """Where the stages of this round are kept; those of the run that this one goes on from are looked into too.
-
-        What an earlier run into the same folder kept of more rounds is removed.
-        """
-        own_run, rounds = self.trainer.run, self.model.config.refine_rounds
-        kept = own_run / PREPARED / STAGES
-        own = {f"round_{index + 1}" for index in range(rounds)}
-        for folder in kept.glob("round_*") if processes.is_first() else ():
-            if folder.name not in own:
-                shutil.rmtree(folder)
-        former = self.trainer.loaded_run
-        runs = [own_run] if former in (None, own_run.absolute()) else [own_run, former]
-        here, *others = (run / PREPARED / STAGES / f"round_{self.rounds + 1}" for run in runs)
-        return StageStore(here, others)
 
     def _background_voxels(self) -> bool:
         return any(loss.asks_grid_about_background for loss in self.model.losses.values())
@@ -194,8 +174,7 @@ class RefinementSwitch:
             _clear(self.trainer.base_dir / PREPARED)
             for name in (PREPARED, BASE_SNAPSHOT):
                 if (former / name).is_dir():
-                    skipped = shutil.ignore_patterns(STAGES)
-                    shutil.copytree(former / name, self.trainer.base_dir / name, dirs_exist_ok=True, ignore=skipped)
+                    shutil.copytree(former / name, self.trainer.base_dir / name, dirs_exist_ok=True)
         if not (folder / "grid.pt").exists():
             raise UserError(
                 f"{former} was refining, but its folder {PREPARED} with masks and voxel grids is missing: restore it, "
@@ -259,10 +238,9 @@ def save_prepared(prepared: Preparation, names: list[str], folder: Path) -> None
 
 
 def _clear(folder: Path) -> None:
-    """Remove what another run into the same folder prepared, later rounds too; its stages may serve again."""
+    """Remove what another run into the same folder prepared, later rounds too."""
     for path in folder.glob("*"):
-        if path.name != STAGES:
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 @contextmanager

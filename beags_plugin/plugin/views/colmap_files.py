@@ -12,7 +12,6 @@ from nerfstudio.data.utils import colmap_parsing_utils as colmap
 from nerfstudio.process_data.colmap_utils import parse_colmap_camera_params
 from torch import Tensor
 
-from beags_plugin.data.colmap_binary import check_colmap_binary
 from beags_plugin.system.errors import UserError
 
 
@@ -45,8 +44,6 @@ def read_colmap_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read(reader: Callable[[Any], dict], file: Path) -> dict:
-    if file.suffix == ".bin":
-        check_colmap_binary(file)
     try:
         return reader(file)
     # the readers let struct.error, IndexError and the like through

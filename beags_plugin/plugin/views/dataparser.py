@@ -71,8 +71,6 @@ class BeagsDataParserConfig(DataParserConfig):
     """Half the side of the scene box."""
     num_random_points: int = 50_000
     """Number of points to start from where the data brings none."""
-    random_points_seed: int = 0
-    """Seed of these points."""
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that nothing can be made of."""
@@ -85,8 +83,6 @@ class BeagsDataParserConfig(DataParserConfig):
             raise UserError(f"eval_interval is {self.eval_interval}: give a number of views, or 0 to hold out none.")
         if self.num_random_points < 4:
             raise UserError(f"num_random_points is {self.num_random_points}: a scene starts from at least 4.")
-        if self.random_points_seed < 0:
-            raise UserError(f"random_points_seed is {self.random_points_seed}: give 0 or more.")
         if wrong := [index for index in self.ignore_ids if not 0 <= index <= IGNORE]:
             raise UserError(f"ignore_ids holds {wrong[0]}: ids are whole numbers in 0..{IGNORE}.")
 
@@ -183,7 +179,7 @@ class BeagsDataParser(DataParser):
         self._check_named(folder, classes_file)
         known = (scene.class_names, scene.class_names_file)
         return {
-            **starting_points(scene, views, config.num_random_points, config.random_points_seed),
+            **starting_points(scene, views, config.num_random_points),
             "classes": read_class_names(classes_file, present, config.ignore_ids, *known),
             "class_map_filenames": masks,
             "mask_kind": kind,

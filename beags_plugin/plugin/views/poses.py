@@ -19,15 +19,14 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from beags_plugin.data.colmap_binary import check_colmap_binary
 from beags_plugin.data.files import existing_images, photo_names
 from beags_plugin.data.layouts.colmap import points_file
 from beags_plugin.data.scene import ColmapModel, Poses, PoseTable, TransformsFile
 from beags_plugin.data.transforms_file import read_transforms
 from beags_plugin.plugin.views.cameras import concatenate_cameras
 from beags_plugin.plugin.views.colmap_files import read_lens
-from beags_plugin.plugin.views.seed_points import read_ply_points
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.ply import read_ply_points
 
 SPLITS = ("train", "val", "test")
 
@@ -145,9 +144,6 @@ def _transforms_parser(poses: TransformsFile, root: Path, normalization: Normali
 
 def _colmap_parser(poses: ColmapModel, root: Path, normalization: Normalization) -> tuple[DataParser, list[str]]:
     """nerfstudio's COLMAP parser, and the splits named by ``<split>_list.txt``."""
-    for name in ("cameras.bin", "images.bin", "points3D.bin"):
-        if (poses.folder / name).is_file():
-            check_colmap_binary(poses.folder / name)
     parser = ColmapDataParser(
         ColmapDataParserConfig(
             data=root,

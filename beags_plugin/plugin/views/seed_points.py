@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,17 +11,18 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.data.scene import PoseTable, Scene
-from beags_plugin.extraction.splat_file import check_ply_size
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.colmap_files import read_colmap_points
-from beags_plugin.system.errors import UserError
-from beags_plugin.system.reading.text import reason
+from beags_plugin.system.reading.ply import read_ply_points
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.views.poses import PosedViews
 
+SEED = 0
+"""Of the points that are drawn where the data brings none."""
 
-def starting_points(scene: Scene, views: PosedViews, count: int, seed: int) -> dict[str, Any]:
+
+def starting_points(scene: Scene, views: PosedViews, count: int) -> dict[str, Any]:
     """The seed points of a scene in the world of its cameras, or ``count`` drawn ones where it has none.
 
     Returns ``points3D_xyz`` [P, 3] float32, ``points3D_rgb`` [P, 3] uint8 and ``points3D_random``, whether they are
@@ -46,55 +46,26 @@ def starting_points(scene: Scene, views: PosedViews, count: int, seed: int) -> d
     if found["points3D_xyz"] is not None and len(found["points3D_xyz"]) > 0:
         return {**found, "points3D_random": False}
     if bounds is None:
-        xyz, rgb = random_points(cameras, count, seed)
+        xyz, rgb = random_points(cameras, count)
     else:
-        xyz, rgb = points_between(cameras, scale * bounds, count, seed)
+        xyz, rgb = points_between(cameras, scale * bounds, count)
     return {"points3D_xyz": torch.from_numpy(xyz), "points3D_rgb": torch.from_numpy(rgb), "points3D_random": True}
 
 
-def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [N, 3] float32 and colours [N, 3] uint8 (mid-grey where the file has none) of a .ply's vertices.
-
-    Raises ``UserError`` if the file is absent or has no vertices with x, y, z.
-    """
-    from plyfile import PlyData, PlyParseError
-
-    if not path.is_file():
-        raise UserError(f"the seed points {path} (ply_file_path) do not exist: restore the file or remove the key.")
-    try:
-        check_ply_size(path)
-        vertices = PlyData.read(str(path))["vertex"].data
-        points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
-    except OSError as error:
-        raise UserError(f"the seed points {path} cannot be read ({error.strerror}): restore the file.") from error
-    # plyfile lets through what numpy and the text of a header raise
-    except (PlyParseError, LookupError, ValueError, TypeError, MemoryError, OverflowError, RecursionError) as error:
-        told = f"the seed points {path} cannot be read as a .ply with x, y, z ({reason(error)}): export them again."
-        raise UserError(told) from error
-    if points.ndim != 2 or not np.isfinite(points).all():
-        raise UserError(f"the seed points {path} are not all numbers: export them again, or remove the key.")
-    if not all(name in vertices.dtype.names for name in ("red", "green", "blue")):
-        return points, np.full(points.shape, 128, np.uint8)
-    colors = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1)
-    if np.issubdtype(colors.dtype, np.floating):  # floats are shares of 1, integers are bytes
-        colors = np.clip(colors * 255.0 + 0.5, 0, 255)
-    return points, colors.astype(np.uint8)
-
-
-def random_points(cameras: Sequence[Camera], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def random_points(cameras: Sequence[Camera], count: int) -> tuple[np.ndarray, np.ndarray]:
     """Points in the cameras' common view, for scenes without seed points.
 
     Drawn uniformly in the ball around the cameras' point of interest (see ``_point_of_interest``) whose radius is half
     the cameras' median distance from it, and kept where at least half of the views see them (or as many views as
     see the best tenth, where frusta overlap less than that).
 
-    Returns positions [count, 3] float32 and colours [count, 3] uint8, mid-grey. The same seed gives the same points.
+    Returns positions [count, 3] float32 and colours [count, 3] uint8, mid-grey.
     """
     rotations = np.stack([camera.rotation.double().numpy() for camera in cameras])
     centers = np.stack([camera.center.double().numpy() for camera in cameras])
     focus = _point_of_interest(rotations, centers)
     radius = 0.5 * float(np.median(np.linalg.norm(centers - focus, axis=1)))
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(SEED)
     batch = 1 << 14
 
     def draw() -> tuple[np.ndarray, np.ndarray]:
@@ -106,20 +77,17 @@ def random_points(cameras: Sequence[Camera], count: int, seed: int) -> tuple[np.
     return _seen_by_many(draw, count)
 
 
-def points_between(
-    cameras: Sequence[Camera], bounds: np.ndarray, count: int, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
+def points_between(cameras: Sequence[Camera], bounds: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Points in the cameras' common view and within their depths, uniform in each image and in inverse depth.
 
     bounds: [V, 2] nearest and farthest depth of each view. Kept are points that at least half of the views see (or as
-    many as see the best tenth). Returns positions [count, 3] float32 and colours [count, 3] uint8, mid-grey. The same
-    seed gives the same points.
+    many as see the best tenth). Returns positions [count, 3] float32 and colours [count, 3] uint8, mid-grey.
     """
     rotations = np.stack([camera.rotation.double().numpy() for camera in cameras])
     centers = np.stack([camera.center.double().numpy() for camera in cameras])
     to_rays = np.stack([np.linalg.inv(camera.K.double().numpy()) for camera in cameras])
     sizes = np.array([(camera.width, camera.height) for camera in cameras], float)
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(SEED)
 
     def draw() -> tuple[np.ndarray, np.ndarray]:
         view = generator.integers(len(cameras), size=1 << 14)

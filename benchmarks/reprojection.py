@@ -1,4 +1,4 @@
-"""``beags bench reprojection``: time and accuracy of the reprojections against the number of views."""
+"""python -m benchmarks.reprojection: time and accuracy of the reprojections against the number of views."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import tyro
 from rich.console import Console
 from torch import Tensor
 
@@ -25,7 +26,7 @@ from beags_plugin.bench.report import (
 from beags_plugin.core.cameras import Camera
 from beags_plugin.evaluation.metrics import mask_metrics, mean_metrics
 from beags_plugin.masks import REPROJECTIONS
-from beags_plugin.system.errors import UserError
+from beags_plugin.system.errors import UserError, print_user_errors_plainly
 from beags_plugin.system.reading.arrays import load_array
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
@@ -36,7 +37,14 @@ AS_GIVEN = "masks as given"
 
 @dataclass(frozen=True)
 class Options:
-    """What the command line asks for; see ``commands.Reprojection``."""
+    """Time and accuracy of the mask reprojections against the number of views, on the sample.
+
+    views: numbers of training views; a base is trained for each. depths: what is lifted, the trained base's depth or
+    the sample's exact one. methods: names of reprojections; the others are compared with pairwise. preset: its base
+    phase is trained. seed, width, height: of the sample, in pixels. calls: how often each is timed; the least counts.
+    output: folder of scenes, bases and results. json, csv, picture: files; <output>/reprojection.json and so on if
+    left out.
+    """
 
     views: tuple[int, ...] = (30, 60, 120, 240)
     depths: tuple[str, ...] = DEPTHS
@@ -128,12 +136,12 @@ def plain(options: Any) -> dict[str, Any]:
 
 def load_views(options: Options, views: int) -> Scene:
     """The sample with so many training views, and its depth as a base trained on it shows it."""
-    from beags_plugin.bench.bases import trained_base
-    from beags_plugin.commands.demo import make_sample
     from beags_plugin.labels.classes import read_class_map
     from beags_plugin.plugin.runs.read import raster_settings, read_scene, read_transform
     from beags_plugin.rasterizers import make_rasterizer
     from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
+    from beags_plugin.sample.writer import make_sample
+    from benchmarks.bases import trained_base
 
     name = f"sample-{options.seed}-{options.width}x{options.height}-{views}"
     data = options.output / "scenes" / name
@@ -233,3 +241,8 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
     axes[0][0].set_yscale("log")
     axes[0][0].legend(fontsize="small")
     save_figure(path, figure)
+
+
+if __name__ == "__main__":
+    print_user_errors_plainly()
+    run_reprojection(tyro.cli(Options))

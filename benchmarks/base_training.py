@@ -1,4 +1,4 @@
-"""``beags bench base``: how well held-out views are drawn, against steps and number of Gaussians."""
+"""python -m benchmarks.base_training: how well held-out views are drawn, against steps and number of Gaussians."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import tyro
 from rich.console import Console
 
+from beags_plugin.bench.commands import Trainings
 from beags_plugin.bench.experiment import Experiment, Variant, load_experiment
 from beags_plugin.bench.report import (
     new_figure,
@@ -26,6 +28,7 @@ from beags_plugin.bench.scenes import Scene
 from beags_plugin.bench.trials import MODEL, Trial, steps_of
 from beags_plugin.plugin.training.monitor import CURVE
 from beags_plugin.system.digests import code_digest
+from beags_plugin.system.errors import print_user_errors_plainly
 from beags_plugin.system.progress import progress_bar
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
@@ -166,3 +169,20 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
 
 def _minutes(seconds: float | None) -> float | None:
     return None if seconds is None else seconds / 60
+
+
+@dataclass
+class Arguments(Trainings):
+    """How well bases render held-out views, against steps and number of Gaussians."""
+
+    file: tyro.conf.Positional[str] = "base"
+    """base (bases of different lengths), base-limits (one part of the schedule changed), or a TOML file."""
+
+    def run(self) -> None:
+        """Train and report."""
+        run_base(self.file, Options(**{name: value for name, value in vars(self).items() if name != "file"}))
+
+
+if __name__ == "__main__":
+    print_user_errors_plainly()
+    tyro.cli(Arguments).run()

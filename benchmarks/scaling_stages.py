@@ -1,4 +1,4 @@
-"""The stages that ``beags bench scaling`` measures, each as a call on a synthetic scene."""
+"""The stages that python -m benchmarks.scaling measures, each as a call on a synthetic scene."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.optim import Adam
 
 from beags_plugin.assignment.assignment import assign_classes
-from beags_plugin.bench.scaling_scene import SETTINGS, SyntheticScene
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.boundary import BoundaryLoss
@@ -21,6 +20,7 @@ from beags_plugin.occupancy.build import build_visibility_grid
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth, surfel_inputs
+from benchmarks.scaling_scene import SETTINGS, SyntheticScene
 
 STEP = "refinement step"
 CHANNELS = "step, a channel per class"

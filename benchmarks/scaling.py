@@ -1,4 +1,4 @@
-"""``beags bench scaling``: time and memory of each stage against classes, views, Gaussians and pixels."""
+"""python -m benchmarks.scaling: time and memory of each stage against classes, views, Gaussians and pixels."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
+import tyro
 from rich.console import Console
 
-from beags_plugin.bench.memory import peak_of
 from beags_plugin.bench.report import (
     log_slope,
     new_figure,
@@ -22,10 +22,11 @@ from beags_plugin.bench.report import (
     write_csv,
     write_json,
 )
-from beags_plugin.bench.scaling_scene import Sizes, make_scene
-from beags_plugin.bench.scaling_stages import CHANNELS, STAGES, STEP, stages
-from beags_plugin.system.errors import UserError
+from beags_plugin.system.errors import UserError, print_user_errors_plainly
 from beags_plugin.system.progress import progress_bar
+from benchmarks.peak_memory import peak_mb_of
+from benchmarks.scaling_scene import Sizes, make_scene
+from benchmarks.scaling_stages import CHANNELS, STAGES, STEP, stages
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 AXES = ("classes", "views", "gaussians", "pixels")
@@ -37,7 +38,12 @@ QUICK = {
 
 @dataclass(frozen=True)
 class Options:
-    """What the command line asks for; see ``commands.Scaling``."""
+    """Time and memory of a refinement step and of each stage before it against classes, views, Gaussians and pixels.
+
+    channels: up to so many classes, the step of methods that render a channel per class is measured beside ours. calls:
+    how often each is timed, in turn; the median counts. quick: tiny sizes, in seconds; the figures mean nothing.
+    output: folder of results. json, csv, picture: files; <output>/scaling.json and so on if left out.
+    """
 
     classes: tuple[int, ...] = (1, 4, 16, 64, 256)
     views: tuple[int, ...] = (4, 8, 16, 32)
@@ -133,7 +139,7 @@ def measure(axis: str, sizes: Sequence[int], base: Sizes, channels: int, calls: 
         for turn in range(calls + 1):
             for key, call in work.items():
                 if turn == 0:  # warms up too
-                    memory[key] = peak_of(call)
+                    memory[key] = peak_mb_of(call)
                 else:
                     start = time.perf_counter()
                     call()
@@ -209,3 +215,8 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
     handles, names = plots[0][0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=len(STAGES), frameon=False)
     save_figure(path, figure)
+
+
+if __name__ == "__main__":
+    print_user_errors_plainly()
+    run_scaling(tyro.cli(Options))

@@ -1,0 +1,47 @@
+"""The factor by which photos are scaled down for a training that ends in minutes."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from pathlib import Path
+
+from beags_plugin.data.files import image_size
+from beags_plugin.data.layout import read_scene
+from beags_plugin.data.scene import ColmapModel, PoseTable
+from beags_plugin.system.errors import UserError
+
+QUICK_PIXELS = 50_000
+"""Photos are scaled down to at most so many pixels a view."""
+
+
+def quick_downscale(data: Path) -> float:
+    """Whole factor that brings the images of ``data`` to ``QUICK_PIXELS`` or less."""
+    images = _images(data) or _first_frame(data)
+    if not images:
+        return 1.0  # the data parser names what is missing
+    width, height = image_size(images[0])
+    factor = 1
+    while width * height / factor**2 > QUICK_PIXELS:
+        factor += 1
+    return float(factor)
+
+
+def _images(data: Path) -> list[Path]:
+    """The images that the layout of ``data`` takes, or where it is not known, those in images/."""
+    folder, pattern = data, "images*/**/*"
+    with contextlib.suppress(UserError):  # the data parser names what is missing
+        poses = read_scene(data).poses
+        if isinstance(poses, PoseTable):
+            return list(poses.images)
+        if isinstance(poses, ColmapModel):
+            folder, pattern = poses.images, "**/*"
+    return sorted(path for path in folder.glob(pattern) if path.suffix.lower() in {".jpg", ".jpeg", ".png"})
+
+
+def _first_frame(data: Path) -> list[Path]:
+    """The first image that transforms.json names; none where there is no such file, or it is damaged."""
+    try:
+        return [data / json.loads((data / "transforms.json").read_text(encoding="utf-8"))["frames"][0]["file_path"]]
+    except (OSError, ValueError, LookupError, TypeError):
+        return []
