@@ -25,7 +25,7 @@ demo: setup
 	"$(BIN)/beags" demo $(if $(DATA),--data "$(DATA)")
 
 fuzz: setup
-	"$(BIN)/python" scripts/fuzz.py --count "$(or $(COUNT),1000)" --seed "$(or $(SEED),0)"
+	"$(BIN)/python" tests/soak/fuzz.py --count "$(or $(COUNT),1000)" --seed "$(or $(SEED),0)"
 
 lint: setup
 	"$(BIN)/ruff" check .
