@@ -39,7 +39,7 @@ def dry(monkeypatch):
     monkeypatch.setattr(cuda, "case", lambda count, width, height: Size(min(count, 100), width, height))
 
 
-def measured(folder: Path, seconds: float = 60.0) -> tuple[int, dict]:
+def measured(folder: Path, seconds: float = 600.0) -> tuple[int, dict]:
     file = folder / "cuda.json"
     chosen = argparse.Namespace(quick=False, json=str(file), gsplat_seconds=0.0)
     code = cuda.measure({"gpu": "none"}, chosen, time.monotonic() + seconds)
@@ -93,7 +93,7 @@ def test_gsplat_that_does_not_compile_in_time_or_at_all_is_left_out(monkeypatch)
 def check(*stages: str, tools: Path | None = None, **variables: str) -> tuple[int, str]:
     path = f"{tools}:{os.environ['PATH']}" if tools else "/usr/bin:/bin"
     environment = {**os.environ, "PATH": path, **variables}
-    done = subprocess.run(["bash", str(SCRIPT), *stages], capture_output=True, text=True, env=environment, timeout=60)
+    done = subprocess.run(["bash", str(SCRIPT), *stages], capture_output=True, text=True, env=environment, timeout=600)
     return done.returncode, done.stdout + done.stderr
 
 

@@ -28,6 +28,7 @@ pytest.importorskip("nerfstudio")
 
 from viewer_pages import free_port
 
+pytestmark = pytest.mark.long
 BIN = Path(sys.executable).parent
 PROGRAM = re.compile(r"(beags|ns-[a-z]+|make|pip|python) |scripts/")
 README = (ROOT / "README.md").read_text("utf8")
@@ -42,7 +43,7 @@ RUN = {  # in this order; the command in README.md: what is appended
     "beags doctor [--data X]": "--data my_scene",
     "beags masks make --data X --source NAME": "--options folder=masks --output made",
     "beags masks check --data X": "",
-    "ns-train beags-tiny --data my_scene": SHORT,  # killed on its way
+    "ns-train beags-tiny --data my_scene": SHORT.replace("base-steps 60", "base-steps 200"),  # killed on its way
     "beags resume RUN": "",  # and so goes on
     f"beags export {CONFIG} --all --format ply glb": "--resolution 24 --output exported",
     "ns-train beags-refine --data my_scene --pipeline.model.start-from scene.ply": SHORT,
@@ -69,6 +70,7 @@ ELSEWHERE = {
     "make lint": "looks at the code, not at what it does",
     "make format": "changes the files of this clone",
     "make fuzz COUNT=1000 SEED=0": "minutes; test_fuzz.py runs the script, what make calls is looked at below",
+    "make soak": "an hour; tests/soak/ tests each script",
     "scripts/sanitize.sh": "compiles everything anew",
     "pip install -c constraints.txt -e .": "make setup has done it in the environment that runs this test",
 }
@@ -150,10 +152,10 @@ class Reader:
         return text
 
     def waits(self, process: subprocess.Popen[bytes], until) -> None:
-        end = time.monotonic() + 300
+        end = time.monotonic() + 600
         while not until():
             assert process.poll() is None and time.monotonic() < end, (self.folder / "log.txt").read_text()[-3000:]
-            time.sleep(0.1)
+            time.sleep(0.02)
 
     def trains_and_is_killed(self, line: str, more: str) -> None:
         """After the first checkpoint."""

@@ -31,10 +31,13 @@ NEEDED = pytest.mark.skipif(
 """For tests that open a page."""
 
 
+SECONDS = 120.0  # after which a wait has failed; on a busy machine, most end long before
+
+
 def _labelled(label: str) -> str:
     """JavaScript for the control that a label belongs to."""
     labels = "[...document.querySelectorAll('label')]"
-    return f"document.getElementById({labels}.find(l => l.innerText.trim() == {json.dumps(label)}).htmlFor)"
+    return f"document.getElementById({labels}.find(l => l.innerText.trim() == {json.dumps(label)})?.htmlFor)"
 
 
 class Page:
@@ -77,7 +80,7 @@ class Page:
             return next(page["webSocketDebuggerUrl"] for page in json.load(reply) if page["type"] == "page")
 
     @staticmethod
-    def _wait_for(ask, seconds: float = 60.0):
+    def _wait_for(ask, seconds: float = SECONDS):
         end = time.monotonic() + seconds
         while True:
             try:
@@ -91,7 +94,7 @@ class Page:
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:
-            reply = json.loads(self._socket.recv(timeout=120))
+            reply = json.loads(self._socket.recv(timeout=SECONDS))
             if reply.get("id") == self._number:
                 if "error" in reply:
                     raise RuntimeError(f"{method}: {reply['error']}")
@@ -108,14 +111,14 @@ class Page:
         """All text that the page shows."""
         return self.evaluate("document.body?.innerText") or ""
 
-    def wait(self, true, seconds: float = 60.0) -> None:
+    def wait(self, true, seconds: float = SECONDS) -> None:
         """Wait until a function says so."""
         end = time.monotonic() + seconds
         while not true():
             assert time.monotonic() < end, self.text()
             time.sleep(0.3)
 
-    def wait_for_text(self, wanted: str, seconds: float = 60.0) -> str:
+    def wait_for_text(self, wanted: str, seconds: float = SECONDS) -> str:
         """The page's text, once ``wanted`` is part of it."""
         self.wait(lambda: wanted in self.text(), seconds)
         return self.text()
@@ -128,13 +131,13 @@ class Page:
             time.sleep(0.05)
 
     def press(self, label: str) -> None:
-        """Press the button of that name; not with the mouse: the panel may still be moving."""
-        self.evaluate(
-            f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() == {json.dumps(label)}).click()"
-        )
+        """Press the button of that name, once it is there; not with the mouse: the panel may still be moving."""
+        button = f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() == {json.dumps(label)})"
+        self.wait(lambda: self.evaluate(f"(() => {{ const b = {button}; b?.click(); return Boolean(b); }})()"))
 
     def tick(self, label: str) -> None:
         """Tick or untick the box called ``label``, the first of that name."""
+        self._wait_for_control(label)
         self.evaluate(f"{_labelled(label)}.click()")
 
     def choose(self, label: str, option: str) -> None:
@@ -149,18 +152,23 @@ class Page:
             if self.chosen(label) == option:
                 return True
             if next(tries) % 10 == 0:  # again after a while: a panel that is put together anew closes the list
-                self.evaluate(f"{_labelled(label)}.click()")  # not with the mouse: the panel may still be moving
+                self.evaluate(f"{_labelled(label)}?.click()")  # not with the mouse: the panel may still be moving
             self.evaluate(f"{listed}?.click()")
             return False
 
         self.wait(done)
 
-    def chosen(self, label: str) -> str:
-        """What the drop-down list called ``label`` shows."""
-        return self.evaluate(f"{_labelled(label)}.value")
+    def chosen(self, label: str) -> str | None:
+        """What the drop-down list called ``label`` shows; None while there is none."""
+        return self.evaluate(f"{_labelled(label)}?.value")
+
+    def _wait_for_control(self, label: str) -> None:
+        """A panel that is put together anew lacks its controls for a moment."""
+        self.wait(lambda: self.evaluate(f"Boolean({_labelled(label)})"))
 
     def slide(self, label: str, value: float) -> None:
         """Write into the number field beside the slider called ``label``."""
+        self._wait_for_control(label)
         self.evaluate(
             f"(() => {{ const e = {_labelled(label)}.parentElement.querySelector('input[type=text]');"
             " Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value')"

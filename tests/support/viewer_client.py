@@ -51,7 +51,7 @@ class ViewerClient(threading.Thread):
         self._socket.close()
         self.join(30)
 
-    def wait_for_a_picture(self, seconds: float = 60.0) -> bool:
+    def wait_for_a_picture(self, seconds: float = 120.0) -> bool:
         """Whether one comes after this call."""
         self._came.clear()
         return self._came.wait(seconds)

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +48,7 @@ def started(command: list[object], log: Path, ready: str) -> Iterator[subprocess
         words = bound([sys.executable, *command], signal.SIGKILL)
         process = subprocess.Popen(words, stdout=out, stderr=subprocess.STDOUT, env=environment)
     try:
-        end = time.monotonic() + 200
+        end = time.monotonic() + 300
         while ready not in log.read_text():
             assert process.poll() is None and time.monotonic() < end, log.read_text()[-3000:]
             time.sleep(0.2)
@@ -96,13 +97,18 @@ def sharp(page: Page) -> bool:
     return found is not None and max(int(found[1]), int(found[2])) == MAX_RESOLUTION
 
 
-def awaited(page: Page, true) -> np.ndarray:
-    """The picture, once it is as asked for and stays so."""
-    found = [picture(page)]
+def awaited(page: Page, true, press: str | None = None) -> np.ndarray:
+    """The picture, once it is as asked for and stays so.
+
+    press: the button that makes it so; pressed again after a while, as a panel that is put together anew hears nothing.
+    """
+    found, looks = [picture(page)], count()
 
     def holds() -> bool:
+        if press is not None and next(looks) % 40 == 0:
+            page.press(press)
         found.append(picture(page))
         return differing(*found[-2:]) == 0.0 and true(found[-1]) and sharp(page)
 
-    page.wait(holds, 120)
+    page.wait(holds)
     return found[-1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -27,7 +28,6 @@ from resumed_runs import (
     short_config,
     without_clocks,
 )
-from run_folders import write_scene
 
 from beags_plugin.plugin.objects.extract import read_scene
 from beags_plugin.plugin.trainer import BeagsTrainer
@@ -35,20 +35,19 @@ from beags_plugin.preparation import pipeline as preparation
 from beags_plugin.system.child_processes import bound
 from beags_plugin.system.errors import UserError
 
+pytestmark = pytest.mark.spread
 LAST = sum(STEPS) - 1
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return write_scene(tmp_path_factory.mktemp("data"))
+@pytest.fixture
+def data(short_run):
+    return short_run / "data"
 
 
-@pytest.fixture(scope="module")
-def whole(data, tmp_path_factory):
-    """The run without a break."""
-    run = tmp_path_factory.mktemp("whole") / "run"
-    run_to_end(short_config(data, run))
-    return run
+@pytest.fixture
+def whole(short_run):
+    """The run without a break; tests that change it copy it."""
+    return short_run / "run"
 
 
 def kill_at(monkeypatch, step, after=False):
@@ -311,9 +310,10 @@ def test_a_failed_start_in_the_folder_of_another_run_is_not_mixed_with_it(data, 
     assert not (run / "replaced_models").exists()
 
 
-def test_a_run_that_is_training_cannot_be_resumed(whole):
+def test_a_run_that_is_training_cannot_be_resumed(whole, tmp_path):
     from beags_plugin.system.lock import RunLock
 
+    whole = shutil.copytree(whole, tmp_path / "run")
     before = checkpoint_of(whole)["step"]
     part = whole / ".half.part"
     part.touch()
@@ -332,12 +332,13 @@ def contents(folder):
     return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.rglob("*") if path.is_file()}
 
 
-def test_ns_train_into_the_folder_of_a_run_that_is_training_changes_nothing_there(data, whole):
+def test_ns_train_into_the_folder_of_a_run_that_is_training_changes_nothing_there(data, whole, tmp_path):
     """config.yml is the first that ns-train writes."""
     import fcntl
 
     from beags_plugin.system.lock import LOCK
 
+    whole = shutil.copytree(whole, tmp_path / "run")
     before = contents(whole)
     with open(whole / LOCK, "ab") as file:
         fcntl.flock(file, fcntl.LOCK_EX)  # as another process would
@@ -456,7 +457,7 @@ def test_a_real_kill(data, whole, tmp_path):
         "from beags_plugin.plugin.trainer import BeagsTrainer\n"
         "train = BeagsTrainer.train_iteration\n"
         "def slow(self, step):\n"
-        "    time.sleep(0.02)\n"
+        "    time.sleep(600 if step == 50 else 0.02)\n"  # until the kill
         "    return train(self, step)\n"
         "BeagsTrainer.train_iteration = slow\n"
         f"run_to_end(short_config(Path({str(data)!r}), Path({str(run)!r})))"
@@ -464,7 +465,7 @@ def test_a_real_kill(data, whole, tmp_path):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(SUPPORT), os.getcwd()])}
     with subprocess.Popen(bound([sys.executable, "-c", code]), env=environment, stdout=subprocess.DEVNULL) as process:
         deadline = time.monotonic() + 600
-        while not (run / "nerfstudio_models" / "step-000000021.ckpt").exists():
+        while not any(run.glob("nerfstudio_models/step-0000000[234]?.ckpt")):  # one of step 20 or later
             assert process.poll() is None and time.monotonic() < deadline
             time.sleep(0.005)
         process.send_signal(signal.SIGKILL)

@@ -206,7 +206,7 @@ def test_an_export_says_in_the_panel_how_it_ended(window, monkeypatch):
 
 
 def said(panel, beginning: str) -> str:
-    end = time.monotonic() + 10
+    end = time.monotonic() + 120
     while not panel.notes.get("export", "").startswith(beginning):
         assert time.monotonic() < end, panel.notes
         time.sleep(0.01)

@@ -10,7 +10,6 @@ pytest.importorskip("nerfstudio")
 pytest.importorskip("msgspec")
 
 from resumed_runs import STEPS, assert_same_run, run_to_end, short_config
-from run_folders import write_scene
 from viewer_client import ViewerClient
 
 from beags_plugin.plugin.trainer import BeagsTrainer
@@ -24,11 +23,9 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-def test_a_training_that_is_watched_ends_as_it_does_unwatched(tmp_path, monkeypatch):
+def test_a_training_that_is_watched_ends_as_it_does_unwatched(short_run, tmp_path, monkeypatch):
     """Base, preparation and refinement, bit for bit; the render thread lives to the end and still draws."""
-    data = write_scene(tmp_path / "data")
-    run_to_end(short_config(data, tmp_path / "unwatched"))
-    config = short_config(data, tmp_path / "watched", vis="viewer+tensorboard")
+    config = short_config(short_run / "data", tmp_path / "watched", vis="viewer+tensorboard")
     config.viewer.websocket_port = free_port()
     client = ViewerClient(config.viewer.websocket_port, OUTPUTS, distance=1.0)
     after, iteration, last = BeagsTrainer._after_train, BeagsTrainer.train_iteration, {}
@@ -56,4 +53,4 @@ def test_a_training_that_is_watched_ends_as_it_does_unwatched(tmp_path, monkeypa
     assert last == {"picture": True, "alive": [True]}
     assert sum(client.pictures.values()) >= 3 and client.seen["rgb"].std() > 0
     # websockets draw from Python's own generator, the training from none but its own
-    assert_same_run(tmp_path / "watched", tmp_path / "unwatched", but_for="/beags/parts/random/python")
+    assert_same_run(tmp_path / "watched", short_run / "run", but_for="/beags/parts/random/python")
