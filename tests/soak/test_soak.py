@@ -69,7 +69,7 @@ def test_runs_are_the_same_but_for_clocks(tmp_path):
     (tmp_path / "other/held_out.json").unlink()
     (tmp_path / "other/.b.part").touch()
     found = same_bits.run_differences(one, tmp_path / "other")
-    assert f"left behind: {tmp_path}/other/.b.part" in found and "only in one: prepared/grid.pt" in found
+    assert f"left behind: {tmp_path}/other/.b.part" in found and "only in one: held_out.json" in found
 
 
 @pytest.mark.parametrize("share, part", [(0.5, 500), (1.1, 1000)])
