@@ -63,11 +63,6 @@ for _title in ("export", "masks reproject"):
     mistake("a file in place of a folder", _title)(writing(_title, lambda at, folder: folder.write_text("x")))
 
 
-@mistake("a folder in place of a file", "eval")
-def _(at: Place):
-    return at.beags("eval --load-config {run} --json", at.data)
-
-
 @mistake("a folder in place of a file", "a picture")
 def _(at: Place):
     (at.root / "out.png").mkdir()

@@ -120,7 +120,6 @@ def rle(height: int, width: int, counts: Any) -> Callable[[Path], Any]:
     return coco({"size": [height, width], "counts": counts})
 
 
-mistake("mask sources", "an unknown one")(made("magic"))
 mistake("mask sources", "an unknown option")(made("coco", options="color=red"))
 mistake("mask sources", "a wrong value of an option")(made("langsplat", options="similarity=much"))
 mistake("mask sources", "COCO: no such file")(made("coco"))
@@ -220,8 +219,3 @@ def _(at: Place):
 def _(at: Place):
     prompts(boxed([2, 2, 8, 8]))(at.data)
     return at.beags("masks make --data", at.data, "--source grabcut --overwrite --options prompts=prompts.json")
-
-
-@mistake("mask sources", "masks that are there already")
-def _(at: Place):
-    return at.beags("masks make --data", at.data, "--source id-images")

@@ -91,33 +91,17 @@ def _(at: Place):
     return at.train("--pipeline.model.rasterizer", "native")
 
 
-@mistake("options", "a preset that does not exist")
-def _(at: Place):
-    return at.beags("demo --preset beags-huge")
-
-
-mistake("export", "an unknown format")(beags("export --load-config {run} --object cup --format stl"))
-mistake("export", "an unknown frame")(beags("export --load-config {run} --object cup --frame moon"))
-mistake("export", "nothing named")(beags("export --load-config {run}"))
-mistake("export", "everything and one object")(beags("export --load-config {run} --all --object cup"))
-mistake("export", "an unknown object")(beags("export --load-config {run} --object Cup"))
-mistake("export", "a mesh of 0 voxels")(beags("export --load-config {run} --object cup --format glb --resolution 0"))
 mistake("export", "a truncation that is not a number")(
     beags("export --load-config {run} --object cup --format glb --truncation nan")
 )
-mistake("pictures", "an unknown format")(beags("render --load-config {run} --format hologram"))
 mistake("pictures", "a film called .png")(beags("render --load-config {run} --output film.png"))
-mistake("pictures", "a size of 5 pixels")(beags("render --load-config {run} --size 5"))
 mistake("pictures", "no frames")(beags("render --load-config {run} --frames 0"))
 mistake("pictures", "a sheet without views")(beags("render --load-config {run} --format sheet --views 0"))
-mistake("sample", "an unknown damage")(beags("sample --degradation heavy --output out"))
 mistake("sample", "no views")(beags("sample --views 0 --output out"))
 mistake("sample", "a negative seed")(beags("sample --seed -1 --output out"))
 mistake("sample", "pixels that fill no memory")(beags("sample --width 10000000 --height 10000000 --output out"))
-mistake("demo", "a folder that does not exist")(lambda at: at.beags("demo --data", at.root / "nowhere"))
 mistake("demo", "an empty folder")(lambda at: at.beags("demo --data", (at.root / "empty").mkdir() or at.root / "empty"))
 mistake("demo", "a downscale factor of 0")(lambda at: at.beags("demo --downscale 0 --data", at.data))
-mistake("mask checks", "no scene")(beags("masks check"))
 mistake("mask checks", "a number of views below 1")(lambda at: at.beags("masks check --min-views 0 --data", at.data))
 mistake("mask checks", "a negative number of voters")(beags("masks reproject --load-config {run} --voters -1"))
 mistake("mask checks", "a folder of masks that does not exist")(
@@ -157,4 +141,3 @@ mistake("experiments", "TOML broken")(experiment("description = "))
 mistake("experiments", "not UTF-8")(experiment(b"description = '\xff'"))
 mistake("experiments", "data that do not exist")(experiment(GOOD, "--data nowhere"))
 mistake("experiments", "no such file")(beags("bench file nowhere.toml --output bench"))
-mistake("experiments", "a preset that does not exist")(beags("bench ablation --preset beags-huge --output bench"))

@@ -143,13 +143,6 @@ def giant(name: str) -> Callable[[Path], Any]:
     return lambda model: (model / name).write_bytes(struct.pack("<Q", 1 << 60) + (model / name).read_bytes()[8:])
 
 
-def tracks(model: Path) -> None:
-    """The first image promises 2^60 points."""
-    content = bytearray((model / "images.bin").read_bytes())
-    content[8 + 64 + 8 : 8 + 64 + 16] = struct.pack("<Q", 1 << 60)  # after the count, its pose, and v08.png
-    (model / "images.bin").write_bytes(content)
-
-
 mistake("poses", "COLMAP's cameras.bin cut off")(colmap(cut("cameras.bin")))
 mistake("poses", "COLMAP's images.bin promises 2^60")(colmap(giant("images.bin")))
 mistake("poses", "COLMAP's points3D.bin promises 2^60")(colmap(giant("points3D.bin")))

@@ -127,14 +127,6 @@ def _(at: Place):
     return at.train()
 
 
-@mistake("runs", "a base without classes is extracted")
-def _(at: Place):
-    from run_folders import write_trained
-
-    write_trained(at.root / "run", at.data, assigned=False)
-    return at.beags("extract --load-config {run}")
-
-
 @mistake("runs", "an object without Gaussians")
 def _(at: Place):
     def change(found):
@@ -222,21 +214,6 @@ def _(at: Place):
     (run / "config.yml").write_text(text.replace("refine_steps: 8", "refine_steps: 3"), "utf8")
     (run / "training.json").write_text("{}")
     return at.beags("resume", run)
-
-
-@mistake("resuming", "an extracted object")
-def _(at: Place):
-    return at.beags("resume", at.run)
-
-
-@mistake("evaluation", "one run given twice")
-def _(at: Place):
-    return at.beags("eval --load-config {run} {run}")
-
-
-@mistake("evaluation", "a wrong threshold")
-def _(at: Place):
-    return at.beags("eval --load-config {run} --threshold 2")
 
 
 @mistake("evaluation", "a held-out view that does not exist")

@@ -83,8 +83,8 @@ def test_the_run_grows_splits_and_prepares_twice(whole):
     assert saved["beags"]["parts"]["refinement"] == {"rounds": 2, "evaluated": True}
 
 
-# before and after growth, in the last base step, in the first step of refinement, in both rounds
-@pytest.mark.parametrize(("step", "after"), [(9, True), (36, True), (44, True), (45, False), (48, True)])
+# after growth, in the last base step, in the first step of refinement; elsewhere in the test of many kills
+@pytest.mark.parametrize(("step", "after"), [(36, True), (44, True), (45, False)])
 def test_a_killed_run_ends_as_the_whole_one(data, whole, tmp_path, monkeypatch, step, after):
     run = tmp_path / "run"
     broken_off(data, run, monkeypatch, lambda patch: kill_at(patch, step, after))
@@ -184,12 +184,11 @@ def test_a_kill_in_the_middle_of_a_checkpoint_leaves_the_former_one(data, whole,
 
 def test_resuming_by_load_dir_into_another_folder(data, whole, tmp_path, monkeypatch):
     first, second = tmp_path / "first", tmp_path / "second"
-    for step in (30, 53):
-        broken_off(data, first, monkeypatch, lambda patch, step=step: kill_at(patch, step))
-        config = short_config(data, second)
-        config.load_dir = first / "nerfstudio_models"
-        run_to_end(config)
-        assert_same_run(second, whole)
+    broken_off(data, first, monkeypatch, lambda patch: kill_at(patch, 53))
+    config = short_config(data, second)
+    config.load_dir = first / "nerfstudio_models"
+    run_to_end(config)
+    assert_same_run(second, whole)
 
 
 def test_refinement_of_a_loaded_base_is_resumed(data, whole, tmp_path, monkeypatch):
