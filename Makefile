@@ -1,4 +1,4 @@
-# make setup | test | demo [DATA=folder] | fuzz [COUNT=scenes] [SEED=first] | lint | format | clean
+# make setup | test [JOBS=processes] | demo [DATA=folder] | soak | fuzz [COUNT=scenes] [SEED=first] | lint | format | clean
 # BEAGS_VENV names the environment; clones may share one. PYTHON names the interpreter that makes it.
 BEAGS_VENV ?= .venv
 BIN := $(BEAGS_VENV)/bin
@@ -7,7 +7,9 @@ CXX_FILES = $(shell git ls-files --cached --others --exclude-standard '*.cpp' '*
 # With passive waiting, idle OpenMP threads leave the cores to torch's other threads.
 export OMP_WAIT_POLICY = PASSIVE
 
-.PHONY: help setup test demo fuzz lint format clean
+JOBS ?= 2
+
+.PHONY: help setup test demo soak fuzz lint format clean
 
 help:
 	@sed -n '1,2p' Makefile
@@ -17,15 +19,21 @@ setup:
 	@bash scripts/setup_env.sh "$(BEAGS_VENV)"
 
 # Tests of what is not there are skipped, with the reason: CUDA needs a GPU; the viewer in a browser needs Chromium
-# (Debian: apt install chromium).
+# (Debian: apt install chromium). Each process has one thread; tests that need more set them.
 test: setup
-	BEAGS_REQUIRE_NATIVE=1 "$(BIN)/python" -m pytest -q
+	BEAGS_REQUIRE_NATIVE=1 OMP_NUM_THREADS=1 "$(BIN)/python" -m pytest -q -n $(JOBS) --dist loadgroup --no-loadscope-reorder
 
 demo: setup
 	"$(BIN)/beags" demo $(if $(DATA),--data "$(DATA)")
 
+# Long tests: random scenes and files, runs that are killed, memory over thousands of steps. About an hour.
+soak: fuzz
+	"$(BIN)/python" tests/soak/fuzz_parsers.py --count 300
+	"$(BIN)/python" tests/soak/kill_test.py
+	"$(BIN)/python" tests/soak/long_run.py
+
 fuzz: setup
-	"$(BIN)/python" scripts/fuzz.py --count "$(or $(COUNT),1000)" --seed "$(or $(SEED),0)"
+	"$(BIN)/python" tests/soak/fuzz.py --count "$(or $(COUNT),1000)" --seed "$(or $(SEED),0)"
 
 lint: setup
 	"$(BIN)/ruff" check .

@@ -48,9 +48,9 @@ build() {
 }
 
 tests() { # everything that draws or uses an op on the GPU; nothing here imports nerfstudio
-  "$python" -m pytest -q -p no:cacheprovider tests/test_cuda_rasterizer.py tests/test_cuda_ops.py tests/test_cuda_votes.py tests/test_cuda_gpu.py tests/test_image_ops.py \
-    tests/test_rasterizer_reference.py tests/test_rasterizer_robustness.py tests/test_screen_shift.py \
-    tests/test_extremes.py tests/test_invariances.py tests/test_sparse_class_ids.py \
+  "$python" -m pytest -q -p no:cacheprovider tests/ops/test_{cuda_ops,cuda_votes,image_ops}.py \
+    tests/rasterizers/test_{cuda_rasterizer,cuda_gpu,rasterizer_reference,rasterizer_robustness}.py \
+    tests/rasterizers/test_{screen_shift,extremes,invariances,sparse_class_ids}.py \
     -k "cuda and not emulated"
 }
 

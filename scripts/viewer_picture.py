@@ -1,7 +1,7 @@
 """The picture of docs/viewer.md: nerfstudio's viewer with our panel, of a run, in a headless Chromium.
 
 Run ``beags demo`` first; then ``python scripts/viewer_picture.py``. Another run or object: ``--help``. It opens what
-the tests of the viewer open (tests/viewer_pages.py, tests/browser.py), so Chromium must be there.
+the tests of the viewer open (viewer_pages.py and browser.py in tests/support/), so Chromium must be there.
 """
 
 from __future__ import annotations

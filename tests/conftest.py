@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
 from cuda_backends import BACKENDS
+from shared_folders import shared_folder
 
 from beags_plugin.ops import extension
 from beags_plugin.rasterizers import RASTERIZERS
@@ -16,6 +19,34 @@ def pytest_sessionstart(session):
     """`make test` builds the extension first: there its tests must run, not be skipped."""
     if os.environ.get("BEAGS_REQUIRE_NATIVE") and extension.load() is None:
         pytest.exit(f"BEAGS_REQUIRE_NATIVE is set, but {extension.found()[1]}", returncode=1)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Plan `make test`: files marked long first, each file in one process, files marked spread in any, at the end."""
+    items.sort(key=lambda item: (item.get_closest_marker("spread") is not None, not item.get_closest_marker("long")))
+    for item in items:
+        if item.get_closest_marker("spread") is None:
+            item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
+
+
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory):
+    """``shared(name, make)``: the folder that ``make`` filled, once for all processes; tests only read it."""
+    return partial(shared_folder, tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def short_run(shared):
+    """A folder with ``data`` and ``run``: a whole run of all phases, as ``resumed_runs.short_config`` describes it."""
+    pytest.importorskip("nerfstudio")
+    from resumed_runs import run_to_end, short_config
+    from run_folders import write_scene
+
+    def train(folder: Path) -> None:
+        run_to_end(short_config(write_scene(folder / "data"), folder / "run"))
+
+    return shared("short_run", train)
 
 
 @pytest.fixture(params=["torch", "native", *BACKENDS])

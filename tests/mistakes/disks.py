@@ -57,22 +57,10 @@ def writing(title: str, prepare: Callable[[Place, Path], Any]) -> Callable[[Plac
 
 for _title in WRITING:
     mistake("full disk", _title)(writing(_title, lambda at, folder: at.fail_to_write(folder)))
-for _title in WRITING:
-    mistake("no permission", _title)(writing(_title, lambda at, folder: at.fail_to_write(folder, errno.EACCES)))
-for _title in ("extract", "export", "eval", "masks reproject", "sample"):
-    mistake("read-only disk", _title)(writing(_title, lambda at, folder: at.fail_to_write(folder, errno.EROFS)))
-for _title in WRITING:
+mistake("no permission", "masks make")(writing("masks make", lambda at, folder: at.fail_to_write(folder, errno.EACCES)))
+mistake("read-only disk", "extract")(writing("extract", lambda at, folder: at.fail_to_write(folder, errno.EROFS)))
+for _title in ("export", "masks reproject"):
     mistake("a file in place of a folder", _title)(writing(_title, lambda at, folder: folder.write_text("x")))
-
-
-@mistake("a folder in place of a file", "eval")
-def _(at: Place):
-    return at.beags("eval --load-config {run} --json", at.data)
-
-
-@mistake("a folder in place of a file", "extract's list")
-def _(at: Place):
-    return at.beags("extract --load-config {run} --json", at.data)
 
 
 @mistake("a folder in place of a file", "a picture")
@@ -159,19 +147,6 @@ def _(at: Place):
     command = at.train()
     at.fail_to_write(at.root / TRAINED, errno.EACCES)
     return command
-
-
-@mistake("read-only disk", "ns-train")
-def _(at: Place):
-    command = at.train()
-    at.fail_to_write(at.root / TRAINED, errno.EROFS)
-    return command
-
-
-@mistake("a file in place of a folder", "ns-train")
-def _(at: Place):
-    (at.root / TRAINED).write_text("x")
-    return at.train()
 
 
 @mistake("no permission", "a photo")

@@ -30,48 +30,6 @@ def _(at: Place):
     return at.train()
 
 
-@mistake("photos", "cut off, while masks are made")
-def _(at: Place):
-    at.cut(at.data / "images/v02.png")
-    (at.data / "prompts.json").write_text(
-        '{"objects": [{"name": "cup", "prompts": [{"view": "v02", "box": [2, 2, 8, 8]}]}]}'
-    )
-    words = "--source grabcut --overwrite --options prompts=prompts.json --load-config {run}"
-    return at.beags("masks make --data", at.data, words)
-
-
-@mistake("photos", "no bytes")
-def _(at: Place):
-    (at.data / "images/v02.png").write_bytes(b"")
-    return at.train()
-
-
-@mistake("photos", "text called .png")
-def _(at: Place):
-    (at.data / "images/v02.png").write_text("not a photo")
-    return at.train()
-
-
-@mistake("photos", "missing")
-def _(at: Place):
-    (at.data / "images/v02.png").unlink()
-    return at.train()
-
-
-@mistake("photos", "a folder called as one")
-def _(at: Place):
-    (at.data / "images/v02.png").unlink()
-    (at.data / "images/v02.png").mkdir()
-    return at.train()
-
-
-@mistake("photos", "a link that leads nowhere")
-def _(at: Place):
-    (at.data / "images/v02.png").unlink()
-    (at.data / "images/v02.png").symlink_to(at.root / "elsewhere.png")
-    return at.train()
-
-
 @mistake("photos", "not the size that the camera has")
 def _(at: Place):
     write_image(at.data / "images/v02.png", noise(0, 20, 20))

@@ -70,14 +70,9 @@ mistake("configs", "a part of another kind")(
 )
 mistake("configs", "YAML broken")(config(lambda text: "\t{\n" + text))
 mistake("configs", "cut off")(config(lambda text: text[: text.index("\npipeline:") + 1]))
-mistake("configs", "empty")(config(lambda text: ""))
-mistake("configs", "something else")(config(lambda text: "a: 1\n"))
-mistake("configs", "bytes that are no text")(config(lambda text: b"\xff\xfe\x00"))
-mistake("configs", "a command to run")(config(lambda text: "!!python/object/apply:os.system ['touch ran']\n"))
 mistake("configs", "a command to run, hidden in a field")(
     config(lambda text: text + "hidden: !!python/object/apply:os.system ['touch ran']\n")
 )
-mistake("configs", "nested 500 deep")(config(lambda text: "[" * 500))
 mistake("configs", "aliases that grow without end")(
     config(
         lambda text: (
@@ -88,17 +83,6 @@ mistake("configs", "aliases that grow without end")(
 )
 
 
-@mistake("configs", "none in the folder")
-def _(at: Place):
-    (at.run / "config.yml").unlink()
-    return at.beags("extract --load-config", at.run / "config.yml")
-
-
-@mistake("configs", "a folder instead of its config.yml")
-def _(at: Place):
-    return at.beags("extract --load-config", at.run)
-
-
 @mistake("configs", "data that have been moved")
 def _(at: Place):
     at.run  # noqa: B018  (made before its data go)
@@ -106,25 +90,9 @@ def _(at: Place):
     return at.beags("eval --load-config {run}")
 
 
-mistake("checkpoints", "half written")(checkpoint(lambda path: path.write_bytes(path.read_bytes()[:5000])))
-mistake("checkpoints", "no bytes")(checkpoint(lambda path: path.write_bytes(b"")))
-mistake("checkpoints", "text")(checkpoint(lambda path: path.write_text("x")))
-mistake("checkpoints", "a part is missing")(checkpoint(content(lambda found: found.pop("pipeline"))))
 mistake("checkpoints", "a tensor is missing")(checkpoint(content(lambda found: {**found, "pipeline": {
     name: value for name, value in found["pipeline"].items() if name != NAMES}})))  # fmt: skip
-mistake("checkpoints", "class names are missing")(
-    checkpoint(content(lambda found: {**found, "pipeline": {
-        name: value for name, value in found["pipeline"].items() if name != "_model._extra_state"}}))
-)  # fmt: skip
-mistake("checkpoints", "tensors of different lengths")(
-    checkpoint(content(lambda found: found["pipeline"].update({NAMES: torch.zeros(3, 3)}) or found))
-)
-mistake("checkpoints", "a list instead of a table")(checkpoint(content(lambda found: [1, 2])))
-mistake("checkpoints", "a word instead of a tensor")(
-    checkpoint(content(lambda found: found["pipeline"].update({NAMES: "means"}) or found))
-)
 mistake("checkpoints", "a command to run")(checkpoint(lambda path: torch.save(Code("touch ran"), path)))
-mistake("checkpoints", "none")(checkpoint(lambda path: path.unlink()))
 mistake("checkpoints", "a bit exchanged")(
     checkpoint(lambda path: path.write_bytes(path.read_bytes()[:900] + b"\xff\xff\xff\xff" + path.read_bytes()[904:]))
 )
@@ -134,11 +102,6 @@ mistake("checkpoints", "a bit exchanged")(
 def _(at: Place):
     (at.root / "empty").mkdir()
     return at.train(preset="beags-refine", load_dir=at.root / "empty")
-
-
-@mistake("runs", "load-dir does not exist")
-def _(at: Place):
-    return at.train(preset="beags-refine", load_dir=at.root / "nowhere")
 
 
 @mistake("runs", "load-step does not exist")
@@ -152,12 +115,6 @@ def _(at: Place):
     return at.train(preset="beags-refine", load_checkpoint=at.checkpoint)
 
 
-@mistake("runs", "a checkpoint of another kind of scene")
-def _(at: Place):
-    content(lambda found: {**found, "pipeline": {"_model.weights": torch.zeros(3)}})(at.checkpoint)
-    return at.train(preset="beags-refine", load_dir=at.checkpoint.parent)
-
-
 @mistake("runs", "two in one folder")
 def _(at: Place):
     import fcntl
@@ -167,19 +124,6 @@ def _(at: Place):
     at.held = open(folder / ".lock", "ab")  # noqa: SIM115  (as another training holds it)
     fcntl.flock(at.held, fcntl.LOCK_EX)
     return at.train()
-
-
-@mistake("runs", "a base without classes is extracted")
-def _(at: Place):
-    from run_folders import write_trained
-
-    write_trained(at.root / "run", at.data, assigned=False)
-    return at.beags("extract --load-config {run}")
-
-
-@mistake("runs", "an unknown object")
-def _(at: Place):
-    return at.beags("extract --load-config {run} --object cupp")
 
 
 @mistake("runs", "an object without Gaussians")
@@ -236,17 +180,11 @@ mistake("resuming", "a checkpoint of a newer version")(
 mistake("resuming", "a state of training that is no table")(
     resumed(lambda at, run: content(lambda found: {**found, "beags": 3})(at.checkpoint))
 )
-mistake("resuming", "a state of training that lacks a part")(
-    resumed(lambda at, run: content(lambda found: found["beags"]["parts"].pop("refinement"))(at.checkpoint))
-)
 mistake("resuming", "a state of training of wrong content")(
     resumed(lambda at, run: content(lambda found: found["beags"]["parts"].update(views={"a": 1}))(at.checkpoint))
 )
 mistake("resuming", "an optimizer is missing")(
     resumed(lambda at, run: content(lambda found: found["optimizers"].pop("scene"))(at.checkpoint))
-)
-mistake("resuming", "a tensor is missing")(
-    resumed(lambda at, run: content(lambda found: [found["pipeline"].pop(NAMES)].clear())(at.checkpoint))
 )
 mistake("resuming", "a photo has gone since")(
     resumed(lambda at, run: at.edit_poses(lambda meta: meta.update(frames=meta["frames"][2:])))
@@ -259,9 +197,6 @@ mistake("resuming", "prepared/ has gone")(resumed(lambda at, run: shutil.rmtree(
 mistake("resuming", "the voxel grid is damaged")(resumed(lambda at, run: at.cut(run / "prepared/grid.pt")))
 mistake("resuming", "the voxel grid lacks a part")(
     resumed(lambda at, run: torch.save({"classes": torch.zeros(1)}, run / "prepared/grid.pt"))
-)
-mistake("resuming", "the voxel grid is one tensor")(
-    resumed(lambda at, run: torch.save(torch.zeros(3), run / "prepared/grid.pt"))
 )
 mistake("resuming", "a prepared mask is missing")(
     resumed(lambda at, run: next((run / "prepared/masks").iterdir()).unlink())
@@ -278,26 +213,6 @@ def _(at: Place):
     (run / "config.yml").write_text(text.replace("refine_steps: 8", "refine_steps: 3"), "utf8")
     (run / "training.json").write_text("{}")
     return at.beags("resume", run)
-
-
-@mistake("resuming", "a folder that is no run")
-def _(at: Place):
-    return at.beags("resume", at.data)
-
-
-@mistake("resuming", "an extracted object")
-def _(at: Place):
-    return at.beags("resume", at.run)
-
-
-@mistake("evaluation", "one run given twice")
-def _(at: Place):
-    return at.beags("eval --load-config {run} {run}")
-
-
-@mistake("evaluation", "a wrong threshold")
-def _(at: Place):
-    return at.beags("eval --load-config {run} --threshold 2")
 
 
 @mistake("evaluation", "a held-out view that does not exist")

@@ -41,33 +41,12 @@ def splats(count: int, columns: list[str] = COLUMNS) -> str:
     return f"element vertex {count}\n" + "".join(f"property float {name}\n" for name in columns)
 
 
-mistake("starts", "a .ply cut off")(ply(lambda path: path.write_bytes(path.read_bytes()[:-100])))
 mistake("starts", "a .ply without vertices")(ply(text(splats(0), "")))
-mistake("starts", "a .ply of numbers that are none")(ply(text(splats(2), ("nan " * len(COLUMNS) + "\n") * 2)))
 mistake("starts", "a .ply that promises 10^15 vertices")(ply(text(splats(10**15), "0 0 0\n")))
-mistake("starts", "a .ply that promises -1 vertices")(ply(text(splats(-1), "")))
-mistake("starts", "a mesh")(
-    ply(
-        text(
-            "element vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-            "element face 1\nproperty list uchar int vertex_indices\n",
-            "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n",
-        )
-    )
-)
-mistake("starts", "a .ply of faces alone")(
-    ply(text("element face 1\nproperty list uchar int vertex_indices\n", "3 0 1 2\n"))
-)
 mistake("starts", "a .ply with half a colour band")(ply(text(splats(1, [*COLUMNS, "f_rest_0"]), "0 " * 15 + "\n")))
-mistake("starts", "a .ply with a list for a column")(
-    ply(text(splats(1, COLUMNS[1:]) + "property list uchar float x\n", "0 " * 13 + "1 0\n"))
-)
 mistake("starts", "a .ply with an endless list")(
     ply(text(splats(1) + "property list uint float more\n", "0 " * 14 + "4000000000 0\n"))
 )
-mistake("starts", "a .ply with words")(ply(text(splats(1), "a " * 14 + "\n")))
-mistake("starts", "text called .ply")(ply(lambda path: path.write_text("hello")))
-mistake("starts", "a .ply of no bytes")(ply(lambda path: path.write_bytes(b"")))
 
 
 @mistake("starts", "no such file")
@@ -85,12 +64,6 @@ def _(at: Place):
 def _(at: Place):
     (at.root / "scene.ply").write_text("ply")
     return start(at, at.root / "scene.ply", "--pipeline.model.start-format", "splat")
-
-
-@mistake("starts", "a folder without checkpoints")
-def _(at: Place):
-    (at.root / "empty").mkdir()
-    return start(at, at.root / "empty")
 
 
 @mistake("starts", "nothing to refine")
@@ -115,10 +88,4 @@ def _(at: Place):
 @mistake("starts", "a checkpoint cut off")
 def _(at: Place):
     at.cut(at.checkpoint)
-    return start(at, at.run)
-
-
-@mistake("starts", "a run whose transform is broken")
-def _(at: Place):
-    (at.run / "dataparser_transforms.json").write_text('{"transform": [1, 2]}')
     return start(at, at.run)

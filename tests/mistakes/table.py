@@ -286,16 +286,3 @@ def _ns_train(config: Any) -> None:
     from nerfstudio.scripts.train import main
 
     main(config)
-
-
-def summary() -> str:
-    """The table by area, in Markdown: how many mistakes are in it, and how many of them had to be mended."""
-    from mistakes.sentences import WAS
-
-    areas = sorted({one.area for one in TABLE.values()})
-    rows = []
-    for area in areas:
-        own = [one for one in TABLE.values() if one.area == area]
-        rows.append(f"| {area} | {len(own)} | {sum(f'{area}: {one.name}' in WAS for one in own)} |")
-    total = f"| all | {len(TABLE)} | {len(WAS)} |"
-    return "\n".join(["| area | mistakes | mended |", "|---|---|---|", *rows, total])

@@ -1,0 +1,111 @@
+"""``beags bench``: a miniature experiment from its file to the figures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from places import ROOT
+
+pytest.importorskip("nerfstudio")
+
+from experiment_files import written
+
+from beags_plugin.bench import runner
+from beags_plugin.bench.experiment import load_experiment
+from beags_plugin.bench.run import Options, run_experiment
+
+MINIATURE = """
+description = "a miniature"
+preset = "beags-tiny"
+confidence = true
+[sample]
+seeds = [5]
+width = 48
+height = 36
+num_train = 8
+num_test = 2
+num_points = 300
+antialias = 1
+[base]
+"pipeline.model.base_steps" = 25
+[refine]
+"pipeline.model.refine_steps" = 3
+[[variant]]
+name = "alone"
+[variant.refine]
+"pipeline.model.refiner" = "none"
+[[variant]]
+name = "broken"
+[variant.refine]
+"pipeline.model.prepare.k" = 0
+[[sweep]]
+name = "damage"
+key = "damage"
+values = [0.0, 2.0]
+"""
+
+
+@pytest.fixture(scope="module")
+def miniature(tmp_path_factory):
+    """Options of a finished miniature experiment, its file and its rows."""
+    folder = tmp_path_factory.mktemp("bench")
+    options = Options(output=folder / "out", json=folder / "figures.json", csv=folder / "figures.csv")
+    path = written(folder, MINIATURE)
+    return path, options, run_experiment(path, options)
+
+
+def test_trials_are_trained_measured_and_told(miniature):
+    _, options, rows = miniature
+    by_name = {row.variant.name: row for row in rows}
+    assert list(by_name) == ["alone", "broken", "damage = 0", "damage = 2"]
+    assert by_name["broken"].failed == "k is 0: the voxel size needs at least 1 neighbour."
+    alone, exact, damaged = (by_name[name].figures for name in ("alone", "damage = 0", "damage = 2"))
+    for figures in (alone, exact, damaged):
+        assert figures["steps"] == 3 and figures["gaussians"] > 100 and figures["seconds base training"] > 0
+        assert 0 <= figures["extracted_iou_after"] <= 1 and 5 < figures["psnr_after"] < 50
+        assert 0 < figures["own_memory_mb"] < figures["peak_memory_mb"] and figures["cpu_seconds"] > 0
+        assert figures["training_pixels"] == 8 * 48 * 36
+    for metric in ("psnr", "ssim", "extracted_biou", "rendered_iou"):  # it only assigns
+        assert alone[f"{metric}_after"] == alone[f"{metric}_before"]
+    assert exact["psnr_before"] == alone["psnr_before"] and exact["psnr_after"] != exact["psnr_before"]
+    assert exact["mask_error_given"] == 0.0 < damaged["mask_error_given"]
+    report = json.loads(options.json.read_text())
+    assert report["commit"] and report["machine"]["cpu"] and report["experiment"] == "mine"
+    assert [row["failed"] is None for row in report["means"]] == [True, False, True, True]
+    assert options.csv.read_text().count("\n") == 1 + len(report["rows"]) + len(report["means"])
+    for name in ("mine.png", "mine-confidence.png"):
+        assert (options.output / name).stat().st_size > 10_000
+
+
+def test_a_second_call_trains_only_what_failed(miniature, monkeypatch):
+    path, options, rows = miniature
+    ran = []
+
+    def fail_again(self, folder: Path) -> int:
+        ran.append(json.loads((folder / "trial.json").read_text())["overrides"])
+        return 1
+
+    monkeypatch.setattr(runner.Worker, "run", fail_again)
+    again = run_experiment(path, options)
+    assert [overrides["pipeline.model.prepare.k"] for overrides in ran] == [0]
+    assert [row.figures for row in again] == [row.figures for row in rows]
+
+
+def test_the_command_tells_a_mistake_in_one_sentence(capsys, tmp_path):
+    from beags_plugin.commands.cli import main
+
+    with pytest.raises(SystemExit) as end:
+        main(["bench", "file", "ablatoin", "--output", str(tmp_path)])
+    assert end.value.code == 2
+    assert "there is no experiment 'ablatoin'" in capsys.readouterr().out
+
+
+def test_the_file_in_the_documentation_is_an_experiment(tmp_path):
+    text = (ROOT / "docs/experiments.md").read_text()
+    block = text.split("## The file")[1].split("Keys are")[0]
+    path = written(tmp_path, "\n".join(line.strip() for line in block.splitlines()))
+    found = load_experiment(path)
+    assert [variant.name for variant in found.variants][:2] == ["as it is", "worse masks"]
+    assert found.variants[1].damage == 2.0 and found.front and found.confidence and len(found.variants) == 5

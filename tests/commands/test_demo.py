@@ -1,0 +1,170 @@
+"""What ``beags demo`` decides before and around the training."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from data_folders import write_image
+from run_folders import write_scene
+
+from beags_plugin.commands import demo
+from beags_plugin.commands.cli import main
+from beags_plugin.commands.demo import STAMP, _clear, _trained, check_preset
+from beags_plugin.data.quick import quick_downscale
+from beags_plugin.plugin.objects.extract import folder_names
+from beags_plugin.plugin.options.config import base_config
+from beags_plugin.system.errors import UserError
+
+
+def test_large_images_are_scaled_down_by_a_whole_factor(tmp_path):
+    assert quick_downscale(tmp_path) == 1.0
+    write_image(tmp_path / "images/left/a.png", np.zeros((300, 400), np.uint8))
+    assert quick_downscale(tmp_path) == 2.0  # 200 x 150 are 30,000 pixels
+
+
+def test_images_elsewhere_are_found_through_the_poses(tmp_path):
+    write_image(tmp_path / "photos/a.png", np.zeros((300, 400), np.uint8))
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [{"file_path": "photos/a.png"}]}))
+    assert quick_downscale(tmp_path) == 2.0
+
+
+def test_the_images_that_the_layout_takes_decide(tmp_path):
+    """LLFF's poses_bounds.npy with originals too large to take, and copies."""
+    for name, shape in (("images/a.png", (1500, 2000)), ("images_4/a.png", (375, 500))):
+        write_image(tmp_path / name, np.zeros(shape, np.uint8))
+    assert quick_downscale(tmp_path) == 8.0
+    pose = np.column_stack([np.eye(3), [0.0, 0.0, 0.0], [1500.0, 2000.0, 1800.0]])
+    np.save(tmp_path / "poses_bounds.npy", np.concatenate([pose.ravel(), [1.0, 2.0]])[None])
+    assert quick_downscale(tmp_path) == 2.0  # 250 x 187 are 46,750 pixels
+
+
+def test_an_image_that_cannot_be_read_is_told_in_a_sentence(tmp_path):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images/a.png").write_text("no picture")
+    with pytest.raises(UserError, match="cannot be read as an image"):
+        quick_downscale(tmp_path)
+
+
+def test_only_presets_of_both_phases_make_a_demo():
+    check_preset("beags-tiny")
+    with pytest.raises(UserError, match="'beags-huge'"):
+        check_preset("beags-huge")
+    for preset in ("beags-base", "beags-refine"):
+        with pytest.raises(UserError, match="compares a base with its refinement"):
+            check_preset(preset)
+
+
+def test_a_run_that_is_not_the_demos_is_kept(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/notes.txt").write_text("mine")
+    with pytest.raises(UserError, match="is not the demo's"):
+        _clear(tmp_path)
+    assert (tmp_path / "run/notes.txt").exists()
+    (tmp_path / STAMP).write_text("{}")
+    _clear(tmp_path)
+    assert not (tmp_path / "run").exists()
+
+
+def test_nothing_is_written_into_a_folder_that_is_not_the_demos(tmp_path):
+    data, run = write_scene(tmp_path / "data"), tmp_path / "out/run"
+    run.mkdir(parents=True)
+    (run / "notes.txt").write_text("mine")
+    for fresh in (False, True):
+        with pytest.raises(UserError, match="out/run is not the demo's"):
+            demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, fresh)
+    assert sorted(path.relative_to(tmp_path).as_posix() for path in (tmp_path / "out").rglob("*")) == [
+        "out/run", "out/run/notes.txt",
+    ]  # fmt: skip
+
+
+def test_a_damaged_stamp_means_not_trained(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/training.json").write_text("{}")
+    assert not _trained(tmp_path, {"preset": "beags-tiny"})
+    (tmp_path / STAMP).write_text("{")
+    assert not _trained(tmp_path, {"preset": "beags-tiny"})
+    (tmp_path / STAMP).write_text(json.dumps({"preset": "beags-tiny"}))
+    assert _trained(tmp_path, {"preset": "beags-tiny"})
+
+
+def test_a_demo_that_was_killed_goes_on(tmp_path, monkeypatch):
+    """Killed in the training, it resumes; after the training, it measures; with another request, it starts anew."""
+    data, output = write_scene(tmp_path / "data"), tmp_path / "out"
+    run, commands, measured = output / "run", [], []
+
+    def process(command):
+        (word,) = {"resume", "ns-train"} & {Path(part).name for part in command}
+        commands.append(word)
+        run.mkdir(exist_ok=True)
+        (run / "config.yml").touch()
+        if len(commands) == 2:
+            raise KeyboardInterrupt
+        if len(commands) > 2:
+            (run / "training.json").write_text("{}")
+        return SimpleNamespace(returncode=9 if len(commands) == 1 else 0)
+
+    def measure(*_):
+        measured.append(len(commands))
+        if len(measured) == 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(demo.subprocess, "run", process)
+    monkeypatch.setattr(demo, "measure", measure)
+
+    def again(downscale=None, fresh=False):
+        with contextlib.suppress(KeyboardInterrupt, UserError):
+            demo.run_demo(data, output, "beags-tiny", downscale, 0, fresh)
+        return commands[-1], len(commands)
+
+    assert again() == ("ns-train", 1)  # which fails
+    assert again() == ("resume", 2)  # which is killed
+    assert again() == ("resume", 3) and measured == [3]  # then the demo is killed
+    assert again() == ("resume", 3) and measured == [3, 3]
+    assert again(downscale=2.0) == ("ns-train", 4)
+    assert again(fresh=True) == ("ns-train", 5) and again() == ("ns-train", 5)
+
+
+def test_a_demo_that_is_under_way_is_left_alone(tmp_path, monkeypatch):
+    from beags_plugin.system.lock import run_lock
+
+    data, run = write_scene(tmp_path / "data"), tmp_path / "out/run"
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / STAMP).write_text("{}")
+    lock = run_lock(run)
+    with pytest.raises(UserError, match="being trained by another process"):
+        demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, True)
+    assert run.is_dir()
+    lock.release()
+
+
+def test_brackets_in_a_path_are_no_markup(tmp_path, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["demo", "--data", str(tmp_path / "x[/y]")])
+    assert end.value.code == 2
+    assert "x[/y] is no folder" in capsys.readouterr().out.replace("\n", "")
+
+
+def test_objects_never_share_a_folder():
+    assert folder_names({1: "cup 1", 2: "cup_1", 3: "Box", 4: "ring"}) == {
+        1: "cup_1_1",
+        2: "cup_1_2",
+        3: "Box",
+        4: "ring",
+    }
+    assert folder_names({1: "cup", 2: "Cup"}) == {1: "cup_1", 2: "Cup_2"}
+
+
+def test_a_saved_run_names_its_folder_absolutely(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    config = base_config()
+    config.run_dir = config.output_dir / "mine"
+    assert not config.run_dir.is_absolute()
+    config.get_base_dir().mkdir(parents=True)
+    config.save_config()
+    assert config.run_dir == tmp_path / "outputs" / "mine"
+    assert (config.run_dir / "config.yml").exists()

@@ -1,0 +1,190 @@
+"""The commands in README.md and docs/: every line of a code block that calls a program of ours or of nerfstudio.
+
+Names of the reader's own things (``my_scene``, ``outputs/.../config.yml``) are replaced by tiny ones: ``SUBSTITUTES``.
+Commands of ``beags`` that end in seconds then run as they stand, with small sizes appended: ``RUN``. All others
+(training, experiments, the viewer, other programs' commands) are parsed by the same parser that would run them, so that
+a wrong flag or value fails, but not run; the first ``ns-train`` of README.md does run, a few steps long. ``make``
+targets, and scripts and files that ``python`` and ``pip`` name, must exist. New files in docs/ are found by themselves.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import tyro
+from places import ROOT
+from run_folders import write_scene, write_trained
+
+pytest.importorskip("nerfstudio")
+
+from beags_plugin.commands import cli
+from beags_plugin.extraction.ply import write_ply
+
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PROGRAMS = re.compile(r"^(?:[A-Z_]+=\S+ )*(beags|ns-[a-z-]+|make|pip|python) ")
+SUBSTITUTES = {  # what a document calls it: what it is in the test's folder
+    "outputs/.../extracted/cup/config.yml": "run/extracted/cup/config.yml",
+    "outputs/.../config.yml": "run/config.yml",
+    "outputs/.../nerfstudio_models": "run/nerfstudio_models",
+    "outputs/...": "run",
+    "RUN_A/config.yml": "run/config.yml",
+    "RUN_B/config.yml": "other/config.yml",
+}
+RUN = {  # command of beags: what is appended to make it quick
+    "extract": [],
+    "eval": [],
+    "export": ["--resolution", "24", "--min-views", "1"],
+    "render": ["--size", "32", "--frames", "3", "--views", "2"],
+    "sample": ["--width", "32", "--height", "24", "--views", "3"],
+    "masks check": [],
+}
+PARSERS = {
+    "ns-viewer": "nerfstudio.scripts.viewer.run_viewer:RunViewer",
+    "ns-eval": "nerfstudio.scripts.eval:ComputePSNR",
+    "ns-export": "nerfstudio.scripts.exporter:Commands",
+    "ns-render": "nerfstudio.scripts.render:Commands",
+}
+
+
+def code_lines(text: str) -> list[str]:
+    """The lines of fenced and indented code blocks; those that end in a backslash are joined with the next."""
+    lines, fenced = [], False
+    for line in text.replace("\\\n", " ").splitlines():
+        if line.startswith("```"):
+            fenced = not fenced
+        elif fenced or line.startswith("    "):
+            lines.append(line.strip())
+    return lines
+
+
+def commands_of(document: Path) -> list[str]:
+    """The commands that a document's code blocks show; a synopsis (with brackets) is none."""
+    return [
+        line
+        for line in code_lines(document.read_text("utf8"))
+        if PROGRAMS.match(line + " ") and not re.search(r"[\[\]<>]", line)
+    ]
+
+
+COMMANDS = [(document.name, line) for document in DOCUMENTS if document.exists() for line in commands_of(document)]
+pytestmark = pytest.mark.skipif(not COMMANDS, reason="no documents beside the tests")
+
+
+def words_of(line: str) -> list[str]:
+    for name, own in SUBSTITUTES.items():
+        line = line.replace(name, own)
+    words = shlex.split(line, comments=True)
+    return words[next(i for i, word in enumerate(words) if "=" not in word or word.startswith("-")) :]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with what the documents speak of: two runs of the data my_scene, and a scene to start from."""
+    root = tmp_path_factory.mktemp("reader")
+    write_scene(root / "my_scene")
+    for name in ("run", "other"):
+        config = write_trained(root / name, root / "my_scene")
+    from beags_plugin.plugin.objects.extract import extract_objects
+    from beags_plugin.plugin.runs.read import load_scene
+
+    extract_objects(config.parent.parent / "run/config.yml", ["cup"])
+    write_ply(root / "scene.ply", load_scene(config).surfels())
+    return root
+
+
+def parsed_by_tyro(kind, words: list[str], **options):
+    try:
+        return tyro.cli(kind, args=words, **options)
+    except SystemExit as end:
+        raise AssertionError(f"{' '.join(words)} is refused") from end
+
+
+def training_config(words: list[str]):
+    """The config that ns-train makes of ``words``."""
+    from beags_plugin.plugin.options.config import BeagsTrainerConfig
+    from beags_plugin.plugin.presets import load_preset, preset_names
+
+    preset, *flags = words
+    assert preset in preset_names(), f"there is no preset {preset}"
+    kind = tyro.conf.SuppressFixed[tyro.conf.FlagConversionOff[BeagsTrainerConfig]]
+    return parsed_by_tyro(kind, flags, default=load_preset(preset).config)
+
+
+def check_beags(words: list[str]) -> None:
+    name = " ".join(words[:2]) if words[0] == "masks" else words[0]
+    if name in RUN:
+        cli.main([*words, *RUN[name]])
+        return
+    config = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
+    parsed_by_tyro(cli.Command, words, config=config)
+
+
+def check_other(program: str, words: list[str]) -> None:
+    if program == "ns-train":
+        training_config(words)
+    elif program in PARSERS:
+        module, _, name = PARSERS[program].partition(":")
+        parsed_by_tyro(getattr(import_module(module), name), words)
+    elif program == "make":
+        targets = {line.partition(":")[0] for line in (ROOT / "Makefile").read_text().splitlines() if ":" in line}
+        assert {word for word in words if "=" not in word} <= targets
+    elif program == "pip":
+        for flag, file in zip(words, words[1:], strict=False):
+            assert flag != "-c" or (ROOT / file).is_file(), f"{file} is not there"
+    elif program == "python" and words[0] != "-m":
+        script = (ROOT / words[0]).read_text("utf8")
+        flags = [word[2:].replace("-", "_") for word in words if word.startswith("--")]
+        known = script.replace("-", "_")
+        assert all(flag in known or flag.removeprefix("no_") in known for flag in flags), words
+
+
+@pytest.mark.parametrize(("document", "line"), COMMANDS, ids=[f"{name}: {line}" for name, line in COMMANDS])
+def test_a_documented_command_works(folder, monkeypatch, document, line):
+    monkeypatch.chdir(folder)
+    program, *words = words_of(line)
+    if program == "beags":
+        check_beags(words)
+    else:
+        check_other(program, words)
+
+
+def test_the_training_of_the_quick_start_runs(folder, monkeypatch):
+    from beags_plugin.plugin.runs.launch import train
+
+    monkeypatch.chdir(folder)
+    (line, *_) = [line for name, line in COMMANDS if name == "README.md" and line.startswith("ns-train")]
+    config = training_config(words_of(line)[1:])
+    model = config.model_config
+    model.base_steps, model.refine_steps, config.vis, config.run_dir = 3, 2, "tensorboard", folder / "trained"
+    model.prepare, model.split = type(model.prepare)(k=5), type(model.split)()
+    config.data_config.data = config.data or config.data_config.data  # as ns-train does
+    train(config)
+    assert (folder / "trained" / "base" / "config.yml").exists()
+
+
+def test_commands_in_the_text_exist():
+    """What the text calls `beags NAME` is a subcommand."""
+    import typing
+
+    known = {info.name for one in typing.get_args(cli.Command) for info in typing.get_args(one)[1:]}
+    for document in DOCUMENTS:
+        named = set(re.findall(r"`beags ([a-z-]+)", document.read_text("utf8")))
+        assert named <= known, f"{document.name}: {named - known}"
+
+
+def test_links_between_documents_lead_somewhere():
+    for document in DOCUMENTS:
+        for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", document.read_text("utf8")):
+            assert (document.parent / target).exists(), f"{document.name}: {target}"
+
+
+def test_code_blocks_are_found():
+    text = "a\n\n    ns-eval one \\\n        two\n\n```sh\nbeags x\n```\nbeags y\n"
+    assert [re.sub(r"\s+", " ", line) for line in code_lines(text)] == ["ns-eval one two", "beags x"]
+    assert words_of("OMP_NUM_THREADS=1 beags eval --load-config outputs/.../config.yml  # all") == [
+        "beags", "eval", "--load-config", "run/config.yml",
+    ]  # fmt: skip

@@ -1,0 +1,273 @@
+"""The whole job through the command lines a user types: ns-train, ns-eval, beags extract, ns-export, ns-render.
+
+Programs of nerfstudio are started; a second training and beags run in this process, which saves their start.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from called_programs import called
+
+pytest.importorskip("nerfstudio")
+yaml = pytest.importorskip("yaml")
+
+from beags_plugin.sample.writer import SampleConfig, write_sample
+from beags_plugin.system.child_processes import bound
+from beags_plugin.system.reading.ply import read_vertices
+
+pytestmark = pytest.mark.long
+BIN = Path(sys.executable).parent
+
+
+def run(*command, **options):
+    environment = {**os.environ, "OMP_WAIT_POLICY": "PASSIVE", "COLUMNS": "200"}
+    done = subprocess.run(
+        bound([BIN / command[0], *command[1:]]),
+        capture_output=True, text=True, env=environment, timeout=900, **options,
+    )  # fmt: skip
+    return done.returncode, done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data") / "sample"
+    write_sample(folder, SampleConfig(seed=3, width=96, height=72, num_train=16, num_test=3))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(data, tmp_path_factory):
+    """A very short run of beags-tiny, both phases."""
+    folder = tmp_path_factory.mktemp("outputs") / "run"
+    code, text = run(
+        "ns-train", "beags-tiny", "--data", data, "--run-dir", folder, "--vis", "tensorboard",
+        "--pipeline.model.base-steps", 220, "--pipeline.model.refine-steps", 40, "--steps-per-save", 100,
+        "--pipeline.model.prepare.k", 200, "--steps-per-eval-image", 100,
+    )  # fmt: skip
+    assert code == 0, text[-4000:]
+    return folder, text
+
+
+def test_training_reports_what_it_found(trained):
+    folder, text = trained
+    for words in ("reprojection:", "assignment: Gaussians per class", "voxel size", "never seen"):
+        assert words in text
+    assert (folder / "config.yml").exists()
+    assert sorted(path.name for path in (folder / "nerfstudio_models").iterdir()) == ["step-000000259.ckpt"]
+    report = json.loads((folder / "prepared" / "report.json").read_text())
+    assert set(report["seconds"]) == {"reprojection", "assignment", "border split", "voxel grids"}
+
+
+def test_each_loss_has_its_own_curve(trained):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    folder, _ = trained
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    tags = events.Tags()["scalars"]
+    for name in ("photometric", "boundary", "occupancy"):
+        assert any(name in tag for tag in tags), tags
+    boundary = next(tag for tag in tags if "boundary" in tag)
+    assert all(event.step >= 220 for event in events.Scalars(boundary))
+    assert all(np.isfinite(event.value) for event in events.Scalars(boundary))
+
+
+def test_the_base_is_kept_apart_and_has_classes(trained):
+    from beags_plugin.plugin.runs.read import load_scene
+
+    folder, _ = trained
+    base, refined = load_scene(folder / "base" / "config.yml"), load_scene(folder / "config.yml")
+    means, moved = base.state["gauss_params.means"], refined.state["gauss_params.means"]
+    assert len(moved) > len(means)  # beags-tiny splits Gaussians at borders
+    for scene, count in ((base, len(means)), (refined, len(moved))):
+        assert scene.state["class_ids"].shape == (count,)
+    assert set(base.state["class_ids"].tolist()) == set(refined.state["class_ids"].tolist())
+    assert not any((moved == position).all(dim=1).any() for position in means[base.state["class_ids"] > 0])
+    assert len(base.classes) >= 6
+    assert (base.state["class_ids"] > 0).any()
+
+
+@pytest.fixture(scope="module")
+def extracted(trained):
+    folder, _ = trained
+    called("beags", "extract", "--load-config", folder / "config.yml")
+    return sorted(folder.glob("extracted/*/config.yml"))
+
+
+def test_extraction_writes_a_run_and_a_ply_per_object(trained, extracted):
+    from beags_plugin.plugin.runs.read import load_scene
+
+    folder, _ = trained
+    whole = load_scene(folder / "config.yml")
+    assert len(extracted) >= 5
+    for config in extracted:
+        scene = load_scene(config)
+        (index,) = scene.state["class_ids"].unique().tolist()
+        keep = whole.state["class_ids"] == index
+        assert (scene.state["gauss_params.quats"] == whole.state["gauss_params.quats"][keep]).all()
+        (ply,) = config.parent.glob("*.ply")
+        vertex = read_vertices(ply)
+        assert len(vertex) == int(keep.sum())
+        assert (np.asarray(vertex["class_id"]) == index).all()
+        assert {"scale_0", "scale_1", "scale_2"} <= {prop.name for prop in vertex.properties}
+
+
+def test_the_figures_are_those_of_ns_eval(trained, tmp_path):
+    folder, _ = trained
+    ours, theirs = tmp_path / "ours.json", tmp_path / "theirs.json"
+    called("beags", "eval", "--load-config", folder / "config.yml", "--json", ours, "--picture", tmp_path / "a.png")
+    code, text = run("ns-eval", "--load-config", folder / "config.yml", "--output-path", theirs)
+    assert code == 0, text[-3000:]
+    found, expected = json.loads(ours.read_text())["scenes"][0], json.loads(theirs.read_text())["results"]
+    assert expected["psnr"] > 10
+    for metric in ("psnr", "ssim"):
+        assert found[metric]["after"] == pytest.approx(expected[metric], rel=1e-4)
+    assert len(found["objects"]) >= 5 and (tmp_path / "a.png").stat().st_size > 10_000
+
+
+def test_nerfstudio_commands_work_on_an_extracted_run(extracted, tmp_path):
+    config = extracted[0]
+    code, text = run("ns-export", "gaussian-splat", "--load-config", config, "--output-dir", tmp_path / "export")
+    assert code == 0, text[-3000:]
+    (ply,) = (tmp_path / "export").glob("*.ply")
+    assert len(read_vertices(ply)) > 0
+    code, text = run(
+        "ns-render", "dataset", "--load-config", config, "--output-path", tmp_path / "render",
+        "--rendered-output-names", "rgb", "--split", "test",
+    )  # fmt: skip
+    assert code == 0, text[-3000:]
+    assert len(list((tmp_path / "render").rglob("*.jpg"))) == 3
+
+
+def test_export_writes_every_object_and_the_background(trained, tmp_path):
+    folder, _ = trained
+    called(
+        "beags", "export", "--load-config", folder / "config.yml", "--all", "--format", "ply", "ply-2dgs", "spz", "glb",
+        "--resolution", 48, "--output", tmp_path,
+    )  # fmt: skip
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    assert len(manifest["objects"]) >= 6 and manifest["frame"] == "world"
+    for one in manifest["objects"]:
+        written = {file["format"]: file for file in one["files"]}
+        assert {"ply", "ply-2dgs", "spz"} <= set(written) and all((tmp_path / f["path"]).exists() for f in one["files"])
+        assert len(read_vertices(tmp_path / written["ply"]["path"])) == one["gaussians"]
+    assert sum(file["format"] == "glb" for one in manifest["objects"] for file in one["files"]) >= 3
+
+
+def test_removing_an_object_keeps_the_rest(trained):
+    from beags_plugin.plugin.objects.extract import extract_objects
+    from beags_plugin.plugin.runs.read import load_scene
+
+    folder, _ = trained
+    whole = load_scene(folder / "config.yml")
+    name = whole.classes[1]
+    (rest,) = extract_objects(folder / "config.yml", [name], remove=True)
+    assert rest.gaussians == int((whole.state["class_ids"] != 1).sum())
+
+
+def test_a_mistake_in_ns_train_gets_one_sentence(data, tmp_path):
+    code, text = run("ns-train", "beags-refine", "--data", data, "--run-dir", tmp_path / "r")
+    assert code == 2, text[-2000:]
+    assert "starts from a trained base" in text and "Traceback" not in text
+
+
+def test_refiner_none_leaves_the_scene_as_it_is(trained, data, tmp_path):
+    from beags_plugin.plugin.runs.read import load_scene
+
+    folder, _ = trained
+    called(
+        "ns-train", "beags-refine", "--data", data, "--run-dir", tmp_path / "none", "--vis", "tensorboard",
+        "--load-dir", folder / "base" / "nerfstudio_models", "--pipeline.model.refine-steps", 3,
+        "--pipeline.model.refiner", "none",
+    )  # fmt: skip
+    base, kept = load_scene(folder / "base" / "config.yml"), load_scene(tmp_path / "none" / "config.yml")
+    for name in ("means", "quats", "scales", "opacities", "features_dc", "features_rest"):
+        assert (base.state[f"gauss_params.{name}"] == kept.state[f"gauss_params.{name}"]).all(), name
+
+
+def test_a_run_that_was_refining_is_resumed_with_its_classes_and_masks(trained, data, tmp_path):
+    from beags_plugin.plugin.runs.read import load_scene
+
+    folder, _ = trained
+    text = called(
+        "ns-train", "beags-tiny", "--data", data, "--run-dir", tmp_path / "resumed", "--vis", "tensorboard",
+        "--load-dir", folder / "nerfstudio_models",
+        "--pipeline.model.base-steps", 220, "--pipeline.model.refine-steps", 44, "--pipeline.model.prepare.k", 200,
+    )  # fmt: skip
+    assert "refinement taken up" in text and "Gaussians per class" not in text
+    before, after = load_scene(folder / "config.yml"), load_scene(tmp_path / "resumed" / "config.yml")
+    assert after.step == 263 and int(after.state["refined_steps"]) == 44
+    assert (before.state["class_ids"] == after.state["class_ids"]).all()
+    assert (tmp_path / "resumed" / "base" / "config.yml").exists()
+
+
+def test_refinement_of_a_base_makes_masks_again_also_after_a_resume(trained, data, tmp_path):
+    from beags_plugin.plugin.runs.layout import last_prepared
+    from beags_plugin.plugin.runs.read import load_scene
+
+    folder, _ = trained
+    options = (
+        "--data", data, "--vis", "tensorboard", "--steps-per-eval-image", 0, "--pipeline.model.prepare.k", 200,
+        "--pipeline.model.refine-steps", 12, "--pipeline.model.refine-rounds", 2,
+    )  # fmt: skip
+    base = ("--load-dir", folder / "base" / "nerfstudio_models")
+    whole, half, resumed = tmp_path / "whole", tmp_path / "half", tmp_path / "resumed"
+    text = called("ns-train", "beags-refine", "--run-dir", whole, *options, *base)
+    assert "assignment: Gaussians per class" in text and "Preparing refinement again" in text
+    assert (whole / "nerfstudio_models" / "step-000000011.ckpt").exists()
+    first, second = (sorted((path / "masks").glob("*.png")) for path in (whole / "prepared", last_prepared(whole)))
+    assert [path.name for path in first] == [path.name for path in second] and first != second
+    assert any(a.read_bytes() != b.read_bytes() for a, b in zip(first, second, strict=True))
+    called("ns-train", "beags-refine", "--run-dir", half, "--max-num-iterations", 6, *options, *base)
+    assert last_prepared(half) == half / "prepared"
+    text = called("ns-train", "beags-refine", "--run-dir", resumed, *options, "--load-dir", half / "nerfstudio_models")
+    assert "refinement taken up" in text and "Preparing refinement again" in text
+    a, b = load_scene(whole / "config.yml"), load_scene(resumed / "config.yml")
+    assert int(b.state["refined_steps"]) == 12 and a.state["class_ids"].shape == b.state["class_ids"].shape
+    for mask in second:
+        assert mask.read_bytes() == (last_prepared(resumed) / "masks" / mask.name).read_bytes(), mask.name
+
+
+def test_a_trained_scene_is_drawn_whole_cropped_and_in_the_viewer_by_object(trained):
+    import torch
+    from nerfstudio.data.scene_box import OrientedBox
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
+
+    folder, _ = trained
+    _, pipeline, _, _ = eval_setup(folder / "config.yml", test_mode="test")
+    model = pipeline.model
+    camera = pipeline.datamanager.eval_dataset.cameras[:1]
+    whole = model.get_outputs_for_camera(camera)
+    assert {"rgb", "depth", "normal", "accumulation", "class_map"} <= set(whole)
+    assert all(value.dtype == torch.float32 and value.shape[-1] in (1, 3) for value in whole.values())
+    model.viewing.choice = model.viewing.choice.isolate(1)
+    with torch.no_grad():
+        alone = model.viewing.outputs(camera_from_nerfstudio(camera))
+    assert 0 < float(alone["accumulation"].sum()) < 0.5 * float(whole["accumulation"].sum())
+    assert torch.equal(model.get_outputs_for_camera(camera)["rgb"], whole["rgb"])  # figures never see the choice
+    box = OrientedBox.from_params((9.0, 9.0, 9.0), (0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
+    assert float(model.get_outputs_for_camera(camera, obb_box=box)["accumulation"].sum()) == 0.0
+
+
+def test_demo_on_a_folder_writes_table_figures_and_picture(trained, tmp_path, monkeypatch):
+    """The measuring half of the demo, on the run that is there."""
+    from beags_plugin.commands.demo import measure
+
+    folder, _ = trained
+    measure(folder, tmp_path, {})
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert set(summary) == {"mean", "objects", "psnr", "seconds", "peak_memory_mb"}
+    for kind in ("extracted", "rendered"):
+        for stage in ("assigned", "refined"):
+            assert all(0.0 <= summary["mean"][kind][stage][name] <= 1.0 for name in ("acc", "iou", "biou"))
+    assert len(summary["objects"]) >= 5 and summary["psnr"]["after"] > 10
+    assert (tmp_path / "contact_sheet.png").stat().st_size > 10_000

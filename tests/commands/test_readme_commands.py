@@ -1,0 +1,217 @@
+"""The commands of README.md, run one after the other as a reader would, in a folder of their own.
+
+Programs are started, but for most commands of beags, which run in this process.
+
+``RUN`` says how each is run: as it stands, but for the reader's own names (``OWN``), with a few flags appended that
+make it quick. ``ELSEWHERE`` lists the others, each with the reason. Together they must be all of README.md.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from called_programs import called
+from places import ROOT
+from test_documented_commands import code_lines
+
+from beags_plugin.system.child_processes import bound
+
+pytest.importorskip("nerfstudio")
+
+from viewer_pages import free_port
+
+pytestmark = pytest.mark.long
+BIN = Path(sys.executable).parent
+PROGRAM = re.compile(r"(beags|ns-[a-z]+|make|pip|python) |scripts/")
+README = (ROOT / "README.md").read_text("utf8")
+
+SHORT = (
+    "--vis tensorboard --machine.device-type cpu --pipeline.model.base-steps 60 --pipeline.model.refine-steps 10 "
+    "--pipeline.model.prepare.k 20 --steps-per-save 20"
+)
+CONFIG = "--load-config outputs/.../config.yml"
+RUN = {  # in this order; the command in README.md: what is appended
+    "beags sample": "--output my_scene --width 64 --height 48 --views 12",
+    "beags doctor [--data X]": "--data my_scene",
+    "beags masks make --data X --source NAME": "--options folder=masks --output made",
+    "beags masks check --data X": "",
+    "ns-train beags-tiny --data my_scene": SHORT.replace("base-steps 60", "base-steps 200"),  # killed on its way
+    "beags resume RUN": "",  # and so goes on
+    f"beags export {CONFIG} --all --format ply glb": "--resolution 24 --output exported",
+    "ns-train beags-refine --data my_scene --pipeline.model.start-from scene.ply": SHORT,
+    "beags masks reproject --load-config C": "",
+    f"ns-viewer {CONFIG}": "",  # until its page is there
+    f"beags eval {CONFIG} --picture worst.png": "",
+    f"beags extract {CONFIG} --object cup": "",
+    f"beags render {CONFIG} --object cup --format before-after": "--size 48 --views 2",
+    "ns-export gaussian-splat --load-config outputs/.../extracted/cup/config.yml --output-dir exports/": "",
+    "beags demo [--data X]": "--data my_scene --downscale 2",
+}
+STARTED = ("beags sample", "beags resume RUN")
+ELSEWHERE = {
+    "ns-train <preset> --data X": "the two lines of ns-train are run",
+    "beags export --load-config C --all [--format ply spz glb]": "a line with --all is run",
+    "beags eval --load-config C [C ...]": "a line of it is run",
+    "beags extract --load-config C [--object NAME ...] [--remove]": "a line of it is run",
+    "beags render --load-config C [--object NAME ...] [--format before-after]": "a line of it is run",
+    "ns-viewer --load-config C": "a line of it is run",
+    "beags bench ablation [--data X ...]": "trains for minutes; test_bench_running.py runs experiments to their tables",
+    "make demo": "beags demo is run; what make calls is looked at below",
+    "make demo DATA=my_scene": "the same",
+    "make test": "runs these tests",
+    "make lint": "looks at the code, not at what it does",
+    "make format": "changes the files of this clone",
+    "make fuzz COUNT=1000 SEED=0": "minutes; test_fuzz.py runs the script, what make calls is looked at below",
+    "make soak": "an hour; tests/soak/ tests each script",
+    "scripts/sanitize.sh": "compiles everything anew",
+    "pip install -c constraints.txt -e .": "make setup has done it in the environment that runs this test",
+}
+OWN = {  # what README.md calls it: what it is here
+    r" \[.*\]": "",
+    r"outputs/\.\.\.": "{run}",
+    r"RUN$": "{run}",
+    r"--load-config C$": "--load-config {run}/config.yml",
+    r"--data X": "--data my_scene",
+    r"--source NAME": "--source id-images",
+}
+
+
+def commands() -> set[str]:
+    """Those in code blocks, without their comments, and those in the first column of tables."""
+    blocks = [line.partition("  ")[0].partition(" #")[0].strip() for line in code_lines(README)]
+    tables = re.findall(r"^\| `([^`]+)` \|", README, re.MULTILINE)
+    return {line for line in (*blocks, *tables) if PROGRAM.match(line)}
+
+
+def test_every_command_is_run_or_listed_with_a_reason():
+    found = commands()
+    assert len(found) > 25
+    assert found == {*RUN, *ELSEWHERE}, "neither run nor listed, or no longer in README.md"
+    assert not set(RUN) & set(ELSEWHERE) and all(ELSEWHERE.values())
+
+
+def test_make_calls_the_commands():
+    for line, recipe in (
+        ("make demo", '/beags" demo'),
+        ("make demo DATA=my_scene", '/beags" demo --data "my_scene"'),
+        ("make fuzz COUNT=1000 SEED=0", '/python" tests/soak/fuzz.py --count "1000" --seed "0"'),
+    ):
+        command = [*shlex.split(line), "--dry-run", "--no-print-directory"]  # "make test" is a make above this one
+        dry = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+        assert recipe in dry.stdout.splitlines()[-1]
+
+
+class Reader:
+    """Somebody at a terminal in ``folder``."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.environment = {
+            **os.environ, "PATH": f"{BIN}:{os.environ['PATH']}", "OMP_WAIT_POLICY": "PASSIVE", "COLUMNS": "200",
+            "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path[1:]]),
+        }  # fmt: skip
+
+    @property
+    def run(self) -> Path:
+        """The run of ns-train that was begun last."""
+        return max((path.parent for path in self.folder.glob("outputs/my_scene/beags-*/*/config.yml")), key=_changed)
+
+    def words(self, line: str, more: str) -> list[str]:
+        for name, own in OWN.items():
+            if re.search(name, line):
+                line = re.sub(name, own.replace("{run}", str(self.run)) if "{run}" in own else own, line)
+        return shlex.split(f"{line} {more}")
+
+    @contextmanager
+    def started(self, line: str, more: str) -> Iterator[subprocess.Popen[bytes]]:
+        """The program, which ends with this block at the latest."""
+        command = bound(self.words(line, more), signal.SIGKILL)
+        with open(self.folder / "log.txt", "w") as log:
+            process = subprocess.Popen(
+                command, cwd=self.folder, env=self.environment, stdout=log, stderr=subprocess.STDOUT
+            )
+        try:
+            yield process
+        finally:
+            process.kill()
+            process.wait()
+
+    def does(self, line: str, more: str) -> None:
+        if line.startswith("beags") and line not in STARTED:
+            assert "Traceback" not in called(*self.words(line, more))
+            return
+        with self.started(line, more) as process:
+            code = process.wait(600)
+        text = (self.folder / "log.txt").read_text()
+        assert code == 0 and "Traceback" not in text, f"{line}: exit code {code}\n{text[-3000:]}"
+
+    def waits(self, process: subprocess.Popen[bytes], until) -> None:
+        end = time.monotonic() + 600
+        while not until():
+            assert process.poll() is None and time.monotonic() < end, (self.folder / "log.txt").read_text()[-3000:]
+            time.sleep(0.02)
+
+    def trains_and_is_killed(self, line: str, more: str) -> None:
+        """After the first checkpoint."""
+        with self.started(line, more) as process:
+            self.waits(process, lambda: any(self.folder.glob("outputs/my_scene/*/*/nerfstudio_models/step-*.ckpt")))
+
+    def views(self, line: str) -> None:
+        port = free_port()
+        with self.started(line, f"--viewer.websocket-port {port}") as process:
+            self.waits(process, lambda: answers(port))
+            process.terminate()
+            process.wait(120)
+        assert "Traceback" not in (self.folder / "log.txt").read_text()
+
+
+def _changed(path: Path) -> float:
+    return path.stat().st_mtime
+
+
+def answers(port: int) -> bool:
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=5) as page:
+            return b"<html" in page.read()
+    except OSError:
+        return False
+
+
+def test_the_commands_run_in_order(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), *sys.path[1:]]))
+    reader = Reader(tmp_path)
+    for line, more in RUN.items():
+        if line.startswith("ns-train beags-tiny"):
+            reader.trains_and_is_killed(line, more)
+            assert not (reader.run / "training.json").exists()
+        elif line.startswith("ns-viewer"):
+            reader.views(line)
+        else:
+            if "scene.ply" in line:
+                plys = sorted((tmp_path / "exported").glob("*.ply"))
+                (tmp_path / "exported/background.ply").rename(tmp_path / "scene.ply")
+                assert len(plys) > 3
+            reader.does(line, more)
+    first, second = sorted(tmp_path.glob("outputs/my_scene/beags-*/*/training.json"), key=_changed)
+    assert first.parents[1].name == "beags-tiny" and second.parents[1].name == "beags-refine"
+    run = reader.run
+    for name in (
+        "worst.png", "made/masks", "made/classes.json", "exported/manifest.json", "outputs/masks_check/report.json",
+        "outputs/my_scene/summary.json", "outputs/my_scene/contact_sheet.png", run / "extracted/cup/cup.ply",
+        run / "reprojected/before_after.png",
+    ):  # fmt: skip
+        assert (tmp_path / name).exists(), name
+    assert any((tmp_path / "exports").glob("*.ply")) and any((run / "renders").iterdir())
+    assert len(list((tmp_path / "exported").glob("*.glb"))) >= 1

@@ -1,0 +1,246 @@
+"""Every choice of the evaluation protocol against a computation of its own in numpy."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from known_masks import BOX, CLASSES, CUP, FLOOR, SETTINGS, SIZE, Squares, camera, scene, square_mask, truth
+from scipy.ndimage import binary_erosion
+
+from beags_plugin.evaluation.metrics import METRICS, MaskMetrics, mask_metrics
+from beags_plugin.evaluation.protocol import Protocol
+from beags_plugin.evaluation.records import EvalView, MaskRecord, ObjectMetrics, SceneMetrics, ViewRecord
+from beags_plugin.evaluation.report import RunMetrics, data_set
+from beags_plugin.evaluation.run_metrics import average, evaluate_scene
+from beags_plugin.system.errors import UserError
+
+pytestmark = pytest.mark.filterwarnings("ignore:Mean of empty slice")
+
+
+def ratio(a: np.ndarray, b: np.ndarray) -> float:
+    return (a & b).sum() / (a | b).sum()
+
+
+def band(mask: np.ndarray, width: int) -> np.ndarray:
+    return mask & ~binary_erosion(mask, np.ones((3, 3)), iterations=width, border_value=0)
+
+
+def blobs(seed: int, height: int = 60, width: int = 80) -> tuple[np.ndarray, np.ndarray]:
+    """Two overlapping ellipses, the second with specks."""
+    generator = np.random.default_rng(seed)
+    y, x = np.mgrid[:height, :width]
+    masks = []
+    for _ in range(2):
+        cy, cx = height / 2 + generator.uniform(-4, 4), width / 2 + generator.uniform(-4, 4)
+        ry, rx = generator.uniform(12, 25, size=2)
+        masks.append(((y - cy) / ry) ** 2 + ((x - cx) / rx) ** 2 < 1)
+    masks[1] ^= generator.random((height, width)) < 0.01
+    return masks[0], masks[1]
+
+
+@pytest.mark.parametrize("share", [0.005, 0.02, 0.05])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_band_has_the_width_asked_for(share, seed):
+    true, predicted = blobs(seed)
+    width = max(1, round(share * 100))  # the diagonal of 60 x 80
+    found = mask_metrics(predicted, true, None, Protocol(band_share=share))
+    assert found.biou == ratio(band(predicted, width), band(true, width))
+    assert found.iou == ratio(predicted, true)
+
+
+def test_who_is_resized():
+    true, predicted = blobs(5)
+    small = predicted[1::3, 1::3]  # the nearest pixels of a third: the middle ones
+    ignored = np.zeros_like(true)
+    ignored[:, :30] = True
+    by_prediction = mask_metrics(small, true[:60, :78], ignored[:, :78], Protocol())
+    assert small.shape == (20, 27)
+    rows, columns = (np.arange(60) * 2 + 1) * 20 // 120, (np.arange(78) * 2 + 1) * 27 // 156
+    large = small[rows][:, columns][:, 30:]
+    assert by_prediction.iou == ratio(large, true[:, 30:78])
+    by_truth = mask_metrics(small[:, :26], true[:, :78], ignored[:, :78], Protocol(resize="truth"))
+    few = true[1::3, 1:78:3]
+    assert by_truth.iou == ratio(small[:, 10:26], few[:, 10:])
+    assert by_truth.acc == (small[:, 10:26] == few[:, 10:]).mean()
+
+
+@pytest.mark.parametrize(("empty", "value"), [("one", 1.0), ("zero", 0.0), ("skip", None)])
+def test_empty_unions(empty, value):
+    nothing = np.zeros((8, 9), bool)
+    found = mask_metrics(nothing, nothing, None, Protocol(empty=empty))
+    assert found == MaskMetrics(1.0, value, value)
+    # one mask with half of its pixels found, and one that is empty in truth and prediction
+    views = [EvalView(camera(), None, None, {1: square_mask(*CUP)}), EvalView(camera(), None, None, {2: truth() > 9})]
+    x, y, half = CUP
+    surfels, ids = scene([(x - half / 2, y, half), FLOOR]), torch.tensor([1, 0], dtype=torch.int32)
+    metrics = evaluate_scene(surfels, ids, Squares(), SETTINGS, views, CLASSES, protocol=Protocol(empty=empty))
+    expected = ratio(square_mask(x - half / 2, y, half).numpy(), square_mask(*CUP).numpy())
+    assert metrics.mean.extracted is not None
+    counted = [expected] if value is None else [expected, value]
+    assert metrics.mean.extracted.iou == pytest.approx(np.mean(counted))
+    box = metrics.objects[2].extracted
+    assert box is not None and box.iou == value and box.acc == 1.0
+
+
+class Ramp(Squares):
+    """Everything has alpha, and colour, growing from 0 at the left to 1 at the right."""
+
+    def rasterize(self, inputs, camera, settings, background, target=None):
+        drawn = super().rasterize(inputs, camera, settings, background)
+        ramp = ((torch.arange(camera.width) + 0.5) / camera.width).expand(camera.height, -1)
+        return replace(drawn, alpha=ramp, color=ramp[..., None] * inputs.colors[0])
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.25, 0.5, 0.9])
+def test_the_threshold_cuts_both_kinds(threshold):
+    view = EvalView(camera(), None, truth(), {1: square_mask(*CUP)})
+    protocol = Protocol(threshold=threshold)
+    ids = torch.tensor([1], dtype=torch.int32)
+    metrics = evaluate_scene(scene([CUP]), ids, Ramp(), SETTINGS, [view], {1: "cup"}, protocol=protocol)
+    predicted = np.broadcast_to((np.arange(SIZE) + 0.5) / SIZE > threshold, (SIZE, SIZE))
+    cup = metrics.objects[1]
+    assert cup.extracted is not None and cup.rendered is not None
+    assert cup.extracted.iou == ratio(predicted, square_mask(*CUP).numpy())
+    assert cup.rendered.iou == ratio(predicted, (truth() == 1).numpy())
+
+
+@pytest.mark.parametrize("silhouettes", ["seen", "whole"])
+def test_what_no_photo_shows_is_scored_on_demand(silhouettes):
+    known = square_mask(*CUP)
+    known[:, : int(CUP[0])] = False  # the left half is not known, and not there
+    view = EvalView(camera(), None, None, {1: square_mask(*CUP)}, seen={1: known})
+    x, y, half = CUP
+    surfels, ids = scene([(x + half / 2, y, half / 2), BOX]), torch.tensor([1, 2], dtype=torch.int32)
+    metrics = evaluate_scene(
+        surfels, ids, Squares(), SETTINGS, [view], CLASSES, protocol=Protocol(silhouettes=silhouettes)
+    )
+    cup = metrics.objects[1].extracted
+    predicted = square_mask(x + half / 2, y, half / 2)
+    assert cup is not None
+    assert cup.iou == (predicted.sum() / (known if silhouettes == "seen" else square_mask(*CUP)).sum()).item()
+
+
+def records(seed: int, views: int, objects: int) -> list[MaskRecord]:
+    """Random figures; some masks are missing and some have no IoU."""
+    generator, presence = np.random.default_rng(seed), np.random.default_rng(seed % 100)  # alike before and after
+    found = []
+    for view in range(views):
+        for class_id in range(1, objects + 1):
+            for kind in ("extracted", "rendered"):
+                if presence.random() < 0.75:
+                    acc, iou, biou = generator.random(3).tolist()
+                    none = generator.random() < 0.2
+                    figures = MaskMetrics(acc, None if none else iou, biou)
+                    found.append(MaskRecord(kind, class_id, view, "visible", figures))
+    return found
+
+
+def table(masks: list[MaskRecord], kind: str, metric: str, views: int, objects: int) -> np.ndarray:
+    """[views, objects], NaN where there is nothing."""
+    values = np.full((views, objects), np.nan)
+    for mask in masks:
+        value = getattr(mask.metrics, metric)
+        if mask.kind == kind and value is not None:
+            values[mask.view, mask.class_id - 1] = value
+    return values
+
+
+def averaged(values: np.ndarray, how: str) -> float:
+    if how == "objects":
+        values = np.nanmean(values, axis=0)
+    elif how == "views":
+        values = np.nanmean(values, axis=1)
+    return np.nanmean(values)
+
+
+@pytest.mark.parametrize("how", ["masks", "objects", "views"])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_mean_of_a_scene(how, seed):
+    masks = records(seed, 7, 4)
+    for kind in ("extracted", "rendered"):
+        found = average(masks, kind, Protocol(scene_average=how))
+        for metric in METRICS:
+            assert getattr(found, metric) == pytest.approx(averaged(table(masks, kind, metric, 7, 4), how))
+    assert average([], "extracted", Protocol(scene_average=how)) is None
+
+
+NOTHING = ObjectMetrics(None, None)
+
+
+def run(seed: int, views: int, objects: int, protocol: Protocol, before: bool = True) -> RunMetrics:
+    def stage(shift: int) -> SceneMetrics:
+        masks = records(seed + shift, views, objects)
+        generator = np.random.default_rng(seed + shift)
+        images = [ViewRecord(f"v{i}", *generator.uniform(0, 40, 2).tolist()) for i in range(views)]
+        kinds = (average(masks, "extracted", protocol), average(masks, "rendered", protocol))
+        psnr, ssim = (math.fsum(getattr(i, name) for i in images) / views for name in ("psnr", "ssim"))
+        return SceneMetrics(
+            ObjectMetrics(*kinds),
+            {c + 1: NOTHING for c in range(objects)},
+            psnr,
+            "visible",
+            ssim,
+            tuple(masks),
+            tuple(images),
+        )
+
+    return RunMetrics(f"s{seed}", "c", protocol, {}, stage(100) if before else None, stage(0))
+
+
+@pytest.mark.parametrize("how", ["masks", "objects", "views"])
+@pytest.mark.parametrize("over", ["scenes", "pooled"])
+def test_the_mean_of_a_data_set(how, over):
+    protocol = Protocol(scene_average=how, data_set_average=over)
+    sizes = [(3, 2), (8, 4), (5, 5)]
+    runs = [run(seed, *size, protocol) for seed, size in enumerate(sizes)]
+    found = data_set("three", runs)
+    for stage, shift in (("after", 0), ("before", 100)):
+        for kind in ("extracted", "rendered"):
+            for metric in METRICS:
+                tables = [table(records(seed + shift, *size), kind, metric, *size) for seed, size in enumerate(sizes)]
+                if over == "scenes":
+                    expected = np.mean([averaged(values, how) for values in tables])
+                else:  # one block of objects and views per scene
+                    whole = np.full((sum(v for v, _ in sizes), sum(o for _, o in sizes)), np.nan)
+                    row = column = 0
+                    for values in tables:
+                        whole[row : row + len(values), column : column + values.shape[1]] = values
+                        row, column = row + len(values), column + values.shape[1]
+                    expected = averaged(whole, how)
+                assert getattr(getattr(found.means[stage], kind), metric) == pytest.approx(expected)
+        scenes = [getattr(one, stage) for one in runs]
+        ratios = [[view.psnr for view in one.views] for one in scenes]
+        expected = np.mean([np.mean(r) for r in ratios]) if over == "scenes" else np.mean(np.concatenate(ratios))
+        assert found.psnr[stage] == pytest.approx(expected)
+    row = found.csv_rows()[-1]
+    assert row[:3] == ["three", "", "after"] and row[4] == found.means["after"].extracted.iou
+
+
+def test_a_former_state_that_some_scenes_lack_is_not_averaged():
+    protocol = Protocol()
+    found = data_set("two", [run(0, 3, 2, protocol), run(1, 3, 2, protocol, before=False)])
+    assert set(found.means) == {"after"} and found.psnr["before"] is None
+    assert found.to_json()["mean"]["extracted"]["before"] == {"acc": None, "iou": None, "biou": None}
+    with pytest.raises(ValueError, match="one protocol"):
+        data_set("two", [run(0, 3, 2, protocol), run(1, 3, 2, Protocol(threshold=0.3))])
+
+
+@pytest.mark.parametrize(
+    ("choice", "words"),
+    [
+        (dict(threshold=1.0), "threshold is 1.0"),
+        (dict(threshold=math.nan), "threshold is nan"),
+        (dict(band_share=0.0), "band_share is 0.0"),
+        (dict(band_share=math.inf), "band_share is inf"),
+        (dict(empty="two"), "empty is 'two': choose one of one, zero, skip"),
+        (dict(scene_average="median"), "choose one of masks, objects, views"),
+    ],
+)
+def test_choices_that_cannot_be(choice, words):
+    with pytest.raises(UserError, match=words):
+        Protocol(**choice).check()
+    Protocol().check()

@@ -1,0 +1,68 @@
+"""What a user is told of a mistake: one sentence with the file or value and the remedy, and exit code 2.
+
+The mistakes are in ``mistakes/``, what is said of them, word for word, in ``mistakes/sentences.txt``; to write that
+file anew, and then to read what has changed: ``BEAGS_SENTENCES=write pytest tests/mistakes``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("nerfstudio")
+
+from mistakes import disks, masks, options, photos, poses, runs, starts  # noqa: F401  (they fill the table)
+from mistakes.sentences import read_sentences, write_sentence
+from mistakes.table import TABLE, Place, Templates
+
+SENTENCES = read_sentences()
+pytestmark = pytest.mark.spread
+
+
+@pytest.fixture(scope="module")
+def templates(tmp_path_factory):
+    return Templates(tmp_path_factory.mktemp("templates"))
+
+
+def files_below(root: Path) -> dict[Path, str]:
+    """Digest of every file."""
+    found = (path for path in root.rglob("*") if path.is_file())
+    return {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in found}
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_a_mistake_ends_with_one_sentence_and_code_2(name, templates, tmp_path, monkeypatch, capsys):
+    place = Place(tmp_path, templates, monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    with monkeypatch.context() as patch:
+        place.patch = patch
+        command = TABLE[name].make(place)
+        before = files_below(tmp_path)
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            command()
+    said = capsys.readouterr()
+    assert end.value.code == 2
+    assert "Traceback" not in said.out + said.err
+    lines = [line for line in said.out.splitlines() if line.startswith("beags: ")]
+    assert len(lines) == 1
+    sentence = lines[0].removeprefix("beags: ").replace(str(tmp_path), "{tmp}")
+    sentence = re.sub(r"\.masks_\w+", ".masks_...", sentence)  # a temporary folder
+    after = files_below(tmp_path)
+    changed = [path for path in before if after.get(path) != before[path] and path not in place.may_change]
+    assert not changed  # nothing that was saved is lost
+    assert not list(tmp_path.rglob("*.part")) and not (tmp_path / "ran").exists()  # what files of strangers would run
+    if os.environ.get("BEAGS_SENTENCES") == "write":
+        write_sentence(name, sentence, list(TABLE))
+    else:
+        assert sentence == SENTENCES[name]
+    assert sentence.endswith(".") and len(sentence) < 500
+    assert re.search(r"(: |; |\. )[A-Za-z-]", sentence)  # what to do follows what is wrong
+
+
+def test_every_sentence_is_of_a_mistake():
+    assert set(SENTENCES) == set(TABLE)

@@ -1,0 +1,442 @@
+"""A run that is killed and resumed ends bit for bit as without the break."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+import torch
+from places import SUPPORT
+
+pytest.importorskip("nerfstudio")
+
+from resumed_runs import (
+    STEPS,
+    Killed,
+    assert_same_run,
+    checkpoint_of,
+    differences,
+    resume_to_end,
+    run_to_end,
+    short_config,
+    without_clocks,
+)
+
+from beags_plugin.plugin.runs.read import read_scene
+from beags_plugin.plugin.trainer import BeagsTrainer
+from beags_plugin.preparation import pipeline as preparation
+from beags_plugin.system.child_processes import bound
+from beags_plugin.system.errors import UserError
+
+pytestmark = pytest.mark.spread
+LAST = sum(STEPS) - 1
+
+
+@pytest.fixture
+def data(short_run):
+    return short_run / "data"
+
+
+@pytest.fixture
+def whole(short_run):
+    """The run without a break; tests that change it copy it."""
+    return short_run / "run"
+
+
+def kill_at(monkeypatch, step, after=False):
+    """Let the training end as by a kill before or in the middle of a step."""
+    train = BeagsTrainer.train_iteration
+
+    def iteration(self, now):
+        if now == step and not after:
+            raise Killed
+        found = train(self, now)
+        if now == step:
+            raise Killed
+        return found
+
+    monkeypatch.setattr(BeagsTrainer, "train_iteration", iteration)
+
+
+def broken_off(data, run, monkeypatch, kill, **overrides):
+    """Start a run and let ``kill`` end it."""
+    with monkeypatch.context() as patch:
+        kill(patch)
+        with pytest.raises(Killed):
+            run_to_end(short_config(data, run, **overrides))
+
+
+def test_the_run_grows_splits_and_prepares_twice(whole):
+    saved = checkpoint_of(whole)
+    assert saved["step"] == LAST and int(saved["pipeline"]["_model.refined_steps"]) == STEPS[1]
+    base = torch.load(next((whole / "base/nerfstudio_models").iterdir()), weights_only=True)["pipeline"]
+    assert len(saved["pipeline"]["_model.gauss_params.means"]) > len(base["_model.gauss_params.means"])
+    grown = [record["gaussians"] for record in json.loads((whole / "held_out.json").read_text())]
+    assert len(set(grown)) > 2
+    assert saved["beags"]["parts"]["refinement"] == {"rounds": 2, "evaluated": True}
+
+
+# after growth, in the last base step, in the first step of refinement; elsewhere in the test of many kills
+@pytest.mark.parametrize(("step", "after"), [(36, True), (44, True), (45, False)])
+def test_a_killed_run_ends_as_the_whole_one(data, whole, tmp_path, monkeypatch, step, after):
+    run = tmp_path / "run"
+    broken_off(data, run, monkeypatch, lambda patch: kill_at(patch, step, after))
+    resume_to_end(run)
+    assert_same_run(run, whole)
+    assert not list(run.rglob("*.part"))
+
+
+def test_a_run_that_is_killed_again_and_again(data, whole, tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    broken_off(data, run, monkeypatch, lambda patch: kill_at(patch, 15))
+    for step in (30, 46, 52):
+        with monkeypatch.context() as patch:
+            kill_at(patch, step)
+            with pytest.raises(Killed):
+                resume_to_end(run)
+    resume_to_end(run)
+    assert_same_run(run, whole)
+
+
+STAGES = ["render_depths", "reprojected_masks", "assign_classes", "split_at_borders", "build_visibility_grid"]
+
+
+def stage_module(name):
+    from beags_plugin.refiners import bea
+
+    return bea if name == "build_visibility_grid" else preparation
+
+
+@pytest.mark.parametrize(("name", "round_"), [*((name, 1) for name in STAGES), ("assign_classes", 2)])
+def test_a_kill_in_the_preparation_ends_as_the_whole_one(data, whole, tmp_path, monkeypatch, name, round_):
+    """The preparation that was interrupted is made again, from the scene that was saved before it."""
+    run, calls = tmp_path / "run", []
+    compute = getattr(stage_module(name), name)
+
+    def killed(*args, **options):
+        calls.append(name)
+        if len(calls) == round_:
+            raise Killed
+        return compute(*args, **options)
+
+    broken_off(data, run, monkeypatch, lambda patch: patch.setattr(stage_module(name), name, killed))
+    resume_to_end(run)
+    assert_same_run(run, whole)
+
+
+def test_a_kill_while_the_base_or_the_masks_are_written(data, whole, tmp_path, monkeypatch):
+    from beags_plugin.plugin.training import refinement
+
+    for name in ("write_run", "write_class_map"):
+        run = tmp_path / name
+
+        def kill(patch, name=name):
+            def killed(*_, **__):
+                raise Killed
+
+            patch.setattr(refinement, name, killed)
+
+        broken_off(data, run, monkeypatch, kill)
+        resume_to_end(run)
+        assert_same_run(run, whole)
+
+
+@pytest.mark.parametrize("at", [14, 44, LAST])
+def test_a_kill_in_the_middle_of_a_checkpoint_leaves_the_former_one(data, whole, tmp_path, monkeypatch, at):
+    run, save = tmp_path / "run", torch.save
+
+    def kill(patch):
+        def half(content, file):
+            if isinstance(content, dict) and content.get("step") == at and "beags" in content:
+                file.write(b"half of it")
+                raise Killed
+            save(content, file)
+
+        patch.setattr(torch, "save", half)
+
+    broken_off(data, run, monkeypatch, kill, steps_per_save=7)
+    assert [path.suffix for path in run.glob(".*.part")] == [".part"]
+    assert all(torch.load(path, weights_only=True)["step"] < at for path in run.glob("nerfstudio_models/*"))
+    resume_to_end(run)
+    assert not list(run.rglob(".*.part"))
+    assert_same_run(run, whole)
+
+
+def test_resuming_by_load_dir_into_another_folder(data, whole, tmp_path, monkeypatch):
+    first, second = tmp_path / "first", tmp_path / "second"
+    broken_off(data, first, monkeypatch, lambda patch: kill_at(patch, 53))
+    config = short_config(data, second)
+    config.load_dir = first / "nerfstudio_models"
+    run_to_end(config)
+    assert_same_run(second, whole)
+
+
+def test_refinement_of_a_loaded_base_is_resumed(data, whole, tmp_path, monkeypatch):
+    base = whole / "base" / "nerfstudio_models"
+    options = {"pipeline.model.base_steps": 0}
+    runs = [tmp_path / name for name in ("whole", "killed")]
+    for run in runs:
+        config = short_config(data, run, **options)
+        config.load_dir = base
+        with monkeypatch.context() as patch:
+            if run == runs[1]:
+                kill_at(patch, 9, after=True)
+                with pytest.raises(Killed):
+                    run_to_end(config)
+            else:
+                run_to_end(config)
+    resume_to_end(runs[1])
+    assert differences(*(without_clocks(checkpoint_of(run)) for run in runs)) == []
+
+
+def test_another_run_into_the_folder_leaves_no_round_of_the_former(data, tmp_path):
+    run = tmp_path / "run"
+    run_to_end(short_config(data, run))
+    assert (run / "prepared" / "round_2").is_dir()
+    run_to_end(short_config(data, run, **{"pipeline.model.refine_rounds": 1}))
+    assert (run / "prepared" / "masks").is_dir() and not (run / "prepared" / "round_2").exists()
+
+
+def test_ctrl_c_saves_the_step_and_a_resume_goes_on(data, whole, tmp_path, monkeypatch):
+    run, train = tmp_path / "run", BeagsTrainer.train_iteration
+    with monkeypatch.context() as patch:
+
+        def iteration(self, step):
+            if step == 24:
+                signal.raise_signal(signal.SIGTERM)
+            return train(self, step)
+
+        patch.setattr(BeagsTrainer, "train_iteration", iteration)
+        with pytest.raises(KeyboardInterrupt):
+            run_to_end(short_config(data, run))
+    assert checkpoint_of(run)["step"] == 24
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    resume_to_end(run)
+    assert_same_run(run, whole)
+
+
+def test_a_run_of_a_gpu_goes_on_without_one_if_asked(data, tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        kill_at(patch, 20)
+        run_to_end(short_config(data, run))
+    config = run / "config.yml"
+    config.write_text(config.read_text().replace("device_type: cpu", "device_type: cuda"))
+    assert "device_type: cuda" in config.read_text()
+    if not torch.cuda.is_available():
+        with pytest.raises(UserError, match="beags resume: --device cpu"):
+            resume_to_end(run)
+    resume_to_end(run, "cpu")
+    assert checkpoint_of(run)["step"] == LAST
+
+
+def test_a_kill_before_the_first_checkpoint_starts_again(data, whole, tmp_path, monkeypatch, capsys):
+    run = tmp_path / "run"
+    broken_off(data, run, monkeypatch, lambda patch: kill_at(patch, 5))
+    assert not (run / "nerfstudio_models").exists()
+    resume_to_end(run)
+    assert "starts from the beginning" in capsys.readouterr().out
+    assert_same_run(run, whole)
+
+
+def test_a_new_run_into_the_folder_of_another_is_not_taken_for_it(data, whole, tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    run_to_end(short_config(data, run, **{"machine.seed": 7}))
+    broken_off(data, run, monkeypatch, lambda patch: kill_at(patch, 5))
+    assert checkpoint_of_folder(run / "replaced_models")["step"] == LAST
+    resume_to_end(run)
+    assert_same_run(run, whole)
+    assert not (run / "replaced_models").exists()
+
+
+def test_a_failed_start_in_the_folder_of_another_run_is_not_mixed_with_it(data, tmp_path, monkeypatch):
+    """Where all checkpoints are kept, too; the former run has come further than the new one."""
+    run = tmp_path / "run"
+    keep_all = {"save_only_latest_checkpoint": False, "steps_per_save": 50, "pipeline.model.refine_steps": 0}
+    run_to_end(short_config(data, run, **{**keep_all, "machine.seed": 7}))
+    assert (run / "training.json").exists()
+    config = short_config(data, run, **keep_all)
+    config.pipeline.model.start_from = tmp_path / "nothing.ply"
+    with pytest.raises(UserError):
+        run_to_end(config)
+    assert not (run / "training.json").exists() and not (run / "nerfstudio_models").exists()
+    assert any((run / "replaced_models").glob("*.ckpt"))
+    broken_off(data, run, monkeypatch, lambda patch: kill_at(patch, 5), **keep_all)
+    resume_to_end(run)
+    assert not (run / "replaced_models").exists()
+
+
+def test_a_run_that_is_training_cannot_be_resumed(whole, tmp_path):
+    from beags_plugin.system.lock import run_lock
+
+    whole = shutil.copytree(whole, tmp_path / "run")
+    before = checkpoint_of(whole)["step"]
+    part = whole / ".half.part"
+    part.touch()
+    lock = run_lock(whole)
+    try:
+        with pytest.raises(UserError, match="being trained by another process"):
+            resume_to_end(whole)
+        assert part.exists() and checkpoint_of(whole)["step"] == before
+    finally:
+        lock.release()
+        part.unlink()
+    run_lock(whole).release()
+
+
+def contents(folder):
+    return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.rglob("*") if path.is_file()}
+
+
+def test_ns_train_into_the_folder_of_a_run_that_is_training_changes_nothing_there(data, whole, tmp_path):
+    """config.yml is the first that ns-train writes."""
+    import fcntl
+
+    from beags_plugin.system.lock import LOCK
+
+    whole = shutil.copytree(whole, tmp_path / "run")
+    before = contents(whole)
+    with open(whole / LOCK, "ab") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # as another process would
+        with pytest.raises(UserError, match="being trained by another process"):
+            run_to_end(short_config(data, whole, steps_per_save=99))
+    assert contents(whole) == before
+
+
+@pytest.mark.parametrize("devices", [1, 2])
+def test_the_lock_is_held_from_the_first_file_on(data, tmp_path, devices):
+    """Two that start at once: one is refused; where each device has a process of its own, only while it is written."""
+    from filelock import FileLock, Timeout
+
+    from beags_plugin.system.lock import LOCK, run_lock
+
+    config = short_config(data, tmp_path / "run")
+    config.machine.num_devices = devices
+    config.save_config()
+    config.save_config()  # not refused by itself
+    if devices == 1:
+        with pytest.raises(Timeout):
+            FileLock(tmp_path / "run" / LOCK).acquire(blocking=False)
+        run_lock(tmp_path / "run").release()  # as the trainer takes it over
+    run_lock(tmp_path / "run").release()
+
+
+def test_ctrl_c_after_the_end_is_quiet(data, tmp_path, monkeypatch, capsys):
+    """As in a viewer that stays open."""
+    from nerfstudio.engine.trainer import Trainer
+
+    run = tmp_path / "run"
+    config = short_config(data, run, **{"pipeline.model.base_steps": 3, "pipeline.model.refine_steps": 0})
+    after = Trainer._after_train
+
+    def waiting(self):
+        after(self)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Trainer, "_after_train", waiting)
+    run_to_end(config)
+    assert (run / "training.json").exists() and "Stopped" not in capsys.readouterr().out
+
+
+def test_ctrl_c_ends_a_training_that_the_viewer_has_paused(data, tmp_path, monkeypatch):
+    run, train = tmp_path / "run", BeagsTrainer.train_iteration
+
+    def iteration(self, step):
+        if step == 4:
+            self.training_state = "paused"
+            threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+        return train(self, step)
+
+    monkeypatch.setattr(BeagsTrainer, "train_iteration", iteration)
+    with pytest.raises(KeyboardInterrupt):
+        run_to_end(short_config(data, run))
+    assert checkpoint_of(run)["step"] == 4
+
+
+def checkpoint_of_folder(folder):
+    (path,) = folder.iterdir()
+    return torch.load(path, weights_only=True)
+
+
+def edit_checkpoint(run, edit):
+    (path,) = (run / "nerfstudio_models").iterdir()
+    content = torch.load(path, weights_only=True)
+    edit(content)
+    torch.save(content, path)
+    return path
+
+
+def test_what_cannot_be_resumed_is_said_in_one_sentence(data, whole, tmp_path, monkeypatch, capsys):
+    with pytest.raises(UserError, match="complete run"):
+        resume_to_end(whole)
+    with pytest.raises(UserError, match="without the state of its training"):
+        resume_to_end(whole / "base")
+    with pytest.raises(UserError, match="cannot be read"):
+        resume_to_end(tmp_path / "nowhere")
+    run = tmp_path / "run"
+    broken_off(data, run, monkeypatch, lambda patch: kill_at(patch, 50))
+    path = edit_checkpoint(run, lambda content: content["beags"].update(version=99))
+    with pytest.raises(UserError, match="newer version of beags: update"):
+        resume_to_end(run)
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(UserError, match="is damaged"):
+        resume_to_end(run)
+    with pytest.raises(UserError, match="is damaged"):
+        read_scene(run / "config.yml")  # extract, export, render and eval too
+    path.write_bytes(content)
+    edit_checkpoint(run, lambda content: content.pop("beags"))
+    resume_to_end(run)  # of an older version: it goes on all the same
+    assert "older version of beags" in capsys.readouterr().out
+    assert checkpoint_of(run)["step"] == LAST
+
+
+def test_a_kill_between_the_last_checkpoint_and_the_report(data, whole, tmp_path, monkeypatch):
+    run = tmp_path / "run"
+
+    def kill(patch):
+        def killed(_):
+            raise Killed
+
+        patch.setattr(BeagsTrainer, "_write_report", killed)
+
+    broken_off(data, run, monkeypatch, kill)
+    assert checkpoint_of(run)["step"] == LAST and not (run / "training.json").exists()
+    resume_to_end(run)
+    assert json.loads((run / "training.json").read_text())["seconds"]["refinement"] > 0
+    assert_same_run(run, whole)
+
+
+def test_a_real_kill(data, whole, tmp_path):
+    """SIGKILL from outside while a process trains."""
+    run = tmp_path / "run"
+    code = (
+        "import sys, time; from pathlib import Path; from resumed_runs import *\n"
+        "from beags_plugin.plugin.trainer import BeagsTrainer\n"
+        "train = BeagsTrainer.train_iteration\n"
+        "def slow(self, step):\n"
+        "    time.sleep(600 if step == 50 else 0.02)\n"  # until the kill
+        "    return train(self, step)\n"
+        "BeagsTrainer.train_iteration = slow\n"
+        f"run_to_end(short_config(Path({str(data)!r}), Path({str(run)!r})))"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(SUPPORT), os.getcwd()])}
+    with subprocess.Popen(bound([sys.executable, "-c", code]), env=environment, stdout=subprocess.DEVNULL) as process:
+        deadline = time.monotonic() + 600
+        while not any(run.glob("nerfstudio_models/step-0000000[234]?.ckpt")):  # one of step 20 or later
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.005)
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+    assert not (run / "training.json").exists()
+    resume_to_end(run)
+    assert_same_run(run, whole)
+    report = json.loads((run / "training.json").read_text())
+    assert report["seconds"]["base training"] > 0.3  # the killed process's too

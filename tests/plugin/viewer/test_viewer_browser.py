@@ -1,0 +1,123 @@
+"""ns-viewer as a user sees it: the real command, in a headless Chromium."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from run_folders import CLASSES, write_prepared, write_scene, write_trained
+
+pytest.importorskip("nerfstudio")
+
+from browser import NEEDED, Page
+from viewer_pages import COLORS, HEIGHT, WIDTH, awaited, differing, painted, varied, viewed
+
+from beags_plugin.extraction.ply import read_ply
+
+pytestmark = [NEEDED, pytest.mark.long]
+OUTPUTS = (
+    "rgb", "depth", "normal", "accumulation", "class_map", "class_confidence", "boundary_error", "occupancy_violation",
+    "mask_before", "mask_after",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory):
+    """The config.yml of a run, and the address of its viewer.
+
+    The scene is so small that all of it is seen from where the viewer's camera is at first.
+    """
+    root = tmp_path_factory.mktemp("served")
+    config = write_trained(root / "run", write_scene(root / "lab"), scale=0.1)
+    write_prepared(root / "run", shift=1, scale=0.1)
+    with viewed(config, root / "log.txt") as address:
+        yield config, address
+
+
+@pytest.fixture(scope="module")
+def opened(served):
+    """One page for all tests: a browser that draws without a GPU is slow to start."""
+    with Page(served[1], WIDTH, HEIGHT) as page:
+        page.wait_for_text("Export what is shown", 200)
+        yield page
+
+
+@pytest.fixture
+def page(opened):
+    """As it is when it opens."""
+    opened.press("Show all objects")
+    for label in ("Rest", "Least opacity"):
+        opened.slide(label, 0)
+    return opened
+
+
+def struck(page: Page) -> str:
+    """What the legend says is not shown."""
+    return page.evaluate("[...document.querySelectorAll('del')].map(e => e.innerText).join()")
+
+
+def test_every_output_is_a_picture_of_its_own(page):
+    assert all(name in page.text() for name in (*CLASSES.values(), "Least opacity"))
+    seen: dict[str, np.ndarray] = {}
+    for output in OUTPUTS:
+        page.choose("Output type", output)
+        seen[output] = awaited(
+            page,
+            lambda now: varied(now) > 2 and all(differing(now, other) > 0.002 for other in seen.values()),
+        )
+    assert painted(seen["class_map"], "cup") > 0.01 < painted(seen["class_map"], "box")
+    assert painted(seen["mask_before"], "cup") > 0.01 < painted(seen["mask_after"], "cup")
+
+
+def test_objects_are_isolated_hidden_faded_and_removed(page):
+    page.choose("Output type", "class_map")
+    whole = awaited(page, lambda now: painted(now, "cup") > 0.01 < painted(now, "box"))
+    page.choose("Object", "cup")
+    page.press("Isolate")
+    awaited(page, lambda now: painted(now, "box") < 0.001 and painted(now, "cup") > 0.9 * painted(whole, "cup"))
+    page.wait(lambda: struck(page) == "background,box")
+    page.press("Show all objects")
+    awaited(page, lambda now: painted(now, "box") > 0.01)
+    page.press("Hide")
+    awaited(page, lambda now: painted(now, "cup") < 0.001 and painted(now, "box") > 0.01)
+    page.slide("Rest", 0.5)
+    awaited(page, lambda now: painted(now, "cup") > 0.01)
+    page.press("Remove")
+    awaited(page, lambda now: painted(now, "cup") < 0.001 and painted(now, "box") > 0.01)
+    page.wait(lambda: struck(page) == "cup")
+
+
+def test_the_sliders_fade_and_thin_out(page):
+    """The discs have an opacity of 0.95."""
+    page.choose("Output type", "accumulation")
+    whole = awaited(page, lambda now: varied(now) > 2)
+    page.slide("Least opacity", 0.97)
+    awaited(page, lambda now: varied(now) < 1)
+    page.slide("Least opacity", 0.9)
+    awaited(page, lambda now: differing(now, whole) < 0.002)
+    page.choose("Object", "box")
+    page.press("Isolate")
+    alone = awaited(page, lambda now: differing(now, whole) > 0.01)
+    page.slide("Rest", 0.2)
+    awaited(page, lambda now: differing(now, whole) > 0.01 < differing(now, alone))
+
+
+def test_a_click_picks_what_is_under_the_cursor(page):
+    page.choose("Output type", "class_map")
+    seen = awaited(page, lambda now: painted(now, "cup") > 0.01 < painted(now, "box"))
+    for name in ("box", "cup"):
+        rows, columns = (np.abs(seen - np.array(COLORS[name])).max(axis=2) < 30).nonzero()
+        page.click(float(np.median(columns)), 60 + float(np.median(rows)))
+        page.wait_for_text(f"Picked: {name}")
+        assert page.chosen("Object") == name
+    page.click(20, 70)
+    page.wait_for_text("Nothing is shown there.")
+
+
+def test_what_is_shown_is_exported(page, served):
+    page.choose("Object", "cup")
+    page.press("Isolate")
+    page.wait(lambda: struck(page) == "background,box")  # buttons are heard in threads of their own
+    page.press("Export what is shown")
+    page.wait_for_text("Exported to")
+    surfels, classes = read_ply(served[0].parent / "exports/shown_cup.ply")
+    assert len(surfels) == 25 and set(classes.tolist()) == {1}

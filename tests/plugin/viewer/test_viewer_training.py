@@ -1,0 +1,56 @@
+"""A viewer beside a training: somebody watches from the first step to the last."""
+
+from __future__ import annotations
+
+import socket
+
+import pytest
+
+pytest.importorskip("nerfstudio")
+pytest.importorskip("msgspec")
+
+from resumed_runs import STEPS, assert_same_run, run_to_end, short_config
+from viewer_client import ViewerClient
+
+from beags_plugin.plugin.trainer import BeagsTrainer
+
+OUTPUTS = ["class_map", "boundary_error", "occupancy_violation", "mask_after", "depth", "rgb"]
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def test_a_training_that_is_watched_ends_as_it_does_unwatched(short_run, tmp_path, monkeypatch):
+    """Base, preparation and refinement, bit for bit; the render thread lives to the end and still draws."""
+    config = short_config(short_run / "data", tmp_path / "watched", vis="viewer+tensorboard")
+    config.viewer.websocket_port = free_port()
+    client = ViewerClient(config.viewer.websocket_port, OUTPUTS, distance=1.0)
+    after, iteration, last = BeagsTrainer._after_train, BeagsTrainer.train_iteration, {}
+
+    def first_watched(self, step):
+        if step in (1, STEPS[0]):  # in either phase: else so short a run would be over before a picture is drawn
+            self.train_lock.release()
+            try:
+                assert client.wait_for_a_picture()
+            finally:
+                self.train_lock.acquire()
+        return iteration(self, step)
+
+    def watched_to_the_end(self):
+        last["picture"] = client.wait_for_a_picture()
+        last["alive"] = [machine.is_alive() for machine in self.viewer_state.render_statemachines.values()]
+        after(self)
+
+    monkeypatch.setattr(BeagsTrainer, "train_iteration", first_watched)
+    monkeypatch.setattr(BeagsTrainer, "_after_train", watched_to_the_end)
+    client.start()
+    run_to_end(config)
+    client.close()
+    assert not client.is_alive() and not client.errors
+    assert last == {"picture": True, "alive": [True]}
+    assert sum(client.pictures.values()) >= 3 and client.seen["rgb"].std() > 0
+    # websockets draw from Python's own generator, the training from none but its own
+    assert_same_run(tmp_path / "watched", short_run / "run", but_for="/beags/parts/random/python")

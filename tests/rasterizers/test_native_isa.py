@@ -1,0 +1,121 @@
+"""The compiled rasterizer on each instruction set: forced by name, equal in what it draws, safe to load."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from places import ROOT, SUPPORT
+from raster_scenes import FLOATS, OUTPUTS, make_scene
+
+from beags_plugin.rasterizers import native
+from beags_plugin.rasterizers.native import NativeRasterizer
+
+needs_native = pytest.mark.skipif(
+    NativeRasterizer.unavailable() is not None, reason=str(NativeRasterizer.unavailable())
+)
+NAMES = ("avx512", "avx2", "neon", "baseline", "scalar")
+HERE = Path(__file__).parent
+OBJECTS = {  # files compiled for one instruction set: their namespace and a symbol that each must define
+    **{f"tiles_{name}": (f"beags::{name}::", "kKernelsF32") for name in NAMES},
+    "build_avx2": ("beags::ops::avx2::", "table<beags::ops::OpKernels<float> >()::all"),
+}
+DRAW = """
+import sys; sys.path[:0] = sys.argv[3:]
+import torch
+from test_native_isa import draw
+from beags_plugin.rasterizers import native
+assert native.instruction_set() == sys.argv[1]
+torch.save(draw(), sys.argv[2])
+"""
+
+
+def run(isa, program, *args):
+    """A process of its own, as the instruction set is chosen once in each."""
+    environment = os.environ | {"BEAGS_ISA": isa}
+    command = [sys.executable, "-c", program, *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+
+
+def draw():
+    """Images and gradients of a scene across tiles, in float32 and float64."""
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        scene = make_scene(count=120, width=71, height=51, seed=3, size=-1.8).to(dtype)
+        leaves = {name: getattr(scene.inputs, name).clone().requires_grad_() for name in FLOATS}
+        render = scene.draw(NativeRasterizer(), **leaves)
+        images = [getattr(render, name) for name in OUTPUTS]
+        grads = torch.autograd.grad(sum(image.square().sum() for image in images), list(leaves.values()))
+        results.append([image.detach() for image in images] + list(grads))
+    return results
+
+
+def error(a, b):
+    return ((a - b).abs().max() / b.abs().max().clamp_min(1.0)).item()
+
+
+@needs_native
+@pytest.mark.parametrize("name", NAMES)
+def test_every_instruction_set_draws_the_same(name, tmp_path):
+    if name not in native.instruction_sets():
+        pytest.skip(f"{name} is not built or not in this processor")
+    done = run(name, DRAW, name, tmp_path / "drawn.pt", HERE, SUPPORT)
+    assert done.returncode == 0, done.stderr
+    for found, expected, band in zip(torch.load(tmp_path / "drawn.pt"), draw(), (1e-4, 1e-12), strict=True):
+        assert all(error(a, b) < band for a, b in zip(found, expected, strict=True))
+
+
+@needs_native
+def test_a_forced_instruction_set_that_cannot_run_is_told_in_a_sentence():
+    names = [name for name in (*NAMES, "mmx") if name not in native.instruction_sets()]
+    program = """
+import os, sys
+from beags_plugin.system.errors import UserError
+from beags_plugin.rasterizers import make_rasterizer
+for name in sys.argv[1:]:
+    os.environ["BEAGS_ISA"] = name
+    try:
+        make_rasterizer("auto")
+    except UserError as error:
+        print(error)
+"""
+    done = run(names[0], program, *names)
+    assert done.returncode == 0, done.stderr
+    told = done.stdout.splitlines()
+    assert len(told) == len(names)
+    for name, sentence in zip(names, told, strict=True):
+        assert re.fullmatch(rf"BEAGS_ISA asks for the instruction set '{name}', which .* or unset it\.", sentence)
+
+
+@needs_native
+def test_the_best_instruction_set_is_taken():
+    if not os.environ.get("BEAGS_ISA"):
+        assert native.instruction_set() == native.instruction_sets()[0]
+    assert native.instruction_sets()[-1] == "scalar"
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_objects_hold_nothing_that_other_processors_may_run(name):
+    """The linker merges weak symbols, and static initialisers run at load: either would be an illegal instruction."""
+    if shutil.which("nm") is None:
+        pytest.skip("nm is missing")
+    space, kernels = OBJECTS[name]
+    objects = sorted(ROOT.glob(f"build/**/{name}.cpp.o"))
+    objects = [file for file in objects if "sanitize" not in file.parts]  # which hold the sanitizer's own functions
+    if not objects:
+        pytest.skip(f"there is no object of {name}.cpp in build/")
+    for built in objects:
+        lines = subprocess.run(["nm", "-C", built], capture_output=True, text=True, check=True).stdout.splitlines()
+        symbols = [line[17:].split(" ", 1) for line in lines]  # after the address
+        defined = [text for kind, text in symbols if kind not in "Ur"]
+        assert space + kernels in defined
+        assert [text for text in defined if space not in text] == []
+        assert not any("_GLOBAL__sub_I" in text or "std::" in text for text in defined)
+        sections = subprocess.run(["nm", "-a", built], capture_output=True, text=True, check=True).stdout
+        assert ".init_array" not in sections

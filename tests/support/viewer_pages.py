@@ -1,0 +1,114 @@
+"""Nerfstudio's viewer in a browser: a server of it, and what its page shows."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+from browser import Page
+from PIL import Image
+from places import ROOT
+from run_folders import CLASSES
+
+from beags_plugin.labels.colors import colorize
+from beags_plugin.system.child_processes import bound
+
+WIDTH, HEIGHT = 640, 400
+MAX_RESOLUTION = 512  # pixels of the longer side, the default of the viewer
+COLORS = {name: colorize(np.array([[index]]))[0, 0].astype(int) for index, name in CLASSES.items()}
+ENTRY = "from nerfstudio.scripts.viewer.run_viewer import entrypoint; entrypoint()"  # what ns-viewer runs
+
+
+def free_port() -> int:
+    """One that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@contextmanager
+def started(command: list[object], log: Path, ready: str) -> Iterator[subprocess.Popen]:
+    """Python with this checkout's package and these arguments, once it has printed ``ready``; ends it.
+
+    log: the file that it prints to, which must hold no traceback at the end.
+    """
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path[1:]])}
+    with open(log, "wb") as out:
+        words = bound([sys.executable, *command], signal.SIGKILL)
+        process = subprocess.Popen(words, stdout=out, stderr=subprocess.STDOUT, env=environment)
+    try:
+        end = time.monotonic() + 300
+        while ready not in log.read_text():
+            assert process.poll() is None and time.monotonic() < end, log.read_text()[-3000:]
+            time.sleep(0.2)
+        yield process
+        process.terminate()
+        process.wait(120)
+    finally:
+        process.kill()  # where the test failed, or it did not end
+        process.wait()
+    assert "Traceback" not in log.read_text()
+
+
+@contextmanager
+def viewed(config: Path, log: Path) -> Iterator[str]:
+    """The address of ns-viewer of a run."""
+    port = free_port()
+    options = ("--load-config", config, "--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", port)
+    with started(["-c", ENTRY, *options], log, "disabled local writer"):  # the last that it prints
+        yield f"http://127.0.0.1:{port}"
+
+
+def picture(page: Page) -> np.ndarray:
+    """What is left of the panel and below the title, without the cross of axes in the corner; [H, W, 3] int."""
+    pixels = np.asarray(Image.open(BytesIO(page.picture())).convert("RGB"))
+    return pixels[60:340, :310].astype(int)
+
+
+def differing(one: np.ndarray, other: np.ndarray) -> float:
+    """Share of the pixels that differ by more than what JPEG does to them."""
+    return float((np.abs(one - other).max(axis=2) > 40).mean())
+
+
+def varied(pixels: np.ndarray) -> float:
+    """How much a picture varies over its pixels; 0 for one colour."""
+    return float(pixels.reshape(-1, 3).std(axis=0).max())
+
+
+def painted(pixels: np.ndarray, name: str) -> float:
+    """Share of the pixels that have the colour of a class."""
+    return float((np.abs(pixels - np.array(COLORS[name])).max(axis=2) < 30).mean())
+
+
+def sharp(page: Page) -> bool:
+    """Whether the picture is of the full resolution: coarse ones, of which the panel tells too, come before it."""
+    found = re.search(r"Resolution: (\d+)x(\d+)px", page.text())
+    return found is not None and max(int(found[1]), int(found[2])) == MAX_RESOLUTION
+
+
+def awaited(page: Page, true, press: str | None = None) -> np.ndarray:
+    """The picture, once it is as asked for and stays so.
+
+    press: the button that makes it so; pressed again after a while, as a panel that is put together anew hears nothing.
+    """
+    found, looks = [picture(page)], count()
+
+    def holds() -> bool:
+        if press is not None and next(looks) % 40 == 0:
+            page.press(press)
+        found.append(picture(page))
+        return differing(*found[-2:]) == 0.0 and true(found[-1]) and sharp(page)
+
+    page.wait(holds)
+    return found[-1]
