@@ -13,6 +13,19 @@ from beags_plugin.plugin.options.config import BeagsTrainerConfig, base_config
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.shipped import read_toml, shipped_folder
 
+FIRST_OPTIONS = """
+The options that people set first, by what they are about:
+  data     --data FOLDER; at the end of the command: beags-data --masks-path FOLDER --downscale-factor 2
+  start    --load-dir RUN/nerfstudio_models, or --pipeline.model.start-from SCENE.ply
+  length   --pipeline.model.base-steps 30000, --pipeline.model.refine-steps 3000
+  size     --pipeline.model.densify.max-surfels 200000
+  method   --pipeline.model.refiner bea, --pipeline.model.prepare.reprojection auto
+  output   --run-dir FOLDER, --vis viewer+tensorboard
+
+All options follow; docs/training.md describes the method's own.
+"""
+"""Stands above the help of ``ns-train beags``; tyro can hide no option without refusing it."""
+
 
 def preset_folder() -> Path:
     """Where the preset files lie."""
@@ -38,7 +51,8 @@ def load_preset(name: str, folder: Path | None = None) -> MethodSpecification:
     config.method_name = name
     for key, value in content.get("overrides", {}).items():
         override(config, key, value, path)
-    return MethodSpecification(config=config, description=content["description"])
+    description = content["description"] + ("\n" + FIRST_OPTIONS if name == "beags" else "")
+    return MethodSpecification(config=config, description=description)
 
 
 def preset_config(name: str, overrides: Mapping[str, Any], source: Path) -> BeagsTrainerConfig:

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
-import tyro
 import yaml
 from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from tyro.conf import Suppress
 
 from beags_plugin.plugin.options.loss_spec import LossSpec
 from beags_plugin.plugin.options.machine import check_machine, default_device
@@ -62,7 +62,7 @@ class BeagsTrainerConfig(TrainerConfig):
     """Once Gaussians have classes: measure extracted masks on four held-out views and draw every object alone, for
     tensorboard or wandb, every so many steps, and first and last; 0: never."""
 
-    run_format: tyro.conf.Suppress[int] = RUN_FORMAT
+    run_format: Suppress[int] = RUN_FORMAT
     """Version of the files of a run that is trained with this config."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -153,7 +153,7 @@ def base_config() -> BeagsTrainerConfig:
             ),
             model=BeagsModelConfig(
                 losses={
-                    "photometric": LossSpec(options={"ssim_weight": 0.2}),
+                    "photometric": LossSpec(),
                     "distortion": LossSpec(weight=0.0, start=3_000),
                     "normal": LossSpec(weight=0.05, start=7_000),
                     "boundary": LossSpec(weight=0.5, phase="refine"),

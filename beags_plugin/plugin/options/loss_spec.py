@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import Literal, get_args
 
+from tyro.conf import Suppress
+
 from beags_plugin.losses import LOSSES
 from beags_plugin.losses.base import Loss
 from beags_plugin.plugin.options.schedule import PhaseSchedule
@@ -16,13 +18,13 @@ Phase = Literal["base", "refine", "both"]
 
 @dataclass
 class LossSpec:
-    """One term of the training loss, as a config lists it."""
+    """One term of the training loss, as a config lists it; presets alone set ``phase`` and ``start``."""
 
     weight: float = 1.0
     """Factor in the sum; 0 switches the term off."""
-    phase: Phase = "both"
+    phase: Suppress[Phase] = "both"
     """Where the term may act."""
-    start: int = 0
+    start: Suppress[int] = 0
     """First step of the term: of the run, stated for a base of schedule_steps; or, for phase "refine", of the
     refinement, as it is."""
     options: dict[str, bool | int | float] = field(default_factory=dict)

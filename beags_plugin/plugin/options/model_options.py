@@ -10,6 +10,7 @@ from typing import Literal
 import torch
 from nerfstudio.models.base_model import ModelConfig
 from torch import Tensor
+from tyro.conf import Suppress
 
 from beags_plugin.core.densification import DensifyConfig
 from beags_plugin.core.sh import MAX_DEGREE
@@ -30,7 +31,7 @@ class BeagsModelConfig(ModelConfig):
     """Backend: auto, native, torch, cuda (docs/cuda.md), or one that another package registers."""
     sh_degree: int = 3
     """Highest degree of the colour's spherical harmonics (0..3)."""
-    sh_degree_interval: int = 1000
+    sh_degree_interval: Suppress[int] = 1000
     """A degree is added every so many steps."""
     background_color: Literal["black", "white", "random"] = "black"
     """Background behind the scene, and behind images with alpha; "random" draws one per training step, and is black
@@ -48,7 +49,7 @@ class BeagsModelConfig(ModelConfig):
     refine_rounds: int = 1
     """How often masks, classes and voxel grids are made, at even distances of refinement: each round starts again from
     the masks of the data, with the depth of the scene as it then is. 1, as in the paper: before refinement alone."""
-    schedule_steps: int = 30_000
+    schedule_steps: Suppress[int] = 30_000
     """Length of base training for which all other steps and intervals of the base are stated; with another base_steps
     they are scaled in proportion. 0: they are taken as they are."""
     refiner: str = "bea"
@@ -61,13 +62,13 @@ class BeagsModelConfig(ModelConfig):
     """Options of mask reprojection and of the voxel grids."""
     split: BorderSplitConfig = field(default_factory=BorderSplitConfig)
     """Which Gaussians at class borders are split before refinement; none unless rounds is 1 or more."""
-    position_lr: tuple[float, float] = (1.6e-4, 1.6e-6)
+    position_lr: Suppress[tuple[float, float]] = (1.6e-4, 1.6e-6)
     """First and last learning rate of the positions, log-linear, times the scene's extent."""
     refine_position_lr_factor: float = 1.0
     """Factor of the positions' learning rate while refining; 1, as in the paper, is the end of the base schedule."""
-    near: float = 0.01
+    near: Suppress[float] = 0.01
     """Near plane in units of the scene's extent."""
-    far: float = 100.0
+    far: Suppress[float] = 100.0
     """Far plane in units of the scene's extent."""
 
     def check(self) -> None:

@@ -19,6 +19,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import track
 from torch import Tensor
+from tyro.conf import Suppress
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE, objects_in
@@ -39,6 +40,7 @@ from beags_plugin.plugin.views.views import View, unique_names
 from beags_plugin.system import processes
 from beags_plugin.system.errors import UserError
 
+READ_AHEAD = 8  # streamed images that are read before their use
 OWN_KEYS = ("class_map", "alpha")
 
 
@@ -51,10 +53,8 @@ class BeagsDataManagerConfig(FullImageDatamanagerConfig):
     stream: Literal["auto", "always", "never"] = "auto"
     """Whether images are read from disk when they are needed instead of being kept in memory; auto: if the images of a
     split would take more than stream_above_gb. Training gives the same, bit for bit."""
-    stream_above_gb: float = 0.5
+    stream_above_gb: Suppress[float] = 0.5
     """GB (10^9 bytes) that the images of a split may take in memory before they are streamed."""
-    stream_ahead: int = 8
-    """How many streamed images are read before their use."""
 
     def __setattr__(self, name: str, value: object) -> None:
         """Keep ``data`` absolute, so that a saved config.yml works from any folder."""
@@ -98,7 +98,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
                 highlight=False,
             )
             workers = self.config.max_thread_workers or min(4, os.cpu_count() or 1)
-            return StreamedViews(load, len(dataset), self.config.stream_ahead, workers)
+            return StreamedViews(load, len(dataset), READ_AHEAD, workers)
         with ThreadPoolExecutor(max_workers=self.config.max_thread_workers or 2) as pool:
             found = pool.map(load, range(len(dataset)))
             cache = list(track(found, f"Reading {split} images", total=len(dataset), transient=True))

@@ -15,6 +15,7 @@ import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
+from tyro.conf import Suppress
 
 from beags_plugin.data.files import check_same_size, files_of_views, image_size
 from beags_plugin.data.ground_truth import find_ground_truth, of_views
@@ -47,7 +48,7 @@ class BeagsDataParserConfig(DataParserConfig):
     """Folder of the id images <stem>.png, if not the layout's own, mostly "masks"; some or all may be missing."""
     classes_path: Path = Path("classes.json")
     """File {"id": "name"} of the classes; without it they are called class_<id>."""
-    ground_truth_path: Path = Path("ground_truth")
+    ground_truth_path: Suppress[Path] = Path("ground_truth")
     """Folder with exact masks for evaluation: masks/<stem>.png, visible/<object>/<stem>.png,
     silhouettes/<object>/<stem>.png; may be missing."""
     ignore_ids: tuple[int, ...] = ()
@@ -61,15 +62,15 @@ class BeagsDataParserConfig(DataParserConfig):
     """Stems of images to hold out for evaluation besides."""
     orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
     """How the world is turned."""
-    center_method: Literal["poses", "focus", "none"] = "poses"
+    center_method: Suppress[Literal["poses", "focus", "none"]] = "poses"
     """How the world is centred."""
-    auto_scale_poses: bool = True
+    auto_scale_poses: Suppress[bool] = True
     """Scale the world so that the cameras fit in +/- 1."""
-    scale_factor: float = 1.0
+    scale_factor: Suppress[float] = 1.0
     """Scale the world by this besides."""
-    scene_scale: float = 1.0
+    scene_scale: Suppress[float] = 1.0
     """Half the side of the scene box."""
-    num_random_points: int = 50_000
+    num_random_points: Suppress[int] = 50_000
     """Number of points to start from where the data brings none."""
 
     def check(self) -> None:
