@@ -56,7 +56,7 @@ def _results(
     camera, settings = scene.camera, scene.settings
     yield "contributions", [rasterizer.class_contributions(plain, camera, settings, scene.target, CLASSES)]
     yield "class map", list(rasterizer.class_map(plain, camera, settings, CLASSES))
-    yield "heaviest", [rasterizer.heaviest(plain, camera, settings)]
+    yield "dominant_gaussian", [rasterizer.dominant_gaussian(plain, camera, settings)]
     dc, rest = (value.to(dtype).requires_grad_() for value in (scene.surfels.sh_dc, scene.surfels.sh_rest))
     for degree in DEGREES:
         colors = sh_colors(dc, rest, inputs.means, torch.zeros(3, dtype=dtype), degree)

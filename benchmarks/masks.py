@@ -74,8 +74,8 @@ def swaps(data: Path) -> None:
 def rims(data: Path) -> None:
     """IoU and BIoU of ragged and of snapped masks, mean over objects and views."""
     from beags_plugin.evaluation.metrics import mask_metrics, mean_metrics
-    from beags_plugin.labels.classes import read_class_map
-    from beags_plugin.masks.rims import snap_to_edges
+    from beags_plugin.labels.classes import read_id_mask
+    from beags_plugin.masks.snapping import snap_to_edges
     from beags_plugin.sample.degrade import rim_amplitude, roughen_rims
 
     folder = data / "ground_truth/masks" if (data / "ground_truth/masks").is_dir() else data / "masks"
@@ -85,7 +85,7 @@ def rims(data: Path) -> None:
     for strength in RAGGED:
         rows: dict[str, list] = {name: [] for name in ("ragged", *(f"snapped, radius {r}" for r in RADII))}
         for path in files:
-            exact, photo = read_class_map(path), read_photo(photos[path.stem])
+            exact, photo = read_id_mask(path), read_photo(photos[path.stem])
             ragged = roughen_rims(exact, rim_amplitude(strength, *exact.shape), 0, path.stem)
             variants = {"ragged": ragged} | {f"snapped, radius {r}": snap_to_edges(ragged, photo, r) for r in RADII}
             for name, mask in variants.items():

@@ -25,7 +25,7 @@ def measure(reprojection: str, views: int) -> None:
     from beags_plugin.labels.label_maps import LabelMaps
     from beags_plugin.preparation.pipeline import Preparation, PreparationConfig, prepare
     from beags_plugin.rasterizers import make_rasterizer
-    from beags_plugin.rasterizers.rendering import draw_class_map
+    from beags_plugin.rasterizers.rendering import render_class_map
     from beags_plugin.refiners import REFINERS
     from beags_plugin.system.memory import peak_memory_mb
     from benchmarks.peak_memory import peak_mb_of
@@ -37,7 +37,7 @@ def measure(reprojection: str, views: int) -> None:
     cameras = [Camera(camera.viewmat, K, WIDTH, HEIGHT) for camera in scene.cameras]
 
     def mask(view: int) -> torch.Tensor:
-        exact, _ = draw_class_map(rasterizer, scene.surfels, scene.class_ids, cameras[view], SETTINGS)
+        exact, _ = render_class_map(rasterizer, scene.surfels, scene.class_ids, cameras[view], SETTINGS)
         return exact.roll((view % 7 - 3, view % 5 - 2), (0, 1))
 
     labels = LabelMaps(mask(view) for view in range(views))

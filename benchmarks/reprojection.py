@@ -136,8 +136,8 @@ def plain(options: Any) -> dict[str, Any]:
 
 def load_views(options: Options, views: int) -> Scene:
     """The sample with so many training views, and its depth as a base trained on it shows it."""
-    from beags_plugin.labels.classes import read_class_map
-    from beags_plugin.plugin.runs.read import raster_settings, read_scene, read_transform
+    from beags_plugin.labels.classes import read_id_mask
+    from beags_plugin.plugin.runs.read import raster_settings, read_run, read_transform
     from beags_plugin.rasterizers import make_rasterizer
     from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
     from beags_plugin.sample.writer import make_sample
@@ -147,11 +147,11 @@ def load_views(options: Options, views: int) -> Scene:
     data = options.output / "scenes" / name
     make_sample(data, options.seed, options.width, options.height, "mild", views)
     config = trained_base(data, options.output / "bases" / f"{name}-{options.preset}", options.preset)
-    scene = read_scene(config)
+    scene = read_run(config)
     manager = scene.config.data_config.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
     found = manager.views("train")
     truth = manager.train_dataset.metadata["ground_truth"]
-    exact = [torch.from_numpy(read_class_map(path).astype(np.int32)) for path in truth["masks"]]
+    exact = [torch.from_numpy(read_id_mask(path).astype(np.int32)) for path in truth["masks"]]
     transform = read_transform(config.parent)
     factor = 1.0 if transform is None else transform[1]  # from the sample's units to those of the run
     of_sample = [torch.from_numpy(factor * load_array(data / f"ground_truth/depth/{view.name}.npy")) for view in found]

@@ -60,7 +60,7 @@ def take_batches(root: Path, stream: str) -> None:
         asked = time.perf_counter()
         camera, batch = manager.next_train(step)
         waits.append(time.perf_counter() - asked)
-        for part in (batch["image"], batch["class_map"], camera.get_intrinsics_matrices()):
+        for part in (batch["image"], batch["labels"], camera.get_intrinsics_matrices()):
             digest.update(part.numpy().tobytes())
         until = time.thread_time() + WORK_SECONDS
         while time.thread_time() < until:

@@ -32,7 +32,7 @@ def write_data(root: Path, views: int) -> None:
     from beags_plugin.core.cameras import Camera
     from beags_plugin.extraction.ply import write_ply
     from beags_plugin.rasterizers import make_rasterizer
-    from beags_plugin.rasterizers.rendering import draw_class_map, surfel_inputs
+    from beags_plugin.rasterizers.rendering import render_class_map, surfel_inputs
     from benchmarks.scaling_scene import SETTINGS, Sizes, make_scene
 
     rasterizer = make_rasterizer("auto")
@@ -46,7 +46,7 @@ def write_data(root: Path, views: int) -> None:
         with torch.no_grad():
             inputs = surfel_inputs(scene.surfels, camera)
             color = rasterizer.rasterize(inputs, camera, SETTINGS, torch.zeros(3)).color.clamp(0, 1)
-            ids, _ = draw_class_map(rasterizer, scene.surfels, scene.class_ids, camera, SETTINGS)
+            ids, _ = render_class_map(rasterizer, scene.surfels, scene.class_ids, camera, SETTINGS)
         ids = ids.roll((view % 7 - 3, view % 5 - 2), (0, 1))
         photo = (255 * color).round().to(torch.uint8).numpy()[..., ::-1]
         cv2.imwrite(str(root / f"data/images/{name}.jpg"), photo, [cv2.IMWRITE_JPEG_QUALITY, 92])
@@ -81,7 +81,7 @@ def main(views: int, flags: list[str]) -> None:
         print(f"by the end of the preparation {stages['peak_memory_mb']:.0f} MB")
         print("seconds of the preparation:", {name: round(value) for name, value in stages["seconds"].items()})
         print("seconds of the run:", {name: round(value) for name, value in report["seconds"].items()})
-        print("found:", *stages["findings"], sep="\n  ")
+        print("found:", *stages["summary"], sep="\n  ")
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from beags_plugin.extraction.select import select_class
 from beags_plugin.labels.class_ids import resize_nearest
 from beags_plugin.pictures.cells import GAP, below, beside, cell, write_picture
 from beags_plugin.pictures.contact_sheet import mask_overlay
-from beags_plugin.pictures.objects import draw_alone
+from beags_plugin.pictures.objects import render_alone
 from beags_plugin.pictures.orbit import orbit, orbit_settings, stand_of
 from beags_plugin.plugin.objects.evaluate import EvaluatedRun
 from beags_plugin.plugin.runs.read import training_viewpoints
@@ -62,7 +62,7 @@ class Picture:
             lines.append(
                 [
                     cell(
-                        draw_alone(part, camera, settings, run.rasterizer, "checker"),
+                        render_alone(part, camera, settings, run.rasterizer, "checker"),
                         (self.height, self.height),
                         f"{name}, {caption}",
                     )

@@ -18,7 +18,7 @@ from beags_plugin.rasterizers import RASTERIZERS
 def pytest_sessionstart(session):
     """`make test` builds the extension first: there its tests must run, not be skipped."""
     if os.environ.get("BEAGS_REQUIRE_NATIVE") and extension.load() is None:
-        pytest.exit(f"BEAGS_REQUIRE_NATIVE is set, but {extension.found()[1]}", returncode=1)
+        pytest.exit(f"BEAGS_REQUIRE_NATIVE is set, but {extension.status()[1]}", returncode=1)
 
 
 @pytest.hookimpl(tryfirst=True)

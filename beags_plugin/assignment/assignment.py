@@ -56,7 +56,7 @@ def assign_classes(
     settings = replace(settings, geometry=False, distortion=False)
     inputs = geometry_inputs(surfels)
     # float64: thousands of small weights of many views are added up. A table of all classes would be mostly zeros.
-    total = SparseSums() if extension.can_take(surfels.means) else TorchSparseSums(surfels.means.device)
+    total = SparseSums() if extension.supports(surfels.means) else TorchSparseSums(surfels.means.device)
 
     def contributions(index: int) -> tuple[Tensor, Tensor]:
         camera, mask = cameras[index], labels[index]
@@ -64,7 +64,7 @@ def assign_classes(
             return inputs.means.new_zeros(0, dtype=torch.int64), inputs.means.new_zeros(0)
         check_class_ids(mask, index, num_classes)
         with torch.no_grad():
-            return rasterizer.contributing_classes(inputs, camera, settings, mask, num_classes)
+            return rasterizer.sparse_class_contributions(inputs, camera, settings, mask, num_classes)
 
     if len(cameras) != len(labels):
         raise ValueError(f"{len(cameras)} cameras and {len(labels)} masks do not belong together")

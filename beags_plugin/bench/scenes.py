@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.labels.classes import read_mask, write_class_map
+from beags_plugin.labels.classes import read_mask, write_mask
 from beags_plugin.system.digests import folder_digest, value_digest
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.progress import progress_bar
@@ -97,14 +97,14 @@ def damaged_masks(scene: Scene, degree: float, folder: Path) -> Path:
                 labels = np.append(classes, IGNORE)[ranks]
             path = target / _below(image, scene.data / "images").with_suffix(".png")
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_class_map(path, labels.astype(np.uint16))
+            write_mask(path, labels.astype(np.uint16))
     (target / "complete").touch()
     return target
 
 
 def _best_masks(metadata: dict[str, Any], split: str) -> list[tuple[Path | None, str]]:
     """Per view its exact mask, in training views only; else the one it has. With each, what kind it is."""
-    given: list[Path | None] = metadata["class_map_filenames"]
+    given: list[Path | None] = metadata["mask_filenames"]
     truth = metadata["ground_truth"]
     exact = truth["masks"] if truth and split == "train" else [None] * len(given)
     kind: str = metadata["mask_kind"]

@@ -86,7 +86,7 @@ def run(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
 
     {"steps", "gaussians", "seconds": {stage: s}, "cpu_seconds", "peak_memory_mb", "own_memory_mb" (of the peak, what
     the loaded program does not take)}; of a refinement also what
-    ``measure.measure_run`` gives, "findings" (a line per stage), "voxel_size" and "training_pixels".
+    ``measure.measure_run`` gives, "summary" (a line per stage), "voxel_size" and "training_pixels".
     """
     from beags_plugin.plugin.runs.launch import train
     from beags_plugin.system.memory import peak_memory_mb
@@ -105,7 +105,7 @@ def run(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
     del result["seconds"]["base training"]  # that of loading one
     prepared = run_folder / "prepared"
     result["gaussians"] = _gaussians(config)
-    result["findings"] = json.loads((prepared / "report.json").read_text())["findings"]
+    result["summary"] = json.loads((prepared / "report.json").read_text())["summary"]
     result["voxel_size"] = _voxel_size(prepared / "grid.pt")
     result["training_pixels"] = _pixels(prepared / "masks")
     return {**result, **measure_run(run_folder / "config.yml")}

@@ -34,7 +34,7 @@ def run_demo(
     data: Path | None, output: Path | None, preset: str, downscale: float | None, seed: int, fresh: bool
 ) -> None:
     """Do the whole job in ``output`` and print the table; see ``cli.Demo`` for the arguments."""
-    from beags_plugin.data.layout import read_scene
+    from beags_plugin.data.layout import read_dataset
     from beags_plugin.data.quick import quick_downscale
     from beags_plugin.sample.writer import make_sample
 
@@ -51,7 +51,7 @@ def run_demo(
     elif not data.is_dir():
         raise UserError(f"{data} is no folder: name one with images, poses and masks.")
     else:
-        read_scene(data)  # which says what is missing, before a training is started
+        read_dataset(data)  # which says what is missing, before a training is started
         output = output or Path("outputs") / data.resolve().name
         downscale = downscale or quick_downscale(data)
     run = output / "run"

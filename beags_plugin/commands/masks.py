@@ -52,12 +52,12 @@ class Check:
         parser = options_beside(self.load_config, self.data, **{name: getattr(self, name) for name in names})
         report = check_scene(parser, self.min_views)
         run = None
-        readable = not any(finding.level == "error" for finding in report.findings)
+        readable = not any(issue.level == "error" for issue in report.issues)
         if self.load_config is not None and readable:
             run = reproject_run(self.load_config, ReprojectionOptions(method="voxel", run_size=True, parser=parser))
             report = check_with_run(report, run)
-        for finding in report.findings:
-            CONSOLE.print(f"{finding.level}: {finding.message}\n    costs: {finding.cost}")
+        for issue in report.issues:
+            CONSOLE.print(f"{issue.level}: {issue.message}\n    costs: {issue.cost}")
         CONSOLE.print(report.summary())
         for path in write_report(report, self.output, run):
             CONSOLE.print(f"  {path}")

@@ -64,7 +64,7 @@ def sh_colors(sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_center: Tens
     sh_dc: [N, 3], band 0. sh_rest: [N, K, 3], the others, K >= (degree + 1)^2 - 1. means: [N, 3] world.
     camera_center: [3] world, on any device. Returns [N, 3]. Computed by the compiled op where it can be.
     """
-    compiles = extension.can_take(sh_dc, sh_rest, means, camera_center)
+    compiles = extension.supports(sh_dc, sh_rest, means, camera_center)
     compiles = compiles or cuda_extension.module_for(sh_dc, sh_rest, means) is not None
     if compiles and not camera_center.requires_grad:
         return compiled.sh_colors(sh_dc, sh_rest, means, camera_center, degree)

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypedDict
 
+from beags_plugin.data.dataset import Dataset, FilesOfObject
 from beags_plugin.data.files import files_of_views
-from beags_plugin.data.scene import FilesOfObject, Scene
 
 FilesPerView = list[Path | None]
 
@@ -39,7 +39,7 @@ def of_views(truth: GroundTruth, chosen: Sequence[int]) -> GroundTruth:
     )
 
 
-def find_ground_truth(folder: Path, scene: Scene, images: Sequence[Path], images_root: Path) -> GroundTruth | None:
+def find_ground_truth(folder: Path, scene: Dataset, images: Sequence[Path], images_root: Path) -> GroundTruth | None:
     """The ground truth in ``folder`` with what the layout brings; None where there is neither.
 
     In ``folder``: masks/<stem>.png, and <kind>/<object>/<stem>.png for visible, silhouettes and seen.

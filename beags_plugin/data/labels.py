@@ -46,7 +46,7 @@ def read_class_names(
 
 def ids_in_mask(mask: Path, ignore_ids: Sequence[int]) -> set[int]:
     """The class ids of an id image, without IGNORE."""
-    from beags_plugin.labels.classes import read_class_map
+    from beags_plugin.labels.classes import read_id_mask
 
-    counts = np.bincount(read_class_map(mask, ignore_ids).ravel(), minlength=IGNORE + 1)
+    counts = np.bincount(read_id_mask(mask, ignore_ids).ravel(), minlength=IGNORE + 1)
     return {int(i) for i in np.flatnonzero(counts) if i != IGNORE}

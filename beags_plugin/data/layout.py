@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from beags_plugin.data import LAYOUTS
-from beags_plugin.data.scene import Scene
+from beags_plugin.data.dataset import Dataset
 from beags_plugin.system.errors import UserError
 
 
@@ -34,14 +34,14 @@ class Layout(ABC):
         return self.missing(root) is None
 
     @abstractmethod
-    def read(self, root: Path, images: Path | None) -> Scene:
+    def read(self, root: Path, images: Path | None) -> Dataset:
         """The scene in ``root``, which lacks nothing.
 
         images: the folder of the images that the user chose, absolute, or None. Raises ``UserError``.
         """
 
 
-def read_scene(data: Path, layout: str = "auto", images: Path | None = None) -> Scene:
+def read_dataset(data: Path, layout: str = "auto", images: Path | None = None) -> Dataset:
     """The scene in ``data``, a folder or a transforms .json; arguments as of ``find_layout`` and ``Layout.read``."""
     found = find_layout(data, layout)
     root = data if data.is_dir() else data.parent

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from beags_plugin.data.dataset import PoseTable
 from beags_plugin.data.files import list_images
 from beags_plugin.data.layouts.colmap import points_file
-from beags_plugin.data.scene import PoseTable
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.arrays import load_array
 from beags_plugin.system.reading.text import reason

@@ -6,9 +6,9 @@ import contextlib
 import json
 from pathlib import Path
 
+from beags_plugin.data.dataset import ColmapModel, PoseTable
 from beags_plugin.data.files import image_size
-from beags_plugin.data.layout import read_scene
-from beags_plugin.data.scene import ColmapModel, PoseTable
+from beags_plugin.data.layout import read_dataset
 from beags_plugin.system.errors import UserError
 
 QUICK_PIXELS = 50_000
@@ -31,7 +31,7 @@ def _images(data: Path) -> list[Path]:
     """The images that the layout of ``data`` takes, or where it is not known, those in images/."""
     folder, pattern = data, "images*/**/*"
     with contextlib.suppress(UserError):  # the data parser names what is missing
-        poses = read_scene(data).poses
+        poses = read_dataset(data).poses
         if isinstance(poses, PoseTable):
             return list(poses.images)
         if isinstance(poses, ColmapModel):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from beags_plugin.data.scene import Split
+from beags_plugin.data.dataset import Split
 from beags_plugin.system.errors import UserError
 
 

@@ -17,12 +17,12 @@ from beags_plugin.system.errors import UserError
 
 
 class NothingToExport(UserError):
-    """A piece has nothing of what a format holds; with --all the other pieces are written all the same."""
+    """A item has nothing of what a format holds; with --all the other items are written all the same."""
 
 
 @dataclass(frozen=True)
 class Viewpoints:
-    """Where the photos were taken, and what draws the piece from there; all in the frame of the file."""
+    """Where the photos were taken, and what draws the item from there; all in the frame of the file."""
 
     cameras: Sequence[Camera]
     rasterizer: Rasterizer
@@ -30,13 +30,13 @@ class Viewpoints:
 
 
 @dataclass(frozen=True)
-class Piece:
+class ExportItem:
     """What is exported: an object, or the background; all of it in the frame of the file.
 
     name: as the user calls it. surfels: N surfels. class_ids: [N] int32, phi.
     views: of the training photos; None unless an exporter ``needs_views``.
-    shared: what exporters of one piece keep for each other, such as the mesh that two file types hold.
-    drew: is told, by an exporter that ``needs_views``, how many of them it has drawn so far.
+    shared: what exporters of one item keep for each other, such as the mesh that two file types hold.
+    on_render: is told, by an exporter that ``needs_views``, how many of them it has drawn so far.
     """
 
     name: str
@@ -44,13 +44,13 @@ class Piece:
     class_ids: Tensor
     views: Viewpoints | None = None
     shared: dict[Any, Any] = field(default_factory=dict)
-    drew: Callable[[int], None] = lambda done: None
+    on_render: Callable[[int], None] = lambda done: None
 
 
 class Exporter(ABC):
     """One file format. Subclasses are frozen dataclasses; their own fields, all with defaults, are their options.
 
-    suffix: how the files' names end. needs_views: whether it draws the piece from the views of the training photos.
+    suffix: how the files' names end. needs_views: whether it draws the item from the views of the training photos.
     """
 
     suffix: ClassVar[str]
@@ -62,10 +62,10 @@ class Exporter(ABC):
         return None
 
     @abstractmethod
-    def write(self, path: Path, piece: Piece) -> dict[str, Any]:
-        """Write ``piece`` to ``path``; returns what the manifest says of the file (plain values by name).
+    def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
+        """Write ``item`` to ``path``; returns what the manifest says of the file (plain values by name).
 
-        Raises ``UserError`` if the file cannot be written, ``NothingToExport`` if the piece has nothing for it.
+        Raises ``UserError`` if the file cannot be written, ``NothingToExport`` if the item has nothing for it.
         """
 
 

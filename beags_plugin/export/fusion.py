@@ -72,15 +72,15 @@ def fuse(
     truncation: float,
     memory_mb: float,
     min_views: int,
-    drew: Callable[[int], None] = lambda done: None,
+    on_render: Callable[[int], None] = lambda done: None,
 ) -> Mesh:
     """The surface that at least ``min_views`` of the views show of an object drawn alone.
 
-    surfels: N surfels, in the frame of the views. resolution: voxels along the longest side of their box; the drawings
+    surfels: N surfels, in the frame of the views. resolution: voxels along the longest side of their box; the renders
     are close-ups of the box, ``PIXELS_PER_VOXEL`` times as many pixels long. truncation: voxels on either side of the
-    surface that a view changes. memory_mb: bound of the grid, 10^6 bytes. drew: is told after each view how many are
-    done. Returns a mesh, maybe of no face, its vertices and faces in an order that does not depend on the number of
-    threads.
+    surface that a view changes. memory_mb: bound of the grid, 10^6 bytes. on_render: takes the number of views done,
+    after each. Returns a mesh, maybe of no face, its vertices and faces in an order that does not depend on the number
+    of threads.
     """
     low, high = bounding_box(surfels)
     voxel = voxel_size(low, high, resolution, truncation, memory_mb)
@@ -90,7 +90,7 @@ def fuse(
         depth, color = _draw(surfels, close, views, low - truncation * voxel, high + truncation * voxel)
         if bool((depth > 0).any()):
             _integrate(grid, depth / voxel, color, _in_voxels(close, low, voxel), truncation)
-        drew(done)
+        on_render(done)
     weight = min(min_views, len(views.cameras)) - 0.5
     mesh = grid.extract_triangle_mesh(weight_threshold=weight)
     if "positions" not in mesh.vertex or not len(mesh.vertex.positions):

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from beags_plugin.export.base import Exporter, NothingToExport, Piece
+from beags_plugin.export.base import Exporter, ExportItem, NothingToExport
 from beags_plugin.export.fusion import Mesh, fuse, without_small_parts
 from beags_plugin.export.glb import glb_bytes
 from beags_plugin.export.mesh_options import MeshOptions
@@ -17,7 +17,7 @@ from beags_plugin.extraction.files import whole_file
 
 @dataclass(frozen=True)
 class MeshExporter(MeshOptions, Exporter):
-    """The surface that the training views see of a piece drawn alone; both file types hold the same mesh."""
+    """The surface that the training views see of a item drawn alone; both file types hold the same mesh."""
 
     needs_views: ClassVar[bool] = True
 
@@ -29,24 +29,24 @@ class MeshExporter(MeshOptions, Exporter):
             return f"Open3D cannot be loaded ({error}); pip install open3d, which needs libX11 and libGL."
         return None
 
-    def mesh(self, piece: Piece) -> Mesh:
-        """The mesh of ``piece``, made once per piece and options; raises ``NothingToExport`` if no view shows one."""
+    def mesh(self, item: ExportItem) -> Mesh:
+        """The mesh of ``item``, made once per item and options; raises ``NothingToExport`` if no view shows one."""
         key = ("mesh", *astuple(self))
-        if key not in piece.shared:
-            piece.shared[key] = self._mesh(piece)
-        mesh = piece.shared[key]
+        if key not in item.shared:
+            item.shared[key] = self._mesh(item)
+        mesh = item.shared[key]
         if not len(mesh.faces):
             raise NothingToExport(
-                f"no surface of {piece.name!r} is seen in {self.min_views} training views: "
+                f"no surface of {item.name!r} is seen in {self.min_views} training views: "
                 "lower --min-views, or export it as splats."
             )
         return mesh
 
-    def _mesh(self, piece: Piece) -> Mesh:
-        if piece.views is None:
+    def _mesh(self, item: ExportItem) -> Mesh:
+        if item.views is None:
             raise ValueError("a mesh needs the views of the training photos")
         options = self.resolution, self.truncation, self.memory_mb, self.min_views
-        fused = fuse(piece.surfels, piece.views, *options, piece.drew)
+        fused = fuse(item.surfels, item.views, *options, item.on_render)
         return without_small_parts(fused, self.smallest_part)
 
     @staticmethod
@@ -61,10 +61,10 @@ class GlbExporter(MeshExporter):
 
     suffix: ClassVar[str] = "glb"
 
-    def write(self, path: Path, piece: Piece) -> dict[str, Any]:
-        mesh = self.mesh(piece)
+    def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
+        mesh = self.mesh(item)
         with whole_file(path) as part:
-            part.write_bytes(glb_bytes(mesh, piece.name))
+            part.write_bytes(glb_bytes(mesh, item.name))
         return self.facts(mesh)
 
 
@@ -74,8 +74,8 @@ class ObjExporter(MeshExporter):
 
     suffix: ClassVar[str] = "obj"
 
-    def write(self, path: Path, piece: Piece) -> dict[str, Any]:
-        mesh = self.mesh(piece)
+    def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
+        mesh = self.mesh(item)
         with whole_file(path) as part, open(part, "w", encoding="ascii") as file:
             np.savetxt(file, np.concatenate([mesh.vertices, mesh.colors], axis=1), "v %.9g %.9g %.9g %.4f %.4f %.4f")
             np.savetxt(file, mesh.faces + 1, "f %d %d %d")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from beags_plugin.export.base import Exporter, Piece
+from beags_plugin.export.base import Exporter, ExportItem
 from beags_plugin.extraction.ply import write_ply
 
 
@@ -16,8 +16,8 @@ class PlyExporter(Exporter):
 
     suffix: ClassVar[str] = "ply"
 
-    def write(self, path: Path, piece: Piece) -> dict[str, Any]:
-        write_ply(path, piece.surfels, piece.class_ids)
+    def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
+        write_ply(path, item.surfels, item.class_ids)
         return {}
 
 
@@ -27,6 +27,6 @@ class SurfelPlyExporter(Exporter):
 
     suffix: ClassVar[str] = "2dgs.ply"
 
-    def write(self, path: Path, piece: Piece) -> dict[str, Any]:
-        write_ply(path, piece.surfels, piece.class_ids, layout="2dgs")
+    def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
+        write_ply(path, item.surfels, item.class_ids, layout="2dgs")
         return {}

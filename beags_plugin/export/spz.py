@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from beags_plugin.core.surfels import Surfels, opacities
-from beags_plugin.export.base import Exporter, Piece
+from beags_plugin.export.base import Exporter, ExportItem
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.frames import to_input_frame
 from beags_plugin.extraction.ply import THICKNESS
@@ -48,8 +48,8 @@ class SpzExporter(Exporter):
             if not 1 <= getattr(self, name) <= 8:
                 raise UserError(f"{name} is {getattr(self, name)}: it must lie in 1..8.")
 
-    def write(self, path: Path, piece: Piece) -> dict[str, Any]:
-        content, facts = self._content(piece.surfels)
+    def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
+        content, facts = self._content(item.surfels)
         with whole_file(path) as part:
             part.write_bytes(gzip.compress(content, mtime=0))  # the same bytes at any time
         return facts

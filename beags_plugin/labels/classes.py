@@ -17,7 +17,7 @@ _ID_MODES = {"1", "L", "P", "I", "I;16", "I;16L", "I;16B"}  # Pillow's names of 
 _COLOR_MODES = {"RGB", "RGBA", "LA"}
 
 
-def read_class_map(path: Path | str, ignore_ids: Iterable[int] = ()) -> np.ndarray:
+def read_id_mask(path: Path | str, ignore_ids: Iterable[int] = ()) -> np.ndarray:
     """The class ids in an 8-bit grey, 16-bit grey or palette image (a palette's indices, not its colours).
 
     ignore_ids: ids of an 8-bit image that mean "unlabelled", e.g. 255; they become IGNORE.
@@ -31,10 +31,10 @@ def read_class_map(path: Path | str, ignore_ids: Iterable[int] = ()) -> np.ndarr
         )
     if values.min(initial=0) < 0 or values.max(initial=0) > IGNORE:
         raise UserError(f"the mask {path} holds ids outside 0..{IGNORE}: save it as 8-bit or 16-bit grey PNG.")
-    class_map = values.astype(np.uint16)
+    labels = values.astype(np.uint16)
     if mode in {"1", "L", "P"}:
-        class_map[np.isin(class_map, list(ignore_ids))] = IGNORE
-    return class_map
+        labels[np.isin(labels, list(ignore_ids))] = IGNORE
+    return labels
 
 
 def read_binary_mask(path: Path | str) -> np.ndarray:
@@ -56,7 +56,7 @@ def read_binary_mask(path: Path | str) -> np.ndarray:
 
 def read_mask(path: Path | str, kind: str, ignore_ids: Iterable[int] = ()) -> np.ndarray:
     """[H, W] uint16, the class ids in a file of id images ("ids"), or 1 inside and 0 outside of a "binary" mask."""
-    return read_binary_mask(path).astype(np.uint16) if kind == "binary" else read_class_map(path, ignore_ids)
+    return read_binary_mask(path).astype(np.uint16) if kind == "binary" else read_id_mask(path, ignore_ids)
 
 
 def _read_pixels(path: Path | str) -> tuple[str, np.ndarray]:
@@ -72,7 +72,7 @@ def _read_pixels(path: Path | str) -> tuple[str, np.ndarray]:
     return mode, values
 
 
-def write_class_map(path: Path | str, array: np.ndarray) -> None:
+def write_mask(path: Path | str, array: np.ndarray) -> None:
     """Write class ids as a grey PNG: 8 bits if they fit, else 16 (IGNORE needs 16).
 
     array: [H, W] integers in 0..65535. Raises ``UserError`` for another shape, dtype or range.

@@ -9,14 +9,14 @@ import numpy as np
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 
 
-def colorize(class_map: np.ndarray) -> np.ndarray:
+def colorize(labels: np.ndarray) -> np.ndarray:
     """Colours for looking at: an id has the same colour in every image and scene.
 
-    class_map: [H, W] integers. Returns [H, W, 3] uint8 RGB; background is black, IGNORE mid-grey.
+    labels: [H, W] integers. Returns [H, W, 3] uint8 RGB; background is black, IGNORE mid-grey.
     """
-    ids, inverse = np.unique(np.asarray(class_map), return_inverse=True)
+    ids, inverse = np.unique(np.asarray(labels), return_inverse=True)
     colors = np.array([_color(int(class_id)) for class_id in ids], dtype=np.uint8).reshape(-1, 3)
-    return colors[inverse.reshape(np.shape(class_map))]
+    return colors[inverse.reshape(np.shape(labels))]
 
 
 def _color(class_id: int) -> tuple[int, int, int]:

@@ -40,7 +40,7 @@ class NormalConsistencyLoss(Loss):
         render = inputs.render
         if render.depth is None or render.normal is None:
             raise ValueError("the normal loss needs a render with geometry")
-        if cuda_extension.can_take(render.depth, render.normal, render.alpha):
+        if cuda_extension.supports(render.depth, render.normal, render.alpha):
             return normal_consistency(render.depth, render.normal, render.alpha, inputs.camera.host.K, weight)
         slope, known = depth_normals(render.depth, inputs.camera)
         error = 1.0 - (render.normal[1:-1, 1:-1] * slope).sum(-1)

@@ -60,7 +60,7 @@ class OccupancyLoss(Loss):
         num_samples = int(self.samples)
         parameters = (surfels.means, surfels.quats, surfels.log_scales, surfels.opacity_logits)
         lookup = grid.lookup()
-        compiled = cuda_extension.can_take(*parameters)
+        compiled = cuda_extension.supports(*parameters)
         if lookup is not None and compiled:
             stream = sample_stream(inputs.seed, inputs.step)
             ids = class_ids.int()

@@ -59,7 +59,7 @@ def ssim(image: Tensor, reference: Tensor) -> Tensor:
 
 def _compiled_takes(image: Tensor, reference: Tensor) -> bool:
     same = image.ndim == 3 and image.shape == reference.shape and image.shape[2] == 3 and image.numel() > 0
-    return same and not reference.requires_grad and cuda_extension.can_take(image, reference)
+    return same and not reference.requires_grad and cuda_extension.supports(image, reference)
 
 
 class _Ssim(torch.autograd.Function):

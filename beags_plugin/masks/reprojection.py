@@ -11,7 +11,7 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.labels.label_maps import LabelMaps, widened
+from beags_plugin.labels.label_maps import LabelMaps, to_int32
 from beags_plugin.ops import cuda_extension, extension
 from beags_plugin.ops.reprojection_votes import reprojection_votes
 from beags_plugin.system import processes
@@ -59,7 +59,7 @@ def reproject_pairwise(
         return
     depths = list(depths)  # every view is projected into every other
     maps, held = PixelMaps(cameras), _held(labels)
-    compiled = cuda_extension.can_take(*depths)
+    compiled = cuda_extension.supports(*depths)
     size = max(camera.height * camera.width for camera in cameras) * num_classes
     dense = compiled and size <= _DENSE_COUNTERS
     # as many views at a time as there are threads, each with its own counters; several processes take them one by one
@@ -84,11 +84,11 @@ def reproject_pairwise(
 
 
 def _held(labels: Sequence[Tensor | None]) -> list[Tensor | None]:
-    """The maps in the types that the compiled op reads: int32, or uint8 as ``label_maps.narrowed`` gives it."""
+    """The maps in the types that the compiled op reads: int32, or uint8 as ``label_maps.to_compact`` gives it."""
     if not isinstance(labels, LabelMaps):
         return list(labels)
     narrow = (labels.narrow(index) for index in range(len(labels)))
-    return [mask if mask is None or mask.dtype == torch.uint8 else widened(mask) for mask in narrow]
+    return [mask if mask is None or mask.dtype == torch.uint8 else to_int32(mask) for mask in narrow]
 
 
 def _by_torch(depths, cameras, labels, num_classes: int, tau: float, i: int, maps: PixelMaps) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""Space cut into slabs that are voted on one after the other, so that few voxels are in memory at a time."""
+"""Space cut into chunks that are voted on one after the other, so that few voxels are in memory at a time."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _PRIMES = (73856093, 19349663, 83492791)  # as in native/ops/voxel_votes.cpp
 
 
 @dataclass(frozen=True)
-class Slabs:
-    """Slab s holds the points whose coordinate along ``axis`` is in borders[s] .. borders[s + 1], in voxels.
+class SpatialChunks:
+    """Chunk s holds the points whose coordinate along ``axis`` is in borders[s] .. borders[s + 1], in voxels.
 
     borders: the first is -inf, the last inf. margin: what is read about a point lies within so many voxels of it.
     """
@@ -39,21 +39,23 @@ class Slabs:
         see ``ops.voxel_votes``."""
         return _along(self.axis, depth, to_voxels)
 
-    def inside(self, coordinates: Tensor, slab: int) -> Tensor:
-        """[H, W] bool: the points of the slab."""
-        return (coordinates >= self.borders[slab]) & (coordinates < self.borders[slab + 1])
+    def inside(self, coordinates: Tensor, chunk: int) -> Tensor:
+        """[H, W] bool: the points of the chunk."""
+        return (coordinates >= self.borders[chunk]) & (coordinates < self.borders[chunk + 1])
 
-    def about(self, coordinates: Tensor, slab: int) -> Tensor:
-        """[H, W] bool: the points whose votes matter to those of the slab."""
-        first, last = self.borders[slab] - self.margin, self.borders[slab + 1] + self.margin
+    def about(self, coordinates: Tensor, chunk: int) -> Tensor:
+        """[H, W] bool: the points whose votes matter to those of the chunk."""
+        first, last = self.borders[chunk] - self.margin, self.borders[chunk + 1] + self.margin
         return (coordinates >= first) & (coordinates < last)
 
 
-WHOLE = Slabs(0, (-math.inf, math.inf), 0.0)
+WHOLE = SpatialChunks(0, (-math.inf, math.inf), 0.0)
 
 
-def slabs_of(depths: Sequence[Tensor], cameras: Sequence[Camera], to_voxels: Tensor, most: int | None = None) -> Slabs:
-    """As many slabs as keep about ``most`` (``MOST_BRICKS``) bricks of voxels in each, along the longest axis.
+def divide_space(
+    depths: Sequence[Tensor], cameras: Sequence[Camera], to_voxels: Tensor, most: int | None = None
+) -> SpatialChunks:
+    """As many chunks as keep about ``most`` (``MOST_BRICKS``) bricks of voxels in each, along the longest axis.
 
     depths: V x [H, W], asked for once, one view at a time. to_voxels: [V, 13] float64, see ``ops.voxel_votes``.
     Bricks are counted by about a 64th of them, which is what is kept in memory of each view.
@@ -70,7 +72,7 @@ def slabs_of(depths: Sequence[Tensor], cameras: Sequence[Camera], to_voxels: Ten
     axis = int((middle[1] - middle[0]).argmax())
     along = found[:, axis].sort().values
     inner = sorted({int(along[len(along) * s // count]) * _BRICK for s in range(1, count)})
-    return Slabs(axis, (-math.inf, *map(float, inner), math.inf), _margin(cameras))
+    return SpatialChunks(axis, (-math.inf, *map(float, inner), math.inf), _margin(cameras))
 
 
 def _along(axis: int, depth: Tensor, to_voxels: Tensor) -> Tensor:
@@ -83,7 +85,7 @@ def _along(axis: int, depth: Tensor, to_voxels: Tensor) -> Tensor:
 
 
 def _sample(depth: Tensor, to_voxels: Tensor) -> Tensor:
-    compiled = extension.can_take(depth)
+    compiled = extension.supports(depth)
     return (brick_sample if compiled else torch_brick_sample)(depth, to_voxels, _PART)
 
 

@@ -12,7 +12,7 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.masks.depth_agreement import disagreement
 from beags_plugin.masks.pooled_votes import LOOKS, TorchVotes
 from beags_plugin.masks.reprojection import ReprojectedMask, check_counts, check_view
-from beags_plugin.masks.spatial_chunks import Slabs, slabs_of
+from beags_plugin.masks.spatial_chunks import SpatialChunks, divide_space
 from beags_plugin.ops.voxel_votes import votes_for
 from beags_plugin.system.filed_tensors import filed
 from beags_plugin.system.processes import each_view
@@ -44,7 +44,7 @@ def reproject_voxel(
     neighbouring views both see.
     Cost O(V pixels), whatever the number of classes. Depth and masks are asked for several times, one view at a time:
     they may lie on disk (``system.filed_tensors``). Where the voxels would take more than about 0.4 GB, space is cut
-    into slabs (``masks.spatial_chunks``) and the views are gone through once more for each; results are the same bits.
+    into chunks (``masks.spatial_chunks``) and the views are gone through once more for each; results are the same bits.
     """
     check_counts(depths, cameras, labels, tau)
     if not cameras:
@@ -52,36 +52,36 @@ def reproject_voxel(
     size, alike = _survey(depths, cameras, labels, num_classes)
     lifts = _to_voxels(cameras, _origin(cameras), size)
     lifts[:, -1] *= _second_look(depths, cameras, tau) / LOOKS[-1]
-    slabs = slabs_of(depths, cameras, lifts)
-    votes = _Votes(depths, labels, lifts, slabs, alike, progress)
-    if len(slabs) == 1:
+    chunks = divide_space(depths, cameras, lifts)
+    votes = _Votes(depths, labels, lifts, chunks, alike, progress)
+    if len(chunks) == 1:
         yield from (ReprojectedMask(labels, confidence) for labels, confidence, _ in votes.of_slab(0))
         return
-    pieces = [filed(votes.pieces_of(slab), depths[0].device) for slab in range(len(slabs))]
+    pieces = [filed(votes.pieces_of(chunk), depths[0].device) for chunk in range(len(chunks))]
     for i, (depth, mask) in enumerate(zip(depths, labels, strict=True)):
         found, confidence = _known(depth, mask), torch.zeros(depth.shape, dtype=torch.float32, device=depth.device)
-        coordinates = slabs.coordinates(depth, lifts[i].to(depth))
-        for slab, piece in enumerate(pieces):
-            inside = slabs.inside(coordinates, slab)
+        coordinates = chunks.coordinates(depth, lifts[i].to(depth))
+        for chunk, piece in enumerate(pieces):
+            inside = chunks.inside(coordinates, chunk)
             found[inside], confidence[inside] = piece[2 * i], piece[2 * i + 1]
         yield ReprojectedMask(found, confidence)
 
 
 class _Votes:
-    """Votes and their reading, slab by slab."""
+    """Votes and their reading, chunk by chunk."""
 
-    def __init__(self, depths, labels, lifts: Tensor, slabs: Slabs, alike: bool, progress) -> None:
-        self.depths, self.labels, self.lifts, self.slabs = depths, labels, lifts, slabs
+    def __init__(self, depths, labels, lifts: Tensor, chunks: SpatialChunks, alike: bool, progress) -> None:
+        self.depths, self.labels, self.lifts, self.chunks = depths, labels, lifts, chunks
         self._alike, self._progress = alike, progress
-        self._done, self._total = 0, 2 * len(slabs) * len(depths)
+        self._done, self._total = 0, 2 * len(chunks) * len(depths)
 
-    def of_slab(self, slab: int) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
+    def of_slab(self, chunk: int) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
         """Per view the labels [H, W] int32, the confidence [H, W] float32, and which pixels [H, W] bool have their
-        point in the slab (None: all, as there is but one); others keep their label, with confidence 0."""
+        point in the chunk (None: all, as there is but one); others keep their label, with confidence 0."""
         compiled = votes_for([self.depths[0]], IGNORE) if self._alike else None
         votes = compiled or TorchVotes(IGNORE)
         for i, (depth, mask) in enumerate(zip(self.depths, self.labels, strict=True)):
-            about = self._of_slab(i, depth, slab, self.slabs.about)
+            about = self._of_slab(i, depth, chunk, self.chunks.about)
             if mask is not None and (about is None or bool(about.any())):
                 votes.add(_where(about, depth), self.lifts[i].to(depth), mask.int())
             self._tick()
@@ -89,7 +89,7 @@ class _Votes:
 
         def told(i: int) -> tuple[Tensor, Tensor, Tensor | None]:
             depth = self.depths[i]
-            inside = self._of_slab(i, depth, slab, self.slabs.inside)
+            inside = self._of_slab(i, depth, chunk, self.chunks.inside)
             known = _known(depth, self.labels[i])
             return *votes.read(_where(inside, depth), self.lifts[i].to(depth), known), inside
 
@@ -97,15 +97,15 @@ class _Votes:
             yield found
             self._tick()
 
-    def pieces_of(self, slab: int) -> Iterator[Tensor]:
-        """Of each view the labels [P] and the confidence [P] of the points in the slab, in the order of pixels."""
-        for labels, confidence, inside in self.of_slab(slab):
+    def pieces_of(self, chunk: int) -> Iterator[Tensor]:
+        """Of each view the labels [P] and the confidence [P] of the points in the chunk, in the order of pixels."""
+        for labels, confidence, inside in self.of_slab(chunk):
             yield from (labels[inside], confidence[inside])
 
-    def _of_slab(self, i: int, depth: Tensor, slab: int, which) -> Tensor | None:
-        if len(self.slabs) == 1:
+    def _of_slab(self, i: int, depth: Tensor, chunk: int, which) -> Tensor | None:
+        if len(self.chunks) == 1:
             return None
-        return which(self.slabs.coordinates(depth, self.lifts[i].to(depth)), slab)
+        return which(self.chunks.coordinates(depth, self.lifts[i].to(depth)), chunk)
 
     def _tick(self) -> None:
         self._done += 1

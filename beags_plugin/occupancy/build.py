@@ -15,7 +15,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.occupancy.voxel_size import reference_indices, voxel_size_of_reference
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
-from beags_plugin.rasterizers.rendering import draw_class_map, geometry_inputs, surface_depth
+from beags_plugin.rasterizers.rendering import geometry_inputs, render_class_map, surface_depth
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.filed_tensors import filed
 from beags_plugin.system.processes import each_view
@@ -96,7 +96,7 @@ def build_visibility_grid(
 def _render(surfels, class_ids, camera, rasterizer, settings, num_classes: int, depth: str) -> _View:
     with torch.no_grad():
         drawn = rasterizer.rasterize(geometry_inputs(surfels), camera, settings, surfels.means.new_zeros(3))
-    classes, _ = draw_class_map(rasterizer, surfels, class_ids, camera, settings)
+    classes, _ = render_class_map(rasterizer, surfels, class_ids, camera, settings)
     surface = surface_depth(drawn, depth)
     solid = (drawn.alpha >= MIN_ALPHA_LIFTED) & torch.isfinite(surface) & (surface > 0)
     small = torch.uint8 if num_classes <= 1 << 8 else torch.int16 if num_classes <= 1 << 15 else torch.int32

@@ -184,7 +184,7 @@ class VisibilityGrid:
         return cls(size, state["origin"], num_classes, state["keys"], state["classes"], dense_bytes)
 
     def _lookup_for(self, points: Tensor) -> VoxelLookup | None:
-        compiled = cuda_extension.can_take(points)
+        compiled = cuda_extension.supports(points)
         return self.lookup() if compiled else None
 
     def _usable(self, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,9 +13,9 @@ from beags_plugin.ops import extension
 
 
 @cache
-def found() -> tuple[ModuleType | None, str | None]:
+def status() -> tuple[ModuleType | None, str | None]:
     """``beags_plugin._native.cuda``, or one sentence on why it cannot be used here."""
-    module, reason = extension.found()
+    module, reason = extension.status()
     if module is None:
         return None, reason
     cuda = getattr(module, "cuda", None)
@@ -42,7 +42,7 @@ def _dotted(version: int) -> str:
 
 def load() -> ModuleType | None:
     """The module, or None where CUDA kernels cannot run."""
-    return found()[0]
+    return status()[0]
 
 
 def module_for(*tensors: Tensor) -> ModuleType | None:
@@ -55,9 +55,9 @@ def module_for(*tensors: Tensor) -> ModuleType | None:
     return load()
 
 
-def can_take(*tensors: Tensor) -> bool:
+def supports(*tensors: Tensor) -> bool:
     """Whether the compiled ops take these float tensors: all float32 or all float64, on the CPU or on one GPU."""
-    return extension.can_take(*tensors) or module_for(*tensors) is not None
+    return extension.supports(*tensors) or module_for(*tensors) is not None
 
 
 def stream(device: torch.device) -> int:

@@ -16,7 +16,7 @@ _SUFFIXES = {torch.float32: "f32", torch.float64: "f64"}
 
 
 @cache
-def found() -> tuple[ModuleType | None, str | None]:
+def status() -> tuple[ModuleType | None, str | None]:
     """``beags_plugin._native``, or one sentence on why it is not there.
 
     Raises ``UserError`` if the instruction set that the environment asks for cannot run: nothing may hide that.
@@ -41,10 +41,10 @@ def found() -> tuple[ModuleType | None, str | None]:
 
 def load() -> ModuleType | None:
     """``beags_plugin._native``, or None where it was not built or does not load (``beags doctor`` says why)."""
-    return found()[0]
+    return status()[0]
 
 
-def can_take(*tensors: Tensor) -> bool:
+def supports(*tensors: Tensor) -> bool:
     """Whether the compiled ops are there and take these float tensors: on the CPU, all float32 or all float64."""
     dtype = tensors[0].dtype
     for value in tensors:

@@ -79,7 +79,7 @@ class CudaVoxelVotes:
 
 def brick_sample(depth: Tensor, to_voxels: Tensor, part: int) -> Tensor:
     """What ``masks.spatial_chunks.torch_brick_sample`` tells of depth [H, W] on the CPU; the caller asks
-    ``extension.can_take(depth)`` first."""
+    ``extension.supports(depth)`` first."""
     depth, to_voxels = _view(depth, to_voxels)
     found = extension.function("brick_sample", depth)(depth, to_voxels, part)
     return torch.tensor(found, dtype=torch.int64).reshape(-1, 3)
@@ -89,7 +89,7 @@ def votes_for(depths: Sequence[Tensor], ignore: int) -> VoxelVotes | CudaVoxelVo
     """What counts the votes of pixels with these depths, compiled for where they lie; None: nothing was."""
     if (module := cuda_extension.module_for(*depths)) is not None:
         return CudaVoxelVotes(ignore, module, depths[0].device)
-    return VoxelVotes(ignore) if extension.can_take(*depths) else None
+    return VoxelVotes(ignore) if extension.supports(*depths) else None
 
 
 def _view(depth: Tensor, to_voxels: Tensor) -> tuple[Tensor, Tensor]:

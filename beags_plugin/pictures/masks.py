@@ -29,10 +29,10 @@ class Changed:
     confidence: np.ndarray
 
 
-def overlay(photo: np.ndarray, class_map: np.ndarray, strength: float = 0.5) -> np.ndarray:
+def overlay(photo: np.ndarray, labels: np.ndarray, strength: float = 0.5) -> np.ndarray:
     """[H, W, 3] uint8: the photo with its objects tinted (IGNORE grey), the background as it is."""
-    tint = colorize(class_map).astype(np.float32)
-    shown = (class_map != 0)[..., None]
+    tint = colorize(labels).astype(np.float32)
+    shown = (labels != 0)[..., None]
     return np.where(shown, (1 - strength) * photo + strength * tint, photo).astype(np.uint8)
 
 

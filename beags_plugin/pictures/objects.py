@@ -35,7 +35,7 @@ class Subject:
     settings: RasterSettings
 
 
-def draw_alone(
+def render_alone(
     surfels: Surfels, camera: Camera, settings: RasterSettings, rasterizer: Rasterizer, background: Background
 ) -> np.ndarray:
     """[H, W, 3] uint8: surfels before a background."""
@@ -68,7 +68,7 @@ def film(
             groups.append(
                 [
                     cell(
-                        draw_alone(surfels, camera, subject.settings, rasterizer, background),
+                        render_alone(surfels, camera, subject.settings, rasterizer, background),
                         (camera.width, camera.height),
                         _caption(subject.name, stage),
                     )
@@ -90,7 +90,7 @@ def sheet(
         for stage, surfels in subject.stages.items():
             pictures = []
             for number, camera in enumerate(subject.cameras):
-                picture = draw_alone(surfels, camera, subject.settings, rasterizer, background)
+                picture = render_alone(surfels, camera, subject.settings, rasterizer, background)
                 caption = _caption(subject.name, stage) if number == 0 else ""
                 pictures.append([cell(picture, (camera.width, camera.height), caption)])
                 done += 1
@@ -111,7 +111,7 @@ def comparison(
             lines.append(
                 beside(
                     cell(
-                        draw_alone(surfels, camera, subject.settings, rasterizer, background),
+                        render_alone(surfels, camera, subject.settings, rasterizer, background),
                         (camera.width, camera.height),
                         _caption(subject.name, stage),
                     )

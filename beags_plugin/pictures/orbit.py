@@ -19,7 +19,7 @@ _NEAR, _FAR = 0.02, 100.0  # in units of the distance to the centre
 
 
 @dataclass(frozen=True)
-class Stand:
+class OrbitFrame:
     """Where the object stands, in the frame of its surfels.
 
     center: [3] float64, what every camera looks at. up: [3] float64, unit. front: [3] float64, from where the photos
@@ -38,7 +38,7 @@ class Stand:
         return radius / math.sin(_FIELD_OF_VIEW / 2)
 
 
-def stand_of(low: Tensor, high: Tensor, cameras: Sequence[Camera] = (), up: Tensor | None = None) -> Stand:
+def orbit_frame(low: Tensor, high: Tensor, cameras: Sequence[Camera] = (), up: Tensor | None = None) -> OrbitFrame:
     """The stand of a box; up is the mean of the cameras' ups unless given, front their mean direction.
 
     low, high: [3] corners. cameras: of the photos. Without cameras, z is up and -y the front, as in nerfstudio's frame.
@@ -53,10 +53,10 @@ def stand_of(low: Tensor, high: Tensor, cameras: Sequence[Camera] = (), up: Tens
         front = torch.stack([camera.center for camera in cameras]).double().mean(dim=0) - center
     upwards = upwards if up is None else up.double()
     corners = torch.cartesian_prod(*torch.stack([low, high], dim=1).double())
-    return Stand(center, upwards / upwards.norm(), front, corners)
+    return OrbitFrame(center, upwards / upwards.norm(), front, corners)
 
 
-def orbit(stand: Stand, count: int, pixels: int, elevation: float = 20.0, turn: float = 360.0) -> list[Camera]:
+def orbit(stand: OrbitFrame, count: int, pixels: int, elevation: float = 20.0, turn: float = 360.0) -> list[Camera]:
     """Cameras on a circle about the up axis, starting from the front, at even angles; the box fills the widest picture.
 
     count: of cameras. pixels: side of the square pictures. elevation: degrees above the horizon. turn: degrees; a whole
@@ -75,7 +75,7 @@ def orbit(stand: Stand, count: int, pixels: int, elevation: float = 20.0, turn: 
     return [_zoomed(camera, 1.0 / (_MARGIN * max(reach, 1e-3))) for camera in cameras]
 
 
-def orbit_settings(stand: Stand) -> RasterSettings:
+def orbit_settings(stand: OrbitFrame) -> RasterSettings:
     """Depth range of the orbit's cameras; colours only."""
     return RasterSettings(_NEAR * stand.distance, _FAR * stand.distance, geometry=False, distortion=False)
 
@@ -93,7 +93,7 @@ def _zoomed(camera: Camera, factor: float) -> Camera:
     return replace(camera, K=K)
 
 
-def _horizon(stand: Stand) -> tuple[Tensor, Tensor]:
+def _horizon(stand: OrbitFrame) -> tuple[Tensor, Tensor]:
     """Two unit vectors at right angles to the up axis: to the right of the front, and from the front to the object."""
     level = stand.front - (stand.front @ stand.up) * stand.up
     if float(level.norm()) < 1e-6 * max(float(stand.front.norm()), 1e-12):  # seen from straight above
@@ -104,7 +104,7 @@ def _horizon(stand: Stand) -> tuple[Tensor, Tensor]:
     return torch.linalg.cross(forward, stand.up), forward
 
 
-def _look_at(eye: Tensor, stand: Stand, pixels: int) -> Camera:
+def _look_at(eye: Tensor, stand: OrbitFrame, pixels: int) -> Camera:
     """A square view of the centre from ``eye``, the up axis upwards."""
     forward = (stand.center - eye) / (stand.center - eye).norm()
     right = torch.linalg.cross(forward, stand.up)

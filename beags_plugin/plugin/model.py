@@ -25,7 +25,7 @@ from beags_plugin.plugin.viewer.viewing import Viewing, asked_by_viewer, scene_o
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.rasterizers.interface import RasterOutputs, SurfelInputs
 from beags_plugin.rasterizers.rendering import surfel_inputs
-from beags_plugin.system.devices import sent
+from beags_plugin.system.devices import to_device_async
 
 
 class BeagsModel(SceneModel):
@@ -66,7 +66,7 @@ class BeagsModel(SceneModel):
         known = (cameras.metadata or {}).get("camera")  # whose numbers the host has too
         camera = known or camera_from_nerfstudio(cameras, 0).to(self.device)
         needs = frozenset().union(*(loss.needs for loss in self.active_losses().values()))
-        target = (cameras.metadata or {}).get("class_map") if "boundary" in needs else None
+        target = (cameras.metadata or {}).get("labels") if "boundary" in needs else None
         background = self._training_background()
         inputs = surfel_inputs(
             self.surfels(), camera, self.active_sh_degree(), self.class_ids if target is not None else None
@@ -85,7 +85,7 @@ class BeagsModel(SceneModel):
 
     def _training_background(self) -> Tensor:
         if self.config.background_color == "random":
-            return sent(torch.rand(3, generator=self.generator(self.step)), self.device)
+            return to_device_async(torch.rand(3, generator=self.generator(self.step)), self.device)
         return fixed_background(self.config, self.device)
 
     def set_background(self, background_color: Tensor) -> None:
@@ -120,7 +120,7 @@ class BeagsModel(SceneModel):
         image = self._truth(batch, outputs["background"])
         if not self.training or self.last_render is None:
             return {"photometric": (outputs["rgb"] - image).abs().mean()}
-        class_map = batch.get("class_map")
+        labels = batch.get("labels")
         inputs = LossInputs(
             step=self.step,
             seed=self.seed,
@@ -128,7 +128,7 @@ class BeagsModel(SceneModel):
             camera=self.last_render.camera,
             render=self.last_render.render,
             image=image,
-            labels=None if class_map is None else class_map.to(self.device, torch.int32),
+            labels=None if labels is None else labels.to(self.device, torch.int32),
             class_ids=self.class_ids,
             grid=self.grid,
             draw=self._draw_apart,

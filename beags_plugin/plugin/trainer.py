@@ -22,7 +22,7 @@ from beags_plugin.plugin.training.checkpoints import Checkpoints
 from beags_plugin.plugin.training.memory_guard import NO_MEMORY, MemoryWatch, check_room, is_out_of_memory
 from beags_plugin.plugin.training.monitor import HeldOutCurve
 from beags_plugin.plugin.training.optimizers import SceneOptimizer
-from beags_plugin.plugin.training.replicas import Rank
+from beags_plugin.plugin.training.replicas import Replica
 from beags_plugin.plugin.training.resumable import GlobalRandom, Resumable
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.training.timing import Estimate, StageSeconds
@@ -53,7 +53,7 @@ class BeagsTrainer(Trainer):
         self._watch = MemoryWatch(config.machine.device_type)
         self._done = 0  # the last step that was trained
         self._complete = False
-        self._rank = Rank(config, local_rank)
+        self._replica = Replica(config, local_rank)
         super().__init__(config, local_rank, world_size)
         self._checkpoints = Checkpoints(config, self.base_dir, self.checkpoint_dir)
 
@@ -74,7 +74,7 @@ class BeagsTrainer(Trainer):
                 check_start(self.config.model_config)
             used = any((self.base_dir / self.config.logging.relative_log_dir).glob("events.out.tfevents.*"))
             super().setup(test_mode)
-            self._rank.start_alike(self._model)
+            self._replica.start_alike(self._model)
             if self.config.check_memory and processes.rank() == 0:
                 check_room(self.base_dir, self.config.machine.device_type)
             if used:
@@ -110,7 +110,7 @@ class BeagsTrainer(Trainer):
         if self._lock is not None:
             self._lock.release()
             self._lock = None
-        self._rank.end()
+        self._replica.end()
         for each in writer.EVENT_WRITERS:
             if isinstance(each, writer.TensorboardWriter):
                 with suppress(OSError):  # a disk that was full while it wrote, which has been told
@@ -211,7 +211,7 @@ class BeagsTrainer(Trainer):
     @property
     def run(self) -> Path:
         """The run's folder, also in processes that write elsewhere."""
-        return self._rank.run
+        return self._replica.run
 
     @property
     def loaded_run(self) -> Path | None:

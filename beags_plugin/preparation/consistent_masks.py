@@ -13,7 +13,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
-from beags_plugin.labels.label_maps import LabelMaps, PackedMaps
+from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.preparation.refiner import Progress
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
@@ -41,7 +41,7 @@ class ConsistentMasks:
 
     ranked: LabelMaps
     labels: LabelMaps
-    confidence: PackedMaps | None
+    confidence: CompressedMaps | None
 
 
 def chosen_reprojection(name: str, cameras: Sequence[Camera], labels: LabelMaps) -> tuple[str, str | None]:
@@ -83,7 +83,7 @@ def reprojected_masks(
     reprojection is a registered one. Of what the votes give, one view is held at a time.
     """
     given = translated(labels, known, known.ranks)
-    ranked, consistent, confidence = LabelMaps(), LabelMaps(), PackedMaps()
+    ranked, consistent, confidence = LabelMaps(), LabelMaps(), CompressedMaps()
     reproject = REPROJECTIONS.get(config.reprojection)
     found = reproject(depths, cameras, given, len(known), tau=config.tau, progress=progress)
     for mask in found:

@@ -15,7 +15,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
-from beags_plugin.labels.label_maps import LabelMaps, PackedMaps
+from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.preparation.border_split import BorderSplitConfig, split_at_borders
@@ -30,9 +30,9 @@ from beags_plugin.preparation.consistent_masks import (
 )
 from beags_plugin.preparation.refiner import AssignedScene, EditedScene, Refiner
 from beags_plugin.preparation.summary import (
-    assignment_finding,
-    reprojection_finding,
-    split_finding,
+    assignment_summary,
+    reprojection_summary,
+    split_summary,
 )
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import check_surface_depth
@@ -100,16 +100,16 @@ class Preparation:
     edited: the scene and the classes that refinement starts from, where surfels were split; None where it
         starts from the base.
     grid: the visibility voxel grids, or None if the refiner needs none.
-    findings: one line for a reader per stage.
+    summary: one line for a reader per stage.
     seconds: wall time per stage.
     """
 
     labels: LabelMaps
-    confidence: PackedMaps | None
+    confidence: CompressedMaps | None
     assignment: Assignment
     grid: VisibilityGrid | None
     edited: EditedScene | None = None
-    findings: list[str] = field(default_factory=list)
+    summary: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
 
 
@@ -146,23 +146,23 @@ def prepare(
         )
     surfels = surfels.detach()
     known = known_classes(maps, class_names)
-    findings: list[str] = []
+    summary: list[str] = []
     seconds: dict[str, float] = {}
 
     with _timed("reprojection", seconds):
-        masks = _consistent_masks(surfels, cameras, maps, known, rasterizer, settings, config, stage, findings)
+        masks = _consistent_masks(surfels, cameras, maps, known, rasterizer, settings, config, stage, summary)
     ranked = masks.ranked
 
     with _timed("assignment", seconds), stage("Assigning classes") as progress:
         assignment = assign_classes(surfels, cameras, ranked, rasterizer, settings, len(known), progress=progress)
         assignment = replace(assignment, class_ids=known.class_ids(assignment.class_ids))
-    findings.append(assignment_finding(assignment, class_names))
+    summary.append(assignment_summary(assignment, class_names))
 
     edited = None
     if split is not None and split.rounds > 0 and refiner.trains:
         with _timed("border split", seconds), stage("Splitting Gaussians at borders") as progress:
             divided = split_at_borders(surfels, cameras, ranked, rasterizer, settings, len(known), split, progress)
-        findings.append(split_finding(len(surfels), divided))
+        summary.append(split_summary(len(surfels), divided))
         classes = replace(divided.assignment, class_ids=known.class_ids(divided.assignment.class_ids))
         edited, surfels = replace(divided, assignment=classes), divided.edited.surfels
 
@@ -179,8 +179,8 @@ def prepare(
         asked = torch.unique(class_ids)  # classes are fixed: no loss can ask about one that has no Gaussians
         grid = grid.only(asked if background_voxels else asked[asked != 0])
         seconds["voxel grids"] = time.perf_counter() - start
-        findings.append(f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {k})")
-    return Preparation(masks.labels, masks.confidence, assignment, grid, edited, findings, seconds)
+        summary.append(f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {k})")
+    return Preparation(masks.labels, masks.confidence, assignment, grid, edited, summary, seconds)
 
 
 @contextmanager
@@ -199,11 +199,11 @@ def _consistent_masks(
     settings,
     config,
     stage: Stage,
-    findings: list[str],
+    summary: list[str],
 ) -> ConsistentMasks:
     """The masks of all views, reprojected if that is asked for."""
     if config.reprojection == "none":
-        findings.append("reprojection: off, masks used as they are")
+        summary.append("reprojection: off, masks used as they are")
         return masks_as_they_are(maps, cameras, known)
     method, why = chosen_reprojection(config.reprojection, cameras, maps)
     with stage("Rendering depth") as progress:  # as large as all photos in float: it lies in a temporary file
@@ -213,8 +213,8 @@ def _consistent_masks(
     with stage("Reprojecting masks") as progress:
         masks = reprojected_masks(depths, cameras, maps, known, replace(config, reprojection=method), progress)
     if why is not None:
-        findings.append(why)
-    findings.append(reprojection_finding(maps, masks.labels))
+        summary.append(why)
+    summary.append(reprojection_summary(maps, masks.labels))
     return masks
 
 

@@ -11,7 +11,7 @@ from beags_plugin.assignment.assignment import Assignment
 from beags_plugin.preparation.refiner import EditedScene
 
 
-def reprojection_finding(before: Sequence[Tensor | None], after: Sequence[Tensor]) -> str:
+def reprojection_summary(before: Sequence[Tensor | None], after: Sequence[Tensor]) -> str:
     """How much reprojection changed."""
     changed = pixels = filled = 0
     for old, new in zip(before, after, strict=True):  # they are held compressed: one view at a time
@@ -25,13 +25,13 @@ def reprojection_finding(before: Sequence[Tensor | None], after: Sequence[Tensor
     )
 
 
-def split_finding(before: int, divided: EditedScene) -> str:
+def split_summary(before: int, divided: EditedScene) -> str:
     """How many Gaussians were split."""
     after = len(divided.edited.surfels)
     return f"border split: {int(divided.edited.fresh.sum())} halves, {before} Gaussians became {after}"
 
 
-def assignment_finding(assignment: Assignment, class_names: dict[int, str]) -> str:
+def assignment_summary(assignment: Assignment, class_names: dict[int, str]) -> str:
     """How many Gaussians each class has."""
     counts = torch.bincount(assignment.class_ids.long(), minlength=max(class_names) + 1)
     per_class = ", ".join(f"{name} {int(counts[index])}" for index, name in sorted(class_names.items()))

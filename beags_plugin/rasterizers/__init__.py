@@ -40,7 +40,7 @@ def make_rasterizer(name: str = "auto") -> Rasterizer:
                 if not torch.cuda.is_available():
                     return backend()
                 on_gpu = RASTERIZERS.get("torch")
-            from beags_plugin.rasterizers.by_device import ByDevice
+            from beags_plugin.rasterizers.device_dispatch import DeviceDispatchRasterizer
 
-            return ByDevice(backend(), on_gpu())
+            return DeviceDispatchRasterizer(backend(), on_gpu())
     raise UserError("no rasterizer can run here: reinstall beags.")

@@ -70,7 +70,7 @@ class CudaRasterizer(KernelRasterizer):
     @classmethod
     def unavailable(cls) -> str | None:
         """See ``Rasterizer.unavailable``."""
-        return cuda_extension.found()[1]
+        return cuda_extension.status()[1]
 
     def overflowed(self) -> bool:
         """Whether a drawing in a CUDA graph had more pairs than memory in its last replay; its image is then wrong."""
@@ -174,16 +174,17 @@ class CudaRasterizer(KernelRasterizer):
         return classes, share
 
     @torch.no_grad()
-    def heaviest(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
-        """See ``Rasterizer.heaviest``."""
+    def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
+        """See ``Rasterizer.dominant_gaussian``."""
         inputs = _detached(inputs.checked())
         indices = torch.empty(camera.height, camera.width, dtype=torch.int32, device=inputs.means.device)
-        self._frame(inputs, camera, settings, lambda frame: frame.native.heaviest(indices, self._stream(inputs.means)))
+        stream = self._stream(inputs.means)
+        self._frame(inputs, camera, settings, lambda frame: frame.native.dominant_gaussian(indices, stream))
         return indices
 
     def _native(self) -> ModuleType:
         if self._module is None:
-            module, reason = cuda_extension.found()
+            module, reason = cuda_extension.status()
             if module is None:
                 raise UserError(f"the rasterizer 'cuda' cannot run here: {reason}")
             self._module = module

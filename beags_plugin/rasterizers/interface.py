@@ -152,7 +152,7 @@ class Rasterizer(ABC):
     ) -> Tensor:
         """C[i, c] of this view: [N, num_classes], sum of w_i(u) over pixels u with labels(u) = c (E6). No gradient."""
 
-    def contributing_classes(
+    def sparse_class_contributions(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, labels: Tensor, num_classes: int
     ) -> tuple[Tensor, Tensor]:
         """What is not zero of ``class_contributions``: keys [M] int64, ascending, i * num_classes + c, and values [M].
@@ -179,5 +179,5 @@ class Rasterizer(ABC):
         """
 
     @abstractmethod
-    def heaviest(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
+    def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
         """[H, W] int32, index of the surfel with the largest w_i (ties to the nearer); -1 where none. For picking."""

@@ -59,7 +59,7 @@ def work_counts(inputs: SurfelInputs, camera: Camera, settings: RasterSettings) 
 
 
 def _module() -> ModuleType:
-    module, reason = extension.found()
+    module, reason = extension.status()
     if module is None:
         raise UserError(f"the rasterizer 'native' cannot run here: {reason}")
     return module
@@ -71,7 +71,7 @@ class NativeRasterizer(KernelRasterizer):
     @classmethod
     def unavailable(cls) -> str | None:
         """See ``Rasterizer.unavailable``."""
-        return extension.found()[1]
+        return extension.status()[1]
 
     def forward_kernel(self, drawing: Drawing) -> Forward:
         """See ``KernelRasterizer.forward_kernel``."""
@@ -122,14 +122,14 @@ class NativeRasterizer(KernelRasterizer):
         return out
 
     @torch.no_grad()
-    def contributing_classes(
+    def sparse_class_contributions(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, labels: Tensor, num_classes: int
     ) -> tuple[Tensor, Tensor]:
-        """See ``Rasterizer.contributing_classes``."""
+        """See ``Rasterizer.sparse_class_contributions``."""
         inputs = _detached(inputs.checked())
         labels = check_image("labels", labels, camera)
         frame, _ = _frame(inputs, camera, settings)
-        found = frame.contributing_classes(labels, num_classes, extension.threads())
+        found = frame.sparse_class_contributions(labels, num_classes, extension.threads())
         keys = torch.empty(found.count, dtype=torch.int64)
         values = inputs.means.new_empty(found.count)
         found.write(keys, values)
@@ -149,11 +149,11 @@ class NativeRasterizer(KernelRasterizer):
         return classes, share
 
     @torch.no_grad()
-    def heaviest(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
-        """See ``Rasterizer.heaviest``."""
+    def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
+        """See ``Rasterizer.dominant_gaussian``."""
         frame, _ = _frame(_detached(inputs.checked()), camera, settings)
         indices = torch.empty(camera.height, camera.width, dtype=torch.int32)
-        frame.heaviest(indices, extension.threads())
+        frame.dominant_gaussian(indices, extension.threads())
         return indices
 
 

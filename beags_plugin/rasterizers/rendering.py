@@ -35,7 +35,7 @@ def geometry_inputs(surfels: Surfels, class_ids: Tensor | None = None) -> Surfel
     return SurfelInputs(bare.means, bare.quats, bare.log_scales, bare.opacity_logits, colors, class_ids)
 
 
-def draw_class_map(
+def render_class_map(
     rasterizer: Rasterizer, surfels: Surfels, class_ids: Tensor, camera: Camera, settings: RasterSettings
 ) -> tuple[Tensor, Tensor]:
     """``Rasterizer.class_map`` of class ids that may lie far apart; the rasterizer is given their ranks.

@@ -122,7 +122,7 @@ class TorchRasterizer(Rasterizer):
         return images["class"][..., 0], images["share"][..., 0]
 
     @torch.no_grad()
-    def heaviest(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
+    def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
         inputs, camera = inputs.checked(), camera.to(inputs.means)
         projected = project(inputs, camera, settings)
         image = torch.full((camera.height, camera.width), -1, dtype=torch.int32, device=inputs.means.device)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 
-def sent(value: Tensor, device: torch.device | str) -> Tensor:
+def to_device_async(value: Tensor, device: torch.device | str) -> Tensor:
     """``value``, of the CPU, on ``device``; the host does not wait until it is there."""
     if torch.device(device).type != "cuda":
         return value.to(device)

@@ -22,7 +22,7 @@ SETTINGS = RasterSettings(near=0.1, far=100.0)
 class _Stub:
     """Gives contributions to labelled pixels that were written down, one table per camera, and none to others."""
 
-    def contributing_classes(self, inputs, camera, settings, labels, num_classes):
+    def sparse_class_contributions(self, inputs, camera, settings, labels, num_classes):
         assert not settings.geometry and not settings.distortion
         assert inputs.means.requires_grad is False
         table = torch.tensor(camera.table, dtype=torch.float32)
@@ -117,10 +117,10 @@ def test_lists_of_contributions_are_the_table(backend, num_classes):
     labels = (torch.arange(71 * 51, dtype=torch.int32) // 40 % num_classes).reshape(51, 71)
     labels[3], labels[4] = IGNORE, -1
     table = rasterizer.class_contributions(*what, labels, num_classes)
-    keys, values = rasterizer.contributing_classes(*what, labels, num_classes)
+    keys, values = rasterizer.sparse_class_contributions(*what, labels, num_classes)
     assert keys.dtype == torch.int64 and bool((keys.diff() > 0).all()) and bool((values != 0).all())
     again = torch.zeros_like(table).view(-1)
     again[keys] = values
     assert torch.equal(again.view_as(table), table)
-    nothing = rasterizer.contributing_classes(*what, torch.full_like(labels, IGNORE), num_classes)
+    nothing = rasterizer.sparse_class_contributions(*what, torch.full_like(labels, IGNORE), num_classes)
     assert [len(value) for value in nothing] == [0, 0]

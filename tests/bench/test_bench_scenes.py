@@ -16,7 +16,7 @@ from beags_plugin.bench.experiment import load_experiment
 from beags_plugin.bench.run import Options, adapted, scenes_of
 from beags_plugin.bench.scenes import Scene, damaged_masks, given_scenes
 from beags_plugin.bench.trials import plan, steps_of
-from beags_plugin.labels.classes import read_class_map
+from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.sample.writer import SampleConfig, write_sample
 from beags_plugin.system.errors import UserError
 
@@ -36,7 +36,7 @@ def sample(tmp_path_factory):
 
 
 def read_all(folder: Path) -> dict[str, np.ndarray]:
-    return {path.stem: read_class_map(path) for path in sorted(folder.glob("*.png"))}
+    return {path.stem: read_id_mask(path) for path in sorted(folder.glob("*.png"))}
 
 
 def same(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> bool:

@@ -21,7 +21,7 @@ SCRIPT = ROOT / "scripts" / "gpu_check.sh"
 
 def test_rows_of_drawings_and_steps(monkeypatch, tmp_path, capsys):
     """On the CPU, of tiny scenes; the clock only calls what it is given."""
-    if (reason := EmulatedCudaRasterizer.unavailable()) or (reason := extension.found()[1]):
+    if (reason := EmulatedCudaRasterizer.unavailable()) or (reason := extension.status()[1]):
         pytest.skip(reason)
     monkeypatch.setattr(cuda, "DEVICE", "cpu")
     monkeypatch.setattr(cuda, "make_cuda", EmulatedCudaRasterizer)

@@ -89,10 +89,10 @@ def folder(tmp_path_factory):
     for name in ("run", "other"):
         config = write_trained(root / name, root / "my_scene")
     from beags_plugin.plugin.objects.extract import extract_objects
-    from beags_plugin.plugin.runs.read import load_scene
+    from beags_plugin.plugin.runs.read import read_assigned_run
 
     extract_objects(config.parent.parent / "run/config.yml", ["cup"])
-    write_ply(root / "scene.ply", load_scene(config).surfels())
+    write_ply(root / "scene.ply", read_assigned_run(config).surfels())
     return root
 
 

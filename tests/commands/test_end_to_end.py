@@ -80,10 +80,10 @@ def test_each_loss_has_its_own_curve(trained):
 
 
 def test_the_base_is_kept_apart_and_has_classes(trained):
-    from beags_plugin.plugin.runs.read import load_scene
+    from beags_plugin.plugin.runs.read import read_assigned_run
 
     folder, _ = trained
-    base, refined = load_scene(folder / "base" / "config.yml"), load_scene(folder / "config.yml")
+    base, refined = read_assigned_run(folder / "base" / "config.yml"), read_assigned_run(folder / "config.yml")
     means, moved = base.state["gauss_params.means"], refined.state["gauss_params.means"]
     assert len(moved) > len(means)  # beags-tiny splits Gaussians at borders
     for scene, count in ((base, len(means)), (refined, len(moved))):
@@ -102,13 +102,13 @@ def extracted(trained):
 
 
 def test_extraction_writes_a_run_and_a_ply_per_object(trained, extracted):
-    from beags_plugin.plugin.runs.read import load_scene
+    from beags_plugin.plugin.runs.read import read_assigned_run
 
     folder, _ = trained
-    whole = load_scene(folder / "config.yml")
+    whole = read_assigned_run(folder / "config.yml")
     assert len(extracted) >= 5
     for config in extracted:
-        scene = load_scene(config)
+        scene = read_assigned_run(config)
         (index,) = scene.state["class_ids"].unique().tolist()
         keep = whole.state["class_ids"] == index
         assert (scene.state["gauss_params.quats"] == whole.state["gauss_params.quats"][keep]).all()
@@ -163,10 +163,10 @@ def test_export_writes_every_object_and_the_background(trained, tmp_path):
 
 def test_removing_an_object_keeps_the_rest(trained):
     from beags_plugin.plugin.objects.extract import extract_objects
-    from beags_plugin.plugin.runs.read import load_scene
+    from beags_plugin.plugin.runs.read import read_assigned_run
 
     folder, _ = trained
-    whole = load_scene(folder / "config.yml")
+    whole = read_assigned_run(folder / "config.yml")
     name = whole.classes[1]
     (rest,) = extract_objects(folder / "config.yml", [name], remove=True)
     assert rest.gaussians == int((whole.state["class_ids"] != 1).sum())
@@ -179,7 +179,7 @@ def test_a_mistake_in_ns_train_gets_one_sentence(data, tmp_path):
 
 
 def test_refiner_none_leaves_the_scene_as_it_is(trained, data, tmp_path):
-    from beags_plugin.plugin.runs.read import load_scene
+    from beags_plugin.plugin.runs.read import read_assigned_run
 
     folder, _ = trained
     called(
@@ -187,13 +187,13 @@ def test_refiner_none_leaves_the_scene_as_it_is(trained, data, tmp_path):
         "--load-dir", folder / "base" / "nerfstudio_models", "--pipeline.model.refine-steps", 3,
         "--pipeline.model.refiner", "none",
     )  # fmt: skip
-    base, kept = load_scene(folder / "base" / "config.yml"), load_scene(tmp_path / "none" / "config.yml")
+    base, kept = read_assigned_run(folder / "base" / "config.yml"), read_assigned_run(tmp_path / "none" / "config.yml")
     for name in ("means", "quats", "scales", "opacities", "features_dc", "features_rest"):
         assert (base.state[f"gauss_params.{name}"] == kept.state[f"gauss_params.{name}"]).all(), name
 
 
 def test_a_run_that_was_refining_is_resumed_with_its_classes_and_masks(trained, data, tmp_path):
-    from beags_plugin.plugin.runs.read import load_scene
+    from beags_plugin.plugin.runs.read import read_assigned_run
 
     folder, _ = trained
     text = called(
@@ -202,7 +202,7 @@ def test_a_run_that_was_refining_is_resumed_with_its_classes_and_masks(trained, 
         "--pipeline.model.base-steps", 220, "--pipeline.model.refine-steps", 44, "--pipeline.model.prepare.k", 200,
     )  # fmt: skip
     assert "refinement taken up" in text and "Gaussians per class" not in text
-    before, after = load_scene(folder / "config.yml"), load_scene(tmp_path / "resumed" / "config.yml")
+    before, after = read_assigned_run(folder / "config.yml"), read_assigned_run(tmp_path / "resumed" / "config.yml")
     assert after.step == 263 and int(after.state["refined_steps"]) == 44
     assert (before.state["class_ids"] == after.state["class_ids"]).all()
     assert (tmp_path / "resumed" / "base" / "config.yml").exists()
@@ -210,7 +210,7 @@ def test_a_run_that_was_refining_is_resumed_with_its_classes_and_masks(trained, 
 
 def test_refinement_of_a_base_makes_masks_again_also_after_a_resume(trained, data, tmp_path):
     from beags_plugin.plugin.runs.layout import last_prepared
-    from beags_plugin.plugin.runs.read import load_scene
+    from beags_plugin.plugin.runs.read import read_assigned_run
 
     folder, _ = trained
     options = (
@@ -229,7 +229,7 @@ def test_refinement_of_a_base_makes_masks_again_also_after_a_resume(trained, dat
     assert last_prepared(half) == half / "prepared"
     text = called("ns-train", "beags-refine", "--run-dir", resumed, *options, "--load-dir", half / "nerfstudio_models")
     assert "refinement taken up" in text and "Preparing refinement again" in text
-    a, b = load_scene(whole / "config.yml"), load_scene(resumed / "config.yml")
+    a, b = read_assigned_run(whole / "config.yml"), read_assigned_run(resumed / "config.yml")
     assert int(b.state["refined_steps"]) == 12 and a.state["class_ids"].shape == b.state["class_ids"].shape
     for mask in second:
         assert mask.read_bytes() == (last_prepared(resumed) / "masks" / mask.name).read_bytes(), mask.name

@@ -14,7 +14,7 @@ from source_scenes import truth
 
 from beags_plugin.commands.cli import main
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.labels.classes import read_class_map
+from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Progress, SourceScene
 from beags_plugin.plugin.objects.make_masks import make_masks
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
@@ -30,8 +30,8 @@ def test_the_command_writes_masks_that_training_finds(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "9 masks of 9 views, 1 objects" in out and (tmp_path / "made.png").exists()
     metadata = BeagsDataParserConfig(data=tmp_path).setup().get_dataparser_outputs("train").metadata
-    assert metadata["classes"] == {0: "background", 1: "cup"} and all(metadata["class_map_filenames"])
-    np.testing.assert_array_equal(read_class_map(tmp_path / "masks/v03.png"), truth(0) == 1)
+    assert metadata["classes"] == {0: "background", 1: "cup"} and all(metadata["mask_filenames"])
+    np.testing.assert_array_equal(read_id_mask(tmp_path / "masks/v03.png"), truth(0) == 1)
     extra = tmp_path / "objects"
     for index in range(5, 9):
         (extra / f"cup/v{index:02d}.png").unlink()
@@ -84,11 +84,11 @@ def test_masks_of_other_methods_are_trained_on(tmp_path, capsys):
         )  # fmt: skip
         metadata = parser.setup().get_dataparser_outputs("train").metadata
         count = 3 if source[0] == "g" else 4  # LangSplat has a segment for the background too
-        assert len(metadata["classes"]) == count and len(metadata["class_map_filenames"]) == 7
+        assert len(metadata["classes"]) == count and len(metadata["mask_filenames"]) == 7
         pairs = set()
-        for path in metadata["class_map_filenames"]:
+        for path in metadata["mask_filenames"]:
             exact = truth(int(path.stem[1:]) % 4)
-            pairs |= set(zip(read_class_map(path).ravel().tolist(), exact.ravel().tolist(), strict=True))
+            pairs |= set(zip(read_id_mask(path).ravel().tolist(), exact.ravel().tolist(), strict=True))
         assert len(pairs) == 3  # an id for each object, the same in all views
         assert source[0] == "l" or pairs == {(0, 0), (37, 1), (112, 2)}
 
@@ -143,17 +143,17 @@ def test_reprojection_of_a_run_writes_masks_of_the_photos_size(tmp_path, lens, c
     assert ("reprojection pairwise: 7 views have" in " ".join(capsys.readouterr().out.split())) == (method == "auto")
     masks = sorted((tmp_path / "out/masks").glob("*.png"))
     assert [path.stem for path in masks] == [f"v{index:02d}" for index in range(1, 8)]
-    assert all(read_class_map(path).shape == (HEIGHT, WIDTH) for path in masks)
+    assert all(read_id_mask(path).shape == (HEIGHT, WIDTH) for path in masks)
     assert (tmp_path / "out/before_after.png").exists() and (tmp_path / "out/confidence/v01.png").exists()
-    confidence = [read_class_map(tmp_path / "out/confidence" / path.name) for path in masks]
+    confidence = [read_id_mask(tmp_path / "out/confidence" / path.name) for path in masks]
     assert all(values.shape == (HEIGHT, WIDTH) and values.max() > 0 for values in confidence)
     for mask, values in zip(masks, confidence, strict=True):
-        unlabelled = read_class_map(mask) == IGNORE
+        unlabelled = read_id_mask(mask) == IGNORE
         assert not values[unlabelled].any()  # where the straight view does not reach, or nothing voted
     report = json.loads((tmp_path / "out/report.json").read_text())
     assert report["method"] == "pairwise"
-    before = read_class_map(data / "masks/v01.png")
-    after = read_class_map(masks[0])
+    before = read_id_mask(data / "masks/v01.png")
+    after = read_id_mask(masks[0])
     if not lens:
         assert report["views"][0]["changed"] == int((before != after).sum())
     main(["masks", "check", "--load-config", str(config), "--masks-path", str(tmp_path / "out/masks"),
@@ -164,7 +164,7 @@ def test_reprojection_of_a_run_writes_masks_of_the_photos_size(tmp_path, lens, c
 def test_the_check_of_a_run_takes_its_options_and_what_replaces_them(tmp_path):
     from beags_plugin.plugin.objects.check_masks import options_beside
     from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject
-    from beags_plugin.plugin.runs.read import read_scene
+    from beags_plugin.plugin.runs.read import read_run
 
     data = write_scene(tmp_path / "scene")
     config = write_trained(tmp_path / "run", data)
@@ -173,7 +173,7 @@ def test_the_check_of_a_run_takes_its_options_and_what_replaces_them(tmp_path):
     (data / "masks").rename(data / "others")
     parser = options_beside(config, None, masks_path=Path("others"), ignore_ids=(2,), layout=None)
     assert (parser.layout, parser.orientation_method) == (own.layout, "none")
-    manager = data_to_reproject(read_scene(config), config, ReprojectionOptions(run_size=True, parser=parser))
+    manager = data_to_reproject(read_run(config), config, ReprojectionOptions(run_size=True, parser=parser))
     labels = manager.views("train")[0].labels
     assert labels is not None and set(labels.unique().tolist()) == {0, 1, IGNORE}
     main(["masks", "check", "--load-config", str(config), "--masks-path", "others", "--output", str(tmp_path / "out")])

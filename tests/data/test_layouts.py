@@ -24,8 +24,8 @@ from parsed_views import AS_GIVEN, POINT, moved, names, parse, pixel, real, titl
 
 import beags_plugin.data.files as files
 from beags_plugin.data import LAYOUTS
+from beags_plugin.data.dataset import Dataset, PoseTable
 from beags_plugin.data.layout import Layout
-from beags_plugin.data.scene import PoseTable, Scene
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.dataset import BeagsDataset
 from beags_plugin.system.errors import UserError
@@ -63,7 +63,7 @@ def test_mipnerf360_masks_and_ground_truth_of_both_kinds(tmp_path):
     truth = outputs.metadata["ground_truth"]
     assert truth["visible"] == {"table": [None, tmp_path / f"ground_truth/visible/table/{stems[8]}.png"]}
     assert truth["silhouettes"] == {"table": [tmp_path / f"ground_truth/silhouettes/table/{stems[0]}.png", None]}
-    labels = BeagsDataset(parse(tmp_path)).get_data(0)["class_map"].numpy()
+    labels = BeagsDataset(parse(tmp_path)).get_data(0)["labels"].numpy()
     np.testing.assert_array_equal(labels, ids(3))
 
 
@@ -113,12 +113,13 @@ class Turntable(Layout):
     def missing(self, root: Path) -> str | None:
         return None if (root / "turntable.txt").is_file() else "no turntable.txt"
 
-    def read(self, root: Path, images: Path | None) -> Scene:
+    def read(self, root: Path, images: Path | None) -> Dataset:
         K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
         poses = np.linalg.inv(opencv_matrices(9)) @ np.diag([1.0, -1.0, -1.0, 1.0])
         shots = tuple(root / f"shot{index}.png" for index in range(9))
         sizes = np.full((9, 2), (WIDTH, HEIGHT))
-        return Scene(self.title, root, PoseTable(root / "turntable.txt", shots, poses[:, :3], np.stack([K] * 9), sizes))
+        table = PoseTable(root / "turntable.txt", shots, poses[:, :3], np.stack([K] * 9), sizes)
+        return Dataset(self.title, root, table)
 
 
 def test_another_package_can_add_a_layout(tmp_path, monkeypatch):
@@ -175,7 +176,7 @@ def test_intrinsics_follow_the_size_of_the_images(tmp_path, layout):
         options = {"images_path": Path("copies")}
     for split in ("train", "test"):
         outputs = parse(tmp_path, split, layout=layout, **options)
-        for path in (*outputs.image_filenames, *outputs.metadata["class_map_filenames"]):
+        for path in (*outputs.image_filenames, *outputs.metadata["mask_filenames"]):
             if path is not None:
                 enlarged(path)
     after = parse(tmp_path, layout=layout, **options)

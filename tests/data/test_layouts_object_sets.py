@@ -21,8 +21,8 @@ def test_lerf_mask(tmp_path, capsys):
     outputs, test = parse(tmp_path), parse(tmp_path, "test")
     assert names(test) == ["frame_00041", "frame_00152"] and set(names(outputs)) == set(stems) - set(names(test))
     assert outputs.metadata["classes"] == {0: "background", 37: "class_37"}
-    assert (BeagsDataset(outputs).get_data(2)["class_map"].numpy() == ids(37)).all()
-    assert test.metadata["class_map_filenames"] == [None, None]
+    assert (BeagsDataset(outputs).get_data(2)["labels"].numpy() == ids(37)).all()
+    assert test.metadata["mask_filenames"] == [None, None]
     truth, folder = test.metadata["ground_truth"]["visible"], tmp_path / "test_mask"
     assert truth == {
         "green apple": [folder / "0/green apple.png", folder / "1/green apple.png"],
@@ -81,7 +81,7 @@ def test_3dovs(tmp_path):
     with pytest.raises(UserError, match=r"holds id 4, which .*classes\.txt does not name"):
         parse(tmp_path)
     write_image(tmp_path / "masks/01.png", ids(2))
-    assert (BeagsDataset(parse(tmp_path)).get_data(0)["class_map"].numpy() == ids(2)).all()
+    assert (BeagsDataset(parse(tmp_path)).get_data(0)["labels"].numpy() == ids(2)).all()
 
 
 def test_spin_nerf(tmp_path, capsys):
@@ -96,7 +96,7 @@ def test_spin_nerf(tmp_path, capsys):
     assert (camera.width, camera.height) == (WIDTH // 4, HEIGHT // 4)
     np.testing.assert_allclose(camera.K.numpy()[:2, 2], [CX / 4, CY / 4], rtol=1e-6)
     assert outputs.metadata["classes"] == {0: "background", 1: "object"}
-    assert (BeagsDataset(outputs).get_data(0)["class_map"].numpy() == ids(1, WIDTH // 4, HEIGHT // 4)).all()
+    assert (BeagsDataset(outputs).get_data(0)["labels"].numpy() == ids(1, WIDTH // 4, HEIGHT // 4)).all()
 
 
 def test_spin_nerf_with_single_labels_leaves_nothing_out(tmp_path):
@@ -114,8 +114,8 @@ def test_dtu(tmp_path):
         x, y, w = projection @ [*POINT, 1.0]  # whole numbers are pixel centres there, halves here
         np.testing.assert_allclose(pixel(outputs, index, POINT), [x / w + 0.5, y / w + 0.5], atol=1e-3)
     assert outputs.metadata["classes"] == {0: "background", 1: "object"}
-    assert outputs.metadata["class_map_filenames"][4] == tmp_path / "mask/004.png"
-    assert (BeagsDataset(outputs).get_data(4)["class_map"].numpy() == ids()).all()
+    assert outputs.metadata["mask_filenames"][4] == tmp_path / "mask/004.png"
+    assert (BeagsDataset(outputs).get_data(4)["labels"].numpy() == ids()).all()
     assert names(parse(tmp_path, "test")) == ["000000", "000008"]
     silhouettes = parse(tmp_path, "test").metadata["ground_truth"]["silhouettes"]
     assert silhouettes == {"object": [tmp_path / "mask/000.png", tmp_path / "mask/008.png"]}

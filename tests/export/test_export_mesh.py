@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.lifting import project
-from beags_plugin.export.base import NothingToExport, Piece, Viewpoints, make_exporter
+from beags_plugin.export.base import ExportItem, NothingToExport, Viewpoints, make_exporter
 from beags_plugin.export.close_up import close_up
 from beags_plugin.export.frames import bounding_box
 from beags_plugin.export.fusion import Mesh, _grid_mb, sorted_mesh, voxel_size, without_small_parts
@@ -43,17 +43,17 @@ def thing() -> Thing:
 
 
 @pytest.fixture(scope="module")
-def piece(thing) -> Piece:
+def item(thing) -> ExportItem:
     """The cup covered with small opaque discs where the views see it."""
     views = cameras()
     surfels = covered(thing, views)
     viewpoints = Viewpoints(views, make_rasterizer("auto"), RasterSettings(0.05, 50.0))
-    return Piece("cup", surfels, torch.ones(len(surfels), dtype=torch.int32), viewpoints)
+    return ExportItem("cup", surfels, torch.ones(len(surfels), dtype=torch.int32), viewpoints)
 
 
 @pytest.fixture(scope="module")
-def mesh(piece) -> Mesh:
-    return GlbExporter(**OPTIONS).mesh(piece)
+def mesh(item) -> Mesh:
+    return GlbExporter(**OPTIONS).mesh(item)
 
 
 def test_vertices_lie_on_the_exact_surface(thing, mesh):
@@ -64,9 +64,9 @@ def test_vertices_lie_on_the_exact_surface(thing, mesh):
     assert np.median(distance) < 0.5 * mesh.voxel
 
 
-def test_the_mesh_covers_what_the_views_see(thing, piece, mesh):
+def test_the_mesh_covers_what_the_views_see(thing, item, mesh):
     tree = cKDTree(mesh.vertices)
-    seen = np.concatenate([hits(thing, camera) for camera in piece.views.cameras[::4]])
+    seen = np.concatenate([hits(thing, camera) for camera in item.views.cameras[::4]])
     assert len(seen) > 200
     assert np.quantile(tree.query(seen)[0], 0.98) < 2 * mesh.voxel
 
@@ -81,10 +81,10 @@ def test_faces_look_outwards_and_colours_are_those_of_the_place(thing, mesh):
     assert np.abs(mesh.colors - color_at(mesh.vertices)).mean() < 0.02
 
 
-def test_a_glb_is_read_back(piece, mesh, tmp_path):
-    facts = make_exporter("glb", **OPTIONS).write(tmp_path / "cup.glb", piece)
+def test_a_glb_is_read_back(item, mesh, tmp_path):
+    facts = make_exporter("glb", **OPTIONS).write(tmp_path / "cup.glb", item)
     assert facts == {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "voxel": mesh.voxel}
-    (read,) = trimesh.load_scene(tmp_path / "cup.glb", process=False).geometry.values()
+    (read,) = trimesh.read_assigned_run(tmp_path / "cup.glb", process=False).geometry.values()
     assert np.allclose(read.vertices, mesh.vertices, atol=1e-6) and np.array_equal(read.faces, mesh.faces)
     other = open3d.io.read_triangle_mesh(str(tmp_path / "cup.glb"))
     tree = cKDTree(np.asarray(other.vertices))  # this reader may renumber
@@ -98,22 +98,22 @@ def test_a_glb_is_read_back(piece, mesh, tmp_path):
     assert "KHR_materials_unlit" in content["materials"][0]["extensions"]
 
 
-def test_an_obj_is_read_back(piece, mesh, tmp_path):
-    make_exporter("obj", **OPTIONS).write(tmp_path / "cup.obj", piece)
+def test_an_obj_is_read_back(item, mesh, tmp_path):
+    make_exporter("obj", **OPTIONS).write(tmp_path / "cup.obj", item)
     read = trimesh.load_mesh(tmp_path / "cup.obj", process=False, maintain_order=True)
     assert np.allclose(read.vertices, mesh.vertices, atol=1e-6) and np.array_equal(read.faces, mesh.faces)
     assert np.abs(read.visual.vertex_colors[:, :3] / 255.0 - mesh.colors).max() < 3e-3
 
 
-def test_both_file_types_share_one_mesh(piece):
-    assert make_exporter("glb", **OPTIONS).mesh(piece) is make_exporter(
+def test_both_file_types_share_one_mesh(item):
+    assert make_exporter("glb", **OPTIONS).mesh(item) is make_exporter(
         "obj", **OPTIONS
-    ).mesh(piece)  # fmt: skip
+    ).mesh(item)  # fmt: skip
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
-def test_the_scale_of_a_scene_changes_nothing(piece, mesh, scale):
-    surfels, views = piece.surfels, piece.views
+def test_the_scale_of_a_scene_changes_nothing(item, mesh, scale):
+    surfels, views = item.surfels, item.views
 
     def scaled(camera: Camera) -> Camera:
         viewmat = camera.viewmat.clone()
@@ -123,19 +123,19 @@ def test_the_scale_of_a_scene_changes_nothing(piece, mesh, scale):
     large = replace(surfels, means=scale * surfels.means, log_scales=surfels.log_scales + float(np.log(scale)))
     settings = RasterSettings(scale * views.settings.near, scale * views.settings.far)
     views = Viewpoints([scaled(camera) for camera in views.cameras], views.rasterizer, settings)
-    other = GlbExporter(**OPTIONS).mesh(replace(piece, surfels=large, views=views, shared={}))
+    other = GlbExporter(**OPTIONS).mesh(replace(item, surfels=large, views=views, shared={}))
     assert other.voxel == pytest.approx(scale * mesh.voxel, rel=1e-5)
     # not bit by bit: a pixel's depth may fall to the neighbouring disc
     distance, _ = cKDTree(mesh.vertices).query(other.vertices / scale)
     assert np.quantile(distance, 0.99) < 0.1 * mesh.voxel
 
 
-def test_the_same_mesh_for_any_number_of_threads(piece, mesh):
+def test_the_same_mesh_for_any_number_of_threads(item, mesh):
     threads = torch.get_num_threads()
     for count in (1, 4):
         torch.set_num_threads(count)
         try:
-            again = GlbExporter(**OPTIONS).mesh(replace(piece, shared={}))
+            again = GlbExporter(**OPTIONS).mesh(replace(item, shared={}))
         finally:
             torch.set_num_threads(threads)
         for name in ("vertices", "faces", "colors"):
@@ -177,15 +177,15 @@ def test_voxels_grow_to_keep_the_memory():
     assert voxel > 2.0 / 4096 and 100 < _grid_mb(high, voxel, 8.0) <= 200
 
 
-def test_the_grid_is_as_small_as_was_said(piece, monkeypatch):
+def test_the_grid_is_as_small_as_was_said(item, monkeypatch):
     """All blocks that Open3D allocates, at 20 bytes a voxel, stay within the bound."""
     from beags_plugin.export import fusion
 
     grids = []
     make = fusion._new_grid
     monkeypatch.setattr(fusion, "_new_grid", lambda: grids.append(make()) or grids[-1])
-    mesh = GlbExporter(resolution=400, memory_mb=60.0).mesh(replace(piece, shared={}))
-    low, high = bounding_box(piece.surfels)
+    mesh = GlbExporter(resolution=400, memory_mb=60.0).mesh(replace(item, shared={}))
+    low, high = bounding_box(item.surfels)
     assert mesh.voxel > float((high - low).max()) / 400
     assert 0 < grids[0].hashmap().size() * 16**3 * 20 / 1e6 < 60.0
 
@@ -206,8 +206,8 @@ def test_a_close_up_sees_the_same_larger():
     assert torch.allclose(inside.K[0, 0], camera.K[0, 0] * 100 / 64)
 
 
-def test_what_no_view_shows_is_said(piece):
-    behind = replace(piece, surfels=replace(piece.surfels, means=piece.surfels.means + 1000.0), shared={})
+def test_what_no_view_shows_is_said(item):
+    behind = replace(item, surfels=replace(item.surfels, means=item.surfels.means + 1000.0), shared={})
     with pytest.raises(NothingToExport, match="no surface of 'cup' is seen in 3 training views"):
         make_exporter("glb").write(None, behind)
 

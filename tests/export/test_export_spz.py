@@ -14,7 +14,7 @@ from run_folders import discs
 
 from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.export.base import Piece, make_exporter
+from beags_plugin.export.base import ExportItem, make_exporter
 from beags_plugin.export.spz import fractional_bits
 from beags_plugin.system.errors import UserError
 
@@ -22,7 +22,7 @@ SH_COUNT = {0: 0, 1: 3, 2: 8, 3: 15}
 
 
 def write(path, surfels: Surfels, **options) -> dict:
-    return make_exporter("spz", **options).write(path, Piece("cup", surfels, torch.zeros(len(surfels))))
+    return make_exporter("spz", **options).write(path, ExportItem("cup", surfels, torch.zeros(len(surfels))))
 
 
 def read(path) -> dict[str, np.ndarray]:
@@ -158,7 +158,7 @@ def test_the_same_bytes_again_and_much_smaller_than_a_ply(tmp_path):
     surfels = random_surfels(count=2000)
     write(tmp_path / "a.spz", surfels)
     write(tmp_path / "b.spz", surfels)
-    make_exporter("ply").write(tmp_path / "a.ply", Piece("cup", surfels, torch.zeros(2000, dtype=torch.int32)))
+    make_exporter("ply").write(tmp_path / "a.ply", ExportItem("cup", surfels, torch.zeros(2000, dtype=torch.int32)))
     assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()
     assert (tmp_path / "a.spz").stat().st_size * 4 < (tmp_path / "a.ply").stat().st_size
 

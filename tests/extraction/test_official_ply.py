@@ -19,7 +19,7 @@ from scipy.special import expit, logit
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.flattening import flatten
-from beags_plugin.export.base import Piece, make_exporter
+from beags_plugin.export.base import ExportItem, make_exporter
 from beags_plugin.extraction.ply import write_ply
 from beags_plugin.importers.ply import PlyImporter
 from beags_plugin.rasterizers import make_rasterizer
@@ -134,7 +134,7 @@ def test_what_is_exported_for_2dgs_has_its_columns_in_its_order(tmp_path, classe
     """With classes, they come behind what the official code asks for by name."""
     surfels, path = random_surfels(degree=2), tmp_path / "cup.ply"
     if classes:
-        make_exporter("ply-2dgs").write(path, Piece("cup", surfels, torch.ones(7, dtype=torch.int32)))
+        make_exporter("ply-2dgs").write(path, ExportItem("cup", surfels, torch.ones(7, dtype=torch.int32)))
     else:
         write_ply(path, surfels, layout="2dgs")
     lines = path.read_bytes().partition(b"end_header\n")[0].decode("ascii").splitlines()

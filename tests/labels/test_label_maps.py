@@ -9,29 +9,29 @@ from hypothesis import strategies as st
 from voted_views import METHODS, larger_scene, same
 
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.labels.label_maps import LabelMaps, narrowed, widened
+from beags_plugin.labels.label_maps import LabelMaps, to_compact, to_int32
 
 
 @given(st.lists(st.one_of(st.integers(0, 300), st.integers(65500, IGNORE)), min_size=1, max_size=12))
 def test_every_id_comes_back(ids):
     wide = torch.tensor([ids], dtype=torch.int32)
-    narrow = narrowed(wide)
-    assert widened(narrow).dtype == torch.int32 and torch.equal(widened(narrow), wide)
+    narrow = to_compact(wide)
+    assert to_int32(narrow).dtype == torch.int32 and torch.equal(to_int32(narrow), wide)
     fits = all(value < 255 or value == IGNORE for value in ids)
     assert narrow.dtype == (torch.uint8 if fits else torch.uint16)
 
 
 def test_255_classes_fit_in_a_byte_and_256_do_not():
     most = torch.arange(255, dtype=torch.int32)[None]
-    assert narrowed(torch.cat([most, torch.tensor([[IGNORE]])], 1)).dtype == torch.uint8
-    assert narrowed(torch.tensor([[255]])).dtype == torch.uint16
-    assert narrowed(torch.tensor([[IGNORE + 1]])).dtype == torch.int32  # no id; whoever reads it says so
-    assert narrowed(torch.tensor([[-1]])).dtype == torch.int32
+    assert to_compact(torch.cat([most, torch.tensor([[IGNORE]])], 1)).dtype == torch.uint8
+    assert to_compact(torch.tensor([[255]])).dtype == torch.uint16
+    assert to_compact(torch.tensor([[IGNORE + 1]])).dtype == torch.int32  # no id; whoever reads it says so
+    assert to_compact(torch.tensor([[-1]])).dtype == torch.int32
 
 
 def test_maps_are_read_one_at_a_time():
     wide = torch.tensor([[0, 7, IGNORE]], dtype=torch.int32)
-    maps = LabelMaps([wide, None, narrowed(wide)])
+    maps = LabelMaps([wide, None, to_compact(wide)])
     assert len(maps) == 3 and maps[1] is None
     assert maps.stored[2] is LabelMaps(maps.stored).stored[2]  # held maps are not copied
     read = list(maps)

@@ -13,7 +13,7 @@ from source_scenes import make, mask_at, scene_of, scene_of_folders, values_of
 from beags_plugin.commands.cli import main
 from beags_plugin.data.files import photo_names
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.labels.classes import read_class_map
+from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.masks.sources.coco import CocoSource
 from beags_plugin.masks.sources.id_images import IdImagesSource
 from beags_plugin.masks.sources.langsplat import LangSplatSource
@@ -153,8 +153,8 @@ def test_the_command_and_training_agree_on_photos_of_equal_stems(tmp_path, capsy
     expected = {"left/v0": 1, "left/v1": 2, "right/v0": 3, "right/v1": 4}
     outputs = BeagsDataParserConfig(data=tmp_path, eval_interval=0).setup().get_dataparser_outputs("train")
     found = {
-        path.relative_to(tmp_path / "images").with_suffix("").as_posix(): int(read_class_map(mask).max())
-        for path, mask in zip(outputs.image_filenames, outputs.metadata["class_map_filenames"], strict=True)
+        path.relative_to(tmp_path / "images").with_suffix("").as_posix(): int(read_id_mask(mask).max())
+        for path, mask in zip(outputs.image_filenames, outputs.metadata["mask_filenames"], strict=True)
     }
     assert found == expected
     held_out = BeagsDataParserConfig(data=tmp_path, eval_interval=0, held_out=("right/v0",)).setup()

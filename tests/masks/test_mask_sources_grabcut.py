@@ -10,7 +10,7 @@ import pytest
 from source_scenes import Wall, coloured, make
 
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.masks.rims import snap_to_edges
+from beags_plugin.masks.snapping import snap_to_edges
 from beags_plugin.masks.sources.base import SourceScene
 from beags_plugin.masks.sources.grabcut import GrabCutSource, carry, cut_by_box
 from beags_plugin.masks.sources.prompts import Prompt

@@ -14,7 +14,7 @@ from data_folders import look_at, write_image, write_transforms
 
 from beags_plugin.commands.cli import main
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.labels.classes import write_class_map
+from beags_plugin.labels.classes import write_mask
 from beags_plugin.masks.check.areas import contradicted
 from beags_plugin.masks.check.consistency import UNSEEN, Agreement, labels_at, ranks_of
 from beags_plugin.masks.check.issues import named, percent
@@ -59,12 +59,12 @@ def write_balls(root: Path, change=lambda view, ids: ids) -> Path:
     return root
 
 
-def findings(root: Path, **options) -> dict[str, list]:
+def issues(root: Path, **options) -> dict[str, list]:
     from beags_plugin.plugin.objects.check_masks import check_scene, data_options
 
     found: dict[str, list] = {}
-    for finding in check_scene(data_options(root, **options)).findings:
-        found.setdefault(finding.kind, []).append(finding)
+    for issue in check_scene(data_options(root, **options)).issues:
+        found.setdefault(issue.kind, []).append(issue)
     return found
 
 
@@ -73,14 +73,14 @@ def exchanged(ids: np.ndarray, *order: int) -> np.ndarray:
 
 
 def test_good_masks_give_no_finding(tmp_path):
-    assert findings(write_balls(tmp_path)) == {}
+    assert issues(write_balls(tmp_path)) == {}
 
 
 def test_exchanged_ids_are_found_with_the_view(tmp_path):
     plan = {3: (2, 1, 3), 9: (3, 1, 2)}
-    found = findings(write_balls(tmp_path, lambda view, ids: exchanged(ids, *plan.get(view, (1, 2, 3)))))
-    assert {finding.views for finding in found["swapped ids"]} == {("v03",), ("v09",)}
-    pair = next(finding for finding in found["swapped ids"] if finding.views == ("v03",))
+    found = issues(write_balls(tmp_path, lambda view, ids: exchanged(ids, *plan.get(view, (1, 2, 3)))))
+    assert {issue.views for issue in found["swapped ids"]} == {("v03",), ("v09",)}
+    pair = next(issue for issue in found["swapped ids"] if issue.views == ("v03",))
     assert "2 (right) instead of 1 (left), 1 (left) instead of 2 (right)" in pair.message
     assert f"1 masks ({tmp_path / 'masks/v03.png'})" in pair.message
     pixels = int(np.isin(draw(poses()[3]), (1, 2)).sum())
@@ -95,7 +95,7 @@ def test_an_inverted_mask_is_found(tmp_path):
 
     root = write_balls(tmp_path, change)
     (root / "classes.json").write_text('{"1": "left"}')
-    found = findings(root)
+    found = issues(root)
     assert found["inverted"][0].views == ("v05",) and set(found) == {"inverted"}
     assert str(root / "masks/v05.png") in found["inverted"][0].message
 
@@ -103,7 +103,7 @@ def test_an_inverted_mask_is_found(tmp_path):
 def test_an_id_used_in_a_single_view_is_an_exchange(tmp_path):
     root = write_balls(tmp_path, lambda view, ids: exchanged(ids, 1, 2, 9 if view == 4 else 3))
     (root / "classes.json").write_text('{"1": "left", "2": "right", "3": "top", "9": "odd"}')
-    found = findings(root)
+    found = issues(root)
     assert found["swapped ids"][0].views == ("v04",) and "9 (odd) instead of 3 (top)" in found["swapped ids"][0].message
     assert "id 9 (odd) is in 1 of" in found["few views"][0].message
     assert str(root / "masks/v04.png") in found["few views"][0].message
@@ -119,7 +119,7 @@ def test_mistakes_in_files_name_file_and_remedy(tmp_path):
 
     root = write_balls(tmp_path, change)
     write_image(root / "masks/other.png", np.zeros((4, 4), np.uint8))
-    found = findings(root)
+    found = issues(root)
     assert str(root / "masks/v02.png") in found["size"][0].message and "48x24" in found["size"][0].message
     assert str(root / "masks/v03.png") in found["type"][0].message and "has colours" in found["type"][0].message
     assert (
@@ -130,7 +130,7 @@ def test_mistakes_in_files_name_file_and_remedy(tmp_path):
     assert "other.png" in found["unused"][0].message and "3 (top)" in found["unused name"][0].message
     levels = {kind: found[kind][0].level for kind in ("size", "type", "unknown id", "missing", "unused", "unused name")}
     assert list(levels.values()) == ["error"] * 3 + ["warning"] * 3
-    ignoring = findings(root, ignore_ids=(255,))
+    ignoring = issues(root, ignore_ids=(255,))
     assert "unknown id" not in ignoring
 
 
@@ -140,7 +140,7 @@ def test_the_command_writes_its_report_and_ends_with_1_on_errors(tmp_path, capsy
         main(["masks", "check", "--data", str(root), "--output", str(tmp_path / "out")])
     assert ended.value.code == 1
     report = json.loads((tmp_path / "out/report.json").read_text())
-    assert [finding["kind"] for finding in report["findings"]] == ["size"]
+    assert [issue["kind"] for issue in report["issues"]] == ["size"]
     assert report["coverage"][0]["pixels"]["1"] == int((draw(poses()[0]) == 1).sum())
     assert (tmp_path / "out/coverage.png").stat().st_size > 5000
     assert "11 usable masks, 3 objects; 1 errors" in capsys.readouterr().out
@@ -151,7 +151,7 @@ def test_unlabelled_masks_are_named(tmp_path):
         return np.full_like(ids, 255) if view in (2, 7, 10) else ids
 
     root = write_balls(tmp_path, change)
-    (note,) = findings(root, ignore_ids=(255,))["unlabelled"]
+    (note,) = issues(root, ignore_ids=(255,))["unlabelled"]
     assert f"most in {root / 'masks/v02.png'}, v07.png, v10.png: fine" in note.message and note.message.startswith(
         "25 %"
     )
@@ -161,15 +161,15 @@ def test_an_image_that_is_no_id_image_is_told_and_not_compared(tmp_path):
     root = write_balls(tmp_path)
     (root / "classes.json").unlink()
     depth = np.arange(draw(poses()[2]).size, dtype=np.uint16).reshape(draw(poses()[2]).shape)
-    write_class_map(root / "masks/v02.png", depth)
-    found = findings(root)
+    write_mask(root / "masks/v02.png", depth)
+    found = issues(root)
     assert set(found) == {"no id image"} and found["no id image"][0].level == "error"
     assert str(root / "masks/v02.png") in found["no id image"][0].message and found["no id image"][0].views == ("v02",)
 
 
 def test_no_mask_at_all_is_an_error(tmp_path):
     write_transforms(tmp_path)
-    found = findings(tmp_path)
+    found = issues(tmp_path)
     assert found["missing"][0].level == "error" and "beags masks make" in found["missing"][0].message
 
 
@@ -209,7 +209,7 @@ def test_contradicted_areas_are_more_than_rims():
 
 
 def test_areas_that_a_run_contradicts_are_told_with_what_they_cost(tmp_path):
-    from beags_plugin.labels.label_maps import LabelMaps, PackedMaps
+    from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
     from beags_plugin.plugin.objects.check_masks import check_scene, check_with_run, data_options
 
     def change(view, ids):
@@ -221,14 +221,14 @@ def test_areas_that_a_run_contradicts_are_told_with_what_they_cost(tmp_path):
     report = check_scene(data_options(root))
     given = LabelMaps(torch.from_numpy(change(view, draw(pose)).astype(np.int32)) for view, pose in enumerate(poses()))
     voted = LabelMaps(torch.from_numpy(draw(pose).astype(np.int32)) for pose in poses())
-    sure = PackedMaps(torch.full((SIDE, SIDE), 255, dtype=torch.uint8) for _ in poses())
+    sure = CompressedMaps(torch.full((SIDE, SIDE), 255, dtype=torch.uint8) for _ in poses())
     run = SimpleNamespace(names=report.stems, given=given, voted=voted, confidence=sure, classes=report.names)
     found = check_with_run(report, cast(Any, run))
-    (finding,) = [finding for finding in found.findings if finding.kind == "contradicted"]
+    (issue,) = [issue for issue in found.issues if issue.kind == "contradicted"]
     (area,) = found.areas
-    assert (area.view, area.given, area.voted) == ("v03", 2, 0) and finding.views == ("v03",)
-    assert "1 areas in 1 views" in finding.message and f"correct these masks of {root}" in finding.message
-    assert 60 < area.pixels <= 100 and finding.cost.startswith(f"{area.pixels} pixels (0.")
+    assert (area.view, area.given, area.voted) == ("v03", 2, 0) and issue.views == ("v03",)
+    assert "1 areas in 1 views" in issue.message and f"correct these masks of {root}" in issue.message
+    assert 60 < area.pixels <= 100 and issue.cost.startswith(f"{area.pixels} pixels (0.")
     assert check_with_run(report, cast(Any, SimpleNamespace(**{**vars(run), "given": voted}))).areas == []
 
 

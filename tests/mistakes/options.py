@@ -87,7 +87,7 @@ def _(at: Place):
 
     reason = "the compiled module was not built: install a C++17 compiler, then run make clean setup."
     at.patch.setattr(extension, "load", lambda: None)
-    at.patch.setattr(extension, "found", lambda: (None, reason))
+    at.patch.setattr(extension, "status", lambda: (None, reason))
     return at.train("--pipeline.model.rasterizer", "native")
 
 

@@ -12,13 +12,13 @@ from beags_plugin.ops import cuda_extension, extension
 
 @pytest.fixture
 def found(monkeypatch):
-    """``cuda_extension.found`` on a machine with a GPU; driver, needed: CUDA versions, as CUDA counts."""
+    """``cuda_extension.status`` on a machine with a GPU; driver, needed: CUDA versions, as CUDA counts."""
 
     def ask(driver: int, needed: int):
         cuda = SimpleNamespace(driver_version=lambda: driver, needed_driver_version=lambda: needed)
-        monkeypatch.setattr(extension, "found", lambda: (SimpleNamespace(cuda=cuda), None))
+        monkeypatch.setattr(extension, "status", lambda: (SimpleNamespace(cuda=cuda), None))
         monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-        module, reason = cuda_extension.found.__wrapped__()
+        module, reason = cuda_extension.status.__wrapped__()
         assert (module is cuda) == (reason is None)
         return reason
 
@@ -36,5 +36,5 @@ def test_a_driver_that_is_too_old_is_named(found):
 
 
 def test_a_module_without_kernels_says_how_to_get_them(monkeypatch):
-    monkeypatch.setattr(extension, "found", lambda: (SimpleNamespace(), None))
-    assert "install the CUDA toolkit" in cuda_extension.found.__wrapped__()[1]
+    monkeypatch.setattr(extension, "status", lambda: (SimpleNamespace(), None))
+    assert "install the CUDA toolkit" in cuda_extension.status.__wrapped__()[1]

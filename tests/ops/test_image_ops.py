@@ -42,7 +42,7 @@ def in_torch(monkeypatch):
 
     def call(function):
         with monkeypatch.context() as patch:
-            patch.setattr(cuda_extension, "can_take", lambda *tensors: False)
+            patch.setattr(cuda_extension, "supports", lambda *tensors: False)
             return function()
 
     return call

@@ -13,9 +13,9 @@ from start_scenes import a_frame, drawn
 from beags_plugin.core.lifting import project
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.pictures import video
-from beags_plugin.pictures.objects import Subject, comparison, draw_alone, film, sheet
+from beags_plugin.pictures.objects import Subject, comparison, film, render_alone, sheet
 from beags_plugin.pictures.options import RenderOptions
-from beags_plugin.pictures.orbit import orbit, orbit_settings, stand_of
+from beags_plugin.pictures.orbit import orbit, orbit_frame, orbit_settings
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.system.errors import UserError
 
@@ -39,7 +39,7 @@ def ball(color: float = 1.0, count: int = 200) -> Surfels:
 
 @pytest.mark.parametrize(("elevation", "turn"), [(20.0, 360.0), (0.0, 90.0), (-30.0, 360.0), (90.0, 360.0)])
 def test_cameras_look_at_the_middle_and_the_box_fills_the_widest_picture(elevation, turn):
-    stand = stand_of(LOW, HIGH)
+    stand = orbit_frame(LOW, HIGH)
     cameras = orbit(stand, 12, 100, elevation, turn)
     reach = []
     for camera in cameras:
@@ -60,7 +60,7 @@ def test_cameras_look_at_the_middle_and_the_box_fills_the_widest_picture(elevati
 
 
 def test_a_turn_starts_at_the_front_goes_round_and_less_of_one_swings():
-    stand = stand_of(LOW, HIGH)  # the front is -y
+    stand = orbit_frame(LOW, HIGH)  # the front is -y
 
     def angles(turn: float) -> list[float]:
         centers = [camera.center.double() - stand.center for camera in orbit(stand, 8, 32, 0.0, turn)]
@@ -73,8 +73,8 @@ def test_a_turn_starts_at_the_front_goes_round_and_less_of_one_swings():
 
 
 def test_up_and_front_are_those_of_the_photos():
-    photos = orbit(stand_of(LOW, HIGH), 8, 32, 30.0, 80.0)
-    stand = stand_of(LOW, HIGH, photos)
+    photos = orbit(orbit_frame(LOW, HIGH), 8, 32, 30.0, 80.0)
+    stand = orbit_frame(LOW, HIGH, photos)
     tilted = torch.tensor([0.0, math.sin(math.radians(30)), math.cos(math.radians(30))], dtype=torch.float64)
     assert float(stand.up @ tilted) > 0.98
     assert float(torch.nn.functional.normalize(stand.front, dim=0)[1]) < -0.8
@@ -83,13 +83,13 @@ def test_up_and_front_are_those_of_the_photos():
     moved = [
         type(c)(c.viewmat.double() @ torch.block_diag(turn.T, torch.eye(1)), c.K, c.width, c.height) for c in photos
     ]
-    again = stand_of(LOW, HIGH, moved)
+    again = orbit_frame(LOW, HIGH, moved)
     assert torch.allclose(again.up, turn @ stand.up, atol=1e-6)
 
 
 def test_an_empty_box_and_photos_from_straight_above_are_no_trouble():
-    point = stand_of(torch.zeros(3), torch.zeros(3))
-    above = stand_of(LOW, HIGH, up=torch.tensor([0.0, -1.0, 0.0]))  # the front is up itself
+    point = orbit_frame(torch.zeros(3), torch.zeros(3))
+    above = orbit_frame(LOW, HIGH, up=torch.tensor([0.0, -1.0, 0.0]))  # the front is up itself
     for stand in (point, above):
         assert all(bool(camera.viewmat.isfinite().all()) for camera in orbit(stand, 4, 32))
 
@@ -98,11 +98,11 @@ def test_an_empty_box_and_photos_from_straight_above_are_no_trouble():
 
 
 def test_what_is_not_covered_shows_the_background():
-    stand = stand_of(-torch.ones(3), torch.ones(3))
+    stand = orbit_frame(-torch.ones(3), torch.ones(3))
     (camera,) = orbit(stand, 1, 64)
     settings, rasterizer = orbit_settings(stand), make_rasterizer("auto")
     white, black, checker = (
-        draw_alone(ball(0.4), camera, settings, rasterizer, name) for name in ("white", "black", "checker")
+        render_alone(ball(0.4), camera, settings, rasterizer, name) for name in ("white", "black", "checker")
     )
     assert white[0, 0].tolist() == [255] * 3 and black[0, 0].tolist() == [0] * 3
     assert {tuple(pixel) for pixel in checker[0]} == {(200, 200, 200), (236, 236, 236)}
@@ -110,12 +110,12 @@ def test_what_is_not_covered_shows_the_background():
     expected = (255 * drawn(ball(0.4), camera, settings).clamp(0, 1)).round().to(torch.uint8).numpy()
     assert np.array_equal(black, expected)
     assert np.array_equal(
-        draw_alone(ball()[:0], camera, settings, rasterizer, "black"), np.zeros((64, 64, 3), np.uint8)
+        render_alone(ball()[:0], camera, settings, rasterizer, "black"), np.zeros((64, 64, 3), np.uint8)
     )
 
 
 def subjects(count: int, stages: tuple[str, ...]) -> list[Subject]:
-    stand = stand_of(-torch.ones(3), torch.ones(3))
+    stand = orbit_frame(-torch.ones(3), torch.ones(3))
     cameras = orbit(stand, count, 33)
     return [
         Subject(name, {stage: ball(0.2 + 0.4 * i) for i, stage in enumerate(stages)}, cameras, orbit_settings(stand))

@@ -141,7 +141,7 @@ def test_prepare_splits_only_for_refiners_that_train():
     assert divided.edited is not None and len(divided.assignment.class_ids) == 3
     assert len(divided.edited.edited.surfels) == len(seen[0].surfels) == 4
     assert torch.equal(seen[0].class_ids, divided.edited.assignment.class_ids)
-    assert any("became 4" in finding for finding in divided.findings) and "border split" in divided.seconds
+    assert any("became 4" in finding for finding in divided.summary) and "border split" in divided.seconds
     assert prepare(*arguments, Recorder(), config, BorderSplitConfig()).edited is None
 
 

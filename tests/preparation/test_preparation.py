@@ -87,11 +87,11 @@ def test_auto_gives_what_the_method_that_it_chose_gives(monkeypatch):
 
     stated = {name: of(name) for name in ("voxel", "pairwise")}
     few = of("auto")
-    assert any(line.startswith("reprojection pairwise: 5 views") for line in few.findings)
+    assert any(line.startswith("reprojection pairwise: 5 views") for line in few.summary)
     monkeypatch.setattr(consistent_masks, "PAIRWISE_PIXELS", 1)
     many = of("auto")
-    assert any(line.startswith("reprojection voxel: 5 views") for line in many.findings)
-    assert not any(line.startswith("reprojection voxel") for line in stated["voxel"].findings)
+    assert any(line.startswith("reprojection voxel: 5 views") for line in many.summary)
+    assert not any(line.startswith("reprojection voxel") for line in stated["voxel"].summary)
     for found, name in ((few, "pairwise"), (many, "voxel")):
         assert all(torch.equal(a, b) for a, b in zip(found.labels, stated[name].labels, strict=True))
         assert all(torch.equal(a, b) for a, b in zip(found.confidence, stated[name].confidence, strict=True))

@@ -9,8 +9,8 @@ import torch
 from raster_scenes import make_scene
 
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.by_device import ByDevice
 from beags_plugin.rasterizers.cuda import UNKNOWN, CudaRasterizer
+from beags_plugin.rasterizers.device_dispatch import DeviceDispatchRasterizer
 from beags_plugin.rasterizers.interface import SurfelInputs
 
 pytestmark = pytest.mark.skipif(CudaRasterizer.unavailable() is not None, reason=str(CudaRasterizer.unavailable()))
@@ -31,7 +31,7 @@ def on_gpu(scene):
 def test_auto_draws_where_the_surfels_lie_cuda():
     scene = make_scene().to(torch.float32)
     rasterizer = make_rasterizer("auto")
-    assert isinstance(rasterizer, ByDevice)
+    assert isinstance(rasterizer, DeviceDispatchRasterizer)
     there, here = on_gpu(scene).draw(rasterizer), scene.draw(rasterizer)
     assert there.color.is_cuda and not here.color.is_cuda
     assert (there.color.cpu() - here.color).abs().max() < 1e-3

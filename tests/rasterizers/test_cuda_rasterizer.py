@@ -111,7 +111,7 @@ def test_products_are_the_references(cuda, name):
     expected = TorchRasterizer()
     contributions = cuda.class_contributions(*what, scene.target, CLASSES)
     assert error(contributions, expected.class_contributions(*what, scene.target, CLASSES)) < 1e-9
-    assert torch.equal(cuda.heaviest(*what), expected.heaviest(*what))
+    assert torch.equal(cuda.dominant_gaussian(*what), expected.dominant_gaussian(*what))
     (classes, share), (true_classes, true_share) = cuda.class_map(*what, CLASSES), expected.class_map(*what, CLASSES)
     assert torch.equal(classes, true_classes)
     assert error(share, true_share) < 1e-9
@@ -127,7 +127,7 @@ def test_more_classes_than_one_walk_takes(cuda):
     assert error(share, expected[1]) < 1e-9
     labels = (torch.arange(37 * 29, dtype=torch.int32) % 256).reshape(29, 37)
     labels[3] = IGNORE
-    keys, values = cuda.contributing_classes(*what, labels, 256)
+    keys, values = cuda.sparse_class_contributions(*what, labels, 256)
     found = torch.zeros(60 * 256, dtype=torch.float64)
     found[keys] = values
     assert error(found.view(60, 256), TorchRasterizer().class_contributions(*what, labels, 256)) < 1e-9
@@ -203,7 +203,7 @@ def test_images_of_more_tiles_than_a_key_holds_are_refused(emulated):
     scene = make_scene(count=1)
     camera = replace(scene.camera, width=20_000, height=2_000)
     with pytest.raises(UserError, match="16 million pixels"):
-        emulated.heaviest(scene.inputs, camera, scene.settings)
+        emulated.dominant_gaussian(scene.inputs, camera, scene.settings)
 
 
 def test_without_cuda_the_reason_is_told():

@@ -72,7 +72,7 @@ def test_a_million_gaussians(dtype):
     assert all(getattr(drawn, name).isfinite().all() for name in OUTPUTS)
     assert all(leaf.grad.isfinite().all() for leaf in leaves.values())
     assert drawn.num_nonfinite == 0 and int(drawn.visible.sum()) > 300_000
-    keys, sums = rasterizer.contributing_classes(scene.inputs, scene.camera, scene.settings, scene.target, 4)
+    keys, sums = rasterizer.sparse_class_contributions(scene.inputs, scene.camera, scene.settings, scene.target, 4)
     assert (keys // 4).max() < 1_000_000 and len(keys) > 300_000
     labelled = drawn.alpha.detach()[scene.target != IGNORE].double().sum()
     torch.testing.assert_close(sums.double().sum(), labelled, rtol=1e-4, atol=1e-3)

@@ -117,7 +117,7 @@ def test_any_number_of_threads_gives_the_same_bits(dtype, threads):
         results = [getattr(render, name) for name in OUTPUTS] + [render.visible]
         results += list(gradients(backend, scene).values())
         products = (scene.inputs, scene.camera, scene.settings)
-        results += [backend.class_contributions(*products, scene.target, CLASSES), backend.heaviest(*products)]
+        results += [backend.class_contributions(*products, scene.target, CLASSES), backend.dominant_gaussian(*products)]
         results += list(backend.class_map(*products, CLASSES))
         runs.append(results)
     for other in runs[1:]:
@@ -143,7 +143,7 @@ def test_products_are_the_references(name):
     found, expected = NativeRasterizer(), TorchRasterizer()
     contributions = found.class_contributions(*what, scene.target, CLASSES)
     assert error(contributions, expected.class_contributions(*what, scene.target, CLASSES)) < 1e-9
-    assert torch.equal(found.heaviest(*what), expected.heaviest(*what))
+    assert torch.equal(found.dominant_gaussian(*what), expected.dominant_gaussian(*what))
     (classes, share), (true_classes, true_share) = found.class_map(*what, CLASSES), expected.class_map(*what, CLASSES)
     assert torch.equal(classes, true_classes)
     assert error(share, true_share) < 1e-9
@@ -201,7 +201,7 @@ def test_a_missing_module_is_told_in_a_sentence(monkeypatch):
     def missing(name):
         raise ModuleNotFoundError(f"No module named {name!r}")
 
-    extension.found.cache_clear()
+    extension.status.cache_clear()
     monkeypatch.setattr(extension, "import_module", missing)
     try:
         reason = NativeRasterizer.unavailable()
@@ -214,16 +214,16 @@ def test_a_missing_module_is_told_in_a_sentence(monkeypatch):
         with pytest.raises(UserError, match="was not built"):
             scene.draw(NativeRasterizer())
     finally:
-        extension.found.cache_clear()
+        extension.status.cache_clear()
 
 
 def test_the_compiled_module_can_be_turned_off(monkeypatch):
     monkeypatch.setenv("BEAGS_NATIVE", "0")
-    extension.found.cache_clear()
+    extension.status.cache_clear()
     try:
         assert "turns the compiled module off" in str(NativeRasterizer.unavailable())
         assert extension.load() is None
         assert isinstance(make_rasterizer("auto"), TorchRasterizer)
     finally:
         monkeypatch.undo()
-        extension.found.cache_clear()
+        extension.status.cache_clear()

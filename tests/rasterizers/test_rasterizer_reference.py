@@ -107,8 +107,8 @@ def test_contributions_class_map_and_heaviest(worked_out, rasterizer):
     winner = np.divide(per_class.max(-1), alpha, out=np.zeros_like(alpha), where=alpha > 0)
     np.testing.assert_allclose(share.numpy(), winner, rtol=1e-6, atol=1e-8)
 
-    heaviest = np.where(weights.max(-1) > 0, weights.argmax(-1), -1)
-    np.testing.assert_array_equal(rasterizer.heaviest(*arguments).numpy(), heaviest)
+    dominant_gaussian = np.where(weights.max(-1) > 0, weights.argmax(-1), -1)
+    np.testing.assert_array_equal(rasterizer.dominant_gaussian(*arguments).numpy(), dominant_gaussian)
 
 
 @pytest.mark.parametrize("output", OUTPUTS)
@@ -256,7 +256,7 @@ def test_nothing_to_draw_gives_the_background_with_finite_gradients(rasterizer):
     drawn.color.sum().backward()
     pixels = scene.camera.width * scene.camera.height
     torch.testing.assert_close(background.grad, torch.full((3,), float(pixels), dtype=torch.float64))
-    assert int(rasterizer.heaviest(scene.inputs, scene.camera, scene.settings).max()) == -1
+    assert int(rasterizer.dominant_gaussian(scene.inputs, scene.camera, scene.settings).max()) == -1
 
 
 def test_depth_has_finite_gradients_where_nothing_is(rasterizer):

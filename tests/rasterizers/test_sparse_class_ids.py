@@ -17,7 +17,7 @@ from beags_plugin.masks import reprojection
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.preparation.pipeline import Preparation, PreparationConfig, prepare
 from beags_plugin.rasterizers.interface import RasterSettings
-from beags_plugin.rasterizers.rendering import draw_class_map
+from beags_plugin.rasterizers.rendering import render_class_map
 from beags_plugin.refiners.bea import BeaRefiner
 from beags_plugin.system.errors import UserError
 
@@ -67,9 +67,9 @@ class Recorder:
     def rasterize(self, *arguments):
         return self.inner.rasterize(*arguments)
 
-    def contributing_classes(self, *arguments):
+    def sparse_class_contributions(self, *arguments):
         self.asked.append(arguments[-1])
-        return self.inner.contributing_classes(*arguments)
+        return self.inner.sparse_class_contributions(*arguments)
 
     def class_map(self, *arguments):
         self.asked.append(arguments[-1])
@@ -99,7 +99,7 @@ def test_preparation_gives_the_same_bits(method, rasterizer, monkeypatch):
     far, classes_asked = prepared(rasterizer, FAR, reprojection=method)
     assert asked == ([3, 3] if method == "pairwise" else [])
     assert sorted(classes_asked) == [3] * 4 + [4] * 4  # class maps; masks, with what is not labelled
-    assert near.findings == far.findings
+    assert near.summary == far.summary
     for old, new in zip(near.labels, far.labels, strict=True):
         assert torch.equal(renamed(old, FAR), new) and new.dtype == torch.int32
     assert set(near.assignment.class_ids.tolist()) == set(NEAR)
@@ -197,8 +197,8 @@ def test_class_maps_of_sparse_ids(rasterizer):
     classes = torch.arange(300).int() % 3
     camera = make_views()[0][0]
     recorder = Recorder(rasterizer, [])
-    near = draw_class_map(rasterizer, make_surfels(), classes, camera, SETTINGS)
-    far = draw_class_map(recorder, make_surfels(), renamed(classes, FAR), camera, SETTINGS)
+    near = render_class_map(rasterizer, make_surfels(), classes, camera, SETTINGS)
+    far = render_class_map(recorder, make_surfels(), renamed(classes, FAR), camera, SETTINGS)
     assert recorder.asked == [3]
     assert set(near[0].unique().tolist()) == set(NEAR)
     assert torch.equal(renamed(near[0], FAR), far[0]) and torch.equal(near[1], far[1])

@@ -350,7 +350,7 @@ def test_folder_layout(folder):
 def test_class_maps_are_readable_by_the_mask_module(folder):
     classes = pytest.importorskip("beags_plugin.labels.classes")
     for path in (folder / "masks").iterdir():
-        assert np.array_equal(classes.read_class_map(path), grey(path))
+        assert np.array_equal(classes.read_id_mask(path), grey(path))
     assert len(classes.read_classes(folder / "classes.json")) == 8
 
 

@@ -101,7 +101,7 @@ def everything(rasterizer: Rasterizer, scene: Scene) -> dict[str, Tensor]:
         results[f"gradient of {name}"] = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
     results["broken"] = torch.tensor(drawn.num_nonfinite)
     arguments = (scene.inputs, scene.camera, scene.settings)
-    keys, sums = rasterizer.contributing_classes(*arguments, scene.target, scene.num_classes)
+    keys, sums = rasterizer.sparse_class_contributions(*arguments, scene.target, scene.num_classes)
     surfels, classes = keys // scene.num_classes, keys % scene.num_classes
     for name, values in (("contributions", sums), ("contributions by class", sums * torch.cos(classes.to(sums)))):
         results[name] = scene.inputs.means.new_zeros(len(scene.inputs.means)).index_add(0, surfels, values)

@@ -29,7 +29,7 @@ def cuda_device(request, monkeypatch) -> torch.device:
     ``request.param``: "cuda" or "cuda emulated".
     """
     if request.param == "cuda":
-        if reason := cuda_extension.found()[1]:
+        if reason := cuda_extension.status()[1]:
             pytest.skip(reason)
         return torch.device("cuda")
     module = emulation()
@@ -76,8 +76,8 @@ class CudaOnCpuTensors(Rasterizer):
         classes, share = self.cuda.class_map(_to_gpu(inputs), camera, settings, num_classes)
         return classes.cpu(), share.cpu()
 
-    def heaviest(self, inputs, camera, settings):
-        return self.cuda.heaviest(_to_gpu(inputs), camera, settings).cpu()
+    def dominant_gaussian(self, inputs, camera, settings):
+        return self.cuda.dominant_gaussian(_to_gpu(inputs), camera, settings).cpu()
 
 
 def _to_gpu(inputs: SurfelInputs) -> SurfelInputs:

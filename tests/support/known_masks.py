@@ -36,7 +36,7 @@ class Squares(Rasterizer):
     def class_map(self, inputs, camera, settings, num_classes):
         raise NotImplementedError
 
-    def heaviest(self, inputs, camera, settings):
+    def dominant_gaussian(self, inputs, camera, settings):
         raise NotImplementedError
 
 

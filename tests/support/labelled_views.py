@@ -10,7 +10,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
-from beags_plugin.rasterizers.rendering import draw_class_map
+from beags_plugin.rasterizers.rendering import render_class_map
 
 
 def labelled_views(
@@ -27,7 +27,7 @@ def labelled_views(
         cameras.append(Camera(viewmat, scene.camera.K, scene.camera.width, scene.camera.height))
     rasterizer = make_rasterizer("auto")
     masks: list[Tensor | None] = [
-        draw_class_map(rasterizer, surfels, s.class_ids, camera, scene.settings)[0] for camera in cameras
+        render_class_map(rasterizer, surfels, s.class_ids, camera, scene.settings)[0] for camera in cameras
     ]
     masks[3] = None
     return surfels, cameras, masks, rasterizer, scene.settings

@@ -57,7 +57,7 @@ def write_drawn_scene(root: Path, factor: int = 4) -> Surfels:
     from beags_plugin.core.cameras import Camera, viewmat_from_opengl
     from beags_plugin.rasterizers import make_rasterizer
     from beags_plugin.rasterizers.interface import RasterSettings
-    from beags_plugin.rasterizers.rendering import draw_class_map, surfel_inputs
+    from beags_plugin.rasterizers.rendering import render_class_map, surfel_inputs
 
     surfels, class_ids = discs()
     rasterizer, settings = make_rasterizer("auto"), RasterSettings(0.03, 300.0)
@@ -71,7 +71,7 @@ def write_drawn_scene(root: Path, factor: int = 4) -> Surfels:
         camera = Camera(viewmat, K, factor * WIDTH, factor * HEIGHT)
         image = rasterizer.rasterize(surfel_inputs(surfels, camera), camera, settings, torch.zeros(3)).color
         write_image(root / f"images/v{index:02d}.png", (255 * image.clamp(0, 1)).round().to(torch.uint8).numpy())
-        labels, _ = draw_class_map(rasterizer, surfels, class_ids, camera, settings)
+        labels, _ = render_class_map(rasterizer, surfels, class_ids, camera, settings)
         labels[labels > max(CLASSES)] = 0  # nothing drawn
         write_image(root / f"masks/v{index:02d}.png", labels.to(torch.uint8).numpy())
     return surfels
@@ -119,7 +119,7 @@ def write_prepared(run: Path, shift: int = 0, later: str = "", scale: float = 1.
     """Masks after reprojection, those of the data moved down by ``shift`` rows, and a grid in which all that is left
     of the middle is valid for the cup, as refinement would keep them. later: folder of a later round;
     scale: of the world."""
-    from beags_plugin.labels.classes import write_class_map
+    from beags_plugin.labels.classes import write_mask
     from beags_plugin.occupancy.grid import VisibilityGrid
 
     folder = run / "prepared" / later
@@ -127,7 +127,7 @@ def write_prepared(run: Path, shift: int = 0, later: str = "", scale: float = 1.
     ids = np.zeros((12, 20), np.uint8)
     ids[4:9, 4:9], ids[4:8, 11:15] = 1, 2
     for index in range(9):
-        write_class_map(folder / f"masks/v{index:02d}.png", np.roll(np.roll(ids, index % 3, axis=1), shift, axis=0))
+        write_mask(folder / f"masks/v{index:02d}.png", np.roll(np.roll(ids, index % 3, axis=1), shift, axis=0))
     points = torch.cartesian_prod(*(torch.arange(-2.0, 2.0, 0.25) for _ in range(3)))
     cup = points[points[:, 0] < -0.75]  # valid is one voxel more
     grid = VisibilityGrid.from_points(

@@ -12,7 +12,7 @@ import torch
 from labelled_views import labelled_views
 from raster_scenes import CLASSES
 
-from beags_plugin.labels.label_maps import LabelMaps, PackedMaps
+from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.masks.reprojection import check_views
 from beags_plugin.masks.voxel_reprojection import reproject_voxel
@@ -156,7 +156,7 @@ def test_what_is_prepared_from_files_is_what_is_prepared_from_memory():
         config = PreparationConfig(reprojection=name, k=20)
         refiner = REFINERS.get("bea")()
         found = prepare(surfels, cameras, masks, names, rasterizer, settings, refiner, config)
-        assert isinstance(found.labels, LabelMaps) and isinstance(found.confidence, PackedMaps)
+        assert isinstance(found.labels, LabelMaps) and isinstance(found.confidence, CompressedMaps)
         return [*found.labels, *found.confidence, found.assignment.margin, found.grid.keys, found.grid.classes]
 
     for name in ("voxel", "pairwise"):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from beags_plugin.data.dataset import ColmapModel, Dataset
 from beags_plugin.data.layout import Layout
-from beags_plugin.data.scene import ColmapModel, Scene
 from beags_plugin.system.errors import UserError
 
 FOLDERS = ("sparse/0", "colmap/sparse/0", "sparse")
@@ -60,5 +60,5 @@ class Colmap(Layout):
     def missing(self, root: Path) -> str | None:
         return "no COLMAP model (sparse/0)" if root.is_file() or model_folder(root) is None else None
 
-    def read(self, root: Path, images: Path | None) -> Scene:
-        return Scene(self.title, root, ColmapModel(checked_model(root), images or root / "images"))
+    def read(self, root: Path, images: Path | None) -> Dataset:
+        return Dataset(self.title, root, ColmapModel(checked_model(root), images or root / "images"))

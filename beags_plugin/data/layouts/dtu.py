@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from beags_plugin.data.dataset import Dataset, PoseTable
 from beags_plugin.data.files import choose_images, image_size, list_images
 from beags_plugin.data.layout import Layout
-from beags_plugin.data.scene import PoseTable, Scene
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.arrays import load_arrays
 from beags_plugin.system.reading.text import reason
@@ -36,7 +36,7 @@ class Dtu(Layout):
             return f"no {FILE}"
         return None if any(list_images(root / name) for name in IMAGES) else "no images (image)"
 
-    def read(self, root: Path, images: Path | None) -> Scene:
+    def read(self, root: Path, images: Path | None) -> Dataset:
         original = next(list_images(root / name) for name in IMAGES if list_images(root / name))
         files = list_images(choose_images(root, images)) if images is not None else original
         poses = read_cameras(root / FILE, original)
@@ -46,7 +46,7 @@ class Dtu(Layout):
         if masks and len(masks) != len(files):
             raise UserError(f"{root / 'mask'} holds {len(masks)} masks for {len(files)} images: keep one for each.")
         by_stem = {file.stem: mask for file, mask in zip(files, masks, strict=False)}
-        return Scene(
+        return Dataset(
             self.title,
             root,
             PoseTable(root / FILE, tuple(files), *poses),

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from beags_plugin.data.dataset import ColmapModel, Dataset, Split
 from beags_plugin.data.files import choose_images, list_images
 from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.colmap import checked_model, model_folder
-from beags_plugin.data.scene import ColmapModel, Scene, Split
 from beags_plugin.system.errors import UserError
 
 
@@ -26,11 +26,11 @@ class LerfMask(Layout):
             return "no COLMAP model (sparse/0)"
         return next((f"no folder {name}" for name in ("images_train", "test_mask") if not (root / name).is_dir()), None)
 
-    def read(self, root: Path, images: Path | None) -> Scene:
+    def read(self, root: Path, images: Path | None) -> Dataset:
         folder = choose_images(root, images or root / "images")
         trained = {path.stem for path in list_images(root / "images_train")}
         test = [path.stem for path in list_images(folder) if path.stem not in trained]
-        return Scene(
+        return Dataset(
             self.title,
             root,
             ColmapModel(checked_model(root), folder),

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from beags_plugin.data.dataset import ColmapModel, Dataset, PoseTable, Split
 from beags_plugin.data.files import choose_images, image_folders, list_images
 from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.colmap import complete_model
 from beags_plugin.data.poses_bounds import FILE, read_poses_bounds, seed_points
-from beags_plugin.data.scene import ColmapModel, PoseTable, Scene, Split
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import reason
 
@@ -21,7 +21,7 @@ NVOS_TARGETS = {
     "orchids": "IMG_4480",
     "trex": "DJI_20200223_163619_411",
 }
-"""Scene to the stem of the camera's file of the view whose mask NVOS scores (method, section 9)."""
+"""Dataset to the stem of the camera's file of the view whose mask NVOS scores (method, section 9)."""
 ORIGINAL_NAMES = "original_names.txt"
 
 
@@ -38,10 +38,10 @@ class Llff(Layout):
     def recognises(self, root: Path) -> bool:
         return (root / FILE).is_file() or (root.name.lower() in NVOS_TARGETS and complete_model(root) is not None)
 
-    def read(self, root: Path, images: Path | None) -> Scene:
+    def read(self, root: Path, images: Path | None) -> Dataset:
         folder = choose_images(root, images)
         poses, points = model_or_bounds(root, folder)
-        return Scene(self.title, root, poses, Split(nvos_target(root, folder)), seed_points=points)
+        return Dataset(self.title, root, poses, Split(nvos_target(root, folder)), seed_points=points)
 
 
 def lacks_poses(root: Path) -> str | None:

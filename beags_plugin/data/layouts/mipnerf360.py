@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from beags_plugin.data.dataset import ColmapModel, Dataset
 from beags_plugin.data.files import choose_images, image_folders
 from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.colmap import checked_model, model_folder
-from beags_plugin.data.scene import ColmapModel, Scene
 
 SCENES = ("bicycle", "bonsai", "counter", "flowers", "garden", "kitchen", "room", "stump", "treehill")
 FOLDERS = {"images", "images_2", "images_4", "images_8"}
@@ -33,5 +33,5 @@ class MipNerf360(Layout):
         folders = {folder.name for folder in image_folders(root)}
         return folders >= FOLDERS or (root.name in SCENES and bool(folders))
 
-    def read(self, root: Path, images: Path | None) -> Scene:
-        return Scene(self.title, root, ColmapModel(checked_model(root), choose_images(root, images)))
+    def read(self, root: Path, images: Path | None) -> Dataset:
+        return Dataset(self.title, root, ColmapModel(checked_model(root), choose_images(root, images)))

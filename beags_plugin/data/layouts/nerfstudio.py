@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from beags_plugin.data.dataset import Dataset, TransformsFile
 from beags_plugin.data.layout import Layout
-from beags_plugin.data.scene import Scene, TransformsFile
 
 
 class NerfstudioLayout(Layout):
@@ -18,6 +18,6 @@ class NerfstudioLayout(Layout):
     def missing(self, root: Path) -> str | None:
         return None if root.is_file() or (root / "transforms.json").is_file() else "no transforms.json"
 
-    def read(self, root: Path, images: Path | None) -> Scene:
+    def read(self, root: Path, images: Path | None) -> Dataset:
         file = root if root.is_file() else root / "transforms.json"
-        return Scene(self.title, file.parent, TransformsFile(file, images))
+        return Dataset(self.title, file.parent, TransformsFile(file, images))

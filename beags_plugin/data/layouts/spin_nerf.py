@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from beags_plugin.data.dataset import Dataset, Split
 from beags_plugin.data.files import choose_images, image_folders, list_images
 from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.llff import lacks_poses, model_or_bounds
-from beags_plugin.data.scene import Scene, Split
 
 LABELS = "label"
 
@@ -28,7 +28,7 @@ class SpinNerf(Layout):
             return "no folder of labels (images_4/label)"
         return lacks_poses(root)
 
-    def read(self, root: Path, images: Path | None) -> Scene:
+    def read(self, root: Path, images: Path | None) -> Dataset:
         own = _labelled(root)
         folder = choose_images(root, images or own)
         labels = (folder if (folder / LABELS).is_dir() else own or folder) / LABELS
@@ -37,7 +37,7 @@ class SpinNerf(Layout):
         gone = stems[: stems.index(labelled[0])] if labelled and set(stems[-len(labelled) :]) == set(labelled) else []
         poses, points = model_or_bounds(root, folder)
         note = f"{len(gone)} images before the first label are left out: the object is gone there."
-        return Scene(
+        return Dataset(
             self.title,
             root,
             poses,

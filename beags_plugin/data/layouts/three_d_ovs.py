@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from beags_plugin.data.dataset import Dataset, Split
 from beags_plugin.data.files import choose_images, list_images
 from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.llff import lacks_poses, model_or_bounds
-from beags_plugin.data.scene import Scene, Split
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import reason
 
@@ -30,7 +30,7 @@ class ThreeDOvs(Layout):
             return f"no {CLASSES}"
         return lacks_poses(root)
 
-    def read(self, root: Path, images: Path | None) -> Scene:
+    def read(self, root: Path, images: Path | None) -> Dataset:
         folder = choose_images(root, images)
         stems = [path.stem for path in list_images(folder)]
         names = _class_names(root / CLASSES)
@@ -43,7 +43,7 @@ class ThreeDOvs(Layout):
                 if (view / f"{name}.png").is_file():
                     visible.setdefault(name, {})[stem] = view / f"{name}.png"
         poses, points = model_or_bounds(root, folder)
-        return Scene(
+        return Dataset(
             self.title,
             root,
             poses,

@@ -105,8 +105,8 @@ class Agreement:
         return [{rank: said[rank] for rank in path}] if following == start and len(path) > 1 else []
 
 
-def ranks_of(class_map: np.ndarray, ids: Sequence[int], ignore: int) -> np.ndarray:
+def ranks_of(labels: np.ndarray, ids: Sequence[int], ignore: int) -> np.ndarray:
     """[H, W] int16, the place of each class id among ``ids`` (sorted); ``UNSEEN`` for IGNORE and other ids."""
     table = np.full(ignore + 1, UNSEEN, np.int16)
     table[np.asarray(ids, np.int64)] = np.arange(len(ids))
-    return table[class_map]
+    return table[labels]

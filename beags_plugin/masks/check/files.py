@@ -12,7 +12,7 @@ import numpy as np
 from beags_plugin.data.files import IMAGE_SUFFIXES, image_size
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.labels.classes import read_mask
-from beags_plugin.masks.check.issues import STOPS, Finding, named, percent
+from beags_plugin.masks.check.issues import STOPS, Issue, named, percent
 from beags_plugin.system.errors import UserError
 
 FEW_VIEWS = 3  # an object needs two other views to outvote one
@@ -69,18 +69,18 @@ class Coverage:
     ignored: np.ndarray
     size: np.ndarray
     usable: np.ndarray
-    findings: list[Finding] = field(default_factory=list)
+    issues: list[Issue] = field(default_factory=list)
 
 
 def check_files(
     files: MaskFiles, few_views: int = FEW_VIEWS, progress: Callable[[int, int], None] | None = None
 ) -> Coverage:
-    """Read every mask once; what is wrong with files is among the findings instead of raised."""
+    """Read every mask once; what is wrong with files is among the issues instead of raised."""
     views = len(files.stems)
     counts: list[dict[int, int] | None] = [None] * views
-    findings: list[Finding] = []
+    issues: list[Issue] = []
 
-    def look(view: int) -> dict[int, int] | Finding | None:
+    def look(view: int) -> dict[int, int] | Issue | None:
         path = files.masks[view]
         if path is None:
             return None
@@ -88,27 +88,27 @@ def check_files(
             size = image_size(path)  # of the header: what is far too large is not decoded
             if size != tuple(files.sizes[view]):
                 return _wrong_size(files, view, size)
-            class_map = files.read(view)
+            labels = files.read(view)
         except UserError as error:
-            return Finding("error", "type", str(error), STOPS, (files.stems[view],))
-        assert class_map is not None
-        found = np.bincount(class_map.ravel(), minlength=IGNORE + 1)
+            return Issue("error", "type", str(error), STOPS, (files.stems[view],))
+        assert labels is not None
+        found = np.bincount(labels.ravel(), minlength=IGNORE + 1)
         if np.count_nonzero(found) > MOST_IDS:
             return _no_id_image(files, view, np.count_nonzero(found))
         return {int(i): int(found[i]) for i in np.flatnonzero(found)}
 
     with ThreadPoolExecutor(max_workers=4) as pool:  # decoding a .png releases the interpreter
         for view, found in enumerate(pool.map(look, range(views))):
-            if isinstance(found, Finding):
-                findings.append(found)
+            if isinstance(found, Issue):
+                issues.append(found)
             else:
                 counts[view] = found
             if progress:
                 progress(view + 1, views)
     coverage = _coverage(counts)
-    coverage.findings += findings
-    coverage.findings += [*_missing(files), *_strays(files), *_names(files, coverage)]
-    coverage.findings += [*_few_views(files, coverage, few_views), *_unlabelled(files, coverage)]
+    coverage.issues += issues
+    coverage.issues += [*_missing(files), *_strays(files), *_names(files, coverage)]
+    coverage.issues += [*_few_views(files, coverage, few_views), *_unlabelled(files, coverage)]
     return coverage
 
 
@@ -120,9 +120,9 @@ def _coverage(counts: Sequence[Mapping[int, int] | None]) -> Coverage:
     return Coverage(ids, pixels, ignored, pixels.sum(1) + ignored, usable)
 
 
-def _wrong_size(files: MaskFiles, view: int, found: tuple[int, ...]) -> Finding:
+def _wrong_size(files: MaskFiles, view: int, found: tuple[int, ...]) -> Issue:
     width, height = files.sizes[view]
-    return Finding(
+    return Issue(
         "error",
         "size",
         f"the mask {files.masks[view]} is {found[0]}x{found[1]} pixels but its image is {width}x{height}: "
@@ -132,8 +132,8 @@ def _wrong_size(files: MaskFiles, view: int, found: tuple[int, ...]) -> Finding:
     )
 
 
-def _no_id_image(files: MaskFiles, view: int, ids: int) -> Finding:
-    return Finding(
+def _no_id_image(files: MaskFiles, view: int, ids: int) -> Issue:
+    return Issue(
         "error",
         "no id image",
         f"the mask {files.masks[view]} holds {ids} different ids: this is no id image (a photo? depth?), replace it.",
@@ -142,14 +142,14 @@ def _no_id_image(files: MaskFiles, view: int, ids: int) -> Finding:
     )
 
 
-def _missing(files: MaskFiles) -> list[Finding]:
+def _missing(files: MaskFiles) -> list[Issue]:
     trained = [view for view, used in enumerate(files.trained) if used]
     without = [files.stems[view] for view in trained if files.masks[view] is None]
     if not without:
         return []
     if len(without) == len(trained):
         return [
-            Finding(
+            Issue(
                 "error",
                 "missing",
                 f"no training view has a mask in {files.folder}: put id images there, named as the images, or make "
@@ -159,7 +159,7 @@ def _missing(files: MaskFiles) -> list[Finding]:
             )
         ]
     return [
-        Finding(
+        Issue(
             "warning",
             "missing",
             f"{len(without)} of {len(trained)} training views have no mask in {files.folder}: {named(without)}; "
@@ -171,7 +171,7 @@ def _missing(files: MaskFiles) -> list[Finding]:
     ]
 
 
-def _strays(files: MaskFiles) -> list[Finding]:
+def _strays(files: MaskFiles) -> list[Issue]:
     """Images among the masks that belong to no view: another suffix, another name."""
     if not files.folder.is_dir():
         return []
@@ -184,7 +184,7 @@ def _strays(files: MaskFiles) -> list[Finding]:
     other_type = [path for path in others if path.suffix.lower() != ".png"]
     why = "masks are .png files" if other_type else "no image has such a name"
     return [
-        Finding(
+        Issue(
             "warning",
             "unused",
             f"{len(others)} files in {files.folder} are not used ({named([path.name for path in others], 3)}), as "
@@ -194,19 +194,19 @@ def _strays(files: MaskFiles) -> list[Finding]:
     ]
 
 
-def _names(files: MaskFiles, coverage: Coverage) -> list[Finding]:
+def _names(files: MaskFiles, coverage: Coverage) -> list[Issue]:
     """Ids that classes.json does not name, and names that no mask holds."""
     if files.names is None or files.kind != "ids":
         return []
-    findings = []
+    issues = []
     for column, class_id in enumerate(coverage.ids):
         views = np.flatnonzero(coverage.pixels[:, column])
         if class_id == BACKGROUND or class_id in files.names or not len(views):
             continue
         pixels = int(coverage.pixels[:, column].sum())
         unlabelled = ", or, if it means unlabelled, add: beags-data --ignore-ids 255" if class_id == 255 else ""
-        findings.append(
-            Finding(
+        issues.append(
+            Issue(
                 "error",
                 "unknown id",
                 f"id {class_id} is in {len(views)} masks, the first {files.masks[views[0]]}, but not in "
@@ -217,20 +217,20 @@ def _names(files: MaskFiles, coverage: Coverage) -> list[Finding]:
         )
     absent = [f"{i} ({name})" for i, name in files.names.items() if i != BACKGROUND and i not in coverage.ids]
     if absent:
-        findings.append(
-            Finding(
+        issues.append(
+            Issue(
                 "warning",
                 "unused name",
                 f"{files.names_file} names ids that no mask holds: {named(absent)}; remove them or correct the masks.",
                 "these objects get no Gaussians and cannot be extracted",
             )
         )
-    return findings
+    return issues
 
 
-def _few_views(files: MaskFiles, coverage: Coverage, few_views: int) -> list[Finding]:
+def _few_views(files: MaskFiles, coverage: Coverage, few_views: int) -> list[Issue]:
     trained = np.asarray(files.trained, bool)
-    findings = []
+    issues = []
     for column, class_id in enumerate(coverage.ids):
         present = trained & (coverage.pixels[:, column] > 0)
         count = int(present.sum())
@@ -239,8 +239,8 @@ def _few_views(files: MaskFiles, coverage: Coverage, few_views: int) -> list[Fin
         name = (files.names or {}).get(class_id, f"class_{class_id}")
         pixels = int(coverage.pixels[present, column].sum())
         where = files.paths([int(view) for view in np.flatnonzero(present)]) or "only held-out views"
-        findings.append(
-            Finding(
+        issues.append(
+            Issue(
                 "warning",
                 "few views",
                 f"id {class_id} ({name}) is in {count} of {int(trained.sum())} training views ({where}), fewer than "
@@ -249,16 +249,16 @@ def _few_views(files: MaskFiles, coverage: Coverage, few_views: int) -> list[Fin
                 tuple(files.stems[int(view)] for view in np.flatnonzero(present)),
             )
         )
-    return findings
+    return issues
 
 
-def _unlabelled(files: MaskFiles, coverage: Coverage) -> list[Finding]:
+def _unlabelled(files: MaskFiles, coverage: Coverage) -> list[Issue]:
     total, ignored = int(coverage.size.sum()), int(coverage.ignored.sum())
     if not total or ignored / total < LARGE_IGNORE:
         return []
     most = [int(view) for view in np.argsort(-coverage.ignored, kind="stable") if coverage.ignored[view]]
     return [
-        Finding(
+        Issue(
             "note",
             "unlabelled",
             f"{percent(ignored, total)} of the masks' pixels are unlabelled, most in {files.paths(most[:3])}: fine if "

@@ -12,11 +12,11 @@ STOPS = "training stops when it reads this file"
 
 
 @dataclass(frozen=True)
-class Finding:
+class Issue:
     """One thing that is wrong with the masks, or may be.
 
     level: "error": training refuses it; "warning": it costs quality; "note": fine if it is meant.
-    kind: the same short word for all findings alike. message: which file or object, what is wrong, what to do.
+    kind: the same short word for all issues alike. message: which file or object, what is wrong, what to do.
     cost: what it costs to leave it, with figures. views: stems of the images that it is about.
     """
 
@@ -31,9 +31,9 @@ class Finding:
         return {**vars(self), "views": list(self.views)}
 
 
-def ordered(findings: Sequence[Finding]) -> list[Finding]:
+def ordered(issues: Sequence[Issue]) -> list[Issue]:
     """Errors first, then warnings, then notes; alike ones stay in their order."""
-    return sorted(findings, key=lambda finding: (LEVELS.index(finding.level), finding.kind))
+    return sorted(issues, key=lambda issue: (LEVELS.index(issue.level), issue.kind))
 
 
 def named(items: Sequence[object], most: int = 5) -> str:

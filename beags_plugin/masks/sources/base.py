@@ -54,11 +54,11 @@ class Geometry(Protocol):
         """[h, w] float32, depth of the surface, 0 where nothing is."""
         ...
 
-    def to_straight(self, class_map: np.ndarray, view: int) -> np.ndarray:
+    def to_straight(self, labels: np.ndarray, view: int) -> np.ndarray:
         """[h, w] uint16: a class map [H, W] of the photograph without its lens distortion."""
         ...
 
-    def to_photo(self, class_map: np.ndarray, view: int) -> np.ndarray:
+    def to_photo(self, labels: np.ndarray, view: int) -> np.ndarray:
         """[H, W] uint16: a class map [h, w] with the photograph's lens distortion."""
         ...
 
@@ -138,19 +138,19 @@ def per_photo(
 ) -> Iterator[np.ndarray | None]:
     """``read`` of each photo, with progress; raises ``UserError`` where a map has another size than its photo."""
     for index, photo in enumerate(scene.photos):
-        class_map = read(photo)
-        if class_map is not None and class_map.shape != (photo.height, photo.width):
+        labels = read(photo)
+        if labels is not None and labels.shape != (photo.height, photo.width):
             raise UserError(
-                f"the masks of {photo.path} are {class_map.shape[1]}x{class_map.shape[0]} pixels but the image is "
+                f"the masks of {photo.path} are {labels.shape[1]}x{labels.shape[0]} pixels but the image is "
                 f"{photo.width}x{photo.height}: make them from the image at its full size."
             )
-        yield class_map
+        yield labels
         progress(index + 1, len(scene.photos))
 
 
 def stacked(objects: Sequence[tuple[int, np.ndarray]], shape: tuple[int, int]) -> np.ndarray:
     """[H, W] uint16: the masks [H, W] bool of objects by id in one map; where they overlap, the smaller one is seen."""
-    class_map = np.zeros(shape, np.uint16)
+    labels = np.zeros(shape, np.uint16)
     for class_id, mask in sorted(objects, key=lambda pair: (-int(pair[1].sum()), pair[0])):
-        class_map[mask] = class_id
-    return class_map
+        labels[mask] = class_id
+    return labels

@@ -111,10 +111,10 @@ def carry(
     """
     known = ClassRanks(torch.tensor([0, *ids]))
     straight = LabelMaps()
-    for view, class_map in zip(views, maps, strict=True):
+    for view, labels in zip(views, maps, strict=True):
         ranks = None
-        if class_map is not None:
-            labels = torch.from_numpy(geometry.to_straight(class_map, view).astype(np.int32))
+        if labels is not None:
+            labels = torch.from_numpy(geometry.to_straight(labels, view).astype(np.int32))
             ranks = torch.where(labels == IGNORE, labels, known.ranks(labels.masked_fill(labels == IGNORE, 0)))
         straight.append(ranks)
     depths = [geometry.depth(view) for view in views]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.labels.classes import read_class_map, read_classes
+from beags_plugin.labels.classes import read_classes, read_id_mask
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo
 from beags_plugin.masks.sources.matching import files_by_name
 from beags_plugin.system.errors import UserError
@@ -58,7 +58,7 @@ class IdImagesSource(MaskSource):
 
     def _ids(self, path: Path, palette: dict[int, int]) -> np.ndarray:
         if not self.colors:
-            return read_class_map(path, self.ignore_ids)
+            return read_id_mask(path, self.ignore_ids)
         form, pixels = read_image(
             path,
             lambda image: (image.format, np.asarray(image.convert("RGB")).astype(np.uint32)),

@@ -51,11 +51,11 @@ class LangSplatSource(MaskSource):
             if photo.name not in tables:
                 return None
             segments = self._segments(segments_of[photo.name])
-            class_map = np.full(segments.shape, 0, np.uint16)
-            class_map[segments < 0] = IGNORE
+            labels = np.full(segments.shape, 0, np.uint16)
+            labels[segments < 0] = IGNORE
             for segment, found in tables[photo.name].items():
-                class_map[segments == segment] = ids[found]
-            return class_map
+                labels[segments == segment] = ids[found]
+            return labels
 
         names = {0: "background", **{index: f"object_{index}" for index in ids.values()}}
         return MadeMasks(names, per_photo(scene, progress, read), [])

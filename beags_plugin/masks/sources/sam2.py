@@ -68,7 +68,7 @@ class Sam2Source(MaskSource):
                 names = [photo.name for photo in scene.photos]
                 notes.extend(retrieve(objects, frame_of, names, predictor, detector, best, options, progress))
                 for frame, photo in enumerate(scene.photos):
-                    yield best.class_map(frame, (photo.height, photo.width))
+                    yield best.labels(frame, (photo.height, photo.width))
 
         return MadeMasks(names, maps(), notes)
 

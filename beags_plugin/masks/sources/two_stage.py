@@ -71,7 +71,7 @@ class BestLabels:
         labels[larger], best[larger] = class_id, values[larger]
         np.savez_compressed(path, labels=labels, best=best)
 
-    def class_map(self, frame: int, shape: tuple[int, int]) -> np.ndarray:
+    def labels(self, frame: int, shape: tuple[int, int]) -> np.ndarray:
         """[H, W] uint16; all background where nothing was added."""
         path = self.folder / f"{frame:06d}.npz"
         if not path.exists():

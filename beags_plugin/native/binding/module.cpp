@@ -102,7 +102,7 @@ void bind(nb::module_& m, const char* name) {
           },
           "labels"_a, "num_classes"_a, "out"_a, "threads"_a)
       .def(
-          "contributing_classes",
+          "sparse_class_contributions",
           [](const Frame<T>& self, Ids labels, int num_classes, int threads) {
             nb::gil_scoped_release release;
             return self.sparse_class_contributions(labels.data(), num_classes, threads);
@@ -116,7 +116,7 @@ void bind(nb::module_& m, const char* name) {
           },
           "num_classes"_a, "classes"_a, "share"_a, "threads"_a)
       .def(
-          "heaviest",
+          "dominant_gaussian",
           [](const Frame<T>& self, Array<int32_t> indices, int threads) {
             nb::gil_scoped_release release;
             self.dominant_gaussian(indices.data(), threads);

@@ -168,7 +168,7 @@ void bind_frame(nb::module_& m, const char* name) {
       },
       "num_classes"_a, "classes"_a, "share"_a, "stream"_a);
   frame.def(
-      "heaviest",
+      "dominant_gaussian",
       [](const Frame<T>& self, Ints indices, uintptr_t stream) {
         dominant_gaussian(self.job(), indices.data(), stream_of(stream));
       },

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from beags_plugin.data.dataset import Dataset
 from beags_plugin.data.files import image_size, photo_names
-from beags_plugin.data.scene import Scene
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import read_classes
 from beags_plugin.masks.check.areas import Area, contradicted
 from beags_plugin.masks.check.consistency import Agreement, labels_at, ranks_of
 from beags_plugin.masks.check.disagreement import views_against_others
 from beags_plugin.masks.check.files import FEW_VIEWS, MOST_IDS, Coverage, MaskFiles, check_files
-from beags_plugin.masks.check.issues import LEVELS, Finding, ordered, percent
+from beags_plugin.masks.check.issues import LEVELS, Issue, ordered, percent
 from beags_plugin.pictures.masks import contradictions, coverage_picture
 from beags_plugin.plugin.runs.run_config import load_run_config
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
@@ -45,12 +45,12 @@ class Report:
     stems: list[str]
     names: dict[int, str]
     coverage: Coverage
-    findings: list[Finding]
+    issues: list[Issue]
     areas: list[Area] = field(default_factory=list)
 
     def summary(self) -> str:
-        """How many views, objects and findings, in a line."""
-        counts = [f"{sum(f.level == level for f in self.findings)} {level}s" for level in LEVELS]
+        """How many views, objects and issues, in a line."""
+        counts = [f"{sum(f.level == level for f in self.issues)} {level}s" for level in LEVELS]
         objects = sum(i != 0 for i in self.coverage.ids)
         return (
             f"{self.data}: {len(self.stems)} views, {int(self.coverage.usable.sum())} usable masks, {objects} objects; "
@@ -67,7 +67,7 @@ class Report:
         return {
             "data": str(self.data),
             "classes": {str(i): name for i, name in self.names.items()},
-            "findings": [finding.to_json() for finding in self.findings],
+            "issues": [issue.to_json() for issue in self.issues],
             "coverage": views,
             "areas": [area.to_json() for area in self.areas],
         }
@@ -86,10 +86,10 @@ def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Re
         coverage = check_files(files, few_views, progress)
     shown = dict(files.names or {})
     shown = {i: shown.get(i, "background" if i == 0 else f"class_{i}") for i in coverage.ids}
-    findings = list(coverage.findings)
+    issues = list(coverage.issues)
     if len(coverage.ids) > MOST_IDS:
-        findings.append(
-            Finding(
+        issues.append(
+            Issue(
                 "note",
                 "not compared",
                 f"the masks hold {len(coverage.ids)} ids, so views are not compared: more than {MOST_IDS} take too "
@@ -99,8 +99,8 @@ def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Re
         )
     elif coverage.usable.sum() > 3 and len(coverage.ids) > 1:
         points = _points(scene, views, config)
-        findings += views_against_others(_agreement(files, coverage, views, points), files, coverage, shown)
-    return Report(scene.root, list(files.stems), shown, coverage, ordered(findings))
+        issues += views_against_others(_agreement(files, coverage, views, points), files, coverage, shown)
+    return Report(scene.root, list(files.stems), shown, coverage, ordered(issues))
 
 
 def agreement_of(config: BeagsDataParserConfig) -> tuple[np.ndarray, int]:
@@ -110,7 +110,7 @@ def agreement_of(config: BeagsDataParserConfig) -> tuple[np.ndarray, int]:
     return _agreement(files, coverage, views, _points(scene, views, config)).labels, len(coverage.ids)
 
 
-def _files(config: BeagsDataParserConfig) -> tuple[Scene, PosedViews, MaskFiles]:
+def _files(config: BeagsDataParserConfig) -> tuple[Dataset, PosedViews, MaskFiles]:
     parser: BeagsDataParser = config.setup()
     scene, views = parser.posed_views()
     sizes = [image_size(path) for path in views.images]
@@ -133,7 +133,7 @@ def _files(config: BeagsDataParserConfig) -> tuple[Scene, PosedViews, MaskFiles]
     return scene, views, files
 
 
-def _points(scene: Scene, views: PosedViews, config: BeagsDataParserConfig) -> np.ndarray:
+def _points(scene: Dataset, views: PosedViews, config: BeagsDataParserConfig) -> np.ndarray:
     """[P, 3] float64 in the cameras' world: seed points and points drawn where the cameras look."""
     found = starting_points(scene, views, config.num_random_points)
     seeds = found["points3D_xyz"].double().numpy()
@@ -162,12 +162,12 @@ def check_with_run(report: Report, run: ReprojectedRun) -> Report:
     """The report with the areas of masks that the other views contradict where a trained run puts them."""
     areas = [area for index in range(len(run.names)) for area in _areas(run, index)]
     areas.sort(key=lambda area: -area.pixels)
-    findings = list(report.findings)
+    issues = list(report.issues)
     if areas:
         pixels, views = sum(area.pixels for area in areas), {area.view for area in areas}
         total = sum(mask.pixels for mask in run.given.stored if mask is not None)
-        findings.append(
-            Finding(
+        issues.append(
+            Issue(
                 "warning",
                 "contradicted",
                 f"{len(areas)} areas in {len(views)} views are contradicted by the other views, the largest: "
@@ -178,7 +178,7 @@ def check_with_run(report: Report, run: ReprojectedRun) -> Report:
                 tuple(sorted(views)),
             )
         )
-    return replace(report, findings=ordered(findings), areas=areas)
+    return replace(report, issues=ordered(issues), areas=areas)
 
 
 def _areas(run: ReprojectedRun, index: int) -> list[Area]:

@@ -18,7 +18,7 @@ from beags_plugin.pictures.worst_views import By, WorstMask, draw_worst
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.options.model_options import fixed_background
 from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, EXTRACTION_FILE
-from beags_plugin.plugin.runs.read import SavedScene, data_of_run, raster_settings, read_scene
+from beags_plugin.plugin.runs.read import SavedScene, data_of_run, raster_settings, read_run
 from beags_plugin.plugin.views.held_out_views import HeldOutViews
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import Rasterizer
@@ -50,10 +50,10 @@ class EvaluatedRun:
 
     def __init__(self, config_path: Path, name: str = "") -> None:
         self.config_path = Path(config_path)
-        after = read_scene(self.config_path)
+        after = read_run(self.config_path)
         self.stages: dict[Stage, SavedScene] = {"after": after}
         snapshot = self.config_path.parent / BASE_SNAPSHOT / "config.yml"
-        if after.assigned and snapshot.exists() and (before := read_scene(snapshot)).assigned:
+        if after.assigned and snapshot.exists() and (before := read_run(snapshot)).assigned:
             self.stages = {"before": before, "after": after}
         self.complete = not (self.config_path.parent / EXTRACTION_FILE).exists()
         self.classes = after.classes if self.complete else present_classes(after)

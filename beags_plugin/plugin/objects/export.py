@@ -13,16 +13,16 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.export.base import Exporter, NothingToExport, Piece, Viewpoints, make_exporter
+from beags_plugin.export.base import Exporter, ExportItem, NothingToExport, Viewpoints, make_exporter
 from beags_plugin.export.frames import Frame, bounding_box, check_placement
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.select import select_class
 from beags_plugin.plugin.objects.extract import file_name, folder_names, objects_with_gaussians
 from beags_plugin.plugin.runs.read import (
     SavedScene,
-    load_scene,
     raster_settings,
-    read_scene,
+    read_assigned_run,
+    read_run,
     read_transform,
     training_viewpoints,
 )
@@ -111,7 +111,7 @@ def export_run(
     exporters = {name: make_exporter(name, **(options or {}).get(name, {})) for name in formats}
     if not exporters:
         raise UserError("no format is named: name one with --format.")
-    scene = load_scene(config_path) if everything or objects or not whole else read_scene(config_path)
+    scene = read_assigned_run(config_path) if everything or objects or not whole else read_run(config_path)
     present = objects_with_gaussians(scene, objects, run) if scene.assigned else {}
     if everything and objects:
         raise UserError("--all exports every object: leave --object out.")
@@ -132,11 +132,11 @@ def export_run(
         tolerant=everything,
     )
     names, titles = list(present) if everything else list(dict.fromkeys(objects)), folder_names(scene.classes)
-    pieces: list[tuple[str, int | None, str]] = [(name, present[name], titles[present[name]]) for name in names]
+    items: list[tuple[str, int | None, str]] = [(name, present[name], titles[present[name]]) for name in names]
     if whole:
-        pieces.append((WHOLE, None, "whole_scene"))
-    steps = _Steps(job.steps(), len(pieces), progress or (lambda done, total: None))
-    exported = [job.export(name, class_id, folder / title, steps) for name, class_id, title in pieces]
+        items.append((WHOLE, None, "whole_scene"))
+    steps = _Steps(job.steps(), len(items), progress or (lambda done, total: None))
+    exported = [job.export(name, class_id, folder / title, steps) for name, class_id, title in items]
     if everything:
         world = "run" if transform is None else "input"
         _write_manifest(folder, {"run": str(config_path.absolute()), "frame": placement, "world": world}, exported)
@@ -149,28 +149,28 @@ class _Steps:
     of_a_piece: steps of each exporter's file.
     """
 
-    def __init__(self, of_a_piece: Sequence[int], pieces: int, tell: Progress) -> None:
-        self._of_files = list(of_a_piece) * pieces
+    def __init__(self, of_a_piece: Sequence[int], items: int, tell: Progress) -> None:
+        self._of_files = list(of_a_piece) * items
         self._file = 0
         self._tell = tell
-        self.drew(0)
+        self.on_render(0)
 
-    def drew(self, views: int) -> None:
+    def on_render(self, views: int) -> None:
         """Some of the present file's views are drawn."""
         self._tell(sum(self._of_files[: self._file]) + views, sum(self._of_files))
 
     def wrote(self) -> None:
         """The present file is done, whatever it took."""
         self._file += 1
-        self.drew(0)
+        self.on_render(0)
 
 
 @dataclass(frozen=True)
 class _Job:
-    """What all pieces of an export have in common.
+    """What all items of an export have in common.
 
     world: frame of the files, but for the shift if they are ``centred``. views: in the run's frame.
-    tolerant: leave out a format for which a piece has nothing.
+    tolerant: leave out a format for which a item has nothing.
     """
 
     scene: SavedScene
@@ -181,7 +181,7 @@ class _Job:
     tolerant: bool
 
     def steps(self) -> list[int]:
-        """Of each file of a piece: see ``_Steps``."""
+        """Of each file of a item: see ``_Steps``."""
         views = 0 if self.views is None else len(self.views.cameras)
         return [1 + (views if exporter.needs_views else 0) for exporter in self.exporters.values()]
 
@@ -196,19 +196,19 @@ class _Job:
         center = (low + high) / 2 if self.centred else torch.zeros(3, dtype=torch.float64)
         frame = self.world.centred(center)
         views = None if self.views is None else frame.views(self.views)
-        piece = Piece(name, frame.surfels(chosen), class_ids, views, drew=steps.drew)
+        item = ExportItem(name, frame.surfels(chosen), class_ids, views, on_render=steps.on_render)
         files = []
         for label, exporter in self.exporters.items():
-            files.append(self._write(label, exporter, stem.with_name(f"{stem.name}.{exporter.suffix}"), piece))
+            files.append(self._write(label, exporter, stem.with_name(f"{stem.name}.{exporter.suffix}"), item))
             steps.wrote()
         low, high = low - center, high - center
         return Exported(
             name, class_id, len(chosen), center.tolist(), low.tolist(), high.tolist(), frame.to_run(), files
         )
 
-    def _write(self, label: str, exporter: Exporter, path: Path, piece: Piece) -> ExportedFile:
+    def _write(self, label: str, exporter: Exporter, path: Path, item: ExportItem) -> ExportedFile:
         try:
-            return ExportedFile(label, path, exporter.write(path, piece))
+            return ExportedFile(label, path, exporter.write(path, item))
         except NothingToExport as error:
             if not self.tolerant:
                 raise
@@ -241,7 +241,7 @@ def export_shown(
     path = _free_path(config_path.parent / "exports", title, exporter.suffix)
     total = 0 if views is None else len(views.cameras)
     exporter.write(
-        path, Piece(title, frame.surfels(surfels), class_ids, views, drew=lambda done: progress(done, total))
+        path, ExportItem(title, frame.surfels(surfels), class_ids, views, on_render=lambda done: progress(done, total))
     )
     return path
 

@@ -17,7 +17,7 @@ from beags_plugin.extraction.select import remove_class, select_class
 from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, prepared_digests
 from beags_plugin.plugin.runs.read import (
     SavedScene,
-    load_scene,
+    read_assigned_run,
     read_transform,
 )
 from beags_plugin.plugin.runs.write import write_run
@@ -51,7 +51,7 @@ def extract_objects(
     remove: keep all but the object instead. output: folder for the runs; ``extracted/`` in the run by default.
     progress: is told (done, total) objects. Raises ``UserError`` for an unknown name, before anything is written.
     """
-    scene = load_scene(config_path)
+    scene = read_assigned_run(config_path)
     run = config_path.parent
     class_ids = scene.state["class_ids"]
     ids = objects_with_gaussians(scene, objects, run)

@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 
 from beags_plugin.data.files import image_size, photo_names
-from beags_plugin.labels.classes import check_names, write_class_map
-from beags_plugin.masks.rims import snap_to_edges
+from beags_plugin.labels.classes import check_names, write_mask
+from beags_plugin.masks.snapping import snap_to_edges
 from beags_plugin.masks.sources import MASK_SOURCES
 from beags_plugin.masks.sources.base import MaskSource, Photo, SourceScene
 from beags_plugin.pictures.masks import overlay
 from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
-from beags_plugin.plugin.runs.read import raster_settings, read_scene
+from beags_plugin.plugin.runs.read import raster_settings, read_run
 from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParserConfig
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
@@ -34,7 +34,7 @@ class RunGeometry:
     """The shape that a trained run found, at the size of the photographs: of its training views, then of the others."""
 
     def __init__(self, config_path: Path) -> None:
-        self.scene = read_scene(config_path)
+        self.scene = read_run(config_path)
         self.manager = data_to_reproject(self.scene, config_path, ReprojectionOptions())
         self.images = list(self.manager.train_dataset.image_filenames)
         self.cameras = [view.camera for view in self.manager.views("train")]
@@ -59,14 +59,14 @@ class RunGeometry:
             drawn = self.rasterizer.rasterize(self._surfels, self.cameras[view], self.settings, torch.zeros(3))
             return surface_depth(drawn, kind)
 
-    def to_straight(self, class_map: np.ndarray, view: int) -> np.ndarray:
+    def to_straight(self, labels: np.ndarray, view: int) -> np.ndarray:
         split, index = self._of_split[view]
         of_eval, of_train = self.manager.undistort_eval_map, self.manager.straight_train_map
-        return of_eval(class_map, index) if split == "eval" else of_train(class_map, index)
+        return of_eval(labels, index) if split == "eval" else of_train(labels, index)
 
-    def to_photo(self, class_map: np.ndarray, view: int) -> np.ndarray:
+    def to_photo(self, labels: np.ndarray, view: int) -> np.ndarray:
         split, index = self._of_split[view]
-        return self.manager.as_in_file(class_map, index, split=split)
+        return self.manager.as_in_file(labels, index, split=split)
 
 
 def configured_source(name: str, options: Sequence[str]) -> MaskSource:
@@ -147,17 +147,17 @@ def make_masks(
         unfinished = {place: Path(temporary) / place.name for place in (masks, look_at)}
         made = source.make(made_of, progress)
         check_names(made.names)
-        for index, (path, class_map) in enumerate(zip(mask_paths(views.images), made.maps, strict=True)):
-            if class_map is None:
+        for index, (path, labels) in enumerate(zip(mask_paths(views.images), made.maps, strict=True)):
+            if labels is None:
                 continue
             if snap:
-                class_map = snap_to_edges(class_map, photos[index].pixels(), snap)
+                labels = snap_to_edges(labels, photos[index].pixels(), snap)
             place = look_at if index in made.to_look_at else masks
             file = unfinished[place] / path
             file.parent.mkdir(parents=True, exist_ok=True)
-            write_class_map(file, class_map)
+            write_mask(file, labels)
             if place is masks:
-                shares.append(float((class_map != 0).mean()))
+                shares.append(float((labels != 0).mean()))
             shown.append((photos[index], place / path))
         if not shares:
             raise UserError("the mask source gave no mask for any view: check its options.")
@@ -188,12 +188,12 @@ def _take_the_place(unfinished: Path, masks: Path, stems: set[str]) -> None:
 
 
 def _picture(path: Path, shown: Sequence[tuple[Photo, Path]], most: int = 24) -> None:
-    from beags_plugin.labels.classes import read_class_map
+    from beags_plugin.labels.classes import read_id_mask
     from beags_plugin.pictures.cells import below, cell, wrapped, write_picture
 
     step = -(-len(shown) // most)
     cells = []
     for photo, mask in shown[::step]:
         size = (260, max(1, round(260 * photo.height / photo.width)))
-        cells.append([cell(overlay(photo.pixels(), read_class_map(mask)), size, photo.name)])
+        cells.append([cell(overlay(photo.pixels(), read_id_mask(mask)), size, photo.name)])
     write_picture(path, below(wrapped(cells, 1100)))

@@ -11,12 +11,12 @@ from beags_plugin.extraction.select import select_class
 from beags_plugin.pictures.cells import write_picture
 from beags_plugin.pictures.objects import Subject, comparison, film, sheet
 from beags_plugin.pictures.options import PictureFormat, RenderOptions
-from beags_plugin.pictures.orbit import orbit, orbit_settings, stand_of
+from beags_plugin.pictures.orbit import orbit, orbit_frame, orbit_settings
 from beags_plugin.pictures.video import FILMS, check_film, encoder, write_film
 from beags_plugin.plugin.objects.export import Progress
 from beags_plugin.plugin.objects.extract import folder_names, objects_with_gaussians
 from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT
-from beags_plugin.plugin.runs.read import SavedScene, load_scene, training_viewpoints
+from beags_plugin.plugin.runs.read import SavedScene, read_assigned_run, training_viewpoints
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.system.errors import UserError
 
@@ -42,7 +42,7 @@ def render_run(
     options.check()
     if form not in get_args(PictureFormat):
         raise UserError(f"there is no format {form!r}: choose one of {', '.join(get_args(PictureFormat))}.")
-    scene = load_scene(config_path)
+    scene = read_assigned_run(config_path)
     present = objects_with_gaussians(scene, objects, config_path.parent)
     names = list(dict.fromkeys(objects)) or [name for name, class_id in present.items() if class_id != 0]
     if not names:
@@ -88,7 +88,7 @@ def _base_of(config_path: Path) -> SavedScene:
             f"{config_path.parent} has kept no state before refinement ({BASE_SNAPSHOT}/): name the run that was "
             "refined, or another --format."
         )
-    return load_scene(snapshot)
+    return read_assigned_run(snapshot)
 
 
 def _subjects(
@@ -117,7 +117,7 @@ def _subjects(
             caption: select_class(scene.surfels(), scene.state["class_ids"], present[name])[0]
             for caption, scene in stages.items()
         }
-        stand = stand_of(*bounding_box(list(shown.values())[-1]), photos)
+        stand = orbit_frame(*bounding_box(list(shown.values())[-1]), photos)
         cameras = orbit(stand, count, size, options.elevation, options.turn)
         subjects.append(Subject(name, shown, cameras, orbit_settings(stand)))
     return subjects

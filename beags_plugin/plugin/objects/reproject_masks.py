@@ -15,10 +15,10 @@ import numpy as np
 import torch
 
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.labels.classes import write_class_map
-from beags_plugin.labels.label_maps import LabelMaps, PackedMaps
+from beags_plugin.labels.classes import write_mask
+from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.pictures.masks import Changed, before_and_after
-from beags_plugin.plugin.runs.read import check_data, raster_settings, read_scene
+from beags_plugin.plugin.runs.read import check_data, raster_settings, read_run
 from beags_plugin.preparation.consistent_masks import chosen_reprojection, render_depths, reprojected_masks
 from beags_plugin.preparation.pipeline import known_classes
 from beags_plugin.rasterizers import make_rasterizer
@@ -64,7 +64,7 @@ class ReprojectedRun:
     classes: dict[int, str]
     given: LabelMaps
     voted: LabelMaps
-    confidence: PackedMaps
+    confidence: CompressedMaps
     seconds: float
     method: str
     why: str | None
@@ -88,7 +88,7 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     config_path: config.yml of any run. Raises ``UserError`` for a run, data or an option that cannot be used, and if no
     view has a mask.
     """
-    scene = read_scene(config_path)
+    scene = read_run(config_path)
     manager = data_to_reproject(scene, config_path, options)
     own = {"reprojection": options.method, "tau": options.tau, "depth": options.depth}
     config = replace(scene.config.model_config.prepare, **{k: v for k, v in own.items() if v is not None})
@@ -161,7 +161,7 @@ def _write_reprojection(found: ReprojectedRun, output: Path, min_confidence: flo
         final = np.where(doubtful, np.uint16(IGNORE), voted)
         for folder in ("masks", "confidence"):
             (output / folder / path).parent.mkdir(parents=True, exist_ok=True)
-        write_class_map(output / "masks" / path, found.manager.as_in_file(final, index))
+        write_mask(output / "masks" / path, found.manager.as_in_file(final, index))
         Image.fromarray(found.manager.as_in_file(confidence, index, border=0)).save(output / "confidence" / path)
         changes.append(_change(found, index, doubtful))
     (output / "classes.json").write_text(json.dumps({str(i): name for i, name in found.classes.items()}, indent=1))

@@ -11,7 +11,7 @@ from beags_plugin.system.errors import UserError
 
 def default_device() -> str:
     """Where a run trains unless it is told: "cuda" where there is a GPU that our kernels can use, else "cpu"."""
-    return "cpu" if cuda_extension.found()[1] else "cuda"
+    return "cpu" if cuda_extension.status()[1] else "cuda"
 
 
 def check_machine(machine: MachineConfig) -> None:
@@ -20,7 +20,7 @@ def check_machine(machine: MachineConfig) -> None:
         if (count := getattr(machine, name)) < 1:
             raise UserError(f"--machine.{name.replace('_', '-')} is {count}: give 1 or more.")
     if machine.device_type == "cuda":
-        if reason := cuda_extension.found()[1]:
+        if reason := cuda_extension.status()[1]:
             raise UserError(
                 f"--machine.device-type cuda: {reason} Or train with --machine.device-type cpu (beags resume: --device "
                 "cpu)."

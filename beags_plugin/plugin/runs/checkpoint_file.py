@@ -39,7 +39,7 @@ def scene_alone(checkpoint: dict[str, Any]) -> bool:
     return not checkpoint["optimizers"]
 
 
-def check_state(state: Mapping[str, Any], path: Path) -> None:
+def validate(state: Mapping[str, Any], path: Path) -> None:
     """Raise ``UserError`` unless ``state`` is that of a ``BeagsModel`` with classes. path: the file it comes from."""
     if wrong := _wrong(state):
         raise UserError(f"the checkpoint {path} holds no scene of beags ({wrong}): name another, or train again.")

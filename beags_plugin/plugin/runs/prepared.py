@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.labels.class_ids import resize_nearest
-from beags_plugin.labels.classes import read_class_map, read_mask
+from beags_plugin.labels.classes import read_id_mask, read_mask
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.runs.layout import last_prepared
 from beags_plugin.plugin.views.views import unique_names
@@ -92,14 +92,14 @@ def training_masks(config: BeagsTrainerConfig) -> list[TrainingMasks]:
     for index, (name, photo) in enumerate(
         zip(unique_names(outputs.image_filenames), outputs.image_filenames, strict=True)
     ):
-        used = read_class_map(prepared / "masks" / f"{name}.png")
+        used = read_id_mask(prepared / "masks" / f"{name}.png")
 
         def sized(path: Path | None, kind: str, like: np.ndarray = used) -> np.ndarray | None:
             if path is None:
                 return None
             return resize_nearest(read_mask(path, kind, metadata["ignore_ids"]), *like.shape)
 
-        given = sized(metadata["class_map_filenames"][index], metadata["mask_kind"])
+        given = sized(metadata["mask_filenames"][index], metadata["mask_kind"])
         confidence = prepared / "confidence" / f"{name}.png"
         views.append(TrainingMasks(name, photo, given, used, sized(exact[index], "ids"), confidence))
     return views

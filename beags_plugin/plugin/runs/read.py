@@ -15,7 +15,7 @@ from torch import Tensor
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import Viewpoints
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
-from beags_plugin.plugin.runs.checkpoint_file import check_state, read_checkpoint
+from beags_plugin.plugin.runs.checkpoint_file import read_checkpoint, validate
 from beags_plugin.plugin.runs.layout import TRANSFORM_FILE, newest_checkpoint
 from beags_plugin.plugin.runs.run_config import load_run_config
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
@@ -52,20 +52,20 @@ class SavedScene:
         return self.state["class_ids"] if self.assigned else None
 
 
-def read_scene(config_path: Path) -> SavedScene:
+def read_run(config_path: Path) -> SavedScene:
     """Read a run's newest checkpoint; raises ``UserError`` if the run is incomplete or the file is damaged."""
     config = load_run_config(config_path)
     path = newest_checkpoint(config.get_checkpoint_dir())
     checkpoint = read_checkpoint(path)
     prefix = "_model."
     state = {name[len(prefix) :]: value for name, value in checkpoint["pipeline"].items() if name.startswith(prefix)}
-    check_state(state, path)
+    validate(state, path)
     return SavedScene(config, state, checkpoint["step"], state["_extra_state"]["classes"])
 
 
-def load_scene(config_path: Path) -> SavedScene:
+def read_assigned_run(config_path: Path) -> SavedScene:
     """Read a run's newest checkpoint; raises ``UserError`` if the run is incomplete or no class was assigned."""
-    scene = read_scene(config_path)
+    scene = read_run(config_path)
     if not scene.assigned:
         raise UserError(
             f"{config_path.parent} is a base without classes: refine it first "

@@ -12,7 +12,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
-from beags_plugin.plugin.runs.checkpoint_file import check_state, read_checkpoint
+from beags_plugin.plugin.runs.checkpoint_file import read_checkpoint, validate
 from beags_plugin.plugin.runs.layout import REPORT_FILE, newest_checkpoint
 from beags_plugin.plugin.runs.write import save_atomically
 from beags_plugin.plugin.training.resumable import STATE, VERSION, Resumable, training_state
@@ -72,7 +72,7 @@ class Checkpoints:
         states = training_state(checkpoint, path)
         model = cast(SceneModel, pipeline.model)
         named = dict(model.classes)  # by the data
-        check_state(_of_model(checkpoint["pipeline"]), path)
+        validate(_of_model(checkpoint["pipeline"]), path)
         try:
             pipeline.load_pipeline(checkpoint["pipeline"], checkpoint["step"])
             optimizers.load_optimizers(checkpoint["optimizers"])

@@ -28,7 +28,7 @@ from beags_plugin.losses.photometric import psnr, ssim
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.plugin.views.views import View
-from beags_plugin.rasterizers.rendering import draw_class_map, surfel_inputs
+from beags_plugin.rasterizers.rendering import render_class_map, surfel_inputs
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.memory import memory_mb, peak_memory_mb
 from beags_plugin.system.progress import counted, progress_bar
@@ -150,7 +150,7 @@ class Curves:
     ) -> None:
         model, camera = self.model, view.camera
         surfels, settings = model.surfels().detach(), model.settings(geometry=False)
-        classes, _ = draw_class_map(model.rasterizer, surfels, model.class_ids, camera, settings)
+        classes, _ = render_class_map(model.rasterizer, surfels, model.class_ids, camera, settings)
         writer.put_image("Scene/class map", _colored(classes), step)
         background = model.background_color.to(model.device)
         for drawn_so_far, (index, part) in enumerate(parts.items(), start=1):

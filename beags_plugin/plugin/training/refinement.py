@@ -17,7 +17,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.assignment.assignment import Assignment
 from beags_plugin.core.cameras import Camera
-from beags_plugin.labels.classes import read_class_map, write_class_map
+from beags_plugin.labels.classes import read_id_mask, write_mask
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED, round_folder
@@ -58,7 +58,7 @@ class RefinementSwitch:
 
     def check_masks(self) -> None:
         """Raise ``UserError`` at the start of a run that would find no mask when it comes to refine."""
-        masks = self.datamanager.train_dataset.metadata["class_map_filenames"]
+        masks = self.datamanager.train_dataset.metadata["mask_filenames"]
         if self.wanted and all(path is None for path in masks):
             raise UserError(
                 "no training view has a mask: put id images into masks/<image name>.png, or train the preset "
@@ -135,7 +135,7 @@ class RefinementSwitch:
                     seed=model.seed,
                     stage=_bar,
                 )
-            for finding in prepared.findings:
+            for finding in prepared.summary:
                 CONSOLE.print(f"  {finding}", highlight=False, markup=False)
             self._take_classes(prepared.assignment)
             if first:  # the snapshot first: what save_prepared writes last says that everything is there
@@ -160,7 +160,7 @@ class RefinementSwitch:
 
     def _start(self, grid: VisibilityGrid | None, labels: LabelMaps) -> None:
         more_rounds = self.rounds < self.model.config.refine_rounds  # which need the masks as the data has them
-        self.datamanager.replace_class_maps(labels, keep=more_rounds)
+        self.datamanager.replace_labels(labels, keep=more_rounds)
         self.model.grid = None if grid is None else grid.to(self.model.device)
         self.model.frozen = not self.refiner.trains
         self.model.prepared_rounds = self.rounds
@@ -208,7 +208,7 @@ def _prepared_labels(path: Path, camera: Camera) -> torch.Tensor:
         raise UserError(
             f"the prepared mask {path} is missing: restore it, or refine again from base/nerfstudio_models."
         )
-    labels = torch.from_numpy(read_class_map(path).astype(np.int32))
+    labels = torch.from_numpy(read_id_mask(path).astype(np.int32))
     if labels.shape != (camera.height, camera.width):
         raise UserError(
             f"the prepared mask {path} is {labels.shape[1]}x{labels.shape[0]} pixels but its view is "
@@ -228,10 +228,10 @@ def save_prepared(prepared: Preparation, names: list[str], folder: Path) -> None
     with _bar("Keeping masks", passing=True) as progress:
         for index, name in enumerate(counted(names, len(names), progress)):
             labels = prepared.labels[index]
-            write_class_map(folder / "masks" / f"{name}.png", labels.cpu().numpy().astype(np.uint16))
+            write_mask(folder / "masks" / f"{name}.png", labels.cpu().numpy().astype(np.uint16))
             if prepared.confidence is not None:
                 _write_grey(folder / "confidence" / f"{name}.png", prepared.confidence[index])
-    report = {"findings": prepared.findings, "seconds": prepared.seconds, "peak_memory_mb": peak_memory_mb()}
+    report = {"summary": prepared.summary, "seconds": prepared.seconds, "peak_memory_mb": peak_memory_mb()}
     write_text_atomically(json.dumps(report, indent=2), folder / "report.json")
     state = {} if prepared.grid is None else prepared.grid.state_dict()
     write_whole(folder / "grid.pt", lambda file: torch.save(state, file))

@@ -19,7 +19,7 @@ from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.system import processes
 
 
-class Rank:
+class Replica:
     """One process of a training.
 
     config: the run's; in processes other than the first it is changed to write elsewhere, to show nothing, and to
@@ -30,7 +30,7 @@ class Rank:
     def __init__(self, config: BeagsTrainerConfig, local_rank: int) -> None:
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self.run = config.get_base_dir()
-        if config.machine.device_type == "cuda" and cuda_extension.found()[1] is None:
+        if config.machine.device_type == "cuda" and cuda_extension.status()[1] is None:
             torch.cuda.set_device(local_rank)  # else all processes would exchange objects through the first GPU
         if processes.rank() > 0:
             self._folder = tempfile.TemporaryDirectory(prefix="beags-rank-", ignore_cleanup_errors=True)

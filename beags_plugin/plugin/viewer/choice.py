@@ -73,7 +73,7 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Shown:
+class Visible:
     """The surfels that are drawn, with the opacity that they are drawn with.
 
     index: [M] int64, which of the scene's they are, ascending; None: all of them, as they are.
@@ -87,14 +87,14 @@ class Shown:
 @torch.no_grad()
 def shown(
     surfels: Surfels, class_ids: Tensor, choice: Choice, rest: bool = True, inside: Tensor | None = None
-) -> Shown:
+) -> Visible:
     """What ``choice`` leaves of a scene.
 
     surfels: N surfels. class_ids: [N] int, phi. rest: whether the rest is drawn at all. inside: [N] bool, the surfels
     of a crop box, or None for all.
     """
     if not choice.of_classes and choice.min_opacity <= 0.0 and inside is None:
-        return Shown(surfels, class_ids, None)
+        return Visible(surfels, class_ids, None)
     keep = torch.ones(len(surfels), dtype=torch.bool, device=class_ids.device)
     if inside is not None:
         keep &= inside
@@ -111,7 +111,7 @@ def shown(
     chosen = surfels[index]
     if 0.0 < left < 1.0:
         chosen = replace(chosen, opacity_logits=_faded(chosen.opacity_logits, fades[index], left))
-    return Shown(chosen, class_ids[index], index)
+    return Visible(chosen, class_ids[index], index)
 
 
 def _member(class_ids: Tensor, members: frozenset[int]) -> Tensor:

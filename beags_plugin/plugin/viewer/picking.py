@@ -33,7 +33,7 @@ def camera_along(origin: Sequence[float], direction: Sequence[float]) -> Camera:
 
 @dataclass(frozen=True)
 class Picked:
-    """The heaviest Gaussian of a pixel: its index among those that were drawn, and its class."""
+    """The dominant_gaussian Gaussian of a pixel: its index among those that were drawn, and its class."""
 
     index: int
     class_id: int
@@ -53,5 +53,5 @@ def pick(
     surfels: N surfels, as they are drawn. class_ids: [N] int, phi. origin, direction: [3], world. Draws one pixel.
     """
     camera = camera_along(origin, direction).to(surfels.means.device)
-    index = int(rasterizer.heaviest(geometry_inputs(surfels), camera, settings)[0, 0])
+    index = int(rasterizer.dominant_gaussian(geometry_inputs(surfels), camera, settings)[0, 0])
     return None if index < 0 else Picked(index, int(class_ids[index]))

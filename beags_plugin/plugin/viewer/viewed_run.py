@@ -13,7 +13,7 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import resize_nearest
-from beags_plugin.labels.classes import read_class_map
+from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, prepared_digests, preparing_run, round_digest, round_folder
 from beags_plugin.plugin.runs.prepared import grid_state, read_grid
@@ -38,7 +38,7 @@ class ViewedRun:
         self.datamanager = datamanager
         dataset = datamanager.train_dataset
         self.names = unique_names(dataset.image_filenames)
-        self.has_masks = any(path is not None for path in dataset.metadata["class_map_filenames"])
+        self.has_masks = any(path is not None for path in dataset.metadata["mask_filenames"])
         cameras = dataset.cameras
         self.cameras: list[Camera] = [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))]
         self.grid: VisibilityGrid | None = None
@@ -116,4 +116,4 @@ class ViewedRun:
 
 def _read_mask(path: Path, _changed: int) -> np.ndarray:
     """_changed: time of the file's last change, so that what is kept in memory is read again after one."""
-    return read_class_map(path)
+    return read_id_mask(path)

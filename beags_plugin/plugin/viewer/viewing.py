@@ -14,7 +14,7 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.occupancy.violation import violation_shares
 from beags_plugin.plugin.training.scene_model import SceneModel
-from beags_plugin.plugin.viewer.choice import Choice, Shown, shown
+from beags_plugin.plugin.viewer.choice import Choice, Visible, shown
 from beags_plugin.plugin.viewer.pictures import (
     boundary_picture,
     class_picture,
@@ -23,7 +23,7 @@ from beags_plugin.plugin.viewer.pictures import (
     nearest_view,
     value_picture,
 )
-from beags_plugin.rasterizers.rendering import draw_class_map, surfel_inputs
+from beags_plugin.rasterizers.rendering import render_class_map, surfel_inputs
 from beags_plugin.system.errors import UserError
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def scene_outputs(model: SceneModel, camera: Camera) -> dict[str, Tensor]:
     return outputs
 
 
-def plain_outputs(model: SceneModel, scene: Shown, camera: Camera, background: Tensor) -> dict[str, Tensor]:
+def plain_outputs(model: SceneModel, scene: Visible, camera: Camera, background: Tensor) -> dict[str, Tensor]:
     """What every run can show: see ``scene_outputs``."""
     background = background.to(model.device)
     inputs = surfel_inputs(scene.surfels, camera, model.active_sh_degree())
@@ -77,9 +77,9 @@ def plain_outputs(model: SceneModel, scene: Shown, camera: Camera, background: T
     }
 
 
-def class_outputs(model: SceneModel, scene: Shown, camera: Camera) -> dict[str, Tensor]:
+def class_outputs(model: SceneModel, scene: Visible, camera: Camera) -> dict[str, Tensor]:
     """The class that each pixel shows, in its colour, and the share that it has of the pixel."""
-    classes, share = draw_class_map(model.rasterizer, scene.surfels, scene.class_ids, camera, model.settings())
+    classes, share = render_class_map(model.rasterizer, scene.surfels, scene.class_ids, camera, model.settings())
     return {"class_map": class_picture(classes), "class_confidence": share[..., None].float()}
 
 
@@ -152,7 +152,7 @@ class Viewing:
         self.run = run
         self.listed = tuple(name for name in CHANNELS if available[name])
 
-    def shown(self, rest: bool = True) -> Shown:
+    def shown(self, rest: bool = True) -> Visible:
         """The surfels that the choice leaves. rest: whether what is only faded counts."""
         model = self.model
         choice = self.choice if bool(model.assigned) else Choice(min_opacity=self.choice.min_opacity)
@@ -181,7 +181,7 @@ class Viewing:
         self.notes = notes
         return outputs
 
-    def _violation(self, scene: Shown, camera: Camera, notes: dict[str, str]) -> dict[str, Tensor]:
+    def _violation(self, scene: Visible, camera: Camera, notes: dict[str, str]) -> dict[str, Tensor]:
         shares = self.shares
         if shares is None or len(shares.values) != self.model.num_points:
             notes["violation"] = "occupancy_violation: being computed, or there is no voxel grid yet."
@@ -191,7 +191,7 @@ class Viewing:
         return {"occupancy_violation": value_picture(self.model.rasterizer, scene.surfels, values, camera, settings)}
 
     def _of_training_view(
-        self, names: frozenset[str], scene: Shown, camera: Camera, notes: dict[str, str]
+        self, names: frozenset[str], scene: Visible, camera: Camera, notes: dict[str, str]
     ) -> dict[str, Tensor]:
         """Pictures of the training view nearest to ``camera``, as large as fits into the viewer's picture."""
         model, run = self.model, self.run
@@ -225,11 +225,11 @@ class Viewing:
                 outputs["boundary_error"] = framed(error, camera.width, camera.height)
         return outputs
 
-    def copy(self, rest: bool = True) -> Shown:
+    def copy(self, rest: bool = True) -> Visible:
         """``shown``, in memory of its own; waits for the training step, if there is one."""
         with self.lock:
             scene = self.shown(rest)
-            return Shown(scene.surfels.clone(), scene.class_ids.clone(), scene.index)
+            return Visible(scene.surfels.clone(), scene.class_ids.clone(), scene.index)
 
     def refresh_shares(self) -> bool:
         """Compute what ``occupancy_violation`` shows, if the scene has changed; tells whether it did.

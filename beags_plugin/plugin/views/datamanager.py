@@ -23,25 +23,25 @@ from tyro.conf import Suppress
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE, objects_in
-from beags_plugin.labels.label_maps import PackedMap, narrowed, widened
+from beags_plugin.labels.label_maps import CompressedMap, to_compact, to_int32
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig, absolute
 from beags_plugin.plugin.views.dataset import BeagsDataset
 from beags_plugin.plugin.views.streaming import Lazy, StreamedViews
 from beags_plugin.plugin.views.undistortion import (
     has_lens,
-    redistort_class_map,
+    redistort_labels,
     straighten,
     undistort_alpha,
-    undistort_class_map,
     undistort_image,
+    undistort_labels,
 )
 from beags_plugin.plugin.views.views import View, unique_names
 from beags_plugin.system import processes
 from beags_plugin.system.errors import UserError
 
 READ_AHEAD = 8  # streamed images that are read before their use
-OWN_KEYS = ("class_map", "alpha")
+OWN_KEYS = ("labels", "alpha")
 
 
 @dataclass
@@ -64,9 +64,9 @@ class BeagsDataManagerConfig(FullImageDatamanagerConfig):
 class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
     """nerfstudio's data manager of full images, for CPUs too, with class maps in every batch.
 
-    Batches hold ``image`` [H, W, 3], ``class_map`` [H, W] int32 and ``alpha`` [H, W] uint8 where the image has it, all
-    on the device, and, once ``replace_class_maps`` was called, ``present``, the objects of ``class_map``. A training
-    camera's metadata holds its ``class_map`` too. The cache holds class maps in the narrowest type. Training views come
+    Batches hold ``image`` [H, W, 3], ``labels`` [H, W] int32 and ``alpha`` [H, W] uint8 where the image has it, all
+    on the device, and, once ``replace_labels`` was called, ``present``, the objects of ``labels``. A training
+    camera's metadata holds its ``labels`` too. The cache holds class maps in the narrowest type. Training views come
     in a random order without repetition within a round, given by ``train_cameras_sampling_seed`` alone.
     """
 
@@ -130,41 +130,39 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         if has_lens(distorted, index):
             data["image"] = torch.from_numpy(undistort_image(data["image"].numpy(), distorted, index))
         lens = (distorted, dataset.cameras, index)
-        class_map = undistort_class_map(data["class_map"].numpy(), *lens)
-        if class_map.shape != tuple(data["image"].shape[:2]):
-            raise RuntimeError(f"class map {class_map.shape} and image {data['image'].shape} differ in size")
-        data["class_map"] = narrowed(torch.from_numpy(class_map.astype(np.int32)))
+        labels = undistort_labels(data["labels"].numpy(), *lens)
+        if labels.shape != tuple(data["image"].shape[:2]):
+            raise RuntimeError(f"class map {labels.shape} and image {data['image'].shape} differ in size")
+        data["labels"] = to_compact(torch.from_numpy(labels.astype(np.int32)))
         if (alpha := dataset.get_alpha(index)) is not None:
             data["alpha"] = torch.from_numpy(undistort_alpha(alpha, *lens))
         return data
 
-    def _straight(self, split: Literal["train", "eval"], class_map: np.ndarray, index: int) -> np.ndarray:
+    def _straight(self, split: Literal["train", "eval"], labels: np.ndarray, index: int) -> np.ndarray:
         """A class map [h, w] of a view, of any size, as it would be had the camera no lens distortion."""
-        return undistort_class_map(class_map, self._distorted[split], self._dataset(split).cameras, index)
+        return undistort_labels(labels, self._distorted[split], self._dataset(split).cameras, index)
 
     def _labels_of_file(self, split: Literal["train", "eval"], index: int) -> Tensor:
         """The labels of a view's mask file in the narrowest type, without its photo."""
-        class_map = self._dataset(split).get_metadata({"image_idx": index})["class_map"].numpy()
-        return narrowed(torch.from_numpy(self._straight(split, class_map, index).astype(np.int32)))
+        labels = self._dataset(split).get_metadata({"image_idx": index})["labels"].numpy()
+        return to_compact(torch.from_numpy(self._straight(split, labels, index).astype(np.int32)))
 
-    def undistort_eval_map(self, class_map: np.ndarray, index: int) -> np.ndarray:
+    def undistort_eval_map(self, labels: np.ndarray, index: int) -> np.ndarray:
         """A class map [h, w] of an evaluation view, of any size, as it would be had the camera no lens distortion."""
-        return self._straight("eval", class_map, index)
+        return self._straight("eval", labels, index)
 
     def training_mask(self, index: int) -> np.ndarray | None:
         """The class map [h, w] uint16 in a training view's mask file, without lens distortion; None without a file."""
-        if self.train_dataset.metadata["class_map_filenames"][index] is None:
+        if self.train_dataset.metadata["mask_filenames"][index] is None:
             return None
-        return self._straight(
-            "train", self.train_dataset.get_metadata({"image_idx": index})["class_map"].numpy(), index
-        )
+        return self._straight("train", self.train_dataset.get_metadata({"image_idx": index})["labels"].numpy(), index)
 
-    def straight_train_map(self, class_map: np.ndarray, index: int) -> np.ndarray:
+    def straight_train_map(self, labels: np.ndarray, index: int) -> np.ndarray:
         """A class map [h, w] of a training view's file without its lens distortion."""
-        return self._straight("train", class_map, index)
+        return self._straight("train", labels, index)
 
     def as_in_file(
-        self, class_map: np.ndarray, index: int, border: int = IGNORE, split: Literal["train", "eval"] = "train"
+        self, labels: np.ndarray, index: int, border: int = IGNORE, split: Literal["train", "eval"] = "train"
     ) -> np.ndarray:
         """A class map [h', w'] of a view with the lens distortion of its file, at the size it was read at.
 
@@ -172,7 +170,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         """
         width, height = self._dataset(split).file_sizes[index]
         lens = (self._distorted[split], self._dataset(split).cameras, index)
-        return redistort_class_map(class_map, *lens, (height, width), border)
+        return redistort_labels(labels, *lens, (height, width), border)
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         own = processes.rank()  # each process draws a view of its own, from an order that all have
@@ -184,7 +182,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         data = self._on_device(data)
         # the boundary is computed inside the rasterizer, which sees the camera only: the mask travels with it
         metadata = camera.metadata or {}
-        camera.metadata = {**metadata, "class_map": data["class_map"], "camera": self._camera(metadata["cam_idx"])}
+        camera.metadata = {**metadata, "labels": data["labels"], "camera": self._camera(metadata["cam_idx"])}
         if self._present is not None:
             data["present"] = self._present[metadata["cam_idx"]]
         return camera, data
@@ -254,7 +252,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
     def views(self, split: Literal["train", "val", "test", "eval"], original: bool = False) -> list[View]:
         """All views of the training or (any other name) the evaluation split, in name order.
 
-        original: give the labels of the mask files also after ``replace_class_maps``, if it kept them.
+        original: give the labels of the mask files also after ``replace_labels``, if it kept them.
         """
         if split not in ("train", "val", "test", "eval"):
             raise ValueError(f"unknown split {split!r}")
@@ -263,30 +261,30 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         names = unique_names(self._dataset(whose).image_filenames)
         return [self._view(whose, cache, index, name, original) for index, name in enumerate(names)]
 
-    def replace_class_maps(self, class_maps: Sequence[Tensor], keep: bool = True) -> None:
-        """Train on ``class_maps``, one [H, W] integer tensor per training view, instead of the mask files.
+    def replace_labels(self, labels: Sequence[Tensor], keep: bool = True) -> None:
+        """Train on ``labels``, one [H, W] integer tensor per training view, instead of the mask files.
 
         keep: whether ``views`` may be asked for the labels of the files later on.
         Raises ``ValueError`` if their number, a size or an id (0..IGNORE) is wrong.
         """
         cache, cameras = self.cached_train, self.train_dataset.cameras
-        if len(class_maps) != len(cache):
-            raise ValueError(f"{len(class_maps)} class maps for {len(cache)} training views")
+        if len(labels) != len(cache):
+            raise ValueError(f"labels of {len(labels)} views for {len(cache)} training views")
         present = []
-        for index, labels in enumerate(class_maps):
+        for index, each in enumerate(labels):
             shape = (int(cameras.height[index]), int(cameras.width[index]))
-            if labels.shape != shape:
-                raise ValueError(f"class map {tuple(labels.shape)} for a view of {shape}")
-            if labels.numel() and not 0 <= int(labels.min()) <= int(labels.max()) <= IGNORE:
+            if each.shape != shape:
+                raise ValueError(f"labels {tuple(each.shape)} for a view of {shape}")
+            if each.numel() and not 0 <= int(each.min()) <= int(each.max()) <= IGNORE:
                 raise ValueError(f"class ids must lie in 0..{IGNORE}")
-            present.append(objects_in(labels))
+            present.append(objects_in(each))
         if isinstance(cache, StreamedViews):
-            cache.class_maps = [PackedMap(labels.int()) for labels in class_maps]
+            cache.labels = [CompressedMap(each.int()) for each in labels]
         else:
             if not self._replaced:
-                self._originals = [data["class_map"] for data in cache]
-            for data, labels in zip(cache, class_maps, strict=True):
-                data["class_map"] = narrowed(labels.detach().int()).to(data["class_map"].device)
+                self._originals = [data["labels"] for data in cache]
+            for data, each in zip(cache, labels, strict=True):
+                data["labels"] = to_compact(each.detach().int()).to(data["labels"].device)
         self._originals = self._originals if keep else None
         self._originals_kept = keep
         self._present = present
@@ -300,7 +298,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
                 raise ValueError("the labels of the mask files were not kept")
             replaced = False
         labels: Callable[[], Tensor] | None = None
-        if replaced or dataset.metadata["class_map_filenames"][index] is not None:
+        if replaced or dataset.metadata["mask_filenames"][index] is not None:
             labels = self._labels(split, cache, index, replaced)
         camera = camera_from_nerfstudio(dataset.cameras, index).to(self.device)
 
@@ -313,15 +311,15 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
     def _labels(self, split: Literal["train", "eval"], cache: Any, index: int, replaced: bool) -> Callable[[], Tensor]:
         """What gives the labels that a view has now, also after they are replaced again."""
         if isinstance(cache, StreamedViews):
-            packed = cache.class_maps[index] if replaced else None
+            packed = cache.labels[index] if replaced else None
             if packed is None:
                 return lambda: self._labels_of_file(split, index).to(self.device)
             return lambda: packed.unpacked().to(self.device)
         original = self._replaced and split == "train" and not replaced
-        stored = self._originals[index] if original and self._originals is not None else cache[index]["class_map"]
+        stored = self._originals[index] if original and self._originals is not None else cache[index]["labels"]
         return lambda: stored.to(self.device)
 
     def _on_device(self, data: dict) -> dict:
         """The view's data for use: class map and alpha on the device, the class map as int32."""
         moved = {key: value.to(self.device) if key in OWN_KEYS else value for key, value in data.items()}
-        return {**moved, "class_map": widened(moved["class_map"])}
+        return {**moved, "labels": to_int32(moved["labels"])}

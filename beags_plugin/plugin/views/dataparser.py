@@ -17,11 +17,11 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from tyro.conf import Suppress
 
+from beags_plugin.data.dataset import ColmapModel, Dataset, MaskKind, TransformsFile
 from beags_plugin.data.files import check_same_size, files_of_views, image_size
 from beags_plugin.data.ground_truth import find_ground_truth, of_views
 from beags_plugin.data.labels import read_class_names
-from beags_plugin.data.layout import read_scene
-from beags_plugin.data.scene import ColmapModel, MaskKind, Scene, TransformsFile
+from beags_plugin.data.layout import read_dataset
 from beags_plugin.data.split import split_views
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.plugin.views.cameras import check_cameras, downscaled_size, resize_cameras
@@ -102,7 +102,7 @@ class BeagsDataParser(DataParser):
 
     Metadata of what it returns, per view of the split where it is a list: ``points3D_xyz`` [P, 3] float32 in the world
     of the cameras, ``points3D_rgb`` [P, 3] uint8, ``points3D_random`` bool, ``classes`` dict id -> name,
-    ``class_map_filenames`` list of Path or None, ``mask_kind`` (see ``data.scene.MaskKind``), ``ignore_ids``,
+    ``mask_filenames`` list of Path or None, ``mask_kind`` (see ``data.dataset.MaskKind``), ``ignore_ids``,
     ``ground_truth`` (see ``data.ground_truth.GroundTruth``) or None.
     Every user's mistake is a ``UserError``.
     """
@@ -122,7 +122,7 @@ class BeagsDataParser(DataParser):
         assert views is not None
         chosen = self._views_of_split(views, split)
         metadata = dict(self._metadata)
-        metadata["class_map_filenames"] = [metadata["class_map_filenames"][i] for i in chosen]
+        metadata["mask_filenames"] = [metadata["mask_filenames"][i] for i in chosen]
         if metadata["ground_truth"] is not None:
             metadata["ground_truth"] = of_views(metadata["ground_truth"], chosen)
         return DataparserOutputs(
@@ -134,17 +134,17 @@ class BeagsDataParser(DataParser):
             metadata=metadata,
         )
 
-    def posed_views(self) -> tuple[Scene, PosedViews]:
+    def posed_views(self) -> tuple[Dataset, PosedViews]:
         """The scene and all its views, before anything is asked of masks."""
         config = self.config
         config.check()
-        self._scene = scene = read_scene(Path(config.data).absolute(), config.layout, config.images_path)
+        self._scene = scene = read_dataset(Path(config.data).absolute(), config.layout, config.images_path)
         options = {name: getattr(config, name) for name in Normalization.__dataclass_fields__}
         views = read_poses(scene.poses, scene.root, Normalization(**options))
         check_cameras(views.cameras, views.images)
         return scene, views
 
-    def mask_files(self, scene: Scene, views: PosedViews) -> tuple[list[Path | None], Path, MaskKind]:
+    def mask_files(self, scene: Dataset, views: PosedViews) -> tuple[list[Path | None], Path, MaskKind]:
         """Of each view the file of its mask or None; the folder where masks are looked for; and what they are."""
         folder, kind = self._masks(scene)
         if self.config.masks_path is None and scene.mask_files is not None:
@@ -162,7 +162,7 @@ class BeagsDataParser(DataParser):
             CONSOLE.print(line, markup=False, highlight=False, soft_wrap=True)
         self._views = views
 
-    def _read_metadata(self, scene: Scene, views: PosedViews) -> dict[str, Any]:
+    def _read_metadata(self, scene: Dataset, views: PosedViews) -> dict[str, Any]:
         """Checks of files against each other, and what all splits share."""
         config = self.config
         sizes = [image_size(path) for path in views.images]
@@ -182,7 +182,7 @@ class BeagsDataParser(DataParser):
         return {
             **starting_points(scene, views, config.num_random_points),
             "classes": read_class_names(classes_file, present, config.ignore_ids, *known),
-            "class_map_filenames": masks,
+            "mask_filenames": masks,
             "mask_kind": kind,
             "ignore_ids": tuple(config.ignore_ids),
             "ground_truth": find_ground_truth(scene.root / config.ground_truth_path, scene, views.images, images_root),
@@ -196,7 +196,7 @@ class BeagsDataParser(DataParser):
         if classes.is_dir() or not (usual or classes.is_file()):
             raise UserError(f"the class names {classes} are no file: correct classes_path.")
 
-    def _masks(self, scene: Scene) -> tuple[Path, MaskKind]:
+    def _masks(self, scene: Dataset) -> tuple[Path, MaskKind]:
         """The folder of the masks, and what they are."""
         if self.config.masks_path is not None:
             return scene.root / self.config.masks_path, "ids"
@@ -236,7 +236,7 @@ class BeagsDataParser(DataParser):
         train, held_out = split_views(views.stems, self._scene.split, config.eval_interval, config.held_out)
         return train if split == "train" else held_out
 
-    def _recognised(self, scene: Scene, views: PosedViews) -> list[str]:
+    def _recognised(self, scene: Dataset, views: PosedViews) -> list[str]:
         """What the data was taken for, in a line, and what the user should know."""
         stems = set().union(*views.stems)
         absent = [name for name in scene.split.held_out if name not in stems]
@@ -249,7 +249,7 @@ class BeagsDataParser(DataParser):
                 f"Exact masks of {', '.join(map(repr, unknown))} do not count, as no class is called so: "
                 f'name the classes in {scene.root / self.config.classes_path}, {{"id": "name"}}.'
             )
-        masks = self._metadata["class_map_filenames"]
+        masks = self._metadata["mask_filenames"]
         points = "random" if self._metadata["points3D_random"] else len(self._metadata["points3D_xyz"])
         line = (
             f"{scene.root}: {scene.layout} layout, poses of {_source(scene)}, {len(views.images)} images in "
@@ -263,7 +263,7 @@ class BeagsDataParser(DataParser):
         truth = self._metadata["ground_truth"]
         return set() if truth is None else {name for kind in ("visible", "silhouettes") for name in truth[kind]}
 
-    def _split_in_words(self, views: PosedViews, scene: Scene) -> str:
+    def _split_in_words(self, views: PosedViews, scene: Dataset) -> str:
         if views.members is not None:
             return "splits named by the data"
         train, out = (self._views_of_split(views, split) for split in ("train", "test"))
@@ -274,14 +274,14 @@ class BeagsDataParser(DataParser):
         return f"{len(out)} held out{also}"
 
 
-def _images_root(scene: Scene) -> Path:
+def _images_root(scene: Dataset) -> Path:
     """The folder below which images and masks have the same paths."""
     if isinstance(scene.poses, TransformsFile):
         return scene.poses.images or scene.root / "images"
     return scene.poses.images if isinstance(scene.poses, ColmapModel) else scene.poses.images[0].parent
 
 
-def _source(scene: Scene) -> str:
+def _source(scene: Dataset) -> str:
     poses = scene.poses
     file = poses.folder if isinstance(poses, ColmapModel) else poses.file
     return f"{file.relative_to(scene.root) if file.is_relative_to(scene.root) else file}"

@@ -16,7 +16,7 @@ from beags_plugin.system.reading.images import read_image
 
 
 class BeagsDataset(InputDataset):
-    """Views of one split: ``image`` [H, W, 3] and ``class_map`` [H, W] uint16, all IGNORE where a view has no mask.
+    """Views of one split: ``image`` [H, W, 3] and ``labels`` [H, W] uint16, all IGNORE where a view has no mask.
 
     Images with alpha are put on black; ``get_alpha`` gives the alpha. Images are averaged over the area of each new
     pixel, class maps take the id at its centre; both cover the camera's image from edge to edge.
@@ -24,7 +24,7 @@ class BeagsDataset(InputDataset):
     scale_factor: of the data manager's ``camera_res_scale_factor``, on top of the parser's downscale factor.
     """
 
-    exclude_batch_keys_from_device = ["image", "mask", "class_map", "alpha"]
+    exclude_batch_keys_from_device = ["image", "mask", "labels", "alpha"]
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
         super().__init__(dataparser_outputs)  # not the factor: nerfstudio rounds the size down but scales K exactly
@@ -66,13 +66,13 @@ class BeagsDataset(InputDataset):
 
         index = data["image_idx"]
         width, height = self.file_sizes[index]
-        path = self.metadata["class_map_filenames"][index]
+        path = self.metadata["mask_filenames"][index]
         if path is None:
-            class_map = np.full((height, width), IGNORE, np.uint16)
+            labels = np.full((height, width), IGNORE, np.uint16)
         else:
             ids = read_mask(path, self.metadata["mask_kind"], self.metadata["ignore_ids"])
-            class_map = resize_nearest(ids, height, width)
-        return {"class_map": torch.from_numpy(class_map)}
+            labels = resize_nearest(ids, height, width)
+        return {"labels": torch.from_numpy(labels)}
 
 
 def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:

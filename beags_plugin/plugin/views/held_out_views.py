@@ -60,7 +60,7 @@ class HeldOutViews(Sequence[EvalView]):
         view = self._views[index]
         truth = self._metadata["ground_truth"] or _NO_TRUTH
         exact = truth["masks"][index] if truth["masks"] else None
-        file, kind = (exact, "ids") if exact else (self._metadata["class_map_filenames"][index], self._kind)
+        file, kind = (exact, "ids") if exact else (self._metadata["mask_filenames"][index], self._kind)
         visible = None
         if file is not None:
             ids = read_mask(file, kind, self._metadata["ignore_ids"])

@@ -19,9 +19,9 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from beags_plugin.data.dataset import ColmapModel, Poses, PoseTable, TransformsFile
 from beags_plugin.data.files import existing_images, photo_names
 from beags_plugin.data.layouts.colmap import points_file
-from beags_plugin.data.scene import ColmapModel, Poses, PoseTable, TransformsFile
 from beags_plugin.data.transforms_file import read_transforms
 from beags_plugin.plugin.views.cameras import concatenate_cameras
 from beags_plugin.plugin.views.colmap_files import read_lens

@@ -10,7 +10,7 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.data.scene import PoseTable, Scene
+from beags_plugin.data.dataset import Dataset, PoseTable
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.colmap_files import read_colmap_points
 from beags_plugin.system.reading.ply import read_ply_points
@@ -22,7 +22,7 @@ SEED = 0
 """Of the points that are drawn where the data brings none."""
 
 
-def starting_points(scene: Scene, views: PosedViews, count: int) -> dict[str, Any]:
+def starting_points(scene: Dataset, views: PosedViews, count: int) -> dict[str, Any]:
     """The seed points of a scene in the world of its cameras, or ``count`` drawn ones where it has none.
 
     Returns ``points3D_xyz`` [P, 3] float32, ``points3D_rgb`` [P, 3] uint8 and ``points3D_random``, whether they are

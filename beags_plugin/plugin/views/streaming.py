@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
-from beags_plugin.labels.label_maps import PackedMap
+from beags_plugin.labels.label_maps import CompressedMap
 
 Load = Callable[[int], dict[str, Any]]
 
@@ -15,7 +15,7 @@ class StreamedViews(Sequence[dict[str, Any]]):
     """The data of V views, none of which is kept: each is loaded when it is asked for, or before, if it is expected.
 
     load: gives the data of a view; it is called in threads. ahead: how many views are loaded before their use;
-    workers: by how many threads. ``class_maps`` replaces what is loaded where it is not None.
+    workers: by how many threads. ``labels`` replaces what is loaded where it is not None.
     What a view holds does not depend on who loads it when.
     """
 
@@ -23,7 +23,7 @@ class StreamedViews(Sequence[dict[str, Any]]):
         self._load, self._count, self.ahead = load, count, ahead
         self._pool = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="beags-views")
         self._coming: dict[int, Future[dict[str, Any]]] = {}
-        self.class_maps: list[PackedMap | None] = [None] * count
+        self.labels: list[CompressedMap | None] = [None] * count
 
     def __len__(self) -> int:
         return self._count
@@ -36,9 +36,9 @@ class StreamedViews(Sequence[dict[str, Any]]):
         index %= self._count
         coming = self._coming.pop(index, None)
         data = dict(self._load(index) if coming is None else coming.result())
-        replaced = self.class_maps[index]
+        replaced = self.labels[index]
         if replaced is not None:
-            data["class_map"] = replaced.unpacked()
+            data["labels"] = replaced.unpacked()
         return data
 
     def expect(self, indices: Iterable[int]) -> None:

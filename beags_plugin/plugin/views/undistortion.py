@@ -48,41 +48,41 @@ def _by_nerfstudio(image: np.ndarray, distorted: Cameras, index: int) -> tuple[n
     return K, image
 
 
-def undistort_class_map(class_map: np.ndarray, distorted: Cameras, straight: Cameras, index: int) -> np.ndarray:
+def undistort_labels(labels: np.ndarray, distorted: Cameras, straight: Cameras, index: int) -> np.ndarray:
     """Remove the lens distortion from a class map; the nearest id is taken: ids never blend.
 
-    class_map: [h, w], the whole distorted image at any size. distorted, straight: the cameras before and after
+    labels: [h, w], the whole distorted image at any size. distorted, straight: the cameras before and after
     nerfstudio undistorted (and cropped) the photographs; ``index``: which of them.
     Returns [h', w'], the whole straight image at the same pixels per camera pixel; outside the lens IGNORE.
     """
-    maps = _lens_maps(distorted, straight, index, class_map.shape)
+    maps = _lens_maps(distorted, straight, index, labels.shape)
     if maps is None:
-        return class_map
+        return labels
     options = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": (IGNORE,)}
-    return cv2.remap(class_map, *maps, cv2.INTER_NEAREST, **options)
+    return cv2.remap(labels, *maps, cv2.INTER_NEAREST, **options)
 
 
-def redistort_class_map(
-    class_map: np.ndarray,
+def redistort_labels(
+    labels: np.ndarray,
     distorted: Cameras,
     straight: Cameras,
     index: int,
     shape: tuple[int, int],
     border: int = IGNORE,
 ) -> np.ndarray:
-    """A class map of the straight view as the photograph's file has it: the inverse of ``undistort_class_map``.
+    """A class map of the straight view as the photograph's file has it: the inverse of ``undistort_labels``.
 
-    class_map: [h', w'], the whole straight image. shape: (h, w) of the distorted image, at as many pixels per camera
+    labels: [h', w'], the whole straight image. shape: (h, w) of the distorted image, at as many pixels per camera
     pixel. Returns [h, w], the nearest value of each pixel; ``border`` where the straight image does not reach.
     """
     if distorted.distortion_params is None or not distorted.distortion_params[index].any():
-        return class_map
+        return labels
     height, width = shape
     parameters = distorted.distortion_params[index].double().numpy()
     sizes = [[int(getattr(c, side)[index]) for side in ("width", "height")] for c in (distorted, straight)]
     (full_width, full_height), (cropped_width, cropped_height) = sizes
     K = _scaled_intrinsics(distorted, index, width / full_width, height / full_height)
-    new_K = _scaled_intrinsics(straight, index, class_map.shape[1] / cropped_width, class_map.shape[0] / cropped_height)
+    new_K = _scaled_intrinsics(straight, index, labels.shape[1] / cropped_width, labels.shape[0] / cropped_height)
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     pixels = np.stack([columns, rows], axis=2).reshape(-1, 1, 2)
     if int(distorted.camera_type[index]) == CameraType.FISHEYE.value:
@@ -93,7 +93,7 @@ def redistort_class_map(
         found = cv2.undistortPointsIter(pixels, K, np.array([k1, k2, p1, p2, k3]), np.eye(3), new_K, exact)
     maps = found.reshape(height, width, 2).astype(np.float32)
     options = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": (border,)}
-    return cv2.remap(class_map, maps[..., 0], maps[..., 1], cv2.INTER_NEAREST, **options)
+    return cv2.remap(labels, maps[..., 0], maps[..., 1], cv2.INTER_NEAREST, **options)
 
 
 def undistort_alpha(alpha: np.ndarray, distorted: Cameras, straight: Cameras, index: int) -> np.ndarray:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.labels.label_maps import widened
+from beags_plugin.labels.label_maps import to_int32
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class View:
     anew: of all views at once, the images in float would take six times as much as their files, opened.
 
     name: the stem of the image file; where several share it, with the folders that tell them apart, joined by "_".
-    data: gives what batches hold of it. labels_of: gives its labels, as ``label_maps.narrowed`` does, or None.
+    data: gives what batches hold of it. labels_of: gives its labels, as ``label_maps.to_compact`` does, or None.
     """
 
     camera: Camera
@@ -56,7 +56,7 @@ class View:
     def labels(self) -> Tensor | None:
         """[H, W] int32 class ids or IGNORE; None if the view has no mask."""
         stored = self.stored_labels
-        return None if stored is None else widened(stored)
+        return None if stored is None else to_int32(stored)
 
     @property
     def alpha(self) -> Tensor | None:

@@ -19,7 +19,7 @@ pytest.importorskip("nerfstudio")
 from beags_plugin.commands.cli import main
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export import EXPORTERS
-from beags_plugin.export.base import Exporter, Piece, Viewpoints, make_exporter
+from beags_plugin.export.base import Exporter, ExportItem, Viewpoints, make_exporter
 from beags_plugin.export.frames import Frame, bounding_box
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.ply import read_ply
@@ -91,8 +91,8 @@ def test_the_box_holds_the_discs_and_a_thin_part_but_not_a_stray(count):
 def test_the_2dgs_ply_has_what_the_official_code_reads(tmp_path):
     """The official reader takes columns by prefix in the order of their numbers, and wants 45 of f_rest_."""
     surfels = random_surfels(degree=1)
-    piece = Piece("cup", surfels, torch.ones(7, dtype=torch.int32))
-    make_exporter("ply-2dgs").write(tmp_path / "cup.ply", piece)
+    item = ExportItem("cup", surfels, torch.ones(7, dtype=torch.int32))
+    make_exporter("ply-2dgs").write(tmp_path / "cup.ply", item)
     element = read_vertices(tmp_path / "cup.ply")
     names_of_columns = element.dtype.names or ()
 
@@ -223,10 +223,10 @@ class PointsExporter(Exporter):
     suffix: ClassVar[str] = "xyz"
     digits: int = 6
 
-    def write(self, path: Path, piece: Piece) -> dict[str, Any]:
+    def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
         with whole_file(path) as part, open(part, "w") as file:
-            np.savetxt(file, piece.surfels.means.numpy(), f"%.{self.digits}g")
-        return {"points": len(piece.surfels)}
+            np.savetxt(file, item.surfels.means.numpy(), f"%.{self.digits}g")
+        return {"points": len(item.surfels)}
 
 
 def test_extract_and_export_write_the_same_ply(trained, tmp_path):

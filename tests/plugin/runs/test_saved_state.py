@@ -11,7 +11,7 @@ from beags_plugin.system.errors import UserError
 
 pytest.importorskip("nerfstudio")
 
-from beags_plugin.plugin.runs.checkpoint_file import check_state
+from beags_plugin.plugin.runs.checkpoint_file import validate
 
 
 def state(**changed) -> dict:
@@ -28,7 +28,7 @@ def state(**changed) -> dict:
 
 
 def test_a_whole_scene_passes():
-    check_state(state(), Path("a.ckpt"))
+    validate(state(), Path("a.ckpt"))
 
 
 @pytest.mark.parametrize(
@@ -48,4 +48,4 @@ def test_a_whole_scene_passes():
 )
 def test_a_damaged_one_is_refused(changed, words):
     with pytest.raises(UserError, match=f"a.ckpt holds no scene of beags .*{words}"):
-        check_state(state(**changed), Path("a.ckpt"))
+        validate(state(**changed), Path("a.ckpt"))

@@ -29,7 +29,7 @@ from resumed_runs import (
     without_clocks,
 )
 
-from beags_plugin.plugin.runs.read import read_scene
+from beags_plugin.plugin.runs.read import read_run
 from beags_plugin.plugin.trainer import BeagsTrainer
 from beags_plugin.preparation import pipeline as preparation
 from beags_plugin.system.child_processes import bound
@@ -134,7 +134,7 @@ def test_a_kill_in_the_preparation_ends_as_the_whole_one(data, whole, tmp_path, 
 def test_a_kill_while_the_base_or_the_masks_are_written(data, whole, tmp_path, monkeypatch):
     from beags_plugin.plugin.training import refinement
 
-    for name in ("write_run", "write_class_map"):
+    for name in ("write_run", "write_mask"):
         run = tmp_path / name
 
         def kill(patch, name=name):
@@ -390,7 +390,7 @@ def test_what_cannot_be_resumed_is_said_in_one_sentence(data, whole, tmp_path, m
     with pytest.raises(UserError, match="is damaged"):
         resume_to_end(run)
     with pytest.raises(UserError, match="is damaged"):
-        read_scene(run / "config.yml")  # extract, export, render and eval too
+        read_run(run / "config.yml")  # extract, export, render and eval too
     path.write_bytes(content)
     edit_checkpoint(run, lambda content: content.pop("beags"))
     resume_to_end(run)  # of an older version: it goes on all the same

@@ -19,8 +19,8 @@ from beags_plugin.ops import cuda_extension
 from beags_plugin.plugin.presets import preset_config, preset_names
 from beags_plugin.plugin.training import replicas as several
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.by_device import ByDevice
 from beags_plugin.rasterizers.cuda import CudaRasterizer
+from beags_plugin.rasterizers.device_dispatch import DeviceDispatchRasterizer
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 from beags_plugin.sample.writer import SampleConfig, write_sample
 from beags_plugin.system.errors import UserError
@@ -29,13 +29,13 @@ from beags_plugin.system.errors import UserError
 @pytest.fixture
 def two_gpus(monkeypatch):
     """A machine with two GPUs, as far as questions go."""
-    monkeypatch.setattr(cuda_extension, "found", lambda: (SimpleNamespace(EMULATED=False), None))
+    monkeypatch.setattr(cuda_extension, "status", lambda: (SimpleNamespace(EMULATED=False), None))
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
 
 
 @pytest.fixture
 def no_gpu(monkeypatch):
-    monkeypatch.setattr(cuda_extension, "found", lambda: (None, "torch finds no CUDA device."))
+    monkeypatch.setattr(cuda_extension, "status", lambda: (None, "torch finds no CUDA device."))
 
 
 def device_of(preset: str) -> str:
@@ -45,7 +45,7 @@ def device_of(preset: str) -> str:
 def test_presets_train_on_a_gpu_where_its_kernels_can_run(two_gpus):
     assert {device_of(name) for name in preset_names()} == {"cuda"}
     rasterizer = make_rasterizer("auto")
-    assert isinstance(rasterizer, ByDevice) and isinstance(rasterizer.gpu, CudaRasterizer)
+    assert isinstance(rasterizer, DeviceDispatchRasterizer) and isinstance(rasterizer.gpu, CudaRasterizer)
     on_gpu = SimpleNamespace(means=SimpleNamespace(is_cuda=True))
     on_cpu = SimpleNamespace(means=SimpleNamespace(is_cuda=False))
     assert rasterizer._backend(on_gpu) is rasterizer.gpu and rasterizer._backend(on_cpu) is rasterizer.cpu
@@ -53,13 +53,13 @@ def test_presets_train_on_a_gpu_where_its_kernels_can_run(two_gpus):
 
 def test_presets_train_on_the_cpu_elsewhere(no_gpu):
     assert {device_of(name) for name in preset_names()} == {"cpu"}
-    assert not isinstance(make_rasterizer("auto"), ByDevice)
+    assert not isinstance(make_rasterizer("auto"), DeviceDispatchRasterizer)
 
 
 def test_a_gpu_without_our_kernels_is_drawn_on_by_torch(no_gpu, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     rasterizer = make_rasterizer("auto")
-    assert isinstance(rasterizer, ByDevice) and isinstance(rasterizer.gpu, TorchRasterizer)
+    assert isinstance(rasterizer, DeviceDispatchRasterizer) and isinstance(rasterizer.gpu, TorchRasterizer)
 
 
 def test_devices_that_are_there_are_accepted(two_gpus):

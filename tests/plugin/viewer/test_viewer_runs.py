@@ -17,7 +17,7 @@ pytest.importorskip("nerfstudio")
 from nerfstudio.utils.eval_utils import eval_setup
 from viewer_windows import ALWAYS, Stand, write_finished
 
-from beags_plugin.labels.classes import write_class_map
+from beags_plugin.labels.classes import write_mask
 from beags_plugin.plugin.objects.extract import extract_objects
 from beags_plugin.plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.viewer.viewing import CHANNELS
@@ -50,7 +50,7 @@ def test_masks_of_a_former_run_in_the_folder_are_not_shown_while_a_base_is_train
     window.model.prepared_rounds = 1  # as the switch to refinement says once it is done
     first = run.mask(0, "after", 20, 12)
     path = tmp_path / "run/prepared/masks" / f"{run.names[0]}.png"
-    write_class_map(path, np.zeros((12, 20), np.uint8))  # prepared again
+    write_mask(path, np.zeros((12, 20), np.uint8))  # prepared again
     os.utime(path, ns=(1, path.stat().st_mtime_ns + 1))
     assert set(first.unique().tolist()) == {0, 1, 2} and not run.mask(0, "after", 20, 12).any()
     assert run.has_grid and run.load_grid()
@@ -109,7 +109,7 @@ def test_an_extracted_run_whose_origin_was_trained_again_shows_none_of_its_masks
     shutil.rmtree(run / "prepared")
     write_prepared(run, shift=1, **({"scale": 2.0} if changed == "the grid" else {}))
     if changed == "a mask":
-        write_class_map(run / "prepared/masks/v03.png", np.zeros((12, 20), np.uint8))
+        write_mask(run / "prepared/masks/v03.png", np.zeros((12, 20), np.uint8))
     os.utime(run / "prepared/grid.pt", ns=(1, 1))  # another file, even where the clock is coarse
     assert open_now.prepared is None and open_now.mask(0, "after", 20, 12) is None
     for each in (extracted, of_extracted):

@@ -123,7 +123,7 @@ def test_the_least_opacity_and_a_crop_box_leave_surfels_out():
 
 
 def test_the_ray_of_a_pixel_picks_what_the_whole_picture_has_there(rasterizer):
-    """Same surfel as ``heaviest`` of a whole view whose pixels are as fine as the one that picking draws."""
+    """Same surfel as ``dominant_gaussian`` of a whole view whose pixels are as fine as the one that picking draws."""
     surfels, ids = discs()
     camera = view(24, 20)
     K = torch.tensor([[1000.0, 0, 12.0], [0, 1000.0, 10.0], [0, 0, 1]])
@@ -131,7 +131,7 @@ def test_the_ray_of_a_pixel_picks_what_the_whole_picture_has_there(rasterizer):
         viewmat = view(turn=turn).viewmat.clone()
         viewmat[1, 3] += lift
         camera = Camera(viewmat, K, 24, 20)
-        whole = rasterizer.heaviest(geometry_inputs(surfels), camera, SETTINGS)
+        whole = rasterizer.dominant_gaussian(geometry_inputs(surfels), camera, SETTINGS)
         for x, y in ((3, 4), (12, 10), (20, 15)):
             local = torch.tensor([(x + 0.5 - 12.0) / 1000, (y + 0.5 - 10.0) / 1000, 1.0])
             found = pick(

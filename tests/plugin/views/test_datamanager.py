@@ -13,7 +13,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_imag
 
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.plugin.views.datamanager import BeagsDataManagerConfig
-from beags_plugin.plugin.views.undistortion import undistort_class_map
+from beags_plugin.plugin.views.undistortion import undistort_labels
 from beags_plugin.plugin.views.views import unique_names
 
 
@@ -63,7 +63,7 @@ def test_every_label_comes_from_the_pixel_that_the_image_came_from(tmp_path, mod
     for name, value in zip(("fx", "fy", "cx", "cy"), (*np.diag(new_K)[:2], *new_K[:2, 2]), strict=True):
         getattr(straight, name)[0] = float(value)
     straight.height[0], straight.width[0] = ramps.shape[:2]
-    labels = undistort_class_map((rows * LARGE_W + columns).astype(np.uint16), cameras, straight, 0)
+    labels = undistort_labels((rows * LARGE_W + columns).astype(np.uint16), cameras, straight, 0)
     assert labels.shape == ramps.shape[:2]
     known = labels != IGNORE
     inside = known & (ramps[..., 0] > 1) & (ramps[..., 1] > 1)  # at the rim the ramp blends with black
@@ -104,11 +104,11 @@ def test_batches_on_a_cpu(tmp_path, cache, kind):
     data = manager(tmp_path, cache_images=cache, cache_images_type=kind)
     camera, batch = data.next_train(0)
     assert batch["image"].dtype == getattr(torch, kind)
-    assert batch["class_map"].shape == (HEIGHT, WIDTH) and batch["class_map"].dtype == torch.int32
-    assert camera.metadata["class_map"] is batch["class_map"] and "mask" not in batch
-    assert data.next_eval_image(0)[1]["class_map"].shape == (HEIGHT, WIDTH)
+    assert batch["labels"].shape == (HEIGHT, WIDTH) and batch["labels"].dtype == torch.int32
+    assert camera.metadata["labels"] is batch["labels"] and "mask" not in batch
+    assert data.next_eval_image(0)[1]["labels"].shape == (HEIGHT, WIDTH)
     batches = data.fixed_indices_eval_dataloader
-    assert len(batches) == 2 and all("class_map" in batch for _, batch in batches)
+    assert len(batches) == 2 and all("labels" in batch for _, batch in batches)
     assert data.views("train")[0].image.dtype == torch.float32 and data.views("train")[0].image.max() <= 1
 
 
@@ -135,21 +135,21 @@ def test_replaced_class_maps_reach_batches_and_views(tmp_path):
     data = manager(tmp_path)
     new = [torch.full((HEIGHT, WIDTH), 5 + index, dtype=torch.int32) for index in range(7)]
     assert "present" not in data.next_train(0)[1]  # the host knows those of the maps that it is given
-    data.replace_class_maps(new)
+    data.replace_labels(new)
     for step in range(1, 8):
         camera, batch = data.next_train(step)
-        assert (batch["class_map"].int() == 5 + batch["image_idx"]).all()
+        assert (batch["labels"].int() == 5 + batch["image_idx"]).all()
         assert batch["present"] == [5 + batch["image_idx"]]
-        assert torch.equal(camera.metadata["class_map"], batch["class_map"])
+        assert torch.equal(camera.metadata["labels"], batch["labels"])
     assert all(torch.equal(view.labels, labels) for view, labels in zip(data.views("train"), new, strict=True))
     originals = [view.labels for view in data.views("train", original=True)]
     assert (originals[0] == 1).all() and originals[1:] == [None] * 6
 
     new[0].fill_(9)  # the manager keeps its own copy
-    data.replace_class_maps([labels + 1 for labels in new])
+    data.replace_labels([labels + 1 for labels in new])
     assert (data.views("train", original=True)[0].labels == 1).all()
     assert (data.views("train")[0].labels == 10).all()
-    data.replace_class_maps(new, keep=False)
+    data.replace_labels(new, keep=False)
     assert (data.views("train")[1].labels == 6).all()
     with pytest.raises(ValueError, match="were not kept"):
         data.views("train", original=True)
@@ -158,7 +158,7 @@ def test_replaced_class_maps_reach_batches_and_views(tmp_path):
 @pytest.mark.parametrize(
     ("maps", "message"),
     [
-        ([torch.zeros(HEIGHT, WIDTH)] * 6, "6 class maps for 7"),
+        ([torch.zeros(HEIGHT, WIDTH)] * 6, "6 views for 7"),
         ([torch.zeros(WIDTH, HEIGHT)] * 7, "for a view of"),
         ([torch.full((HEIGHT, WIDTH), -1)] * 7, "must lie in"),
     ],
@@ -166,7 +166,7 @@ def test_replaced_class_maps_reach_batches_and_views(tmp_path):
 def test_wrong_class_maps_are_refused(tmp_path, maps, message):
     write_transforms(tmp_path)
     with pytest.raises(ValueError, match=message):
-        manager(tmp_path).replace_class_maps(maps)
+        manager(tmp_path).replace_labels(maps)
 
 
 def test_paths_of_the_configuration_are_absolute(tmp_path, monkeypatch):

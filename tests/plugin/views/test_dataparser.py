@@ -124,7 +124,7 @@ def test_every_eighth_view_by_name_is_held_out(tmp_path, write):
     for split in ("val", "test"):
         outputs = parser.get_dataparser_outputs(split)
         assert names(outputs) == ["v00", "v08"]
-        assert len(outputs.cameras) == len(outputs.metadata["class_map_filenames"]) == 2
+        assert len(outputs.cameras) == len(outputs.metadata["mask_filenames"]) == 2
 
 
 def test_held_out_views_leave_the_training_set(tmp_path):
@@ -156,7 +156,7 @@ def test_splits_named_by_lists_win(tmp_path):
 
 def labels_of(root: Path, index: int = 0, **options) -> np.ndarray:
     outputs = parse(root, eval_interval=0, **options)
-    return BeagsDataset(outputs).get_data(index)["class_map"]
+    return BeagsDataset(outputs).get_data(index)["labels"]
 
 
 @pytest.mark.parametrize("kind", ["8-bit", "16-bit", "palette"])
@@ -197,7 +197,7 @@ def test_ignore_ids_become_ignore_and_are_no_class(tmp_path):
 def test_missing_masks_are_ignore(tmp_path):
     write_transforms(tmp_path)
     write_image(tmp_path / "masks/v03.png", np.ones((HEIGHT, WIDTH), np.uint8))
-    files = parse(tmp_path, eval_interval=0).metadata["class_map_filenames"]
+    files = parse(tmp_path, eval_interval=0).metadata["mask_filenames"]
     assert [file and file.name for file in files] == [None] * 3 + ["v03.png"] + [None] * 5
     assert (labels_of(tmp_path, 0).numpy() == IGNORE).all()
     assert (labels_of(tmp_path, 3).numpy() == 1).all()
@@ -243,8 +243,8 @@ def test_downscaled_image_and_class_map_stay_aligned(tmp_path):
     assert data["image"].shape == (3, 5, 3)
     # Columns 0..3 average to 1.5; the new pixel's centre lies on the edge between columns 1 and 2.
     np.testing.assert_allclose(data["image"][0, :, 0] * 255, 10 * (1.5 + 4 * np.arange(5)), atol=0.01)
-    np.testing.assert_array_equal(data["class_map"][0].numpy(), 2 + 4 * np.arange(5))
-    odd = BeagsDataset(parse(tmp_path, eval_interval=0, downscale_factor=20 / 4)).get_data(0)["class_map"]
+    np.testing.assert_array_equal(data["labels"][0].numpy(), 2 + 4 * np.arange(5))
+    odd = BeagsDataset(parse(tmp_path, eval_interval=0, downscale_factor=20 / 4)).get_data(0)["labels"]
     np.testing.assert_array_equal(odd[0].numpy(), 2 + 5 * np.arange(4))  # the middle one of five
 
 
@@ -253,7 +253,7 @@ def test_camera_res_scale_factor_scales_both_once_more(tmp_path):
     dataset = BeagsDataset(parse(tmp_path, eval_interval=0), scale_factor=0.5)
     camera = camera_from_nerfstudio(dataset.cameras, 0)
     data = dataset.get_data(0)
-    assert data["image"].shape[:2] == data["class_map"].shape == (camera.height, camera.width) == (6, 10)
+    assert data["image"].shape[:2] == data["labels"].shape == (camera.height, camera.width) == (6, 10)
     np.testing.assert_allclose(camera.K[0, 2], CX / 2)
 
 
@@ -453,8 +453,8 @@ def test_fruit_reprojects_and_its_masks_fit():
     error = np.linalg.norm((moved[:, :2] / moved[:, 2:]).numpy() - view.xys[tracked], axis=1)
     assert np.median(error) < 1.0  # the reconstruction's mean error is 0.74 px
     data = BeagsDataset(outputs).get_data(5)
-    assert data["image"].shape[:2] == data["class_map"].shape == (camera.height, camera.width)
-    assert set(np.unique(data["class_map"].numpy())) <= {0, 1, 2}
+    assert data["image"].shape[:2] == data["labels"].shape == (camera.height, camera.width)
+    assert set(np.unique(data["labels"].numpy())) <= {0, 1, 2}
 
 
 def test_skull_has_no_seed_points_but_starts_around_the_skull():
@@ -469,4 +469,4 @@ def test_skull_has_no_seed_points_but_starts_around_the_skull():
     original = (points / outputs.dataparser_scale - transform[:, 3]) @ transform[:, :3]
     assert (original.norm(dim=1) < 1).double().mean() > 0.1
     data = BeagsDataset(outputs).get_data(3)
-    assert data["image"].shape[:2] == data["class_map"].shape == (300, 400)
+    assert data["image"].shape[:2] == data["labels"].shape == (300, 400)

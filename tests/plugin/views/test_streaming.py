@@ -11,7 +11,7 @@ from data_folders import HEIGHT, WIDTH, write_image, write_transforms
 from distorted_views import manager, write_distorted
 
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.labels.label_maps import PackedMap, widened
+from beags_plugin.labels.label_maps import CompressedMap, to_int32
 from beags_plugin.plugin.views.streaming import Lazy, StreamedViews
 
 
@@ -33,7 +33,7 @@ def test_batches_and_views_are_the_same_bit_for_bit(tmp_path, model, kind):
         (camera, batch), (other, found) = cached.next_train(step), streamed.next_train(step)
         assert batch["image_idx"] == found["image_idx"] and same(batch, found)
         assert torch.equal(camera.get_intrinsics_matrices(), other.get_intrinsics_matrices())
-        assert torch.equal(camera.metadata["class_map"], other.metadata["class_map"])
+        assert torch.equal(camera.metadata["labels"], other.metadata["labels"])
     for split in ("train", "test"):
         for a, b in zip(cached.views(split), streamed.views(split), strict=True):
             assert torch.equal(a.image, b.image) and torch.equal(a.camera.K, b.camera.K) and a.name == b.name
@@ -51,13 +51,13 @@ def test_replaced_class_maps_of_streamed_views(tmp_path):
     new[2][0] = IGNORE
     new[3][1] = 300
     for data in (cached, streamed):
-        data.replace_class_maps(new)
+        data.replace_labels(new)
     for step in range(7):
         assert same(cached.next_train(step)[1], streamed.next_train(step)[1])
     assert all(torch.equal(view.labels, labels) for view, labels in zip(streamed.views("train"), new, strict=True))
     originals = [view.labels for view in streamed.views("train", original=True)]
     assert (originals[0] == 1).all() and originals[1:] == [None] * 6
-    streamed.replace_class_maps(new, keep=False)
+    streamed.replace_labels(new, keep=False)
     with pytest.raises(ValueError, match="were not kept"):
         streamed.views("train", original=True)
 
@@ -112,8 +112,8 @@ def test_a_failure_while_loading_ahead_is_raised_where_the_view_is_asked_for():
 @pytest.mark.parametrize("ids", [(0, 3, IGNORE), (0, 300, IGNORE), (0, 70000)])
 def test_packed_maps_are_small_and_give_every_id_back(ids):
     labels = torch.tensor(ids, dtype=torch.int32).repeat_interleave(40_000).reshape(-1, 200)
-    packed = PackedMap(labels)
-    assert torch.equal(widened(packed.unpacked()), labels) and len(packed.packed) < 0.02 * labels.numel()
+    packed = CompressedMap(labels)
+    assert torch.equal(to_int32(packed.unpacked()), labels) and len(packed.packed) < 0.02 * labels.numel()
 
 
 def test_lazy_sequences():

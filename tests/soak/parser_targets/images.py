@@ -15,10 +15,10 @@ from parser_targets.target import SIDE, Target
 
 
 def _mask(path: Path) -> None:
-    from beags_plugin.labels.classes import read_binary_mask, read_class_map
+    from beags_plugin.labels.classes import read_binary_mask, read_id_mask
 
     try:
-        read_class_map(path, (255,))
+        read_id_mask(path, (255,))
     except UserError:
         read_binary_mask(path)
 

@@ -35,7 +35,7 @@ def _colmap(path: Path) -> None:
 
 
 def _transforms(path: Path) -> None:
-    from beags_plugin.data.scene import TransformsFile
+    from beags_plugin.data.dataset import TransformsFile
     from beags_plugin.plugin.views.cameras import check_cameras
     from beags_plugin.plugin.views.poses import Normalization, read_poses
 

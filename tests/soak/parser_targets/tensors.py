@@ -16,12 +16,12 @@ from parser_targets.target import Target
 
 def _checkpoint(path: Path) -> None:
     from beags_plugin.importers.checkpoint import _gaussians
-    from beags_plugin.plugin.runs.checkpoint_file import check_state, read_checkpoint
+    from beags_plugin.plugin.runs.checkpoint_file import read_checkpoint, validate
     from beags_plugin.plugin.training.resumable import training_state
 
     try:
         state = read_checkpoint(path)
-        check_state({k.removeprefix("_model."): v for k, v in state["pipeline"].items() if isinstance(k, str)}, path)
+        validate({k.removeprefix("_model."): v for k, v in state["pipeline"].items() if isinstance(k, str)}, path)
         training_state(state, path)
     except UserError:
         _gaussians(path)

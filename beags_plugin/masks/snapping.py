@@ -9,27 +9,27 @@ from beags_plugin.labels.class_ids import IGNORE
 EPSILON = 1e-2  # variance of colour (0..1) below which the guide counts as flat
 
 
-def snap_to_edges(class_map: np.ndarray, photo: np.ndarray, radius: int) -> np.ndarray:
+def snap_to_edges(labels: np.ndarray, photo: np.ndarray, radius: int) -> np.ndarray:
     """[H, W] uint16: the class map with its rims where the photo's edges are, as a guided filter sees them.
 
-    class_map: [H, W] uint16. photo: [H, W, 3] uint8 RGB. radius: pixels of the filter's window, and how far from a
+    labels: [H, W] uint16. photo: [H, W, 3] uint8 RGB. radius: pixels of the filter's window, and how far from a
     rim a label may change. Each class's indicator is filtered with the photo as guide (He et al., "Guided image
     filtering"); near rims the class of the largest value is taken. IGNORE stays.
     """
     import cv2
 
-    ids = [int(i) for i in np.unique(class_map) if i != IGNORE]
+    ids = [int(i) for i in np.unique(labels) if i != IGNORE]
     if radius < 1 or len(ids) < 2:
-        return class_map
+        return labels
     kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     guide = np.ascontiguousarray(photo, np.float32) / np.float32(255.0)
-    flat = class_map.astype(np.float32)
+    flat = labels.astype(np.float32)
     near = cv2.dilate(flat, kernel) != cv2.erode(flat, kernel)
-    best = np.full(class_map.shape, -np.inf, np.float32)
-    found = class_map.copy()
+    best = np.full(labels.shape, -np.inf, np.float32)
+    found = labels.copy()
     for class_id in ids:
-        indicator = (class_map == class_id).astype(np.float32)
+        indicator = (labels == class_id).astype(np.float32)
         value = cv2.ximgproc.guidedFilter(guide, indicator, radius, EPSILON)
         larger = value > best
         found[larger], best[larger] = class_id, value[larger]
-    return np.where(near & (class_map != IGNORE), found, class_map)
+    return np.where(near & (labels != IGNORE), found, labels)

@@ -1,4 +1,4 @@
-"""Voxel votes slab by slab: the same bits, with few voxels in memory at a time."""
+"""Voxel votes chunk by chunk: the same bits, with few voxels in memory at a time."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import pytest
 import torch
 from voted_views import larger_scene, same
 
-from beags_plugin.masks import spatial_chunks as slabs
+from beags_plugin.masks import spatial_chunks as chunks
 from beags_plugin.masks import voxel_reprojection
 from beags_plugin.masks.pooled_votes import lift
-from beags_plugin.masks.spatial_chunks import WHOLE, slabs_of, torch_brick_sample
+from beags_plugin.masks.spatial_chunks import WHOLE, divide_space, torch_brick_sample
 from beags_plugin.masks.voxel_reprojection import _to_voxels, reproject_voxel
 from beags_plugin.ops import extension
 from beags_plugin.ops.voxel_votes import brick_sample
@@ -24,13 +24,13 @@ def test_any_number_of_slabs_gives_the_same_bits(monkeypatch, dtype):
     whole, cut, told = list(reproject_voxel(*scene)), [], []
 
     def observed(*args):
-        cut.append(slabs_of(*args))
+        cut.append(divide_space(*args))
         return cut[-1]
 
-    monkeypatch.setattr(voxel_reprojection, "slabs_of", observed)
-    monkeypatch.setattr(slabs, "_PART", 2)  # there are few bricks
+    monkeypatch.setattr(voxel_reprojection, "divide_space", observed)
+    monkeypatch.setattr(chunks, "_PART", 2)  # there are few bricks
     for most in (10**6, 60, 12):
-        monkeypatch.setattr(slabs, "MOST_BRICKS", most)
+        monkeypatch.setattr(chunks, "MOST_BRICKS", most)
         assert same(list(reproject_voxel(*scene, progress=lambda *now: told.append(now))), whole)
         assert told[-1] == (10 * len(cut[-1]), 10 * len(cut[-1])) and len(told) == told[-1][1]
         told.clear()
@@ -48,8 +48,8 @@ def test_slabs_hold_about_as_many_bricks_as_they_may():
     lifted = [lift(depth, own.to(depth)) for depth, own in zip(depths, lifts, strict=True)]
     bricks = torch.unique(torch.cat([torch.floor(p[near] / 4) for p, _, near in lifted]), dim=0)
     assert len(bricks) > 5000  # nearly every pixel has its own: the worst case
-    assert slabs_of(depths, cameras, lifts, most=10**4) is WHOLE
-    found = slabs_of(depths, cameras, lifts, most=1500)
+    assert divide_space(depths, cameras, lifts, most=10**4) is WHOLE
+    found = divide_space(depths, cameras, lifts, most=1500)
     assert abs(len(found) - len(bricks) / 1500) < 2
     assert (found.axis, found.borders[0], found.borders[-1]) == (2, -math.inf, math.inf)  # depth is the longest
     in_slab = torch.bucketize(bricks[:, 2].contiguous(), torch.tensor(found.borders[1:-1]) / 4, right=True)
@@ -71,8 +71,8 @@ def test_the_compiled_sample_of_bricks_is_that_of_torch(dtype):
 
 
 def test_each_point_is_in_one_slab_and_what_matters_to_it_is_about():
-    cut = slabs.Slabs(0, (-math.inf, -4.0, 8.0, math.inf), 5.0)
+    cut = chunks.SpatialChunks(0, (-math.inf, -4.0, 8.0, math.inf), 5.0)
     coordinates = torch.tensor([-1e6, -4.0, -4.001, 7.9, 8.0, math.nan])
-    inside = torch.stack([cut.inside(coordinates, slab) for slab in range(3)])
+    inside = torch.stack([cut.inside(coordinates, chunk) for chunk in range(3)])
     assert inside.int().argmax(0)[:5].tolist() == [0, 1, 0, 1, 2] and inside.sum(0).tolist() == [1] * 5 + [0]
     assert cut.about(torch.tensor([-9.1, -9.0, 12.9, 13.0]), 1).tolist() == [False, True, True, False]

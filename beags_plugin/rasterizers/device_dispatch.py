@@ -8,7 +8,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings, SurfelInputs
 
 
-class ByDevice(Rasterizer):
+class DeviceDispatchRasterizer(Rasterizer):
     """Hands every call to one of two backends, by the device of the surfels.
 
     cpu, gpu: the two.
@@ -42,11 +42,11 @@ class ByDevice(Rasterizer):
         """See ``Rasterizer.class_contributions``."""
         return self._backend(inputs).class_contributions(inputs, camera, settings, labels, num_classes)
 
-    def contributing_classes(
+    def sparse_class_contributions(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, labels: Tensor, num_classes: int
     ) -> tuple[Tensor, Tensor]:
-        """See ``Rasterizer.contributing_classes``."""
-        return self._backend(inputs).contributing_classes(inputs, camera, settings, labels, num_classes)
+        """See ``Rasterizer.sparse_class_contributions``."""
+        return self._backend(inputs).sparse_class_contributions(inputs, camera, settings, labels, num_classes)
 
     def class_map(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
@@ -54,6 +54,6 @@ class ByDevice(Rasterizer):
         """See ``Rasterizer.class_map``."""
         return self._backend(inputs).class_map(inputs, camera, settings, num_classes)
 
-    def heaviest(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
-        """See ``Rasterizer.heaviest``."""
-        return self._backend(inputs).heaviest(inputs, camera, settings)
+    def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
+        """See ``Rasterizer.dominant_gaussian``."""
+        return self._backend(inputs).dominant_gaussian(inputs, camera, settings)

@@ -76,7 +76,7 @@ FilesOfObject = Mapping[str, Path]
 
 
 @dataclass(frozen=True)
-class Scene:
+class Dataset:
     """A scene as its layout describes it.
 
     layout: what to call it. root: its folder. poses: where they come from.

@@ -11,10 +11,10 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import (
     check_names,
     read_binary_mask,
-    read_class_map,
     read_classes,
+    read_id_mask,
     read_mask,
-    write_class_map,
+    write_mask,
 )
 from beags_plugin.labels.colors import colorize
 from beags_plugin.system.errors import UserError
@@ -23,31 +23,31 @@ from beags_plugin.system.errors import UserError
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32, np.int64])
 def test_written_maps_come_back(tmp_path, dtype):
     ids = np.arange(12).reshape(3, 4).astype(dtype)
-    write_class_map(tmp_path / "a.png", ids)
+    write_mask(tmp_path / "a.png", ids)
     with Image.open(tmp_path / "a.png") as image:
         assert image.mode == "L"
-    back = read_class_map(tmp_path / "a.png")
+    back = read_id_mask(tmp_path / "a.png")
     assert back.dtype == np.uint16 and np.array_equal(back, ids)
 
 
 def test_sixteen_bits_keep_large_ids_and_ignore(tmp_path):
     ids = np.array([[0, 1, 300], [IGNORE, 65534, 255]], dtype=np.int32)
-    write_class_map(tmp_path / "a.png", ids)
-    assert np.array_equal(read_class_map(tmp_path / "a.png"), ids)
-    assert np.array_equal(read_class_map(str(tmp_path / "a.png"), ignore_ids=[255]), ids)  # for 8-bit files only
+    write_mask(tmp_path / "a.png", ids)
+    assert np.array_equal(read_id_mask(tmp_path / "a.png"), ids)
+    assert np.array_equal(read_id_mask(str(tmp_path / "a.png"), ignore_ids=[255]), ids)  # for 8-bit files only
 
 
 def test_ignore_ids_of_eight_bit_files(tmp_path):
-    write_class_map(tmp_path / "a.png", np.array([[0, 1, 254, 255]]))
-    assert read_class_map(tmp_path / "a.png", ignore_ids=[255, 254]).tolist() == [[0, 1, IGNORE, IGNORE]]
-    assert read_class_map(tmp_path / "a.png").tolist() == [[0, 1, 254, 255]]
+    write_mask(tmp_path / "a.png", np.array([[0, 1, 254, 255]]))
+    assert read_id_mask(tmp_path / "a.png", ignore_ids=[255, 254]).tolist() == [[0, 1, IGNORE, IGNORE]]
+    assert read_id_mask(tmp_path / "a.png").tolist() == [[0, 1, 254, 255]]
 
 
 def test_palette_images_give_indices_not_colours(tmp_path):
     image = Image.fromarray(np.array([[0, 2], [1, 2]], dtype=np.uint8), mode="P")
     image.putpalette([0, 0, 0, 200, 10, 10, 10, 200, 10])
     image.save(tmp_path / "a.png")
-    assert read_class_map(tmp_path / "a.png").tolist() == [[0, 2], [1, 2]]
+    assert read_id_mask(tmp_path / "a.png").tolist() == [[0, 2], [1, 2]]
 
 
 GREY = np.array([[0, 100, 128], [255, 1, 127]], dtype=np.uint8)
@@ -81,19 +81,19 @@ def test_binary_masks_with_loss_are_refused(tmp_path):
 
 def test_one_bit_images_are_ids_0_and_1(tmp_path):
     Image.fromarray(np.array([[True, False]])).save(tmp_path / "a.png")
-    assert read_class_map(tmp_path / "a.png").tolist() == [[1, 0]]
+    assert read_id_mask(tmp_path / "a.png").tolist() == [[1, 0]]
 
 
 @pytest.mark.parametrize("shape", [(4, 4, 3), (4, 4, 4)])
 def test_colour_images_are_refused(tmp_path, shape):
     Image.fromarray(np.zeros(shape, dtype=np.uint8)).save(tmp_path / "a.png")
     with pytest.raises(UserError, match="a.png has colours"):
-        read_class_map(tmp_path / "a.png")
+        read_id_mask(tmp_path / "a.png")
 
 
 def test_unreadable_missing_and_lossy_files_are_refused(tmp_path):
     (tmp_path / "broken.png").write_bytes(b"no image")
-    write_class_map(tmp_path / "whole.png", np.arange(10000).reshape(100, 100))
+    write_mask(tmp_path / "whole.png", np.arange(10000).reshape(100, 100))
     (tmp_path / "cut.png").write_bytes((tmp_path / "whole.png").read_bytes()[:500])
     Image.fromarray(np.zeros((4, 4), dtype=np.uint8)).save(tmp_path / "a.jpg")
     for name, message in [
@@ -103,7 +103,7 @@ def test_unreadable_missing_and_lossy_files_are_refused(tmp_path):
         ("a.jpg", "JPEG"),
     ]:
         with pytest.raises(UserError, match=f"{name}.*{message}"):
-            read_class_map(tmp_path / name)
+            read_id_mask(tmp_path / name)
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_unreadable_missing_and_lossy_files_are_refused(tmp_path):
 )
 def test_only_ids_can_be_written(tmp_path, array, message):
     with pytest.raises(UserError, match=message):
-        write_class_map(tmp_path / "a.png", array)
+        write_mask(tmp_path / "a.png", array)
 
 
 def test_names(tmp_path):
@@ -171,9 +171,9 @@ def test_colours_are_stable_and_distinct():
 
 
 def test_an_image_too_large_to_decode_is_told(tmp_path, monkeypatch):
-    write_class_map(tmp_path / "a.png", np.zeros((20, 20), np.uint8))
+    write_mask(tmp_path / "a.png", np.zeros((20, 20), np.uint8))
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)  # Pillow refuses more than twice as many
-    for read in (read_class_map, image_size):
+    for read in (read_id_mask, image_size):
         with pytest.raises(UserError, match="a.png cannot be read as an image"):
             read(tmp_path / "a.png")
 
