@@ -1,4 +1,4 @@
-# make setup | test [JOBS=processes] | demo [DATA=folder] | soak | fuzz [COUNT=scenes] [SEED=first] | lint | format | clean
+# make setup | test [JOBS=n] | demo [DATA=folder] | soak | fuzz [COUNT=scenes] [SEED=first] | lint | format | clean
 # BEAGS_VENV names the environment; clones may share one. PYTHON names the interpreter that makes it.
 BEAGS_VENV ?= .venv
 BIN := $(BEAGS_VENV)/bin
@@ -21,7 +21,8 @@ setup:
 # Tests of what is not there are skipped, with the reason: CUDA needs a GPU; the viewer in a browser needs Chromium
 # (Debian: apt install chromium). Each process has one thread; tests that need more set them.
 test: setup
-	BEAGS_REQUIRE_NATIVE=1 OMP_NUM_THREADS=1 "$(BIN)/python" -m pytest -q -n $(JOBS) --dist loadgroup --no-loadscope-reorder
+	BEAGS_REQUIRE_NATIVE=1 OMP_NUM_THREADS=1 \
+	  "$(BIN)/python" -m pytest -q -n $(JOBS) --dist loadgroup --no-loadscope-reorder
 
 demo: setup
 	"$(BIN)/beags" demo $(if $(DATA),--data "$(DATA)")

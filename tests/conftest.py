@@ -9,10 +9,14 @@ from pathlib import Path
 import pytest
 import torch
 from cuda_backends import BACKENDS
+from hypothesis import settings
 from shared_folders import shared_folder
 
 from beags_plugin.ops import extension
 from beags_plugin.rasterizers import RASTERIZERS
+
+settings.register_profile("beags", deadline=None)  # a busy machine is no failure
+settings.load_profile("beags")
 
 
 def pytest_sessionstart(session):

@@ -14,14 +14,6 @@ from parsed_views import parse
 
 from beags_plugin.system.errors import UserError
 
-MISTAKES = {
-    "poses": (lambda root: np.save(root / "poses_bounds.npy", np.ones((10, 15))), "no finite .views, 17. numbers"),
-    "text": (lambda root: (root / "poses_bounds.npy").write_text("x"), r"poses_bounds\.npy cannot be read"),
-    "empty": (lambda root: (root / "poses_bounds.npy").write_bytes(b""), r"poses_bounds\.npy cannot be read"),
-    "image gone": (lambda root: (root / "images_4/image003.png").unlink(), "has 10 poses but .*images_4 9 images"),
-    "no images": (lambda root: [p.unlink() for p in (root / "images_4").iterdir()], "images_4 holds no images"),
-}
-
 
 def check_refused(folder: Path, message: str, **options: Any) -> None:
     with pytest.raises(UserError, match=message) as raised:
@@ -29,23 +21,16 @@ def check_refused(folder: Path, message: str, **options: Any) -> None:
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_mistakes_are_told_in_one_sentence(tmp_path, mistake):
+def test_a_folder_without_images_is_told_in_one_sentence(tmp_path):
     write_llff(tmp_path)
-    make, message = MISTAKES[mistake]
-    make(tmp_path)
-    check_refused(tmp_path, message, images_path=Path("images_4"))
+    for path in (tmp_path / "images_4").iterdir():
+        path.unlink()
+    check_refused(tmp_path, "images_4 holds no images", images_path=Path("images_4"))
 
 
 def with_smaller_images(root: Path) -> None:
     for index, path in enumerate(sorted((root / "image").iterdir())):
         write_image(path, noise(index, WIDTH // 2, HEIGHT // 2))
-
-
-def without_camera(root: Path) -> None:
-    with np.load(root / "cameras_sphere.npz") as cameras:
-        kept = {name: cameras[name] for name in cameras.files if name != "world_mat_3"}
-    np.savez(root / "cameras_sphere.npz", **kept)
 
 
 def with_camera(root: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
@@ -62,14 +47,12 @@ FLAT = np.diag([1.0, 1.0, 1e-13, 1.0])
 
 
 DTU_MISTAKES = {
-    "camera gone": (without_camera, "has 8 cameras but there are 9 images"),
     "image gone": (lambda root: (root / "image/000003.png").unlink(), "has 9 cameras but there are 8 images"),
     "mask gone": (lambda root: (root / "mask/003.png").unlink(), "mask holds 8 masks for 9 images"),
     "smaller images": (with_smaller_images, "far from the middle of its 10x6 pixels: keep the images .* --images-path"),
     "skew": (lambda root: with_camera(root, lambda camera: SKEW @ camera), "world_mat_2 in .* is no camera with axes"),
     "denormal": (lambda root: with_camera(root, lambda _: DENORMAL), "far from the middle of its 20x12"),
     "flat": (lambda root: with_camera(root, lambda _: FLAT), "world_mat_2 in .* projects no space"),
-    "infinite": (lambda root: with_camera(root, lambda camera: camera + np.inf), "world_mat_2 in .* projects no space"),
     "half a file": (
         lambda root: (root / "cameras_sphere.npz").write_bytes(b"PK\x03\x04"),
         "cannot be read .*: restore",

@@ -23,8 +23,6 @@ from parser_targets import TARGETS, Target, examine
 
 from beags_plugin.system import whole_files
 
-pytestmark = pytest.mark.spread
-
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_changed_files_are_taken_or_refused(name):

@@ -13,21 +13,6 @@ from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.preparation.pipeline import PreparationConfig
 from beags_plugin.system.errors import UserError
 
-WRONG = [
-    ({"reprojection": "pairs"}, "there is no reprojection 'pairs': choose one of auto, none, pairwise, voxel."),
-    ({"depth": "mean"}, "there is no surface depth 'mean': choose one of median, expected."),
-    ({"tau": -0.1}, "tau is -0.1: it must be 0 or more (inf counts every vote)."),
-    ({"tau": math.nan}, "tau is nan: it must be 0 or more (inf counts every vote)."),
-    ({"k": 0}, "k is 0: the voxel size needs at least 1 neighbour."),
-]
-
-
-@pytest.mark.parametrize(("options", "sentence"), WRONG)
-def test_wrong_options_of_the_preparation(options, sentence):
-    with pytest.raises(UserError) as error:
-        PreparationConfig(**options).check()
-    assert str(error.value) == sentence
-
 
 @pytest.mark.parametrize("reprojection", ["auto", "none", "pairwise", "voxel"])
 @pytest.mark.parametrize("tau", [0.0, math.inf])
