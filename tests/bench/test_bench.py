@@ -103,7 +103,7 @@ def test_the_command_tells_a_mistake_in_one_sentence(capsys, tmp_path):
 
 
 def test_the_file_in_the_documentation_is_an_experiment(tmp_path):
-    text = (ROOT / "docs/experiments.md").read_text()
+    text = (ROOT / "docs/results.md").read_text()
     block = text.split("## The file")[1].split("Keys are")[0]
     path = written(tmp_path, "\n".join(line.strip() for line in block.splitlines()))
     found = load_experiment(path)
