@@ -176,7 +176,7 @@ class Arguments(Trainings):
     """How well bases render held-out views, against steps and number of Gaussians."""
 
     file: tyro.conf.Positional[str] = "base"
-    """base (bases of different lengths), base-limits (one part of the schedule changed), or a TOML file."""
+    """base (bases of different lengths), or a TOML file."""
 
     def run(self) -> None:
         """Train and report."""
