@@ -22,7 +22,6 @@ yaml = pytest.importorskip("yaml")
 from beags_plugin.sample.writer import SampleConfig, write_sample
 from beags_plugin.system.child_processes import bound
 
-pytestmark = pytest.mark.long
 BIN = Path(sys.executable).parent
 
 
