@@ -22,7 +22,7 @@ setup:
 # (Debian: apt install chromium). Each process has one thread; tests that need more set them.
 test: setup
 	BEAGS_REQUIRE_NATIVE=1 OMP_NUM_THREADS=1 \
-	  "$(BIN)/python" -m pytest -q -n $(JOBS) --dist loadgroup --no-loadscope-reorder
+	  "$(BIN)/python" -m pytest -q -n $(JOBS) --dist loadscope --no-loadscope-reorder
 
 demo: setup
 	"$(BIN)/beags" demo $(if $(DATA),--data "$(DATA)")

@@ -25,13 +25,33 @@ def pytest_sessionstart(session):
         pytest.exit(f"BEAGS_REQUIRE_NATIVE is set, but {extension.status()[1]}", returncode=1)
 
 
-@pytest.hookimpl(tryfirst=True)
+LONG = {  # files that take minutes: begun first, so that no process waits for them at the end
+    "tests/commands/test_end_to_end.py", "tests/commands/test_readme_commands.py",
+    "tests/plugin/viewer/test_viewer_browser.py", "tests/plugin/viewer/test_viewer_browser_runs.py",
+}  # fmt: skip
+SPREAD = {"tests/mistakes/test_mistakes.py", "tests/plugin/training/test_resume.py"}
+"""Files whose tests any process may run; each other file runs in one process, which makes its fixtures once."""
+
+
+def file_of(nodeid: str) -> str:
+    return nodeid.partition("::")[0]
+
+
 def pytest_collection_modifyitems(items):
-    """Plan `make test`: files marked long first, each file in one process, files marked spread in any, at the end."""
-    items.sort(key=lambda item: (item.get_closest_marker("spread") is not None, not item.get_closest_marker("long")))
-    for item in items:
-        if item.get_closest_marker("spread") is None:
-            item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
+    """Begin long files first; tests that any process may run come last and fill the gaps."""
+    items.sort(key=lambda item: (file_of(item.nodeid) in SPREAD, file_of(item.nodeid) not in LONG))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Let pytest-xdist hand out files, and single tests of those in ``SPREAD``."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByFile(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return nodeid if file_of(nodeid) in SPREAD else file_of(nodeid)
+
+    return ByFile(config, log) if config.getvalue("dist") == "loadscope" else None
 
 
 @pytest.fixture(scope="session")

@@ -22,7 +22,6 @@ from beags_plugin.sample.writer import SampleConfig, write_sample
 from beags_plugin.system.child_processes import bound
 from beags_plugin.system.reading.ply import read_vertices
 
-pytestmark = pytest.mark.long
 BIN = Path(sys.executable).parent
 
 

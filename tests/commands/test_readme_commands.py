@@ -31,7 +31,6 @@ pytest.importorskip("nerfstudio")
 
 from viewer_pages import free_port
 
-pytestmark = pytest.mark.long
 BIN = Path(sys.executable).parent
 PROGRAM = re.compile(r"(beags|ns-[a-z]+|make|pip|python) |scripts/")
 README = (ROOT / "README.md").read_text("utf8")

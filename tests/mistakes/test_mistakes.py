@@ -20,7 +20,6 @@ from mistakes.sentences import read_sentences, write_sentence
 from mistakes.table import TABLE, Place, Templates
 
 SENTENCES = read_sentences()
-pytestmark = pytest.mark.spread
 
 
 @pytest.fixture(scope="module")

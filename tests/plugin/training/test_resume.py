@@ -35,7 +35,6 @@ from beags_plugin.preparation import pipeline as preparation
 from beags_plugin.system.child_processes import bound
 from beags_plugin.system.errors import UserError
 
-pytestmark = pytest.mark.spread
 LAST = sum(STEPS) - 1
 
 

@@ -13,7 +13,7 @@ from viewer_pages import COLORS, HEIGHT, WIDTH, awaited, differing, painted, var
 
 from beags_plugin.extraction.ply import read_ply
 
-pytestmark = [NEEDED, pytest.mark.long]
+pytestmark = NEEDED
 OUTPUTS = (
     "rgb", "depth", "normal", "accumulation", "class_map", "class_confidence", "boundary_error", "occupancy_violation",
     "mask_before", "mask_after",

@@ -18,7 +18,7 @@ from viewer_pages import HEIGHT, WIDTH, awaited, differing, free_port, painted, 
 from beags_plugin.extraction.ply import read_ply, write_ply
 from beags_plugin.plugin.objects.extract import extract_objects
 
-pytestmark = [NEEDED, pytest.mark.long]
+pytestmark = NEEDED
 STEPS = 60, 240  # of base and refinement
 
 
