@@ -115,7 +115,7 @@ def test_extraction_writes_a_run_and_a_ply_per_object(trained, extracted):
         vertex = read_vertices(ply)
         assert len(vertex) == int(keep.sum())
         assert (np.asarray(vertex["class_id"]) == index).all()
-        assert {"scale_0", "scale_1", "scale_2"} <= {prop.name for prop in vertex.properties}
+        assert {"scale_0", "scale_1", "scale_2"} <= set(vertex.dtype.names)
 
 
 def test_the_figures_are_those_of_ns_eval(trained, tmp_path):

@@ -280,9 +280,6 @@ def test_importers_are_chosen_by_name_or_by_what_the_file_is(tmp_path):
     assert IMPORTERS.names() == ["checkpoint", "ply"]
     write_ply(tmp_path / "scene.PLY", random_surfels())
     assert isinstance(find_importer(tmp_path / "scene.PLY"), PlyImporter)
-    assert isinstance(find_importer(tmp_path / "scene.PLY", "checkpoint"), CheckpointImporter)
-    with pytest.raises(UserError, match="there is no importer 'spz': choose one of checkpoint, ply"):
-        find_importer(tmp_path / "scene.PLY", "spz")
     with pytest.raises(UserError, match="holds no checkpoint"):
         CheckpointImporter().read(tmp_path)
 

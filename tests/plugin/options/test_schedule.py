@@ -52,19 +52,6 @@ def test_adam_moments_follow_their_surfels():
     assert len(optimizer.state) == 1
 
 
-def test_adam_moments_follow_the_bands_that_are_left():
-    parameter = torch.nn.Parameter(torch.zeros(2, 3, 3))
-    optimizer = torch.optim.Adam([parameter], lr=0.1)
-    parameter.grad = torch.arange(18.0).reshape(2, 3, 3)
-    optimizer.step()
-    before = optimizer.state[parameter]["exp_avg_sq"].clone()
-    former, parameter = parameter, torch.nn.Parameter(torch.zeros(2, 1, 3))
-    move_adam_state(optimizer, former, parameter, torch.tensor([1, 0]), torch.tensor([False, False]))
-    assert torch.equal(optimizer.state[parameter]["exp_avg_sq"], before[[1, 0], :1])
-    parameter.grad = torch.ones(2, 1, 3)
-    optimizer.step()
-
-
 # -- the official schedule, and shorter runs of it -------------------------------------------------------------------
 
 
