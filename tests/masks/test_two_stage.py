@@ -121,7 +121,7 @@ def test_logits_lie_on_disk_one_frame_at_a_time(tmp_path):
     best.add(4, 1, np.full(SHAPE, 1e6, np.float32))
     best.add(4, 2, np.full(SHAPE, -1.0, np.float32))
     assert [path.name for path in tmp_path.iterdir()] == ["000004.npz"]
-    assert (best.labels(4, SHAPE) == 1).all() and not best.class_map(5, SHAPE).any()
+    assert (best.labels(4, SHAPE) == 1).all() and not best.labels(5, SHAPE).any()
     assert all(not isinstance(value, np.ndarray) for value in vars(best).values())
 
 

@@ -211,7 +211,7 @@ def _names(files: MaskFiles, coverage: Coverage) -> Iterator[Issue]:
 def _few_views(files: MaskFiles, coverage: Coverage, few_views: int) -> Iterator[Issue]:
     trained = np.asarray(files.trained, bool)
     for column, class_id in enumerate(coverage.ids):
-        views = np.flatnonzero(trained & (coverage.pixels[:, column] > 0)).tolist()
+        views = [int(view) for view in np.flatnonzero(trained & (coverage.pixels[:, column] > 0))]
         if class_id == BACKGROUND or len(views) >= few_views:
             continue
         name = (files.names or {}).get(class_id, f"class_{class_id}")
