@@ -1,4 +1,4 @@
-"""The class of each Gaussian: the one to which it contributes most (method, section 3; E6)."""
+"""Assignment of each Gaussian to the class to which it contributes most (method, section 3; E6)."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from beags_plugin.system.processes import each_view
 
 @dataclass(frozen=True)
 class Assignment:
-    """Classes of N Gaussians, fixed from now on.
+    """Fixed classes of N Gaussians.
 
-    class_ids: [N] int32, phi; background (0) where never seen.
-    margin: [N] float32 in 0..1, the class's share of the Gaussian's contributions; 0 where never seen.
-    never_seen: [N] bool, contributes to no labelled pixel of any view.
+    class_ids: [N] int32, phi; background (0) if never seen.
+    margin: [N] float32 in 0..1, the class's share of the Gaussian's contributions; 0 if never seen.
+    never_seen: [N] bool, without contribution to a labelled pixel of any view.
     """
 
     class_ids: Tensor
@@ -34,7 +34,7 @@ class Assignment:
     never_seen: Tensor
 
     def __getitem__(self, selection: Tensor) -> Assignment:
-        """Those of a part of the Gaussians; selection: [N] bool or [M] int64."""
+        """Return the classes of some Gaussians; selection: [N] bool or [M] int64."""
         return Assignment(self.class_ids[selection], self.margin[selection], self.never_seen[selection])
 
 
@@ -47,15 +47,14 @@ def assign_classes(
     num_classes: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> Assignment:
-    """phi_i = argmax_c C[i, c], C[i, c] = sum over views and pixels with M' = c of w_i (E6); ties to the lower id.
+    """Return phi_i = argmax_c C[i, c], C[i, c] = sum over views and pixels with M' = c of w_i (E6); ties to lower ids.
 
-    surfels: N surfels. labels: per camera [H, W] int32 class ids below ``num_classes`` or IGNORE; None for no mask.
-    Memory is linear in the (Gaussian, class) pairs that occur: nearly the same for any number of classes.
-    Raises ``UserError`` for ids out of range.
+    surfels: N Gaussians. labels: per camera [H, W] int32 class ids below ``num_classes`` or IGNORE, or None.
+    Memory is linear in the (Gaussian, class) pairs that occur. Raises ``UserError`` for ids out of range.
     """
     settings = replace(settings, geometry=False, distortion=False)
     inputs = geometry_inputs(surfels)
-    # float64: thousands of small weights of many views are added up. A table of all classes would be mostly zeros.
+    # float64, for thousands of small weights; sparse, as a table of all classes would be mostly zeros
     total = SparseSums() if extension.supports(surfels.means) else TorchSparseSums(surfels.means.device)
 
     def contributions(index: int) -> tuple[Tensor, Tensor]:

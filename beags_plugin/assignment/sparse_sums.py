@@ -1,4 +1,4 @@
-"""Sums for the (row, column) pairs that occur, of a table too wide to keep whole."""
+"""Sparse sums over (row, column) pairs of a wide table."""
 
 from __future__ import annotations
 
@@ -7,10 +7,7 @@ from torch import Tensor
 
 
 class TorchSparseSums:
-    """What the compiled ``ops.sparse_sums.SparseSums`` does, in torch: its reference, and where it is missing.
-
-    The same bits as a dense table of zeros to which the values are added: adding 0 changes nothing.
-    """
+    """The torch version of the compiled ``ops.sparse_sums.SparseSums``, with the bits of a dense table of sums."""
 
     def __init__(self, device: torch.device | str = "cpu") -> None:
         self._keys = torch.zeros(0, dtype=torch.int64, device=device)  # ascending
@@ -36,10 +33,10 @@ class TorchSparseSums:
 
 
 def largest_in_rows(keys: Tensor, sums: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The column of each row's largest sum (of equals the first; 0 for a row without sums), that sum, and their sum.
+    """Return per row the first column of the largest sum, that sum, and the total; 0 for rows without sums.
 
     keys: [K] int64, row * columns + column, ascending. sums: [K] float64, above 0.
-    Returns [rows] int64 and twice [rows] float64, 0 for a row without sums.
+    Returns [rows] int64 and twice [rows] float64.
     """
     row, column = keys // columns, keys % columns
     zeros = torch.zeros(rows, dtype=torch.float64, device=keys.device)

@@ -1,4 +1,4 @@
-"""What data sets look like on disk, as registered layouts (entry points: ``beags.layouts``); nothing of nerfstudio."""
+"""Layouts of data sets on disk, registered by name (entry points: ``beags.layouts``)."""
 
 from beags_plugin.system.registry import Registry
 

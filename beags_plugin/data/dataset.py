@@ -1,4 +1,4 @@
-"""What a layout says of a scene: where its files are, and what its protocol is."""
+"""A data set as its layout reads it: the files, and the protocol of its evaluation."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import numpy as np
 import numpy.typing as npt
 
 MaskKind = Literal["ids", "binary"]
-"""Images of class ids, or of one object: not 0 is inside, see ``labels.classes.read_binary_mask``."""
+"""Images of class ids, or binary masks of one object (``labels.classes.read_binary_mask``)."""
 
 
 @dataclass(frozen=True)
 class ColmapModel:
     """Poses in a COLMAP model, binary or text.
 
-    folder: of the model. images: folder of the images that it names. in_order: where no file has the name that the
-    model says, the files stand for its images in the order of their names.
+    folder: of the model. images: folder of the images that it names. in_order: if no file has a name of the model,
+    files and names are paired in the order of names.
     """
 
     folder: Path
@@ -29,7 +29,7 @@ class ColmapModel:
 
 @dataclass(frozen=True)
 class TransformsFile:
-    """Poses in nerfstudio's transforms.json; ``images`` replaces the folder that its file_path names, or is None."""
+    """Poses in nerfstudio's transforms.json; ``images``, unless None, replaces the folder of its file_path."""
 
     file: Path
     images: Path | None = None
@@ -37,13 +37,13 @@ class TransformsFile:
 
 @dataclass(frozen=True)
 class PoseTable:
-    """Poses that the layout has read itself, V views in the order of their names.
+    """Poses of V views in the order of their names, read by the layout.
 
-    images: V files. camera_to_world: [V, 3, 4] float64, OpenGL axes (x right, y up, z backward), any world.
+    file: source of the poses, for messages. images: V files.
+    camera_to_world: [V, 3, 4] float64, OpenGL axes (x right, y up, z backward), any world.
     K: [V, 3, 3] float64, pixels of ``sizes``. sizes: [V, 2] integer width and height; the files may be smaller copies.
-    bounds: [V, 2] float64, nearest and farthest depth in the world's units, or None.
-    lens: COLMAP's cameras.bin or cameras.txt, whose only camera made all images: its lens distortion; or None.
-    file: what messages call the source of these poses.
+    bounds: [V, 2] float64, nearest and farthest depth, world units, or None.
+    lens: COLMAP's cameras.bin or cameras.txt with one camera, for its lens distortion, or None.
     """
 
     file: Path
@@ -60,10 +60,10 @@ Poses = ColmapModel | TransformsFile | PoseTable
 
 @dataclass(frozen=True)
 class Split:
-    """Which views are held out for evaluation.
+    """Protocol of the held-out views.
 
-    held_out: stems of images that the protocol names. every: whether every so many (``eval_interval``) of the
-    name-sorted views are held out besides. left_out: stems of images that serve neither purpose.
+    held_out: stems of images that the protocol names. every: also hold out each ``eval_interval``-th view in the order
+    of names. left_out: stems of images for neither training nor evaluation.
     """
 
     held_out: tuple[str, ...] = ()
@@ -77,17 +77,15 @@ FilesOfObject = Mapping[str, Path]
 
 @dataclass(frozen=True)
 class Dataset:
-    """A scene as its layout describes it.
+    """A data set of one scene as its layout describes it.
 
-    layout: what to call it. root: its folder. poses: where they come from.
-    masks, mask_kind: the folder of the masks <stem>.png to train on, which may be missing, and what they are.
-    mask_files: stem of an image to its mask, where they are called otherwise; or None.
-    class_names: id to name, or None; class_names_file: where they stand (for messages).
-    visible, silhouettes: object name to its exact masks for evaluation: of what is seen of it, and of what it covers
-        with nothing before it. More may lie in the folder of the ground truth.
-    seed_points: .ply, or COLMAP's points3D.bin or .txt, in the frame of a ``PoseTable``, or None; the other kinds of
-        poses know their own.
-    notes: sentences to tell the user.
+    layout: title of the layout. root: folder of the data set.
+    masks, mask_kind: folder of the training masks <stem>.png, which may be missing, and their kind.
+    mask_files: stem of an image to its mask, if masks have other names; or None.
+    class_names: id to name, or None; class_names_file: their file, for messages.
+    visible, silhouettes: object name to exact masks for evaluation: of its visible part, and occlusion-free.
+    seed_points: .ply, or COLMAP's points3D.bin or .txt, in the frame of a ``PoseTable``; None: the poses bring them.
+    notes: sentences for the user.
     """
 
     layout: str

@@ -1,4 +1,4 @@
-"""Images and masks of a scene on disk, and cheap checks that they fit together."""
+"""Images and masks of a data set on disk, and cheap checks that they fit together."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LARGEST_WIDTH = 1600  # pixels; with it Mip-NeRF 360 gets images_4 outdoors and 
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The images right in a folder, sorted by name; none where it does not exist."""
+    """Return the images directly in a folder, sorted by name; none if the folder does not exist."""
     if not folder.is_dir():
         return []
     files = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
@@ -24,7 +24,7 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def image_folders(root: Path) -> list[Path]:
-    """The folders ``images``, ``images_2``, ... of a scene that hold images, the largest images first."""
+    """Return the folders ``images``, ``images_2``, ... that hold images, the largest images first."""
     numbered = {}
     for folder in root.glob("images*"):
         if (match := re.fullmatch(r"images(?:_(\d+))?", folder.name)) and list_images(folder):
@@ -33,7 +33,7 @@ def image_folders(root: Path) -> list[Path]:
 
 
 def choose_images(root: Path, chosen: Path | None = None) -> Path:
-    """The folder of images to use: ``chosen``, else the largest copies that are at most 1600 pixels on a side.
+    """Return ``chosen``, else the folder of the largest copies that are at most 1600 pixels on a side.
 
     Raises ``UserError`` if there is no image.
     """
@@ -47,7 +47,7 @@ def choose_images(root: Path, chosen: Path | None = None) -> Path:
 
 
 def image_size(path: Path, what: str = "the image") -> tuple[int, int]:
-    """Width and height in pixels, from the file's header; raises ``UserError`` if it is no readable image."""
+    """Read width and height in pixels from the file's header; raise ``UserError`` for an unreadable image."""
     try:
         return read_image(path, lambda image: image.size, what)
     except FileNotFoundError:
@@ -55,9 +55,9 @@ def image_size(path: Path, what: str = "the image") -> tuple[int, int]:
 
 
 def photo_names(images: Sequence[Path]) -> list[str]:
-    """Of each image its path below their common folder, without suffix: "v1", or "left/v1" where there are folders.
+    """Return each image's path below their common folder, without suffix: "v1", or "left/v1".
 
-    Raises ``UserError`` if two images have one name: masks are found by it, and held-out views named.
+    Raises ``UserError`` if two images share a name, since masks are found by it.
     """
     if not images:
         return []
@@ -77,11 +77,11 @@ def photo_names(images: Sequence[Path]) -> list[str]:
 
 
 def existing_images(named: Sequence[Path], folder: Path, in_order: bool) -> list[Path]:
-    """The files for the images that a COLMAP model names, smaller copies of which may have other names.
+    """Find the files of the images that a COLMAP model names; copies may have other names.
 
-    A name that does not exist stands for the file in ``folder`` of the same path but for the suffix, else of the same
-    stem, if no other image has it. If ``in_order`` and not one image is found so, the files in ``folder`` stand for the
-    images in the order of their names, if there are as many. Raises ``UserError`` where a name may stand for two files.
+    A missing file is replaced by the one of the same path with another suffix, else by the one in ``folder`` of the
+    same stem, if the stem is unique. If that finds no file and ``in_order``, as many files in ``folder`` as images are
+    paired with them in the order of names. Raises ``UserError`` if two files fit a name.
     """
     files = list_images(folder)
     if all(path.exists() for path in named):
@@ -108,9 +108,9 @@ def existing_images(named: Sequence[Path], folder: Path, in_order: bool) -> list
 
 
 def files_of_views(folder: Path, images: Sequence[Path], images_root: Path) -> list[Path | None]:
-    """For each image its .png in ``folder``: at the image's path below ``images_root``, else by its stem, else None.
+    """Find each image's .png in ``folder``, by its path below ``images_root``, else by its stem; None without.
 
-    Raises ``UserError`` if a stem that several images share would give them the same file.
+    Raises ``UserError`` if several images share the stem of a file.
     """
     if not folder.is_dir():
         return [None] * len(images)
@@ -134,7 +134,7 @@ def files_of_views(folder: Path, images: Sequence[Path], images_root: Path) -> l
 
 
 def check_same_size(masks: Sequence[Path | None], sizes: Sequence[tuple[int, int]]) -> None:
-    """Raise ``UserError`` for the first mask that is not as large as its image, ``sizes`` (width, height)."""
+    """Raise ``UserError`` for the first mask that differs in size from its image (width, height)."""
     for mask, (width, height) in zip(masks, sizes, strict=True):
         if mask is not None and (found := image_size(mask, "the mask")) != (width, height):
             raise UserError(

@@ -15,8 +15,8 @@ FilesPerView = list[Path | None]
 class GroundTruth(TypedDict):
     """Files of exact masks, one or None per view.
 
-    masks: id images of what is seen. visible: object name to binary masks of what is seen of it. silhouettes: object
-    name to occlusion-free ones. seen: likewise, the part of the silhouette that training photos show.
+    masks: id images. visible, silhouettes, seen: object name to binary masks of its visible part, without occlusion,
+    and of the part of the silhouette that training photos show.
     """
 
     masks: FilesPerView
@@ -26,7 +26,7 @@ class GroundTruth(TypedDict):
 
 
 def of_views(truth: GroundTruth, chosen: Sequence[int]) -> GroundTruth:
-    """The ground truth of some of the views."""
+    """Return the ground truth of some views."""
 
     def each(files: dict[str, FilesPerView]) -> dict[str, FilesPerView]:
         return {name: [of_object[i] for i in chosen] for name, of_object in files.items()}
@@ -39,12 +39,12 @@ def of_views(truth: GroundTruth, chosen: Sequence[int]) -> GroundTruth:
     )
 
 
-def find_ground_truth(folder: Path, scene: Dataset, images: Sequence[Path], images_root: Path) -> GroundTruth | None:
-    """The ground truth in ``folder`` with what the layout brings; None where there is neither.
+def find_ground_truth(folder: Path, dataset: Dataset, images: Sequence[Path], images_root: Path) -> GroundTruth | None:
+    """Find the exact masks in ``folder`` and those of the layout; None without any.
 
-    In ``folder``: masks/<stem>.png, and <kind>/<object>/<stem>.png for visible, silhouettes and seen.
+    ``folder`` holds masks/<stem>.png, and <kind>/<object>/<stem>.png for visible, silhouettes and seen.
     """
-    if not (folder.is_dir() or scene.visible or scene.silhouettes):
+    if not (folder.is_dir() or dataset.visible or dataset.silhouettes):
         return None
 
     def per_object(kind: str, own: Mapping[str, FilesOfObject]) -> dict[str, FilesPerView]:
@@ -57,7 +57,7 @@ def find_ground_truth(folder: Path, scene: Dataset, images: Sequence[Path], imag
 
     return GroundTruth(
         masks=files_of_views(folder / "masks", images, images_root),
-        visible=per_object("visible", scene.visible),
-        silhouettes=per_object("silhouettes", scene.silhouettes),
+        visible=per_object("visible", dataset.visible),
+        silhouettes=per_object("silhouettes", dataset.silhouettes),
         seen=per_object("seen", {}),
     )

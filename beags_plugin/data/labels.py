@@ -1,4 +1,4 @@
-"""Names of the classes that the masks of a scene hold."""
+"""Names of the classes in the masks of a data set."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
+from beags_plugin.labels.classes import read_classes, read_id_mask
 from beags_plugin.system.errors import UserError
 
 
@@ -19,16 +20,18 @@ def read_class_names(
     known: Mapping[int, str] | None = None,
     known_file: Path | None = None,
 ) -> dict[int, str]:
-    """Names of the classes, sorted by id: of ``classes_file``, else those ``known``, else ``class_<id>``.
+    """Return the class names by ascending id: of ``classes_file``, else ``known``, else ``class_<id>``.
 
-    masks: id images. known, known_file: names that the layout brings, and where they stand.
-    Raises ``UserError`` if a mask holds an id without a name where names are given. Reads all masks once.
+    masks: id images, each read once. known, known_file: names of the layout, and their file.
+    Raises ``UserError`` if names are given but a mask holds an id without one.
     """
-    from beags_plugin.labels.class_ids import BACKGROUND
-    from beags_plugin.labels.classes import read_classes
+
+    def ids_in(mask: Path) -> set[int]:
+        counts = np.bincount(read_id_mask(mask, ignore_ids).ravel(), minlength=IGNORE + 1)
+        return set(np.flatnonzero(counts).tolist()) - {IGNORE}
 
     with ThreadPoolExecutor(max_workers=4) as pool:  # decoding a .png releases the interpreter
-        ids_of_masks = list(pool.map(lambda mask: ids_in_mask(mask, ignore_ids), masks))
+        ids_of_masks = list(pool.map(ids_in, masks))
     if classes_file.is_file():
         classes, source = read_classes(classes_file), classes_file
     elif known is not None:
@@ -42,11 +45,3 @@ def read_class_names(
                 f"add it there, correct the mask, or list it in ignore_ids."
             )
     return classes
-
-
-def ids_in_mask(mask: Path, ignore_ids: Sequence[int]) -> set[int]:
-    """The class ids of an id image, without IGNORE."""
-    from beags_plugin.labels.classes import read_id_mask
-
-    counts = np.bincount(read_id_mask(mask, ignore_ids).ravel(), minlength=IGNORE + 1)
-    return {int(i) for i in np.flatnonzero(counts) if i != IGNORE}

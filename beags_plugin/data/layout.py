@@ -1,4 +1,4 @@
-"""The interface of layouts, and finding the one that a folder has."""
+"""The interface of layouts, and the search for the layout of a folder."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from beags_plugin.system.errors import UserError
 
 
 class Layout(ABC):
-    """How one data set lays out its scenes.
+    """Interface of the layouts: recognises and reads one kind of data set.
 
-    title: what to call it. marks: the files by which it is known, for messages. refines: names of the layouts that
-    folders of this one fit too; this one is taken then.
+    title: for messages. marks: the files that mark it, for messages. refines: names of coarser layouts, over which
+    this one takes precedence.
     """
 
     title: ClassVar[str]
@@ -24,34 +24,31 @@ class Layout(ABC):
 
     @abstractmethod
     def missing(self, root: Path) -> str | None:
-        """What ``root`` lacks to be read as this layout, as in "no poses_bounds.npy"; None if nothing.
-
-        root: a folder that exists, or a .json file.
-        """
+        """Describe what ``root``, a folder or a .json file, lacks, as "no poses_bounds.npy"; None if nothing."""
 
     def recognises(self, root: Path) -> bool:
-        """Whether to take ``root`` for this layout where the user named none."""
+        """Return whether ``root`` has this layout, for a user who named none."""
         return self.missing(root) is None
 
     @abstractmethod
     def read(self, root: Path, images: Path | None) -> Dataset:
-        """The scene in ``root``, which lacks nothing.
+        """Read the data set in ``root``, which lacks nothing; raise ``UserError``.
 
-        images: the folder of the images that the user chose, absolute, or None. Raises ``UserError``.
+        images: the folder of images that the user chose, absolute, or None.
         """
 
 
 def read_dataset(data: Path, layout: str = "auto", images: Path | None = None) -> Dataset:
-    """The scene in ``data``, a folder or a transforms .json; arguments as of ``find_layout`` and ``Layout.read``."""
+    """Read the data set in ``data``, a folder or a transforms .json; see ``find_layout`` and ``Layout.read``."""
     found = find_layout(data, layout)
     root = data if data.is_dir() else data.parent
     return found.read(data, None if images is None else root / images)
 
 
 def find_layout(data: Path, wanted: str = "auto") -> Layout:
-    """The layout called ``wanted``, or the one that ``data`` has.
+    """Return the layout ``wanted``, or for "auto" the one of ``data``.
 
-    Raises ``UserError`` if ``data`` does not exist, lacks what the wanted layout needs, or fits none or several.
+    Raises ``UserError`` if ``data`` does not exist, lacks files of that layout, or fits none or several.
     """
     if not data.exists():
         raise UserError(f"the data folder {data} does not exist: give --data the folder that holds the scene.")

@@ -8,7 +8,6 @@ import numpy as np
 
 from beags_plugin.data.dataset import PoseTable
 from beags_plugin.data.files import list_images
-from beags_plugin.data.layouts.colmap import points_file
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.arrays import load_array
 from beags_plugin.system.reading.text import reason
@@ -19,12 +18,12 @@ _TO_OPENGL = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def read_poses_bounds(file: Path, images: Path) -> PoseTable:
-    """The poses in ``file`` for the images in the folder ``images``, in the order of their names.
+    """Read the poses in ``file`` of the images in the folder ``images``, in the order of their names.
 
     A row holds a 3 x 5 matrix [R | t | (height, width, focal length)], camera to world, in pixels of the original
-    images, then the nearest and the farthest depth. The principal point is the centre. Beside it COLMAP's
-    sparse/0/cameras tells the lens distortion, which the rows leave out.
-    Raises ``UserError`` if the file is something else or has another number of rows than there are images.
+    images, then the nearest and the farthest depth. The principal point is the centre. The lens distortion comes from
+    COLMAP's sparse/0/cameras.
+    Raises ``UserError`` for another content, or if the numbers of rows and images differ.
     """
     try:
         rows = load_array(file)
@@ -45,11 +44,13 @@ def read_poses_bounds(file: Path, images: Path) -> PoseTable:
     K[:, 0, 2], K[:, 1, 2], K[:, 2, 2] = width / 2, height / 2, 1.0
     poses = np.concatenate([matrices[:, :, :3] @ _TO_OPENGL.T, matrices[:, :, 3:4]], axis=2)
     sizes = np.stack([width, height], axis=1).astype(np.int64)
-    return PoseTable(file, tuple(files), poses, K, sizes, rows[:, 15:].astype(np.float64), _cameras_file(file.parent))
+    lenses = (file.parent / "sparse" / "0" / f"cameras.{end}" for end in ("txt", "bin"))
+    lens = next((each for each in lenses if each.is_file()), None)
+    return PoseTable(file, tuple(files), poses, K, sizes, rows[:, 15:].astype(np.float64), lens=lens)
 
 
 def _check_rows(file: Path, images: list[Path], rows: np.ndarray) -> None:
-    """Raise ``UserError`` for the first row that no camera has."""
+    """Raise ``UserError`` for the first row that describes no camera."""
     for image, row in zip(images, rows, strict=True):
         (height, width, focal), (near, far) = row[[4, 9, 14]], row[15:]
         if not (height >= 1 and width >= 1 and focal > 0):
@@ -62,13 +63,3 @@ def _check_rows(file: Path, images: list[Path], rows: np.ndarray) -> None:
                 f"{file} gives {image.name} the depths {near:g} to {far:g}: they must grow from above 0; save the "
                 "poses as LLFF does."
             )
-
-
-def seed_points(root: Path) -> Path | None:
-    """The points of the COLMAP model that LLFF made the poses from: they share its world."""
-    return points_file(root / "sparse" / "0")
-
-
-def _cameras_file(root: Path) -> Path | None:
-    files = (root / "sparse" / "0" / f"cameras.{end}" for end in ("txt", "bin"))
-    return next((file for file in files if file.is_file()), None)

@@ -1,4 +1,4 @@
-"""The factor by which photos are scaled down for a training that ends in minutes."""
+"""Downscaling of photos for a training of minutes."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ from beags_plugin.data.files import image_size
 from beags_plugin.data.layout import read_dataset
 from beags_plugin.system.errors import UserError
 
-QUICK_PIXELS = 50_000
-"""Photos are scaled down to at most so many pixels a view."""
+QUICK_PIXELS = 50_000  # per view, at most
 
 
 def quick_downscale(data: Path) -> float:
-    """Whole factor that brings the images of ``data`` to ``QUICK_PIXELS`` or less."""
+    """Return the whole factor that brings the images of ``data`` to ``QUICK_PIXELS`` or less."""
     images = _images(data) or _first_frame(data)
     if not images:
         return 1.0  # the data parser names what is missing
@@ -28,7 +27,7 @@ def quick_downscale(data: Path) -> float:
 
 
 def _images(data: Path) -> list[Path]:
-    """The images that the layout of ``data`` takes, or where it is not known, those in images/."""
+    """Find the images of the layout of ``data``, or those in images/ if the layout is unknown."""
     folder, pattern = data, "images*/**/*"
     with contextlib.suppress(UserError):  # the data parser names what is missing
         poses = read_dataset(data).poses
@@ -40,7 +39,7 @@ def _images(data: Path) -> list[Path]:
 
 
 def _first_frame(data: Path) -> list[Path]:
-    """The first image that transforms.json names; none where there is no such file, or it is damaged."""
+    """Return the first image in transforms.json; none if that file is missing or damaged."""
     try:
         return [data / json.loads((data / "transforms.json").read_text(encoding="utf-8"))["frames"][0]["file_path"]]
     except (OSError, ValueError, LookupError, TypeError):

@@ -1,4 +1,4 @@
-"""Which views are trained on and which are held out."""
+"""Training views and held-out views."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ from beags_plugin.system.errors import UserError
 def split_views(
     names: Sequence[set[str]], split: Split, interval: int, held_out: Sequence[str] = ()
 ) -> tuple[list[int], list[int]]:
-    """Indices of the training and of the evaluation views.
+    """Return the indices of the training and of the evaluation views; without held-out views, all serve both.
 
-    names: of each view, sorted: the stem of its file, and the one by which its poses know it. interval: of
-    ``Split.every``, counted from the first view that is not left out; 0 for none. held_out: what the user names besides
-    (the protocol may name views that this copy of the data does not have). Without any held-out view, all serve both.
-    Raises ``UserError`` if a stem of ``held_out`` does not exist or if no view is left to train on.
+    names: of each view, sorted: the stem of its file, and its name in the poses. interval: of ``Split.every``, counted
+    from the first view that is not left out; 0 for none. held_out: names from the user, besides the protocol's.
+    Raises ``UserError`` if a name of ``held_out`` does not exist or no view is left to train on.
     """
     if unknown := sorted(set(held_out) - set().union(*names)):
         raise UserError(f"held_out names {unknown[0]!r}, but no image has that stem: correct the name.")

@@ -11,22 +11,20 @@ from beags_plugin.system.reading.text import load_json, reason
 
 _FOCAL = ("fl_x", "fl_y")
 _SIZE = ("w", "h")
-_NUMBERS = (*_FOCAL, *_SIZE, "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
 _NEEDED = (*_FOCAL, *_SIZE, "cx", "cy")
+_NUMBERS = (*_NEEDED, "k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def read_transforms(file: Path) -> dict[str, Any]:
-    """The content of a transforms.json whose frames have files, poses and cameras of finite numbers.
-
-    Raises ``UserError`` that names the frame and the entry for the first that is missing or wrong.
-    """
+    """Read a transforms.json; raise ``UserError`` for the first frame without a file, a pose or a finite camera."""
     try:
         meta = load_json(file)
         if not isinstance(meta, dict) or not isinstance(meta["frames"], list):
             raise ValueError('it has no list "frames"')
     except (OSError, ValueError, KeyError) as error:
-        told = reason(error)
-        raise UserError(f"{file} is not a nerfstudio transforms file ({told}): export the poses again.") from error
+        raise UserError(
+            f"{file} is not a nerfstudio transforms file ({reason(error)}): export the poses again."
+        ) from error
     frames = meta["frames"]
     if len(frames) < 2:
         named = "only one frame" if frames else "no frames"
@@ -41,13 +39,10 @@ def read_transforms(file: Path) -> dict[str, Any]:
         _check_numbers(file, f"the frame of {name}", frame)
         _check_matrix(file, name, frame.get("transform_matrix"))
         for key in _NEEDED:
-            if key not in meta and key not in frame and not (key in _FOCAL and _has_angle(meta, frame)):
+            given = {*meta, *frame}
+            if key not in given and not (key in _FOCAL and given & {"camera_angle_x", "camera_angle_y"}):
                 raise UserError(f"{file} has no {key}, neither for all frames nor for that of {name}: add it.")
     return meta
-
-
-def _has_angle(meta: dict[str, Any], frame: dict[str, Any]) -> bool:
-    return any(f"camera_angle_{axis}" in entries for axis in "xy" for entries in (meta, frame))
 
 
 def _checked_name(file: Path, index: int, frame: Any) -> str:
@@ -80,7 +75,7 @@ def _check_matrix(file: Path, name: str, matrix: Any) -> None:
 
 
 def _finite(value: Any) -> bool:
-    """Whether JSON gave a number that fits into a float."""
+    """Return whether a value from JSON is a number that fits into a float."""
     try:
         return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
     except OverflowError:

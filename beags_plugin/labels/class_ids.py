@@ -1,4 +1,4 @@
-"""Class ids that have a meaning of their own, and what class maps need besides (method, section 0)."""
+"""Class ids with a meaning of their own, and small functions on label maps (method, section 0)."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ IGNORE = 65535  # an unlabelled pixel: it neither votes nor is penalised
 
 
 def objects_in(labels: Tensor) -> list[int]:
-    """The ids of the objects that a mask [H, W] int shows, ascending: all but background (0) and IGNORE."""
+    """Return the ascending ids of the objects in labels [H, W] int, without background (0) and IGNORE."""
     found = torch.bincount(labels.reshape(-1)).nonzero()[:, 0].tolist()
     return [class_id for class_id in found if class_id not in (0, IGNORE)]
 
 
 def resize_nearest(labels: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Resize a map [H', W'] to [height, width]: each new pixel takes the old one under its centre.
+    """Resize a map [H', W'] to [height, width] by the old pixel under each new centre (OpenCV's is half a pixel off).
 
-    The arithmetic is in integers: (i + 0.5) old / new, rounded down. (OpenCV's nearest is half a new pixel off.)
+    The arithmetic is in integers: (i + 0.5) old / new, rounded down.
     """
     rows = (2 * np.arange(height) + 1) * labels.shape[0] // (2 * height)
     columns = (2 * np.arange(width) + 1) * labels.shape[1] // (2 * width)

@@ -7,17 +7,16 @@ from torch import Tensor
 
 
 class ClassRanks:
-    """Numbers the different class ids 0, 1, ... in their order, so that ties between classes fall as they did.
+    """Ranks 0, 1, ... of class ids in ascending order, which keeps the order of ties between classes.
 
-    An array with an entry per class then grows with the number of classes, not with the largest id (up to 65534).
-
-    ids: int tensor of any shape, ids 0 .. 65534, repeated or not. Background (0) always counts, and keeps the number 0.
+    Arrays with an entry per class then grow with the number of classes, not with the largest id (up to 65534).
+    ids: int tensor of any shape, 0 .. 65534, repeated or not. Background (0) is always included.
     """
 
     def __init__(self, ids: Tensor) -> None:
         ids = ids.reshape(-1).int()
         self.ids = torch.unique(torch.cat([ids.new_zeros(1), ids]))  # sorted
-        # Of the ids -1, 0, ... to one past the last: a fifth of the time of a search, and 256 KB at most.
+        # Table of the ids -1, 0, ... to one past the last: a fifth of the time of a search, 256 KB at most.
         self._table = self.ids.new_full((int(self.ids[-1]) + 3,), len(self.ids))
         self._table[self.ids.long() + 1] = torch.arange(len(self.ids), dtype=torch.int32, device=ids.device)
 
@@ -26,14 +25,14 @@ class ClassRanks:
 
     @property
     def trivial(self) -> bool:
-        """Whether every rank is its id: there is no gap between the ids."""
+        """Whether every rank equals its id."""
         return int(self.ids[-1]) + 1 == len(self)
 
     def ranks(self, class_ids: Tensor) -> Tensor:
-        """The number of each id, int32; ``len(self)`` for an id that is not known. class_ids: int of any shape."""
+        """Return the rank of each id, int32; ``len(self)`` for an unknown id. class_ids: int of any shape."""
         place = class_ids.reshape(-1).int().clamp(-1, len(self._table) - 2) + 1
         return self._table.to(place.device).index_select(0, place).view(class_ids.shape)
 
     def class_ids(self, ranks: Tensor) -> Tensor:
-        """The ids of ranks 0 .. ``len(self)`` - 1, int32. ranks: int of any shape."""
+        """Return the ids of ranks 0 .. ``len(self)`` - 1, int32. ranks: int of any shape."""
         return self.ids.to(ranks.device)[ranks.long()]

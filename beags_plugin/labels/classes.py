@@ -1,4 +1,4 @@
-"""Class maps (images of class ids) and the classes' names, on disk."""
+"""Masks (images of class ids) and class names on disk."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _COLOR_MODES = {"RGB", "RGBA", "LA"}
 
 
 def read_id_mask(path: Path | str, ignore_ids: Iterable[int] = ()) -> np.ndarray:
-    """The class ids in an 8-bit grey, 16-bit grey or palette image (a palette's indices, not its colours).
+    """Read class ids [H, W] uint16 from an 8-bit grey, 16-bit grey or palette image (its indices, not its colours).
 
-    ignore_ids: ids of an 8-bit image that mean "unlabelled", e.g. 255; they become IGNORE.
-    Returns [H, W] uint16; 65535 is IGNORE. Raises ``UserError`` for a file that is no such image.
+    ignore_ids: ids of an 8-bit image that mean "unlabelled", e.g. 255; they become IGNORE (65535).
+    Raises ``UserError`` for any other file.
     """
     mode, values = _read_pixels(path)
     if mode not in _ID_MODES or values.ndim != 2:
@@ -38,11 +38,11 @@ def read_id_mask(path: Path | str, ignore_ids: Iterable[int] = ()) -> np.ndarray
 
 
 def read_binary_mask(path: Path | str) -> np.ndarray:
-    """Where the mask of one object is inside, [H, W] bool.
+    """Read the mask of one object, [H, W] bool.
 
-    Brightness (8-bit grey or colours that reach 128 somewhere) is inside from 128 on, as rims may be blended; in other
-    images, such as labels 0 and 1, all but 0 and IGNORE is inside. Alpha says nothing.
-    Raises ``UserError`` for a file that is no such image.
+    In 8-bit grey or colour images that reach 128, pixels are inside from 128 on, as outlines may be blended. In other
+    images, such as labels 0 and 1, all but 0 and IGNORE is inside. Alpha is ignored.
+    Raises ``UserError`` for any other file.
     """
     mode, values = _read_pixels(path)
     if mode in _COLOR_MODES:
@@ -55,12 +55,12 @@ def read_binary_mask(path: Path | str) -> np.ndarray:
 
 
 def read_mask(path: Path | str, kind: str, ignore_ids: Iterable[int] = ()) -> np.ndarray:
-    """[H, W] uint16, the class ids in a file of id images ("ids"), or 1 inside and 0 outside of a "binary" mask."""
+    """Read [H, W] uint16: the class ids of an id image ("ids"), or 1 inside and 0 outside of a "binary" mask."""
     return read_binary_mask(path).astype(np.uint16) if kind == "binary" else read_id_mask(path, ignore_ids)
 
 
 def _read_pixels(path: Path | str) -> tuple[str, np.ndarray]:
-    """Pillow's mode and the values of an image without loss."""
+    """Read Pillow's mode and the values of a lossless image."""
     try:
         form, mode, values = read_image(
             path, lambda image: (image.format, image.mode, np.asarray(image)), "the mask", "save it as PNG again"
@@ -91,7 +91,7 @@ def write_mask(path: Path | str, array: np.ndarray) -> None:
 
 
 def check_names(names: Mapping[int, str]) -> None:
-    """Raise ``UserError`` for names of classes that ``read_classes`` would refuse."""
+    """Raise ``UserError`` for class names that ``read_classes`` would refuse."""
     for class_id, name in names.items():
         if not 0 <= class_id < IGNORE:
             raise UserError(f"the masks hold the class id {class_id}: only 0..{IGNORE - 1} can be used.")
@@ -103,11 +103,11 @@ def check_names(names: Mapping[int, str]) -> None:
 
 
 def read_classes(path: Path | str | None, ids_present: Iterable[int] | None = None) -> dict[int, str]:
-    """Names of the classes from a JSON file {"id": "name"}, sorted by id; background (0) is added.
+    """Read class names by ascending id from a JSON file {"id": "name"}; background (0) is added.
 
-    path: the file. None, or (with ``ids_present``) a file that does not exist, means that nothing is named.
-    ids_present: ids that occur in the masks; those without a name get "class_<id>". IGNORE is left out.
-    Raises ``UserError`` for invalid JSON, an id outside 0..65534, an empty name, or one name or id given twice.
+    path: None, or (with ``ids_present``) a missing file, names nothing.
+    ids_present: ids in the masks; those without a name get "class_<id>". IGNORE is left out.
+    Raises ``UserError`` for invalid JSON, an id outside 0..65534, an empty name, or a repeated name or id.
     """
     names = {BACKGROUND: "background"}
     if path is not None and (ids_present is None or Path(path).exists()):
@@ -117,11 +117,8 @@ def read_classes(path: Path | str | None, ids_present: Iterable[int] | None = No
             raise UserError(f"the masks hold the class id {class_id}: only 0..{IGNORE - 1} can be used.")
         if class_id != IGNORE:
             names.setdefault(int(class_id), f"class_{int(class_id)}")
-    repeated = {name for name in names.values() if list(names.values()).count(name) > 1}
-    if repeated:
-        raise UserError(
-            f"{path or 'classes.json'} gives the name {min(repeated)!r} to two classes: rename one of them."
-        )
+    if repeated := sorted(name for name, uses in Counter(names.values()).items() if uses > 1):
+        raise UserError(f"{path or 'classes.json'} gives the name {repeated[0]!r} to two classes: rename one of them.")
     return dict(sorted(names.items()))
 
 
@@ -131,9 +128,10 @@ def _read_names(path: Path) -> dict[int, str]:
     except FileNotFoundError:
         raise UserError(f"the class names {path} do not exist: correct the path.") from None
     except (OSError, ValueError) as error:
-        told = f'the class names {path} cannot be read as JSON ({reason(error)}): write e.g. {{"1": "cup"}}.'
-        raise UserError(told) from None
-    # The hook turns every object into a list of pairs, so that an id given twice is still seen.
+        raise UserError(
+            f'the class names {path} cannot be read as JSON ({reason(error)}): write e.g. {{"1": "cup"}}.'
+        ) from None
+    # The hook turns every object into a list of pairs, which keeps repeated ids.
     if not isinstance(pairs, list) or not all(isinstance(pair, tuple) for pair in pairs):
         raise UserError(f'the class names {path} must be one JSON object: write e.g. {{"1": "cup"}}.')
     names: dict[int, str] = {}

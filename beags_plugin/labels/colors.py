@@ -10,10 +10,7 @@ from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 
 
 def colorize(labels: np.ndarray) -> np.ndarray:
-    """Colours for looking at: an id has the same colour in every image and scene.
-
-    labels: [H, W] integers. Returns [H, W, 3] uint8 RGB; background is black, IGNORE mid-grey.
-    """
+    """Return [H, W, 3] uint8 RGB of labels [H, W]: one colour per id in all scenes, background black, IGNORE grey."""
     ids, inverse = np.unique(np.asarray(labels), return_inverse=True)
     colors = np.array([_color(int(class_id)) for class_id in ids], dtype=np.uint8).reshape(-1, 3)
     return colors[inverse.reshape(np.shape(labels))]

@@ -1,4 +1,4 @@
-"""Label maps of many views, each in the narrowest type that its ids fit in, and compressed."""
+"""Label maps of many views, each in the narrowest type of its ids, and compressed."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ NARROW_IGNORE = 255  # stands for IGNORE in a map of uint8, so that 255 classes 
 
 
 def to_compact(labels: Tensor) -> Tensor:
-    """Return the map in the narrowest type: uint8 (255: IGNORE) for ids below 255, else uint16, else int32.
+    """Return labels [H, W] of class ids or IGNORE in the narrowest type; ``to_int32`` restores every id.
 
-    labels: [H, W] int32 or int64 class ids or IGNORE. A uint8 or uint16 map passes as it is. Nothing is lost:
-    ``to_int32`` gives every id back.
+    The type is uint8 (255: IGNORE) for ids below 255, else uint16, else int32. uint8 and uint16 pass unchanged.
     """
     if labels.dtype in (torch.uint8, torch.uint16):
         return labels
@@ -31,16 +30,13 @@ def to_compact(labels: Tensor) -> Tensor:
 
 
 def to_int32(labels: Tensor) -> Tensor:
-    """Return [H, W] int32 class ids or IGNORE. labels: [H, W], as ``to_compact`` gave them."""
+    """Return [H, W] int32 class ids or IGNORE from labels of ``to_compact``."""
     wide = labels.to(torch.int32)
     return wide.masked_fill_(wide == NARROW_IGNORE, IGNORE) if labels.dtype == torch.uint8 else wide
 
 
 class CompressedMap:
-    """A map [H, W] in the narrowest type and compressed: some kilobytes for the classes of a photo.
-
-    labels: as for ``to_compact``; any uint8 image will do.
-    """
+    """A map [H, W] for ``to_compact`` (or any uint8 image), narrow and compressed: kilobytes for a photo's classes."""
 
     def __init__(self, labels: Tensor) -> None:
         array = to_compact(labels.detach()).cpu().contiguous().numpy()
@@ -48,18 +44,18 @@ class CompressedMap:
         self.packed = zlib.compress(array.tobytes(), level=1)
 
     def unpacked(self) -> Tensor:
-        """[H, W], as ``to_compact`` gave it, on the device where it was."""
+        """Return the map [H, W] of ``to_compact``, on its former device."""
         array = np.frombuffer(bytearray(zlib.decompress(self.packed)), self.dtype)
         return torch.from_numpy(array.reshape(self.shape)).to(self.device)
 
     @property
     def pixels(self) -> int:
-        """How many pixels the map has."""
+        """Number of pixels."""
         return int(np.prod(self.shape))
 
 
 class CompressedMaps(Sequence[Tensor]):
-    """One uint8 image [H, W] per view, held compressed and read one view at a time."""
+    """One uint8 image [H, W] per view, held compressed."""
 
     def __init__(self, images: Iterable[Tensor] = ()) -> None:
         self.stored = [CompressedMap(image) for image in images]
@@ -72,15 +68,15 @@ class CompressedMaps(Sequence[Tensor]):
         return len(self.stored)
 
     def __getitem__(self, index: int | slice) -> Any:
-        """[H, W] uint8 of one view; of a slice, a list."""
+        """Return [H, W] uint8 of one view, or a list for a slice."""
         found = self.stored[index]
         return found.unpacked() if isinstance(found, CompressedMap) else [each.unpacked() for each in found]
 
 
 class LabelMaps(Sequence[Any]):
-    """One label map per view, None where a view has none: held narrow and compressed, read as int32, one at a time.
+    """One label map [H, W], or None, per view: held narrow and compressed, read as int32.
 
-    maps: [H, W] int32 class ids or IGNORE, or as ``to_compact`` gives them; ``CompressedMap`` are kept as they are.
+    maps: class ids or IGNORE, int32 or of ``to_compact``; a ``CompressedMap`` is kept as it is.
     """
 
     def __init__(self, maps: Iterable[Tensor | CompressedMap | None] = ()) -> None:
@@ -96,18 +92,13 @@ class LabelMaps(Sequence[Any]):
         return len(self.stored)
 
     def __getitem__(self, index: int | slice) -> Any:
-        """[H, W] int32 of one view, or None; of a slice, the maps as they are held."""
+        """Return [H, W] int32 or None of one view; for a slice, ``LabelMaps`` of the same held maps."""
         if isinstance(index, slice):
             return LabelMaps(self.stored[index])
         narrow = self.narrow(index)
         return None if narrow is None else to_int32(narrow)
 
     def narrow(self, index: int) -> Tensor | None:
-        """[H, W] of one view, as ``to_compact`` gives it, or None."""
+        """Return the map [H, W] of one view in its narrow type, or None."""
         found = self.stored[index]
         return None if found is None else found.unpacked()
-
-    @property
-    def bytes(self) -> int:
-        """How much memory the maps take."""
-        return sum(len(labels.packed) for labels in self.stored if labels is not None)

@@ -1,4 +1,4 @@
-"""Class maps, and ways to make them consistent between views (entry points: ``beags.reprojections``)."""
+"""Masks, and reprojections that make them consistent between views (entry points: ``beags.reprojections``)."""
 
 from beags_plugin.system.registry import Registry
 

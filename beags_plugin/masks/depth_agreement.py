@@ -1,4 +1,4 @@
-"""How far the depths of neighbouring views disagree: what one pixel's depth may be wrong by."""
+"""Disagreement of depths between neighbouring views, an estimate of the error of one pixel's depth."""
 
 from __future__ import annotations
 
@@ -10,18 +10,17 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.masks.reprojection import PixelMaps, landing
 
-_VIEWS = 48  # at most so many are compared with their neighbours, and
-_SAMPLES = 1 << 16  # so many pixels of them
-_ALIKE = 0.7  # least cosine between the axes of two views that see the same sides of things: 45 degrees
+_VIEWS = 48  # views compared with their neighbours, at most
+_SAMPLES = 1 << 16  # pixels of them, at most
+_ALIKE = 0.7  # least cosine between the axes of neighbouring views: 45 degrees
 
 
 def disagreement(depths: Sequence[Tensor], cameras: Sequence[Camera], tau: float, share: float) -> float | None:
-    """The ``share`` of points that lie nearest to what the neighbouring view shows there lie nearer than this, along
-    its axis; in pixels (z / focal length).
+    """Return the ``share`` quantile of differences in depth between neighbouring views, in pixels (z / focal length).
 
-    depths: V x [H, W] float, world units along z; 0 where nothing is drawn. Each view is compared with the one that
-    stands nearest to it among those that look the same way; of many views, some are. tau: points further than tau z
-    from what is shown are hidden, and do not count. None where no two views show the same point.
+    depths: V x [H, W] float, world units along z; 0: nothing rendered. Each view, or some of many, is compared with the
+    nearest one that looks the same way. tau: points further than tau z from the other depth are hidden and do not
+    count. None if no two views show the same point.
     """
     pairs = [(i, j) for i, j in enumerate(_neighbours(cameras)) if j is not None]
     pairs = [pairs[n * len(pairs) // _VIEWS] for n in range(_VIEWS)] if len(pairs) > _VIEWS else pairs
@@ -32,7 +31,7 @@ def disagreement(depths: Sequence[Tensor], cameras: Sequence[Camera], tau: float
 
 
 def _neighbours(cameras: Sequence[Camera]) -> list[int | None]:
-    """Of each view the number of its neighbour, if it has one."""
+    """Return the index of each view's neighbour, or None."""
     views = [camera.to("cpu", torch.float64) for camera in cameras]
     centres, axes = (torch.stack(values) for values in zip(*((v.center, v.rotation[2]) for v in views), strict=True))
     found = []
@@ -46,7 +45,7 @@ def _neighbours(cameras: Sequence[Camera]) -> list[int | None]:
 
 
 def _apart(depth: Tensor, shown: Tensor, camera: Camera, other: Camera, tau: float, step: int) -> Tensor:
-    """[P] float64 on the CPU: of every ``step``-th pixel of a view whose point the other view sees."""
+    """Return [P] float64 on the CPU, for each ``step``-th pixel of a view whose point the other view sees."""
     pixel = torch.arange(0, depth.numel(), step, device=depth.device)
     x, y, d = pixel % camera.width + 0.5, pixel // camera.width + 0.5, depth.reshape(-1)[pixel]
     A, b = (values[0] for values in PixelMaps([camera, other]).towards(1))

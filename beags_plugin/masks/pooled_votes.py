@@ -1,4 +1,4 @@
-"""What the compiled ``ops.voxel_votes.VoxelVotes`` does, in torch: its reference, and where it is missing."""
+"""The torch version of the compiled ``ops.voxel_votes.VoxelVotes``: its reference, and its substitute."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from torch import Tensor
 
 _BITS = 21  # of each of the three voxel indices in a key
 _HALF = 1 << (_BITS - 1)
-_MARGIN = 8  # what is read about a point is in reach too
-_PARTS = 64  # of a voxel, in interpolation weights: whole numbers, whose sums have no order
-LOOKS = (-2, 2)  # steps before and behind a point along its ray, where votes disagree; a step is a voxel at most
+_MARGIN = 8  # voxels about a point that are read too
+_PARTS = 64  # of a voxel, in interpolation weights: integers, whose sums have no order
+LOOKS = (-2, 2)  # steps along the ray to places read where votes disagree; a step is a voxel at most
 
 
 class TorchVotes:
@@ -52,7 +52,7 @@ class TorchVotes:
         return voted, confidence
 
     def _winners(self, points: Tensor, steps: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """[P] int32 and [P] float32. points, steps along the rays: [P, 3], in voxels; labels: [P] int32."""
+        """Return labels [P] int32 and confidence [P] float32. points, steps: [P, 3], in voxels; labels: [P] int32."""
         voxels, weights, own = self._about(points)
         open_points = torch.nonzero(~self._agree(voxels))[:, 0]
         polls = [self._poll(torch.arange(len(points), device=points.device), voxels, weights)]
@@ -60,7 +60,7 @@ class TorchVotes:
             moved = points[open_points] + step * steps[open_points]
             polls.append(self._poll(open_points, *self._about(moved)[:2]))
         label, share = self._count(polls, labels)
-        # The pixel's own voxel says how sure its label is, if anybody voted there.
+        # the confidence is that in the pixel's own voxel, if it has votes
         known = (own >= 0) & (label >= 0) & (label < self._classes)
         pair = own.clamp(min=0) * self._classes + torch.where(known, label, 0)
         at = torch.searchsorted(self._pairs, pair).clamp_(max=len(self._pairs) - 1)
@@ -69,8 +69,8 @@ class TorchVotes:
         return label, torch.where(own >= 0, own_share, share)
 
     def _about(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The eight voxels about each point [P, 3]: their numbers [8, P], -1 where nobody voted, and their weights
-        [8, P]; and the number [P] of the one that holds the point."""
+        """Return indices [8, P] (-1 without votes) and weights [8, P] of the voxels about points [P, 3], and the
+        index [P] of the voxel that holds each point."""
         corner = torch.floor(points - 0.5)
         fraction = (((points - 0.5) - corner) * _PARTS).long()
         numbers, weights = [], []
@@ -87,13 +87,13 @@ class TorchVotes:
         return torch.where(self._voxels[at] == key, at, -1)
 
     def _agree(self, voxels: Tensor) -> Tensor:
-        """[P] whether one class has more than half of the votes of each of the voxels [8, P] that have any."""
+        """Return [P] bool: one class has more than half of the votes in each of the voxels [8, P] with votes."""
         leaders = self._leaders[voxels.clamp(min=0)]
         least = torch.where(voxels >= 0, leaders, self._classes).amin(0)
         return (least >= 0) & (least == torch.where(voxels >= 0, leaders, -1).amax(0))
 
     def _poll(self, points: Tensor, voxels: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """Keys point * classes + label and weighted votes, [M]. points: [P]; voxels, weights: [8, P]."""
+        """Return keys point * classes + label and weighted votes, [M]. points: [P]; voxels, weights: [8, P]."""
         found = (voxels >= 0) & (weights > 0)
         voxel = voxels[found]
         counts = self._first[voxel + 1] - self._first[voxel]
@@ -104,7 +104,7 @@ class TorchVotes:
         return point * self._classes + self._pairs[pair] % self._classes, votes
 
     def _count(self, polls: list[tuple[Tensor, Tensor]], labels: Tensor) -> tuple[Tensor, Tensor]:
-        """The winners [P] int32 (``labels`` where several lead or nobody voted) and their share of the votes."""
+        """Return the winners [P] int32 (``labels`` in a tie or without votes) and their share of the votes."""
         keys, votes = (torch.cat(column) for column in zip(*polls, strict=True))
         pairs, inverse = torch.unique(keys, return_inverse=True)
         sums = torch.zeros_like(pairs).scatter_add_(0, inverse, votes)
@@ -115,13 +115,13 @@ class TorchVotes:
         best = sums == most[point]
         leaders = zeros.scatter_add(0, point, best.long())
         winner = zeros.clone()
-        winner[point[best]] = label[best]  # where two lead, it is not used
+        winner[point[best]] = label[best]  # not used in a tie
         share = most.float() / total.clamp(min=1).float()
         return torch.where(leaders == 1, winner.int(), labels), share
 
 
 def lift(depth: Tensor, to_voxels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Points [H, W, 3] in voxels, steps along their rays [H, W, 3], and which of them [H, W] count."""
+    """Return points [H, W, 3] in voxels, steps along their rays [H, W, 3], and a mask [H, W] of those that count."""
     height, width = depth.shape
     x = torch.arange(width, dtype=depth.dtype, device=depth.device) + 0.5
     y = torch.arange(height, dtype=depth.dtype, device=depth.device)[:, None] + 0.5

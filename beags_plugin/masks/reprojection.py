@@ -18,15 +18,15 @@ from beags_plugin.system import processes
 from beags_plugin.system.errors import UserError
 
 _CHUNK_PIXELS = 1 << 16  # source pixels projected at a time: their temporaries stay in the cache
-_DENSE_COUNTERS = 1 << 26  # up to this many (pixel, class) pairs a view's votes are counted in one array (256 MiB)
+_DENSE_COUNTERS = 1 << 26  # most (pixel, class) pairs of a view counted in one array (256 MiB)
 
 
 @dataclass(frozen=True)
 class ReprojectedMask:
     """One view's consistent labels M'.
 
-    labels: [H, W] int32 class ids, or IGNORE where nothing is known.
-    confidence: [H, W] float32 in 0..1, votes of the winner / all votes; 0 where there is no vote.
+    labels: [H, W] int32 class ids or IGNORE.
+    confidence: [H, W] float32 in 0..1, votes of the winner / all votes; 0 without votes.
     """
 
     labels: Tensor
@@ -41,18 +41,15 @@ def reproject_pairwise(
     tau: float = 0.02,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[ReprojectedMask]:
-    """Give every pixel of every view the class that most lifted pixels of all views put there (E5).
+    """Give every pixel of every view the class with the most votes by lifted pixels of all views (E5).
 
-    depths: V x [H, W] float, world units along z; 0 where nothing is drawn. Views may differ in size.
-    labels: V x [H, W] int32 class ids below ``num_classes`` or IGNORE; None for a view without a mask. ``LabelMaps``
-        are read as they are held.
+    depths: V x [H, W] float, world units along z; 0: nothing rendered. Views may differ in size.
+    labels: V x [H, W] int32 class ids below ``num_classes`` or IGNORE; None without a mask. ``LabelMaps`` stay narrow.
     tau: a vote counts only if its point is visible, |z - D_i| <= tau z; ``inf`` counts all (the paper's literal text).
     IGNORE pixels and pixels without depth do not vote; a view votes in itself too. A tie or no vote keeps the original
-    label; a view without a mask counts as all IGNORE, so there it leaves IGNORE (an ambiguous pixel is better left
-    unlabelled than guessed). Cost O(V^2 pixels). Depth and masks of all V views are held in memory (5 bytes a pixel),
-    beside O(pixels of one view x classes).
-    Yields the views in their order; none is kept here.
-    Raises ``UserError`` for a mask of the wrong size or with ids out of range.
+    label, which is IGNORE in a view without a mask. Cost O(V^2 pixels). Memory: depth and labels of all views (5 bytes
+    a pixel), and O(pixels of one view x classes).
+    Yields the views in order. Raises ``UserError`` for a mask of the wrong size or with ids out of range.
     """
     check_views(depths, cameras, labels, num_classes, tau)
     if not cameras:
@@ -62,7 +59,7 @@ def reproject_pairwise(
     compiled = cuda_extension.supports(*depths)
     size = max(camera.height * camera.width for camera in cameras) * num_classes
     dense = compiled and size <= _DENSE_COUNTERS
-    # as many views at a time as there are threads, each with its own counters; several processes take them one by one
+    # a view per thread at a time, each with its own counters; several processes take views one by one
     threads = extension.threads() if processes.size() == 1 else 1
     together = max(1, min(threads, 2 * _DENSE_COUNTERS // size)) if dense else 1
     batches = [range(i, min(i + together, len(cameras))) for i in range(0, len(cameras), together)]
@@ -84,7 +81,7 @@ def reproject_pairwise(
 
 
 def _held(labels: Sequence[Tensor | None]) -> list[Tensor | None]:
-    """The maps in the types that the compiled op reads: int32, or uint8 as ``label_maps.to_compact`` gives it."""
+    """Return the maps in the types of the compiled op: int32, or uint8 of ``label_maps.to_compact``."""
     if not isinstance(labels, LabelMaps):
         return list(labels)
     narrow = (labels.narrow(index) for index in range(len(labels)))
@@ -92,7 +89,7 @@ def _held(labels: Sequence[Tensor | None]) -> list[Tensor | None]:
 
 
 def _by_torch(depths, cameras, labels, num_classes: int, tau: float, i: int, maps: PixelMaps) -> tuple[Tensor, Tensor]:
-    """View i, as the compiled op does it; its reference."""
+    """Reproject view i in torch, the reference of the compiled op."""
     camera = cameras[i]
     votes = _Votes(camera.height * camera.width, num_classes, depths[i].device)
     for depth, mask, A, b in zip(depths, labels, *maps.towards(i), strict=True):
@@ -109,7 +106,7 @@ def check_views(depths, cameras, labels, num_classes: int, tau: float) -> None:
 
 
 def check_counts(depths, cameras, labels, tau: float) -> None:
-    """What ``check_views`` asks before it looks at a view."""
+    """Raise for unequal numbers of views or a negative tau."""
     if not len(depths) == len(cameras) == len(labels):
         raise ValueError(f"{len(depths)} depths, {len(cameras)} cameras and {len(labels)} masks do not belong together")
     if not tau >= 0:
@@ -117,7 +114,7 @@ def check_counts(depths, cameras, labels, tau: float) -> None:
 
 
 def check_view(index: int, depth: Tensor, camera: Camera, mask: Tensor | None, num_classes: int) -> None:
-    """What ``check_views`` asks of one view."""
+    """Raise for one view as ``check_views`` does."""
     size = (camera.height, camera.width)
     if tuple(depth.shape) != size:
         raise ValueError(f"depth {index} must be {list(size)}, not {list(depth.shape)}")
@@ -137,7 +134,7 @@ def check_view(index: int, depth: Tensor, camera: Camera, mask: Tensor | None, n
 
 
 class PixelMaps:
-    """Between the pixels of all views: lifting and projecting in one step, so that no point has to be kept."""
+    """Maps between the pixels of all views: lifting and projection in one step."""
 
     def __init__(self, cameras: Sequence[Camera]) -> None:
         views = [camera.to("cpu", torch.float64) for camera in cameras]
@@ -148,7 +145,7 @@ class PixelMaps:
         self.lift = _product(self.rotation.transpose(1, 2), torch.linalg.inv(self.K))
 
     def towards(self, i: int) -> tuple[Tensor, Tensor]:
-        """A [V, 3, 3] and b [V, 3], float64: a pixel (x, y) at depth d of view v projects to
+        """Return A [V, 3, 3] and b [V, 3], float64, that project a pixel (x, y) at depth d of view v to
         d A (x, y, 1) + b = z (x', y', 1) in view i."""
         A = _product(_product(self.K[i], self.rotation[i]), self.lift)
         turn = _product(self.rotation[i], self.rotation.transpose(1, 2))
@@ -159,31 +156,31 @@ class PixelMaps:
 
 
 def _product(left: Tensor, right: Tensor) -> Tensor:
-    """[.., 3, 3] times [.., 3, C], always in the same order of operations, unlike a library's product."""
+    """Multiply [.., 3, 3] by [.., 3, C] in a fixed order of operations, unlike a library's product."""
     return sum(left[..., k, None] * right[..., k, None, :] for k in range(3))  # type: ignore[return-value]
 
 
 def landing(
     x: Tensor, y: Tensor, depth: Tensor, pixel_map: tuple[Tensor, Tensor], size: tuple[int, int], counted: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Where pixels fall in another view: which do [..] bool, and of these [M] the number of the pixel there and z.
+    """Project pixels to another view; return a mask [..] of those inside, and of these [M] the pixel index and z.
 
-    x, y, depth: of the pixels, centres at + 0.5, world units along z; they may be broadcast to one shape [..].
+    x, y, depth: of the pixels, centres at + 0.5, world units along z; broadcast to one shape [..].
     pixel_map: A [3, 3] and b [3] of ``PixelMaps.towards``. size: width and height of the other view. counted: [..]
-    bool, those that are looked at.
+    bool, False excludes a pixel.
     """
     (A, b), (width, height) = (value.to(depth) for value in pixel_map), size
     hx, hy, z = (depth * (A[r, 0] * x + (A[r, 1] * y + A[r, 2])) + b[r] for r in range(3))
-    # Written as products so that z = 0, infinite and NaN points simply fail.
+    # products, for which z = 0, infinite and NaN points fail
     lands = counted & (z > 0) & (hx >= 0) & (hy >= 0) & (hx < width * z) & (hy < height * z)
     hx, hy, z = hx[lands], hy[lands], z[lands]
-    # The quotient may round up to the border itself.
+    # the quotient may round up to the width or height
     column, row = (hx / z).long().clamp_(max=width - 1), (hy / z).long().clamp_(max=height - 1)
     return lands, row * width + column, z
 
 
 def _cast(votes: _Votes, depth: Tensor, mask: Tensor, target_depth: Tensor, pixel_map, tau: float) -> None:
-    """Add the votes of one view (``depth``, ``mask``) in another (``target_depth``)."""
+    """Add the votes of one view (``depth``, ``mask``) for another (``target_depth``)."""
     height, width = depth.shape
     x = torch.arange(width, dtype=depth.dtype, device=depth.device) + 0.5
     rows = max(1, _CHUNK_PIXELS // width)
@@ -200,17 +197,17 @@ def _cast(votes: _Votes, depth: Tensor, mask: Tensor, target_depth: Tensor, pixe
 
 
 class _Votes:
-    """Counts per (pixel, class) of one view: one array, or the pairs that occur where that would be too large."""
+    """Counts per (pixel, class) of one view: one array, or sorted pairs if that is too large."""
 
     def __init__(self, num_pixels: int, num_classes: int, device: torch.device) -> None:
         self.num_pixels, self.num_classes = num_pixels, num_classes
         self.dense = num_pixels * num_classes <= _DENSE_COUNTERS
         size = num_pixels * num_classes if self.dense else 0
         self.counts = torch.zeros(size, dtype=torch.int32, device=device)
-        self.keys = torch.zeros(0, dtype=torch.int64, device=device)  # sorted; used where not dense
+        self.keys = torch.zeros(0, dtype=torch.int64, device=device)  # sorted; if not dense
 
     def add(self, pixel: Tensor, label: Tensor) -> None:
-        """One vote for ``label`` [M] int32 at each ``pixel`` [M] int64. Determinism: sums of integers have no order."""
+        """Add a vote for ``label`` [M] int32 at each ``pixel`` [M] int64; integer sums are deterministic."""
         key = pixel * self.num_classes + label.long()
         if self.dense:
             self.counts.scatter_add_(0, key, torch.ones_like(key, dtype=torch.int32))
@@ -221,7 +218,7 @@ class _Votes:
         self.counts = torch.zeros_like(self.keys, dtype=torch.int32).scatter_add_(0, inverse, both)
 
     def winners(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Per pixel [num_pixels]: the winner's id int64, its votes, how many classes have as many, all votes."""
+        """Return per pixel the winner's id int64, its votes, the number of classes with as many, and all votes."""
         if self.dense:
             counts = self.counts.view(self.num_pixels, self.num_classes)
             most, winner = counts.max(dim=1)
@@ -233,12 +230,12 @@ class _Votes:
         best = self.counts == most[pixel]
         leaders = zeros.scatter_add(0, pixel, best.int())
         winner = zeros.long()
-        winner[pixel[best]] = self.keys[best] % self.num_classes  # where two lead, the label is not used
+        winner[pixel[best]] = self.keys[best] % self.num_classes  # not used in a tie
         return winner, most, leaders, total
 
 
 def _decide(votes: _Votes, original: Tensor | None, camera: Camera) -> tuple[Tensor, Tensor]:
-    """The label and the confidence of each pixel."""
+    """Return label and confidence of each pixel."""
     winner, most, leaders, total = votes.winners()
     size = (camera.height, camera.width)
     if original is None:

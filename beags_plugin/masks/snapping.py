@@ -1,4 +1,4 @@
-"""Outlines of masks moved to edges of the photograph, an optional step for any source."""
+"""Snapping of mask outlines to edges of the photo, an optional step for any source."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ EPSILON = 1e-2  # variance of colour (0..1) below which the guide counts as flat
 
 
 def snap_to_edges(labels: np.ndarray, photo: np.ndarray, radius: int) -> np.ndarray:
-    """[H, W] uint16: the class map with its rims where the photo's edges are, as a guided filter sees them.
+    """Move outlines of labels [H, W] uint16 to edges of the photo [H, W, 3] uint8 RGB, by a guided filter.
 
-    labels: [H, W] uint16. photo: [H, W, 3] uint8 RGB. radius: pixels of the filter's window, and how far from a
-    rim a label may change. Each class's indicator is filtered with the photo as guide (He et al., "Guided image
-    filtering"); near rims the class of the largest value is taken. IGNORE stays.
+    radius: pixels of the filter's window, and the largest distance of a changed label from an outline. Each class's
+    indicator is filtered with the photo as guide (He et al., "Guided image filtering"); near outlines the class of the
+    largest value is taken. IGNORE stays.
     """
     import cv2
 

@@ -1,4 +1,4 @@
-"""Space cut into chunks that are voted on one after the other, so that few voxels are in memory at a time."""
+"""Chunks of space whose votes are counted one after the other, which bounds the memory of voxels."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from beags_plugin.masks.pooled_votes import LOOKS, lift
 from beags_plugin.ops import extension
 from beags_plugin.ops.voxel_votes import brick_sample
 
-MOST_BRICKS = 1 << 19  # bricks of 4 x 4 x 4 voxels that may be in memory: about 0.4 GB
+MOST_BRICKS = 1 << 19  # bricks of 4 x 4 x 4 voxels in memory: about 0.4 GB
 _BRICK = 4
-_PART = 64  # one brick of about so many is counted
+_PART = 64  # about one brick in 64 is counted
 _PRIMES = (73856093, 19349663, 83492791)  # as in native/ops/voxel_votes.cpp
 
 
 @dataclass(frozen=True)
 class SpatialChunks:
-    """Chunk s holds the points whose coordinate along ``axis`` is in borders[s] .. borders[s + 1], in voxels.
+    """Chunks s of the points with coordinates borders[s] .. borders[s + 1] along ``axis``, in voxels.
 
-    borders: the first is -inf, the last inf. margin: what is read about a point lies within so many voxels of it.
+    borders: the first is -inf, the last inf. margin: farthest voxels read about a point.
     """
 
     axis: int
@@ -35,16 +35,23 @@ class SpatialChunks:
         return len(self.borders) - 1
 
     def coordinates(self, depth: Tensor, to_voxels: Tensor) -> Tensor:
-        """[H, W] of the points of a view along the axis; NaN where nothing is lifted. to_voxels: [13] like ``depth``,
-        see ``ops.voxel_votes``."""
-        return _along(self.axis, depth, to_voxels)
+        """Return [H, W], the points of a view along the axis; NaN without depth.
+
+        to_voxels: [13] like ``depth``, see ``ops.voxel_votes``.
+        """
+        height, width = depth.shape
+        x = torch.arange(width, dtype=depth.dtype, device=depth.device) + 0.5
+        y = torch.arange(height, dtype=depth.dtype, device=depth.device)[:, None] + 0.5
+        across, down, rest = to_voxels[3 * self.axis : 3 * self.axis + 3]
+        found = (across * x + (down * y + rest)).mul_(depth).add_(to_voxels[9 + self.axis])
+        return found.masked_fill_(~(depth > 0), math.nan)
 
     def inside(self, coordinates: Tensor, chunk: int) -> Tensor:
-        """[H, W] bool: the points of the chunk."""
+        """Return [H, W] bool: the points of the chunk."""
         return (coordinates >= self.borders[chunk]) & (coordinates < self.borders[chunk + 1])
 
     def about(self, coordinates: Tensor, chunk: int) -> Tensor:
-        """[H, W] bool: the points whose votes matter to those of the chunk."""
+        """Return [H, W] bool: the points whose votes matter to the chunk."""
         first, last = self.borders[chunk] - self.margin, self.borders[chunk + 1] + self.margin
         return (coordinates >= first) & (coordinates < last)
 
@@ -55,15 +62,18 @@ WHOLE = SpatialChunks(0, (-math.inf, math.inf), 0.0)
 def divide_space(
     depths: Sequence[Tensor], cameras: Sequence[Camera], to_voxels: Tensor, most: int | None = None
 ) -> SpatialChunks:
-    """As many chunks as keep about ``most`` (``MOST_BRICKS``) bricks of voxels in each, along the longest axis.
+    """Cut space along its longest axis into chunks of about ``most`` (``MOST_BRICKS``) bricks of voxels.
 
-    depths: V x [H, W], asked for once, one view at a time. to_voxels: [V, 13] float64, see ``ops.voxel_votes``.
-    Bricks are counted by about a 64th of them, which is what is kept in memory of each view.
+    depths: V x [H, W], read once, one view at a time. to_voxels: [V, 13] float64, see ``ops.voxel_votes``.
+    A 64th of the bricks, kept in memory for each view, estimates their number.
     """
     most = MOST_BRICKS if most is None else most
     if sum(camera.height * camera.width for camera in cameras) <= most:
         return WHOLE
-    samples = [_sample(depth, own.to(depth)) for depth, own in zip(depths, to_voxels, strict=True)]
+    samples = [
+        (brick_sample if extension.supports(depth) else torch_brick_sample)(depth, own.to(depth), _PART)
+        for depth, own in zip(depths, to_voxels, strict=True)
+    ]
     found = torch.unique(torch.cat(samples), dim=0)
     count = -(-_PART * len(found) // most)
     if count <= 1:
@@ -75,25 +85,11 @@ def divide_space(
     return SpatialChunks(axis, (-math.inf, *map(float, inner), math.inf), _margin(cameras))
 
 
-def _along(axis: int, depth: Tensor, to_voxels: Tensor) -> Tensor:
-    height, width = depth.shape
-    x = torch.arange(width, dtype=depth.dtype, device=depth.device) + 0.5
-    y = torch.arange(height, dtype=depth.dtype, device=depth.device)[:, None] + 0.5
-    across, down, rest = to_voxels[3 * axis : 3 * axis + 3]
-    found = (across * x + (down * y + rest)).mul_(depth).add_(to_voxels[9 + axis])
-    return found.masked_fill_(~(depth > 0), math.nan)
-
-
-def _sample(depth: Tensor, to_voxels: Tensor) -> Tensor:
-    compiled = extension.supports(depth)
-    return (brick_sample if compiled else torch_brick_sample)(depth, to_voxels, _PART)
-
-
 def torch_brick_sample(depth: Tensor, to_voxels: Tensor, part: int) -> Tensor:
-    """[M, 3] int64, sorted, on the CPU: of the bricks that hold the points of a view [H, W] about one in ``part``.
+    """Return [M, 3] int64, sorted, on the CPU: about one in ``part`` of the bricks with points of a view [H, W].
 
-    The same bricks are chosen in every view. to_voxels: [13] like ``depth``, see ``ops.voxel_votes``. part: a power of
-    two.
+    The choice of a brick is the same in every view. to_voxels: [13] like ``depth``, see ``ops.voxel_votes``.
+    part: a power of two.
     """
     points, _, near = lift(depth, to_voxels)
     bricks = torch.floor(points[near] / _BRICK).int()
@@ -102,7 +98,7 @@ def torch_brick_sample(depth: Tensor, to_voxels: Tensor, part: int) -> Tensor:
 
 
 def _margin(cameras: Sequence[Camera]) -> float:
-    """How many voxels from a point its votes are read: steps along the ray are longest in the corners of images."""
+    """Return the farthest voxels read about a point: steps along rays are longest in the corners of images."""
     longest = 1.0
     for camera in cameras:
         corners = [(x, y, 1.0) for x in (0, camera.width) for y in (0, camera.height)]

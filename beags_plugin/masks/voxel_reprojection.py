@@ -18,7 +18,7 @@ from beags_plugin.system.filed_tensors import filed
 from beags_plugin.system.processes import each_view
 
 VOXEL_PIXELS = 1.5  # side of a voxel, in pixels seen at the objects' median depth
-_DOUBTS = 0.95  # share of depths that are no further off than the second look reaches
+_DOUBTS = 0.95  # share of depths with errors within the second look
 _FOOTPRINTS = 1 << 16  # pixels that measure the voxel size, spread over all views
 
 
@@ -30,21 +30,18 @@ def reproject_voxel(
     tau: float = 0.02,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[ReprojectedMask]:
-    """Give every pixel of every view the class for which most lifted pixels of all views vote about its point.
+    """Give every pixel of every view the class with the most votes by lifted pixels of all views near its point.
 
-    Arguments and results are those of ``reprojection.reproject_pairwise``, and so is what a tie does. A pixel votes in
-    the voxel that holds its lifted point; voxels are ``VOXEL_PIXELS`` pixels wide at the median depth of the objects.
-    It reads the votes of the eight voxels about its point, each weighted by how near it is (trilinear), so that it does
-    not matter where the borders of the voxels lie. Unless one class has more than half of the votes of each, it reads
-    them before and behind its point along its ray too: an error of its own depth then does less harm. That second look
-    reaches as far as depths disagree between neighbouring views, up to two voxels: with depth that is right, it would
-    only bring votes about other things.
+    Arguments, results and ties are those of ``reprojection.reproject_pairwise``; ``tau`` only decides which points two
+    neighbouring views share. A pixel votes in the voxel of its lifted point; voxels are ``VOXEL_PIXELS`` pixels wide at
+    the median depth of the objects. It reads the votes of the eight voxels about its point with trilinear weights,
+    which hides the grid. Unless one class has more than half of the votes of each, it also reads before and behind its
+    point along its ray, against errors of its own depth. That second look reaches as far as depths disagree between
+    neighbouring views, up to two voxels: with exact depth it would only add votes about other things.
     The confidence is the label's share of the votes in the voxel of the point, or of those read if that has none.
-    The points are lifted from what each view sees, so no vote passes through a surface; ``tau`` tells only which points
-    neighbouring views both see.
-    Cost O(V pixels), whatever the number of classes. Depth and masks are asked for several times, one view at a time:
-    they may lie on disk (``system.filed_tensors``). Where the voxels would take more than about 0.4 GB, space is cut
-    into chunks (``masks.spatial_chunks``) and the views are gone through once more for each; results are the same bits.
+    Cost O(V pixels) for any number of classes. Depth and labels are read several times, one view at a time, perhaps
+    from disk (``system.filed_tensors``). If voxels need more than about 0.4 GB, space is cut into chunks
+    (``masks.spatial_chunks``) and all views are read for each; results are the same bits.
     """
     check_counts(depths, cameras, labels, tau)
     if not cameras:
@@ -55,7 +52,7 @@ def reproject_voxel(
     chunks = divide_space(depths, cameras, lifts)
     votes = _Votes(depths, labels, lifts, chunks, alike, progress)
     if len(chunks) == 1:
-        yield from (ReprojectedMask(labels, confidence) for labels, confidence, _ in votes.of_slab(0))
+        yield from (ReprojectedMask(labels, confidence) for labels, confidence, _ in votes.of_chunk(0))
         return
     pieces = [filed(votes.pieces_of(chunk), depths[0].device) for chunk in range(len(chunks))]
     for i, (depth, mask) in enumerate(zip(depths, labels, strict=True)):
@@ -68,44 +65,44 @@ def reproject_voxel(
 
 
 class _Votes:
-    """Votes and their reading, chunk by chunk."""
+    """Casting and reading of votes, chunk by chunk."""
 
     def __init__(self, depths, labels, lifts: Tensor, chunks: SpatialChunks, alike: bool, progress) -> None:
         self.depths, self.labels, self.lifts, self.chunks = depths, labels, lifts, chunks
         self._alike, self._progress = alike, progress
         self._done, self._total = 0, 2 * len(chunks) * len(depths)
 
-    def of_slab(self, chunk: int) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
-        """Per view the labels [H, W] int32, the confidence [H, W] float32, and which pixels [H, W] bool have their
-        point in the chunk (None: all, as there is but one); others keep their label, with confidence 0."""
+    def of_chunk(self, chunk: int) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
+        """Yield per view labels [H, W] int32, confidence [H, W] float32, and a mask [H, W] of the pixels with points in
+        the chunk (None: all); the others keep their label, with confidence 0."""
         compiled = votes_for([self.depths[0]], IGNORE) if self._alike else None
         votes = compiled or TorchVotes(IGNORE)
         for i, (depth, mask) in enumerate(zip(self.depths, self.labels, strict=True)):
-            about = self._of_slab(i, depth, chunk, self.chunks.about)
+            about = self._part(i, depth, chunk, self.chunks.about)
             if mask is not None and (about is None or bool(about.any())):
                 votes.add(_where(about, depth), self.lifts[i].to(depth), mask.int())
             self._tick()
         votes.decide()
 
-        def told(i: int) -> tuple[Tensor, Tensor, Tensor | None]:
+        def read(i: int) -> tuple[Tensor, Tensor, Tensor | None]:
             depth = self.depths[i]
-            inside = self._of_slab(i, depth, chunk, self.chunks.inside)
+            inside = self._part(i, depth, chunk, self.chunks.inside)
             known = _known(depth, self.labels[i])
             return *votes.read(_where(inside, depth), self.lifts[i].to(depth), known), inside
 
-        for found in each_view(len(self.depths), told):
+        for found in each_view(len(self.depths), read):
             yield found
             self._tick()
 
     def pieces_of(self, chunk: int) -> Iterator[Tensor]:
-        """Of each view the labels [P] and the confidence [P] of the points in the chunk, in the order of pixels."""
-        for labels, confidence, inside in self.of_slab(chunk):
+        """Yield labels [P], then confidence [P], of each view's points in the chunk, in the order of pixels."""
+        for labels, confidence, inside in self.of_chunk(chunk):
             yield from (labels[inside], confidence[inside])
 
-    def _of_slab(self, i: int, depth: Tensor, chunk: int, which) -> Tensor | None:
+    def _part(self, i: int, depth: Tensor, chunk: int, choose) -> Tensor | None:
         if len(self.chunks) == 1:
             return None
-        return which(self.chunks.coordinates(depth, self.lifts[i].to(depth)), chunk)
+        return choose(self.chunks.coordinates(depth, self.lifts[i].to(depth)), chunk)
 
     def _tick(self) -> None:
         self._done += 1
@@ -114,7 +111,7 @@ class _Votes:
 
 
 def _second_look(depths: Sequence[Tensor], cameras: Sequence[Camera], tau: float) -> float:
-    """How many voxels it reaches before a point and behind it."""
+    """Return the reach of the second look before and behind a point, in voxels."""
     pixels = disagreement(depths, cameras, tau, _DOUBTS)
     return LOOKS[-1] if pixels is None else min(pixels / VOXEL_PIXELS, LOOKS[-1])
 
@@ -124,16 +121,15 @@ def _where(chosen: Tensor | None, depth: Tensor) -> Tensor:
 
 
 def _known(depth: Tensor, mask: Tensor | None) -> Tensor:
-    """[H, W] int32, a copy."""
+    """Return a copy of the labels, [H, W] int32; IGNORE without a mask."""
     return torch.full_like(depth, IGNORE, dtype=torch.int32) if mask is None else mask.to(torch.int32, copy=True)
 
 
 def _survey(depths, cameras, labels, num_classes: int) -> tuple[float, bool]:
-    """The size of the voxels, and whether all depths are of one type and place; raises as ``check_views``.
+    """Return the size of the voxels, and whether all depths share type and device; raise as ``check_views``.
 
-    The size is ``VOXEL_PIXELS`` times the median of depth / focal length over the objects' pixels (over all that are
-    drawn, if there are none); world units. Objects, as it is about them that classes meet: what is behind them may be
-    far away.
+    The size is ``VOXEL_PIXELS`` times the median of depth / focal length over the objects' pixels (or all rendered
+    ones, without objects); world units. The background, which may be far away, does not count.
     """
     step = max(1, sum(camera.height * camera.width for camera in cameras) // _FOOTPRINTS)
     thinned, labelled, kinds = [], [], set()
@@ -141,28 +137,27 @@ def _survey(depths, cameras, labels, num_classes: int) -> tuple[float, bool]:
         check_view(index, depth, camera, mask, num_classes)
         thinned.append((depth.reshape(-1)[::step] / camera.focal).double().cpu())
         label = torch.zeros(len(thinned[-1]), dtype=torch.int32) if mask is None else mask.reshape(-1)[::step].cpu()
-        labelled.append(label.clone())  # not a piece of the view's map, which would stay in memory as a whole
+        labelled.append(label.clone())  # a slice would keep the view's whole map in memory
         kinds.add((depth.dtype, depth.device))
     return _voxel_size(torch.cat(thinned), torch.cat(labelled)), len(kinds) == 1
 
 
 def _voxel_size(footprints: Tensor, label: Tensor) -> float:
-    """footprints: [P] float64, sides of pixels where they lie; label: [P] int32 class ids or IGNORE."""
-    drawn = (footprints > 0) & footprints.isfinite()
-    for counted in (drawn & (label > 0) & (label != IGNORE), drawn):
+    """Return the voxel size from sides of pixels [P] float64, world units, and labels [P] int32."""
+    rendered = (footprints > 0) & footprints.isfinite()
+    for counted in (rendered & (label > 0) & (label != IGNORE), rendered):
         if counted.any():
             return VOXEL_PIXELS * float(footprints[counted].median())
     return 1.0
 
 
 def _origin(cameras: Sequence[Camera]) -> Tensor:
-    """[3] float64: amid the cameras, as the voxels reach equally far to all sides."""
+    """Return the mean of the camera centres, [3] float64, as voxels reach equally far to all sides."""
     return torch.stack([camera.to("cpu", torch.float64).center for camera in cameras]).mean(0)
 
 
 def _to_voxels(cameras: Sequence[Camera], origin: Tensor, size: float) -> Tensor:
-    """[V, 13] float64: A row by row, b, and the depth that is one voxel long along the ray of the image's centre: what
-    ``LOOKS`` are multiples of.
+    """Return [V, 13] float64: A row by row, b, and the depth of one voxel along the central ray, the unit of ``LOOKS``.
 
     A pixel (x, y) at depth d lies at d A (x, y, 1) + b, in voxels.
     """

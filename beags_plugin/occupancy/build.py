@@ -1,4 +1,4 @@
-"""Build the visibility voxel grids from what the training views show (method, section 5; paper 3.4)."""
+"""Build the visibility voxel grids from the training views (method, section 5; paper 3.4)."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ MIN_ALPHA_LIFTED = 0.5  # pixels with less alpha are not lifted
 
 @dataclass(frozen=True)
 class _View:
-    """What one view shows: solid [H, W] bool, with P True; of those, row by row, depth [P] float and class_id [P], in
-    the narrowest type that holds all class ids."""
+    """The P solid pixels of a view: solid [H, W] bool; of them, row by row, depth [P] float and class_id [P]."""
 
     camera: Camera
     solid: Tensor
@@ -34,17 +33,17 @@ class _View:
     class_id: Tensor
 
     def points(self) -> Tensor:
-        """[P, 3] world."""
+        """Return the lifted pixels, [P, 3] world."""
         depth = self.depth.new_zeros(self.solid.shape).masked_scatter_(self.solid, self.depth)
         return lift(depth, self.camera)[self.solid]
 
 
 class _Views:
-    """What all views show, on disk; each is read anew whenever they are gone through."""
+    """All views on disk; each iteration reads them one by one."""
 
     def __init__(self, views: Iterable[_View], cameras: Sequence[Camera], device: torch.device) -> None:
         self._cameras = cameras
-        self.counts: list[int] = []  # of the points of each view
+        self.counts: list[int] = []  # points per view
         self._tensors = filed(self._flat(views), device)
 
     def _flat(self, views: Iterable[_View]) -> Iterator[Tensor]:
@@ -71,11 +70,10 @@ def build_visibility_grid(
 ) -> VisibilityGrid:
     """Render depth and class of every view, lift the pixels with A >= 0.5, and voxelise them per class.
 
-    surfels: N surfels. class_ids: [N] int32, phi, below ``num_classes``.
-    k: sets the voxel size (E8); seed: of the points that measure it.
-    depth: which depth is lifted: see ``surface_depth``.
-    Whether a pixel is solid, and its depth and class if so, goes to a temporary file (6 bytes for up to 256 class ids),
-    which is read twice, view by view: memory grows with the voxels, and with the points that measure their size.
+    surfels: N Gaussians. class_ids: [N] int32, phi, below ``num_classes``.
+    k: sets the voxel size (E8); seed: of the points that measure it. depth: the lifted depth (``surface_depth``).
+    Solid pixels lie in a temporary file (6 bytes each for up to 256 class ids), read twice, view by view: memory grows
+    with the voxels and with the points that measure their size.
     Raises ``UserError`` if no pixel of any view reaches an alpha of 0.5.
     """
     settings = replace(settings, geometry=True, distortion=False)
@@ -95,26 +93,22 @@ def build_visibility_grid(
 
 def _render(surfels, class_ids, camera, rasterizer, settings, num_classes: int, depth: str) -> _View:
     with torch.no_grad():
-        drawn = rasterizer.rasterize(geometry_inputs(surfels), camera, settings, surfels.means.new_zeros(3))
+        rendered = rasterizer.rasterize(geometry_inputs(surfels), camera, settings, surfels.means.new_zeros(3))
     classes, _ = render_class_map(rasterizer, surfels, class_ids, camera, settings)
-    surface = surface_depth(drawn, depth)
-    solid = (drawn.alpha >= MIN_ALPHA_LIFTED) & torch.isfinite(surface) & (surface > 0)
+    surface = surface_depth(rendered, depth)
+    solid = (rendered.alpha >= MIN_ALPHA_LIFTED) & torch.isfinite(surface) & (surface > 0)
     small = torch.uint8 if num_classes <= 1 << 8 else torch.int16 if num_classes <= 1 << 15 else torch.int32
     return _View(camera, solid, surface[solid], classes[solid].to(small))
 
 
 def _reference_cloud(views: _Views, k: int, seed: int) -> tuple[np.ndarray, int]:
-    """The thinned cloud of all classes [R, 3], and how many points there are in all."""
+    """Return the thinned cloud of all classes [R, 3] and the number of all points."""
     total = sum(views.counts)
     chosen = reference_indices(total, k, seed)
     pieces, first = [np.zeros((0, 3), dtype=np.float32)], 0
     for view in views:
-        pieces.append(_piece(view, chosen, first))
+        start, stop = np.searchsorted(chosen, [first, first + len(view.depth)])
+        own = torch.from_numpy(chosen[start:stop] - first).to(view.depth.device)
+        pieces.append(view.points()[own].cpu().numpy())
         first += len(view.depth)
     return np.concatenate(pieces), total
-
-
-def _piece(view: _View, chosen: np.ndarray, first: int) -> np.ndarray:
-    """The chosen points of a view whose points are number ``first`` and following."""
-    start, stop = np.searchsorted(chosen, [first, first + len(view.depth)])
-    return view.points()[torch.from_numpy(chosen[start:stop] - first).to(view.depth.device)].cpu().numpy()

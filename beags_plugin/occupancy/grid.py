@@ -1,4 +1,4 @@
-"""The per-class visibility voxel grids V_phi and how many voxels around a point are occupied (method, section 5)."""
+"""The per-class visibility voxel grids V_phi and their counts of occupied neighbours (method, section 5)."""
 
 from __future__ import annotations
 
@@ -22,16 +22,15 @@ _HALF = 1 << (_BITS - 1)
 
 
 class VisibilityGrid:
-    """Voxels that hold lifted points of one class and of no other, for all classes at once.
+    """Voxels of all classes that hold lifted points of one class alone.
 
-    D_occ(x, V_phi) is the number of occupied voxels of V_phi among the 27 around x. A class whose grid is empty (it
-    is seen nowhere, or collides everywhere) has D_occ = 0 everywhere: all of it is penalised.
+    D_occ(x, V_phi) is the number of occupied voxels of V_phi among the 27 around x. An empty grid, of a class that is
+    never seen or collides everywhere, has D_occ = 0: all of the class is penalised.
 
-    voxel_size: world units. origin: [3] float64, corner of voxel (0, 0, 0), world. num_classes: ids lie below it,
-        perhaps far apart: memory and speed depend on how many classes have voxels, not on their ids.
+    voxel_size: world units. origin: [3] float64, corner of voxel (0, 0, 0), world. num_classes: ids lie below it;
+        memory and speed depend on the number of classes with voxels.
     keys: [M] int64, sorted, unique: the occupied voxels, 21 bits per axis. classes: [M] int32, the class of each.
-    dense_bytes: see ``DENSE_BYTES``; 0 forces sorted keys. It changes the speed of ``valid``, never its result, and
-        only where the compiled ``lookup`` is absent.
+    dense_bytes: see ``DENSE_BYTES``; 0 forces sorted keys. It affects the speed of ``valid`` without the extension.
     """
 
     def __init__(
@@ -53,9 +52,9 @@ class VisibilityGrid:
         cls, clouds: Iterable[tuple[Tensor, Tensor]], voxel_size: float, origin: Tensor, num_classes: int,
         dense_bytes: int = DENSE_BYTES,
     ) -> VisibilityGrid:  # fmt: skip
-        """The grid of lifted points; a voxel in which classes collide is empty in all (section 5).
+        """Build the grid of lifted points; a voxel in which classes collide is empty in all (method, section 5).
 
-        clouds: pairs (points [P, 3] float, class_ids [P] int), taken one by one, e.g. one per view.
+        clouds: pairs (points [P, 3] float, class_ids [P] int), read one by one, e.g. one per view.
         Raises ``UserError`` if the cloud spans more than 2^21 voxels along an axis.
         """
         origin = origin.to(torch.float64)
@@ -64,8 +63,12 @@ class VisibilityGrid:
         if first is not None:
             clouds = itertools.chain([first], clouds)
             if (module := cuda_extension.module_for(first[0])) is not None:
-                found = _tallied(VoxelTally(module, first[0].device), clouds, origin, voxel_size)
-                return cls(voxel_size, origin, num_classes, *found, dense_bytes)
+                tally = VoxelTally(module, first[0].device)
+                for points, class_ids in clouds:
+                    tally.add_points(points, class_ids.int(), origin, voxel_size)
+                if not tally.all_near():
+                    raise _too_far(voxel_size)
+                return cls(voxel_size, origin, num_classes, *tally.pure(), dense_bytes)
         keys = torch.zeros(0, dtype=torch.int64, device=origin.device)
         classes = torch.zeros(0, dtype=torch.int32, device=origin.device)
         for points, class_ids in clouds:
@@ -74,28 +77,25 @@ class VisibilityGrid:
         keys, inverse, counts = torch.unique(keys, return_inverse=True, return_counts=True)
         alone = counts == 1
         of_key = torch.zeros_like(keys, dtype=torch.int32)
-        of_key[inverse] = classes  # meaningful where one class was there
+        of_key[inverse] = classes  # meaningful for voxels of one class
         return cls(voxel_size, origin, num_classes, keys[alone], of_key[alone], dense_bytes)
 
     def only(self, classes: Tensor) -> VisibilityGrid:
-        """The grid without the voxels of other classes: it takes less memory, and answers the same about these.
-
-        classes: [C] int, ids in any order.
-        """
+        """Return the grid of some classes alone, which needs less memory. classes: [C] int, ids in any order."""
         kept = torch.isin(self.classes, classes.to(self.classes))
         return VisibilityGrid(
             self.voxel_size, self.origin, self.num_classes, self.keys[kept], self.classes[kept], self._dense_bytes
         )
 
     def to(self, device: torch.device | str) -> VisibilityGrid:
-        """The grid there; itself if it lies there already."""
+        """Return the grid on a device; itself if it lies there already."""
         if self.keys.device == torch.device(device):
             return self
         parts = (self.keys.to(device), self.classes.to(device))
         return VisibilityGrid(self.voxel_size, self.origin.to(device), self.num_classes, *parts, self._dense_bytes)
 
     def lookup(self) -> VoxelLookup | None:
-        """The compiled lookup, made when it is first asked for; None without the extension (for a GPU, with CUDA)."""
+        """Return the compiled lookup, built on first use; None without the extension (for a GPU, with CUDA)."""
         if extension.load() is None or (not self.keys.is_cpu and cuda_extension.load() is None):
             return None
         if self._lookup is None:
@@ -103,12 +103,12 @@ class VisibilityGrid:
         return self._lookup
 
     def __getstate__(self) -> dict[str, object]:
-        return {**self.__dict__, "_lookup": None}  # compiled objects cannot be copied; it is made again
+        return {**self.__dict__, "_lookup": None}  # compiled objects cannot be copied
 
     def count(self, points: Tensor, class_ids: Tensor) -> Tensor:
-        """D_occ exactly: [P] int64 in 0..27; the plain definition, for checks and display.
+        """Return D_occ by its definition, [P] int64 in 0..27, for checks and display.
 
-        points: [P, 3] float, world. class_ids: [P] int; of IGNORE there are no voxels.
+        points: [P, 3] float, world. class_ids: [P] int; IGNORE has no voxels.
         """
         if (lookup := self._lookup_for(points)) is not None:
             return lookup.count(points, class_ids)
@@ -116,10 +116,11 @@ class VisibilityGrid:
         if len(asked := (class_ids != IGNORE).nonzero()[:, 0]) < len(points):
             total[asked] = self.count(points[asked], class_ids[asked])
             return total
-        points, usable = self._usable(points)
+        usable = (_scaled(points, self.origin, self.voxel_size).abs() < _HALF).all(-1)
+        points = torch.where(usable[:, None], points, self.origin.to(points))
         voxels = _voxels(points, self.origin, self.voxel_size)
-        for offset in _offsets(points.device):
-            neighbour = voxels + offset
+        for step in itertools.product((-1, 0, 1), repeat=3):
+            neighbour = voxels + voxels.new_tensor(step)
             near = ((neighbour >= -_HALF) & (neighbour < _HALF)).all(-1) & usable
             key = _pack(neighbour.clamp(-_HALF, _HALF - 1))
             position = torch.searchsorted(self.keys, key).clamp_(max=max(len(self.keys) - 1, 0))
@@ -128,9 +129,9 @@ class VisibilityGrid:
         return total
 
     def valid(self, points: Tensor, class_ids: Tensor) -> Tensor:
-        """Whether D_occ > 0: [P] bool, one look-up per point.
+        """Return D_occ > 0, [P] bool, by one look-up per point.
 
-        points: [P, 3] float, world; a point that is not finite is not valid. class_ids: [P] int.
+        points: [P, 3] float, world; False if not finite. class_ids: [P] int.
         """
         if (lookup := self._lookup_for(points)) is not None:
             return lookup.valid(points, class_ids)
@@ -139,11 +140,10 @@ class VisibilityGrid:
         return self._member(voxels, class_ids)
 
     def disc_inside(self, means: Tensor, axes_u: Tensor, axes_v: Tensor, class_ids: Tensor) -> Tensor:
-        """Discs that surely lie in valid voxels: [N] bool; True only if every point of the disc is valid.
+        """Return [N] bool, True only for discs of which every point is valid.
 
-        means: [N, 3] centres, world. axes_u, axes_v: [N, 3], the two half axes, from the centre to the rim, world.
-        class_ids: [N] int. The test looks at the disc's axis-aligned box; one over more than four voxels along an axis
-        gives False.
+        means: [N, 3] centres, world. axes_u, axes_v: [N, 3] half axes, world. class_ids: [N] int. The test uses the
+        disc's axis-aligned box; a box over more than four voxels along an axis gives False.
         """
         if (lookup := self._lookup_for(means)) is not None:
             return lookup.disc_inside(means, axes_u, axes_v, class_ids)
@@ -158,7 +158,7 @@ class VisibilityGrid:
         span = high - low
         inside = (span <= _BOX - 1).all(-1)  # False for NaN
         for step in sorted(itertools.product(range(_BOX), repeat=3), key=max):
-            if max(step) != 1:  # few reach further than to the next voxel
+            if max(step) != 1:  # few boxes reach beyond the next voxel
                 asked = torch.nonzero(inside & (span.amax(-1) >= max(step)))[:, 0]
             if len(asked) == 0:
                 break
@@ -168,7 +168,7 @@ class VisibilityGrid:
         return inside
 
     def state_dict(self) -> dict[str, Tensor]:
-        """All that makes the grid, as tensors."""
+        """Return the grid as tensors."""
         return {
             "voxel_size": torch.tensor(self.voxel_size, dtype=torch.float64),
             "origin": self.origin,
@@ -178,24 +178,16 @@ class VisibilityGrid:
         }
 
     @classmethod
-    def from_state_dict(cls, state: dict[str, Tensor], dense_bytes: int = DENSE_BYTES) -> VisibilityGrid:
-        """The grid of which ``state_dict`` gave ``state``."""
+    def from_state_dict(cls, state: dict[str, Tensor]) -> VisibilityGrid:
+        """Restore the grid of a ``state_dict``."""
         size, num_classes = float(state["voxel_size"]), int(state["num_classes"])
-        return cls(size, state["origin"], num_classes, state["keys"], state["classes"], dense_bytes)
+        return cls(size, state["origin"], num_classes, state["keys"], state["classes"])
 
     def _lookup_for(self, points: Tensor) -> VoxelLookup | None:
-        compiled = cuda_extension.supports(points)
-        return self.lookup() if compiled else None
-
-    def _usable(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        usable = (_scaled(points, self.origin, self.voxel_size).abs() < _HALF).all(-1)
-        return torch.where(usable[:, None], points, self.origin.to(points)), usable
+        return self.lookup() if cuda_extension.supports(points) else None
 
     def _prepare_valid(self) -> None:
-        """The valid voxels, i.e. those next to an occupied one, cropped to a box with a rim of invalid voxels.
-
-        What is needed without the compiled lookup; made when it is first asked for.
-        """
+        """Collect, on first use, the valid voxels (next to an occupied one) in a box with a border of invalid ones."""
         if self._prepared:
             return
         self._prepared = True
@@ -203,7 +195,7 @@ class VisibilityGrid:
         device = voxels.device
         low = voxels.amin(0) if len(voxels) else torch.zeros(3, dtype=torch.int64, device=device)
         high = voxels.amax(0) if len(voxels) else low
-        self._base = low - 2  # one voxel for the dilation, one for the rim
+        self._base = low - 2  # one voxel for the dilation, one for the border
         dims = high - low + 5
         self._last = (dims - 1).tolist()
         x, y, z = dims.tolist()
@@ -215,7 +207,7 @@ class VisibilityGrid:
         linear = self._ranks.ranks(self.classes).long() * self._per_class
         for axis, stride in enumerate(self._strides):
             linear = linear + (voxels[:, axis] - self._base[axis]) * stride
-        for stride in self._strides:  # the 27 neighbours, axis by axis; the rim keeps them inside the box
+        for stride in self._strides:  # the 27 neighbours, axis by axis; the border keeps them inside the box
             linear = torch.unique(torch.cat([linear - stride, linear, linear + stride]))
         self._valid_keys = linear
         self._volume: Tensor | None = None
@@ -225,12 +217,12 @@ class VisibilityGrid:
             self._valid_keys = linear[:0]
 
     def _member(self, voxels: Tensor, class_ids: Tensor) -> Tensor:
-        """Validity of voxels given as whole floats [P, 3] relative to the box; those outside are moved to its rim."""
+        """Look up whole float voxels [P, 3] relative to the box; those outside are moved to its border."""
         ranks = self._ranks.ranks(class_ids)
-        known = ranks < len(self._ranks)  # a class without voxels has none that is valid
+        known = ranks < len(self._ranks)
         linear = ranks.masked_fill(~known, 0).long() * self._per_class
         for axis, stride in enumerate(self._strides):
-            # nan_to_num: NaN goes to the rim too
+            # nan_to_num: NaN goes to the border too
             index = voxels[:, axis].nan_to_num(nan=0.0).clamp(0, self._last[axis])
             linear = linear + index.long() * stride
         if self._volume is not None:
@@ -242,7 +234,7 @@ class VisibilityGrid:
 
 
 def _scaled(points: Tensor, origin: Tensor, size: float) -> Tensor:
-    """Voxel indices as whole floats. Each step is monotonic, which ``disc_inside`` relies on."""
+    """Return voxel indices as whole floats. Each step is monotonic, as ``disc_inside`` requires."""
     return torch.floor((points - origin.to(points)) / size)
 
 
@@ -260,17 +252,8 @@ def _too_far(size: float) -> UserError:
     )
 
 
-def _tallied(tally: VoxelTally, clouds: Iterable[tuple[Tensor, Tensor]], origin: Tensor, size: float):
-    """Keys and classes of the voxels of one class alone, counted on a GPU."""
-    for points, class_ids in clouds:
-        tally.add_points(points, class_ids.int(), origin, size)
-    if not tally.all_near():
-        raise _too_far(size)
-    return tally.pure()
-
-
 def _pack(voxels: Tensor) -> Tensor:
-    """[P, 3] int64 indices in -2^20..2^20-1 to [P] int64 keys."""
+    """Pack [P, 3] int64 indices in -2^20..2^20-1 into [P] int64 keys."""
     x, y, z = (voxels + _HALF).unbind(-1)
     return (x << 2 * _BITS) | (y << _BITS) | z
 
@@ -281,12 +264,7 @@ def _unpack(keys: Tensor) -> Tensor:
 
 
 def _unique_pairs(keys: Tensor, classes: Tensor, num_classes: int) -> tuple[Tensor, Tensor]:
-    """The different (key, class) pairs; a pair does not fit in 64 bits, a key's rank with a class does."""
+    """Return the distinct (key, class) pairs; 64 bits hold a key's rank and a class, but no key and class."""
     voxels, rank = torch.unique(keys, return_inverse=True)
     pairs = torch.unique(rank * num_classes + classes)
     return voxels[pairs // num_classes], (pairs % num_classes).int()
-
-
-def _offsets(device: torch.device) -> list[Tensor]:
-    steps = (-1, 0, 1)
-    return [torch.tensor([x, y, z], device=device) for x in steps for y in steps for z in steps]

@@ -1,4 +1,4 @@
-"""Random points of the UV disc that depend on their counters alone, not on what else is drawn (method, section 6)."""
+"""Random points of the UV disc by a hash of counters, whatever else is sampled (method, section 6)."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ RADIUS = 3.0  # of the disc, in units of the scales (method, section 6)
 
 _WORD = (1 << 64) - 1
 _GOLDEN = 0x9E3779B97F4A7C15  # 2^64 / golden ratio: counters times it are spread over all bits
-_MULTIPLIERS = (0xBF58476D1CE4E5B9, 0x94D049BB133111EB)  # of the SplitMix64 finaliser, as are the shifts 30, 27, 31
+_MULTIPLIERS = (0xBF58476D1CE4E5B9, 0x94D049BB133111EB)  # of SplitMix64, as are the shifts 30, 27, 31
 
 
 def _mix(word: int) -> int:
-    """The SplitMix64 finaliser of one 64-bit word."""
+    """Apply the SplitMix64 finaliser to one 64-bit word."""
     word = ((word ^ (word >> 30)) * _MULTIPLIERS[0]) & _WORD
     word = ((word ^ (word >> 27)) * _MULTIPLIERS[1]) & _WORD
     return word ^ (word >> 31)
@@ -30,19 +30,19 @@ def _logical_shift(words: Tensor, bits: int) -> Tensor:
 
 
 def _mix_tensor(words: Tensor) -> Tensor:
-    """``_mix`` of every element of an int64 tensor (multiplication wraps)."""
+    """Apply ``_mix`` to every element of an int64 tensor (multiplication wraps)."""
     words = (words ^ _logical_shift(words, 30)) * _signed(_MULTIPLIERS[0])
     words = (words ^ _logical_shift(words, 27)) * _signed(_MULTIPLIERS[1])
     return words ^ _logical_shift(words, 31)
 
 
 def sample_stream(seed: int, step: int) -> int:
-    """The 64 bits that seed and step give to all counters of one step."""
+    """Hash seed and step into the 64 bits shared by all counters of one step."""
     return _mix((_mix(seed & _WORD) + step * _GOLDEN) & _WORD)
 
 
 def sample_words(seed: int, step: int, gaussians: Tensor, samples: Tensor) -> Tensor:
-    """64 random bits for every (sample, Gaussian): a hash of seed, step, Gaussian and sample.
+    """Hash seed, step, Gaussian and sample into 64 random bits for every (sample, Gaussian).
 
     gaussians: [N] int64 indices. samples: [Z] int64 sample numbers. Returns [Z, N] int64.
     """
@@ -51,12 +51,11 @@ def sample_words(seed: int, step: int, gaussians: Tensor, samples: Tensor) -> Te
 
 
 def disc_points(words: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """(u, v), uniform in the disc of radius 3, from 64 random bits each.
+    """Return (u, v), uniform in the disc of radius 3, from int64 words of any shape.
 
-    words: int64 of any shape. Returns two tensors of that shape; float32 and float64 give the same points, up to
-    rounding.
+    float32 and float64 give the same points, up to rounding.
     """
-    # 24 bits a coordinate (what float32 holds); the two halves of the word are independent.
+    # 24 bits a coordinate, as in float32; the two halves of the word are independent
     radial = _logical_shift(words, 40).to(dtype) * 2.0**-24
     angle = ((words >> 8) & 0xFFFFFF).to(dtype) * (2.0**-24 * 2.0 * math.pi)
     radius = RADIUS * radial.sqrt()  # area grows with the square of the radius

@@ -1,4 +1,4 @@
-"""Where the 3D occupancy loss acts, per Gaussian: for looking at, and for figures (method, section 6; E9)."""
+"""The 3D occupancy loss per Gaussian, for display and figures (method, section 6; E9)."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.occupancy.sampling import RADIUS, disc_points, sample_words
 
-_CHUNK_POINTS = 1 << 18  # points looked up at a time: bounds the memory, never changes the result
+_CHUNK_POINTS = 1 << 18  # points looked up at a time: bounds the memory
 
 
 @dataclass(frozen=True)
 class DiscSums:
-    """Of each Gaussian, sums over points x_r of its disc, both [N] float64; 0 for surfels that are not finite.
+    """Sums over points x_r of the disc of each Gaussian, [N] float64; 0 for Gaussians that are not finite.
 
-    whole: sum_r G(x_r). wrong: sum_r G(x_r) Q(x_r), what of it lies where its class was never seen. The loss is the
-    mean over Gaussians of opacity times ``wrong``, divided by the number of points.
+    whole: sum_r G(x_r). wrong: sum_r G(x_r) Q(x_r), the part at places where the class was never seen. The loss is
+    the mean over Gaussians of opacity times ``wrong``, divided by the number of points.
     """
 
     whole: Tensor
@@ -37,12 +37,12 @@ def disc_sums(
     seed: int = 0,
     step: int = 0,
 ) -> DiscSums:
-    """How much of each Gaussian lies where its class was never seen, and how much there is of it in all (E9).
+    """Sum G and G Q over points of each Gaussian's disc (E9).
 
     Q(x) = 1 where D_occ(x, V_phi) = 0, else 0; the x_r are uniform in the UV disc, as in the loss.
 
-    surfels: N surfels. class_ids: [N] int, phi. samples: Z, points per Gaussian. background: whether the loss acts on
-    the Gaussians of class 0, of which else nothing counts as wrong. seed, step: decide the points.
+    surfels: N Gaussians. class_ids: [N] int, phi. samples: Z, points per Gaussian. background: whether the loss acts
+    on class 0; otherwise its ``wrong`` is 0. seed, step: determine the points.
     """
     means = surfels.means.detach()
     axes = surfels.log_scales.detach().exp()[:, None, :] * rotation_from_quat(surfels.quats.detach())[..., :2]
@@ -68,6 +68,6 @@ def disc_sums(
 def violation_shares(
     surfels: Surfels, class_ids: Tensor, grid: VisibilityGrid, samples: int = 20, background: bool = True, seed: int = 0
 ) -> Tensor:
-    """The share of each Gaussian that lies where its class was never seen, [N] float in 0..1; see ``disc_sums``."""
+    """Return ``wrong`` / ``whole`` of ``disc_sums``, [N] float in 0..1."""
     sums = disc_sums(surfels, class_ids, grid, samples, background, seed)
     return (sums.wrong / sums.whole.clamp_min(torch.finfo(torch.float64).tiny)).to(surfels.means.dtype)

@@ -14,17 +14,17 @@ _LEAST_NEIGHBOURS = 16  # keep enough points that the rounding of k / f stays sm
 def voxel_size(
     points: np.ndarray, k: int = 2000, seed: int = 0, num_queries: int = 2000, max_reference: int = MAX_REFERENCE
 ) -> float:
-    """s = (k / rho)^(1/3) with rho = k / (4/3 pi d_k^3), so s = (4 pi / 3)^(1/3) d_k (E8); world units.
+    """Return s = (k / rho)^(1/3) with rho = k / (4/3 pi d_k^3), so s = (4 pi / 3)^(1/3) d_k (E8); world units.
 
-    points: [P, 3] float, P >= 1. k: neighbours; seed: decides which points are thinned away and sampled.
-    Raises ``ValueError`` for an empty cloud; warns, and says what it does instead, where d_k cannot be measured.
+    points: [P, 3] float, P >= 1. k: neighbours; seed: of thinning and sampling.
+    Raises ``ValueError`` for an empty cloud; warns and falls back if d_k cannot be measured.
     """
     chosen = reference_indices(len(points), k, seed, max_reference)
     return voxel_size_of_reference(points[chosen], len(points), k, seed, num_queries)
 
 
 def reference_indices(total: int, k: int, seed: int = 0, max_reference: int = MAX_REFERENCE) -> np.ndarray:
-    """Sorted int64 indices of the points to keep of ``total``: all, or about ``max_reference`` drawn at random."""
+    """Return sorted int64 indices of the kept points of ``total``: all, or about ``max_reference`` at random."""
     count = max(max_reference, math.ceil(total * min(1.0, _LEAST_NEIGHBOURS / k)))
     if total <= count:
         return np.arange(total)
@@ -34,7 +34,7 @@ def reference_indices(total: int, k: int, seed: int = 0, max_reference: int = MA
 def voxel_size_of_reference(
     reference: np.ndarray, total: int, k: int = 2000, seed: int = 0, num_queries: int = 2000
 ) -> float:
-    """``voxel_size`` of a cloud of ``total`` points of which only ``reference`` [R, 3] was kept, evenly at random."""
+    """Return ``voxel_size`` of ``total`` points, of which ``reference`` [R, 3] was kept evenly at random."""
     from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
 
     if k < 1:
@@ -45,7 +45,7 @@ def voxel_size_of_reference(
     available = len(reference) - 1  # the query itself is no neighbour
     kept = len(reference) / total  # 1 / f
     neighbours = max(1, round(k * kept))  # k / f: with k fixed, thinning would enlarge the voxel
-    # d grows with the cube root of k; this undoes the rounding of k / f only.
+    # d grows with the cube root of k; this undoes the rounding of k / f
     rounding = (k * kept / neighbours) ** (1 / 3)
     if neighbours > available:
         if available:
@@ -63,7 +63,7 @@ def voxel_size_of_reference(
         neighbours = min(2 * neighbours, available)
         distance = _mean_distance(tree, queries, neighbours)
     if distance == 0.0:
-        # Any length serves for one place; relative to the coordinates, so that it scales with the scene.
+        # any length serves for one place; this one scales with the scene
         size = 1e-3 * (float(np.abs(reference).max()) or 1.0)
         warnings.warn(f"all points of the views coincide, so the voxel size is set to {size:.4g}.", stacklevel=2)
         return size
@@ -76,7 +76,7 @@ def voxel_size_of_reference(
 
 
 def _mean_distance(tree, queries: np.ndarray, neighbours: int) -> float:
-    """Mean distance d_k to the k-th nearest neighbour; the queries are points of the tree, hence k + 1."""
+    """Return the mean distance d_k to the k-th nearest neighbour; queries are points of the tree, hence k + 1."""
     if tree.n <= neighbours:
         return 0.0
     distances, _ = tree.query(queries, k=[neighbours + 1], workers=-1)

@@ -1,1 +1,1 @@
-"""Stages between base training and refinement: consistent labels, classes, grids (method, sections 2, 3 and 5)."""
+"""Stages between base training and refinement: consistent labels, classes and grids."""

@@ -1,7 +1,6 @@
-"""Split the Gaussians at class borders before refinement, so that they can follow them (our extension of the method).
+"""Split the Gaussians at class boundaries before refinement (our extension of the method).
 
-The base places one Gaussian where a pixel or two of colour need no more; at a border of two classes each of its sides
-must then end in a straight edge, which one Gaussian cannot draw.
+One Gaussian of the base may suffice for colour across a boundary of two classes, but it cannot form the straight edge.
 """
 
 from __future__ import annotations
@@ -24,25 +23,22 @@ from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.system.errors import UserError
 
-BAND = 1
-"""A pixel is at a border if another class lies within so many pixels of it."""
-MIN_SHARE = 0.2
-"""A Gaussian is split if at least this share of its contributions to labelled pixels is at borders ..."""
-MIN_SIGMA = 0.7
-"""... and its longer scale covers more than so many pixels in the view nearest to it."""
+BAND = 1  # pixels from another class, at most, for a pixel at a boundary
+MIN_SHARE = 0.2  # least share of a split Gaussian's contributions that is at boundaries
+MIN_SIGMA = 0.7  # pixels that the longer scale of a split Gaussian exceeds in its nearest view
 
 
 @dataclass(frozen=True)
 class BorderSplitConfig:
-    """Which Gaussians are split in two, along their longer axis, before refinement.
+    """Options of splitting Gaussians in two, along their longer axis, before refinement.
 
-    rounds: how often; classes are assigned again after the last. 0, as in the paper, never.
+    rounds: number of splits, before classes are assigned again; 0 in the paper.
     """
 
     rounds: int = 0
 
     def check(self) -> None:
-        """Raise ``UserError`` for a value that makes no sense."""
+        """Raise ``UserError`` for a negative number of rounds."""
         if self.rounds < 0:
             raise UserError(f"the border split has rounds = {self.rounds}: it must be 0 or more.")
 
@@ -57,9 +53,9 @@ def split_at_borders(
     config: BorderSplitConfig,
     progress: Callable[[int, int], None] | None = None,
 ) -> EditedScene:
-    """Split those at the borders of the masks ``config.rounds`` times and assign classes again.
+    """Split the Gaussians at boundaries of the labels ``config.rounds`` times and assign classes again.
 
-    surfels: N surfels without gradients. labels: per camera [H, W] int32 class ids below ``num_classes`` or IGNORE, M'.
+    surfels: N Gaussians without gradients. labels: per camera M', [H, W] int32 ids below ``num_classes`` or IGNORE.
     """
     total, done = (config.rounds + 1) * len(cameras), 0
 
@@ -80,22 +76,22 @@ def split_at_borders(
 
 
 def border_band(labels: Tensor, width: int) -> Tensor:
-    """[H, W] int32: 1 where a pixel of another class is at most ``width`` rows and columns away, else 0.
+    """Return [H, W] int32: 1 where another class is at most ``width`` rows and columns away, else 0.
 
-    labels: [H, W] int32 class ids or IGNORE; unlabelled pixels stay IGNORE and border on nothing.
+    labels: [H, W] int32 class ids or IGNORE; unlabelled pixels stay IGNORE and make no boundary.
     """
     unlabelled = labels == IGNORE
     size = 2 * width + 1
-    # IGNORE must be neither the smallest nor the largest of a window that it lies in
+    # IGNORE must be neither the smallest nor the largest of its window
     highest = labels.masked_fill(unlabelled, -1).float()[None, None]
-    lowest = -labels.float()[None, None]  # IGNORE is above all classes
+    lowest = -labels.float()[None, None]
     largest = torch.nn.functional.max_pool2d(highest, size, stride=1, padding=width)[0, 0]
     smallest = -torch.nn.functional.max_pool2d(lowest, size, stride=1, padding=width)[0, 0]
     return (largest != smallest).int().masked_fill_(unlabelled, IGNORE)
 
 
 def _share_of_class(surfels, cameras, bands, rasterizer, settings, tick) -> Tensor:
-    """[N] share of each surfel's contributions that falls on pixels of value 1; 0 where there are none."""
+    """Return [N], the share of each Gaussian's contributions on pixels of value 1; 0 without contributions."""
     inputs = geometry_inputs(surfels)
     settings = replace(settings, geometry=False, distortion=False)
     total = torch.zeros(len(surfels), 2, dtype=torch.float64, device=surfels.means.device)
@@ -107,7 +103,7 @@ def _share_of_class(surfels, cameras, bands, rasterizer, settings, tick) -> Tens
 
 
 def largest_sigma(surfels: Surfels, cameras: Sequence[Camera]) -> Tensor:
-    """[N] pixels that the longer scale covers, seen face on, in the view where it is largest; 0 behind all cameras."""
+    """Return [N], the longer scale face on in pixels of the view where it is largest; 0 behind all cameras."""
     per_length = torch.zeros_like(surfels.opacity_logits)
     for camera in cameras:
         depth = (surfels.means @ camera.rotation.T + camera.translation)[:, 2]

@@ -1,4 +1,4 @@
-"""Masks made consistent across views: depth of every view, then reprojection (method, section 2)."""
+"""Consistent labels of all views: depth of every view, then reprojection (method, section 2)."""
 
 from __future__ import annotations
 
@@ -20,23 +20,20 @@ from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
 from beags_plugin.system.processes import each_view
 
-AUTO = "auto"
-PAIRWISE_PIXELS = 100_000_000
-"""Up to so many pixels in all views "auto" is pairwise, which holds 5 bytes for each: 0.5 GB."""
-PAIRWISE_PAIRS = 10_000_000_000
-"""Up to so many pairs of a voting pixel and a view "auto" is pairwise: 7 to 9 ns each on one core at 256 x 192."""
+AUTO = "auto"  # pairwise up to the two limits, else voxel
+PAIRWISE_PIXELS = 100_000_000  # in all views; pairwise holds 5 bytes for each: 0.5 GB
+PAIRWISE_PAIRS = 10_000_000_000  # of a voting pixel and a view: 7 to 9 ns each on one core at 256 x 192
 
 Stage = Callable[[str], AbstractContextManager[Progress | None]]
-"""Opens a named stage and gives its progress callback; a command line draws a bar with it."""
+"""Opens a named stage and returns its progress callback, such as a progress bar."""
 
 
 @dataclass(frozen=True)
 class ConsistentMasks:
-    """M' of V views.
+    """M' of V views, held compressed.
 
-    ranked: ranks of the classes, for the stages. labels: class ids, for the losses; the same maps where ids are ranks.
-    confidence: per view [H, W] uint8, the winner's share of the votes in steps of 1/255; None: nothing was reprojected.
-    All are held compressed.
+    ranked: ranks of the classes, for the stages. labels: class ids, for the losses; the same maps if ids are ranks.
+    confidence: per view [H, W] uint8, the winner's share of the votes in steps of 1/255; None without reprojection.
     """
 
     ranked: LabelMaps
@@ -45,27 +42,32 @@ class ConsistentMasks:
 
 
 def chosen_reprojection(name: str, cameras: Sequence[Camera], labels: LabelMaps) -> tuple[str, str | None]:
-    """The reprojection that ``name`` means for these views, and where that was chosen here, why: a line for a reader.
+    """Resolve "auto" for these views, with a line of reasons; any other name is returned with None.
 
-    "auto" is pairwise, which is a little more exact, where its memory (pixels) and its time (pairs) are small; else
-    voxel, which grows with neither. Any other name means itself.
+    "auto" is pairwise, which is slightly more exact, if its memory (pixels) and its time (pairs) are small; else voxel,
+    which grows with neither.
     """
     if name != AUTO:
         return name, None
     sizes = [camera.height * camera.width for camera in cameras]
     voting = [size for size, mask in zip(sizes, labels.stored, strict=True) if mask is not None]
     pixels, pairs = sum(sizes), sum(voting) * len(cameras)
-    few = pixels <= PAIRWISE_PIXELS and pairs <= PAIRWISE_PAIRS
-    return "pairwise" if few else "voxel", (
-        f"reprojection {'pairwise' if few else 'voxel'}: {len(cameras)} views have {pixels / 1e6:.3g} million pixels, "
+    chosen = "pairwise" if pixels <= PAIRWISE_PIXELS and pairs <= PAIRWISE_PAIRS else "voxel"
+    return chosen, (
+        f"reprojection {chosen}: {len(cameras)} views have {pixels / 1e6:.3g} million pixels, "
         f"{pairs / 1e9:.3g} billion pairs of a pixel and a view; pairwise is taken up to {PAIRWISE_PIXELS / 1e6:g} "
         f"million and {PAIRWISE_PAIRS / 1e9:g} billion"
     )
 
 
 def masks_as_they_are(labels: LabelMaps, cameras: Sequence[Camera], known: ClassRanks) -> ConsistentMasks:
-    """The masks without reprojection; a view that has none is all IGNORE."""
-    whole = LabelMaps(_or_ignore(mask, camera) for mask, camera in zip(labels, cameras, strict=True))
+    """Return the labels without reprojection; a view without a mask is all IGNORE."""
+    whole = LabelMaps(
+        torch.full((camera.height, camera.width), IGNORE, dtype=torch.int32, device=camera.viewmat.device)
+        if mask is None
+        else mask
+        for mask, camera in zip(labels, cameras, strict=True)
+    )
     return ConsistentMasks(translated(whole, known, known.ranks), whole, None)
 
 
@@ -77,20 +79,19 @@ def reprojected_masks(
     config,
     progress: Progress | None = None,
 ) -> ConsistentMasks:
-    """The masks of all views, voted by those that have one.
+    """Return the labels of all views, voted by the views with masks; voted views are held one at a time.
 
-    depths: per view [H, W], of the surface; they may lie on disk. config: a ``preparation.PreparationConfig`` whose
-    reprojection is a registered one. Of what the votes give, one view is held at a time.
+    depths: per view [H, W], of the surface, perhaps on disk. config: a ``PreparationConfig`` with a registered
+    reprojection.
     """
     given = translated(labels, known, known.ranks)
     ranked, consistent, confidence = LabelMaps(), LabelMaps(), CompressedMaps()
     reproject = REPROJECTIONS.get(config.reprojection)
-    found = reproject(depths, cameras, given, len(known), tau=config.tau, progress=progress)
-    for mask in found:
+    for mask in reproject(depths, cameras, given, len(known), tau=config.tau, progress=progress):
         ranked.append(mask.labels)
         confidence.append((mask.confidence * 255.0 + 0.5).to(torch.uint8))
         if config.min_confidence > 0.0:
-            # for the losses alone: the border split looks for the very rims that are doubtful
+            # for the losses alone: the border split looks for the very boundaries that are doubtful
             doubtful = mask.confidence < config.min_confidence
             consistent.append(_translated(mask.labels, known.class_ids).masked_fill_(doubtful, IGNORE))
     if len(ranked) != len(cameras):
@@ -101,7 +102,7 @@ def reprojected_masks(
 
 
 def translated(labels: LabelMaps, known: ClassRanks, table: Callable[[Tensor], Tensor]) -> LabelMaps:
-    """The maps with ``table`` of their values, IGNORE as it is; the same maps where ranks are ids."""
+    """Return the maps with ``table`` applied to all but IGNORE; the same maps if ranks are ids."""
     return labels if known.trivial else LabelMaps(None if mask is None else _translated(mask, table) for mask in labels)
 
 
@@ -118,17 +119,13 @@ def render_depths(
     depth: str,
     progress: Progress | None = None,
 ) -> Iterator[Tensor]:
-    """Per view [H, W], the depth of the surface, drawn when it is asked for: see ``drawing.surface_depth``."""
+    """Render the surface depth [H, W] of each view in turn: see ``rasterizers.rendering.surface_depth``."""
 
     @torch.no_grad()
     def render(index: int) -> Tensor:
         background = surfels.means.new_zeros(3)
-        drawn = rasterizer.rasterize(geometry_inputs(surfels), cameras[index], settings, background)
-        return surface_depth(drawn, depth)
+        return surface_depth(
+            rasterizer.rasterize(geometry_inputs(surfels), cameras[index], settings, background), depth
+        )
 
     return each_view(len(cameras), render, progress)
-
-
-def _or_ignore(mask: Tensor | None, camera: Camera) -> Tensor:
-    size, device = (camera.height, camera.width), camera.viewmat.device
-    return mask if mask is not None else torch.full(size, IGNORE, dtype=torch.int32, device=device)

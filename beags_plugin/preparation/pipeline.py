@@ -1,4 +1,4 @@
-"""From a trained base and raw masks to all that refinement needs (method, sections 2, 3 and 5), stage by stage."""
+"""The stages between a trained base with masks and refinement (method, sections 2, 3 and 5)."""
 
 from __future__ import annotations
 
@@ -29,32 +29,27 @@ from beags_plugin.preparation.consistent_masks import (
     reprojected_masks,
 )
 from beags_plugin.preparation.refiner import AssignedScene, EditedScene, Refiner
-from beags_plugin.preparation.summary import (
-    assignment_summary,
-    reprojection_summary,
-    split_summary,
-)
+from beags_plugin.preparation.summary import assignment_summary, reprojection_summary, split_summary
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import check_surface_depth
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.filed_tensors import filed
 
-LEAST_K = 10  # nearer neighbours tell the noise of the depth rather than the distance of points
+LEAST_K = 10  # nearer neighbours measure the noise of the depth rather than the distance of points
 
 
 @dataclass(frozen=True)
 class PreparationConfig:
     """Options of the stages between base training and refinement.
 
-    reprojection: how masks are made consistent: "pairwise", "voxel" or another name of ``masks.REPROJECTIONS``; "auto"
-        chooses of these two by the number of views and pixels (``consistent_masks.chosen_reprojection``); "none" keeps
-        the masks.
-    min_confidence: reprojected pixels whose winner has a smaller share of the votes are IGNORE to the losses.
+    reprojection: "pairwise", "voxel" or another name of ``masks.REPROJECTIONS``; "auto" chooses one of these two
+        (``consistent_masks.chosen_reprojection``); "none" keeps the masks.
+    min_confidence: reprojected pixels with a smaller share of votes for the winner are IGNORE to the losses.
     tau: pairwise: a vote counts if its point is visible: |z - D| <= tau z; infinity counts every vote (E5).
-    depth: which depth is lifted into space, "median" or "expected": see ``rasterizers.rendering.surface_depth``.
+    depth: the lifted depth, "median" or "expected": see ``rasterizers.rendering.surface_depth``.
     k: neighbours that set the voxel size (E8).
-    k_pixels: training pixels for which k is stated; fewer of them lift a thinner cloud and take k in proportion, so
-        that voxels keep their size. 0, as in the paper, takes k as it is.
+    k_pixels: training pixels for which k is stated; with fewer, k shrinks in proportion, so that voxels keep their
+        size. 0, as in the paper, takes k as it is.
     """
 
     reprojection: str = AUTO
@@ -65,12 +60,12 @@ class PreparationConfig:
     k_pixels: int = 0
 
     def check(self) -> None:
-        """Raise ``UserError`` for a value that no stage can work with: hours before the stages would say so."""
+        """Raise ``UserError`` for a value that a stage would refuse, hours before that stage."""
         choices = [AUTO, "none", *REPROJECTIONS.names()]
         if self.reprojection not in choices:
             raise UserError(f"there is no reprojection {self.reprojection!r}: choose one of {', '.join(choices)}.")
         if self.reprojection not in (AUTO, "none"):
-            REPROJECTIONS.get(self.reprojection)  # one of another package may not load
+            REPROJECTIONS.get(self.reprojection)  # that of another package may not load
         if not 0.0 <= self.min_confidence <= 1.0:
             raise UserError(f"min_confidence is {self.min_confidence}: it must be a share of the votes, 0 to 1.")
         check_surface_depth(self.depth)
@@ -82,7 +77,7 @@ class PreparationConfig:
             raise UserError(f"k_pixels is {self.k_pixels}: it must be a number of pixels, or 0 to take k as it is.")
 
     def neighbours(self, cameras: Sequence[Camera]) -> int:
-        """The k of a scene with these training views, at least ``LEAST_K`` where it was made smaller."""
+        """Return k for these training views, at least ``LEAST_K`` if it shrinks."""
         pixels = sum(camera.height * camera.width for camera in cameras)
         if self.k_pixels == 0 or pixels >= self.k_pixels:
             return self.k
@@ -91,17 +86,13 @@ class PreparationConfig:
 
 @dataclass(frozen=True)
 class Preparation:
-    """What the stages made.
+    """Results of the stages.
 
-    labels: per training view [H, W] int32, M'; held in the narrowest type, compressed.
-    confidence: per training view [H, W] uint8, share of the winning votes times 255, held compressed; None where
-        nothing was reprojected.
-    assignment: the class of every surfel and its margin.
-    edited: the scene and the classes that refinement starts from, where surfels were split; None where it
-        starts from the base.
+    labels, confidence: per training view, see ``ConsistentMasks``.
+    assignment: classes of the base.
     grid: the visibility voxel grids, or None if the refiner needs none.
-    summary: one line for a reader per stage.
-    seconds: wall time per stage.
+    edited: start of refinement if Gaussians were split; None if it starts from the base.
+    summary: a line of text per stage. seconds: wall time per stage.
     """
 
     labels: LabelMaps
@@ -127,16 +118,15 @@ def prepare(
     seed: int = 0,
     stage: Stage = lambda name: nullcontext(),
 ) -> Preparation:
-    """Make masks consistent, assign classes, split at borders if the refiner trains, build the voxel grids.
+    """Make labels consistent, assign classes, split at boundaries if the refiner trains, build the voxel grids.
 
-    surfels: the trained base, N surfels.
-    cameras: V training views; labels: per view [H, W] int32 class ids or IGNORE, None where there is no mask; held in
-        the narrowest type and compressed, as ``LabelMaps`` already are.
-    class_names: id to name, background (0) included; ids may lie far apart: the stages work on their ranks.
-    background_voxels: whether a loss will ask the grid about the background; if none will, those voxels are not kept.
-    What is as large as the photos lies in temporary files: memory grows with the views by compressed masks, and by
-    what the voxels of the scene take. "pairwise" alone reads depth and masks of all views into memory.
-    Raises ``UserError`` if no view has a mask or no mask names an object.
+    surfels: the trained base, N Gaussians.
+    cameras: V training views; labels: per view [H, W] int32 class ids or IGNORE, or None; held as ``LabelMaps``.
+    class_names: id to name with background (0), in any range: the stages work on ranks.
+    background_voxels: False drops the voxels of the background, for losses that ignore it.
+    Data as large as the photos lies in temporary files: memory grows by compressed labels per view and by voxels. Only
+    "pairwise" reads depth and labels of all views into memory.
+    Raises ``UserError`` if no mask names an object.
     """
     maps = labels if isinstance(labels, LabelMaps) else LabelMaps(labels)
     if not any(mask is not None and bool(((mask > 0) & (mask != IGNORE)).any()) for mask in maps):
@@ -176,7 +166,7 @@ def prepare(
     with stage("Building voxel grids") as progress:
         grid = refiner.build_grid(scene, k, progress)
     if grid is not None:
-        asked = torch.unique(class_ids)  # classes are fixed: no loss can ask about one that has no Gaussians
+        asked = torch.unique(class_ids)  # classes are fixed: no loss asks about one without Gaussians
         grid = grid.only(asked if background_voxels else asked[asked != 0])
         seconds["voxel grids"] = time.perf_counter() - start
         summary.append(f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {k})")
@@ -191,25 +181,16 @@ def _timed(name: str, seconds: dict[str, float]) -> Iterator[None]:
 
 
 def _consistent_masks(
-    surfels,
-    cameras,
-    maps: LabelMaps,
-    known: ClassRanks,
-    rasterizer,
-    settings,
-    config,
-    stage: Stage,
-    summary: list[str],
+    surfels, cameras, maps: LabelMaps, known: ClassRanks, rasterizer, settings, config, stage: Stage, summary: list[str]
 ) -> ConsistentMasks:
-    """The masks of all views, reprojected if that is asked for."""
+    """Return the labels of all views, reprojected unless that is off, and add lines to ``summary``."""
     if config.reprojection == "none":
         summary.append("reprojection: off, masks used as they are")
         return masks_as_they_are(maps, cameras, known)
     method, why = chosen_reprojection(config.reprojection, cameras, maps)
-    with stage("Rendering depth") as progress:  # as large as all photos in float: it lies in a temporary file
-        depths = filed(
-            render_depths(surfels, cameras, rasterizer, settings, config.depth, progress), surfels.means.device
-        )
+    with stage("Rendering depth") as progress:  # as large as all photos in float
+        rendered = render_depths(surfels, cameras, rasterizer, settings, config.depth, progress)
+        depths = filed(rendered, surfels.means.device)
     with stage("Reprojecting masks") as progress:
         masks = reprojected_masks(depths, cameras, maps, known, replace(config, reprojection=method), progress)
     if why is not None:
@@ -219,7 +200,7 @@ def _consistent_masks(
 
 
 def known_classes(labels: Sequence[Tensor | None], class_names: dict[int, str]) -> ClassRanks:
-    """The named classes and those between them that masks hold; ``UserError`` for ids above the last named one."""
+    """Rank the named classes and the unnamed ids in labels; raise ``UserError`` for ids above the last named one."""
     named = ClassRanks(torch.tensor(sorted(class_names)))
     if named.trivial:
         return named  # the stages check the masks

@@ -1,4 +1,4 @@
-"""What a refiner is: the part of an extraction method that comes after class assignment."""
+"""The interface of refiners: the part of an extraction method after class assignment."""
 
 from __future__ import annotations
 
@@ -20,14 +20,12 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class AssignedScene:
-    """A trained scene whose surfels have classes; the same input for every refiner, so that they can be compared.
+    """A trained scene with classes, the common input of all refiners.
 
-    surfels: the base scene, N surfels, without gradients.
-    class_ids: [N] int32, phi.
-    cameras: the training views.
-    labels: per training view [H, W] int32, the masks M' that all refiners are given.
-    num_classes: ids lie below it, perhaps far apart: see ``labels.class_ranks`` before an array has an entry per class.
-    depth: which depth stands for the surface: see ``rasterizers.rendering.surface_depth``.
+    surfels: the base scene, N Gaussians, without gradients. class_ids: [N] int32, phi.
+    cameras: the training views. labels: per training view M', [H, W] int32.
+    num_classes: ids lie below it, perhaps far apart: see ``labels.class_ranks`` for arrays with an entry per class.
+    depth: the depth of the surface: see ``rasterizers.rendering.surface_depth``.
     """
 
     surfels: Surfels
@@ -43,10 +41,9 @@ class AssignedScene:
 
 @dataclass(frozen=True)
 class EditedScene:
-    """A scene of M surfels, some of them split before refinement, with classes of its own.
+    """A scene of M Gaussians, some of them split before refinement, and their classes.
 
-    edited: the surfels, for each the index [M] of the one that it came from, and whether it is new [M] bool.
-    assignment: their classes.
+    edited: the Gaussians, of each the index [M] of its source and whether it is new [M] bool.
     """
 
     edited: Densified
@@ -54,13 +51,13 @@ class EditedScene:
 
 
 class Refiner(ABC):
-    """One way to go on from assigned classes."""
+    """Interface of the refiners."""
 
     @property
     @abstractmethod
     def trains(self) -> bool:
-        """Whether the scene's parameters are optimised after assignment; False leaves them bit for bit as they are."""
+        """Whether the scene's parameters are optimised after assignment; False keeps them bit for bit."""
 
     @abstractmethod
     def build_grid(self, scene: AssignedScene, k: int, progress: Progress | None = None) -> VisibilityGrid | None:
-        """The visibility voxel grid that the refiner's losses need (``k`` as in E8), or None if they need none."""
+        """Build the visibility voxel grid of the refiner's losses (``k`` as in E8), or None if they need none."""

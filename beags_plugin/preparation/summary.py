@@ -1,4 +1,4 @@
-"""What the stages of a preparation found, a line each for a reader."""
+"""Lines of text about the results of the stages of a preparation."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from beags_plugin.preparation.refiner import EditedScene
 
 
 def reprojection_summary(before: Sequence[Tensor | None], after: Sequence[Tensor]) -> str:
-    """How much reprojection changed."""
+    """Describe the pixels that reprojection changed."""
     changed = pixels = filled = 0
-    for old, new in zip(before, after, strict=True):  # they are held compressed: one view at a time
+    for old, new in zip(before, after, strict=True):  # held compressed: one view at a time
         if old is None:
             filled += 1
         else:
@@ -26,13 +26,13 @@ def reprojection_summary(before: Sequence[Tensor | None], after: Sequence[Tensor
 
 
 def split_summary(before: int, divided: EditedScene) -> str:
-    """How many Gaussians were split."""
+    """Describe the number of split Gaussians."""
     after = len(divided.edited.surfels)
     return f"border split: {int(divided.edited.fresh.sum())} halves, {before} Gaussians became {after}"
 
 
 def assignment_summary(assignment: Assignment, class_names: dict[int, str]) -> str:
-    """How many Gaussians each class has."""
+    """Describe the number of Gaussians of each class."""
     counts = torch.bincount(assignment.class_ids.long(), minlength=max(class_names) + 1)
     per_class = ", ".join(f"{name} {int(counts[index])}" for index, name in sorted(class_names.items()))
     return f"assignment: Gaussians per class: {per_class}; never seen: {int(assignment.never_seen.sum())}"

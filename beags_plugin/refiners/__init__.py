@@ -1,4 +1,4 @@
-"""What happens after assignment, as registered refiners (entry points: ``beags.refiners``)."""
+"""Refiners of a scene with assigned classes, registered by name (entry points: ``beags.refiners``)."""
 
 from beags_plugin.system.registry import Registry
 

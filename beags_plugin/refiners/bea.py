@@ -8,7 +8,7 @@ from beags_plugin.preparation.refiner import AssignedScene, Progress, Refiner
 
 
 class BeaRefiner(Refiner):
-    """Trains on, with every loss that is configured for the refinement phase; classes and number of surfels fixed."""
+    """Trains on with the losses of the refinement phase; classes and number of Gaussians stay fixed."""
 
     @property
     def trains(self) -> bool:

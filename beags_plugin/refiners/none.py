@@ -1,4 +1,4 @@
-"""Assignment alone, as FlashSplat does it: the scene stays as it is."""
+"""Assignment alone, as in FlashSplat."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from beags_plugin.preparation.refiner import AssignedScene, Progress, Refiner
 
 
 class NoRefiner(Refiner):
-    """Leaves every parameter bit for bit as the base training left it."""
+    """Keeps every parameter of the base bit for bit."""
 
     @property
     def trains(self) -> bool:

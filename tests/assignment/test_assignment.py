@@ -1,4 +1,4 @@
-"""Assignment (E6): sums over views, ties, never seen; and the reference rasterizer's contributions on a small scene."""
+"""Assignment (E6): sums over views, ties, Gaussians never seen; and the reference rasterizer's contributions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SETTINGS = RasterSettings(near=0.1, far=100.0)
 
 
 class _Stub:
-    """Gives contributions to labelled pixels that were written down, one table per camera, and none to others."""
+    """Returns the contributions in the camera's table."""
 
     def sparse_class_contributions(self, inputs, camera, settings, labels, num_classes):
         assert not settings.geometry and not settings.distortion
@@ -32,13 +32,8 @@ class _Stub:
 
 
 def _surfels(count: int) -> Surfels:
-    return Surfels.of(
-        torch.zeros(count, 3, requires_grad=True),
-        torch.ones(count, 4),
-        torch.zeros(count, 2),
-        torch.zeros(count),
-        torch.zeros(count, 1, 3),
-    )
+    shapes = [(count, 4), (count, 2), (count,), (count, 1, 3)]
+    return Surfels.of(torch.zeros(count, 3, requires_grad=True), *(torch.zeros(shape) for shape in shapes))
 
 
 def test_sums_over_views_with_ties_to_the_lower_id():
@@ -69,30 +64,16 @@ def test_contributions_are_image_derivatives():
     """C[i, c] summed over classes is d(sum of the image over labelled pixels) / d(colour of i)."""
     scene = make_scene()
     inputs = scene.inputs
-    surfels = Surfels.of(
-        inputs.means,
-        inputs.quats,
-        inputs.log_scales,
-        inputs.opacity_logits,
-        torch.zeros(len(inputs.means), 1, 3).double(),
-    )
+    sh = torch.zeros(len(inputs.means), 1, 3).double()
+    surfels = Surfels.of(inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits, sh)
     rasterizer = make_rasterizer("torch")
     result = assign_classes(surfels, [scene.camera] * 2, [scene.target, None], rasterizer, scene.settings, CLASSES)
     colors = torch.zeros_like(inputs.means).requires_grad_()
     bare = geometry_inputs(surfels)
-    drawn = rasterizer.rasterize(
-        type(bare)(bare.means, bare.quats, bare.log_scales, bare.opacity_logits, colors),
-        scene.camera,
-        scene.settings,
-        torch.zeros(3, dtype=torch.float64),
-    ).color[..., 0]
-    table = torch.stack(
-        [
-            torch.autograd.grad(drawn[scene.target == c].sum(), colors, retain_graph=True)[0][:, 0]
-            for c in range(CLASSES)
-        ],
-        1,
-    )
+    coloured = type(bare)(bare.means, bare.quats, bare.log_scales, bare.opacity_logits, colors)
+    rendered = rasterizer.rasterize(coloured, scene.camera, scene.settings, torch.zeros(3, dtype=torch.float64))
+    sums = [rendered.color[..., 0][scene.target == c].sum() for c in range(CLASSES)]
+    table = torch.stack([torch.autograd.grad(each, colors, retain_graph=True)[0][:, 0] for each in sums], 1)
     seen = table.sum(1) > 0
     assert 0 < seen.sum() < len(seen)
     assert torch.equal(result.never_seen, ~seen)
@@ -101,7 +82,7 @@ def test_contributions_are_image_derivatives():
     assert torch.allclose(result.margin[seen], (table.max(1).values / table.sum(1))[seen].float())
 
 
-def test_ids_out_of_range_are_told():
+def test_ids_out_of_range_are_refused():
     mask = torch.tensor([[0, IGNORE, 5]], dtype=torch.int32)
     with pytest.raises(UserError, match="view 0 holds class ids 0..5"):
         assign_classes(_surfels(1), [SimpleNamespace(table=[[1.0]])], [mask], _Stub(), SETTINGS, 3)

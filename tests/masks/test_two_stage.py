@@ -57,7 +57,7 @@ def run(tmp_path: Path, objects, predictor, detector=None, frames: int = 10, opt
     stems = [f"v{index}" for index in range(frames)]
     frame_of = {stem: index for index, stem in enumerate(stems)}
     notes = retrieve(objects, frame_of, stems, predictor, detector, best, options, lambda done, total: None)
-    return notes, [best.class_map(frame, SHAPE) for frame in range(frames)]
+    return notes, [best.labels(frame, SHAPE) for frame in range(frames)]
 
 
 def test_the_first_stage_goes_both_ways_from_the_prompt(tmp_path):
@@ -121,7 +121,7 @@ def test_logits_lie_on_disk_one_frame_at_a_time(tmp_path):
     best.add(4, 1, np.full(SHAPE, 1e6, np.float32))
     best.add(4, 2, np.full(SHAPE, -1.0, np.float32))
     assert [path.name for path in tmp_path.iterdir()] == ["000004.npz"]
-    assert (best.class_map(4, SHAPE) == 1).all() and not best.class_map(5, SHAPE).any()
+    assert (best.labels(4, SHAPE) == 1).all() and not best.labels(5, SHAPE).any()
     assert all(not isinstance(value, np.ndarray) for value in vars(best).values())
 
 

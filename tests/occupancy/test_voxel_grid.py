@@ -26,15 +26,12 @@ both = pytest.mark.usefixtures("ops")  # run with the torch versions and with th
 E8 = (4 * math.pi / 3) ** (1 / 3)  # 1.612
 
 
-# ---------------------------------------------------------------- voxel size
-
-
-def _cube_cloud(count: int, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).random((count, 3))
+def _cube_cloud(count: int) -> np.ndarray:
+    return np.random.default_rng(0).random((count, 3))
 
 
 def test_size_of_a_uniform_cloud_is_that_of_k_points():
-    """A voxel holds k points of a uniform cloud: s = (k / rho)^(1/3). Rims make the mean a little larger."""
+    """A voxel holds k points of a uniform cloud: s = (k / rho)^(1/3). Boundaries make the mean a little larger."""
     count, k = 60_000, 30
     assert voxel_size(_cube_cloud(count), k=k) == pytest.approx((k / count) ** (1 / 3), rel=0.06)
 
@@ -46,22 +43,12 @@ def test_size_is_1612_times_the_distance_by_brute_force():
         assert voxel_size(points, k=k) == pytest.approx(E8 * distances[:, k].mean(), rel=1e-12)
 
 
-def test_sampling_the_queries_changes_little():
-    points = _cube_cloud(20_000)
-    assert voxel_size(points, k=200, num_queries=2000) == pytest.approx(
-        voxel_size(points, k=200, num_queries=20_000), rel=0.02
-    )
-
-
-@pytest.mark.parametrize("kept", [20_000, 4_000, 3_100])
-def test_thinning_the_cloud_does_not_change_the_size(kept):
+def test_thinning_the_cloud_and_sampling_queries_hardly_change_the_size():
     points = _cube_cloud(40_000)
-    assert voxel_size(points, k=400, max_reference=kept) == pytest.approx(voxel_size(points, k=400), rel=0.03)
-
-
-def test_small_k_is_not_thinned_away():
-    points = _cube_cloud(20_000)
-    assert voxel_size(points, k=4, max_reference=100) == voxel_size(points, k=4)
+    whole = voxel_size(points, k=400)
+    for options in [{"max_reference": kept} for kept in (20_000, 4_000, 3_100)] + [{"num_queries": 20_000}]:
+        assert voxel_size(points, k=400, **options) == pytest.approx(whole, rel=0.03)
+    assert voxel_size(points[:20_000], k=4, max_reference=100) == voxel_size(points[:20_000], k=4)  # small k: all kept
 
 
 def test_size_is_deterministic_and_scales():
@@ -93,51 +80,46 @@ def test_coincident_points():
         voxel_size(np.zeros((0, 3)))
 
 
-# ---------------------------------------------------------------- grid
-
 SIZE, CLASSES = 0.25, 3
 
 
-def _clouds(seed: int = 0, count: int = 60):
-    g = torch.Generator().manual_seed(seed)
-    return [(torch.rand(count, 3, generator=g) * 2 - 0.7, torch.randint(0, CLASSES, (count,), generator=g).int())] * 2
+ORIGIN = (0.1, 0.0, -0.1)
 
 
-def _grid(dense_bytes: int = 1 << 28, seed: int = 0, origin=(0.1, 0.0, -0.1)) -> VisibilityGrid:
-    return VisibilityGrid.from_points(
-        _clouds(seed), SIZE, torch.tensor(origin, dtype=torch.float64), CLASSES, dense_bytes
-    )
+def _clouds():
+    g = torch.Generator().manual_seed(0)
+    return [(torch.rand(60, 3, generator=g) * 2 - 0.7, torch.randint(0, CLASSES, (60,), generator=g).int())] * 2
 
 
-def _by_sets(clouds, origin) -> dict[int, set]:
+def _grid(dense_bytes: int = 1 << 28) -> VisibilityGrid:
+    return VisibilityGrid.from_points(_clouds(), SIZE, torch.tensor(ORIGIN, dtype=torch.float64), CLASSES, dense_bytes)
+
+
+def _voxels(points: torch.Tensor, ids: torch.Tensor) -> list[tuple[int, tuple[int, ...]]]:
+    found = [tuple(math.floor((x - o) / SIZE) for x, o in zip(point, ORIGIN, strict=True)) for point in points.tolist()]
+    return list(zip(ids.tolist(), found, strict=True))
+
+
+def _by_sets() -> dict[int, set]:
     """V_phi as Python sets of voxels: collisions are empty in all."""
     voxels: dict[int, set] = {c: set() for c in range(CLASSES)}
-    for points, ids in clouds:
-        for point, c in zip(points.tolist(), ids.tolist(), strict=True):
-            voxels[c].add(tuple(math.floor((x - o) / SIZE) for x, o in zip(point, origin, strict=True)))
+    for c, voxel in [each for cloud in _clouds() for each in _voxels(*cloud)]:
+        voxels[c].add(voxel)
     return {c: voxels[c].difference(*(voxels[o] for o in voxels if o != c)) for c in voxels}
 
 
-def _queries(count: int = 3000, seed: int = 9):
-    g = torch.Generator().manual_seed(seed)
-    return torch.rand(count, 3, generator=g) * 5 - 2.0, torch.randint(0, CLASSES, (count,), generator=g).int()
+def _queries():
+    g = torch.Generator().manual_seed(9)
+    return torch.rand(3000, 3, generator=g) * 5 - 2.0, torch.randint(0, CLASSES, (3000,), generator=g).int()
 
 
 @both
 @pytest.mark.parametrize("dense_bytes", [1 << 28, 0])
 def test_count_and_valid_equal_sets(dense_bytes):
-    origin = (0.1, 0.0, -0.1)
-    grid, sets = _grid(dense_bytes), _by_sets(_clouds(), origin)
+    grid, sets = _grid(dense_bytes), _by_sets()
     points, ids = _queries()
-    expected = []
-    for point, c in zip(points.tolist(), ids.tolist(), strict=True):
-        voxel = [math.floor((x - o) / SIZE) for x, o in zip(point, origin, strict=True)]
-        expected.append(
-            sum(
-                tuple(v + d for v, d in zip(voxel, step, strict=True)) in sets[c]
-                for step in itertools.product((-1, 0, 1), repeat=3)
-            )
-        )
+    steps = list(itertools.product((-1, 0, 1), repeat=3))
+    expected = [sum((x + i, y + j, z + k) in sets[c] for i, j, k in steps) for c, (x, y, z) in _voxels(points, ids)]
     count = grid.count(points, ids)
     assert count.tolist() == expected and max(expected) >= 3
     assert torch.equal(grid.valid(points, ids), count > 0)
@@ -189,7 +171,7 @@ def test_grids_scale(factor):
     scaled = VisibilityGrid.from_points(
         [((p.double() * factor), c) for p, c in _clouds()],
         SIZE * factor,
-        torch.tensor([0.1, 0.0, -0.1], dtype=torch.float64) * factor,
+        torch.tensor(ORIGIN, dtype=torch.float64) * factor,
         CLASSES,
     )
     agree = scaled.count(points.double() * factor, ids) == _grid().count(points, ids)
@@ -214,11 +196,11 @@ def test_too_many_voxels_are_told():
 
 @both
 @pytest.mark.parametrize("dense_bytes", [1 << 28, 0])
-@pytest.mark.parametrize("origin", [(0.1, 0.0, -0.1), (1000.1, -500.0, 0.0)])
+@pytest.mark.parametrize("origin", [ORIGIN, (1000.1, -500.0, 0.0)])
 def test_disc_inside_is_never_wrong(dense_bytes, origin):
     """Every one of many points of every disc that is called inside is valid; float32 far from 0 as well."""
     g = torch.Generator().manual_seed(4)
-    shift = torch.tensor(origin) - torch.tensor([0.1, 0.0, -0.1])
+    shift = torch.tensor(origin) - torch.tensor(ORIGIN)
     clouds = [(torch.rand(3000, 3, generator=g) * 1.5 + shift, torch.ones(3000).int())]
     grid = VisibilityGrid.from_points(clouds, SIZE, torch.tensor(origin, dtype=torch.float64), 2, dense_bytes)
     count = 4000
@@ -246,11 +228,8 @@ def test_large_and_broken_discs_are_not_inside():
     assert grid.disc_inside(means, u, v, torch.ones(4).int()).tolist() == [True, False, False, False]
 
 
-# ---------------------------------------------------------------- building
-
-
 class _Stub:
-    """Draws images that were written down."""
+    """Renders the images of its views."""
 
     def rasterize(self, inputs, camera, settings, background, target=None):
         assert settings.geometry and not inputs.means.requires_grad
@@ -286,13 +265,15 @@ def _surfels(count: int = 1) -> Surfels:
 SETTINGS = RasterSettings(near=0.1, far=100.0, geometry=False)
 
 
+def _build(views, depth: str = "median", **options) -> VisibilityGrid:
+    ids = torch.arange(CLASSES).int()
+    return build_visibility_grid(_surfels(CLASSES), ids, views, _Stub(), SETTINGS, CLASSES, depth=depth, **options)
+
+
 @pytest.mark.parametrize("kind", ["median", "expected"])
 def test_build_lifts_solid_pixels_of_all_views(kind):
     views, calls = [_view(0), _view(1, 30, 20), _view(2)], []
-    grid = build_visibility_grid(
-        _surfels(CLASSES), torch.arange(CLASSES).int(), views, _Stub(), SETTINGS, CLASSES, k=3, depth=kind,
-        progress=lambda *s: calls.append(s),
-    )  # fmt: skip
+    grid = _build(views, kind, k=3, progress=lambda *state: calls.append(state))
     solid = [view.alpha >= 0.5 for view in views]
     depths = [view.median_depth if kind == "median" else view.depth for view in views]
     points = torch.cat([lift(d, v)[s] for d, v, s in zip(depths, views, solid, strict=True)])
@@ -308,23 +289,10 @@ def test_build_skips_depths_that_cannot_be_lifted():
     view = _view(3)
     view.median_depth[2, :] = math.nan
     view.median_depth[3, :] = 0.0
-    ids = torch.arange(CLASSES).int()
-    grid = build_visibility_grid(_surfels(CLASSES), ids, [view], _Stub(), SETTINGS, CLASSES, k=5)
-    assert math.isfinite(grid.voxel_size)
-
-
-def test_build_says_when_nothing_is_solid():
-    view = _view(4)
+    assert math.isfinite(_build([view], k=5).voxel_size)
     view.alpha.fill_(0.3)
-    with pytest.raises(UserError, match="nothing solid|anything solid"):
-        build_visibility_grid(_surfels(CLASSES), torch.arange(CLASSES).int(), [view], _Stub(), SETTINGS, CLASSES)
-
-
-def test_build_names_an_unknown_depth():
-    with pytest.raises(UserError, match="'mean'.*median, expected"):
-        build_visibility_grid(
-            _surfels(CLASSES), torch.arange(CLASSES).int(), [_view(0)], _Stub(), SETTINGS, CLASSES, depth="mean"
-        )
+    with pytest.raises(UserError, match="anything solid"):
+        _build([view])
 
 
 def test_build_with_the_reference_rasterizer():
@@ -332,13 +300,8 @@ def test_build_with_the_reference_rasterizer():
     x, y = torch.meshgrid(torch.linspace(-1, 1, 8), torch.linspace(-0.6, 0.6, 6), indexing="xy")
     means = torch.stack([x, y, torch.full_like(x, 4.0)], -1).view(-1, 3)
     count = len(means)
-    surfels = Surfels.of(
-        means,
-        torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
-        torch.full((count, 2), math.log(0.15)),
-        torch.full((count,), 4.0),
-        torch.zeros(count, 1, 3),
-    )
+    quats, scales = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1), torch.full((count, 2), math.log(0.15))
+    surfels = Surfels.of(means, quats, scales, torch.full((count,), 4.0), torch.zeros(count, 1, 3))
     ids = (means[:, 0] > 0).int() + 1
     camera = Camera(torch.eye(4), torch.tensor([[40.0, 0, 16], [0, 40.0, 12], [0, 0, 1]]), 32, 24)
     with warnings.catch_warnings():

@@ -98,11 +98,6 @@ def test_auto_gives_what_the_method_that_it_chose_gives(monkeypatch):
     assert not all(torch.equal(a, b) for a, b in zip(few.confidence, many.confidence, strict=True))
 
 
-def test_wrong_options_are_refused():
-    with pytest.raises(UserError, match="min_confidence is 1.5"):
-        PreparationConfig(min_confidence=1.5).check()
-
-
 def test_k_follows_the_training_pixels_where_it_is_stated_for_more():
     cameras = [SimpleNamespace(height=100, width=200)] * 5  # 1e5 pixels
     assert PreparationConfig(k=2000).neighbours(cameras) == 2000
@@ -112,16 +107,3 @@ def test_k_follows_the_training_pixels_where_it_is_stated_for_more():
     assert PreparationConfig(k=4, k_pixels=10**9).neighbours(cameras) == 4
     with pytest.raises(UserError, match="k_pixels is -1"):
         PreparationConfig(k_pixels=-1).check()
-
-
-def test_a_run_says_which_rounds_it_could_not_make():
-    pytest.importorskip("nerfstudio")
-    from beags_plugin.plugin.options.config import base_config
-    from beags_plugin.plugin.training.refinement import RefinementSwitch
-
-    config = base_config().model_config
-    config.refine_steps = 3
-    for rounds in (0, 4):
-        config.refine_rounds = rounds
-        with pytest.raises(UserError, match=f"refine_rounds is {rounds}: it must be 1 to refine_steps, which is 3"):
-            RefinementSwitch(SimpleNamespace(config=config), None, None).check_options()

@@ -22,28 +22,29 @@ needs_gloo = pytest.mark.skipif(not dist.is_gloo_available(), reason="torch was 
 
 
 def test_alone_views_come_one_after_the_other():
-    calls, told = [], []
+    calls, reported = [], []
 
     def work(index):
         calls.append(index)
         return index * index
 
-    views = each_view(4, work, lambda done, count: told.append((done, count)))
+    views = each_view(4, work, lambda done, count: reported.append((done, count)))
     assert next(views) == 0 and calls == [0]  # nothing is done before it is asked for
     assert list(views) == [1, 4, 9]
-    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert reported == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert list(each_view(0, work)) == []
 
 
 def in_two_processes(folder: Path) -> list:
-    """What each of two processes finds."""
+    """Return the results of two processes."""
     root = str(ROOT)
+    environment = {**os.environ, "PYTHONPATH": root, "OMP_NUM_THREADS": "1"}
     folder.mkdir()
 
     def start(rank):
         files = [str(path) for path in (folder / "meeting", folder / str(rank))]
         command = [sys.executable, str(PROGRAM), str(rank), "2", *files]
-        return subprocess.Popen(bound(command, signal.SIGKILL), cwd=root, env=environment(root))
+        return subprocess.Popen(bound(command, signal.SIGKILL), cwd=root, env=environment)
 
     running = [start(0), start(1)]
     try:
@@ -63,7 +64,3 @@ def test_steps_of_two_processes_are_those_of_one_that_sees_both_views(tmp_path):
         torch.testing.assert_close(*total)  # a sum over all steps, in another order
     start = steps_in_processes.labelled_views(4, 0.15)[0]
     assert (alone[0] - start.means).abs().max() > 0.01  # they did move
-
-
-def environment(root: str) -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": root, "OMP_NUM_THREADS": "1"}

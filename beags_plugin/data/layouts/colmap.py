@@ -1,4 +1,4 @@
-"""Any scene with a COLMAP model, binary or text; and what other layouts share with it."""
+"""Any data set with a COLMAP model, binary or text; other layouts share its functions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FOLDERS = ("sparse/0", "colmap/sparse/0", "sparse")
 
 
 def model_folder(root: Path) -> Path | None:
-    """The folder of a COLMAP model in a scene, complete or not; None without."""
+    """Find the folder of a COLMAP model below ``root``, complete or not; None without."""
     for name in FOLDERS:
         if any((root / name / f"{part}.{end}").is_file() for part in ("cameras", "images") for end in ("bin", "txt")):
             return root / name
@@ -20,19 +20,19 @@ def model_folder(root: Path) -> Path | None:
 
 
 def missing_part(folder: Path) -> str | None:
-    """The file that a COLMAP model lacks, or None."""
+    """Return the name of a file that a COLMAP model lacks, or None."""
     end = "txt" if (folder / "cameras.txt").is_file() else "bin"  # the order in which nerfstudio looks
     return next((f"{part}.{end}" for part in ("cameras", "images") if not (folder / f"{part}.{end}").is_file()), None)
 
 
 def complete_model(root: Path) -> Path | None:
-    """The folder of a complete COLMAP model in a scene, or None."""
+    """Find the folder of a complete COLMAP model below ``root``, or None."""
     folder = model_folder(root)
     return folder if folder is not None and missing_part(folder) is None else None
 
 
 def checked_model(root: Path) -> Path:
-    """The folder of the scene's COLMAP model; raises ``UserError`` if a part is missing."""
+    """Find the folder of the COLMAP model below ``root``; raise ``UserError`` if a part is missing."""
     folder = model_folder(root)
     if folder is None:
         raise UserError(f"{root} holds no COLMAP model (sparse/0): run COLMAP first.")
@@ -42,7 +42,7 @@ def checked_model(root: Path) -> Path:
 
 
 def points_file(folder: Path) -> Path | None:
-    """The seed points of a COLMAP model, or None without any (nerfstudio fails on an empty list of them)."""
+    """Find the seed points of a COLMAP model; None without any (nerfstudio fails on an empty list)."""
     binary, text = folder / "points3D.bin", folder / "points3D.txt"
     if binary.is_file():  # the order in which nerfstudio looks; the file starts with a 64-bit count
         return binary if any(binary.open("rb").read(8)) else None

@@ -1,4 +1,4 @@
-"""DTU as NeuS and its followers keep it: projection matrices in cameras_sphere.npz."""
+"""DTU in the form of NeuS: projection matrices in cameras_sphere.npz."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ OFF_CENTRE = 0.2  # of the image's sides: the principal point of no camera lies 
 
 
 class Dtu(Layout):
-    """image/*.png, mask/*.png and cameras_sphere.npz, in the world in which the object fills the unit sphere.
+    """image/*.png, mask/*.png and cameras_sphere.npz; in its world the object fills the unit sphere.
 
-    Masks belong to images in the order of names. Nothing stands before the object: its masks are its silhouettes.
+    Masks and images are paired in the order of names. Nothing occludes the object: its masks are its silhouettes.
     """
 
     title = "DTU"
@@ -60,10 +60,10 @@ class Dtu(Layout):
 def read_cameras(
     file: Path, images: list[Path]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.int64]]:
-    """Camera to world [V, 3, 4] (OpenGL axes), K [V, 3, 3] and sizes [V, 2] of images, the originals.
+    """Read camera to world [V, 3, 4] (OpenGL axes), K [V, 3, 3] and sizes [V, 2] of the original images.
 
-    Entry i has ``world_mat_i`` [4, 4], which projects the world to pixels, and ``scale_mat_i``, which takes the unit
-    sphere to the world. Raises ``UserError`` if an entry is missing or is no camera's.
+    ``world_mat_i`` [4, 4] projects the world to pixels, ``scale_mat_i`` takes the unit sphere to the world.
+    Raises ``UserError`` if an entry is missing or describes no camera.
     """
     try:
         table = {name: entry.astype(np.float64) for name, entry in load_arrays(file).items() if "_mat_" in name}
@@ -105,13 +105,13 @@ def read_cameras(
 
 
 def _is_regular(matrix: npt.NDArray[np.float64]) -> bool:
-    """Whether a matrix [3, 3] can be inverted in float64; NumPy's rank takes one that it then cannot solve."""
+    """Return whether a matrix [3, 3] is invertible in float64; NumPy's rank accepts some that it cannot solve."""
     values = np.linalg.svd(matrix, compute_uv=False)
     return bool(values[-1] > LEAST_SINGULAR_VALUE * values[0])
 
 
 def decompose(projection: npt.NDArray[np.float64]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """K [3, 3], world-to-camera rotation [3, 3] (OpenCV) and centre [3] of K [R | -R c], given up to scale."""
+    """Return K [3, 3], world-to-camera rotation [3, 3] (OpenCV) and centre [3] of K [R | -R c], given up to scale."""
     from scipy.linalg import rq
 
     K, rotation = (np.asarray(part) for part in rq(projection[:, :3]))

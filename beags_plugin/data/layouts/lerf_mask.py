@@ -41,7 +41,7 @@ class LerfMask(Layout):
 
 
 def _masks_by_prompt(folder: Path, test: list[str]) -> dict[str, dict[str, Path]]:
-    """Prompt to the masks of the test views, by stem; raises ``UserError`` for a folder that is no test view's."""
+    """Find the masks of the test views by prompt and stem; raise ``UserError`` for a folder of no test view."""
     found: dict[str, dict[str, Path]] = {}
     for view in sorted(path for path in folder.iterdir() if path.is_dir()):
         if view.name in test:

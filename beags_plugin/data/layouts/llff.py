@@ -7,8 +7,8 @@ from pathlib import Path
 from beags_plugin.data.dataset import ColmapModel, Dataset, PoseTable, Split
 from beags_plugin.data.files import choose_images, image_folders, list_images
 from beags_plugin.data.layout import Layout
-from beags_plugin.data.layouts.colmap import complete_model
-from beags_plugin.data.poses_bounds import FILE, read_poses_bounds, seed_points
+from beags_plugin.data.layouts.colmap import complete_model, points_file
+from beags_plugin.data.poses_bounds import FILE, read_poses_bounds
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import reason
 
@@ -21,7 +21,7 @@ NVOS_TARGETS = {
     "orchids": "IMG_4480",
     "trex": "DJI_20200223_163619_411",
 }
-"""Dataset to the stem of the camera's file of the view whose mask NVOS scores (method, section 9)."""
+"""Scene to the stem of the camera's file of the view that NVOS scores (method, section 9)."""
 ORIGINAL_NAMES = "original_names.txt"
 
 
@@ -45,28 +45,28 @@ class Llff(Layout):
 
 
 def lacks_poses(root: Path) -> str | None:
-    """What a scene lacks where neither of the two sources of poses is there; else None."""
+    """Describe the two sources of poses if ``root`` has neither; else None."""
     if root.is_dir() and ((root / FILE).is_file() or complete_model(root) is not None):
         return None
     return f"neither {FILE} nor a complete COLMAP model (sparse/0)"
 
 
 def model_or_bounds(root: Path, images: Path) -> tuple[ColmapModel | PoseTable, Path | None]:
-    """The poses of the images in the folder ``images``: COLMAP's, which know the lens, else LLFF's; and seed points.
+    """Return the poses of the images in a folder, COLMAP's, which know the lens, else LLFF's; and seed points.
 
     Smaller copies of the images may have other names in the same order, as LLFF makes them.
     """
     model = complete_model(root)
     if model is not None:
         return ColmapModel(model, images, in_order=True), None
-    return read_poses_bounds(root / FILE, images), seed_points(root)
+    return read_poses_bounds(root / FILE, images), points_file(root / "sparse" / "0")  # both in one world
 
 
 def nvos_target(root: Path, folder: Path) -> tuple[str, ...]:
-    """The stem in ``folder`` of the view that NVOS scores; the camera's own where that is not known; else nothing.
+    """Return the stem in ``folder`` of the view that NVOS scores, or the camera's own stem if that is unknown.
 
-    LLFF numbers its smaller copies (image000.png, ...) in the order of the camera's names, which are those in images/,
-    or the second column of original_names.txt.
+    LLFF numbers its smaller copies (image000.png, ...) in the order of the camera's names: those in images/, or the
+    second column of original_names.txt. Empty for other scenes.
     """
     target = NVOS_TARGETS.get(root.name.lower())
     if target is None:
@@ -77,14 +77,15 @@ def nvos_target(root: Path, folder: Path) -> tuple[str, ...]:
         try:
             lines = [line.split() for line in (root / ORIGINAL_NAMES).read_text("utf8").splitlines()]
         except (OSError, ValueError) as error:
-            told = f"{root / ORIGINAL_NAMES} cannot be read ({reason(error)}): restore or remove it."
-            raise UserError(told) from error
+            raise UserError(
+                f"{root / ORIGINAL_NAMES} cannot be read ({reason(error)}): restore or remove it."
+            ) from error
         pairs |= {Path(names[1]).stem: Path(names[0]).stem for names in lines if len(names) == 2}
     return (target,) if target in stems else (pairs.get(target, target),)
 
 
 def _originals(root: Path, count: int) -> list[Path]:
-    """The images as the camera named them, if there are ``count``."""
+    """Return the images with the camera's names, if there are ``count``."""
     folders = image_folders(root)
     files = list_images(folders[0]) if folders else []
     return files if len(files) == count else []

@@ -15,8 +15,8 @@ LABELS = "label"
 class SpinNerf(Layout):
     """images_4/<image>, images_4/label/<stem>.png (or another size), and sparse/0 or poses_bounds.npy.
 
-    Views before the first labelled one, in the order of names, show the scene once the object is gone: they are left
-    out. Every 8th of the others is held out.
+    Views before the first labelled one, in the order of names, show the scene without the object: they are left out.
+    Every 8th of the others is held out.
     """
 
     title = "SPIn-NeRF"
@@ -51,6 +51,6 @@ class SpinNerf(Layout):
 
 
 def _labelled(root: Path) -> Path | None:
-    """The folder of the smallest images that have labels; None without."""
+    """Find the folder of the smallest images with labels; None without."""
     folders = [folder for folder in image_folders(root) if any((folder / LABELS).glob("*.png"))]
     return folders[-1] if folders else None

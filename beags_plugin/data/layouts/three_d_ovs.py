@@ -17,8 +17,8 @@ CLASSES = "segmentations/classes.txt"
 class ThreeDOvs(Layout):
     """images, segmentations/classes.txt, segmentations/<NN>/<class>.png, and poses_bounds.npy or sparse/0.
 
-    The views in segmentations/ are held out, by the stem <NN> or, where no image is called so, by its place in the
-    order of names. Ids are the lines of classes.txt from 1 on.
+    The views in segmentations/ are held out; <NN> is the stem of an image or its place in the order of names.
+    Ids are the lines of classes.txt from 1 on.
     """
 
     title = "3D-OVS"

@@ -1,1 +1,1 @@
-"""What is wrong with the masks of a scene, found before training on them; nothing of nerfstudio."""
+"""Checks of the masks of a scene before training."""

@@ -1,4 +1,4 @@
-"""Areas of masks that the other views contradict, once there is a base whose depth can be trusted."""
+"""Areas of masks that the other views contradict, according to the depth of a trained base."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ import numpy as np
 
 from beags_plugin.labels.class_ids import IGNORE
 
-SMALLEST = 0.0005  # share of the image that an area must cover
-RIM = 0.003  # of the image diagonal: contradiction this near an outline is that of any mask
-CONFIDENCE = 0.6  # share of the votes that must contradict
+SMALLEST = 0.0005  # least share of the image
+BAND = 0.003  # of the image diagonal: any mask is contradicted so near an outline
+CONFIDENCE = 0.6  # least share of contradicting votes
 
 
 @dataclass(frozen=True)
 class Area:
-    """A connected area of a view's mask that says ``given`` where the other views say ``voted``.
+    """A connected area of class ``given`` in a view's mask that the other views label ``voted``.
 
-    box: (left, top, right, bottom) in pixels of the compared mask. pixels: of the area.
+    share: of the image. box: (left, top, right, bottom) in pixels of the compared mask.
     """
 
     view: str
@@ -31,18 +31,18 @@ class Area:
     box: tuple[int, int, int, int]
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return plain values."""
         return {**vars(self), "box": list(self.box)}
 
-    def told(self, names: Mapping[int, str]) -> str:
-        """The area in words."""
+    def describe(self, names: Mapping[int, str]) -> str:
+        """Describe the area in words."""
         left, top, right, bottom = self.box
         kinds = [f"{i} ({names.get(i, f'class_{i}')})" for i in (self.given, self.voted)]
         return f"{self.view}, x {left}-{right}, y {top}-{bottom}: {kinds[0]}, the others say {kinds[1]}"
 
 
 def contradicted(given: np.ndarray, voted: np.ndarray, confidence: np.ndarray, view: str) -> list[Area]:
-    """Areas of one view that are more than a rim, the largest first.
+    """Find areas of one view that are wider than the band about outlines, the largest first.
 
     given, voted: [H, W] class ids or IGNORE, before and after reprojection. confidence: [H, W] in 0..1.
     """
@@ -50,7 +50,7 @@ def contradicted(given: np.ndarray, voted: np.ndarray, confidence: np.ndarray, v
 
     height, width = given.shape
     wrong = (given != voted) & (given != IGNORE) & (voted != IGNORE) & (confidence >= CONFIDENCE)
-    radius = max(1, round(RIM * math.hypot(height, width)))
+    radius = max(1, round(BAND * math.hypot(height, width)))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     core = cv2.morphologyEx(wrong.astype(np.uint8), cv2.MORPH_OPEN, disc)
     count, pieces, stats, _ = cv2.connectedComponentsWithStats(core, connectivity=8)

@@ -1,4 +1,4 @@
-"""Points in space that tell whether views agree on which object is which."""
+"""Agreement of views about the classes of points in space."""
 
 from __future__ import annotations
 
@@ -7,19 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-UNSEEN = -1  # of a point in a view: outside the image, behind the camera or another surface, or unlabelled
-AGREEMENT = 0.6  # share of the other views' labels that must be one class for a point to say anything
-LEAST_OTHERS = 3  # other views that must see the point
-LEAST_POINTS = 8  # points of an object in a view that say anything about it
-MOST = 0.5  # share of an object's points that must carry another label
+UNSEEN = -1  # label of a point outside the image, behind the camera or another surface, or unlabelled
+AGREEMENT = 0.6  # least share of one class in the other views' labels of a point that counts
+LEAST_OTHERS = 3  # other views that see a point that counts
+LEAST_POINTS = 8  # of an object in a view
+MOST = 0.5  # least share of an object's points with another label
 
 
 @dataclass(frozen=True)
 class Renamed:
-    """A view in which ids stand for each other's objects: ``instead`` of the key the view says the value.
-
-    points: how many say so.
-    """
+    """A view with exchanged ids: ``instead`` of each key it has the value, at a number of points."""
 
     view: int
     instead: dict[int, int]
@@ -29,9 +26,9 @@ class Renamed:
 def labels_at(
     xy: np.ndarray, z: np.ndarray, ranks: np.ndarray, depth: np.ndarray | None = None, tau: float = 0.02
 ) -> np.ndarray:
-    """[P] int16, the label that a view gives each point, or ``UNSEEN``.
+    """Return the label of each point in a view, [P] int16, or ``UNSEEN``.
 
-    xy: [P, 2] pixels; z: [P] depth of the points; ranks: [H, W] int16 classes, ``UNSEEN`` where unlabelled.
+    xy: [P, 2] pixels; z: [P] depth of the points; ranks: [H, W] int16 classes, ``UNSEEN`` if unlabelled.
     depth: [H, W] of the surface, or None; a point counts then only if |z - D| <= tau z.
     """
     height, width = ranks.shape
@@ -48,7 +45,7 @@ def labels_at(
 
 
 class Agreement:
-    """What all views say of P points, and what each view says against the others.
+    """Labels of P points in all views, and the confusion of each view with the others.
 
     labels: [P, V] int16 ranks below ``classes``, or ``UNSEEN``; see ``labels_at``. Rank 0 is the background.
     """
@@ -61,7 +58,7 @@ class Agreement:
             seen = np.flatnonzero(labels[:, view] != UNSEEN)
             self.votes[seen, labels[seen, view]] += 1
         self.confusion = np.stack([self._against_others(view) for view in range(views)])
-        """[V, C, C]: points of which the others say the row's class and the view the column's."""
+        """[V, C, C]: points with the row's class in the other views and the column's in the view."""
 
     def _against_others(self, view: int) -> np.ndarray:
         own = self.labels[:, view]
@@ -74,39 +71,39 @@ class Agreement:
         return np.bincount(pairs, minlength=self.classes**2).reshape(self.classes, self.classes)
 
     def renamed(self) -> list[Renamed]:
-        """Views in which ids are exchanged (the background's with an object's: the mask is inverted), or one is new."""
+        """Find views with exchanged ids (an exchange with the background inverts the mask), or with a new id."""
         return [found for view in range(len(self.confusion)) for found in self._renamed(view)]
 
     def _renamed(self, view: int) -> list[Renamed]:
         confusion = self.confusion[view]
         points = confusion.sum(1)
-        said = {
+        given = {
             int(rank): int(confusion[rank].argmax())
             for rank in np.flatnonzero(points >= LEAST_POINTS)
             if confusion[rank].max() >= MOST * points[rank]
         }
         exchanged: list[dict[int, int]] = []
-        for start in said:
+        for start in given:
             if not any(start in pairs for pairs in exchanged):
-                exchanged += self._cycle(said, start)
-        shares = {rank: confusion[rank, new] / points[rank] for rank, new in said.items()}
-        for new in sorted(set(said.values()) - {0}):
-            # an id of which no view tells where it is: the object was called anew; what it hides has its label too
+                exchanged += self._cycle(given, start)
+        shares = {rank: confusion[rank, new] / points[rank] for rank, new in given.items()}
+        for new in sorted(set(given.values()) - {0}):
+            # no view places this id: the object has a new one, as has what it hides
             if self.confusion[:, new].sum() < LEAST_POINTS:
-                exchanged.append({max((r for r in said if said[r] == new), key=lambda rank: shares[rank]): new})
+                exchanged.append({max((r for r in given if given[r] == new), key=lambda rank: shares[rank]): new})
         return [Renamed(view, pairs, sum(int(confusion[pair]) for pair in pairs.items())) for pairs in exchanged]
 
     @staticmethod
-    def _cycle(said: dict[int, int], start: int) -> list[dict[int, int]]:
-        """Classes that stand for each other in a ring, as a ↔ b, beginning with ``start``; or none."""
+    def _cycle(given: dict[int, int], start: int) -> list[dict[int, int]]:
+        """Return the ring of exchanged classes, as a ↔ b, that begins with ``start``; or none."""
         path = [start]
-        while (following := said.get(path[-1])) is not None and following not in path:
+        while (following := given.get(path[-1])) is not None and following not in path:
             path.append(following)
-        return [{rank: said[rank] for rank in path}] if following == start and len(path) > 1 else []
+        return [{rank: given[rank] for rank in path}] if following == start and len(path) > 1 else []
 
 
 def ranks_of(labels: np.ndarray, ids: Sequence[int], ignore: int) -> np.ndarray:
-    """[H, W] int16, the place of each class id among ``ids`` (sorted); ``UNSEEN`` for IGNORE and other ids."""
+    """Return [H, W] int16, the index of each class id in ``ids`` (sorted); ``UNSEEN`` for IGNORE and other ids."""
     table = np.full(ignore + 1, UNSEEN, np.int16)
     table[np.asarray(ids, np.int64)] = np.arange(len(ids))
     return table[labels]

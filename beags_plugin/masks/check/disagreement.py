@@ -1,4 +1,4 @@
-"""What points in space tell about whole views: ids exchanged, masks inverted."""
+"""Issues of whole views that disagree with the others: exchanged ids, inverted masks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from beags_plugin.masks.check.issues import Issue, percent
 def views_against_others(
     agreement: Agreement, files: MaskFiles, coverage: Coverage, names: Mapping[int, str]
 ) -> list[Issue]:
-    """The issues of ``agreement`` in words; its ranks are places in ``coverage.ids``."""
+    """Describe the disagreements as issues; ranks of ``agreement`` are indices in ``coverage.ids``."""
     titles = [f"{i} ({names[i]})" for i in coverage.ids]
     groups: dict[tuple[tuple[int, int], ...], list[int]] = {}
     for found in agreement.renamed():

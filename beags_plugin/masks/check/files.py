@@ -1,8 +1,8 @@
-"""Checks of the mask files alone: missing, of the wrong size or type, ids without a name, objects in few views."""
+"""Checks of mask files alone: missing, wrong size or type, ids without a name, objects in few views."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,18 +16,17 @@ from beags_plugin.masks.check.issues import STOPS, Issue, named, percent
 from beags_plugin.system.errors import UserError
 
 FEW_VIEWS = 3  # an object needs two other views to outvote one
-MOST_IDS = 256  # in one file, or compared between views, which takes memory with their square
-LARGE_IGNORE = 0.2  # share of unlabelled pixels that is worth a word
+MOST_IDS = 256  # in one file, or compared between views, with memory of their square
+LARGE_IGNORE = 0.2  # least share of unlabelled pixels in a note
 
 
 @dataclass(frozen=True)
 class MaskFiles:
-    """The views of a scene and the mask of each.
+    """The views of a scene and their masks.
 
     stems: names of the V images (``data.files.photo_names``); sizes: (width, height) of their files; masks: file or
-    None. folder: where masks are looked for. kind, ignore_ids: see ``labels.classes.read_mask``. trained: whether each
-    view is trained on. names: id to name where the user or the layout gave names, else None; names_file: where they
-    stand.
+    None. folder: of the masks. kind, ignore_ids: see ``labels.classes.read_mask``. trained: False for held-out views.
+    names: id to name from the user or the layout, or None; names_file: their file.
     """
 
     stems: Sequence[str]
@@ -41,12 +40,12 @@ class MaskFiles:
     names_file: Path
 
     def read(self, view: int) -> np.ndarray | None:
-        """[H, W] uint16 class ids or IGNORE of a view; None without a mask; ``UserError`` if it cannot be read."""
+        """Read [H, W] uint16 class ids or IGNORE of a view; None without a mask; raise ``UserError``."""
         path = self.masks[view]
         return None if path is None else read_mask(path, self.kind, self.ignore_ids)
 
     def paths(self, views: Sequence[int]) -> str:
-        """The masks of some views for a message: the first by its path, others by what follows the folder."""
+        """Name the masks of some views: the first by its path, the others by their paths below the folder."""
         found = [path for view in views if (path := self.masks[view]) is not None]
         return named(
             [
@@ -58,10 +57,10 @@ class MaskFiles:
 
 @dataclass
 class Coverage:
-    """How much of every view each id covers.
+    """Pixels of each id in every view.
 
-    ids: sorted, without IGNORE. pixels: [V, C] of each id; ignored, size: [V] pixels unlabelled and in all (0 where
-    there is no mask that can be read). usable: [V] bool, whether there is such a mask, of the right size.
+    ids: sorted, without IGNORE. pixels: [V, C]; ignored, size: [V] unlabelled and all pixels, 0 without a usable mask.
+    usable: [V] bool, False without a readable mask of the right size.
     """
 
     ids: list[int]
@@ -75,7 +74,7 @@ class Coverage:
 def check_files(
     files: MaskFiles, few_views: int = FEW_VIEWS, progress: Callable[[int, int], None] | None = None
 ) -> Coverage:
-    """Read every mask once; what is wrong with files is among the issues instead of raised."""
+    """Read every mask once; mistakes in files become issues instead of errors."""
     views = len(files.stems)
     counts: list[dict[int, int] | None] = [None] * views
     issues: list[Issue] = []
@@ -142,24 +141,20 @@ def _no_id_image(files: MaskFiles, view: int, ids: int) -> Issue:
     )
 
 
-def _missing(files: MaskFiles) -> list[Issue]:
+def _missing(files: MaskFiles) -> Iterator[Issue]:
     trained = [view for view, used in enumerate(files.trained) if used]
     without = [files.stems[view] for view in trained if files.masks[view] is None]
-    if not without:
-        return []
-    if len(without) == len(trained):
-        return [
-            Issue(
-                "error",
-                "missing",
-                f"no training view has a mask in {files.folder}: put id images there, named as the images, or make "
-                "them with: beags masks make",
-                "training stops before refinement (beags-base needs no masks)",
-                tuple(without),
-            )
-        ]
-    return [
-        Issue(
+    if without and len(without) == len(trained):
+        yield Issue(
+            "error",
+            "missing",
+            f"no training view has a mask in {files.folder}: put id images there, named as the images, or make "
+            "them with: beags masks make",
+            "training stops before refinement (beags-base needs no masks)",
+            tuple(without),
+        )
+    elif without:
+        yield Issue(
             "warning",
             "missing",
             f"{len(without)} of {len(trained)} training views have no mask in {files.folder}: {named(without)}; "
@@ -168,101 +163,78 @@ def _missing(files: MaskFiles) -> list[Issue]:
             "others, and with --pipeline.model.prepare.reprojection none no loss about masks looks at them",
             tuple(without),
         )
-    ]
 
 
-def _strays(files: MaskFiles) -> list[Issue]:
-    """Images among the masks that belong to no view: another suffix, another name."""
-    if not files.folder.is_dir():
-        return []
-    used = {path for path in files.masks if path is not None}
-    others = sorted(
-        path for path in files.folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES and path not in used
-    )
-    if not others:
-        return []
-    other_type = [path for path in others if path.suffix.lower() != ".png"]
-    why = "masks are .png files" if other_type else "no image has such a name"
-    return [
-        Issue(
+def _strays(files: MaskFiles) -> Iterator[Issue]:
+    """Find images in the masks' folder that belong to no view."""
+    images = (path for path in files.folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+    if others := sorted(set(images) - set(files.masks)):
+        other_type = any(path.suffix.lower() != ".png" for path in others)
+        why = "masks are .png files" if other_type else "no image has such a name"
+        yield Issue(
             "warning",
             "unused",
             f"{len(others)} files in {files.folder} are not used ({named([path.name for path in others], 3)}), as "
             f"{why}: rename them after their images, save them as .png, or remove them.",
             "what they show does not count",
         )
-    ]
 
 
-def _names(files: MaskFiles, coverage: Coverage) -> list[Issue]:
-    """Ids that classes.json does not name, and names that no mask holds."""
+def _names(files: MaskFiles, coverage: Coverage) -> Iterator[Issue]:
+    """Find ids without a name, and names without a mask."""
     if files.names is None or files.kind != "ids":
-        return []
-    issues = []
+        return
     for column, class_id in enumerate(coverage.ids):
         views = np.flatnonzero(coverage.pixels[:, column])
         if class_id == BACKGROUND or class_id in files.names or not len(views):
             continue
         pixels = int(coverage.pixels[:, column].sum())
         unlabelled = ", or, if it means unlabelled, add: beags-data --ignore-ids 255" if class_id == 255 else ""
-        issues.append(
-            Issue(
-                "error",
-                "unknown id",
-                f"id {class_id} is in {len(views)} masks, the first {files.masks[views[0]]}, but not in "
-                f"{files.names_file}: name it there or correct the masks{unlabelled}.",
-                f"{STOPS}; the id covers {pixels} pixels ({percent(pixels, coverage.size.sum())})",
-                tuple(files.stems[int(view)] for view in views),
-            )
+        yield Issue(
+            "error",
+            "unknown id",
+            f"id {class_id} is in {len(views)} masks, the first {files.masks[views[0]]}, but not in "
+            f"{files.names_file}: name it there or correct the masks{unlabelled}.",
+            f"{STOPS}; the id covers {pixels} pixels ({percent(pixels, coverage.size.sum())})",
+            tuple(files.stems[int(view)] for view in views),
         )
     absent = [f"{i} ({name})" for i, name in files.names.items() if i != BACKGROUND and i not in coverage.ids]
     if absent:
-        issues.append(
-            Issue(
-                "warning",
-                "unused name",
-                f"{files.names_file} names ids that no mask holds: {named(absent)}; remove them or correct the masks.",
-                "these objects get no Gaussians and cannot be extracted",
-            )
+        yield Issue(
+            "warning",
+            "unused name",
+            f"{files.names_file} names ids that no mask holds: {named(absent)}; remove them or correct the masks.",
+            "these objects get no Gaussians and cannot be extracted",
         )
-    return issues
 
 
-def _few_views(files: MaskFiles, coverage: Coverage, few_views: int) -> list[Issue]:
+def _few_views(files: MaskFiles, coverage: Coverage, few_views: int) -> Iterator[Issue]:
     trained = np.asarray(files.trained, bool)
-    issues = []
     for column, class_id in enumerate(coverage.ids):
-        present = trained & (coverage.pixels[:, column] > 0)
-        count = int(present.sum())
-        if class_id == BACKGROUND or count >= few_views:
+        views = [int(view) for view in np.flatnonzero(trained & (coverage.pixels[:, column] > 0))]
+        if class_id == BACKGROUND or len(views) >= few_views:
             continue
         name = (files.names or {}).get(class_id, f"class_{class_id}")
-        pixels = int(coverage.pixels[present, column].sum())
-        where = files.paths([int(view) for view in np.flatnonzero(present)]) or "only held-out views"
-        issues.append(
-            Issue(
-                "warning",
-                "few views",
-                f"id {class_id} ({name}) is in {count} of {int(trained.sum())} training views ({where}), fewer than "
-                f"{few_views}: mask it in more views, or set it to 0 if it is a mistake.",
-                f"its {pixels} pixels can hardly outvote or be outvoted: sides that no mask shows go to other classes",
-                tuple(files.stems[int(view)] for view in np.flatnonzero(present)),
-            )
+        pixels = int(coverage.pixels[views, column].sum())
+        yield Issue(
+            "warning",
+            "few views",
+            f"id {class_id} ({name}) is in {len(views)} of {int(trained.sum())} training views "
+            f"({files.paths(views) or 'only held-out views'}), fewer than {few_views}: mask it in more views, or set "
+            "it to 0 if it is a mistake.",
+            f"its {pixels} pixels can hardly outvote or be outvoted: sides that no mask shows go to other classes",
+            tuple(files.stems[view] for view in views),
         )
-    return issues
 
 
-def _unlabelled(files: MaskFiles, coverage: Coverage) -> list[Issue]:
+def _unlabelled(files: MaskFiles, coverage: Coverage) -> Iterator[Issue]:
     total, ignored = int(coverage.size.sum()), int(coverage.ignored.sum())
-    if not total or ignored / total < LARGE_IGNORE:
-        return []
-    most = [int(view) for view in np.argsort(-coverage.ignored, kind="stable") if coverage.ignored[view]]
-    return [
-        Issue(
+    if total and ignored / total >= LARGE_IGNORE:
+        most = [int(view) for view in np.argsort(-coverage.ignored, kind="stable") if coverage.ignored[view]]
+        yield Issue(
             "note",
             "unlabelled",
             f"{percent(ignored, total)} of the masks' pixels are unlabelled, most in {files.paths(most[:3])}: fine if "
             "nobody knows what is there, else label them (background is 0).",
             f"{ignored} pixels do not vote, and boundary and silhouette loss do not look at them",
         )
-    ]

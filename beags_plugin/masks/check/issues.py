@@ -1,4 +1,4 @@
-"""What a check found: which file, what is wrong, what to do, and what it costs to leave it."""
+"""Findings of a check: the file, the mistake, the remedy, and the cost of leaving it."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ STOPS = "training stops when it reads this file"
 
 @dataclass(frozen=True)
 class Issue:
-    """One thing that is wrong with the masks, or may be.
+    """A mistake in the masks, or a possible one.
 
-    level: "error": training refuses it; "warning": it costs quality; "note": fine if it is meant.
-    kind: the same short word for all issues alike. message: which file or object, what is wrong, what to do.
-    cost: what it costs to leave it, with figures. views: stems of the images that it is about.
+    level: "error": training refuses it; "warning": it costs quality; "note": fine if intended.
+    kind: a short word for similar issues. message: file or object, mistake, remedy.
+    cost: of leaving it, with figures. views: stems of the images concerned.
     """
 
     level: Level
@@ -27,22 +27,22 @@ class Issue:
     views: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return plain values."""
         return {**vars(self), "views": list(self.views)}
 
 
 def ordered(issues: Sequence[Issue]) -> list[Issue]:
-    """Errors first, then warnings, then notes; alike ones stay in their order."""
+    """Sort errors first, then warnings, then notes; by kind within a level."""
     return sorted(issues, key=lambda issue: (LEVELS.index(issue.level), issue.kind))
 
 
 def named(items: Sequence[object], most: int = 5) -> str:
-    """The first few of many in words, and how many more there are."""
+    """List the first few of many items, and the number of the others."""
     shown = ", ".join(str(item) for item in items[:most])
     return shown if len(items) <= most else f"{shown} and {len(items) - most} more"
 
 
 def percent(part: float, whole: float) -> str:
-    """A share in percent with as many digits as tell something."""
+    """Format a share in percent, with two digits below 10 %."""
     share = 100.0 * part / whole if whole else 0.0
     return f"{share:.0f} %" if share >= 10 else f"{share:.2g} %"

@@ -1,4 +1,4 @@
-"""Where masks come from, as registered sources (entry points: ``beags.mask_sources``); nothing of nerfstudio."""
+"""Sources of masks, registered by name (entry points: ``beags.mask_sources``)."""
 
 from beags_plugin.system.registry import Registry
 

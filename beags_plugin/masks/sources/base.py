@@ -1,4 +1,4 @@
-"""The interface of mask sources, and what they are given."""
+"""The interface of mask sources, their input and their output."""
 
 from __future__ import annotations
 
@@ -22,8 +22,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Photo:
-    """One view: its name (see ``data.files.photo_names``), the file, and its width and height in pixels; trained: not
-    held out."""
+    """A view: its name (``data.files.photo_names``), its file, its size in pixels; trained: not held out."""
 
     name: str
     path: Path
@@ -32,40 +31,40 @@ class Photo:
     trained: bool = True
 
     def pixels(self) -> np.ndarray:
-        """[H, W, 3] uint8 RGB."""
-        # a copy: torch wants memory that can be written to
+        """Read [H, W, 3] uint8 RGB."""
+        # a copy: torch needs writable memory
         return read_image(self.path, lambda image: np.array(image.convert("RGB")))
 
 
 class Geometry(Protocol):
-    """The scene's own shape, from a trained run: of its views, held-out ones included, without lens distortion."""
+    """Shape of the scene from a trained run, for all its views, without lens distortion."""
 
     @property
     def images(self) -> Sequence[Path]:
-        """The photographs of its views."""
+        """Photos of the views."""
         ...
 
     @property
     def cameras(self) -> Sequence[Camera]:
-        """Without distortion, of the photographs' size."""
+        """Cameras without distortion, of the photos' size."""
         ...
 
     def depth(self, view: int) -> Tensor:
-        """[h, w] float32, depth of the surface, 0 where nothing is."""
+        """Return [h, w] float32, depth of the surface, 0 without one."""
         ...
 
     def to_straight(self, labels: np.ndarray, view: int) -> np.ndarray:
-        """[h, w] uint16: a class map [H, W] of the photograph without its lens distortion."""
+        """Remove the photo's lens distortion from labels [H, W]; return [h, w] uint16."""
         ...
 
     def to_photo(self, labels: np.ndarray, view: int) -> np.ndarray:
-        """[H, W] uint16: a class map [h, w] with the photograph's lens distortion."""
+        """Apply the photo's lens distortion to labels [h, w]; return [H, W] uint16."""
         ...
 
 
 @dataclass(frozen=True)
 class SourceScene:
-    """What masks are made for. root: the scene's folder. geometry: None unless a trained run was given."""
+    """The scene of a source. root: its folder. geometry: None without a trained run."""
 
     root: Path
     photos: Sequence[Photo]
@@ -73,18 +72,22 @@ class SourceScene:
 
     @cached_property
     def names(self) -> PhotoNames:
-        """What the photos are called."""
+        """Names of the photos."""
         return PhotoNames([photo.name for photo in self.photos])
 
+    def by_photo(self, files: Mapping[str, Path]) -> dict[str, Path]:
+        """Return the file of each photo that the name of a file means, by the photo's name; raise ``UserError``."""
+        return {self.photos[index].name: path for index, path in self.names.assigned(files, str).items()}
+
     def index_of(self, name: str, whose: str) -> int:
-        """The place of the view that ``name`` means; ``whose`` says in the error where it was named."""
+        """Return the index of the view that ``name`` means; ``whose`` is the source of the name, for errors."""
         found = self.names.find(name, whose)
         if found is None:
             raise UserError(f"{whose} names the view {name!r}, but no image of {self.root} is called so: correct it.")
         return found
 
     def places(self) -> list[int]:
-        """Of each view of ``geometry`` its place among the photos; ``UserError`` if it is of another scene."""
+        """Return the photo index of each view of ``geometry``; raise ``UserError`` for another scene."""
         assert self.geometry is not None
         known = {photo.path.resolve(): index for index, photo in enumerate(self.photos)}
         for image in self.geometry.images:
@@ -96,17 +99,17 @@ class SourceScene:
         return [known[image.resolve()] for image in self.geometry.images]
 
     def below(self, path: Path) -> Path:
-        """The path in the scene's folder, if it is not absolute and exists there; else as it is."""
+        """Return the path below the scene's folder if it exists there; else the path itself."""
         inside = self.root / path
         return inside if not path.is_absolute() and inside.exists() else path
 
 
 @dataclass(frozen=True)
 class MadeMasks:
-    """Class names by id, and one class map [H, W] uint16 per photo in their order; None: no mask for that view.
+    """Class names by id, and per photo its labels [H, W] uint16, or None.
 
-    notes: sentences to tell the user, filled while the maps are made. to_look_at: places of photos whose maps are
-    neither to be trained on nor to be scored against.
+    notes: sentences for the user, filled while maps are made. to_look_at: indices of photos whose maps serve neither
+    training nor evaluation.
     """
 
     names: Mapping[int, str]
@@ -116,27 +119,27 @@ class MadeMasks:
 
 
 class MaskSource(ABC):
-    """Makes the masks of a scene. A source is a frozen dataclass; its own fields are its options.
+    """Interface of the sources: frozen dataclasses whose fields are their options.
 
-    needs_run: whether it works only with ``SourceScene.geometry``.
+    needs_run: True if ``SourceScene.geometry`` is needed.
     """
 
     needs_run: ClassVar[bool] = False
 
     @classmethod
     def unavailable(cls) -> str | None:
-        """None, or one sentence on why it cannot run here."""
+        """Return a sentence on why the source cannot run here, or None."""
         return None
 
     @abstractmethod
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
-        """The masks of all photos; raises ``UserError`` for input that cannot be used. progress: (done, total)."""
+        """Make the masks of all photos; raise ``UserError`` for unusable input. progress: (done, total)."""
 
 
 def per_photo(
     scene: SourceScene, progress: Progress, read: Callable[[Photo], np.ndarray | None]
 ) -> Iterator[np.ndarray | None]:
-    """``read`` of each photo, with progress; raises ``UserError`` where a map has another size than its photo."""
+    """Yield ``read`` of each photo, with progress; raise ``UserError`` for labels of another size than the photo."""
     for index, photo in enumerate(scene.photos):
         labels = read(photo)
         if labels is not None and labels.shape != (photo.height, photo.width):
@@ -149,7 +152,7 @@ def per_photo(
 
 
 def stacked(objects: Sequence[tuple[int, np.ndarray]], shape: tuple[int, int]) -> np.ndarray:
-    """[H, W] uint16: the masks [H, W] bool of objects by id in one map; where they overlap, the smaller one is seen."""
+    """Combine masks [H, W] bool of objects by id into labels [H, W] uint16; smaller objects cover larger ones."""
     labels = np.zeros(shape, np.uint16)
     for class_id, mask in sorted(objects, key=lambda pair: (-int(pair[1].sum()), pair[0])):
         labels[mask] = class_id

@@ -1,4 +1,4 @@
-"""Source of masks in COCO's JSON: run lengths or polygons."""
+"""Source for COCO's JSON: run lengths or polygons."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progre
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import load_json, reason
 
-FARTHEST = 1e5  # pixels of a polygon's points from the image's corner; the library rasterizes every one
+FARTHEST = 1e5  # pixels of a polygon's points from the image's corner; the library rasterizes all of them
 INSTANCE_KEYS = ("instance_id", "track_id", "object_id")
 
 
@@ -23,8 +23,8 @@ class CocoSource(MaskSource):
     """COCO annotations: ``images``, ``annotations`` with a ``segmentation`` (RLE, compressed or not, or polygons),
     ``categories``.
 
-    file: the JSON. by: what one object is: "category", or "instance": the annotation's instance_id, track_id or
-    object_id. Where masks overlap, the smaller object is seen.
+    file: the JSON. by: the key of an object: "category", or "instance" for instance_id, track_id or object_id. Smaller
+    objects cover larger ones.
     """
 
     file: Path = Path("annotations.json")
@@ -48,7 +48,7 @@ class CocoSource(MaskSource):
         )
         if not set(meant.values()) & {view for view, _, _ in annotations}:
             raise UserError(f"{path} annotates no image of {scene.root}: its file_name must be theirs.")
-        # a file may mix numbers and words: numbers come first
+        # numbers come before words
         keys = sorted({key for _, key, _ in annotations}, key=lambda key: [(isinstance(k, str), k) for k in key])
         if len(keys) > IGNORE - 1:
             raise UserError(f"{path} has {len(keys)} objects: only {IGNORE - 1} ids can be saved.")
@@ -62,7 +62,7 @@ class CocoSource(MaskSource):
             if photo.name not in annotated:
                 return None
             shape = (photo.height, photo.width)
-            whole: dict[int, np.ndarray] = {}  # an object may be annotated in pieces
+            whole: dict[int, np.ndarray] = {}  # an object may have several annotations
             for class_id, segmentation in of_view[annotated[photo.name]]:
                 mask = decoded(segmentation, shape, f"{path}, image {photo.name}")
                 whole[class_id] = whole.get(class_id, False) | mask
@@ -75,7 +75,7 @@ class CocoSource(MaskSource):
         return MadeMasks(names, per_photo(scene, progress, read), [])
 
     def _key(self, entry: dict[str, Any]) -> tuple[int | str, int | str]:
-        """What one object is called: (category, instance)."""
+        """Return the key of an annotation's object: (category, instance)."""
         if self.by == "category":
             return _number_or_word(entry["category_id"]), 0
         for key in INSTANCE_KEYS:
@@ -85,16 +85,16 @@ class CocoSource(MaskSource):
 
 
 def _number_or_word(value: Any) -> int | str:
-    """An id as JSON may write it; ``ValueError`` for anything else."""
+    """Return an id from JSON; raise ``ValueError`` for anything but a number or a word."""
     if not isinstance(value, (int, str)):
         raise ValueError(f"the id {value!r} is neither a whole number nor a word")
     return value
 
 
 def packed_total(counts: str) -> int:
-    """The sum of the run lengths in COCO's packed text: 5 bits a character, every length less that before the last.
+    """Sum the run lengths in COCO's packed text: 5 bits a character, each length minus the one before the last.
 
-    Raises ``ValueError`` for other text, and for a length below 0. The library that unpacks it checks neither.
+    Raises ``ValueError`` for other text and for a length below 0; the library checks neither.
     """
     lengths: list[int] = []
     value = shift = 0
@@ -119,7 +119,7 @@ def packed_total(counts: str) -> int:
 
 
 def _check_polygons(polygons: Any) -> None:
-    """Raise ``ValueError`` unless these are lists of at least three x, y that lie near some image."""
+    """Raise ``ValueError`` unless these are lists of at least three points x, y near the image."""
     if not isinstance(polygons, list) or not polygons:
         raise ValueError("it is no list of polygons")
     for polygon in polygons:
@@ -130,10 +130,10 @@ def _check_polygons(polygons: Any) -> None:
 
 
 def decoded(segmentation: Any, shape: tuple[int, int], where: str) -> np.ndarray:
-    """[H, W] bool of one annotation: {"size", "counts"} or a list of polygons; ``where`` names it in errors."""
+    """Decode an annotation, {"size", "counts"} or a list of polygons, to [H, W] bool; ``where`` names it in errors."""
     from pycocotools import mask
 
-    coco: Any = mask  # its types do not know all that it takes
+    coco: Any = mask  # its types are incomplete
     height, width = shape
     try:
         if isinstance(segmentation, dict):
@@ -161,5 +161,5 @@ def decoded(segmentation: Any, shape: tuple[int, int], where: str) -> np.ndarray
         return coco.decode(runs).astype(bool)
     except UserError:
         raise
-    except Exception as error:  # the library raises whatever it meets
+    except Exception as error:  # the library raises errors of any type
         raise UserError(f"{where}: a segmentation is neither RLE nor polygons ({error}): export it again.") from error

@@ -1,4 +1,4 @@
-"""Source that needs no weights: GrabCut from boxes in a few views, carried to the others by the scene's own depth."""
+"""Source without weights: GrabCut from boxes in a few views, carried to the others by the scene's depth."""
 
 from __future__ import annotations
 
@@ -19,20 +19,19 @@ from beags_plugin.masks.sources.prompts import Prompt, PromptedObject, read_prom
 from beags_plugin.system.errors import UserError
 
 _ITERATIONS = 5
-_BAND = 0.012  # of the image diagonal: how far a carried outline may be wrong
-_MARGIN = 0.3  # of an object's box: how much background around it GrabCut sees
-PIECE = 0.1  # share of an object's largest piece that another piece needs: smaller ones are colours found elsewhere
+_BAND = 0.012  # of the image diagonal: error of a carried outline
+_MARGIN = 0.3  # of an object's box: background around it in GrabCut
+PIECE = 0.1  # of an object's largest piece: smaller ones are the same colours elsewhere
 _POINT = 0.006  # of the image diagonal: radius of a prompted point
 
 
 @dataclass(frozen=True)
 class GrabCutSource(MaskSource):
-    """GrabCut from boxes (and points, if given) in a few views; the other views get what the scene's depth carries
-    to them as a start, and GrabCut draws the outline there.
+    """GrabCut from boxes (and points) in a few views, and in the others from labels carried by the scene's depth.
 
     prompts: JSON, see ``prompts.read_prompts``. rounds: of carrying; from the second on all views vote, not only the
-    prompted ones. tau: a vote counts if |z - depth| <= tau z. held_out: masks of held-out views too, drawn in the last
-    round, which never vote: to look at, as nothing that a program drew is a truth to score against.
+    prompted ones. tau: a vote counts if |z - depth| <= tau z. held_out: also make masks of held-out views, in the last
+    round and without a vote: to look at, not to score against.
     """
 
     needs_run: ClassVar[bool] = True
@@ -48,16 +47,16 @@ class GrabCutSource(MaskSource):
         objects = read_prompts(path)
         places = scene.places()
         trained = {view for view in places if scene.photos[view].trained}
-        drawn = self._prompted(scene, objects, path)
-        if held_out := sorted(scene.photos[view].name for view in drawn if view not in trained):
+        prompted = self._prompted(scene, objects, path)
+        if held_out := sorted(scene.photos[view].name for view in prompted if view not in trained):
             raise UserError(f"{path} has prompts in {held_out[0]}, which is held out: prompt a training view.")
         names = {0: "background", **{one.class_id: one.name for one in objects}}
         ids = sorted(one.class_id for one in objects)
-        maps = self._carried(scene, places, trained, drawn, ids, progress)
+        maps = self._carried(scene, places, trained, prompted, ids, progress)
         return MadeMasks(names, maps, [], frozenset(places) - trained if self.held_out else frozenset())
 
     def _prompted(self, scene: SourceScene, objects: Sequence[PromptedObject], path: Path) -> dict[int, np.ndarray]:
-        """Place of a photo to its class map, of the prompted views; each must show all objects that are in it."""
+        """Cut the labels of the prompted views, by photo index; a view needs prompts for all its objects."""
         found: dict[int, list[tuple[int, np.ndarray]]] = {}
         for one in objects:
             if not one.prompts:
@@ -77,13 +76,13 @@ class GrabCutSource(MaskSource):
         scene: SourceScene,
         places: Sequence[int],
         trained: set[int],
-        drawn: dict[int, np.ndarray],
+        prompted: dict[int, np.ndarray],
         ids: list[int],
         progress: Progress,
     ) -> Iterator[np.ndarray | None]:
         geometry = scene.geometry
         assert geometry is not None
-        rounds, maps, done = max(1, self.rounds), dict(drawn), 0
+        rounds, maps, done = max(1, self.rounds), dict(prompted), 0
         own = [index for index, view in enumerate(places) if view in trained]
         others = [index for index, view in enumerate(places) if self.held_out and view not in trained]
         total = len(own) * rounds + len(others)
@@ -92,7 +91,7 @@ class GrabCutSource(MaskSource):
             carried = carry(geometry, chosen, [maps.get(places[index]) for index in chosen], ids, self.tau)
             for index, (labels, sure) in zip(chosen, carried, strict=True):
                 view = places[index]
-                if view not in drawn:
+                if view not in prompted:
                     start = geometry.to_photo(np.where(sure, labels, IGNORE).astype(np.uint16), index)
                     maps[view] = cut_from_labels(scene.photos[view].pixels(), start, ids)
                 progress(done := done + 1, total)
@@ -103,10 +102,10 @@ class GrabCutSource(MaskSource):
 def carry(
     geometry: Geometry, views: Sequence[int], maps: Sequence[np.ndarray | None], ids: Sequence[int], tau: float
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Of each of some views of ``geometry`` what the class maps of the others say there.
+    """Vote on the labels of some views of ``geometry`` by the labels of all of them.
 
-    maps: of ``views``, as their photographs; None: none.
-    Returns per view labels [h, w] uint16 and [h, w] bool, whether more than half of the votes agree; both without
+    maps: labels of ``views`` with distortion, or None.
+    Returns per view labels [h, w] uint16 and [h, w] bool, True where more than half of the votes agree; both without
     distortion.
     """
     known = ClassRanks(torch.tensor([0, *ids]))
@@ -128,7 +127,7 @@ def carry(
 
 
 def cut_by_box(photo: np.ndarray, prompt: Prompt) -> np.ndarray:
-    """[H, W] bool: the object in the prompt's box; photo: [H, W, 3] uint8 RGB."""
+    """Cut the object in the prompt's box, [H, W] bool; photo: [H, W, 3] uint8 RGB."""
     import cv2
 
     height, width = photo.shape[:2]
@@ -146,11 +145,10 @@ def cut_by_box(photo: np.ndarray, prompt: Prompt) -> np.ndarray:
 
 
 def cut_from_labels(photo: np.ndarray, labels: np.ndarray, ids: Sequence[int]) -> np.ndarray:
-    """[H, W] uint16 class map: GrabCut per object, started from carried labels [H, W] uint16 (IGNORE: unknown).
+    """Cut each object from carried labels [H, W] uint16 (IGNORE: unknown) by GrabCut; return labels [H, W] uint16.
 
-    Labels far enough from where they change are kept; between them, and where nothing was carried, colours decide.
-    An object stays within the convex hull of what was carried, and a band about it: where no view voted, as on far
-    walls, colours alone would find it again.
+    Labels far from an outline are kept; in between, and in unknown areas, colours decide. An object stays in the convex
+    hull of its labels and a band about it, as its colours may occur elsewhere.
     """
     import cv2
 
@@ -164,18 +162,22 @@ def cut_from_labels(photo: np.ndarray, labels: np.ndarray, ids: Sequence[int]) -
         inside = large_pieces(cv2.morphologyEx((labels == class_id).astype(np.uint8), cv2.MORPH_OPEN, small) > 0)
         if not inside.any():
             continue
-        box = _box_around(inside)
-        nearest = _nearer(inside, outside)
-        start = np.where(nearest, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+        left, top, wide, high = cv2.boundingRect(inside.astype(np.uint8))
+        to_inside, to_outside = (
+            cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) for mask in (inside, outside)
+        )
+        start = np.where(to_inside <= to_outside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
         start[cv2.erode(inside.astype(np.uint8), disc) > 0] = cv2.GC_FGD
         start[cv2.erode(outside.astype(np.uint8), disc) > 0] = cv2.GC_BGD
-        start[cv2.dilate(_hull(inside), disc, iterations=3) == 0] = cv2.GC_BGD  # parts that no view has carried
-        objects.append((class_id, large_pieces(_cut(photo, start, box))))
+        corners = cv2.convexHull(cv2.findNonZero(inside.astype(np.uint8)))
+        hull = cv2.fillConvexPoly(np.zeros(labels.shape, np.uint8), corners, (1,))
+        start[cv2.dilate(hull, disc, iterations=3) == 0] = cv2.GC_BGD  # parts that no view has carried
+        objects.append((class_id, large_pieces(_cut(photo, start, (left, top, left + wide, top + high)))))
     return stacked(objects, (height, width))
 
 
 def large_pieces(mask: np.ndarray) -> np.ndarray:
-    """[H, W] bool: the connected pieces of a mask that have at least a tenth of the largest one's pixels."""
+    """Return [H, W] bool: the connected pieces of a mask with at least a tenth of the largest one's pixels."""
     import cv2
 
     _, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
@@ -184,32 +186,8 @@ def large_pieces(mask: np.ndarray) -> np.ndarray:
     return np.isin(pieces, kept) & mask
 
 
-def _hull(mask: np.ndarray) -> np.ndarray:
-    """[H, W] uint8: 1 in the convex hull of a mask's pixels."""
-    import cv2
-
-    row, column = np.nonzero(mask)
-    corners = cv2.convexHull(np.stack([column, row], axis=1).astype(np.int32))
-    return cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), corners, (1,))
-
-
-def _nearer(inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
-    """[H, W] bool: whether the nearest known pixel is inside."""
-    import cv2
-
-    to_inside, to_outside = (
-        cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) for mask in (inside, outside)
-    )
-    return to_inside <= to_outside
-
-
-def _box_around(mask: np.ndarray) -> tuple[int, int, int, int]:
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
-
-
 def _cut(photo: np.ndarray, start: np.ndarray, box: tuple[int, int, int, int]) -> np.ndarray:
-    """GrabCut in the box and a margin about it; outside of it nothing is the object."""
+    """Apply GrabCut in the box and a margin about it; the rest is background."""
     import cv2
 
     height, width = start.shape
@@ -223,7 +201,7 @@ def _cut(photo: np.ndarray, start: np.ndarray, box: tuple[int, int, int, int]) -
     if kinds.all() or not kinds.any():  # GrabCut needs both
         mask[rows, columns] = kinds
         return mask
-    cv2.setRNGSeed(0)  # its mixture models start from k-means with OpenCV's own generator
+    cv2.setRNGSeed(0)  # for the k-means of its mixture models
     background, foreground = np.zeros((1, 65)), np.zeros((1, 65))
     image = np.ascontiguousarray(photo[rows, columns, ::-1])
     cv2.grabCut(image, part, (0, 0, 1, 1), background, foreground, _ITERATIONS, cv2.GC_INIT_WITH_MASK)

@@ -1,4 +1,4 @@
-"""Sources of masks that are images of ids already: any folder of them, and that of Gaussian Grouping."""
+"""Sources for images of ids: any folder of them, and that of Gaussian Grouping."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from beags_plugin.system.reading.images import read_image
 
 @dataclass(frozen=True)
 class IdImagesSource(MaskSource):
-    """Images of ids, called as the photos, with their folders: grey or palette; or of colours, each an id.
+    """Images of ids with the names of the photos: grey or palette; or colour images with an id per colour.
 
-    folder: with the images. names: JSON {"id": "name"}, or None. colors: take colour images; black is the background,
-    other colours get ids 1, 2, ... in the order in which they first come. ignore_ids: ids that mean "not labelled".
+    folder: of the images. names: JSON {"id": "name"}, or None. colors: read colour images; black is the background,
+    other colours get ids 1, 2, ... in the order of appearance. ignore_ids: ids that mean "not labelled".
     least_views: ids in fewer images become background (0: all stay).
     """
 
@@ -33,8 +33,7 @@ class IdImagesSource(MaskSource):
 
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
         folder = scene.below(self.folder)
-        of_photo = scene.names.assigned(files_by_name(folder), str)
-        files = {scene.photos[index].name: path for index, path in of_photo.items()}
+        files = scene.by_photo(files_by_name(folder))
         if not files:
             raise UserError(f"{folder} holds no image named as one of the scene's: give options folder=...")
         palette: dict[int, int] = {}
@@ -80,7 +79,7 @@ class IdImagesSource(MaskSource):
 
 @dataclass(frozen=True)
 class GaussianGroupingSource(IdImagesSource):
-    """The ``object_mask`` folder that Gaussian Grouping's tracker writes: grey ids, many in few views only."""
+    """The ``object_mask`` folder of Gaussian Grouping's tracker: grey ids, many of them in few views."""
 
     folder: Path = Path("object_mask")
     least_views: int = 3

@@ -1,4 +1,4 @@
-"""Source of masks as LangSplat's preprocessing leaves them: segments of single views, matched by their features."""
+"""Source for the output of LangSplat's preprocessing: segments of single views, matched by their features."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ LEVELS = ("default", "small", "medium", "large")
 class LangSplatSource(MaskSource):
     """``language_features/<stem>_s.npy`` [4, H, W] (segments of four sizes, -1: none) and ``<stem>_f.npy`` [N, D].
 
-    Segments are numbered in each view anew, so they become one object across views if their features are alike.
-    folder: with the files. level: default, small, medium or large. similarity: least cosine of the angle between a
-    segment's features and the mean of the object's. least_views: objects in fewer views become background.
+    Each view numbers its segments anew; segments of similar features become one object.
+    folder: of the files. level: default, small, medium or large. similarity: least cosine between a segment's features
+    and the mean of the object's. least_views: objects in fewer views become background.
     """
 
     folder: Path = Path("language_features")
@@ -35,8 +35,7 @@ class LangSplatSource(MaskSource):
 
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
         folder = scene.below(self.folder)
-        files = scene.names.assigned(files_by_name(folder, ("_s.npy",)), str)
-        segments_of = {scene.photos[index].name: path for index, path in files.items()}
+        segments_of = scene.by_photo(files_by_name(folder, ("_s.npy",)))
         if not segments_of:
             raise UserError(f"{folder} holds no <stem>_s.npy for an image of the scene: give options folder=...")
         tables = self._objects(segments_of)
@@ -67,7 +66,7 @@ class LangSplatSource(MaskSource):
         return maps[LEVELS.index(self.level)].astype(np.int64)
 
     def _objects(self, files: Mapping[str, Path]) -> dict[str, dict[int, int]]:
-        """Per photo's name, segment to object, without objects in few views. files: of the segments, by that name."""
+        """Map segments to objects for each photo, without objects in few views. files: of the segments, by photo."""
         means: list[np.ndarray] = []  # sums of unit features
         views: list[set[str]] = []
         tables: dict[str, dict[int, int]] = {}
@@ -105,7 +104,7 @@ class LangSplatSource(MaskSource):
 
 
 def _array(path: Path) -> np.ndarray:
-    """A .npy file of numbers."""
+    """Read a .npy file of numbers."""
     try:
         array = load_array(path)
     except (OSError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""Which photo a file, an entry or a prompt is about: by the photo's path below the folder of all photos."""
+"""Matching of files, entries and prompts to photos, by the photo's path below the folder of all photos."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ Found = TypeVar("Found")
 
 
 class PhotoNames:
-    """The names of V photos, as ``data.files.photo_names`` gives them, and what other names may mean.
+    """The names of V photos of ``data.files.photo_names``, and the photos that other names mean.
 
-    A name means the photo that is called so; else those whose names end with it, or that it ends with (whole parts of
-    the path count: "v1" and "images/left/v1" mean "left/v1", "right/v1" does not).
+    A name means the photo of that name; else those whose names end with it, or that it ends with (in whole parts of the
+    path: "v1" and "images/left/v1" mean "left/v1", "right/v1" does not).
     """
 
     def __init__(self, names: Sequence[str]) -> None:
@@ -27,7 +27,7 @@ class PhotoNames:
             self._of_stem.setdefault(_stem(name), []).append(index)
 
     def candidates(self, name: str) -> list[int]:
-        """The places of the photos that ``name`` (with or without the suffix of an image) may mean."""
+        """Return the indices of the photos that ``name``, with or without suffix, may mean."""
         for key in _keys(name):
             if key in self._exact:
                 return [self._exact[key]]
@@ -39,15 +39,15 @@ class PhotoNames:
         return []
 
     def in_other_folders(self, name: str) -> list[int]:
-        """The places of the photos of the same stem, if ``name`` means none because of the folder that it gives."""
+        """Return the indices of the photos of the same stem, if the folder in ``name`` excludes all of them."""
         if self.candidates(name):
             return []
         return next((self._of_stem[stem] for stem in map(_stem, _keys(name)) if stem in self._of_stem), [])
 
     def find(self, name: str, whose: str) -> int | None:
-        """The place of the photo that ``name`` means, or None.
+        """Return the index of the photo that ``name`` means, or None.
 
-        whose: what names it, for errors. Raises ``UserError`` if it may mean several, or gives a photo another folder.
+        whose: source of the name, for errors. Raises ``UserError`` for several photos, or another folder.
         """
         found = self.candidates(name)
         if len(found) > 1:
@@ -61,12 +61,12 @@ class PhotoNames:
             )
         return found[0] if found else None
 
-    def assigned(self, values: Mapping[str, Found], told: Callable[[Found], str]) -> dict[int, Found]:
-        """Place of a photo to the value whose name means it; others mean none.
+    def assigned(self, values: Mapping[str, Found], describe: Callable[[Found], str]) -> dict[int, Found]:
+        """Return the photo index of each value whose name means a photo.
 
-        values: by name. told: calls a value by its file, for errors.
-        Raises ``UserError`` where a name may mean several photos that no other name means exactly, or gives such a
-        photo another folder, and where two names mean one photo and not just one of them is its own.
+        values: by name. describe: names a value's file, for errors.
+        Raises ``UserError`` if a name means several photos or another folder, unless exact names take these photos;
+        and if two names mean a photo, unless exactly one of them is exact.
         """
         found: dict[int, Found] = {}
         loosely: dict[int, Found] = {}
@@ -78,19 +78,19 @@ class PhotoNames:
                 continue
             if others:
                 raise UserError(
-                    f"{told(value)} has the name of {self._listed(others)} but not the folder: give it the photo's own "
-                    "path if it belongs to it, else remove it."
+                    f"{describe(value)} has the name of {self._listed(others)} but not the folder: give it the photo's "
+                    "own path if it belongs to it, else remove it."
                 )
             if len(places) > 1:
                 raise UserError(
-                    f"{told(value)} could belong to {self._listed(places)}: give it the path that its photo has below "
-                    f"the folder of photos, as {self.names[places[0]]}."
+                    f"{describe(value)} could belong to {self._listed(places)}: give it the path that its photo has "
+                    f"below the folder of photos, as {self.names[places[0]]}."
                 )
             taken = found if own else loosely
             if places[0] in taken:
                 raise UserError(
-                    f"{told(taken[places[0]])} and {told(value)} could both belong to {self.names[places[0]]}: remove "
-                    "one of them."
+                    f"{describe(taken[places[0]])} and {describe(value)} could both belong to "
+                    f"{self.names[places[0]]}: remove one of them."
                 )
             taken[places[0]] = value
         return dict(sorted({**loosely, **found}.items()))
@@ -103,15 +103,15 @@ class PhotoNames:
 
 
 def plain(name: str) -> str:
-    """A path with slashes and without the suffix of an image."""
+    """Return a path with slashes and without the suffix of an image."""
     path = PurePosixPath(name.replace("\\", "/"))
     return (path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path).as_posix()
 
 
 def files_by_name(folder: Path, endings: Sequence[str] = IMAGE_SUFFIXES) -> dict[str, Path]:
-    """The files in a folder and below that end so, by their paths in it without these endings.
+    """Find the files below a folder with these endings, by their paths without the ending.
 
-    Raises ``UserError`` where two differ in their endings only.
+    Raises ``UserError`` if two differ only in the ending.
     """
     found: dict[str, Path] = {}
     for path in sorted(folder.rglob("*")):
@@ -125,7 +125,7 @@ def files_by_name(folder: Path, endings: Sequence[str] = IMAGE_SUFFIXES) -> dict
 
 
 def _keys(name: str) -> tuple[str, str]:
-    """How a name may be meant: without the suffix of an image, or whole, as a stem may hold dots."""
+    """Return a name without the suffix of an image, and whole, as a stem may contain dots."""
     return plain(name), PurePosixPath(name.replace("\\", "/")).as_posix()
 
 

@@ -1,4 +1,4 @@
-"""Source of masks that are one image per object and view."""
+"""Source for one image per object and view."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from beags_plugin.system.errors import UserError
 class ObjectImagesSource(MaskSource):
     """One image per object and view: <folder>/<object>/<stem>.png, or <folder>/<stem>/<object>.png.
 
-    Views are called as the photos, with the folders that these are in, if there are any.
-    folder: of them. Where masks overlap, the smaller object is seen. A view without any image has no mask.
+    Views have the names of the photos, with their folders. folder: of the images. Smaller objects cover larger ones.
+    A view without an image has no mask.
     """
 
     folder: Path = Path("object_masks")
@@ -39,26 +39,23 @@ class ObjectImagesSource(MaskSource):
             files = [(ids[name], found[name, photo.name]) for name in objects if (name, photo.name) in found]
             return self._stack(files) if files else None
 
-        return MadeMasks(named_objects(objects), per_photo(scene, progress, read), [])
+        names = {0: "background", **{index: name for name, index in ids.items()}}
+        return MadeMasks(names, per_photo(scene, progress, read), [])
 
     @staticmethod
     def _found(scene: SourceScene, folder: Path) -> dict[tuple[str, str], Path]:
-        """(object, name of a photo) to the file: the object is the first part of a path, or else the last."""
+        """Find the file of each (object, name of a photo): the object is the first part of a path, or else the last."""
         named: dict[str, dict[str, Path]] = {}  # object, then view
         for name, path in files_by_name(folder).items():
             first, _, rest = name.partition("/")
             view, _, last = name.rpartition("/")
             ways = [(first, rest), (last, view)]  # of reading the path: object and view
             meant = [way for way in ways if scene.names.candidates(way[1])]
-            meant += [way for way in ways if scene.names.in_other_folders(way[1])]  # ``assigned`` tells the mistake
+            meant += [way for way in ways if scene.names.in_other_folders(way[1])]  # refused by ``assigned``
             for each, of_view in meant[:1]:
                 if (other := named.setdefault(each, {}).setdefault(of_view, path)) is not path:
                     raise UserError(f"{other} and {path} are both {each} in {of_view}: remove one of them.")
-        return {
-            (each, scene.photos[index].name): path
-            for each, files in named.items()
-            for index, path in scene.names.assigned(files, str).items()
-        }
+        return {(each, name): path for each, files in named.items() for name, path in scene.by_photo(files).items()}
 
     @staticmethod
     def _stack(files: Sequence[tuple[int, Path]]) -> np.ndarray:
@@ -68,8 +65,3 @@ class ObjectImagesSource(MaskSource):
             raise UserError(f"{files[0][1]} and the other objects' masks of this view differ in size: make them alike.")
         height, width = sizes.pop()
         return stacked(masks, (height, width))
-
-
-def named_objects(objects: Sequence[str]) -> dict[int, str]:
-    """Ids 1, 2, ... of objects in their order, and the background."""
-    return {0: "background", **dict(enumerate(objects, 1))}

@@ -1,4 +1,4 @@
-"""Prompts: where objects are in some views, in a small JSON."""
+"""Prompts: places of objects in some views, in a small JSON file."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ EXAMPLE = '{"objects": [{"name": "cup", "prompts": [{"view": "IMG_1", "box": [10
 
 @dataclass(frozen=True)
 class Prompt:
-    """What shows an object in one view.
+    """The place of an object in one view.
 
-    box: (left, top, right, bottom) pixels of the image file, or None. points: (x, y) pixels; inside: of each point
-    whether it is on the object.
+    box: (left, top, right, bottom) pixels of the image file, or None. points: (x, y) pixels; inside: True for points on
+    the object.
     """
 
     box: tuple[float, float, float, float] | None = None
@@ -38,7 +38,7 @@ class PromptedObject:
 
 
 def read_prompts(path: Path) -> list[PromptedObject]:
-    """The objects of a prompts JSON; raises ``UserError`` that names file and object.
+    """Read the objects of a prompts JSON; raise ``UserError`` with file and object.
 
     {"objects": [{"name": ..., "id": optional, "text": optional, "prompts": [{"view": name, "box": [left, top, right,
     bottom], "points": [[x, y], ...], "outside": [[x, y], ...]}, ...]}, ...]}

@@ -1,4 +1,4 @@
-"""Source: two-stage retrieval with SAM2's video model and Grounding DINO, of the library transformers."""
+"""Source by two-stage retrieval with SAM2's video model and Grounding DINO, from the library transformers."""
 
 from __future__ import annotations
 
@@ -17,17 +17,16 @@ from beags_plugin.masks.sources.prompts import Prompt, read_prompts
 from beags_plugin.masks.sources.two_stage import BestLabels, Box, Retrieval, retrieve
 from beags_plugin.system.errors import UserError
 
-KEPT_FRAMES = 32  # of one object's memory behind the frame that is tracked; the model looks at 16 at most
+KEPT_FRAMES = 32  # of an object's memory about the tracked frame; the model uses 16 at most
 
 
 @dataclass(frozen=True)
 class Sam2Source(MaskSource):
-    """SAM2 tracks objects through the views in the order of their names, from points, boxes, or a text that Grounding
-    DINO finds.
+    """SAM2 tracks objects through the views in the order of names, from points, boxes, or texts for Grounding DINO.
 
     prompts: JSON, see ``prompts.read_prompts``. model, detector: a folder with the library's files, or a name on its
-    hub; the detector is loaded only if an object has a text. device: "auto" is CUDA where there is one.
-    threshold, strict, searched, retries: see ``two_stage.Retrieval``. local: never ask the hub.
+    hub; the detector is loaded only if an object has a text. device: "auto" prefers CUDA.
+    threshold, strict, searched, retries: see ``two_stage.Retrieval``. local: never use the hub.
     """
 
     prompts: Path = Path("prompts.json")
@@ -74,7 +73,7 @@ class Sam2Source(MaskSource):
 
 
 def load(name: str, kind: str, local: bool = False) -> tuple[Any, Any]:
-    """The model of this class and its processor, from a folder or the hub; ``UserError`` if they are not there."""
+    """Load the model of class ``kind`` and its processor from a folder or the hub; raise ``UserError``."""
     import transformers  # pyright: ignore[reportMissingImports]
 
     try:
@@ -91,8 +90,8 @@ def load(name: str, kind: str, local: bool = False) -> tuple[Any, Any]:
 class Sam2Predictor:
     """SAM2's video model as a ``two_stage.VideoPredictor``.
 
-    Memory is bounded: frames are read when they are needed, features and memories wait on the CPU, and memories that
-    the model no longer looks at are dropped.
+    Memory is bounded: frames are read when needed, features and memories lie on the CPU, and memories that the model no
+    longer uses are dropped.
     """
 
     def __init__(self, model: Any, processor: Any, photos: Sequence[Photo], device: str = "cpu") -> None:
@@ -133,7 +132,7 @@ class Sam2Predictor:
 
 
 class _Frames(dict):
-    """The frames of a session, read and prepared when they are asked for; the last one is kept."""
+    """The frames of a session, read and prepared on demand; the last one is kept."""
 
     def __init__(self, processor: Any, photos: Sequence[Photo]) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Two-stage retrieval of objects from a video of views (method, section 2; COB-GS), whatever segments the video."""
+"""Two-stage retrieval of objects from a video of views (method, section 2; COB-GS), for any video predictor."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ Box = tuple[float, float, float, float]
 
 
 class VideoPredictor(Protocol):
-    """What carries one object from prompted frames to others, such as SAM2."""
+    """Tracker of one object from prompted frames to others, such as SAM2."""
 
     def track(self, prompts: Mapping[int, Prompt], frames: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        """Each of ``frames`` and its logits [H, W] float32 (above 0: the object), in their order.
+        """Yield each frame and its logits [H, W] float32 (above 0: the object), independently of earlier calls.
 
-        frames: consecutive, up or down; the first is prompted. It knows nothing of earlier calls.
+        frames: consecutive, up or down; the first is prompted.
         """
         ...
 
 
 class Detector(Protocol):
-    """What finds a text in a frame, such as Grounding DINO."""
+    """Detector of a text in a frame, such as Grounding DINO."""
 
     def detect(self, frame: int, text: str, threshold: float) -> list[tuple[Box, float]]:
-        """Boxes (left, top, right, bottom) in pixels and their scores, none below ``threshold``."""
+        """Return boxes (left, top, right, bottom) in pixels and their scores of ``threshold`` or more."""
         ...
 
 
 @dataclass(frozen=True)
 class Retrieval:
-    """How objects are retrieved.
+    """Options of the retrieval.
 
-    threshold: least score of a detection in stage 1; strict: the same in stage 2, where a wrong one would bring in
-    what is not there. searched: most frames of a run in which the text is looked for. retries: how often stage 2 is
-    repeated on what is still empty. least: share of the image below which an object counts as empty.
+    threshold: least score of a detection in stage 1; strict: the same in stage 2, where a wrong one would add an absent
+    object. searched: most frames of a run in which the text is searched. retries: repetitions of stage 2 for runs that
+    stay empty. least: share of the image below which an object counts as empty.
     """
 
     threshold: float = 0.3
@@ -51,16 +51,13 @@ class Retrieval:
 
 
 class BestLabels:
-    """Per frame the object of the largest logit so far, kept on disk: memory does not grow with frames or objects."""
+    """The object of the largest logit so far per frame, on disk: memory does not grow with frames or objects."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def add(self, frame: int, class_id: int, logits: np.ndarray) -> None:
-        """Give the object the pixels where its logit is above 0 and above those of the objects before it.
-
-        logits: [H, W] float32; kept to 16 bits.
-        """
+        """Give the object the pixels where its logit, [H, W] float32, is above 0 and those of earlier objects."""
         path = self.folder / f"{frame:06d}.npz"
         values = np.clip(logits, -6e4, 6e4).astype(np.float16)
         labels, best = np.zeros(values.shape, np.uint16), np.zeros(values.shape, np.float16)
@@ -72,7 +69,7 @@ class BestLabels:
         np.savez_compressed(path, labels=labels, best=best)
 
     def labels(self, frame: int, shape: tuple[int, int]) -> np.ndarray:
-        """[H, W] uint16; all background where nothing was added."""
+        """Return the labels of a frame, [H, W] uint16; 0 before any ``add``."""
         path = self.folder / f"{frame:06d}.npz"
         if not path.exists():
             return np.zeros(shape, np.uint16)
@@ -92,11 +89,10 @@ def retrieve(
 ) -> list[str]:
     """Track every object through all frames, then again through the runs of frames where it was lost.
 
-    frame_of: view of a prompt to its frame. names: of all frames. detector: needed where an object has a text alone.
-    Stage 1 starts at the first prompted frame (or the best detection) and goes both ways. In stage 2 the detector is
-    asked, more strictly, in each run where the object came back empty; where it finds the object, tracking starts
-    there and stays in the run, both ways.
-    Returns sentences about runs that stayed empty. Raises ``UserError`` where an object is found in no frame.
+    frame_of: view of a prompt to its frame. names: of all frames. detector: needed for an object with only a text.
+    Stage 1 starts at the first prompted frame (or the best detection) and goes both ways. In stage 2 the detector
+    searches, more strictly, each run where the object is empty; from a detection, tracking goes both ways in the run.
+    Returns sentences about runs that stayed empty. Raises ``UserError`` if an object is found in no frame.
     """
     notes: list[str] = []
     for index, one in enumerate(objects):
@@ -123,7 +119,7 @@ def retrieve(
 
 
 class _Tracking:
-    """One object: in which frames it was found."""
+    """Tracking of one object, and the frames where it was found."""
 
     def __init__(self, one, frames: int, predictor, detector, best: BestLabels, options: Retrieval) -> None:
         self.one, self.predictor, self.detector, self.best, self.options = one, predictor, detector, best, options
@@ -132,13 +128,13 @@ class _Tracking:
     def both_ways(self, prompts: Mapping[int, Prompt], first: int, last: int) -> None:
         """Track from the first prompted frame up to ``last`` and down to ``first``."""
         start = min(prompts)
-        ways = [list(range(start, last + 1)), list(range(start, first - 1, -1))]
-        for way, frames in enumerate(ways):
-            if way == 1 and len(frames) == 1:
+        for frames in [range(start, last + 1), range(start, first - 1, -1)]:
+            down = frames.step < 0
+            if down and len(frames) == 1:
                 continue
             for frame, logits in self.predictor.track(prompts, frames):
-                if way == 1 and frame == start:
-                    continue  # the way up has given it
+                if down and frame == start:
+                    continue  # already tracked upwards
                 if (logits > 0).sum() >= max(1.0, self.options.least * logits.size):
                     self.seen[frame] = True
                     self.best.add(frame, self.one.class_id, logits)
@@ -158,7 +154,7 @@ class _Tracking:
                 return
 
     def detected(self, frames: Sequence[int], threshold: float) -> tuple[int, Prompt] | None:
-        """The frame with the best detection among some of ``frames``, evenly spread, and its box as a prompt."""
+        """Return the best detection in some evenly spread ``frames``: its frame, and its box as a prompt."""
         if self.one.text is None or self.detector is None:
             return None
         count = min(self.options.searched, len(frames))
@@ -172,6 +168,6 @@ class _Tracking:
 
 
 def runs_of(mask: np.ndarray) -> list[range]:
-    """Maximal runs of True in [N] bool."""
+    """Return the maximal runs of True in [N] bool."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [range(int(start), int(end)) for start, end in zip(edges[::2], edges[1::2], strict=True)]

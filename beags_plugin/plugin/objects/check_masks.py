@@ -171,8 +171,8 @@ def check_with_run(report: Report, run: ReprojectedRun) -> Report:
                 "warning",
                 "contradicted",
                 f"{len(areas)} areas in {len(views)} views are contradicted by the other views, the largest: "
-                f"{'; '.join(area.told(run.classes) for area in areas[:3])}: correct these masks of {report.data}, or "
-                "leave it to reprojection.",
+                f"{'; '.join(area.describe(run.classes) for area in areas[:3])}: correct these masks of {report.data}, "
+                "or leave it to reprojection.",
                 f"{pixels} pixels ({percent(pixels, total)} of the masks) go to another class in reprojection; "
                 "with --pipeline.model.prepare.reprojection none they pull Gaussians to the wrong class",
                 tuple(sorted(views)),
