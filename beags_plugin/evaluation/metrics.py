@@ -41,7 +41,7 @@ def band_width(height: int, width: int, share: float = Protocol.band_share) -> i
 
 def boundary_band(mask: np.ndarray, width: int) -> np.ndarray:
     """Return the pixels of ``mask`` [H, W] bool that ``width`` 3 x 3 erosions take away; outside counts as no mask."""
-    eroded = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=width, borderValue=0)
+    eroded = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=width, borderValue=(0,))
     return mask & (eroded == 0)
 
 

@@ -125,7 +125,9 @@ class MaskRenderer:
         if self.class_ids is None or not objects:
             return {}
         if kind == "rendered":
-            known = {class_id: truth for class_id in objects if (truth := rendered_truth(self.view, class_id))}
+            known = {
+                class_id: truth for class_id in objects if (truth := rendered_truth(self.view, class_id)) is not None
+            }
             rendered = self._rendered(self.class_ids, list(known))
             return {c: RenderedMask(mask, *known[c], "visible") for c, mask in rendered.items()}
         found = {}
@@ -163,7 +165,7 @@ class MaskRenderer:
 
 
 def rendered_truth(view: EvalView, class_id: int) -> tuple[Tensor, Tensor | None] | None:
-    """Return the visible mask of an object, [h, w] bool, and the unlabelled pixels; None if the view has no mask of it."""
+    """Return an object's visible mask, [h, w] bool, and the unlabelled pixels; None if the view has no mask of it."""
     if view.visible_objects is not None:
         truth = view.visible_objects.get(class_id)
         return None if truth is None else (truth, None)

@@ -137,7 +137,7 @@ def interpolate_cameras(first: Camera, second: Camera, fraction: float) -> Camer
 
 
 def _rotation_log(rotation: Tensor) -> Tensor:
-    """Return the [3, 3] skew matrix whose exponential is ``rotation`` [3, 3]; zero for a half turn, which is ambiguous."""
+    """Return the [3, 3] skew matrix whose exponential is ``rotation`` [3, 3]; zero for an (ambiguous) half turn."""
     skew = 0.5 * (rotation - rotation.T)
     sine = torch.stack([skew[2, 1], skew[0, 2], skew[1, 0]]).norm()
     if sine < 1e-9:  # angle 0 (or 180 degrees): angle / sine would be 0 / 0

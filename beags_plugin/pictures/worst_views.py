@@ -108,7 +108,9 @@ def draw_worst(
                 renderer = MaskRenderer(surfels.detach(), class_ids, view, rasterizer, settings, run.protocol)
                 mask = renderer.masks(kind, [record.class_id])[record.class_id]
                 errors[stage] = error_map(mask.prediction, mask.truth, mask.ignore, run.protocol)
-            metrics = {stage: scene.masks[index].metrics for stage, scene in run.stages().items()}
+            metrics: dict[Stage, MaskMetrics] = {
+                stage: scene.masks[index].metrics for stage, scene in run.stages().items()
+            }
             photo = _photo(view, errors["after"].shape)
             title = f"{run.scene}, {view.name}: {names[record.class_id]}"
             found.append(WorstMask(title, kind, photo, errors, metrics))

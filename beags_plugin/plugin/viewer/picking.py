@@ -1,4 +1,4 @@
-"""Which Gaussian lies under the cursor."""
+"""Picking of the Gaussian under the cursor."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs
 
-_FOCAL = 1000.0  # of the one pixel that is drawn: about that of a full-screen view, so that it is as sharp
+_FOCAL = 1000.0  # of the one rendered pixel: about that of a full-screen view, so that it is as sharp
 
 
 def camera_along(origin: Sequence[float], direction: Sequence[float]) -> Camera:
-    """A view of one pixel whose centre looks from ``origin`` along ``direction`` (world; of any length but 0)."""
+    """Return a view of one pixel whose centre looks from ``origin`` along ``direction`` (world; of any length but 0)."""
     position, along = (torch.tensor([float(x) for x in point], dtype=torch.float64) for point in (origin, direction))
     forward = along / along.norm()
     aside = torch.zeros(3, dtype=torch.float64)
@@ -33,7 +33,7 @@ def camera_along(origin: Sequence[float], direction: Sequence[float]) -> Camera:
 
 @dataclass(frozen=True)
 class Picked:
-    """The dominant_gaussian Gaussian of a pixel: its index among those that were drawn, and its class."""
+    """The dominant Gaussian of a pixel: its index among the rendered ones, and its class."""
 
     index: int
     class_id: int
@@ -48,9 +48,9 @@ def pick(
     origin: Sequence[float],
     direction: Sequence[float],
 ) -> Picked | None:
-    """The surfel with the largest w_i along a ray; None where nothing is.
+    """Return the Gaussian with the largest w_i along a ray, by rendering one pixel; None where nothing is.
 
-    surfels: N surfels, as they are drawn. class_ids: [N] int, phi. origin, direction: [3], world. Draws one pixel.
+    surfels: N Gaussians, as they are rendered. class_ids: [N] int, phi. origin, direction: [3], world.
     """
     camera = camera_along(origin, direction).to(surfels.means.device)
     index = int(rasterizer.dominant_gaussian(geometry_inputs(surfels), camera, settings)[0, 0])

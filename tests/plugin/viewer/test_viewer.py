@@ -195,7 +195,7 @@ def test_an_export_says_in_the_panel_how_it_ended(window, monkeypatch):
     monkeypatch.setattr(panel.files, "write", lambda: 1 / 0)
     panel.files.start()
     assert said(panel, "Not exported (ZeroDivisionError")
-    panel.files.say_views(3, 9)
+    panel.files.report_views(3, 9)
     assert said(panel, "Exporting: 3 of 9 views")
     gate = threading.Event()
     monkeypatch.setattr(panel.files, "write", gate.wait)
