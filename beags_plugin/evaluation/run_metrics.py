@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import MaskMetrics, mask_metrics, mean, mean_metrics, psnr
 from beags_plugin.evaluation.protocol import Protocol
@@ -134,16 +135,10 @@ class MaskRenderer:
         for class_id in objects:
             if (truth := extracted_truth(self.view, class_id, self.protocol)) is not None:
                 part = select_class(self.surfels, self.class_ids, class_id)[0]
-                found[class_id] = RenderedMask(self._extracted(part), truth[1], truth[2], truth[0])
+                threshold = self.protocol.threshold
+                mask = extracted_mask(part, self.view.camera, self.rasterizer, self.settings, threshold)
+                found[class_id] = RenderedMask(mask, truth[1], truth[2], truth[0])
         return found
-
-    def _extracted(self, part: Surfels) -> Tensor:
-        """Return [H, W] bool: A > threshold with the object's Gaussians alone."""
-        camera = self.view.camera
-        if len(part) == 0:
-            return torch.zeros(camera.height, camera.width, dtype=torch.bool)
-        render = self.rasterizer.rasterize(geometry_inputs(part), camera, self.settings, part.means.new_zeros(3))
-        return render.alpha > self.protocol.threshold
 
     def _rendered(self, class_ids: Tensor, objects: Sequence[int]) -> dict[int, Tensor]:
         """Return object id to [H, W] bool: value > threshold, with the object 1 and the rest of the scene 0, on black.
@@ -162,6 +157,16 @@ class MaskRenderer:
             value = self.rasterizer.rasterize(colored, self.view.camera, self.settings, black).color
             masks |= {c: value[..., channel] > self.protocol.threshold for channel, c in enumerate(triple)}
         return masks
+
+
+def extracted_mask(
+    part: Surfels, camera: Camera, rasterizer: Rasterizer, settings: RasterSettings, threshold: float
+) -> Tensor:
+    """Return [H, W] bool: A > threshold with the object's Gaussians ``part`` alone."""
+    if len(part) == 0:
+        return torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    black = part.means.new_zeros(3)
+    return rasterizer.rasterize(geometry_inputs(part), camera, settings, black).alpha > threshold
 
 
 def rendered_truth(view: EvalView, class_id: int) -> tuple[Tensor, Tensor | None] | None:

@@ -1,4 +1,4 @@
-"""Every choice of the evaluation protocol against a computation of its own in numpy."""
+"""Choices of the evaluation protocol against computations in numpy."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ _FOCAL = 1000.0  # of the one rendered pixel: about that of a full-screen view, 
 
 
 def camera_along(origin: Sequence[float], direction: Sequence[float]) -> Camera:
-    """Return a view of one pixel whose centre looks from ``origin`` along ``direction`` (world; of any length but 0)."""
+    """Return a view of one pixel that looks from ``origin`` along ``direction`` (world; of any length but 0)."""
     position, along = (torch.tensor([float(x) for x in point], dtype=torch.float64) for point in (origin, direction))
     forward = along / along.norm()
     aside = torch.zeros(3, dtype=torch.float64)

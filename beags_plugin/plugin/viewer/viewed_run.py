@@ -60,7 +60,7 @@ class ViewedRun:
 
     @property
     def note(self) -> str | None:
-        """Return a sentence for the user where the files on disk are no longer those that this scene was prepared with."""
+        """Return a sentence for users where the files on disk are no longer those that this scene was prepared with."""
         folder = self._round()
         if folder is None or not self._replaced(folder):
             return None
@@ -89,7 +89,7 @@ class ViewedRun:
 
     @property
     def has_grid(self) -> bool:
-        """Return whether refinement was prepared with a voxel grid (some refiners need none, and keep an empty file)."""
+        """Return whether refinement was prepared with a voxel grid (without one some refiners keep an empty file)."""
         return self.prepared is not None and bool(grid_state(self.prepared / "grid.pt", mmap=True))
 
     def load_grid(self) -> bool:

@@ -1,8 +1,9 @@
-"""What a viewer shows, without nerfstudio: choices of objects, picking, pictures, the legend's text."""
+"""Parts of the viewer without nerfstudio: choices of objects, picking, pictures, the legend's text."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -41,24 +42,14 @@ def view(width: int = 32, height: int = 24, distance: float = 3.0, turn: float =
 
 
 def wall(z: float, x: float = 0.0, scale: float = 0.3, opacity: float = 0.9) -> Surfels:
-    """One disc that faces the z axis."""
-    return Surfels.of(
-        torch.tensor([[x, 0.0, z]]),
-        torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        torch.full((1, 2), math.log(scale)),
-        torch.logit(torch.tensor([opacity])),
-        torch.zeros(1, 1, 3),
-    )
+    """Return one disc that faces the z axis."""
+    quat, log_scales = torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 2), math.log(scale))
+    opacity_logits = torch.logit(torch.tensor([opacity]))
+    return Surfels.of(torch.tensor([[x, 0.0, z]]), quat, log_scales, opacity_logits, torch.zeros(1, 1, 3))
 
 
 def joined(*parts: Surfels) -> Surfels:
-    return Surfels.of(
-        torch.cat([p.means for p in parts]),
-        torch.cat([p.quats for p in parts]),
-        torch.cat([p.log_scales for p in parts]),
-        torch.cat([p.opacity_logits for p in parts]),
-        torch.cat([p.sh for p in parts]),
-    )
+    return Surfels(*(torch.cat([getattr(part, one.name) for part in parts]) for one in fields(Surfels)))
 
 
 # -- choices ---------------------------------------------------------------------------------------------------------
