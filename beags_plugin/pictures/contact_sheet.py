@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -17,7 +16,7 @@ from beags_plugin.evaluation.run_metrics import extracted_truth
 from beags_plugin.extraction.select import select_class
 from beags_plugin.labels.class_ids import IGNORE, resize_nearest
 from beags_plugin.labels.colors import colorize
-from beags_plugin.pictures.cells import Square, below, cell, checkerboard, crop, square_around, wrapped, write_picture
+from beags_plugin.pictures.cells import Square, below, cell, checkerboard, crop, square_around, wrapped
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import surfel_inputs
 
@@ -171,11 +170,6 @@ def _groups(row: SheetRow, classes: Mapping[int, str]) -> Iterator[list[np.ndarr
         name, window = classes.get(class_id, f"object {class_id}"), _window(row, class_id)
         stages = (("before", row.before[class_id]), ("after", row.after[class_id]))
         yield [cell(_cut_out(image, window), (_SIDE, _SIDE), f"{name}, {stage}") for stage, image in stages]
-
-
-def write_contact_sheet(path: str | Path, rows: Sequence[SheetRow], classes: Mapping[int, str]) -> None:
-    """Write ``contact_sheet`` as a PNG; raises ``UserError`` if it cannot be written."""
-    write_picture(path, contact_sheet(rows, classes))
 
 
 def mask_overlay(photo: np.ndarray, labels: np.ndarray) -> np.ndarray:

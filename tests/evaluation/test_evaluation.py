@@ -23,13 +23,13 @@ from beags_plugin.evaluation.report import RunMetrics
 from beags_plugin.evaluation.run_metrics import evaluate_scene
 from beags_plugin.evaluation.table import render_run, summary_json
 from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.pictures.cells import write_picture
 from beags_plugin.pictures.contact_sheet import (
     SheetRow,
     contact_sheet,
     draw_rows,
     interpolate_cameras,
     novel_camera,
-    write_contact_sheet,
 )
 from beags_plugin.system.errors import UserError
 
@@ -197,7 +197,7 @@ def test_the_sheet_shows_objects_before_and_after(tmp_path):
     assert [row.name for row in rows] == ["view 0.0", "view 1.0", "novel view"]
     assert np.array_equal(rows[0].after[1][..., 3] == 255, square_mask(*CUP).numpy())
     assert (rows[0].before[1][12, 8, :3] == 76).all() and (rows[0].after[1][12, 8, :3] == 153).all()
-    write_contact_sheet(tmp_path / "out" / "sheet.png", rows, CLASSES)
+    write_picture(tmp_path / "out" / "sheet.png", contact_sheet(rows, CLASSES))
     with Image.open(tmp_path / "out" / "sheet.png") as picture:
         sheet = np.asarray(picture)
     assert np.array_equal(sheet, contact_sheet(rows, CLASSES))
@@ -226,4 +226,4 @@ def test_a_sheet_survives_absent_parts_but_not_a_place_that_cannot_be_written(tm
         contact_sheet([], {})
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot be written"):
-        write_contact_sheet(tmp_path / "file" / "sheet.png", [row], {})
+        write_picture(tmp_path / "file" / "sheet.png", np.zeros((4, 4, 3), np.uint8))

@@ -43,7 +43,7 @@ FILES = {
 
 
 def writing(title: str, prepare: Callable[[Place, Path], Any]) -> Callable[[Place], Any]:
-    """A command that writes where it cannot. prepare: is given the folder, which does not exist yet."""
+    """Return a command that writes where it cannot. prepare: receives the folder, which does not exist yet."""
 
     def make(at: Place):
         from beags_plugin.commands.doctor import diagnosis

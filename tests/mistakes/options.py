@@ -62,7 +62,7 @@ mistakes(
 
 
 def loss(name: str, **values: Any) -> Callable[[Place], Any]:
-    """A mistake in the losses of the config, as a package of one's own would make it."""
+    """Return a mistake in the losses of the config, as a package of one's own would make it."""
 
     def make(at: Place):
         from beags_plugin.plugin.options.loss_spec import LossSpec

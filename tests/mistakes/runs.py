@@ -68,7 +68,6 @@ mistakes(
     "configs",
     {
         "a class that has been renamed": replaced("model_options.BeagsModelConfig", "model_options.SceneConfig"),
-        "a module that has been renamed": replaced("plugin.options.model_options", "plugin.options.scene"),
         "of an older version": replaced("run_format: 2\n", ""),
         "a part of another kind": config(
             lambda text: re.sub(r"prepare: !!python/object:\S+", "prepare: !!python/object:builtins.dict", text)
@@ -144,7 +143,7 @@ def _(at: Place):
 
 
 def broken_off(at: Place) -> Path:
-    """A run of ``data`` that ended in the middle of refinement."""
+    """Return a run of ``data`` that ended in the middle of refinement."""
     import yaml
 
     from beags_plugin.plugin.runs.run_config import load_run_config

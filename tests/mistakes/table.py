@@ -1,4 +1,4 @@
-"""The table of mistakes: what is done to a good scene or run, and the command that must then say so."""
+"""The table of mistakes: changes to a good scene or run, and the command that then prints a sentence."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Templates:
         self.scene = write_scene(root / "scene")
 
     def broken_off(self, config: Any) -> Path:
-        """A run on the scene that was killed in the middle of refinement, with a checkpoint to go on from."""
+        """Return a run on the scene that was killed in the middle of refinement, with a checkpoint to resume from."""
         from beags_plugin.plugin.trainer import BeagsTrainer
 
         train = BeagsTrainer.train_iteration
@@ -102,7 +102,7 @@ class Place:
 
     @property
     def data(self) -> Path:
-        """A scene of nine photos with masks, transforms.json and classes.json."""
+        """Return a scene of nine photos with masks, transforms.json and classes.json."""
         folder = self.root / "data"
         if not folder.exists():
             shutil.copytree(self.templates.scene, folder)
@@ -110,7 +110,7 @@ class Place:
 
     @property
     def run(self) -> Path:
-        """A refined run on ``data``."""
+        """Return a refined run on ``data``."""
         folder = self.root / "run"
         if not folder.exists():
             write_trained(folder, self.data)
@@ -118,12 +118,12 @@ class Place:
 
     @property
     def photo(self) -> Path:
-        """One of the photos."""
+        """Return one of the photos."""
         return self.data / "images/v02.png"
 
     @property
     def checkpoint(self) -> Path:
-        """The checkpoint of the run."""
+        """Return the checkpoint of the run."""
         return next((self.run / "nerfstudio_models").iterdir())
 
     def beags(self, *words: object) -> Command:
@@ -136,14 +136,14 @@ class Place:
         return lambda: cli.main(texts)
 
     def train(self, *flags: str, preset: str = "beags-tiny", data: Path | None = None, **settings: Any) -> Command:
-        """The command ``ns-train`` on ``data``, as nerfstudio's entry point runs it."""
+        """Return the command ``ns-train`` on ``data``, as nerfstudio's entry point runs it."""
         config = self.config(*flags, preset=preset, data=data)
         for name, value in settings.items():
             setattr(config, name, value)
         return lambda: ns_train(config)
 
     def config(self, *flags: str, preset: str = "beags-tiny", data: Path | None = None) -> Any:
-        """What ns-train makes of its flags, to train in ``trained``."""
+        """Return the config that ns-train makes of its flags, to train in ``trained``."""
         config = deepcopy(_parsed(preset, flags))
         config.data = self.data if data is None else data
         config.run_dir = self.root / TRAINED
@@ -152,15 +152,12 @@ class Place:
         config.logging.local_writer.enable = False
         return config
 
-    def edit_json(self, path: Path, change: Callable[[Any], Any]) -> None:
-        """Change what a JSON file holds, in place."""
+    def edit_poses(self, change: Callable[[Any], Any]) -> None:
+        """Change transforms.json, in place."""
+        path = self.data / "transforms.json"
         content = json.loads(path.read_text("utf8"))
         change(content)
         path.write_text(json.dumps(content), "utf8")
-
-    def edit_poses(self, change: Callable[[Any], Any]) -> None:
-        """Change transforms.json."""
-        self.edit_json(self.data / "transforms.json", change)
 
     def cut(self, path: Path, share: float = 0.5) -> Path:
         """Keep the first part of a file only."""
@@ -220,7 +217,7 @@ class _Full:
 
 @lru_cache(None)
 def _parsed(preset: str, flags: Sequence[str]) -> Any:
-    """The config that ns-train makes of its flags; read here, as its own parser takes half a second a time."""
+    """Return the config that ns-train makes of its flags; its own parser takes half a second a time."""
     from beags_plugin.plugin.presets import load_preset
 
     config = load_preset(preset).config

@@ -147,29 +147,25 @@ def write_reprojection(found: ReprojectedRun, output: Path, min_confidence: floa
     All maps have the size of the photographs, lens distortion included, so that ``beags-data --masks-path`` takes them
     (the run's own size on request). min_confidence: less certain pixels become IGNORE.
     """
-    with writing(output):
-        return _write_reprojection(found, output, min_confidence)
-
-
-def _write_reprojection(found: ReprojectedRun, output: Path, min_confidence: float) -> list[str]:
     from PIL import Image
 
-    changes = []
-    for index, path in enumerate(mask_paths(found.manager.train_dataset.image_filenames)):
-        voted = found.voted[index].numpy().astype(np.uint16)
-        confidence = found.confidence[index].numpy()
-        doubtful = (confidence < 255.0 * min_confidence) if min_confidence > 0 else np.zeros(voted.shape, bool)
-        final = np.where(doubtful, np.uint16(IGNORE), voted)
-        for folder in ("masks", "confidence"):
-            (output / folder / path).parent.mkdir(parents=True, exist_ok=True)
-        write_mask(output / "masks" / path, found.manager.as_in_file(final, index))
-        Image.fromarray(found.manager.as_in_file(confidence, index, border=0)).save(output / "confidence" / path)
-        changes.append(_change(found, index, doubtful))
-    (output / "classes.json").write_text(json.dumps({str(i): name for i, name in found.classes.items()}, indent=1))
-    report = {"method": found.method, "seconds": found.seconds, "min_confidence": min_confidence, "views": changes}
-    (output / "report.json").write_text(json.dumps(report, indent=1))
-    order = sorted(range(len(changes)), key=lambda index: -changes[index]["changed"])[:6]
-    before_and_after(output / "before_after.png", [found.changed(index) for index in order])
+    with writing(output):
+        changes = []
+        for index, path in enumerate(mask_paths(found.manager.train_dataset.image_filenames)):
+            voted = found.voted[index].numpy().astype(np.uint16)
+            confidence = found.confidence[index].numpy()
+            doubtful = confidence < 255.0 * min_confidence
+            final = np.where(doubtful, np.uint16(IGNORE), voted)
+            for folder in ("masks", "confidence"):
+                (output / folder / path).parent.mkdir(parents=True, exist_ok=True)
+            write_mask(output / "masks" / path, found.manager.as_in_file(final, index))
+            Image.fromarray(found.manager.as_in_file(confidence, index, border=0)).save(output / "confidence" / path)
+            changes.append(_change(found, index, doubtful))
+        (output / "classes.json").write_text(json.dumps({str(i): name for i, name in found.classes.items()}, indent=1))
+        report = {"method": found.method, "seconds": found.seconds, "min_confidence": min_confidence, "views": changes}
+        (output / "report.json").write_text(json.dumps(report, indent=1))
+        order = sorted(range(len(changes)), key=lambda index: -changes[index]["changed"])[:6]
+        before_and_after(output / "before_after.png", [found.changed(index) for index in order])
     pixels, changed = (sum(view[key] for view in changes) for key in ("labelled", "changed"))
     filled = sum(mask is None for mask in found.given.stored)
     return [

@@ -167,22 +167,21 @@ class ObjectPanel(ViewerElement[None]):
             return "The scene is busy: click again."
         try:
             scene = viewing.shown()
-            found = pick(
-                model.rasterizer, scene.surfels, scene.class_ids, model.settings(), click.origin, click.direction
-            )
+            found = pick(model.rasterizer, scene.surfels, model.settings(), click.origin, click.direction)
             if found is None:
                 return "Nothing is shown there."
-            index = found.index if scene.index is None else int(scene.index[found.index])
+            index = found if scene.index is None else int(scene.index[found])
+            picked = int(scene.class_ids[found])
             margin = float(model.class_margin[index])
         finally:
             viewing.lock.release()
         if not bool(model.assigned):
             return f"Gaussian {index}; {NO_CLASSES}"
-        label = next((label for label, class_id in self.labels.items() if class_id == found.class_id), None)
+        label = next((label for label, class_id in self.labels.items() if class_id == picked), None)
         if label is None:
-            return f"Gaussian {index} of class {found.class_id}, which has no name."
+            return f"Gaussian {index} of class {picked}, which has no name."
         self.object.value = label
-        what = "background, no object" if found.class_id == 0 else label
+        what = "background, no object" if picked == 0 else label
         return f"Picked: {what} (Gaussian {index}, {margin:.0%} of its weight)."
 
     def title(self) -> str:

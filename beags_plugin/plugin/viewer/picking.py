@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
@@ -31,27 +29,18 @@ def camera_along(origin: Sequence[float], direction: Sequence[float]) -> Camera:
     return Camera(viewmat.float(), K, 1, 1)
 
 
-@dataclass(frozen=True)
-class Picked:
-    """The dominant Gaussian of a pixel: its index among the rendered ones, and its class."""
-
-    index: int
-    class_id: int
-
-
 @torch.no_grad()
 def pick(
     rasterizer: Rasterizer,
     surfels: Surfels,
-    class_ids: Tensor,
     settings: RasterSettings,
     origin: Sequence[float],
     direction: Sequence[float],
-) -> Picked | None:
-    """Return the Gaussian with the largest w_i along a ray, by rendering one pixel; None where nothing is.
+) -> int | None:
+    """Return the index of the Gaussian with the largest w_i along a ray, by rendering one pixel; None where nothing is.
 
-    surfels: N Gaussians, as they are rendered. class_ids: [N] int, phi. origin, direction: [3], world.
+    surfels: N Gaussians, as they are rendered. origin, direction: [3], world.
     """
     camera = camera_along(origin, direction).to(surfels.means.device)
     index = int(rasterizer.dominant_gaussian(geometry_inputs(surfels), camera, settings)[0, 0])
-    return None if index < 0 else Picked(index, int(class_ids[index]))
+    return None if index < 0 else index

@@ -115,8 +115,7 @@ def test_the_least_opacity_and_a_crop_box_leave_surfels_out():
 
 def test_the_ray_of_a_pixel_picks_what_the_whole_picture_has_there(rasterizer):
     """Same surfel as ``dominant_gaussian`` of a whole view whose pixels are as fine as the one that picking draws."""
-    surfels, ids = discs()
-    camera = view(24, 20)
+    surfels, _ = discs()
     K = torch.tensor([[1000.0, 0, 12.0], [0, 1000.0, 10.0], [0, 0, 1]])
     for turn, lift in ((0.0, 0.0), (0.7, 0.2), (2.0, -0.1)):
         viewmat = view(turn=turn).viewmat.clone()
@@ -125,23 +124,17 @@ def test_the_ray_of_a_pixel_picks_what_the_whole_picture_has_there(rasterizer):
         whole = rasterizer.dominant_gaussian(geometry_inputs(surfels), camera, SETTINGS)
         for x, y in ((3, 4), (12, 10), (20, 15)):
             local = torch.tensor([(x + 0.5 - 12.0) / 1000, (y + 0.5 - 10.0) / 1000, 1.0])
-            found = pick(
-                rasterizer, surfels, ids, SETTINGS, camera.center.tolist(), (camera.rotation.T @ local).tolist()
-            )
-            expected = int(whole[y, x])
-            assert (-1 if found is None else found.index) == expected
-            assert found is None or found.class_id == int(ids[expected])
+            direction = (camera.rotation.T @ local).tolist()
+            found = pick(rasterizer, surfels, SETTINGS, camera.center.tolist(), direction)
+            assert (-1 if found is None else found) == int(whole[y, x])
 
 
 def test_picking_takes_the_heaviest_not_the_nearest(rasterizer):
-    veil, solid = wall(0.0, opacity=0.2), wall(1.0, opacity=0.9)
-    ids = torch.tensor([5, 7], dtype=torch.int32)
+    both = joined(wall(0.0, opacity=0.2), wall(1.0, opacity=0.9))
     towards = ((0.0, 0.0, -3.0), (0.0, 0.0, 2.0))
-    found = pick(rasterizer, joined(veil, solid), ids, SETTINGS, *towards)
-    assert found is not None and (found.index, found.class_id) == (1, 7)
-    assert pick(rasterizer, joined(veil, solid), ids, SETTINGS, (9.0, 0.0, -3.0), (0.0, 0.0, 1.0)) is None
-    none = joined(veil, solid)[torch.zeros(0, dtype=torch.int64)]
-    assert pick(rasterizer, none, ids[:0], SETTINGS, *towards) is None
+    assert pick(rasterizer, both, SETTINGS, *towards) == 1
+    assert pick(rasterizer, both, SETTINGS, (9.0, 0.0, -3.0), (0.0, 0.0, 1.0)) is None
+    assert pick(rasterizer, both[torch.zeros(0, dtype=torch.int64)], SETTINGS, *towards) is None
 
 
 @pytest.mark.parametrize("direction", [(0, 0, 1), (0, -1, 0), (1, 0, 0), (0.3, -5.0, 2.0)])
