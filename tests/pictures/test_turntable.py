@@ -24,7 +24,7 @@ LOW, HIGH = torch.tensor([-1.0, -2.0, 0.0]), torch.tensor([1.0, 2.0, 3.0])
 
 
 def ball(color: float = 1.0, count: int = 200) -> Surfels:
-    """Discs all over the unit sphere, of one grey."""
+    """Return discs all over the unit sphere, of one grey."""
     step = torch.arange(count) + 0.5
     z = 1 - 2 * step / count
     angle, radius = step * 2.399963, torch.sqrt(1 - z * z)

@@ -103,7 +103,7 @@ def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Re
 
 
 def agreement_of(config: BeagsDataParserConfig) -> tuple[np.ndarray, int]:
-    """Return labels [P, V] of points in space in every view, see ``consistency.Agreement``, and the number of classes."""
+    """Return labels [P, V] of points in space in every view (``consistency.Agreement``) and the number of classes."""
     scene, views, files = _files(config)
     coverage = check_files(files)
     return _agreement(files, coverage, views, _points(scene, views, config)).labels, len(coverage.ids)

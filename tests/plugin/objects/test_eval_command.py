@@ -34,7 +34,7 @@ RASTER = RasterSettings(0.03, 300.0, geometry=False)
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """config.yml of a run with a base, on data with ground truth at twice the size of the photographs."""
+    """Return config.yml of a run with a base, on data with ground truth at twice the size of the photographs."""
     root = tmp_path_factory.mktemp("lab")
     return write_trained(root / "run", write_scene(root / "lab", truth_factor=2))
 

@@ -31,7 +31,7 @@ from beags_plugin.system.reading.ply import read_vertices
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """config.yml of a run whose data parser has turned and scaled the world."""
+    """Return config.yml of a run whose data parser has turned and scaled the world."""
     root = tmp_path_factory.mktemp("lab")
     config = write_trained(root / "run", write_scene(root / "lab"))
     transform = torch.cat([a_rotation(3), torch.tensor([[0.4], [-0.2], [0.1]], dtype=torch.float64)], dim=1)

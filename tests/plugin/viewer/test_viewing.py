@@ -34,7 +34,7 @@ SETTINGS = RasterSettings(0.01, 100.0)
 
 
 def view(width: int = 32, height: int = 24, distance: float = 3.0, turn: float = 0.0) -> Camera:
-    """Looks at the origin from ``distance`` away, from an angle ``turn`` about the y axis."""
+    """Return a view of the origin from ``distance`` away, from an angle ``turn`` about the y axis."""
     cos, sin = math.cos(turn), math.sin(turn)
     viewmat = torch.tensor([[cos, 0, sin, 0], [0, 1, 0, 0], [-sin, 0, cos, distance], [0, 0, 0, 1]])
     K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]])
@@ -201,7 +201,7 @@ def test_the_nearest_view_is_near_and_looks_the_same_way():
 
 
 def one_voxel_grid(classes: tuple[int, ...] = (1,)) -> VisibilityGrid:
-    """The 27 voxels of side 1 around the origin are valid for these classes: those next to voxel (0, 0, 0)."""
+    """Return a grid of 27 voxels of side 1 around the origin, valid for these classes."""
     clouds = [(torch.tensor([[0.0, 0.0, 0.0]]), torch.tensor([class_id])) for class_id in classes]
     return VisibilityGrid.from_points(clouds, 1.0, torch.full((3,), -0.5), 8)
 
