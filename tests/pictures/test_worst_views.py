@@ -33,7 +33,7 @@ GREY = 100
 
 
 def evaluated(protocol: Protocol | None = None):
-    """Evaluate a cup that assignment puts two pixels off and refinement puts right; a box hides none of it in view 1."""
+    """Evaluate a cup that assignment puts two pixels off and refinement puts right; in view 1 no box hides it."""
     protocol = protocol or Protocol()
     ids = torch.tensor([1, 2, 0], dtype=torch.int32)
     before, after = scene([SHIFTED, BOX, FLOOR]), scene([CUP, BOX, FLOOR])

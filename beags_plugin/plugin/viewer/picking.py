@@ -37,7 +37,7 @@ def pick(
     origin: Sequence[float],
     direction: Sequence[float],
 ) -> int | None:
-    """Return the index of the Gaussian with the largest w_i along a ray, by rendering one pixel; None where nothing is.
+    """Return the index of the Gaussian with the largest w_i along a ray; None where nothing is. Renders one pixel.
 
     surfels: N Gaussians, as they are rendered. origin, direction: [3], world.
     """
