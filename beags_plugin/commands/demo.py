@@ -151,8 +151,9 @@ def _finish(command: list[str]) -> None:
 
 def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
     """Compare assignment alone with refinement, extract every object, write summary.json and the picture."""
-    from beags_plugin.evaluation.table import print_run, summary_json
-    from beags_plugin.pictures.contact_sheet import draw_rows, novel_camera, write_contact_sheet
+    from beags_plugin.evaluation.table import render_run, summary_json
+    from beags_plugin.pictures.cells import write_picture
+    from beags_plugin.pictures.contact_sheet import contact_sheet, draw_rows, novel_camera
     from beags_plugin.plugin.objects.evaluate import EvaluatedRun
     from beags_plugin.plugin.objects.extract import extract_objects
 
@@ -172,13 +173,13 @@ def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
         drawing = (evaluated.rasterizer, evaluated.settings)
         scenery = {"novel": novel_camera(views), "background": views.background, "progress": progress}
         rows = draw_rows(shown, *scenes, objects, *drawing, **scenery)
-        write_contact_sheet(picture, rows, classes)
+        write_picture(picture, contact_sheet(rows, classes))
     training = json.loads((run / "training.json").read_text())
     stages = {"sample": seconds.pop("sample", 0.0), **training["seconds"], **seconds}
     memory = training["peak_memory_mb"]
     summary = json.dumps(summary_json(metrics, stages, memory), indent=2)
     write_whole(output / "summary.json", lambda file: file.write(summary.encode()))
-    print_run(metrics, stages, memory, CONSOLE)
+    CONSOLE.print(render_run(metrics, stages, memory))
     CONSOLE.print(f"objects: {', '.join(str(item.ply) for item in extracted)}")
     CONSOLE.print(f"figures: {output / 'summary.json'}")
     CONSOLE.print(f"picture: {picture}")

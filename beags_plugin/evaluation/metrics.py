@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 
 from beags_plugin.evaluation.protocol import Protocol
@@ -29,43 +30,29 @@ class MaskMetrics:
 
 
 def _array(image: Any) -> np.ndarray:
-    """A numpy view of an array, or of a tensor on any device."""
+    """Return an array, or a tensor on any device, as a numpy array."""
     return image.detach().cpu().numpy() if hasattr(image, "detach") else np.asarray(image)
 
 
 def band_width(height: int, width: int, share: float = Protocol.band_share) -> int:
-    """d = max(1, round(share x image diagonal)), in pixels (method, section 8)."""
+    """Return d = max(1, round(share x image diagonal)), in pixels (method, section 8)."""
     return max(1, round(share * math.hypot(height, width)))
 
 
-def erode(mask: np.ndarray, times: int) -> np.ndarray:
-    """A 3x3 erosion done ``times`` times; outside the image counts as outside the mask.
-
-    mask: [H, W] bool. Returns [H, W] bool: pixels whose whole (2 times + 1)-square lies in the mask, which is
-    the same set; counted with a summed-area table, so the cost does not grow with ``times``.
-    """
-    size = 2 * times + 1
-    height, width = mask.shape
-    sums = np.zeros((height + size, width + size), dtype=np.int64)
-    sums[1:, 1:] = np.pad(mask.astype(np.int64), times).cumsum(axis=0).cumsum(axis=1)
-    inside = sums[size:, size:] - sums[:-size, size:] - sums[size:, :-size] + sums[:-size, :-size]
-    return inside == size * size
-
-
 def boundary_band(mask: np.ndarray, width: int) -> np.ndarray:
-    """[H, W] bool: the pixels of ``mask`` [H, W] bool that ``width`` erosions take away."""
-    return mask & ~erode(mask, width)
+    """Return the pixels of ``mask`` [H, W] bool that ``width`` 3 x 3 erosions take away; outside counts as no mask."""
+    eroded = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=width, borderValue=(0,))
+    return mask & (eroded == 0)
 
 
 def compared_masks(
     prediction: Any, truth: Any, ignore: Any = None, protocol: Protocol | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The two masks at one size, as they are compared, and the pixels that count.
+    """Return the two masks at one size, as they are compared, and the pixels that count: three bool arrays.
 
-    prediction: [H', W'] bool array or tensor. truth: [H, W] bool. ignore: [H, W] bool or None. Returns three bool
-    arrays of the size of the truth (of the prediction, if the protocol resizes the truth): prediction, truth, counted.
-    Where a pixel does not count, the prediction is taken to be right, so that a hole in an ignored region makes no
-    boundary around it. Raises ``ValueError`` as ``mask_metrics`` does.
+    prediction: [H', W'] bool array or tensor. truth: [H, W] bool. ignore: [H, W] bool or None. The arrays have the size
+    of the truth (of the prediction, if the protocol resizes the truth). A prediction counts as right where a pixel does
+    not count, so that a hole in an ignored region makes no boundary. Raises ``ValueError`` as ``mask_metrics`` does.
     """
     protocol = protocol or Protocol()
     predicted, true = _array(prediction).astype(bool), _array(truth).astype(bool)
@@ -83,13 +70,11 @@ def compared_masks(
 
 
 def mask_metrics(prediction: Any, truth: Any, ignore: Any = None, protocol: Protocol | None = None) -> MaskMetrics:
-    """Acc, IoU and BIoU of a mask.
+    """Return Acc, IoU and BIoU of a mask (method, section 8).
 
-    prediction: [H', W'] bool array or tensor. truth: [H, W] bool. ignore: [H, W] bool or None; True pixels are left
-    out of every count. protocol: who is resized if the sizes differ, the width of the band, what empty unions count.
-    Where no pixel counts at all, Acc is 1.
-    Raises ``ValueError`` for masks that are not two-dimensional or an ``ignore`` of another size than the truth.
-    Source: method, section 8.
+    prediction: [H', W'] bool array or tensor. truth: [H, W] bool. ignore: [H, W] bool or None; True pixels count
+    nowhere. Acc is 1 where no pixel counts. Raises ``ValueError`` for masks that are not two-dimensional and for an
+    ``ignore`` of another size than the truth.
     """
     protocol = protocol or Protocol()
     predicted, true, counted = compared_masks(prediction, truth, ignore, protocol)
@@ -108,9 +93,10 @@ def mask_metrics(prediction: Any, truth: Any, ignore: Any = None, protocol: Prot
 
 
 def psnr(a: Any, b: Any) -> float:
-    """Peak signal-to-noise ratio in dB of two images of one shape with values in 0..1; infinite if they are equal.
+    """Return the peak signal-to-noise ratio in dB of two images of one shape, values in 0..1; infinite if they are
+    equal.
 
-    a, b: arrays or tensors, float. Raises ``ValueError`` if the shapes differ.
+    a, b: float arrays or tensors. Raises ``ValueError`` if the shapes differ.
     """
     first, second = _array(a).astype(np.float64), _array(b).astype(np.float64)
     if first.shape != second.shape:
@@ -120,14 +106,12 @@ def psnr(a: Any, b: Any) -> float:
 
 
 def mean(values: Iterable[float | None]) -> float | None:
-    """The mean of those that are not None; None if there are none."""
+    """Return the mean of the values that are not None; None without any."""
     present = [value for value in values if value is not None]
     return math.fsum(present) / len(present) if present else None
 
 
 def mean_metrics(metrics: Iterable[MaskMetrics | None]) -> MaskMetrics | None:
-    """The mean of each metric over those who have it; None for no metrics at all."""
+    """Return the mean of each metric over those who have it; None for no metrics at all."""
     rows = [row for row in metrics if row is not None]
-    if not rows:
-        return None
-    return MaskMetrics(mean(row.acc for row in rows), mean(row.iou for row in rows), mean(row.biou for row in rows))
+    return MaskMetrics(*(mean(getattr(row, name) for row in rows) for name in METRICS)) if rows else None

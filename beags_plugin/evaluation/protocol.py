@@ -1,4 +1,4 @@
-"""How masks are scored: the choices that papers make differently, each with its default (method, section 8)."""
+"""The choices of mask scoring that papers make differently, each with its default (method, section 8)."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ class Protocol:
                 raise UserError(f"{field.name} is {value!r}: choose one of {', '.join(choices)}.")
 
     def to_json(self) -> dict[str, Any]:
-        """Every choice by name."""
+        """Return every choice by name."""
         return asdict(self)
 
     @property
     def empty_value(self) -> float | None:
-        """What an IoU of an empty union counts; None if it is left out."""
+        """Return the value of an IoU whose union is empty; None if it is left out."""
         return {"one": 1.0, "zero": 0.0, "skip": None}[self.empty]

@@ -1,4 +1,4 @@
-"""What a labelled scene is scored with, and the figures that come of it (method, section 8)."""
+"""Inputs and results of scoring a labelled scene (method, section 8)."""
 
 from __future__ import annotations
 
@@ -17,17 +17,13 @@ KINDS: tuple[Kind, ...] = ("extracted", "rendered")
 
 @dataclass(frozen=True)
 class EvalView:
-    """One held-out view and what is known of it.
+    """One held-out view and its ground truth.
 
-    camera: of the view. name: for tables and pictures.
-    image: [H, W, 3] float in 0..1, the photograph, or None.
-    visible: [h, w] integer class ids of what is seen, or IGNORE; None if there are no masks. May differ in size from
-        the camera: predictions are resized to it.
-    silhouettes: object id to [h, w] bool, what the object covers when nothing stands before it; None if unknown.
-    seen: object id to [h, w] bool, the part of the silhouette whose surface some training photo shows; the rest
-        cannot be known and is left out of the extracted metrics. None counts whole silhouettes.
-    visible_objects: object id to [h, w] bool, what is seen of it, where single objects were labelled and nothing is
-        known of the others; it is scored instead of ``visible``. None if there are no such masks.
+    image: [H, W, 3] float in 0..1, the photograph, or None. visible: [h, w] integer class ids or IGNORE, or None
+    without masks; predictions are resized to it. silhouettes: object id to [h, w] bool, what the object covers when
+    nothing stands before it. seen: object id to [h, w] bool, the part of the silhouette whose surface some training
+    photo shows; the extracted metrics leave out the rest. visible_objects: object id to [h, w] bool, the visible part
+    where single objects were labelled and nothing is known of the others; scored instead of ``visible``.
     """
 
     camera: Camera
@@ -41,7 +37,7 @@ class EvalView:
 
 @dataclass(frozen=True)
 class ObjectMetrics:
-    """The two kinds of mask metrics; None where there was no mask to compare with."""
+    """The metrics of both kinds of masks; None where there was no mask to compare with."""
 
     extracted: MaskMetrics | None
     rendered: MaskMetrics | None
@@ -51,8 +47,8 @@ class ObjectMetrics:
 class MaskRecord:
     """One scored mask.
 
-    kind: extracted (the object drawn alone) or rendered (the object's share of the whole scene). class_id: of the
-    object. view: index of the view. truth: what it was compared with, "silhouette" or "visible".
+    kind: extracted (the object rendered alone) or rendered (the object's share of the whole scene). view: index of the
+    view. truth: "silhouette" or "visible".
     """
 
     kind: Kind
@@ -73,13 +69,12 @@ class ViewRecord:
 
 @dataclass(frozen=True)
 class SceneMetrics:
-    """A scene's figures over all its views.
+    """The figures of a scene over all its views.
 
-    mean: over the scene, as the protocol says. objects: object id to the mean over its masks.
-    psnr: dB, mean over the views with a photograph; None if there is none; infinite for equal images. ssim: likewise.
-    extracted_truth: what extracted masks were compared with: "silhouette" (occlusion-free), "visible" (the visible
-        masks, without the pixels that other objects cover: what is behind them is unknown), "both", or None.
-    masks, views: the single figures that these means are made of.
+    mean: over the scene, as the protocol says. objects: object id to the mean over its masks. psnr: dB, mean over the
+    views with a photograph, infinite for equal images; None without any. ssim: likewise. extracted_truth: "silhouette"
+    (occlusion-free), "visible" (without the pixels that other objects cover), "both", or None. masks, views: the single
+    figures behind these means.
     """
 
     mean: ObjectMetrics

@@ -1,4 +1,4 @@
-"""What an evaluation found, for one run and for several: plain values for JSON, and rows for CSV."""
+"""Results of an evaluation, of one run and of several: plain values for JSON, rows for CSV."""
 
 from __future__ import annotations
 
@@ -23,9 +23,8 @@ CSV_COLUMNS = (
 class RunMetrics:
     """The figures of one run.
 
-    scene: its name in tables. config: path of the run. protocol: the choices behind the figures. classes: id to name,
-    with or without the background. before: after assignment alone, None where the run has kept no such state.
-    after: of the run as it is. notes: what a reader of the figures should know, a sentence each.
+    scene: its name in tables. config: path of the run. classes: id to name, with or without the background. before:
+    after assignment alone, None where the run has kept no such state. notes: sentences for readers of the figures.
     """
 
     scene: str
@@ -37,24 +36,23 @@ class RunMetrics:
     notes: tuple[str, ...] = ()
 
     def stages(self) -> dict[Stage, SceneMetrics]:
-        """The states that there are, in order."""
+        """Return the states that exist, in order."""
         both = {"before": self.before, "after": self.after}
         return {stage: found for stage in STAGES if (found := both[stage]) is not None}
 
     def names(self) -> dict[int, str]:
-        """Object id to a name that no other object has: a name used twice gets its id appended."""
+        """Return object id to a unique name: a name used twice gets its id appended."""
         names = {class_id: self.classes.get(class_id, f"object {class_id}") for class_id in self.after.objects}
         taken = list(names.values())
         return {c: f"{name} ({c})" if taken.count(name) > 1 else name for c, name in names.items()}
 
     def to_json(self) -> dict[str, Any]:
-        """The run as plain values, ready for ``json.dump``; a figure that does not exist or is infinite is None.
+        """Return the run as plain values for ``json.dump``; a figure that does not exist or is infinite is None.
 
-        {"scene", "config", "protocol": {choice: value}, "extracted_truth", "notes": [sentence],
-        "mean": {"extracted": {"before": {"acc", "iou", "biou"}, "after": {...}}, "rendered": {...}},
-        "psnr": {"before", "after"}, "ssim": {"before", "after"}, "objects": {name: as mean},
-        "masks": [{"kind", "object", "view", "truth", "before": {"acc", "iou", "biou"}, "after": {...}}],
-        "views": [{"view", "psnr": {"before", "after"}, "ssim": {...}}]}.
+        {"scene", "config", "protocol": {choice: value}, "extracted_truth", "notes": [sentence], "mean": {"extracted":
+        {"before": {"acc", "iou", "biou"}, "after": {...}}, "rendered": {...}}, "psnr": {"before", "after"}, "ssim":
+        {"before", "after"}, "objects": {name: as mean}, "masks": [{"kind", "object", "view", "truth", "before": {"acc",
+        "iou", "biou"}, "after": {...}}], "views": [{"view", "psnr": {"before", "after"}, "ssim": {...}}]}.
         """
         names, stages = self.names(), self.stages()
         view_names = [view.name for view in self.after.views]
@@ -103,8 +101,8 @@ class RunMetrics:
 class DataSetMetrics:
     """Runs of one protocol and their mean.
 
-    name: of the data set, in tables. means: stage to the mean of both kinds; psnr, ssim: stage to their means. A stage
-    is compared over the scenes that have it, so "before" is left out unless all scenes with "after" have it.
+    name: of the data set, in tables. means: stage to the mean of both kinds. psnr, ssim: stage to their means. "before"
+    is left out unless all scenes with "after" have it.
     """
 
     name: str
@@ -114,7 +112,7 @@ class DataSetMetrics:
     ssim: Mapping[Stage, float | None] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """{"data_set", "protocol", "mean", "psnr", "ssim" (all three as of a run), "scenes": [run, ...]}."""
+        """Return {"data_set", "protocol", "mean", "psnr", "ssim" (all three as of a run), "scenes": [run, ...]}."""
         empty = ObjectMetrics(None, None)
         return {
             "data_set": self.name,
@@ -129,7 +127,7 @@ class DataSetMetrics:
         }
 
     def csv_rows(self) -> list[list[Any]]:
-        """A row per scene, object and stage, then the means; the columns are ``CSV_COLUMNS``, fractions in 0..1."""
+        """Return a row per scene, object and stage, then the means; columns as ``CSV_COLUMNS``, fractions in 0..1."""
         rows = []
         for run in self.runs:
             for stage, scene in run.stages().items():
@@ -142,7 +140,7 @@ class DataSetMetrics:
 
 
 def data_set(name: str, runs: Sequence[RunMetrics]) -> DataSetMetrics:
-    """The runs and their mean, as ``protocol.data_set_average`` says; raises ``ValueError`` without runs."""
+    """Return the runs and their mean, as ``protocol.data_set_average`` says; raises ``ValueError`` without runs."""
     if not runs or len({run.protocol for run in runs}) != 1:
         raise ValueError("a data set needs runs, all scored by one protocol")
     protocol = runs[0].protocol
@@ -173,7 +171,9 @@ def data_set(name: str, runs: Sequence[RunMetrics]) -> DataSetMetrics:
 
 
 def _comparable(runs: Sequence[RunMetrics], has: Callable[[SceneMetrics], Any]) -> dict[Stage, list[SceneMetrics]]:
-    """Stage to the scenes with a figure; without "before" if some have only "after": a mean of fewer would mislead."""
+    """Return stage to the scenes with a figure, without "before" if some have only "after": a mean of fewer would
+    mislead.
+    """
     found = [run for run in runs if has(run.after) is not None]
     scenes: dict[Stage, list[SceneMetrics]] = {"after": [run.after for run in found]}
     before = [run.before for run in found if run.before is not None and has(run.before) is not None]
@@ -183,7 +183,7 @@ def _comparable(runs: Sequence[RunMetrics], has: Callable[[SceneMetrics], Any]) 
 
 
 def plain_metrics(metrics: MaskMetrics | None) -> dict[str, float | None]:
-    """{"acc", "iou", "biou"}, each a float or None."""
+    """Return {"acc", "iou", "biou"}, each a float or None."""
     return {name: None if metrics is None else finite(getattr(metrics, name)) for name in METRICS}
 
 
@@ -192,5 +192,5 @@ def _cells(metrics: ObjectMetrics) -> list[float | None]:
 
 
 def finite(value: float | None) -> float | None:
-    """JSON has no infinity: the PSNR of equal images becomes None."""
+    """Return the value, or None if it is infinite, which JSON lacks."""
     return float(value) if value is not None and math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""The figures of an evaluation as tables for a terminal, and the summary of ``beags demo``."""
+"""Tables of an evaluation for a terminal, and the summary of ``beags demo``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from beags_plugin.evaluation.records import KINDS, ObjectMetrics
 from beags_plugin.evaluation.report import DataSetMetrics, RunMetrics, Stage
 
 if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
+    from rich.console import RenderableType
 
 _STAGE_NAMES = {"before": "assigned", "after": "refined"}  # in summary.json
 _TRUTHS = {
@@ -23,11 +23,11 @@ _SEEN = " (less the parts that hardly any training photo shows, where the data s
 
 
 def summary_json(run: RunMetrics, seconds: Mapping[str, float], peak_memory_mb: float) -> dict[str, Any]:
-    """The summary of one run as plain values, ready for ``json.dump``; a missing or infinite figure is None.
+    """Return the summary of one run as plain values for ``json.dump``; a missing or infinite figure is None.
 
-    seconds: stage to wall time. peak_memory_mb: of the whole process, MB of 10^6 bytes.
-    {"mean": {"extracted": {"assigned": {"acc", "iou", "biou"}, "refined": {...}}, "rendered": {...}},
-    "objects": {name: as mean}, "psnr": {"before", "after"}, "seconds": {stage: s}, "peak_memory_mb": n}.
+    seconds: stage to wall time. peak_memory_mb: of the whole process, MB of 10^6 bytes. {"mean": {"extracted":
+    {"assigned": {"acc", "iou", "biou"}, "refined": {...}}, "rendered": {...}}, "objects": {name: as mean}, "psnr":
+    {"before", "after"}, "seconds": {stage: s}, "peak_memory_mb": n}.
     """
     content = run.to_json()
 
@@ -46,7 +46,7 @@ def summary_json(run: RunMetrics, seconds: Mapping[str, float], peak_memory_mb: 
 def render_run(
     run: RunMetrics, seconds: Mapping[str, float] | None = None, peak_memory_mb: float = 0
 ) -> RenderableType:
-    """One run for a terminal: masks per object and stage in percent, then PSNR, SSIM, seconds, memory and notes."""
+    """Return a table of one run: masks per object and stage in percent, then PSNR, SSIM, seconds, memory and notes."""
     from rich.console import Group
     from rich.text import Text
 
@@ -72,7 +72,7 @@ def render_run(
 
 
 def render_data_set(found: DataSetMetrics) -> RenderableType:
-    """Several runs for a terminal: the means of each scene, then those of the data set."""
+    """Return a table of several runs: the means of each scene, then those of the data set."""
     content = found.to_json()
     stages: list[Stage] = [stage for stage in ("before", "after") if any(stage in run.stages() for run in found.runs)]
     rows = {run.scene: scene for run, scene in zip(found.runs, content["scenes"], strict=True)}
@@ -82,7 +82,7 @@ def render_data_set(found: DataSetMetrics) -> RenderableType:
 
 
 def render_protocol(protocol: Protocol) -> RenderableType:
-    """A line that names the choices that are not the defaults."""
+    """Return a line that names the choices that are not the defaults."""
     from rich.text import Text
 
     default = Protocol().to_json()
@@ -101,7 +101,7 @@ def _mask_table(
     stages: Sequence[Stage],
     images: Mapping[str, Any] | None = None,
 ) -> RenderableType:
-    """Rows of both kinds of metrics per stage; ``images`` adds columns for PSNR and SSIM."""
+    """Return rows of both kinds of metrics per stage; ``images`` adds columns for PSNR and SSIM."""
     from rich.box import SIMPLE
     from rich.table import Table
     from rich.text import Text
@@ -126,12 +126,3 @@ def _mask_table(
 
 def _number(value: float | None, digits: int, factor: float = 1.0) -> str:
     return "–" if value is None else f"{factor * value:.{digits}f}"
-
-
-def print_run(
-    run: RunMetrics, seconds: Mapping[str, float], peak_memory_mb: float, console: Console | None = None
-) -> None:
-    """Print ``render_run`` to the console, by default the terminal."""
-    from rich.console import Console
-
-    (console or Console()).print(render_run(run, seconds, peak_memory_mb))

@@ -1,4 +1,4 @@
-"""How much each class breaks what the two losses of refinement ask for, as figures for curves (method, 4 and 6)."""
+"""Violations, by class, of the two constraints that refinement enforces, as curves (method, sections 4 and 6)."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from beags_plugin.occupancy.violation import disc_sums
 
 @torch.no_grad()
 def boundary_errors(boundary: Tensor, labels: Tensor) -> dict[int, float]:
-    """Mean of B(u) over the pixels of each class in a view: the share of light there that other classes give (E7).
+    """Return class id to the mean of B(u) over the class's pixels in a view: the share of other classes' light (E7).
 
-    boundary: [H, W] float, B. labels: [H, W] int32 class ids M' or IGNORE. Returns class id to 0..1 for those present.
+    boundary: [H, W] float, B. labels: [H, W] int32 class ids M' or IGNORE.
     """
     known = labels != IGNORE
     ids = labels[known]
@@ -32,10 +32,10 @@ def boundary_errors(boundary: Tensor, labels: Tensor) -> dict[int, float]:
 def occupancy_violations(
     surfels: Surfels, class_ids: Tensor, grid: VisibilityGrid, seed: int, step: int, samples: int = 4
 ) -> dict[int, float]:
-    """The share of each class's matter that lies where the class was never seen: sum o G Q / sum o G over samples (E9).
+    """Return class id to the share of its matter that lies where the class was never seen: sum o G Q / sum o G (E9).
 
-    surfels: N surfels. class_ids: [N] int32, phi. seed, step: decide the points, uniform in the discs of radius 3, as
-    the loss draws them. Returns class id to 0..1, of the classes that have Gaussians.
+    surfels: N Gaussians. class_ids: [N] int32, phi. seed, step: choose the points, uniform in the discs of radius 3, as
+    in the loss. Classes without Gaussians are absent.
     """
     sums = disc_sums(surfels, class_ids, grid, samples, seed=seed, step=step)
     opacity = opacities(surfels.opacity_logits.detach()).double()

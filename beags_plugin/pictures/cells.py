@@ -1,4 +1,4 @@
-"""Pictures made of captioned cells: cropping round an object, resizing, joining."""
+"""Pictures made of captioned cells: cropping around an object, resizing, joining."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from beags_plugin.system.errors import UserError, writing
 
 CAPTION = 18  # pixels of text above each cell
 GAP = 4  # pixels between cells
-MARGIN = 0.15  # of the crop, around the object: rims spread outside it
+MARGIN = 0.15  # of the crop, around the object: its boundary may spread
 
 Square = tuple[int, int, int]
 """(top, left, side) in pixels; it may leave the image."""
 
 
 def square_around(shown: np.ndarray) -> Square:
-    """The square that holds the True pixels of ``shown`` [H, W] bool and a margin; the whole image for none."""
+    """Return the square that holds the True pixels of ``shown`` [H, W] bool and a margin; the whole image for none."""
     height, width = shown.shape
     if not shown.any():
         return 0, 0, max(height, width)
@@ -29,7 +29,7 @@ def square_around(shown: np.ndarray) -> Square:
 
 
 def crop(image: np.ndarray, square: Square, fill: int = 0) -> np.ndarray:
-    """[side, side, C]: the part of an image [H, W, C] in the square; ``fill`` outside the image."""
+    """Return [side, side, C]: the part of an image [H, W, C] in the square; ``fill`` outside the image."""
     top, left, side = square
     part = np.full((side, side, *image.shape[2:]), fill, dtype=image.dtype)
     y0, x0 = max(top, 0), max(left, 0)
@@ -40,11 +40,11 @@ def crop(image: np.ndarray, square: Square, fill: int = 0) -> np.ndarray:
 
 
 def cell(image: np.ndarray, size: tuple[int, int], caption: str) -> np.ndarray:
-    """[height + CAPTION, width, 3] uint8: the image resized to (width, height) under its caption."""
+    """Return [height + CAPTION, width, 3] uint8: the image resized to (width, height) under its caption."""
     from PIL import Image, ImageDraw
 
     width, height = size
-    enlarged = image.shape[1] < width  # enlarged pixels stay sharp, so that rims can be judged
+    enlarged = image.shape[1] < width  # enlarged pixels stay sharp, so that boundaries can be judged
     resample = Image.Resampling.NEAREST if enlarged else Image.Resampling.BOX
     picture = Image.new("RGB", (width, height + CAPTION), "white")
     picture.paste(Image.fromarray(image).resize(size, resample), (0, CAPTION))
@@ -52,25 +52,31 @@ def cell(image: np.ndarray, size: tuple[int, int], caption: str) -> np.ndarray:
     return np.asarray(picture)
 
 
+def checkerboard(height: int, width: int, side: int) -> np.ndarray:
+    """Return [height, width] int64: squares of two greys, ``side`` pixels wide."""
+    y, x = np.mgrid[:height, :width] // side
+    return np.where((x + y) % 2, 200, 236)
+
+
 def printable(text: str) -> str:
-    """The text with a question mark for what the picture's font lacks."""
+    """Return the text with a question mark for each character that the picture's font lacks."""
     return text.encode("latin-1", "replace").decode("latin-1")
 
 
 def beside(cells: Iterable[np.ndarray]) -> np.ndarray:
-    """Cells of one height in a line, a gap after each."""
+    """Join cells of one height in a line, with a gap after each."""
     return np.concatenate([np.pad(c, ((0, 0), (0, GAP), (0, 0)), constant_values=255) for c in cells], axis=1)
 
 
 def below(lines: Sequence[np.ndarray]) -> np.ndarray:
-    """Lines of any width below each other, a gap after each."""
+    """Join lines of any width below each other, with a gap after each."""
     widest = max(line.shape[1] for line in lines)
     padded = [np.pad(line, ((0, GAP), (0, widest - line.shape[1]), (0, 0)), constant_values=255) for line in lines]
     return np.concatenate(padded, axis=0)
 
 
 def wrapped(groups: Iterable[Sequence[np.ndarray]], width: int) -> list[np.ndarray]:
-    """Lines at most ``width`` pixels wide, unless one group alone is wider; a group of cells stays together."""
+    """Return lines at most ``width`` pixels wide, unless one group alone is wider; a group of cells stays together."""
     lines: list[list[np.ndarray]] = []
     used = 0
     for group in groups:

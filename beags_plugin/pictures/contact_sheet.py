@@ -1,10 +1,9 @@
-"""One picture of a run: views against renders, and every object alone before and after refinement."""
+"""One picture of a run: views beside renders, and every object alone before and after refinement."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -17,23 +16,22 @@ from beags_plugin.evaluation.run_metrics import extracted_truth
 from beags_plugin.extraction.select import select_class
 from beags_plugin.labels.class_ids import IGNORE, resize_nearest
 from beags_plugin.labels.colors import colorize
-from beags_plugin.pictures.cells import Square, below, cell, crop, square_around, wrapped, write_picture
+from beags_plugin.pictures.cells import Square, below, cell, checkerboard, crop, square_around, wrapped
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import surfel_inputs
 
 _WIDTH = 1920  # pixels; a view of many objects goes on below
 _FAINT = 0.1  # alpha from which a stray splat widens the crop
-_CHECKER = (200, 236)  # two greys behind cut-out objects
-_CHECKER_SIDE = 8
+_SIDE = 220  # pixels of a cell
 
 
 @dataclass(frozen=True)
 class SheetRow:
     """One view of the sheet.
 
-    name: of the view. photo, render: [H, W, 3] uint8; photo may be None. labels: [H, W] integer class ids or None.
-    before, after: object id to [H, W, 4] uint8, the object alone with straight alpha. focus: object id to [H, W]
-    bool, what the crop must hold besides the object's pixels.
+    photo, render: [H, W, 3] uint8; photo may be None. labels: [H, W] integer class ids or None. before, after: object
+    id to [H, W, 4] uint8, the object alone with straight alpha. focus: object id to [H, W] bool, pixels that the crop
+    must hold besides the object's.
     """
 
     name: str
@@ -57,14 +55,12 @@ def draw_rows(
     background: Tensor | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[SheetRow]:
-    """Draw the views and one novel view.
+    """Render the views and one novel view, without gradients.
 
-    before, after: the surfels with assignment alone and after refinement, each with phi, [N] int32.
-    objects: ids to show alone. novel: its camera; ``novel_camera`` of the views if None. background: [3], black if
-    None. progress: is told (done, total) views.
-    No gradients.
+    before, after: the Gaussians with assignment alone and after refinement, each with phi, [N] int32. objects: ids to
+    show alone. novel: its camera; left out if None. background: [3], black if None. progress: receives (done, total)
+    views.
     """
-    novel = novel or novel_camera(views)
     if novel is not None:
         views = [*views, EvalView(novel, None, name="novel view")]
     settings = replace(settings, geometry=False, distortion=False)
@@ -93,7 +89,7 @@ def draw_rows(
 
 
 def novel_camera(views: Sequence[EvalView]) -> Camera | None:
-    """Half-way between the first view and the one nearest to it, so that it still looks at the scene; None for one."""
+    """Return the camera half-way between the first view and the one nearest to it; None for one view."""
     if len(views) < 2:
         return None
     first, *others = (view.camera for view in views)
@@ -104,14 +100,14 @@ def novel_camera(views: Sequence[EvalView]) -> Camera | None:
 def _alone(
     surfels: Surfels, class_ids: Tensor, class_id: int, camera: Camera, rasterizer: Rasterizer, settings: RasterSettings
 ) -> np.ndarray:
-    """[H, W, 4] uint8: one object's surfels drawn alone, straight alpha."""
+    """Return [H, W, 4] uint8: one object's Gaussians rendered alone, straight alpha."""
     part = select_class(surfels.detach(), class_ids, class_id)[0]
     if len(part) == 0:
         return np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
-    drawn = rasterizer.rasterize(surfel_inputs(part, camera), camera, settings, part.means.new_zeros(3))
-    alpha = drawn.alpha[..., None]
+    render = rasterizer.rasterize(surfel_inputs(part, camera), camera, settings, part.means.new_zeros(3))
+    alpha = render.alpha[..., None]
     # Under 1/255 alpha is written as 0, so the bound only keeps the quotient finite.
-    return _bytes(torch.cat([drawn.color / alpha.clamp(min=1 / 255), alpha], dim=-1))
+    return _bytes(torch.cat([render.color / alpha.clamp(min=1 / 255), alpha], dim=-1))
 
 
 def _bytes(image: Tensor) -> np.ndarray:
@@ -119,7 +115,7 @@ def _bytes(image: Tensor) -> np.ndarray:
 
 
 def interpolate_cameras(first: Camera, second: Camera, fraction: float) -> Camera:
-    """The camera between two: centre and K linear, rotation along the shortest turn; the first one's image size.
+    """Return the camera between two: centre and K linear, rotation along the shortest turn; the first one's image size.
 
     fraction: 0 gives the first camera, 1 the second's pose.
     """
@@ -140,7 +136,7 @@ def interpolate_cameras(first: Camera, second: Camera, fraction: float) -> Camer
 
 
 def _rotation_log(rotation: Tensor) -> Tensor:
-    """[3, 3] skew matrix whose exponential is ``rotation`` [3, 3]; zero for a half turn, which has no shortest way."""
+    """Return the [3, 3] skew matrix whose exponential is ``rotation`` [3, 3]; zero for an (ambiguous) half turn."""
     skew = 0.5 * (rotation - rotation.T)
     sine = torch.stack([skew[2, 1], skew[0, 2], skew[1, 0]]).norm()
     if sine < 1e-9:  # angle 0 (or 180 degrees): angle / sine would be 0 / 0
@@ -148,21 +144,20 @@ def _rotation_log(rotation: Tensor) -> Tensor:
     return skew * (torch.atan2(sine, 0.5 * (rotation.trace() - 1)) / sine)
 
 
-def contact_sheet(rows: Sequence[SheetRow], classes: Mapping[int, str], cell_height: int = 220) -> np.ndarray:
-    """Put the rows into one picture; objects are cropped alike before and after, and enlarged.
+def contact_sheet(rows: Sequence[SheetRow], classes: Mapping[int, str]) -> np.ndarray:
+    """Return [H, W, 3] uint8: the rows in one picture, with objects cropped alike before and after, and enlarged.
 
-    classes: object id to name. cell_height: pixels of each cell. A row that would be wider than a screen is wrapped.
-    Returns [H, W, 3] uint8. Raises ``ValueError`` without rows.
+    classes: object id to name. A row that would be wider than a screen is wrapped. Raises ``ValueError`` without rows.
     """
     if not rows:
         raise ValueError("a contact sheet needs at least one row")
-    return below([line for row in rows for line in wrapped(_groups(row, classes, cell_height), _WIDTH)])
+    return below([line for row in rows for line in wrapped(_groups(row, classes), _WIDTH)])
 
 
-def _groups(row: SheetRow, classes: Mapping[int, str], cell_height: int) -> Iterator[list[np.ndarray]]:
-    """The cells of a row: photo, mask and render; then each object's two."""
+def _groups(row: SheetRow, classes: Mapping[int, str]) -> Iterator[list[np.ndarray]]:
+    """Yield the cells of a row: photo, mask and render; then the two of each object."""
     height, width = row.render.shape[:2]
-    size = (max(1, round(cell_height * width / height)), cell_height)
+    size = (max(1, round(_SIDE * width / height)), _SIDE)
     blank = np.full((height, width, 3), 255, dtype=np.uint8)
     photo = blank if row.photo is None else row.photo
     overlay = blank if row.labels is None else mask_overlay(photo, row.labels)
@@ -171,22 +166,16 @@ def _groups(row: SheetRow, classes: Mapping[int, str], cell_height: int) -> Iter
         cell(overlay, size, "mask" if row.labels is not None else "no mask"),
         cell(row.render, size, "render"),
     ]
-    square = (cell_height, cell_height)
     for class_id in sorted(row.before):
         name, window = classes.get(class_id, f"object {class_id}"), _window(row, class_id)
         stages = (("before", row.before[class_id]), ("after", row.after[class_id]))
-        yield [cell(_cut_out(image, window, cell_height), square, f"{name}, {stage}") for stage, image in stages]
-
-
-def write_contact_sheet(path: str | Path, rows: Sequence[SheetRow], classes: Mapping[int, str]) -> None:
-    """Write ``contact_sheet`` as a PNG; raises ``UserError`` if it cannot be written."""
-    write_picture(path, contact_sheet(rows, classes))
+        yield [cell(_cut_out(image, window), (_SIDE, _SIDE), f"{name}, {stage}") for stage, image in stages]
 
 
 def mask_overlay(photo: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """The photo in half its strength under the mask colours; background and IGNORE stay as they are.
+    """Return [H, W, 3] uint8: the photo in half its strength under the colours; background and IGNORE stay as they are.
 
-    photo: [h, w, 3] uint8. labels: [H, W] integer class ids. Returns [H, W, 3] uint8.
+    photo: [h, w, 3] uint8. labels: [H, W] integer class ids.
     """
     colors = colorize(labels)
     if photo.shape[:2] != labels.shape:
@@ -197,7 +186,7 @@ def mask_overlay(photo: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def _window(row: SheetRow, class_id: int) -> Square:
-    """The square that holds the object before, after and in truth."""
+    """Return the square that holds the object before, after and in truth."""
     shown = np.zeros(row.render.shape[:2], dtype=bool)
     for image in (row.before[class_id], row.after[class_id]):
         shown |= image[..., 3] > 255 * _FAINT
@@ -206,11 +195,10 @@ def _window(row: SheetRow, class_id: int) -> Square:
     return square_around(shown)
 
 
-def _cut_out(image: np.ndarray, window: Square, size: int) -> np.ndarray:
-    """[size, size, 3] uint8: the window of an [H, W, 4] image, enlarged, over a checkerboard."""
+def _cut_out(image: np.ndarray, window: Square) -> np.ndarray:
+    """Return the window of an [H, W, 4] image, enlarged to a cell, over a checkerboard; uint8."""
     part = crop(image, window)
-    large = np.stack([resize_nearest(part[..., i], size, size) for i in range(4)], axis=-1).astype(np.float64)
-    y, x = np.mgrid[:size, :size] // _CHECKER_SIDE
-    board = np.where((x + y) % 2, *_CHECKER)[..., None]
+    large = np.stack([resize_nearest(part[..., i], _SIDE, _SIDE) for i in range(4)], axis=-1).astype(np.float64)
+    board = checkerboard(_SIDE, _SIDE, 8)[..., None]
     alpha = large[..., 3:] / 255
     return (large[..., :3] * alpha + board * (1 - alpha)).round().astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Pictures of masks: before and after reprojection, where views contradict each other, what each view covers."""
+"""Pictures of masks: before and after reprojection, contradictions between views, and the coverage of each view."""
 
 from __future__ import annotations
 
@@ -29,15 +29,14 @@ class Changed:
     confidence: np.ndarray
 
 
-def overlay(photo: np.ndarray, labels: np.ndarray, strength: float = 0.5) -> np.ndarray:
-    """[H, W, 3] uint8: the photo with its objects tinted (IGNORE grey), the background as it is."""
+def overlay(photo: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Return [H, W, 3] uint8: the photo with its objects tinted (IGNORE grey), the background as it is."""
     tint = colorize(labels).astype(np.float32)
-    shown = (labels != 0)[..., None]
-    return np.where(shown, (1 - strength) * photo + strength * tint, photo).astype(np.uint8)
+    return np.where((labels != 0)[..., None], 0.5 * photo + 0.5 * tint, photo).astype(np.uint8)
 
 
 def before_and_after(path: Path, views: Sequence[Changed]) -> None:
-    """Write a picture, a line per view: mask before, mask after, what changed, confidence."""
+    """Write a picture with a line per view: mask before, mask after, changes, confidence."""
     lines = []
     for view in views:
         height, width = view.voted.shape
@@ -61,7 +60,7 @@ def before_and_after(path: Path, views: Sequence[Changed]) -> None:
 
 
 def contradictions(path: Path, views: Sequence[tuple[Changed, Sequence[tuple[int, int, int, int]]]]) -> None:
-    """Write a picture, a line per view: its mask with the contradicted boxes, and what the other views say."""
+    """Write a picture with a line per view: its mask and the labels of the other views, with the contradicted boxes."""
     lines = []
     for view, boxes in views:
         height, width = view.voted.shape
@@ -91,9 +90,9 @@ def coverage_picture(
     share: np.ndarray,
     usable: np.ndarray,
 ) -> None:
-    """Write a picture of how much of each view each object covers.
+    """Write a picture of the share of each view that each object covers.
 
-    share: [V, C] of the view's pixels for each of ``ids``; usable: [V] bool, views without a mask are hatched.
+    share: [V, C] of the view's pixels for each of ``ids``. usable: [V] bool; views without a mask are hatched.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.colors import LogNorm

@@ -1,4 +1,4 @@
-"""Objects alone before a plain background: single pictures, sheets of them, and films."""
+"""Objects alone before a plain background: sheets, comparisons and films."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ import torch
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.pictures.cells import below, beside, cell, wrapped
+from beags_plugin.pictures.cells import below, beside, cell, checkerboard, wrapped
 from beags_plugin.pictures.options import Background
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import surfel_inputs
 
-_CHECKER, _CHECKER_SIDE = (200, 236), 12  # two greys; pixels of a square
 _WIDTH = 1920  # of a sheet, pixels; what does not fit goes on below
 
 Progress = Callable[[int, int], None]
@@ -23,10 +22,10 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Subject:
-    """What is shown of one object.
+    """One object to show.
 
-    name: for captions. stages: caption to the surfels alone, such as {"before": ..., "after": ...}; {"": ...} for one.
-    cameras: the same for all stages. settings: their depth range.
+    stages: caption to the Gaussians alone, such as {"before": ..., "after": ...}; {"": ...} for one. cameras: the same
+    for all stages. settings: their depth range.
     """
 
     name: str
@@ -38,7 +37,7 @@ class Subject:
 def render_alone(
     surfels: Surfels, camera: Camera, settings: RasterSettings, rasterizer: Rasterizer, background: Background
 ) -> np.ndarray:
-    """[H, W, 3] uint8: surfels before a background."""
+    """Return [H, W, 3] uint8: Gaussians before a background."""
     behind = torch.from_numpy(_behind(camera.height, camera.width, background))
     with torch.no_grad():
         if len(surfels) == 0:
@@ -50,31 +49,18 @@ def render_alone(
 
 
 def _behind(height: int, width: int, background: Background) -> np.ndarray:
-    if background != "checker":
-        return np.full((height, width, 3), 255 if background == "white" else 0, dtype=np.uint8)
-    y, x = np.mgrid[:height, :width] // _CHECKER_SIDE
-    return np.where((x + y) % 2, *_CHECKER).astype(np.uint8)[..., None].repeat(3, axis=2)
+    if background == "checker":
+        return checkerboard(height, width, 12).astype(np.uint8)[..., None].repeat(3, axis=2)
+    return np.full((height, width, 3), 255 if background == "white" else 0, dtype=np.uint8)
 
 
 def film(
     subjects: Sequence[Subject], rasterizer: Rasterizer, background: Background, progress: Progress | None = None
 ) -> Iterator[np.ndarray]:
-    """Frames [H, W, 3] uint8 of even size: all subjects and stages beside each other, captioned."""
+    """Yield frames [H, W, 3] uint8 of even size: all subjects and stages beside each other, captioned."""
     count = len(subjects[0].cameras)
     for index in range(count):
-        groups = []
-        for subject in subjects:
-            camera = subject.cameras[index]
-            groups.append(
-                [
-                    cell(
-                        render_alone(surfels, camera, subject.settings, rasterizer, background),
-                        (camera.width, camera.height),
-                        _caption(subject.name, stage),
-                    )
-                    for stage, surfels in subject.stages.items()
-                ]
-            )
+        groups = [_stages(subject, index, rasterizer, background) for subject in subjects]
         yield _even(below(wrapped(groups, _WIDTH)))
         if progress:
             progress(index + 1, count)
@@ -83,7 +69,7 @@ def film(
 def sheet(
     subjects: Sequence[Subject], rasterizer: Rasterizer, background: Background, progress: Progress | None = None
 ) -> np.ndarray:
-    """[H, W, 3] uint8: a line (or more) for each subject and stage, a picture for each camera."""
+    """Return [H, W, 3] uint8: a line (or more) for each subject and stage, a picture for each camera."""
     lines, done = [], 0
     total = sum(len(subject.cameras) * len(subject.stages) for subject in subjects)
     for subject in subjects:
@@ -103,25 +89,28 @@ def sheet(
 def comparison(
     subjects: Sequence[Subject], rasterizer: Rasterizer, background: Background, progress: Progress | None = None
 ) -> np.ndarray:
-    """[H, W, 3] uint8: the stages beside each other, a line for each subject and camera."""
-    lines, done = [], 0
+    """Return [H, W, 3] uint8: the stages beside each other, a line for each subject and camera."""
+    lines: list[np.ndarray] = []
     total = sum(len(subject.cameras) for subject in subjects)
     for subject in subjects:
-        for camera in subject.cameras:
-            lines.append(
-                beside(
-                    cell(
-                        render_alone(surfels, camera, subject.settings, rasterizer, background),
-                        (camera.width, camera.height),
-                        _caption(subject.name, stage),
-                    )
-                    for stage, surfels in subject.stages.items()
-                )
-            )
-            done += 1
+        for index in range(len(subject.cameras)):
+            lines.append(beside(_stages(subject, index, rasterizer, background)))
             if progress:
-                progress(done, total)
+                progress(len(lines), total)
     return below(lines)
+
+
+def _stages(subject: Subject, index: int, rasterizer: Rasterizer, background: Background) -> list[np.ndarray]:
+    """Return a captioned cell for each stage of a subject, from one of its cameras."""
+    camera = subject.cameras[index]
+    return [
+        cell(
+            render_alone(surfels, camera, subject.settings, rasterizer, background),
+            (camera.width, camera.height),
+            _caption(subject.name, stage),
+        )
+        for stage, surfels in subject.stages.items()
+    ]
 
 
 def _caption(name: str, stage: str) -> str:
@@ -129,6 +118,6 @@ def _caption(name: str, stage: str) -> str:
 
 
 def _even(picture: np.ndarray) -> np.ndarray:
-    """With a white line more where a side is odd: films store colour for squares of 2 x 2 pixels."""
+    """Return the picture with a white line more where a side is odd: films store colour for squares of 2 x 2 pixels."""
     height, width = picture.shape[:2]
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), constant_values=255)

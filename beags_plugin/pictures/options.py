@@ -1,4 +1,4 @@
-"""What can be asked of pictures of objects."""
+"""Options of pictures of objects."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Background = Literal["white", "black", "checker"]
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How the pictures are taken."""
+    """The way that the pictures are taken."""
 
     size: int | None = None
     """Pixels along each side of one picture; 480 in a video, 232 in a sheet, 400 before and after."""

@@ -1,4 +1,4 @@
-"""Cameras that go round an object."""
+"""Cameras that go around an object."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _NEAR, _FAR = 0.02, 100.0  # in units of the distance to the centre
 
 @dataclass(frozen=True)
 class OrbitFrame:
-    """Where the object stands, in the frame of its surfels.
+    """The place of an object, in the frame of its Gaussians.
 
-    center: [3] float64, what every camera looks at. up: [3] float64, unit. front: [3] float64, from where the photos
+    center: [3] float64, which every camera looks at. up: [3] float64, unit. front: [3] float64, from where the photos
     were taken, any length. corners: [8, 3] float64, of the box that the pictures hold.
     """
 
@@ -33,13 +33,13 @@ class OrbitFrame:
 
     @property
     def distance(self) -> float:
-        """Of the cameras from the centre: from there the ball around the box fills the field of view."""
+        """Return the cameras' distance from the centre, at which the ball around the box fills the field of view."""
         radius = float((self.corners - self.center).norm(dim=1).max()) or 1.0
         return radius / math.sin(_FIELD_OF_VIEW / 2)
 
 
-def orbit_frame(low: Tensor, high: Tensor, cameras: Sequence[Camera] = (), up: Tensor | None = None) -> OrbitFrame:
-    """The stand of a box; up is the mean of the cameras' ups unless given, front their mean direction.
+def orbit_frame(low: Tensor, high: Tensor, cameras: Sequence[Camera] = ()) -> OrbitFrame:
+    """Return the place of a box; up is the mean of the cameras' ups, front their mean direction.
 
     low, high: [3] corners. cameras: of the photos. Without cameras, z is up and -y the front, as in nerfstudio's frame.
     """
@@ -51,16 +51,17 @@ def orbit_frame(low: Tensor, high: Tensor, cameras: Sequence[Camera] = (), up: T
         if float(ups.norm()) > 1e-3:  # cameras upside down and upright cancel out
             upwards = ups
         front = torch.stack([camera.center for camera in cameras]).double().mean(dim=0) - center
-    upwards = upwards if up is None else up.double()
+
     corners = torch.cartesian_prod(*torch.stack([low, high], dim=1).double())
     return OrbitFrame(center, upwards / upwards.norm(), front, corners)
 
 
 def orbit(stand: OrbitFrame, count: int, pixels: int, elevation: float = 20.0, turn: float = 360.0) -> list[Camera]:
-    """Cameras on a circle about the up axis, starting from the front, at even angles; the box fills the widest picture.
+    """Return cameras on a circle about the up axis, from the front on, at even angles; the box fills the widest
+    picture.
 
     count: of cameras. pixels: side of the square pictures. elevation: degrees above the horizon. turn: degrees; a whole
-    turn comes back to the start, less swings to and fro about the front. Returns float32 cameras.
+    turn comes back to the start, less swings to and fro about the front. The cameras are float32.
     """
     right, forward = _horizon(stand)
     height = math.radians(elevation)
@@ -76,12 +77,12 @@ def orbit(stand: OrbitFrame, count: int, pixels: int, elevation: float = 20.0, t
 
 
 def orbit_settings(stand: OrbitFrame) -> RasterSettings:
-    """Depth range of the orbit's cameras; colours only."""
+    """Return the depth range of the orbit's cameras, for colours only."""
     return RasterSettings(_NEAR * stand.distance, _FAR * stand.distance, geometry=False, distortion=False)
 
 
 def _reach(camera: Camera, points: Tensor) -> float:
-    """How far from the middle of a square picture the points [P, 3] lie at most; 1 is its border."""
+    """Return the largest distance of the points [P, 3] from the middle of a square picture; 1 is its border."""
     xy, _ = project(points, camera)
     half = 0.5 * camera.width
     return float((xy - half).abs().max()) / half
@@ -94,7 +95,9 @@ def _zoomed(camera: Camera, factor: float) -> Camera:
 
 
 def _horizon(stand: OrbitFrame) -> tuple[Tensor, Tensor]:
-    """Two unit vectors at right angles to the up axis: to the right of the front, and from the front to the object."""
+    """Return two unit vectors at right angles to the up axis: rightwards of the front, and from the front to the
+    object.
+    """
     level = stand.front - (stand.front @ stand.up) * stand.up
     if float(level.norm()) < 1e-6 * max(float(stand.front.norm()), 1e-12):  # seen from straight above
         axis = torch.zeros(3, dtype=torch.float64)
@@ -105,7 +108,7 @@ def _horizon(stand: OrbitFrame) -> tuple[Tensor, Tensor]:
 
 
 def _look_at(eye: Tensor, stand: OrbitFrame, pixels: int) -> Camera:
-    """A square view of the centre from ``eye``, the up axis upwards."""
+    """Return a square view of the centre from ``eye``, the up axis upwards."""
     forward = (stand.center - eye) / (stand.center - eye).norm()
     right = torch.linalg.cross(forward, stand.up)
     if float(right.norm()) < 1e-9:  # from straight above: any side is up

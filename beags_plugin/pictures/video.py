@@ -18,7 +18,7 @@ REPAIR = "pip install --force-reinstall av"
 
 
 def encoder() -> str | None:
-    """The name of the encoder that .mp4 films are written with; None if there is none here."""
+    """Return the name of the encoder for .mp4 films; None if there is none here."""
     try:
         import av
     except ImportError:

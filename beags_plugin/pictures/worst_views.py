@@ -1,10 +1,9 @@
-"""A picture of the masks that came out worst: what is right, missed and wrong, over the photograph."""
+"""A picture of the worst masks: right, missed and wrong pixels over the photograph."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
@@ -13,29 +12,27 @@ from torch import Tensor
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import MaskMetrics, compared_masks
 from beags_plugin.evaluation.protocol import Protocol
-from beags_plugin.evaluation.records import KINDS, EvalView, Kind, MaskRecord
+from beags_plugin.evaluation.records import KINDS, EvalView, Kind
 from beags_plugin.evaluation.report import RunMetrics, Stage
-from beags_plugin.evaluation.run_metrics import MaskDrawing
+from beags_plugin.evaluation.run_metrics import MaskRenderer
 from beags_plugin.pictures.cells import GAP, Square, below, beside, cell, crop, printable, square_around
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 
 RIGHT, MISSED, WRONG, LEFT_OUT = 1, 2, 3, 4  # of an error map; 0 is right too: outside of both masks
 COLORS = {RIGHT: (0, 158, 115), MISSED: (0, 114, 178), WRONG: (213, 94, 0), LEFT_OUT: (150, 150, 150)}
-"""RGB; told apart by colour-blind eyes too (Okabe and Ito)."""
+"""RGB; distinct for colour-blind eyes too (Okabe and Ito)."""
 _MEANINGS = {RIGHT: "right", MISSED: "missed", WRONG: "wrong", LEFT_OUT: "not scored"}
 _SIDE = 240  # pixels of a cell
 _LEGEND = 24  # pixels
 _GREY = 128  # where there is no photograph
-
-By = Literal["iou", "biou"]
 
 
 @dataclass(frozen=True)
 class WorstMask:
     """One mask and its errors.
 
-    title: where it is from, for the caption. kind: extracted or rendered. photo: [h, w, 3] uint8, at the size at which
-    the masks are compared. errors: stage to its error map [h, w] uint8. metrics: stage to its figures.
+    title: its origin, for the caption. photo: [h, w, 3] uint8, at the size at which the masks are compared. errors:
+    stage to its error map [h, w] uint8. metrics: stage to its figures.
     """
 
     title: str
@@ -44,16 +41,18 @@ class WorstMask:
     errors: Mapping[Stage, np.ndarray]
     metrics: Mapping[Stage, MaskMetrics]
 
-    def score(self, by: By) -> float:
-        """What it is ranked by: the figure of the latest state."""
-        value = getattr(self.metrics["after"], by)
+    @property
+    def score(self) -> float:
+        """Return the IoU of the latest state, by which masks are ranked."""
+        value = self.metrics["after"].iou
         return 1.0 if value is None else value
 
 
 def error_map(prediction: Tensor, truth: Tensor, ignore: Tensor | None, protocol: Protocol | None = None) -> np.ndarray:
-    """[h, w] uint8: RIGHT in both masks, MISSED in the truth only, WRONG in the prediction only, LEFT_OUT, else 0.
+    """Return [h, w] uint8: RIGHT in both masks, MISSED in the truth only, WRONG in the prediction only, LEFT_OUT, else
+    0.
 
-    Arguments and size as of ``metrics.compared_masks``, so that what is drawn is what is counted.
+    Arguments and size as of ``metrics.compared_masks``, so that the picture shows the pixels that are counted.
     """
     predicted, true, counted = compared_masks(prediction, truth, ignore, protocol)
     errors = np.zeros(true.shape, dtype=np.uint8)
@@ -65,7 +64,7 @@ def error_map(prediction: Tensor, truth: Tensor, ignore: Tensor | None, protocol
 
 
 def paint(photo: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """[h, w, 3] uint8: the photo [h, w, 3] uint8, half of it replaced by the colour of each error; 0 stays as it is."""
+    """Return the photo [h, w, 3] uint8, half of it replaced by the colour of each error; 0 stays as it is."""
     painted = photo.copy()
     for code, color in COLORS.items():
         there = errors == code
@@ -73,14 +72,14 @@ def paint(photo: np.ndarray, errors: np.ndarray) -> np.ndarray:
     return painted
 
 
-def worst_records(run: RunMetrics, kind: Kind, count: int, by: By) -> list[int]:
-    """Indices into ``run.after.masks`` of the ``count`` masks of a kind with the lowest figure, worst first."""
-
-    def figure(index: int) -> float | None:
-        return getattr(run.after.masks[index].metrics, by)
-
-    scored = [i for i, r in enumerate(run.after.masks) if r.kind == kind and figure(i) is not None]
-    return sorted(scored, key=lambda i: (figure(i), i))[:count]
+def worst_records(run: RunMetrics, kind: Kind, count: int) -> list[int]:
+    """Return indices into ``run.after.masks`` of the ``count`` masks of a kind with the lowest IoU, worst first."""
+    scored = [
+        (mask.metrics.iou, index)
+        for index, mask in enumerate(run.after.masks)
+        if mask.kind == kind and mask.metrics.iou is not None
+    ]
+    return [index for _, index in sorted(scored)[:count]]
 
 
 def draw_worst(
@@ -90,28 +89,28 @@ def draw_worst(
     rasterizer: Rasterizer,
     settings: RasterSettings,
     count: int = 6,
-    by: By = "iou",
     progress: Callable[[int, int], None] | None = None,
 ) -> list[WorstMask]:
-    """Draw again the ``count`` worst masks of each kind.
+    """Render the ``count`` worst masks of each kind again, without gradients.
 
-    run: the figures of these scenes and views. scenes: stage to the surfels and their classes [N] int32. by: the
-    figure that says what is worst. progress: is told (done, total) masks. No gradients.
+    run: the figures of these scenes and views. scenes: stage to the Gaussians and their classes [N] int32. progress:
+    receives (done, total) masks.
     """
     names = run.names()
     found = []
-    chosen: list[tuple[Kind, int]] = [(kind, index) for kind in KINDS for index in worst_records(run, kind, count, by)]
+    chosen: list[tuple[Kind, int]] = [(kind, index) for kind in KINDS for index in worst_records(run, kind, count)]
     with torch.no_grad():
         for kind, index in chosen:
             record = run.after.masks[index]
             view = views[record.view]
             errors: dict[Stage, np.ndarray] = {}
             for stage, (surfels, class_ids) in scenes.items():
-                drawing = MaskDrawing(surfels.detach(), class_ids, view, rasterizer, settings, run.protocol)
-                errors[stage] = _errors(drawing, record, run.protocol)
-            metrics: dict[Stage, MaskMetrics] = {}
-            for stage, scene in run.stages().items():
-                metrics[stage] = scene.masks[index].metrics
+                renderer = MaskRenderer(surfels.detach(), class_ids, view, rasterizer, settings, run.protocol)
+                mask = renderer.masks(kind, [record.class_id])[record.class_id]
+                errors[stage] = error_map(mask.prediction, mask.truth, mask.ignore, run.protocol)
+            metrics: dict[Stage, MaskMetrics] = {
+                stage: scene.masks[index].metrics for stage, scene in run.stages().items()
+            }
             photo = _photo(view, errors["after"].shape)
             title = f"{run.scene}, {view.name}: {names[record.class_id]}"
             found.append(WorstMask(title, kind, photo, errors, metrics))
@@ -120,13 +119,8 @@ def draw_worst(
     return found
 
 
-def _errors(drawing: MaskDrawing, record: MaskRecord, protocol: Protocol) -> np.ndarray:
-    mask = drawing.masks(record.kind, [record.class_id])[record.class_id]
-    return error_map(mask.prediction, mask.truth, mask.ignore, protocol)
-
-
 def _photo(view: EvalView, shape: tuple[int, ...]) -> np.ndarray:
-    """[h, w, 3] uint8: the photograph at the size of the masks; grey without one."""
+    """Return [h, w, 3] uint8: the photograph at the size of the masks; grey without one."""
     from PIL import Image
 
     if view.image is None:
@@ -135,17 +129,17 @@ def _photo(view: EvalView, shape: tuple[int, ...]) -> np.ndarray:
     return np.asarray(Image.fromarray(pixels).resize((shape[1], shape[0]), Image.Resampling.BILINEAR))
 
 
-def worst_views_picture(masks: Sequence[WorstMask], count: int = 6, by: By = "iou") -> np.ndarray:
-    """[H, W, 3] uint8: a legend, then the ``count`` worst masks of each kind, kinds beside each other.
+def worst_views_picture(masks: Sequence[WorstMask], count: int = 6) -> np.ndarray:
+    """Return [H, W, 3] uint8: a legend, then the ``count`` worst masks of each kind, kinds beside each other.
 
-    Each mask has a line: the photograph, then its errors before and after refinement, cropped alike round the object.
+    Each mask has a line: the photograph, then its errors before and after refinement, cropped alike around the object.
     Raises ``ValueError`` without masks.
     """
     if not masks:
         raise ValueError("a picture of the worst views needs at least one mask")
     blocks = []
     for kind in KINDS:
-        worst = sorted((mask for mask in masks if mask.kind == kind), key=lambda mask: mask.score(by))[:count]
+        worst = sorted((mask for mask in masks if mask.kind == kind), key=lambda mask: mask.score)[:count]
         if worst:
             blocks.append(below([_heading(kind), *(_line(mask) for mask in worst)]))
     tallest = max(block.shape[0] for block in blocks)
@@ -165,7 +159,7 @@ def _line(mask: WorstMask) -> np.ndarray:
 
 
 def error_window(mask: WorstMask) -> Square:
-    """The square that holds the object in truth and in every stage's prediction."""
+    """Return the square that holds the object in truth and in every stage's prediction."""
     touched = [np.isin(errors, (RIGHT, MISSED, WRONG)) for errors in mask.errors.values()]
     return square_around(np.logical_or.reduce(touched))
 
@@ -180,7 +174,7 @@ def _heading(kind: Kind) -> np.ndarray:
 
 
 def _legend() -> np.ndarray:
-    """Each colour beside its meaning."""
+    """Return a picture of each colour beside its meaning."""
     entries = []
     for code, meaning in _MEANINGS.items():
         box = np.full((_LEGEND, _LEGEND, 3), 255, dtype=np.uint8)

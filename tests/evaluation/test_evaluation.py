@@ -1,4 +1,4 @@
-"""A run's figures, table, JSON and picture, on scenes drawn by a stand-in rasterizer whose masks are known."""
+"""Figures of a run, their table, JSON and contact sheet, on scenes of a stand-in rasterizer whose masks are known."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import torch
 from known_masks import BOX, CLASSES, CUP, FLOOR, SETTINGS, SIZE, Squares, camera, scene, square_mask, truth
+from PIL import Image
+from rich.console import Console
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.rotations import rotation_from_quat
@@ -19,100 +21,81 @@ from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import EvalView, ObjectMetrics, SceneMetrics
 from beags_plugin.evaluation.report import RunMetrics
 from beags_plugin.evaluation.run_metrics import evaluate_scene
-from beags_plugin.evaluation.table import print_run, summary_json
+from beags_plugin.evaluation.table import render_run, summary_json
 from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.pictures.cells import write_picture
 from beags_plugin.pictures.contact_sheet import (
     SheetRow,
     contact_sheet,
     draw_rows,
     interpolate_cameras,
     novel_camera,
-    write_contact_sheet,
 )
 from beags_plugin.system.errors import UserError
 
+STRAY = (20.0, 20.0, 2.0)
+IDS = torch.tensor([1, 2, 0], dtype=torch.int32)  # of cup, box and floor
+PERFECT = MaskMetrics(1.0, 1.0, 1.0)
+
+
+def evaluated(squares, ids, *views: EvalView, **options) -> SceneMetrics:
+    ids = torch.as_tensor(ids, dtype=torch.int32)
+    return evaluate_scene(scene(list(squares)), ids, Squares(), SETTINGS, views, CLASSES, **options)
+
 
 def test_a_perfect_scene_scores_one():
-    surfels, ids = scene([CUP, BOX, FLOOR]), torch.tensor([1, 2, 0], dtype=torch.int32)
     silhouettes = {1: square_mask(*CUP), 2: square_mask(*BOX)}
     view = EvalView(camera(), torch.full((SIZE, SIZE, 3), 0.3), truth(), silhouettes)
-    metrics = evaluate_scene(surfels, ids, Squares(), SETTINGS, [view], CLASSES)
-    perfect = MaskMetrics(1.0, 1.0, 1.0)
-    assert metrics.mean == ObjectMetrics(perfect, perfect)
-    assert metrics.objects == {1: ObjectMetrics(perfect, perfect), 2: ObjectMetrics(perfect, perfect)}
+    metrics = evaluated([CUP, BOX, FLOOR], IDS, view)
+    assert metrics.mean == metrics.objects[1] == metrics.objects[2] == ObjectMetrics(PERFECT, PERFECT)
     assert metrics.extracted_truth == "silhouette"
     assert metrics.psnr is not None and metrics.psnr > 100
 
 
-def test_a_stray_surfel_costs_what_it_covers():
-    """A floor surfel of 4x4 pixels is labelled cup: extracted IoU 64 / 80, hidden or not; rendered only where seen."""
-    stray = (20.0, 20.0, 2.0)
-    surfels, ids = scene([CUP, BOX, FLOOR, stray]), torch.tensor([1, 2, 0, 1], dtype=torch.int32)
+def test_a_stray_gaussian_costs_what_it_covers():
+    """A floor Gaussian of 4x4 pixels is labelled cup: extracted IoU 64 / 80, rendered IoU 1, as the floor hides it."""
     view = EvalView(camera(), None, truth(), {1: square_mask(*CUP), 2: square_mask(*BOX)})
-    metrics = evaluate_scene(surfels, ids, Squares(), SETTINGS, [view], CLASSES)
+    metrics = evaluated([CUP, BOX, FLOOR, STRAY], [1, 2, 0, 1], view)
     cup = metrics.objects[1]
-    assert cup.extracted is not None and cup.rendered is not None
+    assert cup.extracted is not None and cup.rendered is not None and metrics.mean.extracted is not None
     assert cup.extracted.iou == pytest.approx(64 / 80)
     assert cup.extracted.acc == pytest.approx(1 - 16 / SIZE**2)
     assert cup.rendered.iou == 1.0  # the floor lies before the stray one
-    assert metrics.mean.extracted is not None
     assert metrics.mean.extracted.iou == pytest.approx((64 / 80 + 1) / 2)
     assert metrics.psnr is None
 
 
 def test_only_labelled_objects_are_scored():
     """Only the cup's visible mask is known: the box is not scored, though it is seen; the id image does not count."""
-    surfels, ids = scene([CUP, BOX, FLOOR]), torch.tensor([1, 2, 0], dtype=torch.int32)
     wrong = torch.full((SIZE, SIZE), 2, dtype=torch.int32)
-    view = EvalView(camera(), None, wrong, visible_objects={1: square_mask(*CUP)})
-    metrics = evaluate_scene(surfels, ids, Squares(), SETTINGS, [view], CLASSES)
+    metrics = evaluated([CUP, BOX, FLOOR], IDS, EvalView(camera(), None, wrong, visible_objects={1: square_mask(*CUP)}))
     assert metrics.objects == {1: metrics.mean, 2: ObjectMetrics(None, None)}
-    assert metrics.mean == ObjectMetrics(MaskMetrics(1.0, 1.0, 1.0), MaskMetrics(1.0, 1.0, 1.0))
-    assert metrics.extracted_truth == "visible"
+    assert metrics.mean == ObjectMetrics(PERFECT, PERFECT) and metrics.extracted_truth == "visible"
 
 
-def test_pixels_of_other_labelled_objects_are_left_out_of_extracted_masks():
-    """The box is whole behind the cup; its visible mask lacks the part that the cup, labelled too, covers."""
-    surfels, ids = scene([CUP, BOX, FLOOR]), torch.tensor([1, 2, 0], dtype=torch.int32)
+def test_pixels_of_other_objects_are_left_out_of_extracted_masks():
+    """The box is whole behind the cup; its visible mask lacks the part that the cup covers."""
     seen = {1: square_mask(*CUP), 2: square_mask(*BOX) & ~square_mask(*CUP)}
-    both = EvalView(camera(), None, visible_objects=seen)
-    alone = EvalView(camera(), None, visible_objects={2: seen[2]})
-    for view, iou in ((both, 1.0), (alone, 0.5)):
-        box = evaluate_scene(surfels, ids, Squares(), SETTINGS, [view], CLASSES).objects[2]
-        assert box.extracted is not None and box.extracted.iou == pytest.approx(iou)
-        assert box.rendered is not None and box.rendered.iou == 1.0
-
-
-def test_without_silhouettes_what_lies_behind_others_is_left_out():
-    """The box is complete behind the cup: compared with its visible half, the covered half must not count."""
-    surfels, ids = scene([CUP, BOX, FLOOR]), torch.tensor([1, 2, 0], dtype=torch.int32)
-    metrics = evaluate_scene(surfels, ids, Squares(), SETTINGS, [EvalView(camera(), None, truth())], CLASSES)
-    assert metrics.extracted_truth == "visible"
-    box = metrics.objects[2]
-    assert box.extracted is not None and box.extracted.iou == 1.0 and box.extracted.acc == 1.0
+    views = [EvalView(camera(), None, visible_objects=known) for known in (seen, {2: seen[2]})]
+    for view, iou in zip([EvalView(camera(), None, truth()), *views], (1.0, 1.0, 0.5), strict=True):
+        metrics = evaluated([CUP, BOX, FLOOR], IDS, view)
+        box = metrics.objects[2]
+        assert metrics.extracted_truth == "visible" and box.extracted is not None and box.rendered is not None
+        assert box.extracted.iou == pytest.approx(iou) and box.rendered.iou == 1.0
 
 
 def test_ignored_pixels_do_not_count():
-    stray = (20.0, 20.0, 2.0)
-    surfels, ids = scene([stray, CUP, BOX, FLOOR]), torch.tensor([1, 1, 2, 0], dtype=torch.int32)
     labels = truth()
-    labels[square_mask(*stray)] = IGNORE
-    metrics = evaluate_scene(surfels, ids, Squares(), SETTINGS, [EvalView(camera(), None, labels)], CLASSES)
-    cup = metrics.objects[1]
+    labels[square_mask(*STRAY)] = IGNORE
+    cup = evaluated([STRAY, CUP, BOX, FLOOR], [1, 1, 2, 0], EvalView(camera(), None, labels)).objects[1]
     assert cup.extracted is not None and cup.extracted.iou == 1.0
     assert cup.rendered is not None and cup.rendered.iou == 1.0
 
 
-def test_the_mean_is_over_masks_and_an_object_without_surfels_scores_zero():
-    surfels, ids = scene([CUP, FLOOR]), torch.tensor([1, 0], dtype=torch.int32)
-    views = [
-        EvalView(camera(), None, None, {1: square_mask(*CUP), 2: square_mask(*BOX)}),
-        EvalView(camera(), None, None, {1: square_mask(*CUP)}),
-    ]
-    seen = []
-    metrics = evaluate_scene(
-        surfels, ids, Squares(), SETTINGS, views, CLASSES, progress=lambda done, total: seen.append((done, total))
-    )
+def test_the_mean_is_over_masks_and_an_object_without_gaussians_scores_zero():
+    cup, seen = square_mask(*CUP), []
+    views = [EvalView(camera(), None, None, known) for known in ({1: cup, 2: square_mask(*BOX)}, {1: cup})]
+    metrics = evaluated([CUP, FLOOR], [1, 0], *views, progress=lambda *counts: seen.append(counts))
     assert metrics.objects[2].extracted is not None and metrics.objects[2].extracted.iou == 0.0
     assert metrics.mean.extracted is not None and metrics.mean.extracted.iou == pytest.approx(2 / 3)
     assert metrics.mean.rendered is None and metrics.objects[1].rendered is None
@@ -173,10 +156,8 @@ def test_a_run_without_a_former_state_has_no_before():
 
 
 def test_the_table_shows_both_stages():
-    from rich.console import Console
-
     out = io.StringIO()
-    print_run(report(), SECONDS, 812.0, Console(file=out, width=80))
+    Console(file=out, width=80).print(render_run(report(), SECONDS, 812.0))
     cells = [line.split() for line in out.getvalue().splitlines()]
     assert ["cup", "before", "80.0", "70.0", "60.0", "80.0", "80.0", "80.0"] in cells
     assert ["after", "90.0", "80.0", "70.0", "90.0", "90.0", "90.0"] in cells
@@ -202,32 +183,27 @@ def test_half_way_between_two_cameras():
 def test_the_novel_view_lies_towards_the_nearest_one():
     views = [EvalView(camera(shift), None) for shift in (0.0, 5.0, -1.0)]
     novel = novel_camera(views)
-    assert novel is not None
+    assert novel is not None and novel_camera(views[:1]) is None
     assert torch.allclose(novel.center, 0.5 * (views[0].camera.center + views[2].camera.center), atol=1e-6)
-    assert novel_camera(views[:1]) is None
 
 
 def test_the_sheet_shows_objects_before_and_after(tmp_path):
-    before, after = scene([CUP, BOX, FLOOR]), scene([CUP, BOX, FLOOR], grey=0.6)
-    ids = torch.tensor([1, 2, 0], dtype=torch.int32)
+    scenes = [(scene([CUP, BOX, FLOOR], grey=grey), IDS) for grey in (0.3, 0.6)]
     views = [EvalView(camera(s), torch.rand(SIZE, SIZE, 3), truth(), name=f"view {s}") for s in (0.0, 1.0)]
-    told: list[tuple[int, int]] = []
-    progress = lambda done, total: told.append((done, total))  # noqa: E731
-    rows = draw_rows(views, (before, ids), (after, ids), [1, 2], Squares(), SETTINGS, progress=progress)
-    assert told == [(1, 3), (2, 3), (3, 3)]
+    counts: list[tuple[int, int]] = []
+    options = {"novel": novel_camera(views), "progress": lambda *steps: counts.append(steps)}
+    rows = draw_rows(views, *scenes, [1, 2], Squares(), SETTINGS, **options)
+    assert counts == [(1, 3), (2, 3), (3, 3)]
     assert [row.name for row in rows] == ["view 0.0", "view 1.0", "novel view"]
     assert np.array_equal(rows[0].after[1][..., 3] == 255, square_mask(*CUP).numpy())
     assert (rows[0].before[1][12, 8, :3] == 76).all() and (rows[0].after[1][12, 8, :3] == 153).all()
-    write_contact_sheet(tmp_path / "out" / "sheet.png", rows, CLASSES)
-    from PIL import Image
-
+    write_picture(tmp_path / "out" / "sheet.png", contact_sheet(rows, CLASSES))
     with Image.open(tmp_path / "out" / "sheet.png") as picture:
         sheet = np.asarray(picture)
     assert np.array_equal(sheet, contact_sheet(rows, CLASSES))
     # three rows, each of seven cells: photo, mask, render, and two objects before and after
     assert sheet.shape[0] > 3 * 220 and sheet.shape[1] > 7 * 220
-    for grey in (76, 153):
-        assert (sheet == grey).all(axis=-1).sum() > 1000
+    assert all((sheet == grey).all(axis=-1).sum() > 1000 for grey in (76, 153))
 
 
 def test_a_sheet_of_many_objects_is_no_wider_than_a_screen():
@@ -241,17 +217,13 @@ def test_a_sheet_of_many_objects_is_no_wider_than_a_screen():
         assert (sheet == 30 * index).all(-1).sum() > 220 * 220  # of both stages, with the crop's margin
 
 
-def test_a_sheet_survives_absent_parts():
+def test_a_sheet_survives_absent_parts_but_not_a_place_that_cannot_be_written(tmp_path):
     blank = np.zeros((SIZE, 2 * SIZE, 3), dtype=np.uint8)
     nothing = {1: np.zeros((SIZE, 2 * SIZE, 4), dtype=np.uint8)}
     row = SheetRow("an → name", None, None, blank, nothing, nothing)
     assert contact_sheet([row], {1: "Tasse ☕"}).dtype == np.uint8
     with pytest.raises(ValueError, match="at least one row"):
         contact_sheet([], {})
-
-
-def test_a_picture_that_cannot_be_written(tmp_path):
-    blank = np.zeros((SIZE, SIZE, 3), dtype=np.uint8)
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot be written"):
-        write_contact_sheet(tmp_path / "file" / "sheet.png", [SheetRow("v", None, None, blank, {}, {})], {})
+        write_picture(tmp_path / "file" / "sheet.png", np.zeros((4, 4, 3), np.uint8))

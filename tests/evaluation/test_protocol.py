@@ -1,4 +1,4 @@
-"""Every choice of the evaluation protocol against a computation of its own in numpy."""
+"""Choices of the evaluation protocol against computations in numpy."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def band(mask: np.ndarray, width: int) -> np.ndarray:
 
 
 def blobs(seed: int, height: int = 60, width: int = 80) -> tuple[np.ndarray, np.ndarray]:
-    """Two overlapping ellipses, the second with specks."""
+    """Return two overlapping ellipses, the second with specks."""
     generator = np.random.default_rng(seed)
     y, x = np.mgrid[:height, :width]
     masks = []
@@ -125,7 +125,7 @@ def test_what_no_photo_shows_is_scored_on_demand(silhouettes):
 
 
 def records(seed: int, views: int, objects: int) -> list[MaskRecord]:
-    """Random figures; some masks are missing and some have no IoU."""
+    """Return random figures; some masks are missing and some have no IoU."""
     generator, presence = np.random.default_rng(seed), np.random.default_rng(seed % 100)  # alike before and after
     found = []
     for view in range(views):
@@ -140,7 +140,7 @@ def records(seed: int, views: int, objects: int) -> list[MaskRecord]:
 
 
 def table(masks: list[MaskRecord], kind: str, metric: str, views: int, objects: int) -> np.ndarray:
-    """[views, objects], NaN where there is nothing."""
+    """Return [views, objects], NaN where there is nothing."""
     values = np.full((views, objects), np.nan)
     for mask in masks:
         value = getattr(mask.metrics, metric)

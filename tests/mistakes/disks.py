@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import errno
+import tempfile
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from mistakes.table import SHORT, TRAINED, Place, mistake
+import PIL.Image
+
+from mistakes.table import SHORT, TRAINED, Place, mistake, mistakes
 
 WRITING = {  # commands that write into {out}
     "extract": "extract --load-config {run} --output",
@@ -39,16 +43,15 @@ FILES = {
 
 
 def writing(title: str, prepare: Callable[[Place, Path], Any]) -> Callable[[Place], Any]:
-    """A command that writes where it cannot. prepare: is given the folder, which does not exist yet."""
+    """Return a command that writes where it cannot. prepare: receives the folder, which does not exist yet."""
 
     def make(at: Place):
         from beags_plugin.commands.doctor import diagnosis
 
-        at.patch.setattr(diagnosis, "diagnose", lambda: [])  # of the doctor's own work nothing is asked here
+        at.patch.setattr(diagnosis, "diagnose", lambda: [])  # the doctor's own work is beside the point
         folder = at.root / "out"
         at.run  # noqa: B018  (made before the disk is full)
-        words = WRITING[title].replace("{data}", str(at.data))
-        command = at.beags(words, folder / FILES[title] if title in FILES else folder)
+        command = at.beags(WRITING[title], folder / FILES[title] if title in FILES else folder)
         prepare(at, folder)
         return command
 
@@ -63,38 +66,51 @@ for _title in ("export", "masks reproject"):
     mistake("a file in place of a folder", _title)(writing(_title, lambda at, folder: folder.write_text("x")))
 
 
-@mistake("a folder in place of a file", "a picture")
-def _(at: Place):
-    (at.root / "out.png").mkdir()
-    return at.beags("render --load-config {run} --size 16 --views 1 --format sheet --output", at.root / "out.png")
+mistake("a folder in place of a file", "a picture")(
+    writing("a picture", lambda at, folder: (folder / "out.png").mkdir(parents=True))
+)
 
 
-@mistake("full disk", "ns-train writes its config")
-def _(at: Place):
-    command = at.train()
-    at.fail_to_write(at.root / TRAINED)
-    return command
+def training(code: int) -> Callable[[Place], Any]:
+    def make(at: Place):
+        command = at.train()
+        at.fail_to_write(at.root / TRAINED, code)
+        return command
+
+    return make
 
 
-@mistake("full disk", "ns-train writes its checkpoint")
-def _(at: Place):
-    from beags_plugin.plugin.training import checkpoints
+def filling(module: str, function: str, folder: str, after: int = 0) -> Callable[[Place], Any]:
+    """Return a training whose disk is full below ``folder`` from a function of the program on."""
 
-    command = at.train(*SHORT, preset="beags-tiny")
-    save = checkpoints.save_atomically
+    def make(at: Place):
+        command = at.train(*SHORT, preset="beags-tiny")
+        owner = import_module(f"beags_plugin.plugin.training.{module}")
+        save = getattr(owner, function)
 
-    def full(content, path):
-        at.fail_to_write(at.root / TRAINED, after=1000)
-        save(content, path)
+        def full(*arguments):
+            at.fail_to_write(at.root / folder, after=after)
+            return save(*arguments)
 
-    at.patch.setattr(checkpoints, "save_atomically", full)
-    return command
+        at.patch.setattr(owner, function, full)
+        return command
+
+    return make
+
+
+mistakes(
+    "full disk",
+    {
+        "ns-train writes its config": training(errno.ENOSPC),
+        "ns-train writes its checkpoint": filling("checkpoints", "save_atomically", TRAINED, after=1000),
+        "ns-train prepares refinement": filling("refinement", "save_prepared", f"{TRAINED}/prepared"),
+    },
+)
+mistake("no permission", "ns-train")(training(errno.EACCES))
 
 
 @mistake("full disk", "ns-train writes its curves")
 def _(at: Place):
-    import tempfile
-
     from tensorboard.summary.writer.record_writer import RecordWriter
 
     at.patch.setattr(tempfile, "tempdir", str(at.root))
@@ -111,25 +127,8 @@ def _(at: Place):
     return command
 
 
-@mistake("full disk", "ns-train prepares refinement")
-def _(at: Place):
-    from beags_plugin.plugin.training import refinement
-
-    command = at.train(*SHORT, preset="beags-tiny")
-    save = refinement.save_prepared
-
-    def full(prepared, names, folder):
-        at.fail_to_write(at.root / TRAINED / "prepared")
-        save(prepared, names, folder)
-
-    at.patch.setattr(refinement, "save_prepared", full)
-    return command
-
-
 @mistake("full disk", "the folder of temporary files")
 def _(at: Place):
-    import tempfile
-
     command = at.train(*SHORT)
 
     def full(*_, **__):
@@ -142,37 +141,25 @@ def _(at: Place):
     return command
 
 
-@mistake("no permission", "ns-train")
-def _(at: Place):
-    command = at.train()
-    at.fail_to_write(at.root / TRAINED, errno.EACCES)
-    return command
+def refusing(opened: Callable[..., Any], ending: str) -> Callable[..., Any]:
+    """Return a function that opens files, but none whose path ends so."""
+
+    def opening(path, *rest, **options):
+        if str(path).endswith(ending):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return opened(path, *rest, **options)
+
+    return opening
 
 
 @mistake("no permission", "a photo")
 def _(at: Place):
-    import PIL.Image
-
-    opened = PIL.Image.open
-
-    def refusing(path, *rest, **options):
-        if str(path).endswith("images/v02.png"):
-            raise PermissionError(errno.EACCES, "Permission denied", str(path))
-        return opened(path, *rest, **options)
-
-    at.patch.setattr(PIL.Image, "open", refusing)
+    at.patch.setattr(PIL.Image, "open", refusing(PIL.Image.open, "images/v02.png"))
     return at.train()
 
 
 @mistake("no permission", "the config of a run")
 def _(at: Place):
-    read = Path.read_text
-
-    def refusing(path, *rest, **options):
-        if path.name == "config.yml":
-            raise PermissionError(errno.EACCES, "Permission denied", str(path))
-        return read(path, *rest, **options)
-
     command = at.beags("extract --load-config {run}")
-    at.patch.setattr(Path, "read_text", refusing)
+    at.patch.setattr(Path, "read_text", refusing(Path.read_text, "config.yml"))
     return command

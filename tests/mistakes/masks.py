@@ -11,17 +11,16 @@ import numpy as np
 from data_folders import HEIGHT, WIDTH, noise, write_image
 from PIL import Image
 
-from mistakes.table import Place, mistake
+from mistakes.table import Place, beags_after, mistake, mistakes, train_after
 
 
-def mask(change: Callable[[Path], Any], *flags: str) -> Callable[[Place], Any]:
-    """A mistake in one mask."""
+def mask(change: Callable[[Path], Any]) -> Callable[[Place], Any]:
+    """Return a mistake in one mask."""
+    return train_after(lambda at: change(at.data / "masks/v01.png"))
 
-    def make(at: Place):
-        change(at.data / "masks/v01.png")
-        return at.train(*flags)
 
-    return make
+def every_mask(change: Callable[[Path], Any], *flags: str) -> Callable[[Place], Any]:
+    return train_after(lambda at: [change(path) for path in list((at.data / "masks").iterdir())], *flags)
 
 
 def ids(value: int, dtype: type = np.uint8) -> np.ndarray:
@@ -30,81 +29,61 @@ def ids(value: int, dtype: type = np.uint8) -> np.ndarray:
     return found
 
 
-mistake("masks", "another size than the photo")(mask(lambda path: write_image(path, noise(0, 4, 3)[..., 0])))
-mistake("masks", "colours instead of ids")(mask(lambda path: write_image(path, noise(0))))
-mistake("masks", "an id that classes.json does not name")(mask(lambda path: write_image(path, ids(7))))
-mistake("masks", "cut off")(mask(lambda path: path.write_bytes(path.read_bytes()[:-30])))
-mistake("masks", "no bytes")(mask(lambda path: path.write_bytes(b"")))
-mistake("masks", "a JPEG called .png")(mask(lambda path: Image.fromarray(ids(2)).save(path, format="JPEG")))
-mistake("masks", "ids above 65,535")(mask(lambda path: Image.fromarray(ids(70_000, np.int32)).save(path, "TIFF")))
+mistakes(
+    "masks",
+    {
+        "another size than the photo": mask(lambda path: write_image(path, noise(0, 4, 3)[..., 0])),
+        "colours instead of ids": mask(lambda path: write_image(path, noise(0))),
+        "an id that classes.json does not name": mask(lambda path: write_image(path, ids(7))),
+        "cut off": mask(lambda path: path.write_bytes(path.read_bytes()[:-30])),
+        "no bytes": mask(lambda path: path.write_bytes(b"")),
+        "a JPEG called .png": mask(lambda path: Image.fromarray(ids(2)).save(path, format="JPEG")),
+        "ids above 65,535": mask(lambda path: Image.fromarray(ids(70_000, np.int32)).save(path, "TIFF")),
+        "none of a photo's name": every_mask(lambda path: path.rename(path.with_name(f"mask_{path.name}"))),
+        "none at all": every_mask(lambda path: path.unlink()),
+        "a folder that does not exist": lambda at: at.train("beags-data", "--masks-path", "mask"),
+        "background alone": every_mask(
+            lambda path: write_image(path, ids(0)),
+            *("--pipeline.model.base-steps", "2", "--pipeline.model.refine-steps", "2"),
+        ),
+    },
+)
 
 
-@mistake("masks", "none of a photo's name")
-def _(at: Place):
-    for path in list((at.data / "masks").iterdir()):
-        path.rename(path.with_name(f"mask_{path.name}"))
-    return at.train()
+def classes(content: Any) -> Callable[[Place], Any]:
+    """Return a mistake in classes.json. content: bytes, text, or names as JSON."""
+    text = content if isinstance(content, (str, bytes)) else json.dumps(content)
+    return train_after(
+        lambda at: (at.data / "classes.json").write_bytes(text if isinstance(text, bytes) else text.encode())
+    )
 
 
-@mistake("masks", "none at all")
-def _(at: Place):
-    for path in list((at.data / "masks").iterdir()):
-        path.unlink()
-    return at.train()
-
-
-@mistake("masks", "a folder that does not exist")
-def _(at: Place):
-    return at.train("beags-data", "--masks-path", "mask")
-
-
-@mistake("masks", "background alone")
-def _(at: Place):
-    for path in list((at.data / "masks").iterdir()):
-        write_image(path, ids(0))
-    return at.train("--pipeline.model.base-steps", "2", "--pipeline.model.refine-steps", "2")
-
-
-def classes(text: str | bytes) -> Callable[[Place], Any]:
-    def make(at: Place):
-        path = at.data / "classes.json"
-        path.write_bytes(text if isinstance(text, bytes) else text.encode())
-        return at.train()
-
-    return make
-
-
-def named(names: Any) -> Callable[[Place], Any]:
-    return classes(json.dumps(names))
-
-
-mistake("classes.json", "broken")(classes('{"1": "cup"'))
-mistake("classes.json", "empty")(classes(""))
-mistake("classes.json", "not UTF-8")(classes(b'{"1": "\xff"}'))
-mistake("classes.json", "a list")(named(["cup", "box"]))
-mistake("classes.json", "a negative id")(named({"-1": "cup", "2": "box"}))
-mistake("classes.json", "two classes of one name")(named({"1": "cup", "2": "cup"}))
-mistake("classes.json", "an id named twice")(classes('{"1": "cup", "1": "box"}'))
-mistake("classes.json", "an empty name")(named({"1": "  ", "2": "box"}))
-mistake("classes.json", "a line break in a name")(named({"1": "cup\nbox", "2": "box"}))
-
-
-@mistake("classes.json", "a folder")
-def _(at: Place):
+def folder_for_classes(at: Place) -> None:
     (at.data / "classes.json").unlink()
     (at.data / "classes.json").mkdir()
-    return at.train()
+
+
+mistakes(
+    "classes.json",
+    {
+        "broken": classes('{"1": "cup"'),
+        "empty": classes(""),
+        "not UTF-8": classes(b'{"1": "\xff"}'),
+        "a list": classes(["cup", "box"]),
+        "a negative id": classes({"-1": "cup", "2": "box"}),
+        "two classes of one name": classes({"1": "cup", "2": "cup"}),
+        "an id named twice": classes('{"1": "cup", "1": "box"}'),
+        "an empty name": classes({"1": "  ", "2": "box"}),
+        "a line break in a name": classes({"1": "cup\nbox", "2": "box"}),
+        "a folder": train_after(folder_for_classes),
+    },
+)
 
 
 def made(source: str, prepare: Callable[[Path], Any] = lambda data: None, options: str = "") -> Callable[[Place], Any]:
-    """A mistake in what ``beags masks make`` reads."""
-
-    def make(at: Place):
-        prepare(at.data)
-        words = f"--options {options}" if options else ""
-        return at.beags("masks make --data", at.data, f"--source {source} --overwrite {words}")
-
-    return make
+    """Return a mistake in the files that ``beags masks make`` reads."""
+    words = f"masks make --data {{data}} --source {source} --overwrite {options}"
+    return beags_after(lambda at: prepare(at.data), words)
 
 
 def coco(segmentation: Any, **entries: Any) -> Callable[[Path], Any]:
@@ -120,22 +99,8 @@ def rle(height: int, width: int, counts: Any) -> Callable[[Path], Any]:
     return coco({"size": [height, width], "counts": counts})
 
 
-mistake("mask sources", "an unknown option")(made("coco", options="color=red"))
-mistake("mask sources", "a wrong value of an option")(made("langsplat", options="similarity=much"))
-mistake("mask sources", "COCO: no such file")(made("coco"))
-mistake("mask sources", "COCO: broken")(made("coco", lambda data: (data / "annotations.json").write_text("{")))
-mistake("mask sources", "COCO: no annotations")(
-    made("coco", lambda data: (data / "annotations.json").write_text('{"images": []}'))
-)
-mistake("mask sources", "COCO: of other photos")(
-    made("coco", coco([[1, 1, 5, 1, 5, 5]], images=[{"id": 1, "file_name": "other.png"}]))
-)
-mistake("mask sources", "COCO: run lengths of another size")(made("coco", rle(10, 20, [200])))
-mistake("mask sources", "COCO: packed run lengths that overflow")(made("coco", rle(HEIGHT, WIDTH, "o" * 40)))
-mistake("mask sources", "a folder without masks")(made("id-images", options="folder=nowhere"))
-mistake("mask sources", "Gaussian Grouping without its folder")(made("gaussian-grouping"))
-mistake("mask sources", "images of objects missing")(made("object-images"))
-mistake("mask sources", "LangSplat without its folder")(made("langsplat"))
+def file(name: str, text: str) -> Callable[[Path], Any]:
+    return lambda data: (data / name).write_text(text)
 
 
 def langsplat(segments: Any, features: Any) -> Callable[[Path], Any]:
@@ -151,42 +116,47 @@ def langsplat(segments: Any, features: Any) -> Callable[[Path], Any]:
     return write
 
 
-mistake("mask sources", "LangSplat: pickled objects")(
-    made("langsplat", langsplat(np.array([{}], dtype=object), np.ones((1, 3))))
-)
-mistake("mask sources", "LangSplat: an array cut off")(made("langsplat", langsplat(b"\x93NUMPY\x01", np.ones((1, 3)))))
-mistake("mask sources", "LangSplat: segments of wrong shape")(made("langsplat", langsplat(np.ones(3), np.ones((1, 3)))))
-mistake("mask sources", "LangSplat: segments without features")(
-    made("langsplat", langsplat(np.full((4, HEIGHT, WIDTH), 5), np.ones((1, 3))))
-)
-
-
-def prompts(content: Any) -> Callable[[Path], Any]:
+def grabcut(content: Any) -> Callable[[Place], Any]:
+    """Return a mistake in the prompts of GrabCut, which asks a run for its depth. content: text, or an object."""
     text = content if isinstance(content, str) else json.dumps({"objects": [content]})
-    return lambda data: (data / "prompts.json").write_text(text)
+    return made("grabcut", file("prompts.json", text), "--options prompts=prompts.json --load-config {run}")
 
 
 def boxed(box: list[Any], view: str = "v01") -> dict[str, Any]:
     return {"name": "cup", "prompts": [{"view": view, "box": box}]}
 
 
-def grabcut(prepare: Callable[[Path], Any] = lambda data: None) -> Callable[[Place], Any]:
-    """A mistake in the prompts of GrabCut, which asks a run for its depth."""
-
-    def make(at: Place):
-        prepare(at.data)
-        words = "--source grabcut --overwrite --options prompts=prompts.json --load-config {run}"
-        return at.beags("masks make --data", at.data, words)
-
-    return make
-
-
-mistake("mask sources", "GrabCut: no prompts")(grabcut())
-mistake("mask sources", "GrabCut: a box outside of the picture")(grabcut(prompts(boxed([100, 100, 200, 200]))))
-mistake("mask sources", "GrabCut: a box turned around")(grabcut(prompts(boxed([8, 8, 2, 2]))))
-mistake("mask sources", "GrabCut: a view that does not exist")(grabcut(prompts(boxed([2, 2, 8, 8], "v99"))))
-mistake("mask sources", "GrabCut: prompts broken")(grabcut(prompts("{")))
-mistake("mask sources", "GrabCut: prompts nested 100,000 deep")(grabcut(prompts("[" * 100_000)))
+GOOD = file("prompts.json", json.dumps({"objects": [boxed([2, 2, 8, 8])]}))
+FEATURES = np.ones((1, 3))
+OTHER_PHOTO = [{"id": 1, "file_name": "other.png"}]
+mistakes(
+    "mask sources",
+    {
+        "an unknown option": made("coco", options="--options color=red"),
+        "a wrong value of an option": made("langsplat", options="--options similarity=much"),
+        "COCO: no such file": made("coco"),
+        "COCO: broken": made("coco", file("annotations.json", "{")),
+        "COCO: no annotations": made("coco", file("annotations.json", '{"images": []}')),
+        "COCO: of other photos": made("coco", coco([[1, 1, 5, 1, 5, 5]], images=OTHER_PHOTO)),
+        "COCO: run lengths of another size": made("coco", coco({"size": [10, 20], "counts": [200]})),
+        "COCO: packed run lengths that overflow": made("coco", coco({"size": [HEIGHT, WIDTH], "counts": "o" * 40})),
+        "a folder without masks": made("id-images", options="--options folder=nowhere"),
+        "Gaussian Grouping without its folder": made("gaussian-grouping"),
+        "images of objects missing": made("object-images"),
+        "LangSplat without its folder": made("langsplat"),
+        "LangSplat: pickled objects": made("langsplat", langsplat(np.array([{}], dtype=object), FEATURES)),
+        "LangSplat: an array cut off": made("langsplat", langsplat(b"\x93NUMPY\x01", FEATURES)),
+        "LangSplat: segments of wrong shape": made("langsplat", langsplat(np.ones(3), FEATURES)),
+        "LangSplat: segments without features": made("langsplat", langsplat(np.full((4, HEIGHT, WIDTH), 5), FEATURES)),
+        "GrabCut: no prompts": made("grabcut", options="--options prompts=prompts.json --load-config {run}"),
+        "GrabCut: a box outside of the picture": grabcut(boxed([100, 100, 200, 200])),
+        "GrabCut: a box turned around": grabcut(boxed([8, 8, 2, 2])),
+        "GrabCut: a view that does not exist": grabcut(boxed([2, 2, 8, 8], "v99")),
+        "GrabCut: prompts broken": grabcut("{"),
+        "GrabCut: prompts nested 100,000 deep": grabcut("[" * 100_000),
+        "depth of a run without the run": made("grabcut", GOOD, "--options prompts=prompts.json"),
+    },
+)
 
 
 @mistake("mask sources", "SAM2 without weights")
@@ -199,12 +169,10 @@ def _(at: Place):
     def absent(name, **_):
         raise OSError(f"{name} is not a local folder and is not a valid model identifier")
 
-    prompts(boxed([2, 2, 8, 8]))(at.data)
     library = SimpleNamespace(Sam2VideoModel=SimpleNamespace(from_pretrained=absent))  # which is installed on demand
     at.patch.setitem(sys.modules, "transformers", library)
     at.patch.setattr(sam2.Sam2Source, "unavailable", classmethod(lambda cls: None))
-    words = "--source sam2 --overwrite --options prompts=prompts.json model=nowhere"
-    return at.beags("masks make --data", at.data, words)
+    return made("sam2", GOOD, "--options prompts=prompts.json model=nowhere")(at)
 
 
 @mistake("mask sources", "SAM2 without its extra")
@@ -212,10 +180,4 @@ def _(at: Place):
     from beags_plugin.masks.sources import sam2
 
     at.patch.setattr(sam2, "find_spec", lambda name: None)
-    return at.beags("masks make --data", at.data, "--source sam2 --overwrite")
-
-
-@mistake("mask sources", "depth of a run without the run")
-def _(at: Place):
-    prompts(boxed([2, 2, 8, 8]))(at.data)
-    return at.beags("masks make --data", at.data, "--source grabcut --overwrite --options prompts=prompts.json")
+    return made("sam2")(at)

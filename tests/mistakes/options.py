@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from mistakes.table import Place, mistake
+from mistakes.table import Place, mistake, mistakes, ns_train
 
 
 def trained(*flags: str, preset: str = "beags-tiny", **settings: Any) -> Callable[[Place], Any]:
@@ -20,44 +20,49 @@ def model(flag: str, value: str) -> Callable[[Place], Any]:
     return trained(f"--pipeline.model.{flag}", value)
 
 
-mistake("options", "an unknown backend")(model("rasterizer", "vulkan"))
-mistake("options", "an unknown refiner")(model("refiner", "magic"))
-mistake("options", "an unknown reprojection")(model("prepare.reprojection", "guess"))
-mistake("options", "an unknown kind of depth")(model("prepare.depth", "mean"))
-mistake("options", "negative steps of refinement")(model("refine-steps", "-5"))
-mistake("options", "no steps at all")(trained("--pipeline.model.base-steps", "0", "--pipeline.model.refine-steps", "0"))
-mistake("options", "no rounds of refinement")(model("refine-rounds", "0"))
-mistake("options", "a negative step to stop at")(trained(max_num_iterations=-3))
-mistake("options", "k is 0")(model("prepare.k", "0"))
-mistake("options", "k is negative")(model("prepare.k", "-1"))
-mistake("options", "tau is not a number")(model("prepare.tau", "nan"))
-mistake("options", "a confidence above 1")(model("prepare.min-confidence", "2"))
-mistake("options", "a degree of 9")(model("sh-degree", "9"))
-mistake("options", "a degree of -1")(model("sh-degree", "-1"))
-mistake("options", "a degree every 0 steps")(model("sh-degree-interval", "0"))
-mistake("options", "a near plane that is not a number")(model("near", "nan"))
-mistake("options", "a near plane behind the far one")(model("near", "1e9"))
-mistake("options", "a negative near plane")(model("near", "-1"))
-mistake("options", "growth every 0 steps")(model("densify.every", "0"))
-mistake("options", "a checkpoint every 0 steps")(trained(steps_per_save=0))
-mistake("options", "a downscale factor below 1")(trained("beags-data", "--downscale-factor", "0.5"))
-mistake("options", "a downscale factor that leaves no pixel")(trained("beags-data", "--downscale-factor", "100"))
-mistake("options", "a scale factor that is not a number")(trained("beags-data", "--scale-factor", "nan"))
-mistake("options", "a scale factor of 0")(trained("beags-data", "--scale-factor", "0"))
-mistake("options", "every view held out")(trained("beags-data", "--eval-interval", "1"))
-mistake("options", "a negative interval of held-out views")(trained("beags-data", "--eval-interval", "-2"))
-mistake("options", "a held-out view that does not exist")(trained("beags-data", "--held-out", "nobody"))
-mistake("options", "an id to ignore that is none")(trained("beags-data", "--ignore-ids", "-1"))
-mistake("options", "no random points")(trained("beags-data", "--num-random-points", "0"))
-mistake("options", "a negative number of random points")(trained("beags-data", "--num-random-points", "-5"))
-mistake("options", "a device that is not there")(trained("--machine.device-type", "cuda"))
-mistake("options", "several processes on a CPU")(trained("--machine.num-devices", "2"))
-mistake("options", "no process")(trained("--machine.num-devices", "0"))
-mistake("options", "a learning rate that is not a number")(trained("--pipeline.model.position-lr", "nan", "nan"))
+mistakes(
+    "options",
+    {
+        "an unknown backend": model("rasterizer", "vulkan"),
+        "an unknown refiner": model("refiner", "magic"),
+        "an unknown reprojection": model("prepare.reprojection", "guess"),
+        "an unknown kind of depth": model("prepare.depth", "mean"),
+        "negative steps of refinement": model("refine-steps", "-5"),
+        "no steps at all": trained("--pipeline.model.base-steps", "0", "--pipeline.model.refine-steps", "0"),
+        "no rounds of refinement": model("refine-rounds", "0"),
+        "a negative step to stop at": trained(max_num_iterations=-3),
+        "k is 0": model("prepare.k", "0"),
+        "k is negative": model("prepare.k", "-1"),
+        "tau is not a number": model("prepare.tau", "nan"),
+        "a confidence above 1": model("prepare.min-confidence", "2"),
+        "a degree of 9": model("sh-degree", "9"),
+        "a degree of -1": model("sh-degree", "-1"),
+        "a degree every 0 steps": model("sh-degree-interval", "0"),
+        "a near plane that is not a number": model("near", "nan"),
+        "a near plane behind the far one": model("near", "1e9"),
+        "a negative near plane": model("near", "-1"),
+        "growth every 0 steps": model("densify.every", "0"),
+        "a checkpoint every 0 steps": trained(steps_per_save=0),
+        "a downscale factor below 1": trained("beags-data", "--downscale-factor", "0.5"),
+        "a downscale factor that leaves no pixel": trained("beags-data", "--downscale-factor", "100"),
+        "a scale factor that is not a number": trained("beags-data", "--scale-factor", "nan"),
+        "a scale factor of 0": trained("beags-data", "--scale-factor", "0"),
+        "every view held out": trained("beags-data", "--eval-interval", "1"),
+        "a negative interval of held-out views": trained("beags-data", "--eval-interval", "-2"),
+        "a held-out view that does not exist": trained("beags-data", "--held-out", "nobody"),
+        "an id to ignore that is none": trained("beags-data", "--ignore-ids", "-1"),
+        "no random points": trained("beags-data", "--num-random-points", "0"),
+        "a negative number of random points": trained("beags-data", "--num-random-points", "-5"),
+        "a device that is not there": trained("--machine.device-type", "cuda"),
+        "several processes on a CPU": trained("--machine.num-devices", "2"),
+        "no process": trained("--machine.num-devices", "0"),
+        "a learning rate that is not a number": trained("--pipeline.model.position-lr", "nan", "nan"),
+    },
+)
 
 
 def loss(name: str, **values: Any) -> Callable[[Place], Any]:
-    """A mistake in the losses of the config, as a package of one's own would make it."""
+    """Return a mistake in the losses of the config, as a package of one's own would make it."""
 
     def make(at: Place):
         from beags_plugin.plugin.options.loss_spec import LossSpec
@@ -65,20 +70,25 @@ def loss(name: str, **values: Any) -> Callable[[Place], Any]:
         config = at.config()
         spec = config.model_config.losses.get(name, LossSpec())
         config.model_config.losses[name] = LossSpec(**{**vars(spec), **values})
-        return at.trained(config)
+        return lambda: ns_train(config)
 
     return make
 
 
-mistake("options", "an unknown loss")(loss("beauty"))
-mistake("options", "an unknown option of a loss")(loss("photometric", options={"colour": 1}))
-mistake("options", "a negative weight")(loss("boundary", weight=-1.0))
-mistake("options", "a weight that is not a number")(loss("boundary", weight=float("nan")))
-mistake("options", "an infinite weight")(loss("boundary", weight=float("inf")))
-mistake("options", "an unknown phase")(loss("boundary", phase="later"))
-mistake("options", "a loss that begins before the first step")(loss("normal", start=-5))
-mistake("options", "no samples")(loss("occupancy", options={"samples": 0}))
-mistake("options", "samples that are negative")(loss("occupancy", options={"samples": -1}))
+mistakes(
+    "options",
+    {
+        "an unknown loss": loss("beauty"),
+        "an unknown option of a loss": loss("photometric", options={"colour": 1}),
+        "a negative weight": loss("boundary", weight=-1.0),
+        "a weight that is not a number": loss("boundary", weight=float("nan")),
+        "an infinite weight": loss("boundary", weight=float("inf")),
+        "an unknown phase": loss("boundary", phase="later"),
+        "a loss that begins before the first step": loss("normal", start=-5),
+        "no samples": loss("occupancy", options={"samples": 0}),
+        "samples that are negative": loss("occupancy", options={"samples": -1}),
+    },
+)
 
 
 @mistake("options", "a backend that was not built")
@@ -91,18 +101,45 @@ def _(at: Place):
     return at.train("--pipeline.model.rasterizer", "native")
 
 
-mistake("export", "a truncation that is not a number")(
-    beags("export --load-config {run} --object cup --format glb --truncation nan")
+EXPORT, EVAL, RENDER = (f"{name} --load-config {{run}}" for name in ("export", "eval", "render"))
+mistakes(
+    "export",
+    {
+        "a truncation that is not a number": beags(EXPORT, "--object cup --format glb --truncation nan"),
+        "nothing": beags(EXPORT),
+        "all and one object": beags(EXPORT, "--all --object cup"),
+        "an unknown object": beags(EXPORT, "--object spoon"),
+        "an unknown format": beags(EXPORT, "--all --format usd"),
+        "an unknown frame": beags(EXPORT, "--all --frame camera"),
+    },
 )
-mistake("pictures", "a film called .png")(beags("render --load-config {run} --output film.png"))
-mistake("pictures", "no frames")(beags("render --load-config {run} --frames 0"))
-mistake("pictures", "a sheet without views")(beags("render --load-config {run} --format sheet --views 0"))
+mistakes(
+    "evaluation",
+    {
+        "an absent run": beags("eval --load-config absent.yml"),
+        "a run given twice": beags(EVAL, "{run}"),
+        "a threshold above 1": beags(EVAL, "--threshold 1.5"),
+        "no worst masks": beags(EVAL, "--worst 0"),
+        "a folder for a file": lambda at: at.beags(EVAL, "--json", at.root),
+    },
+)
+mistakes(
+    "pictures",
+    {
+        "a film called .png": beags(RENDER, "--output film.png"),
+        "a sheet called .mp4": beags(RENDER, "--format sheet --output a.mp4"),
+        "a comparison called .txt": beags(RENDER, "--format before-after --output a.txt"),
+        "an unknown object": beags(RENDER, "--object unicorn"),
+        "no frames": beags(RENDER, "--frames 0"),
+        "a sheet without views": beags(RENDER, "--format sheet --views 0"),
+    },
+)
 mistake("sample", "no views")(beags("sample --views 0 --output out"))
 mistake("sample", "a negative seed")(beags("sample --seed -1 --output out"))
 mistake("sample", "pixels that fill no memory")(beags("sample --width 10000000 --height 10000000 --output out"))
 mistake("demo", "an empty folder")(lambda at: at.beags("demo --data", (at.root / "empty").mkdir() or at.root / "empty"))
-mistake("demo", "a downscale factor of 0")(lambda at: at.beags("demo --downscale 0 --data", at.data))
-mistake("mask checks", "a number of views below 1")(lambda at: at.beags("masks check --min-views 0 --data", at.data))
+mistake("demo", "a downscale factor of 0")(beags("demo --downscale 0 --data {data}"))
+mistake("mask checks", "a number of views below 1")(beags("masks check --min-views 0 --data {data}"))
 mistake("mask checks", "a folder of masks that does not exist")(
     beags("masks reproject --load-config {run} --masks-path nowhere")
 )
@@ -124,19 +161,22 @@ def experiment(text: str | bytes, *words: str) -> Callable[[Place], Any]:
     return make
 
 
-mistake("experiments", "an unknown entry")(experiment("colour = 1\n" + GOOD))
-mistake("experiments", "an unknown option of a variant")(experiment(GOOD + "refine = { 'pipeline.model.beauty' = 1 }"))
-mistake("experiments", "an option of the wrong type")(
-    experiment(GOOD + "refine = { 'pipeline.model.prepare.k' = 'many' }")
+mistakes(
+    "experiments",
+    {
+        "an unknown entry": experiment("colour = 1\n" + GOOD),
+        "an unknown option of a variant": experiment(GOOD + "refine = { 'pipeline.model.beauty' = 1 }"),
+        "an option of the wrong type": experiment(GOOD + "refine = { 'pipeline.model.prepare.k' = 'many' }"),
+        "an unknown preset": experiment(GOOD.replace("beags-tiny", "beags-huge")),
+        "no variant": experiment(GOOD.partition("[[")[0]),
+        "two variants of one name": experiment(GOOD + "[[variant]]\nname = 'a'\n"),
+        "a variant that is a number": experiment("variant = 3\n" + GOOD.partition("[[")[0]),
+        "a reference that is no variant": experiment("reference = 'b'\n" + GOOD),
+        "a sweep without values": experiment(GOOD + "[[sweep]]\nname = 's'\nkey = 'damage'\n"),
+        "a damage that is no degree": experiment(GOOD + "damage = 'heavy'\n"),
+        "TOML broken": experiment("description = "),
+        "not UTF-8": experiment(b"description = '\xff'"),
+        "data that do not exist": experiment(GOOD, "--data nowhere"),
+        "no such file": beags("bench file nowhere.toml --output bench"),
+    },
 )
-mistake("experiments", "an unknown preset")(experiment(GOOD.replace("beags-tiny", "beags-huge")))
-mistake("experiments", "no variant")(experiment(GOOD.partition("[[")[0]))
-mistake("experiments", "two variants of one name")(experiment(GOOD + "[[variant]]\nname = 'a'\n"))
-mistake("experiments", "a variant that is a number")(experiment("variant = 3\n" + GOOD.partition("[[")[0]))
-mistake("experiments", "a reference that is no variant")(experiment("reference = 'b'\n" + GOOD))
-mistake("experiments", "a sweep without values")(experiment(GOOD + "[[sweep]]\nname = 's'\nkey = 'damage'\n"))
-mistake("experiments", "a damage that is no degree")(experiment(GOOD + "damage = 'heavy'\n"))
-mistake("experiments", "TOML broken")(experiment("description = "))
-mistake("experiments", "not UTF-8")(experiment(b"description = '\xff'"))
-mistake("experiments", "data that do not exist")(experiment(GOOD, "--data nowhere"))
-mistake("experiments", "no such file")(beags("bench file nowhere.toml --output bench"))

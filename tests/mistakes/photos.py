@@ -7,13 +7,13 @@ import zlib
 from pathlib import Path
 
 import numpy as np
-from data_folders import noise, write_image
+from data_folders import noise, write_colmap, write_image
 
-from mistakes.table import Place, mistake
+from mistakes.table import Place, mistake, mistakes, train_after
 
 
 def huge_png(path: Path, side: int = 60_000) -> None:
-    """A PNG of a few bytes that promises ``side`` x ``side`` pixels."""
+    """Write a PNG of a few bytes that promises ``side`` x ``side`` pixels."""
 
     def chunk(kind: bytes, content: bytes) -> bytes:
         body = kind + content
@@ -24,50 +24,29 @@ def huge_png(path: Path, side: int = 60_000) -> None:
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", packed) + chunk(b"IEND", b""))
 
 
-@mistake("photos", "cut off")
-def _(at: Place):
-    at.cut(at.data / "images/v02.png")
-    return at.train()
+def name_one_twice(meta: dict) -> None:
+    meta["frames"][1]["file_path"] = meta["frames"][0]["file_path"]
 
 
-@mistake("photos", "not the size that the camera has")
-def _(at: Place):
-    write_image(at.data / "images/v02.png", noise(0, 20, 20))
-    return at.train()
-
-
-@mistake("photos", "16 bits per channel")
-def _(at: Place):
-    write_image(at.data / "images/v02.png", np.zeros((12, 20), np.uint16))
-    return at.train()
-
-
-@mistake("photos", "a bomb of 60,000 x 60,000 pixels")
-def _(at: Place):
-    huge_png(at.data / "images/v02.png")
-    return at.train()
-
-
-@mistake("photos", "only one")
-def _(at: Place):
-    at.edit_poses(lambda meta: meta.update(frames=meta["frames"][:1]))
-    return at.train()
+mistakes(
+    "photos",
+    {
+        "cut off": train_after(lambda at: at.cut(at.photo)),
+        "not the size that the camera has": train_after(lambda at: write_image(at.photo, noise(0, 20, 20))),
+        "16 bits per channel": train_after(lambda at: write_image(at.photo, np.zeros((12, 20), np.uint16))),
+        "a bomb of 60,000 x 60,000 pixels": train_after(lambda at: huge_png(at.photo)),
+        "only one": train_after(lambda at: at.edit_poses(lambda meta: meta.update(frames=meta["frames"][:1]))),
+        "one file named by two poses": train_after(lambda at: at.edit_poses(name_one_twice)),
+    },
+)
 
 
 @mistake("photos", "none in the folder of a COLMAP scene")
 def _(at: Place):
-    from data_folders import write_colmap
-
     write_colmap(at.root / "colmap")
     for path in (at.root / "colmap/images").iterdir():
         path.unlink()
     return at.train(data=at.root / "colmap")
-
-
-@mistake("photos", "one file named by two poses")
-def _(at: Place):
-    at.edit_poses(lambda meta: meta["frames"][1].update(file_path=meta["frames"][0]["file_path"]))
-    return at.train()
 
 
 @mistake("photos", "two of one name share a mask")

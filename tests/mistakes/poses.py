@@ -10,157 +10,134 @@ from typing import Any
 import numpy as np
 from data_folders import HEIGHT, WIDTH, noise, ring, write_colmap, write_image
 
-from mistakes.table import Place, mistake
+from mistakes.table import Place, mistakes, train_after
 
 NAN = float("nan")
 
 
 def frames(change: Callable[[dict[str, Any]], Any]) -> Callable[[Place], Any]:
-    """A mistake in the first frame of transforms.json."""
-
-    def make(at: Place):
-        at.edit_poses(lambda meta: change(meta["frames"][0]))
-        return at.train()
-
-    return make
+    """Return a mistake in the first frame of transforms.json."""
+    return train_after(lambda at: at.edit_poses(lambda meta: change(meta["frames"][0])))
 
 
 def entries(**values: Any) -> Callable[[Place], Any]:
-    """A mistake in transforms.json itself."""
+    """Return a mistake in transforms.json itself; None takes an entry out."""
 
-    def make(at: Place):
-        at.edit_poses(lambda meta: meta.update(values))
-        return at.train()
+    def change(meta):
+        meta.update(values)
+        for key in [key for key, value in values.items() if value is None]:
+            del meta[key]
 
-    return make
-
-
-def without(key: str) -> Callable[[Place], Any]:
-    def make(at: Place):
-        at.edit_poses(lambda meta: meta.pop(key))
-        return at.train()
-
-    return make
+    return train_after(lambda at: at.edit_poses(change))
 
 
-def set_row(row: int, values: list[Any]) -> Callable[[dict[str, Any]], None]:
-    return lambda frame: frame["transform_matrix"].__setitem__(row, values)
-
-
-mistake("poses", "not a number in a pose")(frames(set_row(1, [0, 1, 0, NAN])))
-mistake("poses", "singular")(frames(lambda frame: frame.update(transform_matrix=[[0.0] * 4] * 3 + [[0, 0, 0, 1]])))
-
-
-@mistake("poses", "all of one place")
-def _(at: Place):
-    def move(meta):
-        for frame in meta["frames"]:
-            for row in frame["transform_matrix"]:
-                row[3] = float(row[3] == 1.0 and row[:3] == [0.0, 0.0, 0.0])
-
-    at.edit_poses(move)
-    return at.train()
-
-
-mistake("poses", "a matrix of 2 x 2")(frames(lambda frame: frame.update(transform_matrix=[[1, 0], [0, 1]])))
-mistake("poses", "a frame without a file")(frames(lambda frame: frame.pop("file_path")))
-mistake("poses", "no frames")(entries(frames=[]))
-mistake("poses", "focal length 0")(entries(fl_x=0.0))
-mistake("poses", "focal length negative")(entries(fl_y=-16.0))
-mistake("poses", "focal length not a number")(entries(fl_x=NAN))
-mistake("poses", "focal length a word")(entries(fl_x="wide"))
-mistake("poses", "focal length missing")(without("fl_x"))
-mistake("poses", "width 0")(entries(w=0))
-mistake("poses", "height missing")(without("h"))
-mistake("poses", "principal point not a number")(entries(cx=NAN))
-mistake("poses", "distortion not a number")(entries(k1=NAN))
-mistake("poses", "distortion k4 a word")(entries(k4="much"))
-mistake("poses", "an unknown kind of camera")(entries(camera_model="MAGIC"))
-mistake("poses", "a panorama")(entries(camera_model="EQUIRECTANGULAR"))
-mistake("poses", "splits without held-out views")(entries(train_filenames=["images/v01.png"]))
-mistake("poses", "splits that name an absent photo")(
-    entries(train_filenames=["images/v01.png"], val_filenames=["images/v77.png"])
-)
-mistake("poses", "seed points missing")(entries(ply_file_path="points.ply"))
-mistake("poses", "seed points are no path")(entries(ply_file_path=7))
+def to_one_place(meta: dict[str, Any]) -> None:
+    for frame in meta["frames"]:
+        for row in frame["transform_matrix"]:
+            row[3] = float(row[3] == 1.0 and row[:3] == [0.0, 0.0, 0.0])
 
 
 def transforms(text: bytes) -> Callable[[Place], Any]:
-    def make(at: Place):
-        (at.data / "transforms.json").write_bytes(text)
-        return at.train()
-
-    return make
-
-
-mistake("poses", "transforms.json broken")(transforms(b'{"frames": ['))
-mistake("poses", "transforms.json nested 100,000 deep")(transforms(b"[" * 100_000))
-
-
-@mistake("poses", "a layout that the folder is not")
-def _(at: Place):
-    return at.train("beags-data", "--layout", "llff")
-
-
-@mistake("poses", "an unknown layout")
-def _(at: Place):
-    return at.train("beags-data", "--layout", "polycam")
+    return train_after(lambda at: (at.data / "transforms.json").write_bytes(text))
 
 
 def seed_points(content: bytes) -> Callable[[Place], Any]:
-    def make(at: Place):
+    def change(at: Place):
         (at.data / "points.ply").write_bytes(content)
         at.edit_poses(lambda meta: meta.update(ply_file_path="points.ply"))
-        return at.train()
 
-    return make
-
-
-HEADER = (
-    b"ply\nformat binary_little_endian 1.0\nelement vertex %d\nproperty float x\nproperty float y\nproperty float z\n"
-)
-mistake("poses", "seed points are text")(seed_points(b"hello"))
-mistake("poses", "seed points not numbers")(
-    seed_points(HEADER % 2 + b"end_header\n" + struct.pack("<6f", 0, 0, 0, NAN, 0, 0))
-)
+    return train_after(change)
 
 
-def colmap(damage: Callable[[Path], Any], text: bool = False) -> Callable[[Place], Any]:
+def colmap(damage: Callable[[Path], Any]) -> Callable[[Place], Any]:
     def make(at: Place):
-        write_colmap(at.root / "colmap", points=np.zeros((20, 3)), text=text)
+        write_colmap(at.root / "colmap", points=np.zeros((20, 3)))
         damage(at.root / "colmap/sparse/0")
         return at.train(data=at.root / "colmap")
 
     return make
 
 
-def cut(name: str) -> Callable[[Path], Any]:
-    return lambda model: (model / name).write_bytes((model / name).read_bytes()[:-40])
-
-
 def giant(name: str) -> Callable[[Path], Any]:
-    """The count that the file begins with is 2^60."""
+    """Return a damage: the count that the file begins with is 2^60."""
     return lambda model: (model / name).write_bytes(struct.pack("<Q", 1 << 60) + (model / name).read_bytes()[8:])
 
 
-mistake("poses", "COLMAP's cameras.bin cut off")(colmap(cut("cameras.bin")))
-mistake("poses", "COLMAP's images.bin promises 2^60")(colmap(giant("images.bin")))
-mistake("poses", "COLMAP's points3D.bin promises 2^60")(colmap(giant("points3D.bin")))
-mistake("poses", "COLMAP's images.bin missing")(colmap(lambda model: (model / "images.bin").unlink()))
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+HEADER = (
+    b"ply\nformat binary_little_endian 1.0\nelement vertex 2\n"
+    b"property float x\nproperty float y\nproperty float z\nend_header\n"
+)
+mistakes(
+    "poses",
+    {
+        "not a number in a pose": frames(lambda frame: frame["transform_matrix"].__setitem__(1, [0, 1, 0, NAN])),
+        "singular": frames(lambda frame: frame.update(transform_matrix=[[0.0] * 4] * 3 + [[0, 0, 0, 1]])),
+        "all of one place": train_after(lambda at: at.edit_poses(to_one_place)),
+        "a matrix of 2 x 2": frames(lambda frame: frame.update(transform_matrix=[[1, 0], [0, 1]])),
+        "a frame without a file": frames(lambda frame: frame.pop("file_path")),
+        "no frames": entries(frames=[]),
+        "focal length 0": entries(fl_x=0.0),
+        "focal length negative": entries(fl_y=-16.0),
+        "focal length not a number": entries(fl_x=NAN),
+        "focal length a word": entries(fl_x="wide"),
+        "focal length missing": entries(fl_x=None),
+        "width 0": entries(w=0),
+        "height missing": entries(h=None),
+        "principal point not a number": entries(cx=NAN),
+        "distortion not a number": entries(k1=NAN),
+        "distortion k4 a word": entries(k4="much"),
+        "an unknown kind of camera": entries(camera_model="MAGIC"),
+        "a panorama": entries(camera_model="EQUIRECTANGULAR"),
+        "splits without held-out views": entries(train_filenames=["images/v01.png"]),
+        "splits that name an absent photo": entries(
+            train_filenames=["images/v01.png"], val_filenames=["images/v77.png"]
+        ),
+        "seed points missing": entries(ply_file_path="points.ply"),
+        "seed points are no path": entries(ply_file_path=7),
+        "transforms.json broken": transforms(b'{"frames": ['),
+        "transforms.json nested 100,000 deep": transforms(b"[" * 100_000),
+        "a layout that the folder is not": lambda at: at.train("beags-data", "--layout", "llff"),
+        "an unknown layout": lambda at: at.train("beags-data", "--layout", "polycam"),
+        "seed points are text": seed_points(b"hello"),
+        "seed points not numbers": seed_points(HEADER + struct.pack("<6f", 0, 0, 0, NAN, 0, 0)),
+        "COLMAP's cameras.bin cut off": colmap(lambda model: cut(model / "cameras.bin")),
+        "COLMAP's images.bin promises 2^60": colmap(giant("images.bin")),
+        "COLMAP's points3D.bin promises 2^60": colmap(giant("points3D.bin")),
+        "COLMAP's images.bin missing": colmap(lambda model: (model / "images.bin").unlink()),
+    },
+)
+
+
+def scene(
+    photos: str, file: str, content: np.ndarray | dict[str, Any] | bytes, preset: str = "beags-tiny"
+) -> Callable[[Place], Any]:
+    """Return a mistake in the file of cameras of a folder with nine photos."""
+
+    def make(at: Place):
+        folder = at.root / "scene"
+        for index in range(9):
+            write_image(folder / photos.format(index), noise(index))
+        if isinstance(content, bytes):
+            (folder / file).write_bytes(content)
+        elif isinstance(content, dict):
+            np.savez(folder / file, **content)
+        else:
+            np.save(folder / file, content)
+        return at.train(data=folder, preset=preset)
+
+    return make
 
 
 def llff(rows: np.ndarray | bytes) -> Callable[[Place], Any]:
-    def make(at: Place):
-        folder = at.root / "llff"
-        for index in range(9):
-            write_image(folder / f"images/v{index}.png", noise(index))
-        if isinstance(rows, bytes):
-            (folder / "poses_bounds.npy").write_bytes(rows)
-        else:
-            np.save(folder / "poses_bounds.npy", rows)
-        return at.train(data=folder, preset="beags-base")
+    return scene("images/v{}.png", "poses_bounds.npy", rows, "beags-base")
 
-    return make
+
+def dtu(content: dict[str, Any]) -> Callable[[Place], Any]:
+    return scene("image/{:06d}.png", "cameras_sphere.npz", content)
 
 
 def llff_rows() -> np.ndarray:
@@ -175,43 +152,21 @@ def changed(column: int, value: float) -> np.ndarray:
     return rows
 
 
-mistake("poses", "poses_bounds.npy of wrong shape")(llff(np.ones((9, 15))))
-mistake("poses", "poses_bounds.npy of another number of rows")(llff(llff_rows()[:7]))
-mistake("poses", "poses_bounds.npy with focal length 0")(llff(changed(14, 0.0)))
-mistake("poses", "poses_bounds.npy with a depth of 0")(llff(changed(15, 0.0)))
-mistake("poses", "poses_bounds.npy is text")(llff(b"no array"))
-mistake("poses", "poses_bounds.npy promises 10^15 rows")(
-    llff(
-        b"\x93NUMPY\x01\x00v\x00"
-        + str({"descr": "<f8", "fortran_order": False, "shape": (10**15, 17)}).ljust(117).encode()
-        + b"\n"
-    )
+K = np.array([[17.0, 0, 10, 0], [0, 16, 6, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+DTU = {f"world_mat_{index}": K @ np.linalg.inv(pose @ np.diag([1.0, -1, -1, 1])) for index, pose in enumerate(ring(9))}
+ENDLESS = str({"descr": "<f8", "fortran_order": False, "shape": (10**15, 17)}).ljust(117).encode()
+mistakes(
+    "poses",
+    {
+        "poses_bounds.npy of wrong shape": llff(np.ones((9, 15))),
+        "poses_bounds.npy of another number of rows": llff(llff_rows()[:7]),
+        "poses_bounds.npy with focal length 0": llff(changed(14, 0.0)),
+        "poses_bounds.npy with a depth of 0": llff(changed(15, 0.0)),
+        "poses_bounds.npy is text": llff(b"no array"),
+        "poses_bounds.npy promises 10^15 rows": llff(b"\x93NUMPY\x01\x00v\x00" + ENDLESS + b"\n"),
+        "cameras_sphere.npz lacks a key": dtu({**DTU, "world_mat_3": [1.0]}),
+        "cameras_sphere.npz of fewer cameras": dtu({name: DTU[name] for name in DTU if name != "world_mat_8"}),
+        "cameras_sphere.npz singular": dtu({**DTU, "world_mat_3": np.zeros((4, 4))}),
+        "cameras_sphere.npz with words": dtu({**DTU, "world_mat_3": np.array(["a"])}),
+    },
 )
-
-
-def dtu(content: dict[str, Any] | bytes) -> Callable[[Place], Any]:
-    def make(at: Place):
-        folder = at.root / "dtu"
-        for index in range(9):
-            write_image(folder / f"image/{index:06d}.png", noise(index))
-        if isinstance(content, bytes):
-            (folder / "cameras_sphere.npz").write_bytes(content)
-        else:
-            np.savez(folder / "cameras_sphere.npz", **content)
-        return at.train(data=folder)
-
-    return make
-
-
-def dtu_cameras() -> dict[str, Any]:
-    K = np.array([[17.0, 0, 10, 0], [0, 16, 6, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    flip = np.diag([1.0, -1, -1, 1])
-    return {f"world_mat_{index}": K @ np.linalg.inv(pose @ flip) for index, pose in enumerate(ring(9))}
-
-
-mistake("poses", "cameras_sphere.npz lacks a key")(dtu({**dtu_cameras(), "world_mat_3": [1.0]}))
-mistake("poses", "cameras_sphere.npz of fewer cameras")(
-    dtu({name: value for name, value in dtu_cameras().items() if name != "world_mat_8"})
-)
-mistake("poses", "cameras_sphere.npz singular")(dtu({**dtu_cameras(), "world_mat_3": np.zeros((4, 4))}))
-mistake("poses", "cameras_sphere.npz with words")(dtu({**dtu_cameras(), "world_mat_3": np.array(["a"])}))

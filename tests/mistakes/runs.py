@@ -11,31 +11,29 @@ from typing import Any
 import torch
 from data_folders import noise, write_image
 
-from mistakes.table import SHORT, Place, mistake
+from mistakes.table import SHORT, Place, beags_after, mistake, mistakes
 
-NAMES = "_model.gauss_params.means"
+EXTRACT = "extract --load-config {run}"
+EVAL = "eval --load-config {run}"
 
 
-def config(change: Callable[[str], str | bytes]) -> Callable[[Place], Any]:
-    """A mistake in config.yml of a run."""
+def config(change: Callable[[str], str], words: str = EXTRACT) -> Callable[[Place], Any]:
+    """Return a mistake in config.yml of a run."""
 
-    def make(at: Place):
+    def edit(at: Place) -> None:
         path = at.run / "config.yml"
-        changed = change(path.read_text("utf8"))
-        path.write_bytes(changed if isinstance(changed, bytes) else changed.encode())
-        return at.beags("extract --load-config {run}")
+        path.write_text(change(path.read_text("utf8")), "utf8")
 
-    return make
+    return beags_after(edit, words)
 
 
-def checkpoint(change: Callable[[Path], Any], words: str = "extract --load-config {run}") -> Callable[[Place], Any]:
-    """A mistake in the checkpoint of a run."""
+def replaced(old: str, new: str, words: str = EXTRACT) -> Callable[[Place], Any]:
+    return config(lambda text: text.replace(old, new), words)
 
-    def make(at: Place):
-        change(at.checkpoint)
-        return at.beags(words)
 
-    return make
+def checkpoint(change: Callable[[Path], Any], words: str = EXTRACT) -> Callable[[Place], Any]:
+    """Return a mistake in the checkpoint of a run."""
+    return beags_after(lambda at: change(at.checkpoint), words)
 
 
 def content(change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:
@@ -58,43 +56,72 @@ class Code:
         return os.system, (self.command,)
 
 
-mistake("configs", "a class that has been renamed")(
-    config(lambda text: text.replace("plugin.model.BeagsModelConfig", "plugin.model.BeagsSceneConfig"))
-)
-mistake("configs", "a module that has been renamed")(
-    config(lambda text: text.replace("plugin.model.", "plugin.scene."))
-)
-mistake("configs", "of an older version")(config(lambda text: text.replace("run_format: 2\n", "")))
-mistake("configs", "a part of another kind")(
-    config(lambda text: re.sub(r"prepare: !!python/object:\S+", "prepare: !!python/object:builtins.dict", text))
-)
-mistake("configs", "YAML broken")(config(lambda text: "\t{\n" + text))
-mistake("configs", "cut off")(config(lambda text: text[: text.index("\npipeline:") + 1]))
-mistake("configs", "a command to run, hidden in a field")(
-    config(lambda text: text + "hidden: !!python/object/apply:os.system ['touch ran']\n")
-)
-mistake("configs", "aliases that grow without end")(
-    config(
-        lambda text: (
-            "a0: &a0 [x, x]\n"
-            + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}, *a{i - 1}, *a{i - 1}]\n" for i in range(1, 40))
-        )
-    )
-)
+ENDLESS = "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}, *a{i - 1}]\n" for i in range(1, 40))
 
 
-@mistake("configs", "data that have been moved")
-def _(at: Place):
+def move_data(at: Place) -> None:
     at.run  # noqa: B018  (made before its data go)
     at.data.rename(at.root / "elsewhere")
-    return at.beags("eval --load-config {run}")
 
 
-mistake("checkpoints", "a tensor is missing")(checkpoint(content(lambda found: {**found, "pipeline": {
-    name: value for name, value in found["pipeline"].items() if name != NAMES}})))  # fmt: skip
-mistake("checkpoints", "a command to run")(checkpoint(lambda path: torch.save(Code("touch ran"), path)))
-mistake("checkpoints", "a bit exchanged")(
-    checkpoint(lambda path: path.write_bytes(path.read_bytes()[:900] + b"\xff\xff\xff\xff" + path.read_bytes()[904:]))
+mistakes(
+    "configs",
+    {
+        "a class that has been renamed": replaced("model_options.BeagsModelConfig", "model_options.SceneConfig"),
+        "of an older version": replaced("run_format: 2\n", ""),
+        "a part of another kind": config(
+            lambda text: re.sub(r"prepare: !!python/object:\S+", "prepare: !!python/object:builtins.dict", text)
+        ),
+        "YAML broken": config(lambda text: "\t{\n" + text),
+        "cut off": config(lambda text: text[: text.index("\npipeline:") + 1]),
+        "a command to run, hidden in a field": config(
+            lambda text: text + "hidden: !!python/object/apply:os.system ['touch ran']\n"
+        ),
+        "aliases that grow without end": config(lambda text: ENDLESS),
+        "data that have been moved": beags_after(move_data, EVAL),
+    },
+)
+
+
+def without_means(found: dict[str, Any]) -> None:
+    del found["pipeline"]["_model.gauss_params.means"]
+
+
+def without_boxes(found: dict[str, Any]) -> None:
+    found["pipeline"]["_model.class_ids"].masked_fill_(found["pipeline"]["_model.class_ids"] == 2, 0)
+
+
+def exchange_a_bit(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:900] + b"\xff\xff\xff\xff" + path.read_bytes()[904:])
+
+
+mistakes(
+    "checkpoints",
+    {
+        "a tensor is missing": checkpoint(content(without_means)),
+        "a command to run": checkpoint(lambda path: torch.save(Code("touch ran"), path)),
+        "a bit exchanged": checkpoint(exchange_a_bit),
+    },
+)
+
+
+def transform(text: str) -> Callable[[Place], Any]:
+    return beags_after(lambda at: (at.run / "dataparser_transforms.json").write_text(text), EXTRACT)
+
+
+mistakes(
+    "runs",
+    {
+        "load-step does not exist": lambda at: at.train(
+            preset="beags-refine", load_dir=at.checkpoint.parent, load_step=7
+        ),
+        "load-checkpoint is damaged": lambda at: at.train(preset="beags-refine", load_checkpoint=at.cut(at.checkpoint)),
+        "an object without Gaussians": checkpoint(content(without_boxes), "export --load-config {run} --object box"),
+        "the transform of a run is broken": transform('{"transform": "x"}'),
+        "a transform that squeezes the world": transform(
+            '{"transform": [[0,0,0,0],[0,0,0,0],[0,0,0,0]], "scale": 0.0}'
+        ),
+    },
 )
 
 
@@ -102,17 +129,6 @@ mistake("checkpoints", "a bit exchanged")(
 def _(at: Place):
     (at.root / "empty").mkdir()
     return at.train(preset="beags-refine", load_dir=at.root / "empty")
-
-
-@mistake("runs", "load-step does not exist")
-def _(at: Place):
-    return at.train(preset="beags-refine", load_dir=at.checkpoint.parent, load_step=7)
-
-
-@mistake("runs", "load-checkpoint is damaged")
-def _(at: Place):
-    at.cut(at.checkpoint)
-    return at.train(preset="beags-refine", load_checkpoint=at.checkpoint)
 
 
 @mistake("runs", "two in one folder")
@@ -126,30 +142,8 @@ def _(at: Place):
     return at.train()
 
 
-@mistake("runs", "an object without Gaussians")
-def _(at: Place):
-    def change(found):
-        ids = found["pipeline"]["_model.class_ids"]
-        found["pipeline"]["_model.class_ids"] = torch.where(ids == 2, 0, ids).to(ids.dtype)
-
-    content(change)(at.checkpoint)
-    return at.beags("export --load-config {run} --object box")
-
-
-@mistake("runs", "the transform of a run is broken")
-def _(at: Place):
-    (at.run / "dataparser_transforms.json").write_text('{"transform": "x"}')
-    return at.beags("extract --load-config {run}")
-
-
-@mistake("runs", "a transform that squeezes the world")
-def _(at: Place):
-    (at.run / "dataparser_transforms.json").write_text('{"transform": [[0,0,0,0],[0,0,0,0],[0,0,0,0]], "scale": 0.0}')
-    return at.beags("extract --load-config {run}")
-
-
 def broken_off(at: Place) -> Path:
-    """A run of ``data`` that ended in the middle of refinement."""
+    """Return a run of ``data`` that ended in the middle of refinement."""
     import yaml
 
     from beags_plugin.plugin.runs.run_config import load_run_config
@@ -164,7 +158,7 @@ def broken_off(at: Place) -> Path:
 
 
 def resumed(change: Callable[[Place, Path], Any]) -> Callable[[Place], Any]:
-    """A mistake with a run that is to be resumed."""
+    """Return a mistake with a run that is to be resumed."""
 
     def make(at: Place):
         run = broken_off(at)
@@ -174,63 +168,58 @@ def resumed(change: Callable[[Place, Path], Any]) -> Callable[[Place], Any]:
     return make
 
 
-mistake("resuming", "a checkpoint of a newer version")(
-    resumed(lambda at, run: content(lambda found: found["beags"].update(version=99))(at.checkpoint))
-)
-mistake("resuming", "a state of training that is no table")(
-    resumed(lambda at, run: content(lambda found: {**found, "beags": 3})(at.checkpoint))
-)
-mistake("resuming", "a state of training of wrong content")(
-    resumed(lambda at, run: content(lambda found: found["beags"]["parts"].update(views={"a": 1}))(at.checkpoint))
-)
-mistake("resuming", "an optimizer is missing")(
-    resumed(lambda at, run: content(lambda found: found["optimizers"].pop("scene"))(at.checkpoint))
-)
-mistake("resuming", "a photo has gone since")(
-    resumed(lambda at, run: at.edit_poses(lambda meta: meta.update(frames=meta["frames"][2:])))
-)
-mistake("resuming", "classes.json has changed since")(
-    resumed(lambda at, run: (at.data / "classes.json").write_text('{"1": "cup", "2": "box", "3": "hat"}'))
-)
-mistake("resuming", "the data have gone")(resumed(lambda at, run: shutil.rmtree(at.data)))
-mistake("resuming", "prepared/ has gone")(resumed(lambda at, run: shutil.rmtree(run / "prepared")))
-mistake("resuming", "the voxel grid is damaged")(resumed(lambda at, run: at.cut(run / "prepared/grid.pt")))
-mistake("resuming", "the voxel grid lacks a part")(
-    resumed(lambda at, run: torch.save({"classes": torch.zeros(1)}, run / "prepared/grid.pt"))
-)
-mistake("resuming", "a prepared mask is missing")(
-    resumed(lambda at, run: next((run / "prepared/masks").iterdir()).unlink())
-)
-mistake("resuming", "a prepared mask is of another size")(
-    resumed(lambda at, run: write_image(run / "prepared/masks/v01.png", noise(0, 4, 3)[..., 0]))
-)
+def resumed_with(change: Callable[[dict[str, Any]], Any]) -> Callable[[Place], Any]:
+    """Return a mistake in the checkpoint of a run that is to be resumed."""
+    return resumed(lambda at, run: content(change)(at.checkpoint))
 
 
-@mistake("resuming", "a finished run")
-def _(at: Place):
-    run = broken_off(at)
+def finish(at: Place, run: Path) -> None:
     text = (run / "config.yml").read_text("utf8")
     (run / "config.yml").write_text(text.replace("refine_steps: 8", "refine_steps: 3"), "utf8")
     (run / "training.json").write_text("{}")
-    return at.beags("resume", run)
 
 
-@mistake("evaluation", "a held-out view that does not exist")
-def _(at: Place):
-    path = at.run / "config.yml"
-    text = path.read_text("utf8")
-    path.write_text(text.replace("held_out: !!python/tuple []", "held_out: !!python/tuple [nobody]"), "utf8")
-    return at.beags("eval --load-config {run}")
+CLASSES = '{"1": "cup", "2": "box", "3": "hat"}'
+mistakes(
+    "resuming",
+    {
+        "a checkpoint of a newer version": resumed_with(lambda found: found["beags"].update(version=99)),
+        "a state of training that is no table": resumed_with(lambda found: {**found, "beags": 3}),
+        "a state of training of wrong content": resumed_with(
+            lambda found: found["beags"]["parts"].update(views={"a": 1})
+        ),
+        "an optimizer is missing": resumed_with(lambda found: {**found, "optimizers": {}}),
+        "a photo has gone since": resumed(
+            lambda at, run: at.edit_poses(lambda meta: meta.update(frames=meta["frames"][2:]))
+        ),
+        "classes.json has changed since": resumed(lambda at, run: (at.data / "classes.json").write_text(CLASSES)),
+        "the data have gone": resumed(lambda at, run: shutil.rmtree(at.data)),
+        "prepared/ has gone": resumed(lambda at, run: shutil.rmtree(run / "prepared")),
+        "the voxel grid is damaged": resumed(lambda at, run: at.cut(run / "prepared/grid.pt")),
+        "the voxel grid lacks a part": resumed(
+            lambda at, run: torch.save({"classes": torch.zeros(1)}, run / "prepared/grid.pt")
+        ),
+        "a prepared mask is missing": resumed(lambda at, run: next((run / "prepared/masks").iterdir()).unlink()),
+        "a prepared mask is of another size": resumed(
+            lambda at, run: write_image(run / "prepared/masks/v01.png", noise(0, 4, 3)[..., 0])
+        ),
+        "a finished run": resumed(finish),
+    },
+)
 
 
-@mistake("evaluation", "no held-out views")
-def _(at: Place):
-    at.run  # noqa: B018
+def hold_nothing_out(at: Place) -> None:
+    at.run  # noqa: B018  (made with held-out views)
     names = [f"images/v{index:02d}.png" for index in range(9)]
     at.edit_poses(lambda meta: meta.update(train_filenames=names, test_filenames=[], val_filenames=[]))
-    return at.beags("eval --load-config {run}")
 
 
-@mistake("evaluation", "a picture of an unknown kind")
-def _(at: Place):
-    return at.beags("eval --load-config {run} --picture worst.txt")
+HELD_OUT = "held_out: !!python/tuple "
+mistakes(
+    "evaluation",
+    {
+        "a held-out view that does not exist": replaced(f"{HELD_OUT}[]", f"{HELD_OUT}[nobody]", EVAL),
+        "no held-out views": beags_after(hold_nothing_out, EVAL),
+        "a picture of an unknown kind": lambda at: at.beags(f"{EVAL} --picture worst.txt"),
+    },
+)

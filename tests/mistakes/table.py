@@ -1,4 +1,4 @@
-"""The table of mistakes: what is done to a good scene or run, and the command that must then say so."""
+"""The table of mistakes: changes to a good scene or run, and the command that then prints a sentence."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -29,31 +29,41 @@ SHORT = (
 """Flags of ns-train for a run that comes through all its phases in a second."""
 
 
-@dataclass(frozen=True)
-class Mistake:
-    """One mistake.
-
-    make: makes it in a ``Place`` and returns the command that meets it.
-    """
-
-    area: str
-    name: str
-    make: Callable[[Place], Command]
+TABLE: dict[str, Callable[[Place], Command]] = {}
+"""Name to what makes the mistake in a ``Place`` and returns the command that meets it."""
 
 
-TABLE: dict[str, Mistake] = {}
-
-
-def mistake(area: str, name: str) -> Callable:
-    """Add what makes a mistake to the table."""
-
-    def add(make: Callable[[Place], Command]) -> Callable[[Place], Command]:
+def mistakes(area: str, makers: dict[str, Callable[[Place], Command]]) -> None:
+    """Add mistakes to the table."""
+    for name, make in makers.items():
         title = f"{area}: {name}"
         assert title not in TABLE
-        TABLE[title] = Mistake(area, name, make)
-        return make
+        TABLE[title] = make
 
-    return add
+
+def mistake(area: str, name: str) -> Callable[[Callable[[Place], Command]], None]:
+    """Add the decorated function to the table."""
+    return lambda make: mistakes(area, {name: make})
+
+
+def train_after(change: Callable[[Place], Any], *flags: str, **settings: Any) -> Callable[[Place], Command]:
+    """Return a mistake that ``change`` makes and ns-train meets."""
+
+    def make(at: Place) -> Command:
+        change(at)
+        return at.train(*flags, **settings)
+
+    return make
+
+
+def beags_after(change: Callable[[Place], Any], words: str) -> Callable[[Place], Command]:
+    """Return a mistake that ``change`` makes and ``beags`` with these words meets."""
+
+    def make(at: Place) -> Command:
+        change(at)
+        return at.beags(words)
+
+    return make
 
 
 class Templates:
@@ -64,7 +74,7 @@ class Templates:
         self.scene = write_scene(root / "scene")
 
     def broken_off(self, config: Any) -> Path:
-        """A run on the scene that was killed in the middle of refinement, with a checkpoint to go on from."""
+        """Return a run on the scene that was killed in the middle of refinement, with a checkpoint to resume from."""
         from beags_plugin.plugin.trainer import BeagsTrainer
 
         train = BeagsTrainer.train_iteration
@@ -89,11 +99,10 @@ class Place:
 
     def __init__(self, root: Path, templates: Templates, patch: pytest.MonkeyPatch) -> None:
         self.root, self.patch, self.templates = root, patch, templates
-        self.may_change: set[Path] = set()
 
     @property
     def data(self) -> Path:
-        """A scene of nine photos with masks, transforms.json and classes.json."""
+        """Return a scene of nine photos with masks, transforms.json and classes.json."""
         folder = self.root / "data"
         if not folder.exists():
             shutil.copytree(self.templates.scene, folder)
@@ -101,39 +110,40 @@ class Place:
 
     @property
     def run(self) -> Path:
-        """A refined run on ``data``."""
+        """Return a refined run on ``data``."""
         folder = self.root / "run"
         if not folder.exists():
             write_trained(folder, self.data)
         return folder
 
     @property
+    def photo(self) -> Path:
+        """Return one of the photos."""
+        return self.data / "images/v02.png"
+
+    @property
     def checkpoint(self) -> Path:
-        """That of the run."""
+        """Return the checkpoint of the run."""
         return next((self.run / "nerfstudio_models").iterdir())
 
     def beags(self, *words: object) -> Command:
-        """The command ``beags``; {run} stands for the config of the run."""
+        """Return the command ``beags``; {run} stands for the config of the run, {data} for the data."""
         from beags_plugin.commands import cli
 
         texts = [str(word) for text in words for word in ([text] if isinstance(text, Path) else str(text).split())]
-        texts = [str(self.run / "config.yml") if text == "{run}" else text for text in texts]
+        known = {"{run}": lambda: str(self.run / "config.yml"), "{data}": lambda: str(self.data)}
+        texts = [known[text]() if text in known else text for text in texts]
         return lambda: cli.main(texts)
 
     def train(self, *flags: str, preset: str = "beags-tiny", data: Path | None = None, **settings: Any) -> Command:
-        """The command ``ns-train`` on ``data``, as nerfstudio's entry point runs it."""
+        """Return the command ``ns-train`` on ``data``, as nerfstudio's entry point runs it."""
         config = self.config(*flags, preset=preset, data=data)
         for name, value in settings.items():
             setattr(config, name, value)
-        return self.trained(config)
-
-    @staticmethod
-    def trained(config: Any) -> Command:
-        """``ns-train`` with this config."""
-        return lambda: _ns_train(config)
+        return lambda: ns_train(config)
 
     def config(self, *flags: str, preset: str = "beags-tiny", data: Path | None = None) -> Any:
-        """What ns-train makes of its flags, to train in ``trained``."""
+        """Return the config that ns-train makes of its flags, to train in ``trained``."""
         config = deepcopy(_parsed(preset, flags))
         config.data = self.data if data is None else data
         config.run_dir = self.root / TRAINED
@@ -142,15 +152,12 @@ class Place:
         config.logging.local_writer.enable = False
         return config
 
-    def edit_json(self, path: Path, change: Callable[[Any], Any]) -> None:
-        """Change what a JSON file holds, in place."""
+    def edit_poses(self, change: Callable[[Any], Any]) -> None:
+        """Change transforms.json, in place."""
+        path = self.data / "transforms.json"
         content = json.loads(path.read_text("utf8"))
         change(content)
         path.write_text(json.dumps(content), "utf8")
-
-    def edit_poses(self, change: Callable[[Any], Any]) -> None:
-        """Change transforms.json."""
-        self.edit_json(self.data / "transforms.json", change)
 
     def cut(self, path: Path, share: float = 0.5) -> Path:
         """Keep the first part of a file only."""
@@ -171,8 +178,7 @@ class Place:
                 return opened(file, mode, *rest, **options)
             if code != errno.ENOSPC:
                 raise OSError(code, os.strerror(code), str(file))
-            stream = opened(file, mode, *rest, **options)
-            return _Full(stream, after) if "b" in mode else _FullText(stream)
+            return _Full(opened(file, mode, *rest, **options), after)
 
         self.patch.setattr(builtins, "open", refusing)
         self.patch.setattr(io, "open", refusing)
@@ -187,62 +193,31 @@ class Place:
             self.patch.setattr(os, "mkdir", refusing_folder)
 
 
-def _no_space() -> OSError:
-    return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
-class _Full(io.RawIOBase):
-    """A binary file on a disk that is full after some bytes."""
+class _Full:
+    """A file on a disk that is full after some bytes."""
 
     def __init__(self, stream: Any, left: int) -> None:
         self._stream, self._left = stream, left
 
     def write(self, content: Any) -> int:
-        self._left -= memoryview(content).nbytes
+        self._left -= len(content) if isinstance(content, str) else memoryview(content).nbytes
         if self._left < 0:
-            raise _no_space()
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return self._stream.write(content)
 
-    def writable(self) -> bool:
-        return True
+    def __enter__(self) -> _Full:
+        return self
 
-    def seekable(self) -> bool:
-        return True
-
-    def seek(self, *where: int) -> int:
-        return self._stream.seek(*where)
-
-    def tell(self) -> int:
-        return self._stream.tell()
-
-    def fileno(self) -> int:
-        return self._stream.fileno()
-
-    def close(self) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stream.close()
-        super().close()
 
-
-class _FullText(io.TextIOBase):
-    """A text file on a full disk."""
-
-    def __init__(self, stream: Any) -> None:
-        self._stream = stream
-
-    def write(self, content: str) -> int:
-        raise _no_space()
-
-    def fileno(self) -> int:
-        return self._stream.fileno()
-
-    def close(self) -> None:
-        self._stream.close()
-        super().close()
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 @lru_cache(None)
 def _parsed(preset: str, flags: Sequence[str]) -> Any:
-    """The config that ns-train makes of its flags; read here, as its own parser takes half a second a time."""
+    """Return the config that ns-train makes of its flags; its own parser takes half a second a time."""
     from beags_plugin.plugin.presets import load_preset
 
     config = load_preset(preset).config
@@ -263,26 +238,26 @@ def _parsed(preset: str, flags: Sequence[str]) -> Any:
 
 def _set(holder: Any, parents: list[str], name: str, values: list[str]) -> None:
     """Set an option, also of a frozen part, as a value of the kind that it has."""
-    if not parents:
-        setattr(holder, name, _converted(getattr(holder, name), name, values))
-        return
-    part = getattr(holder, parents[0])
+    if len(parents) > 1:
+        return _set(getattr(holder, parents[0]), parents[1:], name, values)
+    part = getattr(holder, parents[0]) if parents else holder
+    value = _converted(getattr(part, name), name, values)
     if type(part).__dataclass_params__.frozen:
-        setattr(holder, parents[0], replace(part, **{name: _converted(getattr(part, name), name, values)}))
+        setattr(holder, parents[0], replace(part, **{name: value}))
     else:
-        _set(part, parents[1:], name, values)
+        setattr(part, name, value)
 
 
 def _converted(current: Any, name: str, values: list[str]) -> Any:
     if isinstance(current, tuple):
         kind = type(current[0]) if current else {"ignore_ids": int}.get(name, str)
         return tuple(kind(value) for value in values)
-    if current is None:
-        return Path(values[0])
-    return type(current)(values[0]) if not isinstance(current, Path) else Path(values[0])
+    kind = Path if current is None or isinstance(current, Path) else type(current)
+    return kind(values[0])
 
 
-def _ns_train(config: Any) -> None:
+def ns_train(config: Any) -> None:
+    """Train with a config, as nerfstudio's entry point does."""
     from nerfstudio.scripts.train import main
 
     main(config)

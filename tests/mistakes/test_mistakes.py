@@ -1,7 +1,7 @@
-"""What a user is told of a mistake: one sentence with the file or value and the remedy, and exit code 2.
+"""Messages for users who make mistakes: one sentence with the file or value and the remedy, and exit code 2.
 
-The mistakes are in ``mistakes/``, what is said of them, word for word, in ``mistakes/sentences.txt``; to write that
-file anew, and then to read what has changed: ``BEAGS_SENTENCES=write pytest tests/mistakes``.
+The mistakes are in ``mistakes/``, their sentences, word for word, in ``mistakes/sentences.txt``. To write that file
+anew, and then to read its changes: ``BEAGS_SENTENCES=write pytest tests/mistakes``.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def templates(tmp_path_factory):
 
 
 def files_below(root: Path) -> dict[Path, str]:
-    """Digest of every file."""
+    """Return the digest of every file."""
     found = (path for path in root.rglob("*") if path.is_file())
     return {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in found}
 
@@ -39,22 +39,22 @@ def test_a_mistake_ends_with_one_sentence_and_code_2(name, templates, tmp_path, 
     monkeypatch.chdir(tmp_path)
     with monkeypatch.context() as patch:
         place.patch = patch
-        command = TABLE[name].make(place)
+        command = TABLE[name](place)
         before = files_below(tmp_path)
         capsys.readouterr()
         with pytest.raises(SystemExit) as end:
             command()
-    said = capsys.readouterr()
+    printed = capsys.readouterr()
     assert end.value.code == 2
-    assert "Traceback" not in said.out + said.err
-    lines = [line for line in said.out.splitlines() if line.startswith("beags: ")]
+    assert "Traceback" not in printed.out + printed.err
+    lines = [line for line in printed.out.splitlines() if line.startswith("beags: ")]
     assert len(lines) == 1
     sentence = lines[0].removeprefix("beags: ").replace(str(tmp_path), "{tmp}")
     sentence = re.sub(r"\.masks_\w+", ".masks_...", sentence)  # a temporary folder
     after = files_below(tmp_path)
-    changed = [path for path in before if after.get(path) != before[path] and path not in place.may_change]
+    changed = [path for path in before if after.get(path) != before[path]]
     assert not changed  # nothing that was saved is lost
-    assert not list(tmp_path.rglob("*.part")) and not (tmp_path / "ran").exists()  # what files of strangers would run
+    assert not list(tmp_path.rglob("*.part")) and not (tmp_path / "ran").exists()  # a command in a foreign file
     if os.environ.get("BEAGS_SENTENCES") == "write":
         write_sentence(name, sentence, list(TABLE))
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ LOW, HIGH = torch.tensor([-1.0, -2.0, 0.0]), torch.tensor([1.0, 2.0, 3.0])
 
 
 def ball(color: float = 1.0, count: int = 200) -> Surfels:
-    """Discs all over the unit sphere, of one grey."""
+    """Return discs all over the unit sphere, of one grey."""
     step = torch.arange(count) + 0.5
     z = 1 - 2 * step / count
     angle, radius = step * 2.399963, torch.sqrt(1 - z * z)
@@ -89,7 +90,7 @@ def test_up_and_front_are_those_of_the_photos():
 
 def test_an_empty_box_and_photos_from_straight_above_are_no_trouble():
     point = orbit_frame(torch.zeros(3), torch.zeros(3))
-    above = orbit_frame(LOW, HIGH, up=torch.tensor([0.0, -1.0, 0.0]))  # the front is up itself
+    above = replace(orbit_frame(LOW, HIGH), up=torch.tensor([0.0, -1.0, 0.0]).double())  # the front is up itself
     for stand in (point, above):
         assert all(bool(camera.viewmat.isfinite().all()) for camera in orbit(stand, 4, 32))
 
@@ -124,9 +125,9 @@ def subjects(count: int, stages: tuple[str, ...]) -> list[Subject]:
 
 
 def test_sheets_films_and_comparisons_hold_every_picture():
-    rasterizer, told = make_rasterizer("auto"), []
-    picture = sheet(subjects(3, ("",)), rasterizer, "white", lambda *done: told.append(done))
-    assert picture.shape == (2 * (33 + 18 + 4), 3 * (33 + 4), 3) and told == [(i, 6) for i in range(1, 7)]
+    rasterizer, counts = make_rasterizer("auto"), []
+    picture = sheet(subjects(3, ("",)), rasterizer, "white", lambda *done: counts.append(done))
+    assert picture.shape == (2 * (33 + 18 + 4), 3 * (33 + 4), 3) and counts == [(i, 6) for i in range(1, 7)]
     pair = comparison(subjects(2, ("before", "after")), rasterizer, "black")
     assert pair.shape == (4 * (33 + 18 + 4), 2 * (33 + 4), 3)
     before, after = pair[18:51, :33], pair[18:51, 37:70]

@@ -1,4 +1,4 @@
-"""The picture of the worst masks: which ones, and which colour at which pixel."""
+"""The picture of the worst masks: their ranking, and the colour at each pixel."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ GREY = 100
 
 
 def evaluated(protocol: Protocol | None = None):
-    """A cup that assignment puts two pixels off and refinement puts right; in view 1 a box hides nothing of it."""
+    """Evaluate a cup that assignment puts two pixels off and refinement puts right; in view 1 no box hides it."""
     protocol = protocol or Protocol()
     ids = torch.tensor([1, 2, 0], dtype=torch.int32)
     before, after = scene([SHIFTED, BOX, FLOOR]), scene([CUP, BOX, FLOOR])
@@ -50,7 +50,7 @@ def evaluated(protocol: Protocol | None = None):
     return run, {"before": (before, ids), "after": (after, ids)}, views
 
 
-def test_an_error_map_says_what_is_counted():
+def test_an_error_map_has_a_code_for_each_kind_of_pixel():
     predicted = torch.tensor([[True, True, False, False, True]])
     true = torch.tensor([[True, False, True, False, True]])
     ignore = torch.tensor([[False, False, False, False, True]])
@@ -73,19 +73,17 @@ def test_the_worst_come_first():
     run, _, _ = evaluated()
     extracted = [(r.view, r.class_id) for r in run.after.masks if r.kind == "extracted"]
     assert extracted == [(0, 1), (0, 2), (1, 1)]
-    first = worst_records(run, "extracted", 2, "iou")[0]
+    first = worst_records(run, "extracted", 2)[0]
     assert (run.after.masks[first].view, run.after.masks[first].class_id) == (1, 1)
-    assert len(worst_records(run, "extracted", 2, "iou")) == 2
-    assert len(worst_records(run, "extracted", 9, "iou")) == 3
-    assert len(worst_records(run, "rendered", 9, "biou")) == 2
+    counts = [len(worst_records(run, *query)) for query in (("extracted", 2), ("extracted", 9), ("rendered", 9))]
+    assert counts == [2, 3, 2]
 
 
 def test_the_drawn_errors_are_those_of_the_figures():
     run, scenes, views = evaluated()
-    told: list[tuple[int, int]] = []
-    progress = lambda done, total: told.append((done, total))  # noqa: E731
-    found = draw_worst(run, scenes, views, Squares(), SETTINGS, count=1, progress=progress)
-    assert told == [(1, 2), (2, 2)]
+    counts: list[tuple[int, int]] = []
+    found = draw_worst(run, scenes, views, Squares(), SETTINGS, 1, lambda *steps: counts.append(steps))
+    assert counts == [(1, 2), (2, 2)]
     assert [mask.kind for mask in found] == ["extracted", "rendered"]
     worst = found[0]  # the second view, whose truth is the shifted cup
     assert worst.title == "lab, second: cup"
@@ -98,7 +96,7 @@ def test_the_drawn_errors_are_those_of_the_figures():
     for stage, errors in worst.errors.items():
         counts = {code: (errors == code).sum() for code in (RIGHT, MISSED, WRONG)}
         assert worst.metrics[stage].iou == counts[RIGHT] / sum(counts.values())
-    assert worst.score("iou") == worst.metrics["after"].iou
+    assert worst.score == worst.metrics["after"].iou
     assert (worst.photo == 128).all() and (found[1].photo == GREY).all()  # no photograph: grey
 
 

@@ -1,1 +1,1 @@
-"""What is done with a finished run: extract, export, evaluate, render, masks."""
+"""Work with finished runs: extract, export, evaluate, render, masks."""

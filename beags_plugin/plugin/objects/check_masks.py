@@ -1,9 +1,8 @@
-"""``beags masks check``: what is wrong with the masks of a scene, before training on them."""
+"""``beags masks check``: errors and contradictions in the masks of a scene, found before training on them."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -35,11 +34,12 @@ if TYPE_CHECKING:
 RANDOM_POINTS = 50_000  # beside the seed points: an object that has none of these has some of them in it
 MOST_SEED_POINTS = 100_000
 MOST_COUNTS = 30_000_000  # points times classes that are counted at a time
+MOST_PICTURES = 6  # views in contradicted.png
 
 
 @dataclass
 class Report:
-    """What was found. names: class id to name. areas: where views disagree, if a trained run was given."""
+    """The findings. names: class id to name. areas: places where views disagree, if a trained run was given."""
 
     data: Path
     stems: list[str]
@@ -49,7 +49,7 @@ class Report:
     areas: list[Area] = field(default_factory=list)
 
     def summary(self) -> str:
-        """How many views, objects and issues, in a line."""
+        """Return a line with the numbers of views, objects and issues."""
         counts = [f"{sum(f.level == level for f in self.issues)} {level}s" for level in LEVELS]
         objects = sum(i != 0 for i in self.coverage.ids)
         return (
@@ -58,11 +58,10 @@ class Report:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
-        pixels = self.coverage.pixels
+        """Return plain values."""
         views = [
             {"view": stem, "pixels": {str(i): int(n) for i, n in zip(self.coverage.ids, row, strict=True) if n}}
-            for stem, row in zip(self.stems, pixels, strict=True)
+            for stem, row in zip(self.stems, self.coverage.pixels, strict=True)
         ]
         return {
             "data": str(self.data),
@@ -84,8 +83,8 @@ def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Re
     scene, views, files = _files(config)
     with progress_bar("Reading masks") as progress:
         coverage = check_files(files, few_views, progress)
-    shown = dict(files.names or {})
-    shown = {i: shown.get(i, "background" if i == 0 else f"class_{i}") for i in coverage.ids}
+    names = files.names or {}
+    names = {i: names.get(i, "background" if i == 0 else f"class_{i}") for i in coverage.ids}
     issues = list(coverage.issues)
     if len(coverage.ids) > MOST_IDS:
         issues.append(
@@ -99,12 +98,12 @@ def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Re
         )
     elif coverage.usable.sum() > 3 and len(coverage.ids) > 1:
         points = _points(scene, views, config)
-        issues += views_against_others(_agreement(files, coverage, views, points), files, coverage, shown)
-    return Report(scene.root, list(files.stems), shown, coverage, ordered(issues))
+        issues += views_against_others(_agreement(files, coverage, views, points), files, coverage, names)
+    return Report(scene.root, list(files.stems), names, coverage, ordered(issues))
 
 
 def agreement_of(config: BeagsDataParserConfig) -> tuple[np.ndarray, int]:
-    """What every view says of points in space, see ``consistency.Agreement``: labels [P, V], number of classes."""
+    """Return labels [P, V] of points in space in every view (``consistency.Agreement``) and the number of classes."""
     scene, views, files = _files(config)
     coverage = check_files(files)
     return _agreement(files, coverage, views, _points(scene, views, config)).labels, len(coverage.ids)
@@ -134,13 +133,13 @@ def _files(config: BeagsDataParserConfig) -> tuple[Dataset, PosedViews, MaskFile
 
 
 def _points(scene: Dataset, views: PosedViews, config: BeagsDataParserConfig) -> np.ndarray:
-    """[P, 3] float64 in the cameras' world: seed points and points drawn where the cameras look."""
+    """Return [P, 3] float64 in the cameras' world: seed points, and random points where the cameras look."""
     found = starting_points(scene, views, config.num_random_points)
     seeds = found["points3D_xyz"].double().numpy()
     step = -(-len(seeds) // MOST_SEED_POINTS)
     cameras = [camera_from_nerfstudio(views.cameras, index) for index in range(len(views.images))]
-    drawn, _ = random_points(cameras, RANDOM_POINTS)
-    return np.concatenate([seeds[::step], drawn.astype(np.float64)])
+    random, _ = random_points(cameras, RANDOM_POINTS)
+    return np.concatenate([seeds[::step], random.astype(np.float64)])
 
 
 def _agreement(files: MaskFiles, coverage: Coverage, views: PosedViews, points: np.ndarray) -> Agreement:
@@ -159,7 +158,7 @@ def _agreement(files: MaskFiles, coverage: Coverage, views: PosedViews, points: 
 
 
 def check_with_run(report: Report, run: ReprojectedRun) -> Report:
-    """The report with the areas of masks that the other views contradict where a trained run puts them."""
+    """Return the report with the areas of masks that the other views contradict at the depths of a trained run."""
     areas = [area for index in range(len(run.names)) for area in _areas(run, index)]
     areas.sort(key=lambda area: -area.pixels)
     issues = list(report.issues)
@@ -189,8 +188,8 @@ def _areas(run: ReprojectedRun, index: int) -> list[Area]:
     return contradicted(given.numpy(), run.voted[index].numpy(), confidence, run.names[index])
 
 
-def write_report(report: Report, output: Path, run: ReprojectedRun | None = None, shown: int = 6) -> list[Path]:
-    """Write report.json, coverage.png and, with a run that contradicts masks, contradicted.png; what was written."""
+def write_report(report: Report, output: Path, run: ReprojectedRun | None = None) -> list[Path]:
+    """Write report.json, coverage.png and, with a run that contradicts masks, contradicted.png; return their paths."""
     coverage = report.coverage
     share = coverage.pixels / np.maximum(coverage.size, 1)[:, None]
     written = [output / "report.json", output / "coverage.png"]
@@ -202,7 +201,7 @@ def write_report(report: Report, output: Path, run: ReprojectedRun | None = None
         boxes: dict[str, list[tuple[int, int, int, int]]] = {}
         for area in report.areas:
             boxes.setdefault(area.view, []).append(area.box)
-        worst = list(boxes)[:shown]
+        worst = list(boxes)[:MOST_PICTURES]
         contradictions(
             output / "contradicted.png", [(run.changed(run.names.index(view)), boxes[view]) for view in worst]
         )
@@ -211,7 +210,8 @@ def write_report(report: Report, output: Path, run: ReprojectedRun | None = None
 
 
 def options_beside(run: Path | None, data: Path | None, **given: Any) -> BeagsDataParserConfig:
-    """The data parser's options of a run, or the usual ones without any, replaced by those given that are not None.
+    """Return the data parser's options of a run, or the usual ones without any, replaced by those given that are not
+    None.
 
     run: config.yml. data: folder of the scene, that of the run if None.
     """
@@ -225,19 +225,7 @@ def options_beside(run: Path | None, data: Path | None, **given: Any) -> BeagsDa
 
 
 def data_options(
-    data: Path,
-    layout: str = "auto",
-    images_path: Path | None = None,
-    masks_path: Path | None = None,
-    classes_path: Path = Path("classes.json"),
-    ignore_ids: Sequence[int] = (),
+    data: Path, layout: str = "auto", images_path: Path | None = None, **given: Any
 ) -> BeagsDataParserConfig:
-    """The data parser's options that say where masks are."""
-    return BeagsDataParserConfig(
-        data=data,
-        layout=layout,
-        images_path=images_path,
-        masks_path=masks_path,
-        classes_path=classes_path,
-        ignore_ids=tuple(ignore_ids),
-    )
+    """Return the data parser's options of a scene without a run; given: as of ``options_beside``."""
+    return options_beside(None, data, layout=layout, images_path=images_path, **given)

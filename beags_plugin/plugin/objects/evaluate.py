@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from torch import Tensor
 
@@ -14,7 +13,7 @@ from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import SceneMetrics
 from beags_plugin.evaluation.report import RunMetrics, Stage
 from beags_plugin.evaluation.run_metrics import evaluate_scene
-from beags_plugin.pictures.worst_views import By, WorstMask, draw_worst
+from beags_plugin.pictures.worst_views import WorstMask, draw_worst
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.options.model_options import fixed_background
 from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, EXTRACTION_FILE
@@ -22,9 +21,6 @@ from beags_plugin.plugin.runs.read import SavedScene, data_of_run, raster_settin
 from beags_plugin.plugin.views.held_out_views import HeldOutViews
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import Rasterizer
-
-if TYPE_CHECKING:
-    from beags_plugin.plugin.options.config import BeagsTrainerConfig
 
 Progress = Callable[[int, int], None]
 
@@ -35,17 +31,18 @@ def evaluate_run(
     """Score a trained run on the held-out views of its data, before refinement (if it has kept that) and after.
 
     config_path: config.yml of a run. protocol: the choices behind the figures. name: of the scene in tables; that of
-    the data folder if empty. progress: is told (done, total) views. ``RunMetrics.to_json`` gives plain values.
-    Raises ``UserError`` for a run, data or a protocol that cannot be used.
+    the data folder if empty. progress: receives (done, total) views. Raises ``UserError`` for a run, data or a protocol
+    that cannot be used.
     """
     return EvaluatedRun(config_path, name).metrics(protocol, progress)
 
 
 class EvaluatedRun:
-    """A run on disk with its held-out views, which are read when they are first asked for.
+    """A run on disk with its held-out views, which are read when first used.
 
     name: of the scene in tables. stages: "before" and "after", or "after" alone, to the saved scenes. complete: False
-    for a run of ``beags extract``, which holds a part of a scene. classes: id to name of what can be scored.
+    for a run of ``beags extract``, which holds a part of a scene. classes: id to name of the classes that can be
+    scored.
     """
 
     def __init__(self, config_path: Path, name: str = "") -> None:
@@ -56,20 +53,24 @@ class EvaluatedRun:
         if after.assigned and snapshot.exists() and (before := read_run(snapshot)).assigned:
             self.stages = {"before": before, "after": after}
         self.complete = not (self.config_path.parent / EXTRACTION_FILE).exists()
-        self.classes = after.classes if self.complete else present_classes(after)
+        self.classes = after.classes
+        if not self.complete:
+            assert after.class_ids is not None  # an extracted run has classes
+            present = set(after.class_ids.unique().tolist())
+            self.classes = {c: each for c, each in after.classes.items() if c in present}
         self.name = name or scene_name(after.config)
         self.settings = raster_settings(after)
         self.rasterizer: Rasterizer = make_rasterizer(after.config.model_config.rasterizer)
 
     @cached_property
     def views(self) -> HeldOutViews:
-        """The held-out views; raises ``UserError`` if the run's data cannot be read."""
+        """Return the held-out views; raises ``UserError`` if the run's data cannot be read."""
         config = self.stages["after"].config
         manager = data_of_run(config, self.config_path, split="test")
         return HeldOutViews(manager, self.classes, fixed_background(config.model_config))
 
     def metrics(self, protocol: Protocol | None = None, progress: Progress | None = None) -> RunMetrics:
-        """The figures of all stages; arguments as of ``evaluate_run``."""
+        """Return the figures of all stages; arguments as of ``evaluate_run``."""
         protocol = protocol or Protocol()
         protocol.check()
         found: dict[Stage, SceneMetrics] = {}
@@ -98,15 +99,13 @@ class EvaluatedRun:
             notes=tuple(self._notes(found["after"])),
         )
 
-    def worst(
-        self, metrics: RunMetrics, count: int, by: By = "iou", progress: Progress | None = None
-    ) -> list[WorstMask]:
-        """The ``count`` worst masks of each kind, drawn; metrics: what ``metrics`` gave; progress: (done, total)."""
+    def worst(self, metrics: RunMetrics, count: int, progress: Progress | None = None) -> list[WorstMask]:
+        """Render the ``count`` worst masks of each kind; metrics: of this run; progress: receives (done, total)."""
         scenes: dict[Stage, tuple[Surfels, Tensor]] = {}
         for stage, scene in self.stages.items():
             if scene.class_ids is not None:
                 scenes[stage] = (scene.surfels(), scene.class_ids)
-        return draw_worst(metrics, scenes, self.views, self.rasterizer, self.settings, count, by, progress)
+        return draw_worst(metrics, scenes, self.views, self.rasterizer, self.settings, count, progress)
 
     def _notes(self, after: SceneMetrics) -> Iterator[str]:
         if not self.stages["after"].assigned:
@@ -123,14 +122,7 @@ class EvaluatedRun:
             yield f"{trained_on} of these {len(self.views)} views were trained on, so the figures flatter the run."
 
 
-def present_classes(scene: SavedScene) -> dict[int, str]:
-    """Id to name of the classes that have Gaussians."""
-    assert scene.class_ids is not None  # what was extracted has classes
-    present = set(scene.class_ids.unique().tolist())
-    return {class_id: name for class_id, name in scene.classes.items() if class_id in present}
-
-
 def scene_name(config: BeagsTrainerConfig) -> str:
-    """The name of the run's data folder."""
+    """Return the name of the run's data folder."""
     data = config.data_path
     return data.stem if data.suffix == ".json" else data.name

@@ -1,4 +1,4 @@
-"""Export of runs: the files that other programs read, of each object and of the background."""
+"""Export of runs: files for other programs, of each object and of the background."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -30,17 +30,14 @@ from beags_plugin.plugin.runs.run_config import load_run_config
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.system.errors import UserError
 
-if TYPE_CHECKING:
-    pass
-
 MANIFEST = "manifest.json"
-WHOLE = "whole scene"  # what stands for a class where all Gaussians go into one file
+WHOLE = "whole scene"  # the name of the file that holds all Gaussians
 Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
 class ExportedFile:
-    """One file: its format and path, and what its exporter says of it; path None: nothing to write, for ``reason``."""
+    """One file: its format, its path and its exporter's facts; path None: nothing to write, for ``reason``."""
 
     format: str
     path: Path | None
@@ -52,9 +49,8 @@ class ExportedFile:
 class Exported:
     """One object (or the background, or the whole scene) and its files.
 
-    class_id: None of the whole scene. center: [3] the point of the world that is the files' origin.
-    low, high: [3] its box, in the files' frame. to_run: the 4 x 4 matrix from the files' frame to the run's normalised
-    one.
+    class_id: None of the whole scene. center: [3] the point of the world that is the files' origin. low, high: [3] its
+    box, in the files' frame. to_run: the 4 x 4 matrix from the files' frame to the run's normalised one.
     """
 
     name: str
@@ -67,7 +63,7 @@ class Exported:
     files: list[ExportedFile]
 
     def to_json(self, folder: Path) -> dict[str, Any]:
-        """Plain values for the manifest in ``folder``."""
+        """Return plain values for the manifest in ``folder``."""
         return {
             "name": self.name,
             "class_id": self.class_id,
@@ -99,12 +95,11 @@ def export_run(
     """Write files of objects of a run.
 
     config_path: config.yml of a refined (or assigned) run. objects: names; or everything: all that have Gaussians and
-    the emptied background, and a manifest. whole: the whole scene too, in one file; alone it needs no classes.
-    formats: names of exporters. placement: "world", the frame of the input poses (the run's own if it has not kept how
-    that was normalised), or "object", the same centred on each object. output: folder; ``exports/`` in the run by
-    default. options: format to its exporter's options. progress: is told (done, total) files, and
-    views drawn for the meshes among them.
-    Raises ``UserError`` for a mistake, before anything is written.
+    the emptied background, and a manifest. whole: the whole scene too, in one file; alone it needs no classes. formats:
+    names of exporters. placement: "world", the frame of the input poses (the run's own if it has not kept how that was
+    normalised), or "object", the same centred on each object. output: folder; ``exports/`` in the run by default.
+    options: format to its exporter's options. progress: receives (done, total) files, and rendered views of the meshes
+    among them. Raises ``UserError`` for a mistake, before anything is written.
     """
     run, folder = config_path.parent, output or config_path.parent / "exports"
     check_placement(placement)
@@ -119,18 +114,12 @@ def export_run(
         raise UserError(
             f"nothing to export is named: use --all, --whole, or --object with one of {', '.join(present)}."
         )
-
     transform = read_transform(run)
-    job = _Job(
-        scene,
-        exporters,
-        Frame.of_run() if transform is None else Frame(*transform),
-        placement == "object",
-        training_viewpoints(scene.config, raster_settings(scene), config_path)
-        if any(exporter.needs_views for exporter in exporters.values())
-        else None,
-        tolerant=everything,
-    )
+    frame = Frame.of_run() if transform is None else Frame(*transform)
+    views = None
+    if any(exporter.needs_views for exporter in exporters.values()):
+        views = training_viewpoints(scene.config, raster_settings(scene), config_path)
+    job = _Job(scene, exporters, frame, placement == "object", views, tolerant=everything)
     names, titles = list(present) if everything else list(dict.fromkeys(objects)), folder_names(scene.classes)
     items: list[tuple[str, int | None, str]] = [(name, present[name], titles[present[name]]) for name in names]
     if whole:
@@ -139,38 +128,45 @@ def export_run(
     exported = [job.export(name, class_id, folder / title, steps) for name, class_id, title in items]
     if everything:
         world = "run" if transform is None else "input"
-        _write_manifest(folder, {"run": str(config_path.absolute()), "frame": placement, "world": world}, exported)
+        content = {
+            "run": str(config_path.absolute()),
+            "frame": placement,
+            "world": world,
+            "objects": [one.to_json(folder) for one in exported],
+        }
+        with whole_file(folder / MANIFEST) as part:
+            part.write_text(json.dumps(content, indent=2), "utf8")
     return exported
 
 
 class _Steps:
-    """Tells the progress of an export: a step for each file, and before it one for each view that it draws.
+    """Reports the progress of an export: a step for each file, and before it one for each view that it renders.
 
     of_a_piece: steps of each exporter's file.
     """
 
-    def __init__(self, of_a_piece: Sequence[int], items: int, tell: Progress) -> None:
+    def __init__(self, of_a_piece: Sequence[int], items: int, report: Progress) -> None:
         self._of_files = list(of_a_piece) * items
         self._file = 0
-        self._tell = tell
+        self._report = report
         self.on_render(0)
 
     def on_render(self, views: int) -> None:
-        """Some of the present file's views are drawn."""
-        self._tell(sum(self._of_files[: self._file]) + views, sum(self._of_files))
+        """Report the rendered views of the present file."""
+        self._report(sum(self._of_files[: self._file]) + views, sum(self._of_files))
 
     def wrote(self) -> None:
-        """The present file is done, whatever it took."""
+        """Report the present file as done."""
         self._file += 1
         self.on_render(0)
 
 
 @dataclass(frozen=True)
 class _Job:
-    """What all items of an export have in common.
+    """The common settings of all items of an export.
 
-    world: frame of the files, but for the shift if they are ``centred``. views: in the run's frame.
-    tolerant: leave out a format for which a item has nothing.
+    world: frame of the files, but for the shift if they are ``centred``. views: in the run's frame. tolerant: leave out
+    a format for which an item has nothing.
     """
 
     scene: SavedScene
@@ -181,12 +177,12 @@ class _Job:
     tolerant: bool
 
     def steps(self) -> list[int]:
-        """Of each file of a item: see ``_Steps``."""
+        """Return the steps of each file of an item: see ``_Steps``."""
         views = 0 if self.views is None else len(self.views.cameras)
         return [1 + (views if exporter.needs_views else 0) for exporter in self.exporters.values()]
 
     def export(self, name: str, class_id: int | None, stem: Path, steps: _Steps) -> Exported:
-        """All files of one class (None: of the whole scene), called ``stem`` and their suffixes."""
+        """Write all files of one class (None: of the whole scene), called ``stem`` and their suffixes."""
         class_ids = self.scene.state["class_ids"]
         chosen = self.scene.surfels()
         if class_id is not None:
@@ -224,11 +220,11 @@ def export_shown(
     settings: RasterSettings,
     progress: Progress = lambda done, total: None,
 ) -> Path:
-    """Write surfels that a viewer shows into ``exports/`` of the run, without replacing a file; returns its path.
+    """Write Gaussians that a viewer shows into ``exports/`` of the run, without replacing a file; return the path.
 
-    config_path: config.yml of the run. surfels: M of its frame; class_ids: [M] int32. title: what the file is called,
-    before the suffix. settings: depth range of the scene. progress: is told (done, total) views that a mesh is made of.
-    Raises ``UserError`` if nothing is shown, for an unknown format, or a file that cannot be written.
+    config_path: config.yml of the run. surfels: M of its frame. class_ids: [M] int32. title: file name before the
+    suffix. settings: depth range of the scene. progress: receives (done, total) rendered views of a mesh. Raises
+    ``UserError`` if nothing is shown, for an unknown format, or a file that cannot be written.
     """
     exporter = make_exporter(format_name)
     if len(surfels) == 0:
@@ -247,13 +243,7 @@ def export_shown(
 
 
 def _free_path(folder: Path, title: str, suffix: str) -> Path:
-    """``title`` as a file name that is not taken, with a number if need be."""
+    """Return a path named after ``title`` that is free, with a number if need be."""
     stem = file_name(title)
     names = chain([stem], (f"{stem}_{number}" for number in count(2)))
     return next(path for name in names if not (path := folder / f"{name}.{suffix}").exists())
-
-
-def _write_manifest(folder: Path, origin: dict[str, str], exported: Sequence[Exported]) -> None:
-    content = {**origin, "objects": [one.to_json(folder) for one in exported]}
-    with whole_file(folder / MANIFEST) as part:
-        part.write_text(json.dumps(content, indent=2), "utf8")

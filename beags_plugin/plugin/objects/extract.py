@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import Tensor
 
@@ -23,9 +23,6 @@ from beags_plugin.plugin.runs.read import (
 from beags_plugin.plugin.runs.write import write_run
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.whole_files import write_text_atomically
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True)
@@ -47,9 +44,10 @@ def extract_objects(
 ) -> list[Extracted]:
     """Write a run and a .ply per object.
 
-    config_path: config.yml of a refined (or assigned) run. objects: names; none means every object that has Gaussians.
-    remove: keep all but the object instead. output: folder for the runs; ``extracted/`` in the run by default.
-    progress: is told (done, total) objects. Raises ``UserError`` for an unknown name, before anything is written.
+    config_path: config.yml of a refined (or assigned) run. objects: names; all that have Gaussians but the background
+    if empty. remove: keep all but the object instead. output: folder for the runs; ``extracted/`` in the run by
+    default. progress: receives (done, total) objects. Raises ``UserError`` for an unknown name, before anything is
+    written.
     """
     scene = read_assigned_run(config_path)
     run = config_path.parent
@@ -61,7 +59,7 @@ def extract_objects(
     folders, target = folder_names(scene.classes), output or run / "extracted"
     with writing(target):
         target.mkdir(parents=True, exist_ok=True)
-    prepared = prepared_digests(run)  # tells whether the run was trained again later
+    prepared = prepared_digests(run)  # shows later if the run was trained again
     written = []
     for name in names:
         surfels, index = select(scene.surfels(), class_ids, ids[name])
@@ -80,7 +78,7 @@ def extract_objects(
 
 
 def objects_with_gaussians(scene: SavedScene, objects: Sequence[str], run: Path) -> dict[str, int]:
-    """Name to class id of all classes that have Gaussians; raises ``UserError`` if one of ``objects`` is none."""
+    """Return name to class id of all classes with Gaussians; raises ``UserError`` if one of ``objects`` has none."""
     ids = {name: index for index, name in scene.classes.items()}
     if unknown := [name for name in objects if name not in ids]:
         raise UserError(f"there is no object {unknown[0]!r} in {run}: choose of {', '.join(ids)}.")
@@ -91,7 +89,7 @@ def objects_with_gaussians(scene: SavedScene, objects: Sequence[str], run: Path)
 
 
 def _rows(state: dict[str, Any], index: Tensor) -> dict[str, Any]:
-    """A model's state with the surfels ``index`` [M] only."""
+    """Return a model's state with the Gaussians ``index`` [M] only."""
     per_surfel = {"class_ids", "class_margin"}
     return {
         name: value[index] if name in per_surfel or name.startswith("gauss_params.") else value
@@ -100,12 +98,12 @@ def _rows(state: dict[str, Any], index: Tensor) -> dict[str, Any]:
 
 
 def folder_names(classes: dict[int, str]) -> dict[int, str]:
-    """Class id to the name of its folder; where two would get the same one, the id follows."""
+    """Return class id to the name of its folder, with the id appended where two would get the same one."""
     plain = {index: file_name(name) for index, name in classes.items()}
     shared = Counter(name.lower() for name in plain.values())  # some file systems ignore case
     return {index: name if shared[name.lower()] == 1 else f"{name}_{index}" for index, name in plain.items()}
 
 
 def file_name(name: str) -> str:
-    """A class name as part of a path: anything unusual becomes an underscore."""
+    """Return a class name as part of a path: anything unusual becomes an underscore."""
     return re.sub(r"[^\w.-]+", "_", name).strip("._") or "object"

@@ -31,7 +31,7 @@ from beags_plugin.system.whole_files import write_whole
 
 
 class RunGeometry:
-    """The shape that a trained run found, at the size of the photographs: of its training views, then of the others."""
+    """The surfaces of a trained run, at the size of the photographs: of its training views, then of the others."""
 
     def __init__(self, config_path: Path) -> None:
         self.scene = read_run(config_path)
@@ -53,11 +53,11 @@ class RunGeometry:
         return geometry_inputs(self.scene.surfels())
 
     def depth(self, view: int) -> Tensor:
-        """[h, w] float32."""
+        """Return [h, w] float32."""
         kind = self.scene.config.model_config.prepare.depth
         with torch.no_grad():
-            drawn = self.rasterizer.rasterize(self._surfels, self.cameras[view], self.settings, torch.zeros(3))
-            return surface_depth(drawn, kind)
+            render = self.rasterizer.rasterize(self._surfels, self.cameras[view], self.settings, torch.zeros(3))
+            return surface_depth(render, kind)
 
     def to_straight(self, labels: np.ndarray, view: int) -> np.ndarray:
         split, index = self._of_split[view]
@@ -70,7 +70,7 @@ class RunGeometry:
 
 
 def configured_source(name: str, options: Sequence[str]) -> MaskSource:
-    """A registered source with options "key=value"; raises ``UserError`` for an unknown key or a wrong value."""
+    """Return a registered source with options "key=value"; raises ``UserError`` for an unknown key or a wrong value."""
     import tyro
 
     kind: Any = MASK_SOURCES.get(name)
@@ -90,8 +90,9 @@ def configured_source(name: str, options: Sequence[str]) -> MaskSource:
         source: MaskSource = tyro.cli(kind, args=arguments, console_outputs=False)
     except SystemExit:
         usual = ", ".join(f"{key}={getattr(kind, key)}" for key in known if hasattr(kind, key))
-        told = f"the options {' '.join(options)} of the mask source {name} have a wrong value: give such as {usual}."
-        raise UserError(told) from None
+        raise UserError(
+            f"the options {' '.join(options)} of the mask source {name} have a wrong value: give such as {usual}."
+        ) from None
     if reason := source.unavailable():
         raise UserError(f"the mask source {name} cannot run: {reason}")
     return source
@@ -107,12 +108,11 @@ def make_masks(
 ) -> list[str]:
     """Write the masks of a scene: <output>/masks/<stem>.png, classes.json and made.png, a picture of them.
 
-    The files take their places once all are made; no old mask of any view stays. Masks that are only to be looked at
-    go to <output>/masks_to_look_at/, which nothing reads; all else that is said of masks holds for them too.
-    data: names the scene. run: config.yml of a run trained on it, for sources that need its depth. output: the scene's
-    own folder if None, where ``beags-data`` looks for them. overwrite: replace masks that are there. snap: radius in
-    pixels of ``rims.snap_to_edges``, 0 leaves rims as they are.
-    Returns lines that tell what was written. Raises ``UserError`` before anything is written, or for bad input.
+    The files take their places once all are made; no old mask of any view stays. Masks only to look at go likewise to
+    <output>/masks_to_look_at/, which nothing reads. data: names the scene. run: config.yml of a run trained on it, for
+    sources that need its depth. output: the scene's own folder if None, where ``beags-data`` looks for them. overwrite:
+    replace existing masks. snap: radius in pixels of ``masks.snapping.snap_to_edges``; 0 leaves boundaries as they are.
+    Returns lines that report the written files. Raises ``UserError`` before anything is written, or for bad input.
     """
     parser: BeagsDataParser = data.setup()
     scene, views = parser.posed_views()

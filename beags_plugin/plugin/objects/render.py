@@ -16,7 +16,7 @@ from beags_plugin.pictures.video import FILMS, check_film, encoder, write_film
 from beags_plugin.plugin.objects.export import Progress
 from beags_plugin.plugin.objects.extract import folder_names, objects_with_gaussians
 from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT
-from beags_plugin.plugin.runs.read import SavedScene, read_assigned_run, training_viewpoints
+from beags_plugin.plugin.runs.read import SavedScene, raster_settings, read_assigned_run, training_viewpoints
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.system.errors import UserError
 
@@ -31,12 +31,12 @@ def render_run(
     options: RenderOptions | None = None,
     progress: Progress | None = None,
 ) -> Path:
-    """Draw objects of a run alone, from cameras around each, into one file; returns its path.
+    """Render objects of a run alone, from cameras around each, into one file; return its path.
 
-    config_path: config.yml of a refined (or assigned) run. objects: names; all but the background if empty.
-    form: "video" (.mp4, .gif), "sheet" (.png, .jpg), or "before-after": assignment alone beside the refined object
-    from the same cameras, either. output: the file; in ``renders/`` of the run if None.
-    progress: is told (done, total) pictures. Raises ``UserError`` for a mistake, before anything is drawn.
+    config_path: config.yml of a refined (or assigned) run. objects: names; all but the background if empty. form:
+    "video" (.mp4, .gif), "sheet" (.png, .jpg), or "before-after": assignment alone beside the refined object from the
+    same cameras, either. output: the file; in ``renders/`` of the run if None. progress: receives (done, total)
+    pictures. Raises ``UserError`` for a mistake, before anything is rendered.
     """
     options = options or RenderOptions()
     options.check()
@@ -47,29 +47,24 @@ def render_run(
     names = list(dict.fromkeys(objects)) or [name for name, class_id in present.items() if class_id != 0]
     if not names:
         raise UserError(f"{config_path} holds no object but the background: name it with --object background.")
-    path = output or _default_output(config_path, scene, names, present, form)
-    moving = _check_output(path, form)
+    if output is None:
+        title = folder_names(scene.classes)[present[names[0]]] if len(names) == 1 else "objects"
+        suffix = ".png" if form != "video" else ".gif" if encoder() is None else ".mp4"
+        output = config_path.parent / "renders" / f"{title}_{form}{suffix}"
+    moving = _check_output(output, form)
     stages = {"": scene} if form != "before-after" else {"before": _base_of(config_path), "after": scene}
     subjects = _subjects(config_path, stages, names, present, form, moving, options)
     rasterizer = make_rasterizer(scene.config.model_config.rasterizer)
     if moving:
-        write_film(path, film(subjects, rasterizer, options.background, progress), options.fps)
+        write_film(output, film(subjects, rasterizer, options.background, progress), options.fps)
     else:
         draw = comparison if form == "before-after" else sheet
-        write_picture(path, draw(subjects, rasterizer, options.background, progress))
-    return path
-
-
-def _default_output(
-    config_path: Path, scene: SavedScene, names: Sequence[str], present: dict[str, int], form: str
-) -> Path:
-    title = folder_names(scene.classes)[present[names[0]]] if len(names) == 1 else "objects"
-    suffix = ".png" if form != "video" else ".gif" if encoder() is None else ".mp4"
-    return config_path.parent / "renders" / f"{title}_{form}{suffix}"
+        write_picture(output, draw(subjects, rasterizer, options.background, progress))
+    return output
 
 
 def _check_output(path: Path, form: str) -> bool:
-    """Whether the file is a film; raises ``UserError`` for a name that does not fit the format."""
+    """Return True if the file is a film; raises ``UserError`` for a name that does not fit the format."""
     suffix = path.suffix.lower()
     if form == "video" or (form == "before-after" and suffix in FILMS):
         check_film(path)
@@ -81,7 +76,7 @@ def _check_output(path: Path, form: str) -> bool:
 
 
 def _base_of(config_path: Path) -> SavedScene:
-    """The state with assignment alone, which a refined run has kept."""
+    """Return the state with assignment alone, which a refined run has kept."""
     snapshot = config_path.parent / BASE_SNAPSHOT / "config.yml"
     if not snapshot.exists():
         raise UserError(
@@ -100,8 +95,6 @@ def _subjects(
     moving: bool,
     options: RenderOptions,
 ) -> list[Subject]:
-    from beags_plugin.plugin.runs.read import raster_settings
-
     last = list(stages.values())[-1]
     try:
         photos = training_viewpoints(last.config, raster_settings(last), config_path).cameras

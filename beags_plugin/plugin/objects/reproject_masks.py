@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReprojectionOptions:
-    """What may differ from how the run itself prepares masks; None keeps its choice.
+    """Differences from the run's own preparation of masks; None keeps the run's choice.
 
     masks: folder of other id images. classes: their classes.json. method, tau, depth: see
-    ``preparation.pipeline.PreparationConfig``. run_size: reproject at the size that was trained on, not at that of the
+    ``preparation.pipeline.PreparationConfig``. run_size: reproject at the size of the training, not at that of the
     photographs. parser: the options of ``beags-data``, if not the run's own.
     """
 
@@ -54,8 +54,8 @@ class ReprojectionOptions:
 class ReprojectedRun:
     """The masks of V training views before and after, without lens distortion.
 
-    given, voted: class ids; given is None where a view has no mask. confidence: [H, W] uint8, share of the votes
-    times 255. seconds: wall time. method: the reprojection; why: a line on why it was chosen, if it was not given.
+    given, voted: class ids; given is None where a view has no mask. confidence: [H, W] uint8, share of the votes times
+    255. seconds: wall time. method: the reprojection. why: the reason for its choice, if it was not given.
     """
 
     scene: SavedScene
@@ -70,7 +70,7 @@ class ReprojectedRun:
     why: str | None
 
     def changed(self, view: int) -> Changed:
-        """One view for a picture."""
+        """Return one view for a picture."""
         given = self.given[view]
         photo = self.manager.views("train")[view].image
         return Changed(
@@ -108,8 +108,8 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     config = replace(config, reprojection=method)
     with progress_bar("Rendering depth") as progress:
         surfels = scene.surfels().detach()
-        drawn = render_depths(surfels, cameras, rasterizer, raster_settings(scene), config.depth, progress)
-        depths = filed(drawn, surfels.means.device)
+        rendered = render_depths(surfels, cameras, rasterizer, raster_settings(scene), config.depth, progress)
+        depths = filed(rendered, surfels.means.device)
     with progress_bar("Reprojecting masks") as progress:
         masks = reprojected_masks(depths, cameras, given, known_classes(given, classes), config, progress)
     assert masks.confidence is not None
@@ -119,7 +119,7 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
 
 
 def data_to_reproject(scene: SavedScene, config_path: Path, options: ReprojectionOptions) -> BeagsDataManager:
-    """The data that a run was trained on, at the size and with the masks that ``options`` name."""
+    """Return the data that a run was trained on, at the size and with the masks of ``options``."""
     config = scene.config
     if options.parser is not None:
         parser = replace(options.parser)
@@ -140,35 +140,32 @@ def data_to_reproject(scene: SavedScene, config_path: Path, options: Reprojectio
     return cast("BeagsDataManager", manager)
 
 
-def write_reprojection(found: ReprojectedRun, output: Path, min_confidence: float = 0.0, shown: int = 6) -> list[str]:
-    """Write refined masks, confidence maps, a report and a picture of the views that changed most; what was written.
+def write_reprojection(found: ReprojectedRun, output: Path, min_confidence: float = 0.0) -> list[str]:
+    """Write the labels as masks, confidence maps, a report and a picture of the views that changed most; return a
+    summary.
 
-    All maps are of the size of the photographs, lens distortion included, so that ``beags-data --masks-path`` takes
-    them (at the run's own size if that was asked for). min_confidence: less certain pixels become IGNORE.
+    All maps have the size of the photographs, lens distortion included, so that ``beags-data --masks-path`` takes them
+    (the run's own size on request). min_confidence: less certain pixels become IGNORE.
     """
-    with writing(output):
-        return _write_reprojection(found, output, min_confidence, shown)
-
-
-def _write_reprojection(found: ReprojectedRun, output: Path, min_confidence: float, shown: int) -> list[str]:
     from PIL import Image
 
-    changes = []
-    for index, path in enumerate(mask_paths(found.manager.train_dataset.image_filenames)):
-        voted = found.voted[index].numpy().astype(np.uint16)
-        confidence = found.confidence[index].numpy()
-        doubtful = (confidence < 255.0 * min_confidence) if min_confidence > 0 else np.zeros(voted.shape, bool)
-        final = np.where(doubtful, np.uint16(IGNORE), voted)
-        for folder in ("masks", "confidence"):
-            (output / folder / path).parent.mkdir(parents=True, exist_ok=True)
-        write_mask(output / "masks" / path, found.manager.as_in_file(final, index))
-        Image.fromarray(found.manager.as_in_file(confidence, index, border=0)).save(output / "confidence" / path)
-        changes.append(_change(found, index, doubtful))
-    (output / "classes.json").write_text(json.dumps({str(i): name for i, name in found.classes.items()}, indent=1))
-    report = {"method": found.method, "seconds": found.seconds, "min_confidence": min_confidence, "views": changes}
-    (output / "report.json").write_text(json.dumps(report, indent=1))
-    order = sorted(range(len(changes)), key=lambda index: -changes[index]["changed"])[:shown]
-    before_and_after(output / "before_after.png", [found.changed(index) for index in order])
+    with writing(output):
+        changes = []
+        for index, path in enumerate(mask_paths(found.manager.train_dataset.image_filenames)):
+            voted = found.voted[index].numpy().astype(np.uint16)
+            confidence = found.confidence[index].numpy()
+            doubtful = confidence < 255.0 * min_confidence
+            final = np.where(doubtful, np.uint16(IGNORE), voted)
+            for folder in ("masks", "confidence"):
+                (output / folder / path).parent.mkdir(parents=True, exist_ok=True)
+            write_mask(output / "masks" / path, found.manager.as_in_file(final, index))
+            Image.fromarray(found.manager.as_in_file(confidence, index, border=0)).save(output / "confidence" / path)
+            changes.append(_change(found, index, doubtful))
+        (output / "classes.json").write_text(json.dumps({str(i): name for i, name in found.classes.items()}, indent=1))
+        report = {"method": found.method, "seconds": found.seconds, "min_confidence": min_confidence, "views": changes}
+        (output / "report.json").write_text(json.dumps(report, indent=1))
+        order = sorted(range(len(changes)), key=lambda index: -changes[index]["changed"])[:6]
+        before_and_after(output / "before_after.png", [found.changed(index) for index in order])
     pixels, changed = (sum(view[key] for view in changes) for key in ("labelled", "changed"))
     filled = sum(mask is None for mask in found.given.stored)
     return [
@@ -193,7 +190,7 @@ def _change(found: ReprojectedRun, index: int, doubtful: np.ndarray) -> dict[str
 
 
 def mask_paths(images: Sequence[Path]) -> list[Path]:
-    """Where the masks of images go below their folder, so that ``data.files.files_of_views`` finds them again."""
+    """Return the masks' paths below their folder, by which ``data.files.files_of_views`` finds them again."""
     stems = Counter(image.stem for image in images)
     if len(images) == 1 or max(stems.values()) == 1:
         return [Path(f"{image.stem}.png") for image in images]

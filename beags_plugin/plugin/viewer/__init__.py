@@ -1,1 +1,1 @@
-"""The viewer: what it shows of a scene, its panel and its files."""
+"""The viewer: pictures of a scene, its panel and its files."""

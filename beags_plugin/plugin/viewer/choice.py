@@ -1,4 +1,4 @@
-"""Which surfels a viewer shows, and which it fades."""
+"""Choice of the Gaussians that a viewer shows or fades."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ from beags_plugin.core.surfels import Surfels, opacities
 
 @dataclass(frozen=True)
 class Choice:
-    """What of a scene is looked at. Choosing changes nothing of the scene: every method returns another choice.
+    """The parts of a scene to look at; every method returns another choice and leaves the scene alone.
 
-    hidden: class ids that belong to the rest. removed: class ids that are gone, whatever ``rest`` says.
-    isolated: the one class that does not belong to the rest; None: all but the hidden.
-    rest: 0..1, what is left of the opacity of the rest; 0 leaves it out.
-    min_opacity: 0..1, weaker surfels are left out.
+    hidden: class ids that belong to the rest. removed: class ids that are gone, whatever ``rest`` is. isolated: the one
+    class that does not belong to the rest; None: all but the hidden. rest: 0..1, factor of the rest's opacity; 0 leaves
+    it out. min_opacity: 0..1, weaker Gaussians are left out.
     """
 
     hidden: frozenset[int] = frozenset()
@@ -31,52 +30,47 @@ class Choice:
         return replace(self.show(class_id), isolated=class_id)
 
     def hide(self, class_id: int) -> Choice:
-        """Let this class be part of the rest."""
-        return replace(self.show(class_id), hidden=self.hidden | {class_id}, isolated=self._but(class_id))
+        """Make this class part of the rest."""
+        isolated = None if self.isolated == class_id else self.isolated
+        return replace(self.show(class_id), hidden=self.hidden | {class_id}, isolated=isolated)
 
     def remove(self, class_id: int) -> Choice:
         """Leave this class out."""
-        return replace(self.show(class_id), removed=self.removed | {class_id}, isolated=self._but(class_id))
+        isolated = None if self.isolated == class_id else self.isolated
+        return replace(self.show(class_id), removed=self.removed | {class_id}, isolated=isolated)
 
     def show(self, class_id: int) -> Choice:
-        """Show this class again; also the others, if one was isolated that was not this."""
-        return replace(
-            self, hidden=self.hidden - {class_id}, removed=self.removed - {class_id}, isolated=self._only(class_id)
-        )
+        """Show this class again; also the others, if another one was isolated."""
+        isolated = class_id if self.isolated == class_id else None
+        return replace(self, hidden=self.hidden - {class_id}, removed=self.removed - {class_id}, isolated=isolated)
 
     def show_all(self) -> Choice:
         """Show every class again."""
         return replace(self, hidden=frozenset(), removed=frozenset(), isolated=None)
 
-    def _but(self, class_id: int) -> int | None:
-        return None if self.isolated == class_id else self.isolated
-
-    def _only(self, class_id: int) -> int | None:
-        return self.isolated if self.isolated == class_id else None
-
     def state(self, class_id: int) -> str:
-        """What a reader is told of a class: "removed", "hidden" or "shown"."""
+        """Return "removed", "hidden" or "shown", for the legend."""
         if class_id in self.removed:
             return "removed"
         return "shown" if self.in_full(class_id) else "hidden"
 
     def in_full(self, class_id: int) -> bool:
-        """Whether this class is neither removed nor part of the rest."""
+        """Return whether this class is neither removed nor part of the rest."""
         if class_id in self.removed or class_id in self.hidden:
             return False
         return self.isolated is None or self.isolated == class_id
 
     @property
     def of_classes(self) -> bool:
-        """Whether any class is treated differently from the others."""
+        """Return whether any class is treated differently from the others."""
         return bool(self.hidden or self.removed or self.isolated is not None)
 
 
 @dataclass(frozen=True)
 class Visible:
-    """The surfels that are drawn, with the opacity that they are drawn with.
+    """The Gaussians that are rendered, with their opacity in the picture.
 
-    index: [M] int64, which of the scene's they are, ascending; None: all of them, as they are.
+    index: [M] int64, their indices in the scene, ascending; None: all of them, as they are.
     """
 
     surfels: Surfels
@@ -88,10 +82,10 @@ class Visible:
 def shown(
     surfels: Surfels, class_ids: Tensor, choice: Choice, rest: bool = True, inside: Tensor | None = None
 ) -> Visible:
-    """What ``choice`` leaves of a scene.
+    """Return the part of a scene that ``choice`` leaves.
 
-    surfels: N surfels. class_ids: [N] int, phi. rest: whether the rest is drawn at all. inside: [N] bool, the surfels
-    of a crop box, or None for all.
+    surfels: N Gaussians. class_ids: [N] int, phi. rest: False leaves the rest out. inside: [N] bool, the Gaussians of a
+    crop box, or None for all.
     """
     if not choice.of_classes and choice.min_opacity <= 0.0 and inside is None:
         return Visible(surfels, class_ids, None)
@@ -110,15 +104,10 @@ def shown(
     index = keep.nonzero()[:, 0]
     chosen = surfels[index]
     if 0.0 < left < 1.0:
-        chosen = replace(chosen, opacity_logits=_faded(chosen.opacity_logits, fades[index], left))
+        faded = torch.logit(left * opacities(chosen.opacity_logits), eps=1e-6)  # below 1 / 255 is as good as 0
+        chosen = replace(chosen, opacity_logits=torch.where(fades[index], faded, chosen.opacity_logits))
     return Visible(chosen, class_ids[index], index)
 
 
 def _member(class_ids: Tensor, members: frozenset[int]) -> Tensor:
     return torch.isin(class_ids, class_ids.new_tensor(sorted(members)))
-
-
-def _faded(logits: Tensor, fades: Tensor, left: float) -> Tensor:
-    """Logits of the opacities times ``left`` where ``fades``; the opacities below 1 / 255 are as good as 0."""
-    weaker = left * opacities(logits)
-    return torch.where(fades, torch.logit(weaker, eps=1e-6), logits)

@@ -13,41 +13,41 @@ from beags_plugin.system.errors import UserError
 
 
 class ShownFiles:
-    """Writes what ``viewing`` shows, in a thread of its own, one file at a time.
+    """Writer of the part that ``viewing`` shows, in a thread of its own, one file at a time.
 
-    title, format_name: give what the file is to be called and its format. say: is told in a sentence how it goes.
+    title, format_name: return the file's name and its format. report: receives sentences on the progress.
     """
 
     def __init__(
-        self, viewing: Viewing, title: Callable[[], str], format_name: Callable[[], str], say: Callable[[str], None]
+        self, viewing: Viewing, title: Callable[[], str], format_name: Callable[[], str], report: Callable[[str], None]
     ) -> None:
         self._viewing = viewing
         self._title = title
         self._format_name = format_name
-        self._say = say
+        self._report = report
         self._busy = threading.Lock()
 
     def start(self) -> None:
-        """Begin; ``say`` is told the rest."""
+        """Begin to write; ``report`` receives the rest."""
         if not self._busy.acquire(blocking=False):
-            self._say("The former export is still being written.")
+            self._report("The former export is still being written.")
             return
-        self._say("Exporting ...")
-        threading.Thread(target=self._write_and_say, name="beags export", daemon=True).start()
+        self._report("Exporting ...")
+        threading.Thread(target=self._write_and_report, name="beags export", daemon=True).start()
 
-    def _write_and_say(self) -> None:
+    def _write_and_report(self) -> None:
         try:
-            said = f"Exported to {self.write()}"
+            message = f"Exported to {self.write()}"
         except UserError as error:
-            said = f"Not exported: {error}"
-        except Exception as error:  # a thread has nobody else to tell
-            said = f"Not exported ({type(error).__name__}: {error})."
+            message = f"Not exported: {error}"
+        except Exception as error:  # nobody else sees an exception of a thread
+            message = f"Not exported ({type(error).__name__}: {error})."
         finally:
             self._busy.release()
-        self._say(said)
+        self._report(message)
 
     def write(self) -> Path:
-        """Write what is shown in full, inside the crop box; returns the file. Raises ``UserError``."""
+        """Write what is shown in full, inside the crop box; return the file. Raises ``UserError``."""
         from beags_plugin.plugin.objects.export import export_shown
 
         viewing = self._viewing
@@ -58,9 +58,9 @@ class ShownFiles:
         with torch.no_grad():
             return export_shown(
                 config_path, scene.surfels, scene.class_ids, f"shown_{self._title()}", self._format_name(),
-                viewing.model.settings(), self.say_views,
+                viewing.model.settings(), self.report_views,
             )  # fmt: skip
 
-    def say_views(self, done: int, total: int) -> None:
-        """Tell how many of the views are drawn that a mesh is made of."""
-        self._say(f"Exporting: {done} of {total} views are drawn.")
+    def report_views(self, done: int, total: int) -> None:
+        """Report the number of rendered views of a mesh."""
+        self._report(f"Exporting: {done} of {total} views are drawn.")

@@ -1,4 +1,4 @@
-"""Text for a viewer's panel, in Markdown; names may hold anything."""
+"""Markdown text of a viewer's panel; names may hold anything."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _LONGEST = 40  # characters of a name that the panel's width has room for
 
 @dataclass(frozen=True)
 class LegendRow:
-    """A class as the legend has it. count: of its Gaussians. state: what is not "shown" is struck out."""
+    """A class of the legend. count: of its Gaussians. state: any but "shown" is struck out."""
 
     class_id: int
     name: str
@@ -23,35 +23,35 @@ class LegendRow:
 
 
 def legend(rows: Iterable[LegendRow]) -> str:
-    """A table of classes in their colours: see ``labels.colors.colorize``, on which class maps depend too."""
+    """Return a table of classes in their colours (see ``labels.colors.colorize``)."""
     lines = ["| | object | Gaussians |", "|---|---|---:|"]
     for row in rows:
         name = escaped(shortened(row.name))
-        said = {"shown": name, "hidden": f"~~{name}~~"}.get(row.state, f"~~{name}~~ {row.state}")
-        lines.append(f"| `{hex_color(row.class_id)}` | {said} | {row.count:,} |")
+        text = {"shown": name, "hidden": f"~~{name}~~"}.get(row.state, f"~~{name}~~ {row.state}")
+        lines.append(f"| `{hex_color(row.class_id)}` | {text} | {row.count:,} |")
     return "\n".join(lines)
 
 
 def hex_color(class_id: int) -> str:
-    """The colour of a class, as #rrggbb."""
+    """Return the colour of a class, as #rrggbb."""
     red, green, blue = colorize(np.array([[class_id]]))[0, 0]
     return f"#{red:02x}{green:02x}{blue:02x}"
 
 
 def shortened(name: str) -> str:
-    """A name on one line, cut if it is long."""
+    """Return a name on one line, cut if it is long."""
     line = " ".join(name.split())
     return line if len(line) <= _LONGEST else f"{line[: _LONGEST - 1]}…"
 
 
 def escaped(text: str) -> str:
-    """Text as it is in Markdown, which viser reads as MDX: braces and angle brackets would be taken for a program."""
+    """Return text for Markdown, which viser reads as MDX: braces and angle brackets would be taken for a program."""
     plain = set(" .,:;%…")
     return "".join(c if c.isalnum() or c in plain else f"&#{ord(c)};" for c in text)
 
 
 def unique_labels(classes: Mapping[int, str]) -> dict[str, int]:
-    """What a drop-down calls the classes, to their ids, in the order of ids: names, if need be with the id.
+    """Return a drop-down's entries for the classes, to their ids, in the order of ids: names, if need be with the id.
 
     Browsers refuse a list with two equal entries, or an empty one.
     """

@@ -1,4 +1,4 @@
-"""The panel that nerfstudio's viewer shows for a scene: objects, legend, picking, export."""
+"""The panel of a scene in nerfstudio's viewer: objects, legend, picking, export."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ REFRESH_SECONDS = 0.3  # how often the panel follows what the scene and the rend
 
 
 class ViewerLink(ViewerControl):
-    """Nerfstudio's viewer, once there is one: tells the panel of it, and of clicks on the picture."""
+    """Passes nerfstudio's viewer, once there is one, and clicks on the picture to the panel."""
 
     viewer: Viewer | None = None
 
@@ -51,10 +51,10 @@ class ViewerLink(ViewerControl):
 
 
 class ObjectPanel(ViewerElement[None]):
-    """All controls of ours, as one element, so that they stand in this order and not in that of their names.
+    """All controls of ours as one element, so that they stand in this order and not in that of their names.
 
-    They change ``plugin.viewer.choice``, never the scene. What takes time happens in threads of the panel's own: no
-    control waits for a training step but the click that picks, and none runs in a render thread.
+    They change ``plugin.viewer.choice``, never the scene. Slow work happens in threads of the panel's own: no control
+    waits for a training step but the click that picks, and none runs in a render thread.
     """
 
     def __init__(self, viewing: Viewing) -> None:
@@ -69,7 +69,7 @@ class ObjectPanel(ViewerElement[None]):
         self._legend: Any = None
         self._status: Any = None
         self._counted: tuple | None = None
-        self._said = ["", ""]
+        self._texts = ["", ""]
         self.object = ViewerDropdown("Object", NONE, [NONE], hint="Also chosen by a click on the picture")
         # two rows: four buttons in one are cut off
         self.look = ViewerButtonGroup("Look at it", "Isolate", ["Isolate", "Show"], cb_hook=self._act)
@@ -84,7 +84,7 @@ class ObjectPanel(ViewerElement[None]):
             hint="Weaker Gaussians are left out",
         )  # fmt: skip
         self.clicks = ViewerCheckbox("Click picks an object", True, cb_hook=lambda box: self._listen(box.value))
-        self.files = ShownFiles(viewing, self.title, lambda: self.format.value, lambda said: self.note("export", said))
+        self.files = ShownFiles(viewing, self.title, lambda: self.format.value, lambda text: self.note("export", text))
         formats = EXPORTERS.names()
         self.format = ViewerDropdown("Format", "ply" if "ply" in formats else formats[0], formats)
         self.export = ViewerButton("Export what is shown", lambda _: self.files.start())
@@ -92,30 +92,23 @@ class ObjectPanel(ViewerElement[None]):
     # -- nerfstudio's side -------------------------------------------------------------------------------------------
 
     def install(self, viser_server: ViserServer) -> None:
-        """See ``ViewerElement.install``."""
+        """Add the controls to the page: see ``ViewerElement.install``."""
         self.refresh_objects()
-        for element in (
-            self.object,
-            self.look,
-            self.put_away,
-            self.show_all,
-            self.rest,
-            self.min_opacity,
-            self.clicks,
-        ):
+        rows = self.object, self.look, self.put_away, self.show_all, self.rest, self.min_opacity, self.clicks
+        for element in rows:
             element.install(viser_server)
         self._legend = viser_server.gui.add_markdown("")
         self.format.install(viser_server)
         self.export.install(viser_server)
         self._status = viser_server.gui.add_markdown("")
-        self._said = ["", ""]
+        self._texts = ["", ""]
         self.look.value = self.put_away.value = ""
 
     def _create_gui_handle(self, viser_server: ViserServer) -> None:
         raise NotImplementedError("this element has no handle of its own")
 
     def attach(self, viewer: Viewer, link: ViewerLink) -> None:
-        """Take up work with a viewer that has installed the panel."""
+        """Begin work with a viewer that has installed the panel."""
         self.viewer, self._link = viewer, link
         run = ViewedRun(Path(viewer.log_filename).parent.absolute(), viewer.pipeline.datamanager)  # type: ignore[arg-type]
         self.viewing.attach(run, viewer.trainer is not None, viewer.train_lock)
@@ -149,10 +142,10 @@ class ObjectPanel(ViewerElement[None]):
     def _act(self, group: ViewerParameter) -> None:
         if action := group.value:
             self.act(action)
-            group.value = ""  # viser tells of a button of a group only if it is not the one that was pressed last
+            group.value = ""  # viser reports a button only if it is not the one of its group that was pressed last
 
     def act(self, action: str) -> None:
-        """Do to the chosen object what a button says: "Isolate", "Show", "Hide" or "Remove"."""
+        """Apply a button to the chosen object: "Isolate", "Show", "Hide" or "Remove"."""
         class_id = self.labels.get(self.object.value)
         if class_id is None:
             self.note("object", f"Nothing to choose: {NO_CLASSES}")
@@ -174,26 +167,25 @@ class ObjectPanel(ViewerElement[None]):
             return "The scene is busy: click again."
         try:
             scene = viewing.shown()
-            found = pick(
-                model.rasterizer, scene.surfels, scene.class_ids, model.settings(), click.origin, click.direction
-            )
+            found = pick(model.rasterizer, scene.surfels, model.settings(), click.origin, click.direction)
             if found is None:
                 return "Nothing is shown there."
-            index = found.index if scene.index is None else int(scene.index[found.index])
+            index = found if scene.index is None else int(scene.index[found])
+            picked = int(scene.class_ids[found])
             margin = float(model.class_margin[index])
         finally:
             viewing.lock.release()
         if not bool(model.assigned):
             return f"Gaussian {index}; {NO_CLASSES}"
-        label = next((label for label, class_id in self.labels.items() if class_id == found.class_id), None)
+        label = next((label for label, class_id in self.labels.items() if class_id == picked), None)
         if label is None:
-            return f"Gaussian {index} of class {found.class_id}, which has no name."
+            return f"Gaussian {index} of class {picked}, which has no name."
         self.object.value = label
-        what = "background, no object" if found.class_id == 0 else label
+        what = "background, no object" if picked == 0 else label
         return f"Picked: {what} (Gaussian {index}, {margin:.0%} of its weight)."
 
     def title(self) -> str:
-        """What is shown, in a few words for a file's name."""
+        """Return the shown part in a few words, for a file's name."""
         names = {class_id: label for label, class_id in self.labels.items()}
         choice = self.viewing.choice
         if choice.isolated is not None:
@@ -212,11 +204,15 @@ class ObjectPanel(ViewerElement[None]):
                 self.note("panel", f"{type(error).__name__}: {error}")
 
     def follow(self) -> None:
-        """Bring the panel up to date, and read or compute what the viewer is to show; redraws when that is there."""
+        """Update the panel, read or compute the picture that the viewer lacks, and then ask for a new rendering."""
         self.refresh_objects()
-        self._say()
-        if self._load():
-            self._redraw()
+        self._write_texts()
+        run = self.viewing.run
+        if run is not None and "occupancy_violation" in self._wanted():
+            if self.viewing.model.grid is None:
+                run.load_grid()
+            if self.viewing.refresh_shares():
+                self._redraw()
 
     def _wanted(self) -> frozenset[str]:
         if self.viewer is None:
@@ -229,16 +225,6 @@ class ObjectPanel(ViewerElement[None]):
         controls = self.viewer.control_panel
         return controls.crop_obb if controls.crop_viewport else None
 
-    def _load(self) -> bool:
-        wanted, run, changed = self._wanted(), self.viewing.run, False
-        if run is None:
-            return False
-        if "occupancy_violation" in wanted:
-            if self.viewing.model.grid is None:
-                run.load_grid()
-            changed |= self.viewing.refresh_shares()
-        return changed
-
     def refresh_objects(self) -> None:
         """List the classes that have Gaussians, under the names that the model now has."""
         model = self.viewing.model
@@ -250,21 +236,17 @@ class ObjectPanel(ViewerElement[None]):
         self.counts = dict(zip(numbers.tolist(), counts.tolist(), strict=True))
         self.labels = unique_labels({class_id: model.classes.get(class_id, "") for class_id in self.counts})
         self._counted = key
-        self._offer(list(self.labels) or [NONE])
+        options, former = list(self.labels) or [NONE], self.object.value
+        if self.object.options != options:
+            self.object.set_options(options)
+            if former not in options:  # the first object, rather than the background
+                self.object.value = next((label for label in options if self.labels.get(label)), options[0])
 
-    def _offer(self, options: list[str]) -> None:
-        if self.object.options == options:
-            return
-        former = self.object.value
-        self.object.set_options(options)
-        if former not in options:
-            self.object.value = next((label for label in options if self.labels.get(label)), options[0])  # an object
+    def note(self, about: str, text: str) -> None:
+        """Show a note below the controls, in place of the last one about the same."""
+        self.notes = {**self.notes, about: text}
 
-    def note(self, about: str, said: str) -> None:
-        """Say something below the controls, in place of what was said last about the same."""
-        self.notes = {**self.notes, about: said}
-
-    def _say(self) -> None:
+    def _write_texts(self) -> None:
         """Write legend and notes, if they have changed."""
         choice = self.viewing.choice
         rows = [
@@ -275,16 +257,16 @@ class ObjectPanel(ViewerElement[None]):
         texts = [legend(rows) if rows else escaped(f"No objects: {NO_CLASSES}")]
         texts.append("\n\n".join(escaped(line) for line in lines.values()))
         for index, (handle, text) in enumerate(zip((self._legend, self._status), texts, strict=True)):
-            if handle is not None and text != self._said[index]:
+            if handle is not None and text != self._texts[index]:
                 with suppress(KeyError):  # the viewer is being closed
                     handle.content = text
-                self._said[index] = text
+                self._texts[index] = text
 
 
 def _offer_whole_pictures(controls: Any) -> None:
     """Leave nerfstudio's "gl_z_buf_depth" out of the lists of outputs.
 
-    It is made smaller than the picture. nerfstudio puts it into the split screen at first, and joining the two ends the
+    It is smaller than the picture. nerfstudio puts it into the split screen at first, and joining the two ends the
     render thread.
     """
     offer = controls.update_output_options

@@ -1,23 +1,21 @@
-"""Which Gaussian lies under the cursor."""
+"""Picking of the Gaussian under the cursor."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs
 
-_FOCAL = 1000.0  # of the one pixel that is drawn: about that of a full-screen view, so that it is as sharp
+_FOCAL = 1000.0  # of the one rendered pixel: about that of a full-screen view, so that it is as sharp
 
 
 def camera_along(origin: Sequence[float], direction: Sequence[float]) -> Camera:
-    """A view of one pixel whose centre looks from ``origin`` along ``direction`` (world; of any length but 0)."""
+    """Return a view of one pixel that looks from ``origin`` along ``direction`` (world; of any length but 0)."""
     position, along = (torch.tensor([float(x) for x in point], dtype=torch.float64) for point in (origin, direction))
     forward = along / along.norm()
     aside = torch.zeros(3, dtype=torch.float64)
@@ -31,27 +29,18 @@ def camera_along(origin: Sequence[float], direction: Sequence[float]) -> Camera:
     return Camera(viewmat.float(), K, 1, 1)
 
 
-@dataclass(frozen=True)
-class Picked:
-    """The dominant_gaussian Gaussian of a pixel: its index among those that were drawn, and its class."""
-
-    index: int
-    class_id: int
-
-
 @torch.no_grad()
 def pick(
     rasterizer: Rasterizer,
     surfels: Surfels,
-    class_ids: Tensor,
     settings: RasterSettings,
     origin: Sequence[float],
     direction: Sequence[float],
-) -> Picked | None:
-    """The surfel with the largest w_i along a ray; None where nothing is.
+) -> int | None:
+    """Return the index of the Gaussian with the largest w_i along a ray; None where nothing is. Renders one pixel.
 
-    surfels: N surfels, as they are drawn. class_ids: [N] int, phi. origin, direction: [3], world. Draws one pixel.
+    surfels: N Gaussians, as they are rendered. origin, direction: [3], world.
     """
     camera = camera_along(origin, direction).to(surfels.means.device)
     index = int(rasterizer.dominant_gaussian(geometry_inputs(surfels), camera, settings)[0, 0])
-    return None if index < 0 else Picked(index, int(class_ids[index]))
+    return None if index < 0 else index

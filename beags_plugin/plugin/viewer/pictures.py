@@ -1,4 +1,4 @@
-"""Pictures of what the losses see, for people."""
+"""Pictures of classes, boundary errors and values per Gaussian."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from beags_plugin.rasterizers.rendering import geometry_inputs
 
 
 def class_picture(class_map: Tensor) -> Tensor:
-    """[H, W, 3] float32 in 0..1, the classes' colours. class_map: [H, W] integer ids or IGNORE."""
+    """Return [H, W, 3] float32 in 0..1, the classes' colours. class_map: [H, W] integer ids or IGNORE."""
     colors = colorize(class_map.cpu().numpy().astype(np.uint16))
     return torch.from_numpy(colors).to(class_map.device).float() / 255.0
 
@@ -26,9 +26,9 @@ def class_picture(class_map: Tensor) -> Tensor:
 def boundary_picture(
     rasterizer: Rasterizer, surfels: Surfels, class_ids: Tensor, camera: Camera, settings: RasterSettings, mask: Tensor
 ) -> Tensor:
-    """[H, W, 1] in 0..1, B(u): the share of each pixel that shows another class than its mask does (E7).
+    """Return [H, W, 1] in 0..1, B(u): the share of each pixel that shows another class than its mask (E7).
 
-    surfels: N surfels. class_ids: [N] int32, phi. mask: [H, W] int32 ids of this view, or IGNORE, where it is 0.
+    surfels: N Gaussians. class_ids: [N] int32, phi. mask: [H, W] int32 ids of this view, or IGNORE, where B is 0.
     """
     inputs = geometry_inputs(surfels, class_ids)
     bare = replace(settings, geometry=False, distortion=False)
@@ -41,14 +41,14 @@ def boundary_picture(
 def value_picture(
     rasterizer: Rasterizer, surfels: Surfels, values: Tensor, camera: Camera, settings: RasterSettings
 ) -> Tensor:
-    """[H, W, 1], a value per surfel composited as a colour is: sum_i w_i value_i. values: [N] float."""
+    """Return [H, W, 1], a value per Gaussian composited like a colour: sum_i w_i value_i. values: [N] float."""
     inputs = replace(geometry_inputs(surfels), colors=values[:, None].expand(-1, 3).to(surfels.means).contiguous())
     bare = replace(settings, geometry=False, distortion=False)
     return rasterizer.rasterize(inputs, camera, bare, inputs.means.new_zeros(3)).color[..., :1]
 
 
 def fitted_camera(camera: Camera, width: int, height: int) -> Camera:
-    """The same view at the largest size that fits into ``width`` x ``height`` pixels, each side at least 1."""
+    """Return the same view at the largest size that fits into ``width`` x ``height`` pixels, each side at least 1."""
     factor = min(width / camera.width, height / camera.height)
     new_width = min(max(1, round(camera.width * factor)), width)
     new_height = min(max(1, round(camera.height * factor)), height)
@@ -57,7 +57,7 @@ def fitted_camera(camera: Camera, width: int, height: int) -> Camera:
 
 
 def framed(picture: Tensor, width: int, height: int) -> Tensor:
-    """[height, width, C], ``picture`` [h, w, C] in the middle of a black one that is no smaller."""
+    """Return [height, width, C], ``picture`` [h, w, C] in the middle of a black one that is no smaller."""
     frame = picture.new_zeros(height, width, picture.shape[2])
     top, left = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
     frame[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
@@ -65,9 +65,9 @@ def framed(picture: Tensor, width: int, height: int) -> Tensor:
 
 
 def nearest_view(camera: Camera, views: Sequence[Camera], extent: float) -> int:
-    """Index of the view that looks from nearest, and most the same way.
+    """Return the index of the view that looks from nearest, and most the same way.
 
-    extent: size of the scene, world units: so far away counts as much as looking at a right angle.
+    extent: size of the scene, world units; such a distance counts as much as a right angle between the views.
     """
     centers = torch.stack([view.center for view in views]).double()
     forwards = torch.stack([view.rotation[2] for view in views]).double()

@@ -1,4 +1,4 @@
-"""What a viewer shows of a run besides its scene: the training views' masks, and the voxel grid."""
+"""Parts of a run that a viewer shows besides its scene: the training views' masks, and the voxel grid."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _KEPT_MASKS = 8  # of the views that were looked at last
 
 
 class ViewedRun:
-    """A run on disk with its data manager; what takes time to read is read when ``load_`` is called, by the panel.
+    """A run on disk with its data manager; the panel calls ``load_grid``, which is slow.
 
-    folder: of the run. names: of the training views. cameras: theirs, without lens distortion. grid: the voxel grid
-    of a finished run; None until ``load_grid``.
+    folder: of the run. names: of the training views. cameras: theirs, without lens distortion. grid: the voxel grid of
+    a finished run; None until ``load_grid``.
     """
 
     def __init__(self, folder: Path, datamanager: BeagsDataManager) -> None:
@@ -50,18 +50,17 @@ class ViewedRun:
 
     @property
     def prepared(self) -> Path | None:
-        """The folder of what refinement was prepared with: of this run, or of that which it was taken from.
+        """Return the folder that refinement was prepared with: of this run, or of its origin.
 
-        None while the scene that is shown has been through no preparation; else that of the last round that it has been
-        through: a folder that is used again may hold those of a former run, and the run that this is an extract of may
-        have been prepared again.
+        None while the shown scene has been through no preparation; else the folder of its last round: a folder that is
+        used again may hold rounds of a former run, and the origin of an extracted run may have been prepared again.
         """
         folder = self._round()
         return None if folder is None or self._replaced(folder) else folder
 
     @property
     def note(self) -> str | None:
-        """A sentence for the user where what lies on disk is no longer what this scene was prepared with."""
+        """Return a sentence for users where the files on disk are no longer those that this scene was prepared with."""
         folder = self._round()
         if folder is None or not self._replaced(folder):
             return None
@@ -71,7 +70,7 @@ class ViewedRun:
         )
 
     def _round(self) -> Path | None:
-        """The folder of the round, if something is there."""
+        """Return the folder of the round, if it holds anything."""
         rounds = self.rounds()
         if rounds == 0:
             return None
@@ -79,7 +78,7 @@ class ViewedRun:
         return folder if (folder / "grid.pt").exists() else None
 
     def _replaced(self, folder: Path) -> bool:
-        """Whether the round's folder holds something else than when this run was extracted, as far as that is known."""
+        """Return whether the round's folder has changed since this run was extracted, as far as that is known."""
         if self._kept is None:
             return False
         try:
@@ -90,11 +89,11 @@ class ViewedRun:
 
     @property
     def has_grid(self) -> bool:
-        """Whether refinement was prepared with a voxel grid (some refiners need none, and keep an empty file)."""
+        """Return whether refinement was prepared with a voxel grid (without one some refiners keep an empty file)."""
         return self.prepared is not None and bool(grid_state(self.prepared / "grid.pt", mmap=True))
 
     def load_grid(self) -> bool:
-        """Read the voxel grid; tells whether there was one to read."""
+        """Read the voxel grid; return whether there was one to read."""
         prepared = self.prepared
         if self.grid is not None or prepared is None:
             return False
@@ -102,7 +101,8 @@ class ViewedRun:
         return self.grid is not None
 
     def mask(self, view: int, kind: str, width: int, height: int) -> Tensor | None:
-        """[height, width] int32 ids or IGNORE of a training view, "before" reprojection or "after"; None without one.
+        """Return [height, width] int32 ids or IGNORE of a training view, "before" reprojection or "after"; None without
+        one.
 
         Raises ``UserError`` for a file that cannot be read.
         """
@@ -115,5 +115,5 @@ class ViewedRun:
 
 
 def _read_mask(path: Path, _changed: int) -> np.ndarray:
-    """_changed: time of the file's last change, so that what is kept in memory is read again after one."""
+    """Read a mask; _changed, the time of the file's last change, makes a cache read it again after one."""
     return read_id_mask(path)

@@ -1,4 +1,4 @@
-"""The pictures that nerfstudio asks of a model, and those that its viewer asks for besides."""
+"""Pictures that nerfstudio asks of a model, and further ones of its viewer."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ CHANNELS = {
     "mask_before": 3,
     "mask_after": 3,
 }
-"""What can be shown besides what every run has: name to number of channels."""
+"""Pictures beyond those of every run: name to number of channels."""
 OF_TRAINING_VIEWS = frozenset({"boundary_error", "mask_before", "mask_after"})
 NO_CLASSES = "the Gaussians have no classes yet: they get them between base training and refinement."
 
 
 def asked_by_viewer() -> bool:
-    """Whether nerfstudio's viewer asks, not evaluation or a renderer: what is hidden there must not change figures."""
+    """Return whether nerfstudio's viewer asks; for evaluation and renderers nothing is hidden."""
     return isinstance(threading.current_thread(), RenderStateMachine)
 
 
 def scene_outputs(model: SceneModel, camera: Camera) -> dict[str, Tensor]:
-    """The whole scene (inside nerfstudio's crop box), as evaluation, ns-render and ns-export see it.
+    """Render the whole scene (inside nerfstudio's crop box), for evaluation, ns-render and ns-export.
 
     Each [H, W, 1 or 3] float32: rgb, depth (world units along z), normal, accumulation, background; with classes also
     class_map (colours) and class_confidence (the winner's share).
@@ -63,7 +63,7 @@ def scene_outputs(model: SceneModel, camera: Camera) -> dict[str, Tensor]:
 
 
 def plain_outputs(model: SceneModel, scene: Visible, camera: Camera, background: Tensor) -> dict[str, Tensor]:
-    """What every run can show: see ``scene_outputs``."""
+    """Render the pictures that every run has: see ``scene_outputs``."""
     background = background.to(model.device)
     inputs = surfel_inputs(scene.surfels, camera, model.active_sh_degree())
     render = model.rasterizer.rasterize(inputs, camera, model.settings(), background)
@@ -78,13 +78,13 @@ def plain_outputs(model: SceneModel, scene: Visible, camera: Camera, background:
 
 
 def class_outputs(model: SceneModel, scene: Visible, camera: Camera) -> dict[str, Tensor]:
-    """The class that each pixel shows, in its colour, and the share that it has of the pixel."""
+    """Render the class of each pixel, in its colour, and its share of the pixel."""
     classes, share = render_class_map(model.rasterizer, scene.surfels, scene.class_ids, camera, model.settings())
     return {"class_map": class_picture(classes), "class_confidence": share[..., None].float()}
 
 
 def rounds_of(model: SceneModel) -> int:
-    """Return how often refinement has been prepared for the scene as it now is; a checkpoint tells it by its steps."""
+    """Return the number of preparations of the scene as it now is; a checkpoint shows it by its steps."""
     if model.prepared_rounds is not None:
         return model.prepared_rounds
     if not bool(model.assigned):
@@ -94,28 +94,28 @@ def rounds_of(model: SceneModel) -> int:
 
 
 def within(model: SceneModel, box: OrientedBox | None) -> Tensor | None:
-    """[N] bool, the surfels in nerfstudio's crop box; None without one."""
+    """Return [N] bool, the Gaussians in nerfstudio's crop box; None without one."""
     return None if box is None else box.within(model.means).reshape(-1)
 
 
 @dataclass(frozen=True)
 class Shares:
-    """What ``violation_shares`` gave for the scene in the state that ``key`` names."""
+    """Result of ``violation_shares`` for the scene in the state ``key``."""
 
     key: tuple
     values: Tensor
 
 
 class Viewing:
-    """What a viewer has been told to show of a model, and the drawing of it.
+    """The pictures of a model that a viewer asks for.
 
     The panel's threads set ``choice`` and ``shares``; the viewer's render threads call ``outputs``. Nerfstudio raises
-    an exception between any two lines of a drawing that the user has made obsolete, and any other exception ends the
-    render thread for good: what a drawing changes is changed by one assignment, and what may fail becomes a note.
+    an exception between any two lines of an obsolete rendering, and any other exception ends the render thread for
+    good: so a rendering changes its results by one assignment, and a failure becomes a note.
 
-    choice: what is shown. background: [3], the viewer's. listed: names of ``CHANNELS`` that this run may be asked for;
-    the same ones as long as a viewer runs. wanted: gives those that it shows now. crop_box: gives the viewer's.
-    run: what the run has on disk. notes: what is to be said of the pictures of the last drawing.
+    background: [3], the viewer's. listed: names of ``CHANNELS`` that this run offers; the same ones as long as a viewer
+    runs. wanted: returns those that it shows now. crop_box: returns the viewer's. run: the run's files. notes: remarks
+    on the pictures of the last rendering.
     """
 
     def __init__(self, model: SceneModel) -> None:
@@ -132,10 +132,10 @@ class Viewing:
         self._rest_until = 0.0
 
     def attach(self, run: ViewedRun, training: bool, lock: threading.Lock | None) -> None:
-        """A viewer is there.
+        """Begin work with a viewer.
 
-        run: what the run has besides its scene. training: whether it is being trained. lock: held by whoever changes
-        the scene, or draws it for the viewer.
+        run: parts of the run besides its scene. training: whether it is being trained. lock: held by whoever changes
+        the scene, or renders it for the viewer.
         """
         self.lock = lock or self.lock
         run.rounds = lambda: rounds_of(self.model)
@@ -153,13 +153,13 @@ class Viewing:
         self.listed = tuple(name for name in CHANNELS if available[name])
 
     def shown(self, rest: bool = True) -> Visible:
-        """The surfels that the choice leaves. rest: whether what is only faded counts."""
+        """Return the Gaussians that the choice leaves; rest: False leaves the faded ones out."""
         model = self.model
         choice = self.choice if bool(model.assigned) else Choice(min_opacity=self.choice.min_opacity)
         return shown(model.surfels().detach(), model.class_ids, choice, rest, within(model, self.crop_box()))
 
     def outputs(self, camera: Camera) -> dict[str, Tensor]:
-        """Every picture that the viewer lists; those that it does not show at present are left black."""
+        """Render every picture that the viewer lists; those that it does not show at present are left black."""
         model, notes = self.model, {}
         wanted = self.wanted() & frozenset(self.listed)
         scene = self.shown()
@@ -193,7 +193,7 @@ class Viewing:
     def _of_training_view(
         self, names: frozenset[str], scene: Visible, camera: Camera, notes: dict[str, str]
     ) -> dict[str, Tensor]:
-        """Pictures of the training view nearest to ``camera``, as large as fits into the viewer's picture."""
+        """Render pictures of the training view nearest to ``camera``, as large as fits into the viewer's picture."""
         model, run = self.model, self.run
         if run is None:
             notes["view"] = "There are no training views: no run is shown."
@@ -215,9 +215,8 @@ class Viewing:
         target = before if after is None else after
         if "boundary_error" in names:
             if target is None or not bool(model.assigned):
-                notes["boundary"] = (
-                    f"No boundary error: {NO_CLASSES if target is not None else 'the view has no mask.'}"
-                )
+                reason = NO_CLASSES if target is not None else "the view has no mask."
+                notes["boundary"] = f"No boundary error: {reason}"
             else:
                 error = boundary_picture(
                     model.rasterizer, scene.surfels, scene.class_ids, fitted, model.settings(), target
@@ -226,15 +225,16 @@ class Viewing:
         return outputs
 
     def copy(self, rest: bool = True) -> Visible:
-        """``shown``, in memory of its own; waits for the training step, if there is one."""
+        """Return ``shown`` in memory of its own; waits for the training step, if there is one."""
         with self.lock:
             scene = self.shown(rest)
             return Visible(scene.surfels.clone(), scene.class_ids.clone(), scene.index)
 
     def refresh_shares(self) -> bool:
-        """Compute what ``occupancy_violation`` shows, if the scene has changed; tells whether it did.
+        """Compute the shares behind ``occupancy_violation``, if the scene has changed; return whether it did.
 
-        Outside the lock, so that neither training nor drawing waits, and at most a tenth of the time.
+        The work happens outside the lock, so that neither training nor rendering waits, and at most a tenth of the
+        time.
         """
         model = self.model
         grid = model.grid or (None if self.run is None else self.run.grid)

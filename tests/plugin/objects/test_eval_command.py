@@ -1,4 +1,4 @@
-"""``beags eval`` on runs on disk: figures, files, and what is said of mistakes."""
+"""``beags eval`` on runs on disk: figures and files."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ RASTER = RasterSettings(0.03, 300.0, geometry=False)
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """config.yml of a run with a base, on data with ground truth at twice the size of the photographs."""
+    """Return config.yml of a run with a base, on data with ground truth at twice the size of the photographs."""
     root = tmp_path_factory.mktemp("lab")
     return write_trained(root / "run", write_scene(root / "lab", truth_factor=2))
 
 
-def drawn(config, surfels, index: int, background: float = 0.0):
-    """Colour and alpha of a held-out view, drawn for this test."""
+def rendered(config, surfels, index: int, background: float = 0.0):
+    """Render the colour and alpha of a held-out view."""
     camera = EvaluatedRun(config).views.manager.views("test")[index].camera
     with torch.no_grad():
         inputs = surfel_inputs(surfels, camera)
@@ -56,11 +56,11 @@ def test_the_figures_of_a_run_are_those_of_its_files(trained):
         surfels, ids = discs(shift=shift)
         for index, name in enumerate(("v00", "v08")):
             photo = np.asarray(Image.open(root / f"images/{name}.png")) / 255.0
-            error = np.mean((drawn(trained, surfels, index).color.clamp(0, 1).numpy() - photo) ** 2)
+            error = np.mean((rendered(trained, surfels, index).color.clamp(0, 1).numpy() - photo) ** 2)
             assert scene.views[index].psnr == pytest.approx(-10 * np.log10(error), abs=1e-3)
             silhouette = np.asarray(Image.open(root / f"ground_truth/silhouettes/cup/{name}.png")) > 0
             assert silhouette.shape == (2 * HEIGHT, 2 * WIDTH)
-            alone = drawn(trained, surfels[ids == 1], index).alpha.numpy() > 0.5
+            alone = rendered(trained, surfels[ids == 1], index).alpha.numpy() > 0.5
             alone = alone.repeat(2, axis=0).repeat(2, axis=1)
             mask = next(m for m in scene.masks if (m.kind, m.class_id, m.view) == ("extracted", 1, index))
             assert mask.truth == "silhouette"
@@ -126,12 +126,9 @@ def test_a_base_without_classes_has_image_figures_only(tmp_path, capsys):
     assert run.before is None and run.after.masks == () and run.after.ssim is not None
 
 
-def test_data_without_masks_is_said_to_have_none(tmp_path):
-    config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab", masks=False), base=False)
+def test_notes_name_missing_masks_and_views_that_were_trained_on(tmp_path):
+    config = write_trained(tmp_path / "bare", write_scene(tmp_path / "without", masks=False), base=False)
     assert evaluate_run(config).notes == ("No held-out view has a mask, so only images are scored.",)
-
-
-def test_views_that_were_trained_on_are_named(tmp_path):
     config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"), base=False)
     text = config.read_text()
     assert "eval_interval: 8" in text
@@ -192,7 +189,7 @@ def test_photographs_with_alpha_stand_on_the_background_of_the_training(tmp_path
     expected = share * rgba[..., :3] / 255.0 + (1 - share) * value
     assert views[0].image is not None
     np.testing.assert_allclose(views[0].image.numpy(), expected, atol=0.6 / 255)  # 8 bits
-    error = np.mean((drawn(config, discs()[0], 0, value).color.clamp(0, 1).numpy() - expected) ** 2)
+    error = np.mean((rendered(config, discs()[0], 0, value).color.clamp(0, 1).numpy() - expected) ** 2)
     assert evaluate_run(config).after.views[0].psnr == pytest.approx(-10 * np.log10(error), abs=0.02)
 
     batch = views.manager.fixed_indices_eval_dataloader[0][1]
@@ -210,47 +207,23 @@ def test_the_option_who_is_resized_reaches_the_files(trained):
     run = evaluate_run(trained, Protocol(resize="truth"))
     surfels, ids = discs()
     truth = np.asarray(Image.open(trained.parents[1] / "lab/ground_truth/silhouettes/cup/v00.png")) > 0
-    alone = drawn(trained, surfels[ids == 1], 0).alpha.numpy() > 0.5
+    alone = rendered(trained, surfels[ids == 1], 0).alpha.numpy() > 0.5
     assert run.after.masks[0].metrics == mask_metrics(alone, truth, None, Protocol(resize="truth"))
     assert run.after.masks[0].metrics.iou == pytest.approx(
         (alone & truth[1::2, 1::2]).sum() / (alone | truth[1::2, 1::2]).sum()
     )
 
 
-def mistake(arguments: list[str], capsys) -> str:
-    with pytest.raises(SystemExit) as ended:
-        main(["eval", *arguments])
-    assert ended.value.code == 2
-    printed = capsys.readouterr()
-    assert "Traceback" not in printed.out + printed.err
-    return " ".join(printed.out.split())
-
-
-def test_mistakes_are_told_in_a_sentence(trained, tmp_path, capsys):
-    config, run = str(trained), ["--load-config", str(trained)]
-    assert "absent.yml cannot be read" in mistake(["--load-config", str(tmp_path / "absent.yml")], capsys)
-    assert "is given twice" in mistake([*run, config], capsys)
-    assert "threshold is 1.5" in mistake([*run, "--threshold", "1.5"], capsys)
-    assert "is no .png or .jpg" in mistake([*run, "--picture", str(tmp_path / "a.txt")], capsys)
-    assert "worst is 0" in mistake([*run, "--worst", "0"], capsys)
-    assert "is a folder" in mistake([*run, "--json", str(tmp_path)], capsys)
-    (tmp_path / "file").write_text("")
-    assert "cannot be written" in mistake([*run, "--csv", str(tmp_path / "file" / "a.csv")], capsys)
-
-
-def test_data_that_has_gone_is_named(tmp_path):
-    config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"))
-    (tmp_path / "lab").rename(tmp_path / "moved")
+def test_data_that_has_gone_and_truth_of_other_proportions_are_refused(tmp_path):
+    data = write_scene(tmp_path / "lab", truth_factor=2)
+    write_image(data / "ground_truth/masks/v08.png", np.zeros((2 * HEIGHT, WIDTH), np.uint8))
+    config = write_trained(tmp_path / "run", data)
+    with pytest.raises(UserError, match=r"v08.png is 20x24 pixels but its image is 20x12"):
+        evaluate_run(config)
+    data.rename(tmp_path / "moved")
     with pytest.raises(UserError, match=r"config.yml was trained on .*lab, which is gone: put it back"):
         evaluate_run(config)
     assert load_run_config(config).run_dir == tmp_path / "run"
-
-
-def test_truth_of_other_proportions_is_refused(tmp_path):
-    data = write_scene(tmp_path / "lab", truth_factor=2)
-    write_image(data / "ground_truth/masks/v08.png", np.zeros((2 * HEIGHT, WIDTH), np.uint8))
-    with pytest.raises(UserError, match=r"v08.png is 20x24 pixels but its image is 20x12"):
-        evaluate_run(write_trained(tmp_path / "run", data))
 
 
 def test_unlabelled_ids_of_the_truth_do_not_count(tmp_path):

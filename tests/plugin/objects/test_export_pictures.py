@@ -57,7 +57,7 @@ class ReadMesh:
     colors: np.ndarray
 
     def seen_by(self, view: View) -> Picture:
-        """One ray through the middle of each pixel; the colour between the corners of the face that it hits."""
+        """Cast a ray through the middle of each pixel; interpolate the colours of the face that it hits."""
         scene = open3d.t.geometry.RaycastingScene()
         scene.add_triangles(self.vertices.astype(np.float32), self.faces.astype(np.uint32))
         K = np.array([[view.focal, 0, view.cx], [0, view.focal, view.cy], [0, 0, 1]])
@@ -72,12 +72,12 @@ class ReadMesh:
 
 
 def srgb_from_linear(values: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1."""
+    """Return sRGB values (IEC 61966-2-1)."""
     return np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055)
 
 
 def read(path: Path) -> ReadMesh:
-    """By readers of other projects; trimesh gives no vertex colours where a .glb has a material."""
+    """Read a mesh by other projects' readers; trimesh gives no vertex colours where a .glb has a material."""
     if path.suffix == ".glb":
         glb = open3d.io.read_triangle_mesh(str(path))
         linear = np.asarray(glb.vertex_colors)
@@ -93,7 +93,7 @@ def views() -> list[View]:
 
 @pytest.fixture(scope="module")
 def config(tmp_path_factory, views) -> Path:
-    """config.yml of a run of cup and box, whose data parser has turned, moved and scaled the world."""
+    """Return config.yml of a run of cup and box, whose data parser has turned, moved and scaled the world."""
     root = tmp_path_factory.mktemp("lab")
     lens = views[0]
     frames = [
@@ -129,7 +129,7 @@ def config(tmp_path_factory, views) -> Path:
 
 
 def normalised(surfels: Surfels, transform: torch.Tensor, scale: float) -> Surfels:
-    """World surfels in nerfstudio's frame: scale (R p + t); transform: [3, 4], R and t."""
+    """Return world Gaussians in nerfstudio's frame: scale (R p + t); transform: [3, 4], R and t."""
     rotation, shift = transform[:, :3], transform[:, 3]
     means = scale * (surfels.means.double() @ rotation.T + shift)
     turn = torch.from_numpy(quaternion(rotation.numpy()))
@@ -141,7 +141,7 @@ def normalised(surfels: Surfels, transform: torch.Tensor, scale: float) -> Surfe
 
 @pytest.fixture(scope="module")
 def splats(config, views) -> dict[tuple[str, str], Picture]:
-    """The run's own pictures of each object alone, by object and held-out view."""
+    """Render the run's own pictures of each object alone, by object and held-out view."""
     run = EvaluatedRun(config)
     scene = run.stages["after"]
     found = {}
@@ -159,7 +159,7 @@ def splats(config, views) -> dict[tuple[str, str], Picture]:
 
 @pytest.fixture(scope="module")
 def written(config, tmp_path_factory) -> Path:
-    """Meshes of both objects, in the world's frame and centred."""
+    """Write meshes of both objects, in the world's frame and centred."""
     folder = tmp_path_factory.mktemp("meshes")
     for frame in ("world", "object"):
         main(["export", "--load-config", str(config), "--all", "--format", "glb", "obj", "--resolution", "96",

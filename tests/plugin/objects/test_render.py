@@ -60,23 +60,9 @@ def test_the_data_are_not_needed(tmp_path):
     assert render_run(config, ("cup",), "sheet", tmp_path / "a.png", SMALL).exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ((("unicorn",), "sheet"), "there is no object 'unicorn'"),
-        (((), "hologram"), "there is no format 'hologram': choose one of video, sheet, before-after."),
-        (((), "sheet", "a.mp4"), "the picture a.mp4 is no .png or .jpg: give it such a name."),
-        (((), "video", "a.png"), "the film a.png is no .mp4 or .gif: give it such a name."),
-        (((), "before-after", "a.txt"), "the picture a.txt is no .png or .jpg (or .mp4, .gif): give it such a name."),
-    ],
-)
-def test_mistakes_are_told_before_anything_is_drawn(config, arguments, words):
-    from pathlib import Path
-
-    objects, form, *output = arguments
-    with pytest.raises(UserError) as error:
-        render_run(config, objects, form, Path(output[0]) if output else None, SMALL)
-    assert words in str(error.value)
+def test_an_unknown_format_is_refused(config):
+    with pytest.raises(UserError, match="there is no format 'hologram': choose one of video, sheet, before-after."):
+        render_run(config, (), "hologram", None, SMALL)
 
 
 def test_a_run_that_has_kept_no_base_has_nothing_to_compare(tmp_path):

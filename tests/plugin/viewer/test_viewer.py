@@ -37,7 +37,7 @@ def opened(finished):
 
 @pytest.fixture
 def window(opened):
-    """The viewer of the finished run, as it is when it opens."""
+    """Return the viewer of the finished run, as it is when it opens."""
     opened.model.viewing.run = ViewedRun(opened.model.viewing.run.folder, opened.model.viewing.run.datamanager)
     opened.model.viewing.shares, opened.model.viewing.notes, opened.panel.notes = None, {}, {}
     opened.panel.choose(Choice())
@@ -186,26 +186,26 @@ def test_an_export_says_in_the_panel_how_it_ended(window, monkeypatch):
     panel = window.panel
     panel.choose(Choice(min_opacity=1.0))
     panel.files.start()
-    assert said(panel, "Not exported: nothing is shown")
+    assert note_of(panel, "Not exported: nothing is shown")
     panel.choose(Choice())
     panel.files.start()
-    assert "shown_scene" in said(panel, "Exported to")
+    assert "shown_scene" in note_of(panel, "Exported to")
     panel.follow()
     assert "shown" in panel._status.content
     monkeypatch.setattr(panel.files, "write", lambda: 1 / 0)
     panel.files.start()
-    assert said(panel, "Not exported (ZeroDivisionError")
-    panel.files.say_views(3, 9)
-    assert said(panel, "Exporting: 3 of 9 views")
+    assert note_of(panel, "Not exported (ZeroDivisionError")
+    panel.files.report_views(3, 9)
+    assert note_of(panel, "Exporting: 3 of 9 views")
     gate = threading.Event()
     monkeypatch.setattr(panel.files, "write", gate.wait)
     panel.files.start()
     panel.files.start()
-    assert said(panel, "The former export")
+    assert note_of(panel, "The former export")
     gate.set()
 
 
-def said(panel, beginning: str) -> str:
+def note_of(panel, beginning: str) -> str:
     end = time.monotonic() + 120
     while not panel.notes.get("export", "").startswith(beginning):
         assert time.monotonic() < end, panel.notes

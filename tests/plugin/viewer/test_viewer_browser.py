@@ -22,9 +22,9 @@ OUTPUTS = (
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
-    """The config.yml of a run, and the address of its viewer.
+    """Yield the config.yml of a run, and the address of its viewer.
 
-    The scene is so small that all of it is seen from where the viewer's camera is at first.
+    The scene is so small that the viewer's first camera sees all of it.
     """
     root = tmp_path_factory.mktemp("served")
     config = write_trained(root / "run", write_scene(root / "lab"), scale=0.1)
@@ -35,7 +35,7 @@ def served(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def opened(served):
-    """One page for all tests: a browser that draws without a GPU is slow to start."""
+    """Yield one page for all tests: a browser without a GPU is slow to start."""
     with Page(served[1], WIDTH, HEIGHT) as page:
         page.wait_for_text("Export what is shown", 200)
         yield page
@@ -43,7 +43,7 @@ def opened(served):
 
 @pytest.fixture
 def page(opened):
-    """As it is when it opens."""
+    """Return the page as it is when it opens."""
     opened.press("Show all objects")
     for label in ("Rest", "Least opacity"):
         opened.slide(label, 0)
@@ -51,7 +51,7 @@ def page(opened):
 
 
 def struck(page: Page) -> str:
-    """What the legend says is not shown."""
+    """Return the struck-out names of the legend."""
     return page.evaluate("[...document.querySelectorAll('del')].map(e => e.innerText).join()")
 
 

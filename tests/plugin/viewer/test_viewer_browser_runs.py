@@ -23,7 +23,7 @@ STEPS = 60, 240  # of base and refinement
 
 
 def step_of(page: Page) -> int:
-    """The training step that the page shows."""
+    """Return the training step that the page shows."""
     found = re.search(r"Step: (\d+)", page.text())
     return int(found[1]) if found else -1
 

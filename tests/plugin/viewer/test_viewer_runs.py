@@ -1,4 +1,4 @@
-"""Which masks and grids a viewer shows of a run: in training, used again, a base alone, extracted from another."""
+"""Masks and grids of a run in the viewer: in training, used again, a base alone, extracted from another."""
 
 from __future__ import annotations
 
@@ -125,22 +125,17 @@ def test_an_extracted_run_whose_origin_was_trained_again_shows_none_of_its_masks
     assert Stand(again.config).panel.notes == {}
 
 
-def test_an_extract_that_does_not_say_what_it_was_prepared_with_shows_what_is_there(finished, tmp_path):
+def test_an_extracted_run_without_digests_shows_masks_and_one_without_its_origin_does_not(finished, tmp_path):
     (extracted,) = extract_objects(finished, ["cup"], output=tmp_path / "out")
     origin = extracted.config.parent / "extraction.json"
     content = json.loads(origin.read_text())
-    assert len(content.pop("prepared")) == 1
+    assert len(content["prepared"]) == 1
+    origin.write_text(json.dumps({**content, "run": str(tmp_path / "gone/config.yml")}))
+    listed = set(Stand(extracted.config).look())
+    assert listed == ALWAYS | {"class_map", "class_confidence", "boundary_error", "mask_before"}
+    del content["prepared"]
     origin.write_text(json.dumps(content))
     assert {"mask_after", "occupancy_violation"} <= set(Stand(extracted.config).look())
-
-
-def test_an_extracted_run_whose_origin_is_gone_lists_less(finished, tmp_path):
-    (extracted,) = extract_objects(finished, ["cup"], output=tmp_path / "out")
-    origin = extracted.config.parent / "extraction.json"
-    origin.write_text(json.dumps({**json.loads(origin.read_text()), "run": str(tmp_path / "gone/config.yml")}))
-    window = Stand(extracted.config)
-    listed = set(window.look())
-    assert listed == ALWAYS | {"class_map", "class_confidence", "boundary_error", "mask_before"}
 
 
 def test_a_base_without_masks_lists_what_it_has(tmp_path):

@@ -1,8 +1,9 @@
-"""What a viewer shows, without nerfstudio: choices of objects, picking, pictures, the legend's text."""
+"""Parts of the viewer without nerfstudio: choices of objects, picking, pictures, the legend's text."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ SETTINGS = RasterSettings(0.01, 100.0)
 
 
 def view(width: int = 32, height: int = 24, distance: float = 3.0, turn: float = 0.0) -> Camera:
-    """Looks at the origin from ``distance`` away, from an angle ``turn`` about the y axis."""
+    """Return a view of the origin from ``distance`` away, from an angle ``turn`` about the y axis."""
     cos, sin = math.cos(turn), math.sin(turn)
     viewmat = torch.tensor([[cos, 0, sin, 0], [0, 1, 0, 0], [-sin, 0, cos, distance], [0, 0, 0, 1]])
     K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]])
@@ -41,24 +42,14 @@ def view(width: int = 32, height: int = 24, distance: float = 3.0, turn: float =
 
 
 def wall(z: float, x: float = 0.0, scale: float = 0.3, opacity: float = 0.9) -> Surfels:
-    """One disc that faces the z axis."""
-    return Surfels.of(
-        torch.tensor([[x, 0.0, z]]),
-        torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        torch.full((1, 2), math.log(scale)),
-        torch.logit(torch.tensor([opacity])),
-        torch.zeros(1, 1, 3),
-    )
+    """Return one disc that faces the z axis."""
+    quat, log_scales = torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 2), math.log(scale))
+    opacity_logits = torch.logit(torch.tensor([opacity]))
+    return Surfels.of(torch.tensor([[x, 0.0, z]]), quat, log_scales, opacity_logits, torch.zeros(1, 1, 3))
 
 
 def joined(*parts: Surfels) -> Surfels:
-    return Surfels.of(
-        torch.cat([p.means for p in parts]),
-        torch.cat([p.quats for p in parts]),
-        torch.cat([p.log_scales for p in parts]),
-        torch.cat([p.opacity_logits for p in parts]),
-        torch.cat([p.sh for p in parts]),
-    )
+    return Surfels(*(torch.cat([getattr(part, one.name) for part in parts]) for one in fields(Surfels)))
 
 
 # -- choices ---------------------------------------------------------------------------------------------------------
@@ -124,8 +115,7 @@ def test_the_least_opacity_and_a_crop_box_leave_surfels_out():
 
 def test_the_ray_of_a_pixel_picks_what_the_whole_picture_has_there(rasterizer):
     """Same surfel as ``dominant_gaussian`` of a whole view whose pixels are as fine as the one that picking draws."""
-    surfels, ids = discs()
-    camera = view(24, 20)
+    surfels, _ = discs()
     K = torch.tensor([[1000.0, 0, 12.0], [0, 1000.0, 10.0], [0, 0, 1]])
     for turn, lift in ((0.0, 0.0), (0.7, 0.2), (2.0, -0.1)):
         viewmat = view(turn=turn).viewmat.clone()
@@ -134,23 +124,17 @@ def test_the_ray_of_a_pixel_picks_what_the_whole_picture_has_there(rasterizer):
         whole = rasterizer.dominant_gaussian(geometry_inputs(surfels), camera, SETTINGS)
         for x, y in ((3, 4), (12, 10), (20, 15)):
             local = torch.tensor([(x + 0.5 - 12.0) / 1000, (y + 0.5 - 10.0) / 1000, 1.0])
-            found = pick(
-                rasterizer, surfels, ids, SETTINGS, camera.center.tolist(), (camera.rotation.T @ local).tolist()
-            )
-            expected = int(whole[y, x])
-            assert (-1 if found is None else found.index) == expected
-            assert found is None or found.class_id == int(ids[expected])
+            direction = (camera.rotation.T @ local).tolist()
+            found = pick(rasterizer, surfels, SETTINGS, camera.center.tolist(), direction)
+            assert (-1 if found is None else found) == int(whole[y, x])
 
 
 def test_picking_takes_the_heaviest_not_the_nearest(rasterizer):
-    veil, solid = wall(0.0, opacity=0.2), wall(1.0, opacity=0.9)
-    ids = torch.tensor([5, 7], dtype=torch.int32)
+    both = joined(wall(0.0, opacity=0.2), wall(1.0, opacity=0.9))
     towards = ((0.0, 0.0, -3.0), (0.0, 0.0, 2.0))
-    found = pick(rasterizer, joined(veil, solid), ids, SETTINGS, *towards)
-    assert found is not None and (found.index, found.class_id) == (1, 7)
-    assert pick(rasterizer, joined(veil, solid), ids, SETTINGS, (9.0, 0.0, -3.0), (0.0, 0.0, 1.0)) is None
-    none = joined(veil, solid)[torch.zeros(0, dtype=torch.int64)]
-    assert pick(rasterizer, none, ids[:0], SETTINGS, *towards) is None
+    assert pick(rasterizer, both, SETTINGS, *towards) == 1
+    assert pick(rasterizer, both, SETTINGS, (9.0, 0.0, -3.0), (0.0, 0.0, 1.0)) is None
+    assert pick(rasterizer, both[torch.zeros(0, dtype=torch.int64)], SETTINGS, *towards) is None
 
 
 @pytest.mark.parametrize("direction", [(0, 0, 1), (0, -1, 0), (1, 0, 0), (0.3, -5.0, 2.0)])
@@ -217,7 +201,7 @@ def test_the_nearest_view_is_near_and_looks_the_same_way():
 
 
 def one_voxel_grid(classes: tuple[int, ...] = (1,)) -> VisibilityGrid:
-    """The 27 voxels of side 1 around the origin are valid for these classes: those next to voxel (0, 0, 0)."""
+    """Return a grid of 27 voxels of side 1 around the origin, valid for these classes."""
     clouds = [(torch.tensor([[0.0, 0.0, 0.0]]), torch.tensor([class_id])) for class_id in classes]
     return VisibilityGrid.from_points(clouds, 1.0, torch.full((3,), -0.5), 8)
 
