@@ -66,16 +66,15 @@ class BeagsModel(SceneModel):
         known = (cameras.metadata or {}).get("camera")  # whose numbers the host has too
         camera = known or camera_from_nerfstudio(cameras, 0).to(self.device)
         needs = frozenset().union(*(loss.needs for loss in self.active_losses().values()))
-        target = (cameras.metadata or {}).get("labels") if "boundary" in needs else None
+        labels = (cameras.metadata or {}).get("labels")
+        against = labels if "boundary" in needs else None
         background = self._training_background()
-        inputs = surfel_inputs(
-            self.surfels(), camera, self.active_sh_degree(), self.class_ids if target is not None else None
-        )
+        class_ids = None if against is None else self.class_ids
+        inputs = surfel_inputs(self.surfels(), camera, self.active_sh_degree(), class_ids)
         if self.growing:
             inputs = replace(inputs, screen_shift=torch.zeros_like(inputs.means[:, :2]).requires_grad_())
-        labels = None if target is None else target.to(self.device, torch.int32)
         settings = self.settings(geometry="geometry" in needs, distortion="distortion" in needs)
-        render = self.rasterizer.rasterize(inputs, camera, settings, background, labels)
+        render = self.rasterizer.rasterize(inputs, camera, settings, background, against)
         self.last_render = LastRender(camera, render, inputs.screen_shift, labels)
         self.clock.mark("rendering")
         outputs = {"rgb": render.color, "accumulation": render.alpha[..., None], "background": background}
@@ -120,7 +119,6 @@ class BeagsModel(SceneModel):
         image = self._truth(batch, outputs["background"])
         if not self.training or self.last_render is None:
             return {"photometric": (outputs["rgb"] - image).abs().mean()}
-        labels = batch.get("labels")
         inputs = LossInputs(
             step=self.step,
             seed=self.seed,
@@ -128,7 +126,7 @@ class BeagsModel(SceneModel):
             camera=self.last_render.camera,
             render=self.last_render.render,
             image=image,
-            labels=None if labels is None else labels.to(self.device, torch.int32),
+            labels=self.last_render.labels,
             class_ids=self.class_ids,
             grid=self.grid,
             draw=self._draw_apart,

@@ -119,7 +119,7 @@ class RefinementSwitch:
         with self.trainer.long_stage(step):
             views = self.datamanager.views("train", original=True)
             with _bar("Reading masks", passing=True) as progress:
-                masks = LabelMaps(view.stored_labels for view in counted(views, len(views), progress))
+                masks = LabelMaps(view.labels for view in counted(views, len(views), progress))
             with released(self.trainer.train_lock):  # minutes, which read the scene only: a viewer may draw it
                 prepared = prepare(
                     model.surfels(),
@@ -159,8 +159,7 @@ class RefinementSwitch:
         self.model.assigned.fill_(True)
 
     def _start(self, grid: VisibilityGrid | None, labels: LabelMaps) -> None:
-        more_rounds = self.rounds < self.model.config.refine_rounds  # which need the masks as the data has them
-        self.datamanager.replace_labels(labels, keep=more_rounds)
+        self.datamanager.replace_labels(labels)
         self.model.grid = None if grid is None else grid.to(self.model.device)
         self.model.frozen = not self.refiner.trains
         self.model.prepared_rounds = self.rounds

@@ -28,8 +28,8 @@ FLATNESS = 1e-3  # exported third scale, relative to the smaller of the two: fla
 class LastRender:
     """The render of the last training step.
 
-    screen_shift: [N, 2] of ``SurfelInputs``, whose gradient densification reads. labels: [H, W] int32 M', against which
-    the boundary was rendered; None without a boundary.
+    screen_shift: [N, 2] of ``SurfelInputs``, whose gradient densification reads. labels: [H, W] int32 of the view, from
+    ``BeagsDataManager``; None if the data gives none.
     """
 
     camera: Camera

@@ -13,7 +13,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_imag
 
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.plugin.views.datamanager import BeagsDataManagerConfig
-from beags_plugin.plugin.views.undistortion import undistort_labels
+from beags_plugin.plugin.views.lens import undistort_labels
 from beags_plugin.plugin.views.views import unique_names
 
 
@@ -149,10 +149,6 @@ def test_replaced_class_maps_reach_batches_and_views(tmp_path):
     data.replace_labels([labels + 1 for labels in new])
     assert (data.views("train", original=True)[0].labels == 1).all()
     assert (data.views("train")[0].labels == 10).all()
-    data.replace_labels(new, keep=False)
-    assert (data.views("train")[1].labels == 6).all()
-    with pytest.raises(ValueError, match="were not kept"):
-        data.views("train", original=True)
 
 
 @pytest.mark.parametrize(
