@@ -1,4 +1,4 @@
-"""The scene as nerfstudio's models hold one, and the state that a run changes."""
+"""The scene as a nerfstudio model, and the state that a run changes."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ class LastRender:
 
 
 class SceneModel(SplatfactoModel):
-    """N surfels as parameters, their classes as buffers, and the state of the run that trains them.
+    """N Gaussians as parameters, their classes as buffers, and the state of the run that trains them.
 
-    It derives from nerfstudio's ``SplatfactoModel`` because ns-export and the viewer ask for that type, but shares
-    none of its training.
+    It derives from nerfstudio's ``SplatfactoModel``, whose type ns-export and the viewer ask for; its training is not
+    used.
 
     classes: id to name. step, seed: of the run. grid: voxels of the classes; None before refinement. growing: whether
     this step gathers gradients for densification. frozen: whether the refiner leaves the scene as it is. last_render:
@@ -112,7 +112,7 @@ class SceneModel(SplatfactoModel):
         return RasterSettings(self.config.near * extent, self.config.far * extent, geometry, distortion)
 
     def active_sh_degree(self) -> int:
-        """Return the degree to render: degrees grow one by one while the base trains; other scenes show them all."""
+        """Return the SH degree to render: it grows one by one while the base trains; else all are rendered."""
         if not self.training or self.schedule.warm or self.schedule.refining(self.step):
             return self.config.sh_degree
         interval = max(self.schedule.scaled(self.config.sh_degree_interval), 1)
@@ -125,14 +125,14 @@ class SceneModel(SplatfactoModel):
         return {name: loss for name, loss in self.losses.items() if loss.active(self.step)}
 
     def generator(self, step: int) -> torch.Generator:
-        """Return a generator seeded by (seed, step), so that a resumed run draws what the uninterrupted one drew."""
+        """Return a generator seeded by (seed, step), so that a resumed run samples as the uninterrupted one."""
         return torch.Generator().manual_seed(self.seed * 1_000_003 + step)
 
-    # -- surfels -----------------------------------------------------------------------------------------------------
+    # -- Gaussians ---------------------------------------------------------------------------------------------------
 
     @property
     def scales(self) -> Tensor:
-        """[N, 3] logs of the scales as exporters want them: the third is thin; the parameter itself has two."""
+        """[N, 3] logs of the scales for exporters: the third is thin; the parameter itself has two."""
         flat = self.gauss_params["scales"]
         thin = flat.min(dim=-1, keepdim=True).values + torch.log(flat.new_tensor(FLATNESS))
         return torch.cat([flat, thin], dim=-1)
@@ -149,10 +149,7 @@ class SceneModel(SplatfactoModel):
         )
 
     def replace_surfels(self, surfels: Surfels) -> None:
-        """Put new parameters in place of all, of any number and degree; classes are reset.
-
-        New ones, since autograd still knows the size of those that the last step's graph holds.
-        """
+        """Replace all parameters, in any number and SH degree; classes are reset."""
         values = {
             "means": surfels.means,
             "features_dc": surfels.sh_dc,
@@ -162,7 +159,7 @@ class SceneModel(SplatfactoModel):
             "quats": surfels.quats,
         }
         self.config.sh_degree = surfels.sh_degree
-        for name, value in values.items():
+        for name, value in values.items():  # new ones: autograd keeps the size of those in the last step's graph
             self.gauss_params[name] = nn.Parameter(value.detach().to(self.device).contiguous())
         self.class_ids = torch.zeros(len(surfels), dtype=torch.int32, device=self.device)
         self.class_margin = torch.zeros(len(surfels), device=self.device)
@@ -170,9 +167,9 @@ class SceneModel(SplatfactoModel):
     # -- checkpoints -------------------------------------------------------------------------------------------------
 
     def load_state_dict(self, state: Mapping[str, Any], **kwargs) -> Any:
-        """Load a checkpoint of any number of surfels; parameters are resized in place (optimizers hold them)."""
+        """Load a checkpoint of any number of Gaussians; parameters are resized in place (optimizers hold them)."""
         count = state["gauss_params.means"].shape[0]
-        # colours are shown as they were trained, whatever degree this config asks for
+        # colours are rendered as they were trained, whatever SH degree this config asks for
         self.config.sh_degree = round((state["gauss_params.features_rest"].shape[1] + 1) ** 0.5) - 1
         for name, parameter in self.gauss_params.items():
             parameter.data = torch.zeros_like(state[f"gauss_params.{name}"], device=self.device)
@@ -181,7 +178,7 @@ class SceneModel(SplatfactoModel):
         return nn.Module.load_state_dict(self, state, **kwargs)  # type: ignore[arg-type]
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return what a checkpoint keeps besides tensors: the class names."""
+        """Return the class names, which a checkpoint keeps besides tensors."""
         return {"classes": dict(self.classes)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:

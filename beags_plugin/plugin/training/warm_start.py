@@ -1,4 +1,4 @@
-"""A run that starts from a scene that is there already, instead of seed points."""
+"""A run that starts from a trained scene instead of seed points."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
 
-START_REPORT = "start.json"  # in a run that started from a scene: what that was, and how well it fits
+START_REPORT = "start.json"  # file of a run that started from a scene: the scene, and how well it fits
 StartFrame = Literal["auto", "world", "normalised"]
-_MOST_VIEWS = 48  # drawn to measure; of more, so many at even distances
-_POOR_DB = 2.0  # a scene that fits draws the photos better than one flat colour does by more than this
+_MOST_VIEWS = 48  # rendered to measure the fit
+_POOR_DB = 2.0  # a scene that fits is better than one flat colour by more than this
 _BETTER_DB = 3.0  # by which another frame must fit better to be proposed
 
 Normalization = tuple[Tensor, float]
@@ -39,16 +39,11 @@ Normalization = tuple[Tensor, float]
 
 @dataclass(frozen=True)
 class Fit:
-    """How well the scene draws the photos, mean over training views, dB; flat: what one flat colour reaches."""
+    """Mean PSNR of the rendered scene and of one flat colour over some training views, dB."""
 
     psnr: float
     flat: float
     views: int
-
-    @property
-    def poor(self) -> bool:
-        """Whether the scene is hardly better than a flat colour."""
-        return self.psnr < self.flat + _POOR_DB
 
 
 def check_start(config: BeagsModelConfig) -> None:
@@ -58,10 +53,9 @@ def check_start(config: BeagsModelConfig) -> None:
 
 
 def start_from_scene(model: SceneModel, datamanager: BeagsDataManager, run: Path) -> None:
-    """Put the scene of ``start_from`` in place of the seed points; says what it was and how well it fits.
+    """Put the scene of ``start_from`` in place of the seed points, and report the scene and how well it fits.
 
-    run: folder of the run, where ``start.json`` keeps what was said. Raises ``UserError`` for a scene that cannot be
-    used.
+    run: folder of the run, for ``start.json``. Raises ``UserError`` for a scene that cannot be used.
     """
     config = model.config
     assert config.start_from is not None
@@ -75,10 +69,10 @@ def start_from_scene(model: SceneModel, datamanager: BeagsDataManager, run: Path
     outputs = datamanager.train_dataparser_outputs
     ours = (outputs.dataparser_transform, float(outputs.dataparser_scale))
     views = datamanager.views("train")
-    candidates: dict[StartFrame, Surfels] = {
-        name: _moved(surfels, scene, name, ours) for name in _frames(config.start_frame)
-    }
-    frame = _frames(config.start_frame)[0]
+    frames: Sequence[StartFrame] = ("auto", "world", "normalised")
+    frames = frames if config.start_frame == "auto" else (config.start_frame,)
+    candidates: dict[StartFrame, Surfels] = {name: _moved(surfels, scene, name, ours) for name in frames}
+    frame = frames[0]
     moved = candidates[frame]
     fit = _measure(model, moved, views)
     model.replace_surfels(moved)
@@ -93,16 +87,11 @@ def start_from_scene(model: SceneModel, datamanager: BeagsDataManager, run: Path
         "flat_psnr": fit.flat,
         "views": fit.views,
     }
-    for line in _told(path, scene, report, lost, fit):
+    for line in _description(path, scene, report, lost, fit):
         CONSOLE.print(f"  {line}", markup=False, highlight=False, soft_wrap=True)
-    if fit.poor:
-        _say_poor(model, path, fit, candidates, views)
+    if fit.psnr < fit.flat + _POOR_DB:
+        _warn_of_poor_fit(model, path, fit, candidates, views)
     write_text_atomically(json.dumps(report, indent=2), run / START_REPORT)
-
-
-def _frames(wanted: StartFrame) -> Sequence[StartFrame]:
-    """The frames that come into question, the one to take first."""
-    return ("auto", "world", "normalised") if wanted == "auto" else (wanted,)
 
 
 def _frame_name(frame: StartFrame, scene: ImportedScene) -> str:
@@ -114,7 +103,7 @@ def _frame_name(frame: StartFrame, scene: ImportedScene) -> str:
 
 
 def _moved(surfels: Surfels, scene: ImportedScene, frame: StartFrame, ours: Normalization) -> Surfels:
-    """The surfels in the frame of this run, x' = scale (R x + t) of the input's x."""
+    """Return the Gaussians in the frame of this run, x' = scale (R x + t) of the input's x."""
     theirs = scene.normalization
     if frame == "normalised" or (frame == "auto" and (scene.note or _same(theirs, ours))):
         return surfels
@@ -126,13 +115,13 @@ def _moved(surfels: Surfels, scene: ImportedScene, frame: StartFrame, ours: Norm
 
 
 def _same(theirs: Normalization | None, ours: Normalization) -> bool:
-    """Whether two runs normalised alike; the file keeps float32 in decimal."""
+    """Return whether two runs normalised alike; the file keeps float32 in decimal."""
     return theirs is not None and torch.equal(theirs[0].float(), ours[0].float()) and math.isclose(theirs[1], ours[1])
 
 
 @torch.no_grad()
 def _measure(model: SceneModel, surfels: Surfels, views: Sequence[View], most: int = _MOST_VIEWS) -> Fit:
-    """Draw training views of the surfels and compare them with the photos."""
+    """Render training views of the Gaussians and compare them with the photos."""
     device = model.device
     surfels = Surfels(**{field.name: getattr(surfels, field.name).to(device) for field in fields(surfels)})
     poses = torch.stack([torch.linalg.inv(view.camera.viewmat) for view in views])
@@ -145,18 +134,20 @@ def _measure(model: SceneModel, surfels: Surfels, views: Sequence[View], most: i
     with progress_bar("drawing the start") as progress:
         for number, view in enumerate(chosen):
             image = view.image_on(model.background_color).to(device)
-            drawn = model.rasterizer.rasterize(
+            color = model.rasterizer.rasterize(
                 surfel_inputs(surfels, view.camera), view.camera, settings, model.background_color.to(device)
             ).color.clamp(0.0, 1.0)
             flat = image.mean(dim=(0, 1))
-            found.append([float(psnr(drawn, image)), float(psnr(flat, image))])
+            found.append([float(psnr(color, image)), float(psnr(flat, image))])
             progress(number + 1, len(chosen))
     scene_psnr, flat_psnr = (sum(values) / len(values) for values in zip(*found, strict=True))
     return Fit(scene_psnr, flat_psnr, len(chosen))
 
 
-def _told(path: Path, scene: ImportedScene, report: dict[str, Any], lost: Flattening | None, fit: Fit) -> list[str]:
-    """What the user should know of the start, a line each."""
+def _description(
+    path: Path, scene: ImportedScene, report: dict[str, Any], lost: Flattening | None, fit: Fit
+) -> list[str]:
+    """Describe the start for the user, a line each."""
     dropped = report["dropped"]
     counted = f"{report['gaussians']:,} Gaussians" + (f" ({dropped:,} dropped: not finite)" if dropped else "")
     lines = [f"start: {path} ({scene.kind}), {counted}, frame: {report['frame']}"]
@@ -173,10 +164,10 @@ def _told(path: Path, scene: ImportedScene, report: dict[str, Any], lost: Flatte
     return lines
 
 
-def _say_poor(
+def _warn_of_poor_fit(
     model: SceneModel, path: Path, fit: Fit, candidates: dict[StartFrame, Surfels], views: Sequence[View]
 ) -> None:
-    """Say that the frame or the scale probably does not fit, and which frame does, if one does."""
+    """Warn that the frame or the scale probably does not fit, and name the frame that does, if one does."""
     sentence = (
         f"{path} draws the training views with {fit.psnr:.1f} dB, hardly better than one flat colour "
         f"({fit.flat:.1f} dB): its frame or scale probably does not fit these poses"

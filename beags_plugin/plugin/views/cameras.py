@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
@@ -48,7 +49,8 @@ def downscaled_size(sizes: Tensor, factor: float) -> Tensor:
 def concatenate_cameras(parts: Sequence[Cameras]) -> Cameras:
     """Join several one-dimensional batches into one [N]."""
     names = ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height", "distortion_params", "camera_type")
-    return Cameras(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
+    joined: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+    return Cameras(**joined)
 
 
 def check_cameras(cameras: Cameras, images: Sequence[Path]) -> None:
