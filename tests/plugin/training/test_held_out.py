@@ -54,9 +54,7 @@ class Data:
 
     def views(self, split):
         greys = {"train": (0.1, 0.2, 0.3), "eval": (0.4, 0.6)}[split]
-        return [
-            View(CAMERA, "view", lambda g=grey: {"image": torch.full((20, 24, 3), g)}, lambda: None) for grey in greys
-        ]
+        return [View(CAMERA, "v", lambda g=grey: {"image": torch.full((20, 24, 3), g)}, lambda: None) for grey in greys]
 
 
 def test_it_measures_all_held_out_views_at_the_given_steps_and_where_phases_end(tmp_path):
