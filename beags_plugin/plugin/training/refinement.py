@@ -45,7 +45,7 @@ class RefinementSwitch:
         self.trainer = trainer
         self.datamanager = datamanager
         self.refiner = REFINERS.get(model.config.refiner)()
-        self.ready = False
+        self.ready = False  # to refine
         self._switching = False  # in the middle of the last base step, before nerfstudio evaluates and saves it
         self._evaluation_due = False
         self._done: int | None = None  # host copy of refined_steps, which lies on the GPU

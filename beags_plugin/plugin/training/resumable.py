@@ -76,13 +76,13 @@ class GlobalRandom:
     """The process's shared generators, which losses of other packages may use; this package does not."""
 
     def state(self) -> dict[str, Any]:
-        """See ``Resumable``."""
+        """Return the generators' states; see ``Resumable``."""
         numpy_state: Any = np.random.get_state()  # noqa: NPY002  (that of others)
         name, keys, *rest = numpy_state
         return {"torch": torch.get_rng_state(), "python": random.getstate(), "numpy": (name, keys.tolist(), *rest)}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """See ``Resumable``."""
+        """Set the generators to ``state``."""
         torch.set_rng_state(state["torch"])
         random.setstate(state["python"])
         name, keys, *rest = state["numpy"]

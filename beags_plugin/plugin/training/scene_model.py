@@ -61,16 +61,7 @@ class SceneModel(SplatfactoModel):
 
     def hold(self, surfels: Surfels, classes: Mapping[int, str]) -> None:
         """Make the parameters and buffers of a scene whose Gaussians have no classes yet; called once."""
-        self.gauss_params = nn.ParameterDict(
-            {
-                "means": nn.Parameter(surfels.means),
-                "features_dc": nn.Parameter(surfels.sh_dc),
-                "features_rest": nn.Parameter(surfels.sh_rest),
-                "opacities": nn.Parameter(surfels.opacity_logits[:, None].contiguous()),
-                "scales": nn.Parameter(surfels.log_scales),
-                "quats": nn.Parameter(surfels.quats),
-            }
-        )
+        self.gauss_params = nn.ParameterDict({name: nn.Parameter(value) for name, value in _by_group(surfels).items()})
         self.register_buffer("class_ids", torch.zeros(len(surfels), dtype=torch.int32))
         self.register_buffer("class_margin", torch.zeros(len(surfels)))
         self.register_buffer("assigned", torch.tensor(False))
@@ -150,31 +141,26 @@ class SceneModel(SplatfactoModel):
 
     def replace_surfels(self, surfels: Surfels) -> None:
         """Replace all parameters, in any number and SH degree; classes are reset."""
-        values = {
-            "means": surfels.means,
-            "features_dc": surfels.sh_dc,
-            "features_rest": surfels.sh_rest,
-            "opacities": surfels.opacity_logits[:, None],
-            "scales": surfels.log_scales,
-            "quats": surfels.quats,
-        }
         self.config.sh_degree = surfels.sh_degree
-        for name, value in values.items():  # new ones: autograd keeps the size of those in the last step's graph
+        for name, value in _by_group(
+            surfels
+        ).items():  # new ones: autograd keeps the size of those in the last step's graph
             self.gauss_params[name] = nn.Parameter(value.detach().to(self.device).contiguous())
-        self.class_ids = torch.zeros(len(surfels), dtype=torch.int32, device=self.device)
-        self.class_margin = torch.zeros(len(surfels), device=self.device)
+        self._reset_classes(len(surfels))
+
+    def _reset_classes(self, count: int) -> None:
+        self.class_ids = torch.zeros(count, dtype=torch.int32, device=self.device)
+        self.class_margin = torch.zeros(count, device=self.device)
 
     # -- checkpoints -------------------------------------------------------------------------------------------------
 
     def load_state_dict(self, state: Mapping[str, Any], **kwargs) -> Any:
         """Load a checkpoint of any number of Gaussians; parameters are resized in place (optimizers hold them)."""
-        count = state["gauss_params.means"].shape[0]
         # colours are rendered as they were trained, whatever SH degree this config asks for
         self.config.sh_degree = round((state["gauss_params.features_rest"].shape[1] + 1) ** 0.5) - 1
         for name, parameter in self.gauss_params.items():
             parameter.data = torch.zeros_like(state[f"gauss_params.{name}"], device=self.device)
-        self.class_ids = torch.zeros(count, dtype=torch.int32, device=self.device)
-        self.class_margin = torch.zeros(count, device=self.device)
+        self._reset_classes(len(state["gauss_params.means"]))
         return nn.Module.load_state_dict(self, state, **kwargs)  # type: ignore[arg-type]
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -188,3 +174,9 @@ class SceneModel(SplatfactoModel):
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return one optimizer group per kind of parameter."""
         return {name: [self.gauss_params[name]] for name in PARAMETER_GROUPS}
+
+
+def _by_group(surfels: Surfels) -> dict[str, Tensor]:
+    """Return the Gaussians' values by the names of splatfacto's groups of parameters."""
+    values = (surfels.means, surfels.sh_dc, surfels.sh_rest, surfels.opacity_logits[:, None])
+    return dict(zip(PARAMETER_GROUPS, (*values, surfels.log_scales, surfels.quats), strict=True))

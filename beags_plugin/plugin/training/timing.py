@@ -13,7 +13,7 @@ ESTIMATE_STEPS = (20, 120)  # the estimate is the mean step between these, after
 
 
 class Estimate:
-    """Print once how long ``steps`` steps of a method will take."""
+    """The expected time of ``steps`` steps of a method, printed once."""
 
     def __init__(self, method: str, steps: int) -> None:
         self._steps = steps
@@ -43,7 +43,7 @@ class Estimate:
 
 
 class StageSeconds:
-    """Measure the wall time of base training, each preparation stage and refinement; a resumed run counts on."""
+    """The wall times of base training, each preparation stage and refinement; a resumed run counts on."""
 
     def __init__(self) -> None:
         self._started = time.perf_counter()
@@ -89,7 +89,7 @@ class StageSeconds:
 
 
 class StepClock:
-    """Measure the seconds per part of a step: each lasts from the mark before to its own."""
+    """The seconds per part of a step: each lasts from the mark before to its own."""
 
     def __init__(self) -> None:
         self._last = time.perf_counter()

@@ -77,7 +77,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         self.train_cameras = self.train_dataset.cameras.to(self.device)
         self._cameras: dict[int, Camera] = {}
         self._present: list[list[int]] | None = None  # objects of each training view's labels, once they are replaced
-        # nerfstudio draws evaluation views from Python's global generator, which others use too.
+        # nerfstudio samples evaluation views by Python's global generator, which others use too.
         self._eval_order = random.Random(config.train_cameras_sampling_seed)
 
     def _load_images(self, split: Split, cache_images_device: Literal["cpu", "gpu"]) -> Any:
