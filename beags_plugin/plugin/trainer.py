@@ -15,6 +15,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from beags_plugin.importers.base import find_importer
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.options.machine import check_machine
 from beags_plugin.plugin.runs.layout import REPORT_FILE
@@ -26,7 +27,7 @@ from beags_plugin.plugin.training.replicas import Replica
 from beags_plugin.plugin.training.resumable import GlobalRandom, Resumable
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.training.timing import Estimate, StageSeconds
-from beags_plugin.plugin.training.warm_start import check_start, start_from_scene
+from beags_plugin.plugin.training.warm_start import start_from_scene
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system import processes
 from beags_plugin.system.errors import UserError, is_of_disk, refused
@@ -77,8 +78,8 @@ class BeagsTrainer(Trainer):
             self._lock = run_lock(self.base_dir)
             # At once: config.yml is this run's already, and a resume would take both for one run.
             self._checkpoints.set_aside()
-        if not self._checkpoints.loads:
-            check_start(self.config.model_config)
+        if (start := self._start()) is not None:
+            find_importer(start)  # before the data are read
         used = any((self.base_dir / self.config.logging.relative_log_dir).glob("events.out.tfevents.*"))
         super().setup(test_mode)
         self._replica.start_alike(self._model)
@@ -129,9 +130,14 @@ class BeagsTrainer(Trainer):
                 each.tb_writer.close()
                 each.tb_writer = type(each.tb_writer)(log_dir=folder, purge_step=self._start_step if own else 0)
 
+    def _start(self) -> Path | None:
+        """Return the scene to start from; None where a checkpoint is loaded instead."""
+        start = self.config.model_config.start_from
+        return None if start is None or self._checkpoints.loads else Path(start)
+
     def setup_optimizers(self) -> SceneOptimizer:
         """Build the scene's optimizer, after a scene to start from is in place: it holds the parameters it gets."""
-        if self.config.model_config.start_from is not None and not self._checkpoints.loads:
+        if self._start() is not None:
             start_from_scene(self._model, cast(BeagsDataManager, self.pipeline.datamanager), self.base_dir)
         return SceneOptimizer(self.config.optimizers.copy(), self.pipeline.get_param_groups(), self._model.clock)
 
@@ -265,7 +271,7 @@ class BeagsTrainer(Trainer):
             self._interrupts.at_once = False
 
     def _save_once(self, step: int) -> None:
-        if not self._checkpoints.holds(step):
+        if self._checkpoints.saved_step != step:
             self.save_checkpoint(step)
 
     # -- the end -------------------------------------------------------------------------------------------------------

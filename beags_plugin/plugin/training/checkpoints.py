@@ -28,7 +28,7 @@ _MISFITS = (RuntimeError, LookupError, ValueError, TypeError, AttributeError)  #
 class Checkpoints:
     """Saves and restores the checkpoints of one run.
 
-    loaded_run: the folder of the run that this one resumes; None before ``restore``.
+    loaded_run: the folder of the run that this one resumes; None before ``restore``. saved_step: the last one saved.
     """
 
     def __init__(self, config: BeagsTrainerConfig, base_dir: Path, folder: Path) -> None:
@@ -37,7 +37,7 @@ class Checkpoints:
         self._parts: dict[str, Resumable] = {}
         self._loaded_states: dict[str, Any] = {}
         self._loaded_from: Path | None = None
-        self._saved_step: int | None = None
+        self.saved_step: int | None = None
 
     # -- what is loaded ------------------------------------------------------------------------------------------------
 
@@ -118,16 +118,12 @@ class Checkpoints:
             STATE: {"version": VERSION, "parts": {name: part.state() for name, part in self._parts.items()}},
         }
         save_atomically(content, path)
-        self._saved_step = step
+        self.saved_step = step
         if self.config.save_only_latest_checkpoint:
             for old in self.folder.glob("*.ckpt"):
                 if old != path:
                     old.unlink()
         shutil.rmtree(self.base_dir / REPLACED, ignore_errors=True)
-
-    def holds(self, step: int) -> bool:
-        """Return whether ``step`` was the last to be saved."""
-        return self._saved_step == step
 
     def set_aside(self) -> None:
         """Move away the checkpoints of an earlier run in this folder, and remove its report."""

@@ -13,7 +13,6 @@ import torch
 from nerfstudio.configs import base_config  # noqa: F401  (the writer, which it imports, cannot come first)
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
 
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import mask_metrics
@@ -138,7 +137,8 @@ class Curves:
         """Return the held-out views; none if they cannot be read, which is no reason to end a training."""
         if self._views is None:
             try:
-                self._views = spread(self._all_views, VIEWS)
+                views, count = self._all_views, min(VIEWS, len(self._all_views))
+                self._views = [views[(2 * index + 1) * len(views) // (2 * count)] for index in range(count)]
             except UserError as error:
                 message = f"Extracted IoU and pictures are left out of the curves: {error}"
                 CONSOLE.print(message, style="yellow", markup=False, highlight=False, soft_wrap=True)
@@ -151,23 +151,14 @@ class Curves:
         model, camera = self.model, view.camera
         surfels, settings = model.surfels().detach(), model.settings(geometry=False)
         classes, _ = render_class_map(model.rasterizer, surfels, model.class_ids, camera, settings)
-        writer.put_image("Scene/class map", _colored(classes), step)
+        colors = colorize(classes.cpu().numpy().astype(np.uint16))
+        writer.put_image("Scene/class map", torch.from_numpy(colors).float() / 255.0, step)
         background = model.background_color.to(model.device)
         for rendered, (index, part) in enumerate(parts.items(), start=1):
             progress(rendered)
             if len(part):
                 render = model.rasterizer.rasterize(surfel_inputs(part, camera), camera, settings, background)
                 writer.put_image(f"Objects/{model.classes[index]}", render.color.clamp(0.0, 1.0), step)
-
-
-def _colored(classes: Tensor) -> Tensor:
-    return torch.from_numpy(colorize(classes.cpu().numpy().astype(np.uint16))).float() / 255.0
-
-
-def spread(views: Sequence[EvalView], most: int) -> list[EvalView]:
-    """Return at most ``most`` of the views, at even distances."""
-    count = min(most, len(views))
-    return [views[(2 * index + 1) * len(views) // (2 * count)] for index in range(count)]
 
 
 class HeldOutCurve:

@@ -9,8 +9,8 @@ from nerfstudio.engine.optimizers import Optimizers
 from torch.cuda.amp.grad_scaler import GradScaler
 from torch.nn import Parameter
 
-from beags_plugin.plugin.training.replicas import average_gradients
 from beags_plugin.plugin.training.timing import StepClock
+from beags_plugin.system import processes
 
 SCENE = "scene"  # name of the one optimizer, for nerfstudio and in checkpoints
 
@@ -37,7 +37,7 @@ class SceneOptimizer(Optimizers):
         """Average the gradients of all processes, clip those of groups whose config says so, and step."""
         self.clock.mark("backward")
         groups = self.adam.param_groups  # not `self.parameters`: those are the ones that training began with
-        average_gradients(value for group in groups for value in group["params"])
+        processes.average(v.grad for group in groups for v in group["params"] if v.grad is not None)
         norms = {group["name"]: self.config[group["name"]]["optimizer"].max_norm for group in groups}
         if any(norm is not None for norm in norms.values()):
             grad_scaler.unscale_(self.adam)

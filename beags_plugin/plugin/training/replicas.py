@@ -7,7 +7,6 @@ computed alike in all. Only the first process writes the run: the others write i
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable
 from pathlib import Path
 
 import torch
@@ -47,8 +46,3 @@ class Replica:
         """Remove the folder of a process other than the first."""
         if self._folder is not None:
             self._folder.cleanup()
-
-
-def average_gradients(parameters: Iterable[torch.Tensor]) -> None:
-    """Average the gradients over the processes, each of which has rendered a view."""
-    processes.average(value.grad for value in parameters if value.grad is not None)
