@@ -29,7 +29,7 @@ def test_class_map_is_undistorted_like_its_image(tmp_path, model):
         known = labels != IGNORE
         return float((((labels > 0) & known) != (view.image[..., 0] > 0.5))[known].float().mean())
 
-    assert differing(view.labels) < 0.005  # the discs' rims, where the image is interpolated
+    assert differing(view.labels) < 0.005  # the discs' boundaries, where the image is interpolated
     assert differing(view.labels.roll(1, dims=1)) > 4 * differing(view.labels)
     if view.labels.shape == distorted.shape:
         assert differing(torch.from_numpy(distorted).int()) > 4 * differing(view.labels)
@@ -68,7 +68,7 @@ def test_every_label_comes_from_the_pixel_that_the_image_came_from(tmp_path, mod
     labels = undistort_labels((rows * LARGE_W + columns).astype(np.uint16), cameras, straight, 0)
     assert labels.shape == ramps.shape[:2]
     known = labels != IGNORE
-    inside = known & (ramps[..., 0] > 1) & (ramps[..., 1] > 1)  # at the rim the ramp blends with black
+    inside = known & (ramps[..., 0] > 1) & (ramps[..., 1] > 1)  # at the border the ramp blends with black
     inside &= (ramps[..., 0] < LARGE_W - 2) & (ramps[..., 1] < LARGE_H - 2)
     assert inside.mean() > 0.9
     # OpenCV interpolates at 1/32 pixel, so the nearest pixel is within 0.5 + 1/64 of the ramp.
