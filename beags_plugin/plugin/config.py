@@ -1,4 +1,4 @@
-"""Refuses runs of the first format, whose config.yml names this module, in nerfstudio's own programs too."""
+"""The module that config.yml of runs of the first format names: refuses them, in nerfstudio's programs too."""
 
 from __future__ import annotations
 

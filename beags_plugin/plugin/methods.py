@@ -1,4 +1,4 @@
-"""What nerfstudio's entry points load: one MethodSpecification per preset, built when it is asked for."""
+"""The targets of nerfstudio's entry points: one MethodSpecification per preset, built on access."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ class BeagsModel(SceneModel):
     """Renders, scores and trains a scene by the losses of its config, as nerfstudio asks a model to."""
 
     def populate_modules(self) -> None:
-        """Build the surfels from the seed points that the data supplies."""
+        """Build the Gaussians from the seed points of the data."""
         Model.populate_modules(self)  # not SplatfactoModel's: that one loads weights and calls .cuda()
         self.collider = None
         if self.seed_points is None:
@@ -48,13 +48,13 @@ class BeagsModel(SceneModel):
         self.viewer_link = ViewerLink(self.viewer_panel)
 
     def update_to_step(self, step: int) -> None:
-        """Called with a checkpoint's step before it is loaded."""
+        """Take the step of a checkpoint before it is loaded."""
         self.step = step
 
     # -- rendering ---------------------------------------------------------------------------------------------------
 
     def get_outputs(self, camera: Cameras) -> dict[str, Any]:
-        """Render one view: what training needs while training; else what a viewer is to show, or the whole scene."""
+        """Render one view: for a training step, for the viewer, or the whole scene."""
         if self.training:
             return self._training_outputs(camera)
         with torch.no_grad():
@@ -66,16 +66,15 @@ class BeagsModel(SceneModel):
         known = (cameras.metadata or {}).get("camera")  # whose numbers the host has too
         camera = known or camera_from_nerfstudio(cameras, 0).to(self.device)
         needs = frozenset().union(*(loss.needs for loss in self.active_losses().values()))
-        target = (cameras.metadata or {}).get("labels") if "boundary" in needs else None
+        labels = (cameras.metadata or {}).get("labels")
+        against = labels if "boundary" in needs else None
         background = self._training_background()
-        inputs = surfel_inputs(
-            self.surfels(), camera, self.active_sh_degree(), self.class_ids if target is not None else None
-        )
+        class_ids = None if against is None else self.class_ids
+        inputs = surfel_inputs(self.surfels(), camera, self.active_sh_degree(), class_ids)
         if self.growing:
             inputs = replace(inputs, screen_shift=torch.zeros_like(inputs.means[:, :2]).requires_grad_())
-        labels = None if target is None else target.to(self.device, torch.int32)
         settings = self.settings(geometry="geometry" in needs, distortion="distortion" in needs)
-        render = self.rasterizer.rasterize(inputs, camera, settings, background, labels)
+        render = self.rasterizer.rasterize(inputs, camera, settings, background, against)
         self.last_render = LastRender(camera, render, inputs.screen_shift, labels)
         self.clock.mark("rendering")
         outputs = {"rgb": render.color, "accumulation": render.alpha[..., None], "background": background}
@@ -89,24 +88,24 @@ class BeagsModel(SceneModel):
         return fixed_background(self.config, self.device)
 
     def set_background(self, background_color: Tensor) -> None:
-        """Take the viewer's background [3]: for its pictures alone, so that no figure depends on it."""
+        """Take the viewer's background [3], for its pictures alone."""
         self.viewing.background = background_color
 
     # -- losses and metrics --------------------------------------------------------------------------------------------
 
     def _truth(self, batch: dict[str, Any], background: Tensor) -> Tensor:
-        """The photograph [H, W, 3]; where it is transparent, the background shows, as it does behind the Gaussians."""
+        """Return the photograph [H, W, 3], with the background behind what is transparent."""
         image = self.get_gt_img(batch["image"])
         if "alpha" in batch:  # it comes on black
             image = image + (1.0 - self.get_gt_img(batch["alpha"])[..., None]) * background
         return image
 
     def get_gt_img(self, image: Tensor) -> Tensor:
-        """[H, W, C] float in 0..1 on the model's device; never downscaled."""
+        """Return the image [H, W, C] float in 0..1 on the model's device; never downscaled."""
         return (image.float() / 255.0 if image.dtype == torch.uint8 else image).to(self.device)
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
-        """The number of Gaussians and, in a step whose metrics are read, PSNR of the drawn view."""
+        """Return the number of Gaussians and, in a step whose metrics are read, PSNR of the rendered view."""
         metrics: dict[str, Any] = {"gaussian_count": self.num_points}
         if self.measuring:
             with torch.no_grad():
@@ -116,11 +115,10 @@ class BeagsModel(SceneModel):
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
     ) -> dict[str, Tensor]:
-        """Each active term by name, weighted."""
+        """Return each active term by name, weighted."""
         image = self._truth(batch, outputs["background"])
         if not self.training or self.last_render is None:
             return {"photometric": (outputs["rgb"] - image).abs().mean()}
-        labels = batch.get("labels")
         inputs = LossInputs(
             step=self.step,
             seed=self.seed,
@@ -128,7 +126,7 @@ class BeagsModel(SceneModel):
             camera=self.last_render.camera,
             render=self.last_render.render,
             image=image,
-            labels=None if labels is None else labels.to(self.device, torch.int32),
+            labels=self.last_render.labels,
             class_ids=self.class_ids,
             grid=self.grid,
             draw=self._draw_apart,
@@ -141,7 +139,7 @@ class BeagsModel(SceneModel):
         return terms or {"none": torch.zeros((), device=self.device, requires_grad=True)}
 
     def _draw_apart(self, inputs: SurfelInputs, camera: Camera) -> RasterOutputs:
-        """Surfels that a loss wants to see apart from the scene, with geometry, on black."""
+        """Render Gaussians apart from the scene for a loss, with geometry, on black."""
         return self.rasterizer.rasterize(inputs, camera, self.settings(), inputs.means.new_zeros(3))
 
     def _class_members(self) -> ClassMembers:
@@ -152,7 +150,7 @@ class BeagsModel(SceneModel):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Any], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """PSNR and SSIM of an evaluation view, and pictures for tensorboard."""
+        """Return PSNR and SSIM of an evaluation view, and pictures for tensorboard."""
         image = self._truth(batch, outputs["background"])
         metrics = {"psnr": float(psnr(outputs["rgb"], image)), "ssim": float(ssim(outputs["rgb"], image))}
         images = {"img": torch.cat([image, outputs["rgb"]], dim=1)}
@@ -163,5 +161,5 @@ class BeagsModel(SceneModel):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Schedules, densification and the switch to refinement: see ``plugin.training.callbacks``."""
+        """Return the callbacks of ``plugin.training.callbacks``."""
         return training_callbacks(self, training_callback_attributes)

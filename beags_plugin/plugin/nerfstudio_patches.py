@@ -1,4 +1,4 @@
-"""Lets torch load the checkpoints that nerfstudio 1.1.5 writes; importing this module applies it."""
+"""A patch by which torch loads the checkpoints of nerfstudio 1.1.5; importing this module applies it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import torch
 def allow_numpy_scalars_in_checkpoints() -> None:
     """Let ``torch.load(weights_only=True)`` accept numpy float scalars; without effect where it already does.
 
-    nerfstudio's exponential scheduler returns numpy scalars, torch saves them in the optimizer's and scheduler's state,
-    and nerfstudio's trainer then loads the checkpoint with torch's default, which refuses them.
+    nerfstudio's exponential scheduler returns numpy scalars, which torch saves in the optimizer's state and refuses to
+    load by default.
     """
     add = getattr(torch.serialization, "add_safe_globals", None)
     if add is None:  # torch before 2.4 has no such list and loads everything

@@ -24,21 +24,21 @@ The options that people set first, by what they are about:
 
 All options follow; docs/training.md describes the method's own.
 """
-"""Stands above the help of ``ns-train beags``; tyro can hide no option without refusing it."""
+"""Text above the help of ``ns-train beags``."""
 
 
 def preset_folder() -> Path:
-    """Where the preset files lie."""
+    """Return the folder of the preset files."""
     return shipped_folder("method_configs")
 
 
 def preset_names() -> list[str]:
-    """Names of all presets."""
+    """Return the names of all presets."""
     return sorted(path.stem for path in preset_folder().glob("*.toml"))
 
 
 def load_preset(name: str, folder: Path | None = None) -> MethodSpecification:
-    """The method that ``<folder>/<name>.toml`` describes.
+    """Return the method of ``<folder>/<name>.toml``.
 
     The file has a ``description`` and a table ``[overrides]`` of dotted config keys. Raises ``UserError`` for a file
     that cannot be read and for a key that the base config does not have.
@@ -56,7 +56,7 @@ def load_preset(name: str, folder: Path | None = None) -> MethodSpecification:
 
 
 def preset_config(name: str, overrides: Mapping[str, Any], source: Path) -> BeagsTrainerConfig:
-    """The config of a preset with ``overrides`` besides; source: the file to blame for a wrong one (``UserError``)."""
+    """Return the config of a preset with more ``overrides``; a ``UserError`` about one names their file ``source``."""
     config = cast(BeagsTrainerConfig, load_preset(name).config)
     for key, value in overrides.items():
         override(config, key, value, source)

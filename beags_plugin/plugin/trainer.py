@@ -1,4 +1,4 @@
-"""The trainer: nerfstudio's, with schedules that end where they should and checkpoints that survive a crash."""
+"""The trainer: nerfstudio's, with schedules that end when they should and checkpoints that survive a crash."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from beags_plugin.importers.base import find_importer
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.options.machine import check_machine
 from beags_plugin.plugin.runs.layout import REPORT_FILE
@@ -26,7 +27,7 @@ from beags_plugin.plugin.training.replicas import Replica
 from beags_plugin.plugin.training.resumable import GlobalRandom, Resumable
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.training.timing import Estimate, StageSeconds
-from beags_plugin.plugin.training.warm_start import check_start, start_from_scene
+from beags_plugin.plugin.training.warm_start import start_from_scene
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system import processes
 from beags_plugin.system.errors import UserError, is_of_disk, refused
@@ -62,67 +63,66 @@ class BeagsTrainer(Trainer):
         return cast(SceneModel, self.pipeline.model)
 
     def setup(self, test_mode: Any = "val") -> None:
-        """Load data, build the model, load a checkpoint; a user's mistake ends here, with one sentence."""
+        """Load data, build the model, load a checkpoint; a user error ends the program with one sentence."""
         try:
-            check_machine(self.config.machine)
-            self.config.check()
-            if processes.rank() == 0:
-                self._lock = run_lock(self.base_dir)
-                # At once: config.yml is this run's already, and a resume would take both for one run.
-                self._checkpoints.set_aside()
-            if not self._checkpoints.loads:
-                check_start(self.config.model_config)
-            used = any((self.base_dir / self.config.logging.relative_log_dir).glob("events.out.tfevents.*"))
-            super().setup(test_mode)
-            self._replica.start_alike(self._model)
-            if self.config.check_memory and processes.rank() == 0:
-                check_room(self.base_dir, self.config.machine.device_type)
-            if used:
-                self._forget_events()
-        except UserError as error:
+            self._set_up(test_mode)
+        except BaseException as error:
             self._release()
-            stop(error)
-        except OSError as error:
-            self._release()
-            stop(UserError(NO_MEMORY) if is_out_of_memory(error) else self._told(error))
-        except (MemoryError, RuntimeError) as error:
-            self._release()
-            if not is_out_of_memory(error):
-                raise
-            stop(UserError(NO_MEMORY))
-        except BaseException:
-            self._release()
+            self._stop(error, NO_MEMORY)
             raise
 
-    def _told(self, error: OSError) -> UserError:
-        """What the system refused where nothing else has told it, as to nerfstudio's own writers; other errors pass."""
-        if error.filename is None and is_of_disk(error):
-            return UserError(
-                f"a file of {self.base_dir}, or a temporary one in {gettempdir()}, cannot be written "
-                f"({error.strerror}): free some space there, or choose other places (--run-dir, TMPDIR)."
-            )
-        if (told := refused(error)) is None:
-            raise error
-        return told
+    def _set_up(self, test_mode: Any) -> None:
+        check_machine(self.config.machine)
+        self.config.check()
+        if processes.rank() == 0:
+            self._lock = run_lock(self.base_dir)
+            # At once: config.yml is this run's already, and a resume would take both for one run.
+            self._checkpoints.set_aside()
+        if (start := self._start()) is not None:
+            find_importer(start)  # before the data are read
+        used = any((self.base_dir / self.config.logging.relative_log_dir).glob("events.out.tfevents.*"))
+        super().setup(test_mode)
+        self._replica.start_alike(self._model)
+        if self.config.check_memory and processes.rank() == 0:
+            check_room(self.base_dir, self.config.machine.device_type)
+        if used:
+            self._forget_events()
+
+    def _stop(self, error: BaseException, no_memory: str) -> None:
+        """End the program with one sentence if memory ran out, the system refused a file, or a user can help it.
+
+        no_memory: the sentence where memory ran out. Other errors pass.
+        """
+        if isinstance(error, UserError):
+            stop(error)
+        if is_out_of_memory(error):
+            stop(UserError(no_memory))
+        if isinstance(error, OSError):
+            if error.filename is None and is_of_disk(error):  # as of nerfstudio's own writers
+                stop(
+                    UserError(
+                        f"a file of {self.base_dir}, or a temporary one in {gettempdir()}, cannot be written "
+                        f"({error.strerror}): free some space there, or choose other places (--run-dir, TMPDIR)."
+                    )
+                )
+            if (message := refused(error)) is not None:
+                stop(message)
 
     def _release(self) -> None:
-        """Let others train in this run's folder, and end what writes curves, a thread of tensorboard's too."""
+        """Unlock the run's folder, and close the writers of curves with their threads."""
         if self._lock is not None:
             self._lock.release()
             self._lock = None
         self._replica.end()
         for each in writer.EVENT_WRITERS:
             if isinstance(each, writer.TensorboardWriter):
-                with suppress(OSError):  # a disk that was full while it wrote, which has been told
+                with suppress(OSError):  # of a full disk, which has been reported
                     each.tb_writer.close()
         writer.EVENT_WRITERS.clear()
         writer.EVENT_STORAGE.clear()
 
     def _forget_events(self) -> None:
-        """Let tensorboard forget what was once done here after the checkpoint, which is done again, or by another run.
-
-        Events at step 0 are forgotten with those of a run that begins; nerfstudio writes the config only later.
-        """
+        """Drop tensorboard's events of steps that this run does again, or of another run in this folder."""
         own = self.loaded_run == self.base_dir.absolute()
         for each in writer.EVENT_WRITERS:
             if isinstance(each, writer.TensorboardWriter):
@@ -130,12 +130,14 @@ class BeagsTrainer(Trainer):
                 each.tb_writer.close()
                 each.tb_writer = type(each.tb_writer)(log_dir=folder, purge_step=self._start_step if own else 0)
 
-    def setup_optimizers(self) -> SceneOptimizer:
-        """Build the scene's optimizer.
+    def _start(self) -> Path | None:
+        """Return the scene to start from; None where a checkpoint is loaded instead."""
+        start = self.config.model_config.start_from
+        return None if start is None or self._checkpoints.loads else Path(start)
 
-        A scene to start from takes its place before: the optimizer holds the parameters it is built with.
-        """
-        if self.config.model_config.start_from is not None and not self._checkpoints.loads:
+    def setup_optimizers(self) -> SceneOptimizer:
+        """Build the scene's optimizer, after a scene to start from is in place: it holds the parameters it gets."""
+        if self._start() is not None:
             start_from_scene(self._model, cast(BeagsDataManager, self.pipeline.datamanager), self.base_dir)
         return SceneOptimizer(self.config.optimizers.copy(), self.pipeline.get_param_groups(), self._model.clock)
 
@@ -154,7 +156,7 @@ class BeagsTrainer(Trainer):
             if self.loaded_run == self.base_dir.absolute() and not (self.base_dir / REPORT_FILE).exists():
                 return self._write_report()  # killed after its last checkpoint
             if processes.rank() > 0:
-                return None  # the first process writes the report, or says what is wrong
+                return None  # the first process writes the report, or the error
             stop(
                 UserError(
                     f"the checkpoint is of a complete run ({self._start_step} steps): nothing is left to train; "
@@ -163,7 +165,7 @@ class BeagsTrainer(Trainer):
             )
         self._estimate = Estimate(str(self.config.method_name), self.config.max_num_iterations)
         remove_unfinished(self.base_dir)
-        (self.base_dir / REPORT_FILE).unlink(missing_ok=True)  # it says that the run is complete
+        (self.base_dir / REPORT_FILE).unlink(missing_ok=True)  # it marks the run as complete
         if self.config.steps_per_held_out > 0:
             datamanager = cast(BeagsDataManager, self.pipeline.datamanager)
             self.curve = HeldOutCurve(
@@ -175,20 +177,14 @@ class BeagsTrainer(Trainer):
         try:
             with self._interrupts:
                 super().train()
-        except UserError as error:
-            stop(error)
-        except (MemoryError, RuntimeError, OSError) as error:
-            if is_out_of_memory(error):
-                stop(
-                    UserError(
-                        f"memory ran out after step {self._done} ({reason(error)}): the last checkpoint is whole. "
-                        f"Close other programs and go on with beags resume {self.base_dir}, or begin anew with smaller "
-                        "photos or fewer Gaussians."
-                    )
-                )
-            if not isinstance(error, OSError):
-                raise
-            stop(self._told(error))
+        except (UserError, MemoryError, RuntimeError, OSError) as error:
+            self._stop(
+                error,
+                f"memory ran out after step {self._done} ({reason(error)}): the last checkpoint is whole. "
+                f"Close other programs and go on with beags resume {self.base_dir}, or begin anew with smaller "
+                "photos or fewer Gaussians.",
+            )
+            raise
         except KeyboardInterrupt as interrupt:
             if (self.base_dir / REPORT_FILE).exists():  # complete: the signal ended what shows it in the browser
                 return
@@ -197,7 +193,7 @@ class BeagsTrainer(Trainer):
             raise SystemExit(self._interrupts.exit_code) from interrupt
 
     def train_iteration(self, step: int) -> Any:
-        """One step; after some of them, says how long the run will take, or measures the held-out views."""
+        """Train one step; after some of them, print how long the run will take, or measure the held-out views."""
         self._estimate.before_step(step - self._start_step)
         found = super().train_iteration(step)
         self._done = step
@@ -215,11 +211,11 @@ class BeagsTrainer(Trainer):
 
     @property
     def loaded_run(self) -> Path | None:
-        """The folder of the run whose training goes on here; None where nothing was loaded."""
+        """The folder of the run that this one resumes; None where nothing was loaded."""
         return self._checkpoints.loaded_run
 
     def keep(self, name: str, part: Resumable) -> None:
-        """Let checkpoints hold the state of ``part``; it goes on from what the loaded one holds, if that does."""
+        """Let checkpoints hold the state of ``part``, and restore that of the loaded one if there is any."""
         self._checkpoints.keep(name, part)
 
     def _load_checkpoint(self) -> None:
@@ -244,12 +240,12 @@ class BeagsTrainer(Trainer):
     # -- breaks --------------------------------------------------------------------------------------------------------
 
     def _go_on(self) -> None:
-        """Let a training that the viewer has paused come to its next step, where a signal is heard."""
+        """Let a training that the viewer has paused reach its next step, where a signal stops it."""
         if self.training_state == "paused":
             self.training_state = "training"
 
     def stop_if_asked(self, step: int) -> None:
-        """Before ``step``: save the one before it and end, if a signal asked for that, or memory is running out."""
+        """Save the step before ``step`` and end, if a signal asked for that or memory is running out."""
         if processes.in_any(self._interrupts.asked is not None):
             if step > self._start_step:
                 self._save_once(step - 1)
@@ -263,7 +259,7 @@ class BeagsTrainer(Trainer):
 
     @contextmanager
     def long_stage(self, step: int) -> Iterator[None]:
-        """Save ``step`` and open a long block, which a signal ends at once; a resumed run makes it again."""
+        """Save ``step`` and open a long block, which a signal ends at once; a resumed run repeats it."""
         if step >= 0:
             self._save_once(step)
         self._interrupts.at_once = True
@@ -275,7 +271,7 @@ class BeagsTrainer(Trainer):
             self._interrupts.at_once = False
 
     def _save_once(self, step: int) -> None:
-        if not self._checkpoints.holds(step):
+        if self._checkpoints.saved_step != step:
             self.save_checkpoint(step)
 
     # -- the end -------------------------------------------------------------------------------------------------------

@@ -115,7 +115,7 @@ def _files(config: BeagsDataParserConfig) -> tuple[Dataset, PosedViews, MaskFile
     sizes = [image_size(path) for path in views.images]
     parser.fit_cameras(views, sizes)
     masks, folder, kind = parser.mask_files(scene, views)
-    trained = set(parser.training_views(views))
+    trained = set(parser.views_of_split(views, "train"))
     names_file = scene.root / config.classes_path
     names = read_classes(names_file) if names_file.is_file() else scene.class_names
     files = MaskFiles(

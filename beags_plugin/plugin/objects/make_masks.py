@@ -61,8 +61,7 @@ class RunGeometry:
 
     def to_straight(self, labels: np.ndarray, view: int) -> np.ndarray:
         split, index = self._of_split[view]
-        of_eval, of_train = self.manager.undistort_eval_map, self.manager.straight_train_map
-        return of_eval(labels, index) if split == "eval" else of_train(labels, index)
+        return self.manager.undistorted(labels, index, split)
 
     def to_photo(self, labels: np.ndarray, view: int) -> np.ndarray:
         split, index = self._of_split[view]
@@ -128,7 +127,7 @@ def make_masks(
         raise UserError(
             "this mask source needs the scene's depth: train beags-base, then add --load-config <run>/config.yml."
         )
-    trained = set(parser.training_views(views))
+    trained = set(parser.views_of_split(views, "train"))
     sizes = [image_size(path) for path in views.images]
     photos = [
         Photo(name, path, *size, trained=index in trained)

@@ -99,7 +99,7 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     start = time.perf_counter()
     views = manager.views("train")
     with progress_bar("Reading masks", passing=True) as progress:
-        given = LabelMaps(view.stored_labels for view in counted(views, len(views), progress))
+        given = LabelMaps(view.labels for view in counted(views, len(views), progress))
     if all(mask is None for mask in given.stored):
         raise UserError(f"no training view of {scene.config.data_path} has a mask: give --masks-path, or make some.")
     classes = manager.train_dataset.metadata["classes"]

@@ -31,7 +31,7 @@ CONFIG_FILE = "config.yml"
 
 
 def _adam_fuses_on_cpus() -> bool:
-    """Whether torch's Adam has the one-pass form on CPUs: from 2.4 on."""
+    """Return whether torch's Adam has the one-pass form on CPUs: from 2.4 on."""
     major, minor = torch.__version__.split(".")[:2]
     return (int(major), int(minor)) >= (2, 4)
 
@@ -74,12 +74,12 @@ class BeagsTrainerConfig(TrainerConfig):
 
     @property
     def model_config(self) -> BeagsModelConfig:
-        """Options of the model; nerfstudio's field promises no more than a ``ModelConfig``."""
+        """Options of the model, with their own type."""
         return cast(BeagsModelConfig, self.pipeline.model)
 
     @property
     def data_config(self) -> BeagsDataManagerConfig:
-        """Options of the data manager; nerfstudio's field promises no more than a ``DataManagerConfig``."""
+        """Options of the data manager, with their own type."""
         return cast(BeagsDataManagerConfig, self.pipeline.datamanager)
 
     @property
@@ -96,11 +96,11 @@ class BeagsTrainerConfig(TrainerConfig):
         self.model_config.check()
 
     def get_base_dir(self) -> Path:
-        """Folder of the run."""
+        """Return the folder of the run."""
         return self.run_dir if self.run_dir is not None else super().get_base_dir()
 
     def set_timestamp(self) -> None:
-        """See ``ExperimentConfig.set_timestamp``: the first that nerfstudio does with the config of a new run."""
+        """Check the devices, as nerfstudio calls this first for a new run, and set the time in the folder's name."""
         try:
             check_machine(self.machine)
         except UserError as error:
@@ -108,10 +108,7 @@ class BeagsTrainerConfig(TrainerConfig):
         super().set_timestamp()
 
     def save_config(self) -> None:
-        """Save config.yml with absolute paths, so that every command finds the run from any folder.
-
-        It is the first that ns-train writes: ends the program, with one sentence, if another one trains in the folder.
-        """
+        """Save config.yml, the first file of a run, with absolute paths; end the program if another trains there."""
         try:
             self._lock_and_save()
         except UserError as error:
@@ -134,7 +131,7 @@ class BeagsTrainerConfig(TrainerConfig):
 
 
 def base_config() -> BeagsTrainerConfig:
-    """The documented base: the full schedule of method sections 1 and 7 (33,000 steps).
+    """Return the documented base: the full schedule (method, sections 1 and 7; 33,000 steps).
 
     Learning rates, losses and schedules are those of the 2DGS and BEA-GS papers; a preset states what it changes.
     """

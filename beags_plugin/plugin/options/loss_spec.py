@@ -31,7 +31,7 @@ class LossSpec:
     """Options of the loss itself, e.g. ssim_weight or samples."""
 
     def build(self, name: str, schedule: PhaseSchedule) -> Loss:
-        """The loss, with its steps made absolute; raises ``UserError`` for a value that it cannot have."""
+        """Build the loss, with absolute steps; raises ``UserError`` for a wrong value."""
         kind = LOSSES.get(name)
         if not 0.0 <= self.weight < math.inf:
             raise UserError(f"the loss {name} has the weight {self.weight}: give 0 (off) or more.")

@@ -10,12 +10,12 @@ from beags_plugin.system.errors import UserError
 
 
 def default_device() -> str:
-    """Where a run trains unless it is told: "cuda" where there is a GPU that our kernels can use, else "cpu"."""
+    """Return the default device: "cuda" where there is a GPU that our kernels can use, else "cpu"."""
     return "cpu" if cuda_extension.status()[1] else "cuda"
 
 
 def check_machine(machine: MachineConfig) -> None:
-    """Raise ``UserError`` for devices that are not there."""
+    """Raise ``UserError`` for missing devices."""
     for name in ("num_devices", "num_machines"):
         if (count := getattr(machine, name)) < 1:
             raise UserError(f"--machine.{name.replace('_', '-')} is {count}: give 1 or more.")

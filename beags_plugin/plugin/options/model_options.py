@@ -72,7 +72,7 @@ class BeagsModelConfig(ModelConfig):
     """Far plane in units of the scene's extent."""
 
     def check(self) -> None:
-        """Raise ``UserError`` for a value that training could not work with, or would only end with."""
+        """Raise ``UserError`` for a value with which training cannot work."""
         for name in ("base_steps", "refine_steps", "schedule_steps"):
             if (steps := getattr(self, name)) < 0:
                 raise UserError(f"{name} is {steps}: give a number of steps, 0 or more.")
@@ -89,10 +89,10 @@ class BeagsModelConfig(ModelConfig):
             raise UserError(f"refine_position_lr_factor is {self.refine_position_lr_factor}: give 0 or more.")
 
     def schedule(self) -> PhaseSchedule:
-        """Steps of both phases."""
+        """Return the steps of both phases."""
         return PhaseSchedule(self.base_steps, self.refine_steps, self.schedule_steps, self.start_from is not None)
 
 
 def fixed_background(config: BeagsModelConfig, device: torch.device | str = "cpu") -> Tensor:
-    """[3], the colour behind a scene that is looked at or scored: the one that it was trained on, black for random."""
+    """Return the colour [3] behind a scene outside training: that of its training, black for "random"."""
     return torch.full((3,), 1.0 if config.background_color == "white" else 0.0, device=device)

@@ -1,4 +1,4 @@
-"""When each phase runs and how the learning rates move (method, sections 1 and 7)."""
+"""Steps of the two phases, and the schedules of the learning rates (method, sections 1 and 7)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class PhaseSchedule:
         return self.base_steps / self.stated_for if self.base_steps > 0 and self.stated_for > 0 else 1.0
 
     def scaled(self, steps: int) -> int:
-        """A stated step (or interval: at least 1) in this run; 0 stays 0, which often means never."""
+        """Scale a stated step (or interval: at least 1) to this run; 0 stays 0, which often means never."""
         return max(round(steps * self.scale), 1) if steps > 0 else steps
 
     @property
@@ -37,15 +37,15 @@ class PhaseSchedule:
         return self.base_steps + self.refine_steps
 
     def refining(self, step: int) -> bool:
-        """Whether ``step`` belongs to refinement."""
+        """Return whether ``step`` belongs to refinement."""
         return step >= self.base_steps
 
     def round_starts(self, rounds: int) -> list[int]:
-        """The steps of refinement before which masks, classes and grids are made, the first of them 0."""
+        """Return the steps of refinement before which masks, classes and grids are made, the first of them 0."""
         return [self.refine_steps * index // rounds for index in range(rounds)]
 
     def progress(self, step: int) -> float:
-        """Position in the base's learning-rate schedule, 0..1; refinement runs from 0.9 to 1 again, polish from 0.5."""
+        """Return the position in the base's learning-rate schedule, 0..1; refinement from 0.9, polish from 0.5."""
         if not self.refining(step):
             first = POLISH_SCHEDULE_FROM if self.warm else 0.0
             return first + (1.0 - first) * step / max(self.base_steps, 1)
@@ -54,5 +54,5 @@ class PhaseSchedule:
 
 
 def log_linear(first: float, last: float, progress: float) -> float:
-    """Learning rate at ``progress`` (0..1) of a straight line in the logarithm."""
+    """Interpolate the logarithm of a learning rate at ``progress`` (0..1)."""
     return math.exp(math.log(first) * (1.0 - progress) + math.log(last) * progress)

@@ -1,4 +1,4 @@
-"""Checkpoint files: read, and checked before anything is made of them."""
+"""Checkpoint files: read and checked."""
 
 from __future__ import annotations
 
@@ -20,27 +20,33 @@ _NOT_FLOATS = ("class_ids", "assigned")
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """All that a checkpoint holds, on the CPU; raises ``UserError`` for a file that is none."""
+    """Read a checkpoint to the CPU; raises ``UserError`` for a file that is none."""
     try:
         checkpoint = load_tensors(path)
     except FileNotFoundError:
         raise UserError(f"there is no checkpoint {path}: name one of an earlier run.") from None
     except ValueError as error:
         raise UserError(f"the checkpoint {path} is damaged ({error}): name an earlier one.") from error
-    if not isinstance(checkpoint, dict) or not {"step", "pipeline", "optimizers", "scalers"} <= set(checkpoint):
-        raise UserError(f"{path} is no checkpoint of ns-train: name a step-….ckpt of a run.")
-    if not isinstance(checkpoint["pipeline"], dict) or type(checkpoint["step"]) is not int:
+    whole = isinstance(checkpoint, dict) and {"step", "pipeline", "optimizers", "scalers"} <= set(checkpoint)
+    if not whole or not isinstance(checkpoint["pipeline"], dict) or type(checkpoint["step"]) is not int:
         raise UserError(f"{path} is no checkpoint of ns-train: name a step-….ckpt of a run.")
     return checkpoint
 
 
 def scene_alone(checkpoint: dict[str, Any]) -> bool:
-    """Whether the checkpoint has no state to train on from: ``<run>/base`` and extracted runs are such."""
+    """Return whether the checkpoint has no state of a training, as in ``<run>/base`` and extracted runs."""
     return not checkpoint["optimizers"]
 
 
+def model_state(checkpoint: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """Return the model's state in a checkpoint; raises ``UserError`` if it is no scene. path: of its file."""
+    state = {name[7:]: value for name, value in checkpoint["pipeline"].items() if name.startswith("_model.")}
+    validate(state, path)
+    return state
+
+
 def validate(state: Mapping[str, Any], path: Path) -> None:
-    """Raise ``UserError`` unless ``state`` is that of a ``BeagsModel`` with classes. path: the file it comes from."""
+    """Raise ``UserError`` unless ``state`` is that of a ``BeagsModel``. path: of its file."""
     if wrong := _wrong(state):
         raise UserError(f"the checkpoint {path} holds no scene of beags ({wrong}): name another, or train again.")
 

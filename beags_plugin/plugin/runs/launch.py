@@ -1,4 +1,4 @@
-"""Training from Python, exactly as ``ns-train`` does it, and going on with a run that was broken off."""
+"""Training from Python, as ``ns-train`` does it, and resuming an interrupted run."""
 
 from __future__ import annotations
 
@@ -15,21 +15,17 @@ if TYPE_CHECKING:
 
 
 def train(config: BeagsTrainerConfig) -> None:
-    """Run the training that ``config`` describes; its ``run_dir`` says where.
-
-    Raises ``UserError`` for a user's mistake, where ``ns-train`` would print it and end.
-    """
+    """Run the training of ``config`` into its ``run_dir``; raises ``UserError`` where ``ns-train`` would end."""
     from nerfstudio.scripts.train import main
 
     _complete(lambda: main(config), config)
 
 
 def resume(run: Path, device: Literal["cpu", "cuda"] | None = None, check_memory: bool = True) -> None:
-    """Train a run that was broken off to its end, in its own folder and with the config that it was started with.
+    """Train an interrupted run to its end, in its own folder and with its own config.
 
-    run: its folder, or config.yml in there. device: "cpu" or "cuda" in place of the config's. check_memory: as in
-    ``BeagsTrainerConfig``. Without a checkpoint it starts from the beginning. Raises ``UserError`` for what is no such
-    run, and for one that is complete.
+    run: its folder, or config.yml in it. device: in place of the config's. check_memory: as in ``BeagsTrainerConfig``.
+    Without a checkpoint it starts from the beginning. Raises ``UserError`` for another folder, and a complete run.
     """
     from nerfstudio.scripts.train import launch, train_loop
 
@@ -56,7 +52,7 @@ def resume(run: Path, device: Literal["cpu", "cuda"] | None = None, check_memory
 
 
 def resumed_config(run: Path) -> BeagsTrainerConfig:
-    """The config with which ``resume`` trains."""
+    """Return the config with which ``resume`` trains."""
     from nerfstudio.utils.rich_utils import CONSOLE
 
     from beags_plugin.plugin.runs.checkpoint_file import read_checkpoint, scene_alone
@@ -83,7 +79,7 @@ def resumed_config(run: Path) -> BeagsTrainerConfig:
 
 
 def _complete(run: Callable[[], None], config: BeagsTrainerConfig) -> None:
-    """Run a training; raises what ended it early."""
+    """Run a training; raises the error that ended it early."""
     try:
         run()
     except SystemExit as end:

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from beags_plugin.system.digests import content_digest
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import load_json, reason
 
-if TYPE_CHECKING:
-    pass
-
-
-BASE_SNAPSHOT = "base"  # folder of the run that keeps the scene as it was when refinement started
-PREPARED = "prepared"  # folder of the run that keeps masks, grids and what was found
-EXTRACTION_FILE = "extraction.json"  # in a run that holds a part of another: of which, and what was taken
+BASE_SNAPSHOT = "base"  # folder with the scene as refinement started from it
+PREPARED = "prepared"  # folder with the masks and grids of refinement
+EXTRACTION_FILE = "extraction.json"  # in a run that holds a part of another: which one, and which part
 REPORT_FILE = "training.json"  # seconds and memory of a run that is complete
-TRANSFORM_FILE = "dataparser_transforms.json"  # nerfstudio's name for how the poses were normalised
+TRANSFORM_FILE = "dataparser_transforms.json"  # nerfstudio's name for the normalisation of the poses
 
 
 def newest_checkpoint(folder: Path) -> Path:
-    """The checkpoint of the highest step in ``folder`` (a nerfstudio_models folder); raises ``UserError`` if none."""
+    """Return the checkpoint of the highest step in a nerfstudio_models folder; raises ``UserError`` if none."""
     checkpoints = sorted(folder.glob("step-*.ckpt")) if folder.is_dir() else []
     if not checkpoints:
         raise UserError(f"{folder} holds no checkpoint (step-….ckpt): train longer, or name another run.")
@@ -29,12 +25,12 @@ def newest_checkpoint(folder: Path) -> Path:
 
 
 def round_folder(run: Path, index: int) -> Path:
-    """Where a run keeps what the refinement round of this index was prepared with."""
+    """Return the folder of the masks and grid of this refinement round, from 0."""
     return run / PREPARED if index == 0 else run / PREPARED / f"round_{index + 1}"
 
 
 def preparing_run(run: Path) -> Path:
-    """The run that prepared refinement for what ``run`` holds: itself, or the one it is the base or an extract of."""
+    """Return the run that prepared ``run``: itself, or the one that it is the base or an extract of."""
     origin = run / EXTRACTION_FILE
     if origin.exists():
         return preparing_run(Path(_origin(origin, "run", str, "")).parent)
@@ -42,9 +38,9 @@ def preparing_run(run: Path) -> Path:
 
 
 def prepared_digests(run: Path) -> list[str] | None:
-    """Of each round that refinement was prepared for, for what ``run`` holds, a digest of its masks and grid.
+    """Return a digest of the masks and grid of each prepared round of ``run``.
 
-    Of an extract they are those of the time when it was made; None for one that has not kept them.
+    Of an extract they are those at the time of the extraction; None if its file has none.
     """
     origin = run / EXTRACTION_FILE
     if origin.exists():
@@ -56,7 +52,7 @@ def prepared_digests(run: Path) -> list[str] | None:
 
 
 def _origin(path: Path, name: str, kind: type, absent: Any) -> Any:
-    """An entry of an extract's file; ``UserError`` if the file is damaged."""
+    """Read an entry of an extract's file; raises ``UserError`` if the file is damaged."""
     try:
         found = load_json(path).get(name, absent)
     except (OSError, ValueError, AttributeError) as error:
@@ -67,14 +63,14 @@ def _origin(path: Path, name: str, kind: type, absent: Any) -> Any:
 
 
 def round_digest(folder: Path) -> str | None:
-    """Of the masks and the grid that lie in the folder of a round; None if none was prepared there."""
+    """Return a digest of the masks and the grid in the folder of a round; None if none was prepared there."""
     if not (folder / "grid.pt").exists():
         return None
     return content_digest([folder / "grid.pt", *sorted((folder / "masks").glob("*.png"))])
 
 
 def last_prepared(run: Path) -> Path:
-    """What the last round of a run was prepared with, whether or not anything was."""
+    """Return the folder of the last prepared round of a run; the first round's if none was prepared."""
     index = 0
     while (round_folder(run, index + 1) / "grid.pt").exists():
         index += 1

@@ -1,4 +1,4 @@
-"""Files that refinement was prepared with: voxel grids, and masks as they came and as reprojection left them."""
+"""Files of a prepared refinement: voxel grids, and masks before and after reprojection."""
 
 from __future__ import annotations
 
@@ -28,10 +28,7 @@ _REMEDY = "restore it, or refine again from base/nerfstudio_models"
 
 
 def read_grid(path: Path) -> VisibilityGrid | None:
-    """Read the grid in a file that ``refinement.save_prepared`` wrote; None where the refiner needed none.
-
-    Raises ``UserError`` if the file is damaged.
-    """
+    """Read the grid of a prepared round; None where the refiner needs none. Raises ``UserError`` if damaged."""
     state = grid_state(path)
     return VisibilityGrid.from_state_dict(state) if state else None
 
@@ -41,8 +38,8 @@ def grid_state(path: Path, mmap: bool = False) -> dict[str, Any]:
     try:
         state = load_tensors(path, mmap=mmap)
     except (OSError, ValueError) as error:
-        told = getattr(error, "strerror", None) or error
-        raise UserError(f"the voxel grid {path} cannot be read ({told}): {_REMEDY}.") from error
+        cause = getattr(error, "strerror", None) or error
+        raise UserError(f"the voxel grid {path} cannot be read ({cause}): {_REMEDY}.") from error
     if not isinstance(state, dict) or (state and not _is_grid(state)):
         raise UserError(f"the voxel grid {path} is damaged: {_REMEDY}.")
     return state
@@ -66,8 +63,8 @@ def _is_grid(state: dict[str, Any]) -> bool:
 class TrainingMasks:
     """The masks of one training view, all [h, w] uint16 class ids or IGNORE, of the size that was trained on.
 
-    photo: the image file. given: what the data has; used: what refinement was given after reprojection; exact: the
-    truth. None where there is none. confidence: file of the share of the winning votes, may not exist.
+    photo: the image file. given: of the data; used: after reprojection; exact: the ground truth; None where there is
+    none. confidence: file of the share of the winning votes, may not exist.
     """
 
     name: str
@@ -79,10 +76,7 @@ class TrainingMasks:
 
 
 def training_masks(config: BeagsTrainerConfig) -> list[TrainingMasks]:
-    """Read the masks of every training view of a run that refined, before and after reprojection.
-
-    Masks and truth are compared as the files have them: for photos without lens distortion.
-    """
+    """Read the masks of every training view of a run that refined; all as in their files, lens distortion included."""
     parser = replace(config.data_config.dataparser, data=config.data_path)
     outputs = parser.setup().get_dataparser_outputs("train")
     metadata = outputs.metadata

@@ -15,7 +15,7 @@ from torch import Tensor
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import Viewpoints
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
-from beags_plugin.plugin.runs.checkpoint_file import read_checkpoint, validate
+from beags_plugin.plugin.runs.checkpoint_file import model_state, read_checkpoint
 from beags_plugin.plugin.runs.layout import TRANSFORM_FILE, newest_checkpoint
 from beags_plugin.plugin.runs.run_config import load_run_config
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
@@ -28,7 +28,7 @@ from beags_plugin.system.reading.text import load_json, reason
 
 @dataclass(frozen=True)
 class SavedScene:
-    """A trained run as it lies on disk: config, model state (tensors by name), step and class names."""
+    """A trained run on disk: config, model state (tensors by name), step and class names."""
 
     config: BeagsTrainerConfig
     state: dict[str, Any]
@@ -36,14 +36,14 @@ class SavedScene:
     classes: dict[int, str]
 
     def surfels(self) -> Surfels:
-        """Return the scene's N surfels."""
+        """Return the scene's N Gaussians."""
         state = {name: self.state[f"gauss_params.{name}"] for name in ("means", "quats", "scales", "opacities")}
         dc, rest = self.state["gauss_params.features_dc"], self.state["gauss_params.features_rest"]
         return Surfels(state["means"], state["quats"], state["scales"], state["opacities"][:, 0], dc, rest)
 
     @property
     def assigned(self) -> bool:
-        """Whether the Gaussians have classes."""
+        """True if the Gaussians have classes."""
         return bool(self.state["assigned"])
 
     @property
@@ -57,9 +57,7 @@ def read_run(config_path: Path) -> SavedScene:
     config = load_run_config(config_path)
     path = newest_checkpoint(config.get_checkpoint_dir())
     checkpoint = read_checkpoint(path)
-    prefix = "_model."
-    state = {name[len(prefix) :]: value for name, value in checkpoint["pipeline"].items() if name.startswith(prefix)}
-    validate(state, path)
+    state = model_state(checkpoint, path)
     return SavedScene(config, state, checkpoint["step"], state["_extra_state"]["classes"])
 
 
@@ -81,7 +79,7 @@ def raster_settings(scene: SavedScene) -> RasterSettings:
 
 
 def read_transform(run: Path) -> tuple[Tensor, float] | None:
-    """The data parser's transform ([3, 4], scale) that a run was trained in; None if the run has not kept it.
+    """Read the data parser's transform ([3, 4], scale) of a run; None if the run has no file of it.
 
     Raises ``UserError`` if the file is damaged.
     """
@@ -93,7 +91,7 @@ def read_transform(run: Path) -> tuple[Tensor, float] | None:
         transform, scale = torch.tensor(content["transform"], dtype=torch.float64), float(content["scale"])
         if transform.shape != (3, 4):
             raise ValueError(f"its transform is {list(transform.shape)}, not [3, 4]")
-        if not (bool(transform.isfinite().all()) and math.isfinite(scale) and scale > 0):
+        if not (bool(transform.isfinite().all()) and 0 < scale < math.inf):
             raise ValueError("it holds what is no number, or a scale that is not above 0")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} cannot be read ({reason(error)}): restore it.") from error

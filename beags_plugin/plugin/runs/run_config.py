@@ -1,8 +1,7 @@
 """config.yml of a run, read without running code that somebody may have written into it.
 
-nerfstudio writes its configs as YAML with Python tags, and reads them with a loader that calls whatever they name. Here
-a tag may build only what a config is made of: dataclasses, enumerations and paths; and name only classes. All must be
-of known packages.
+nerfstudio writes its configs as YAML with Python tags, and its loader calls whatever they name. Here a tag may only
+build dataclasses, enumerations and paths, and name classes, all of known packages.
 """
 
 from __future__ import annotations
@@ -31,11 +30,11 @@ _GROUPS = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
 
 
 class Refused(yaml.constructor.ConstructorError):
-    """A tag that a config has no need of."""
+    """A tag that a config does not need."""
 
 
 class _Older(Exception):
-    """A tag that names what an older version of beags had."""
+    """A tag that names a class of an older version of beags."""
 
 
 @lru_cache(None)

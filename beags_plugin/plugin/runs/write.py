@@ -17,15 +17,15 @@ from beags_plugin.system.whole_files import write_text_atomically, write_whole
 
 
 def save_atomically(content: Any, path: Path) -> None:
-    """``torch.save`` that leaves either the old file or the whole new one, never half of one."""
+    """Save by ``torch.save``; the path holds either the old file or the whole new one."""
     # beside the folder, not in it: nerfstudio takes any file among the checkpoints for one
     write_whole(path, lambda file: torch.save(content, file), path.parent.parent)
 
 
 def write_run(config: BeagsTrainerConfig, folder: Path, model_state: dict[str, Tensor], step: int) -> Path:
-    """Write a run of its own that holds ``model_state``; returns the path of its config.yml.
+    """Write a run that holds ``model_state`` of a ``BeagsModel``; returns the path of its config.yml.
 
-    config: of the run it comes from; model_state: of a ``BeagsModel``; step: as stored in the checkpoint.
+    config: of the run it comes from. step: of the checkpoint.
     """
     folder = folder.absolute()
     own = deepcopy(config)

@@ -75,7 +75,7 @@ def _curves(model: SceneModel, trainer: TrainingRun, datamanager: BeagsDataManag
 
 
 def set_learning_rates(model: SceneModel, adam: Adam, configs: dict[str, Any], step: int) -> None:
-    """Set every group's rate for this step, so that nothing depends on what a checkpoint last held."""
+    """Set every group's learning rate for this step."""
     progress, refining = model.schedule.progress(step), model.schedule.refining(step)
     for group in adam.param_groups:
         rate = configs[group["name"]]["optimizer"].lr

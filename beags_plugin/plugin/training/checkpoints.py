@@ -1,4 +1,4 @@
-"""The checkpoints of a run: what they hold, what a run goes on from, and what becomes of an earlier run's."""
+"""The checkpoints of a run: saved, restored, and those of an earlier run set aside."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
-from beags_plugin.plugin.runs.checkpoint_file import read_checkpoint, validate
+from beags_plugin.plugin.runs.checkpoint_file import model_state, read_checkpoint
 from beags_plugin.plugin.runs.layout import REPORT_FILE, newest_checkpoint
 from beags_plugin.plugin.runs.write import save_atomically
 from beags_plugin.plugin.training.resumable import STATE, VERSION, Resumable, training_state
@@ -26,9 +26,9 @@ _MISFITS = (RuntimeError, LookupError, ValueError, TypeError, AttributeError)  #
 
 
 class Checkpoints:
-    """Writes and reads those of one run.
+    """Saves and restores the checkpoints of one run.
 
-    loaded_run: the folder of the run whose training goes on here, None before ``restore`` has found one.
+    loaded_run: the folder of the run that this one resumes; None before ``restore``. saved_step: the last one saved.
     """
 
     def __init__(self, config: BeagsTrainerConfig, base_dir: Path, folder: Path) -> None:
@@ -37,18 +37,18 @@ class Checkpoints:
         self._parts: dict[str, Resumable] = {}
         self._loaded_states: dict[str, Any] = {}
         self._loaded_from: Path | None = None
-        self._saved_step: int | None = None
+        self.saved_step: int | None = None
 
     # -- what is loaded ------------------------------------------------------------------------------------------------
 
     @property
     def loads(self) -> bool:
-        """Whether a checkpoint is loaded: what it holds counts, not the scene that its run may have started from."""
+        """True if a checkpoint is loaded; a scene to start from does not count then."""
         return self.config.load_dir is not None or self.config.load_checkpoint is not None
 
     @property
     def goes_on(self) -> bool:
-        """Whether this run goes on in its own folder."""
+        """True if this run goes on in its own folder."""
         loaded = self.config.load_dir or (self.config.load_checkpoint and self.config.load_checkpoint.parent)
         return loaded is not None and loaded.resolve().parent == self.base_dir.resolve()
 
@@ -63,16 +63,16 @@ class Checkpoints:
         return config.load_dir / f"step-{config.load_step:09d}.ckpt"
 
     def restore(self, path: Path, pipeline: Pipeline, optimizers: Optimizers, scaler: GradScaler) -> int:
-        """Bring pipeline, optimizers and scaler to where the checkpoint was; returns the next step.
+        """Restore pipeline, optimizers and scaler from a checkpoint; returns the next step.
 
-        The parts that ``keep`` names later go on from there too. Raises ``UserError`` for a file that is no checkpoint,
-        does not fit this run, or was of other classes.
+        ``keep`` restores the other parts later. Raises ``UserError`` for a file that is no checkpoint, does not fit
+        this run, or has other classes.
         """
         checkpoint = read_checkpoint(path)
         states = training_state(checkpoint, path)
         model = cast(SceneModel, pipeline.model)
         named = dict(model.classes)  # by the data
-        validate(_of_model(checkpoint["pipeline"]), path)
+        model_state(checkpoint, path)
         try:
             pipeline.load_pipeline(checkpoint["pipeline"], checkpoint["step"])
             optimizers.load_optimizers(checkpoint["optimizers"])
@@ -94,7 +94,7 @@ class Checkpoints:
     # -- what is saved -------------------------------------------------------------------------------------------------
 
     def keep(self, name: str, part: Resumable) -> None:
-        """Let checkpoints hold the state of ``part``; it goes on from what the loaded one holds, if that does."""
+        """Let checkpoints hold the state of ``part``, and restore that of the loaded one if there is any."""
         self._parts[name] = part
         if name in self._loaded_states:
             try:
@@ -103,12 +103,11 @@ class Checkpoints:
                 raise _misfit(self._loaded_from, error, name) from error
 
     def all_are_kept(self) -> None:
-        """What was loaded for parts that nobody named is let go."""
+        """Drop the loaded states of parts that nobody keeps."""
         self._loaded_states = {}
 
     def save(self, step: int, pipeline: Pipeline, optimizers: Optimizers, scaler: GradScaler) -> None:
-        """Save all that decides the rest of the run; the file appears whole or not at all, and only then are older
-        ones removed."""
+        """Save all that decides the rest of the run; older files are removed once the new one is whole."""
         path = self.folder / f"step-{step:09d}.ckpt"
         content = {
             "step": step,
@@ -119,20 +118,15 @@ class Checkpoints:
             STATE: {"version": VERSION, "parts": {name: part.state() for name, part in self._parts.items()}},
         }
         save_atomically(content, path)
-        self._saved_step = step
+        self.saved_step = step
         if self.config.save_only_latest_checkpoint:
             for old in self.folder.glob("*.ckpt"):
                 if old != path:
                     old.unlink()
         shutil.rmtree(self.base_dir / REPLACED, ignore_errors=True)
 
-    def holds(self, step: int) -> bool:
-        """Whether ``step`` was the last to be saved."""
-        return self._saved_step == step
-
     def set_aside(self) -> None:
-        """Move away the checkpoints of an earlier run into this folder, and remove its report: a resume would take
-        them for this run's."""
+        """Move away the checkpoints of an earlier run in this folder, and remove its report."""
         if self.goes_on:
             return
         (self.base_dir / REPORT_FILE).unlink(missing_ok=True)
@@ -147,13 +141,8 @@ class Checkpoints:
             )  # fmt: skip
 
 
-def _of_model(pipeline: dict[str, Any]) -> dict[str, Any]:
-    """The model's part of the state of a pipeline."""
-    return {name.removeprefix("_model."): value for name, value in pipeline.items() if name.startswith("_model.")}
-
-
 def _misfit(path: Path | None, error: Exception, part: str = "") -> UserError:
-    """The sentence for a checkpoint that is whole, but of another run than this one, or changed."""
+    """Return the error for a checkpoint that is whole, but of another run, or changed."""
     state = f"the state of {part} in {path}" if part else f"{path}"
     return UserError(
         f"{state} does not fit this run ({reason(error)}): name an earlier checkpoint, or refine again from "

@@ -28,23 +28,23 @@ class Densifier:
         self.statistics = GradientStatistics(model.num_points, model.device)
 
     def state(self) -> dict[str, Any]:
-        """What was gathered since the scene last grew, as long as it grows; see ``resumable.Resumable``."""
+        """Return the statistics since the scene last grew, as long as it grows; see ``resumable.Resumable``."""
         found = self.statistics if self.model.growing else GradientStatistics(0)
         return {"total": found.total, "views": found.views}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on gathering, in the first process alone: what the others had gathered is not in a checkpoint."""
+        """Go on gathering, in the first process alone: a checkpoint lacks the statistics of the others."""
         if processes.rank() == 0 and len(state["total"]) == self.model.num_points:
             kept = self.statistics
             kept.total, kept.views = state["total"].clone().to(kept.total), state["views"].clone().to(kept.views)
 
     def before_step(self, step: int) -> None:
-        """Let the step be drawn with what is gathered, as long as the scene still grows; a trained one does not."""
+        """Have the step's screen gradients computed as long as the scene still grows; a trained one does not."""
         schedule = self.model.schedule
         self.model.growing = not schedule.warm and step + 1 < min(self.config.stop, schedule.base_steps)
 
     def after_step(self, step: int) -> None:
-        """Gather; densify and reset opacities when their step has come."""
+        """Gather statistics; densify and reset opacities when their step has come."""
         config, last = self.config, self.model.last_render
         done = step + 1
         if not self.model.growing or last is None:

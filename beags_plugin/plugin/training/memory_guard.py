@@ -26,7 +26,7 @@ _ANYWAY = "--check-memory False (beags resume: --no-check-memory) tries it all t
 def check_room(run: Path, device: str) -> None:
     """Raise ``UserError`` where hardly any memory or disk is free.
 
-    run: folder of the run. device: "cpu", or another one, whose memory is not looked at.
+    run: folder of the run. device: "cpu", or another one, whose memory is not checked.
     """
     if device == "cpu" and (left := available_mb()) < LEAST_FREE_MB:
         raise UserError(f"the machine has {left:.0f} MB of memory left: close other programs, or {SMALLER}; {_ANYWAY}")
@@ -44,7 +44,7 @@ def free_disk_mb(folder: Path) -> float:
 
 
 class MemoryWatch:
-    """Notices that a training is about to take the last of the machine's memory, while it can still be saved."""
+    """Watches a training's memory, so that it can be saved before memory runs out."""
 
     EVERY = 20  # steps
 
@@ -59,10 +59,8 @@ class MemoryWatch:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether memory could not be had: Python's error, the compiled code's, torch's on a CPU or a GPU."""
-    text = str(error)
-    return isinstance(error, MemoryError) or (
-        (isinstance(error, OSError) and error.errno == errno.ENOMEM)
-        or isinstance(error, RuntimeError)
-        and any(words in text for words in ("can't allocate memory", "Cannot allocate memory", "out of memory"))
-    )
+    """Return whether memory ran out, as Python, the compiled code, or torch on a CPU or a GPU reports it."""
+    if isinstance(error, RuntimeError):
+        words = ("can't allocate memory", "Cannot allocate memory", "out of memory")
+        return any(each in str(error) for each in words)
+    return isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM)

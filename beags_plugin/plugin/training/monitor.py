@@ -13,7 +13,6 @@ import torch
 from nerfstudio.configs import base_config  # noqa: F401  (the writer, which it imports, cannot come first)
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
 
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import mask_metrics
@@ -34,10 +33,10 @@ from beags_plugin.system.memory import memory_mb, peak_memory_mb
 from beags_plugin.system.progress import counted, progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
 
-MOST_CLASSES = 20  # with a curve and a picture each: the first ones by id; more could not be told apart
+MOST_CLASSES = 20  # with a curve and a picture each: the first ones by id
 CURVE = "held_out.json"
 """File of a run: one record per measurement, see ``HeldOutCurve``."""
-VIEWS = 4  # held-out views that a measurement of masks looks at, spread over all
+VIEWS = 4  # held-out views on which masks are measured, spread over all
 
 
 class Curves:
@@ -57,7 +56,7 @@ class Curves:
         self._measured = False  # objects, at least once
 
     def state(self) -> dict[str, Any]:
-        """Whether objects have been measured; see ``resumable.Resumable``."""
+        """Return whether objects have been measured; see ``resumable.Resumable``."""
         return {"measured": self._measured}
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -65,7 +64,7 @@ class Curves:
         self._measured = state["measured"]
 
     def before_step(self, step: int) -> None:
-        """Measure what a run that was broken off in the preparation would have measured after the step before."""
+        """Measure what a run that was interrupted during the preparation would have measured after the last step."""
         model = self.model  # whose `assigned` may lie on a GPU: it is not asked before it may be True
         asked = self.every > 0 and step > 0 and not self._measured and model.schedule.refining(step)
         if asked and bool(model.assigned):
@@ -99,13 +98,13 @@ class Curves:
 
     @torch.no_grad()
     def _objects(self, step: int) -> None:
-        """Extracted IoU on some held-out views, occupancy violations, pictures of one of the views."""
+        """Write extracted IoU on some held-out views, occupancy violations, and pictures of one of the views."""
         self._measured = True
         with progress_bar("Measuring objects", passing=True) as progress:
             self._measure(step, progress)
 
     def _measure(self, step: int, progress: Callable[[int, int], None]) -> None:
-        """progress: is told (done, total) of the masks and of the pictures."""
+        """Measure and write; ``progress`` is called with (done, total) of the masks and pictures."""
         model = self.model
         surfels, class_ids = model.surfels().detach(), model.class_ids
         if model.grid is not None:
@@ -132,13 +131,14 @@ class Curves:
         if values:
             writer.put_scalar("Extracted IoU/mean", float(np.mean(values)), step)
         if views:
-            self._pictures(step, views[0], parts, lambda drawn: progress(done + drawn, total))
+            self._pictures(step, views[0], parts, lambda rendered: progress(done + rendered, total))
 
     def _looked_at(self) -> list[EvalView]:
-        """The held-out views, none if they cannot be read: no reason to end a training."""
+        """Return the held-out views; none if they cannot be read, which is no reason to end a training."""
         if self._views is None:
             try:
-                self._views = spread(self._all_views, VIEWS)
+                views, count = self._all_views, min(VIEWS, len(self._all_views))
+                self._views = [views[(2 * index + 1) * len(views) // (2 * count)] for index in range(count)]
             except UserError as error:
                 message = f"Extracted IoU and pictures are left out of the curves: {error}"
                 CONSOLE.print(message, style="yellow", markup=False, highlight=False, soft_wrap=True)
@@ -151,23 +151,14 @@ class Curves:
         model, camera = self.model, view.camera
         surfels, settings = model.surfels().detach(), model.settings(geometry=False)
         classes, _ = render_class_map(model.rasterizer, surfels, model.class_ids, camera, settings)
-        writer.put_image("Scene/class map", _colored(classes), step)
+        colors = colorize(classes.cpu().numpy().astype(np.uint16))
+        writer.put_image("Scene/class map", torch.from_numpy(colors).float() / 255.0, step)
         background = model.background_color.to(model.device)
-        for drawn_so_far, (index, part) in enumerate(parts.items(), start=1):
-            progress(drawn_so_far)
+        for rendered, (index, part) in enumerate(parts.items(), start=1):
+            progress(rendered)
             if len(part):
-                drawn = model.rasterizer.rasterize(surfel_inputs(part, camera), camera, settings, background)
-                writer.put_image(f"Objects/{model.classes[index]}", drawn.color.clamp(0.0, 1.0), step)
-
-
-def _colored(classes: Tensor) -> Tensor:
-    return torch.from_numpy(colorize(classes.cpu().numpy().astype(np.uint16))).float() / 255.0
-
-
-def spread(views: Sequence[EvalView], most: int) -> list[EvalView]:
-    """At most so many of the views, at even distances."""
-    count = min(most, len(views))
-    return [views[(2 * index + 1) * len(views) // (2 * count)] for index in range(count)]
+                render = model.rasterizer.rasterize(surfel_inputs(part, camera), camera, settings, background)
+                writer.put_image(f"Objects/{model.classes[index]}", render.color.clamp(0.0, 1.0), step)
 
 
 class HeldOutCurve:
@@ -175,7 +166,7 @@ class HeldOutCurve:
 
     A record holds ``step`` (steps done), ``gaussians``, ``psnr`` (dB) and ``ssim`` of the held-out views (means over
     them), ``train_psnr`` of as many training views spread over all, and ``seconds`` and ``cpu_seconds`` of training so
-    far, without what the measurements took. Only colours are drawn: a view costs a fraction of a step.
+    far, without the measurements. Only colours are rendered: a view costs a fraction of a step.
     """
 
     def __init__(self, folder: Path, every: int, last: int, model: SceneModel, datamanager: BeagsDataManager) -> None:
@@ -191,7 +182,7 @@ class HeldOutCurve:
         self._started = _clocks()
 
     def state(self) -> dict[str, Any]:
-        """The curve so far, and the clocks; see ``resumable.Resumable``."""
+        """Return the curve so far, and the clocks; see ``resumable.Resumable``."""
         now = _clocks()
         return {"records": list(self.records), "clocks": {name: now[name] - self._started[name] for name in now}}
 
@@ -201,7 +192,7 @@ class HeldOutCurve:
         self._started = {name: now - state["clocks"][name] for name, now in _clocks().items()}
 
     def after_step(self, step: int) -> None:
-        """Measure if the time has come: at every multiple of ``every`` steps, and where a phase ends."""
+        """Measure at every multiple of ``every`` steps, and where a phase ends."""
         done = step + 1
         if done % self.every == 0 or done in self.ends:
             began = _clocks()
@@ -229,13 +220,13 @@ class HeldOutCurve:
         model = self.model
         background = model.background_color.to(model.device)
         image = view.image_on(background)
-        drawn = model.rasterizer.rasterize(
+        color = model.rasterizer.rasterize(
             surfel_inputs(model.surfels(), view.camera, model.active_sh_degree()),
             view.camera,
             model.settings(geometry=False),
             background,
         ).color.clamp(0.0, 1.0)
-        return float(psnr(drawn, image)), float(ssim(drawn, image))
+        return float(psnr(color, image)), float(ssim(color, image))
 
 
 def _clocks() -> dict[str, float]:

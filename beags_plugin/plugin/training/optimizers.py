@@ -9,18 +9,14 @@ from nerfstudio.engine.optimizers import Optimizers
 from torch.cuda.amp.grad_scaler import GradScaler
 from torch.nn import Parameter
 
-from beags_plugin.plugin.training.replicas import average_gradients
 from beags_plugin.plugin.training.timing import StepClock
+from beags_plugin.system import processes
 
-SCENE = "scene"
-"""Name of the one optimizer, for nerfstudio and in checkpoints."""
+SCENE = "scene"  # name of the one optimizer, for nerfstudio and in checkpoints
 
 
 class SceneOptimizer(Optimizers):
-    """Step all parameters of the scene in one Adam; its groups have the names and the rates of the config.
-
-    adam: its ``param_groups`` carry a ``name`` each.
-    """
+    """One Adam for all parameters of the scene; its ``param_groups`` carry the names and rates of the config."""
 
     def __init__(
         self, config: dict[str, Any], param_groups: dict[str, list[Parameter]], clock: StepClock | None = None
@@ -38,10 +34,10 @@ class SceneOptimizer(Optimizers):
         self.parameters = {SCENE: [value for parameters in param_groups.values() for value in parameters]}
 
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
-        """Average the gradients of all processes, clip those of groups whose config asks for it, and step."""
+        """Average the gradients of all processes, clip those of groups whose config says so, and step."""
         self.clock.mark("backward")
         groups = self.adam.param_groups  # not `self.parameters`: those are the ones that training began with
-        average_gradients(value for group in groups for value in group["params"])
+        processes.average(v.grad for group in groups for v in group["params"] if v.grad is not None)
         norms = {group["name"]: self.config[group["name"]]["optimizer"].max_norm for group in groups}
         if any(norm is not None for norm in norms.values()):
             grad_scaler.unscale_(self.adam)

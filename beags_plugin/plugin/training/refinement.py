@@ -1,4 +1,4 @@
-"""The switch from base training to refinement, and what of it is kept on disk for resuming."""
+"""The switch from base training to refinement, and its files for a resume."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
+from PIL import Image
 
 from beags_plugin.assignment.assignment import Assignment
 from beags_plugin.core.cameras import Camera
@@ -37,27 +38,27 @@ from beags_plugin.system.whole_files import write_text_atomically, write_whole
 
 
 class RefinementSwitch:
-    """Prepares refinement once the base is trained, or takes it up again in a resumed run."""
+    """Prepares refinement once the base is trained, or restores it in a resumed run."""
 
     def __init__(self, model: SceneModel, trainer: TrainingRun, datamanager: BeagsDataManager) -> None:
         self.model = model
         self.trainer = trainer
         self.datamanager = datamanager
         self.refiner = REFINERS.get(model.config.refiner)()
-        self.ready = False
+        self.ready = False  # to refine
         self._switching = False  # in the middle of the last base step, before nerfstudio evaluates and saves it
         self._evaluation_due = False
-        self._done: int | None = None  # refined_steps, which lies on the GPU, as the host knows it
-        self.rounds = 0  # prepared so far, in this process and those that it goes on from
+        self._done: int | None = None  # host copy of refined_steps, which lies on the GPU
+        self.rounds = 0  # prepared so far, in this process and those that it resumes
         model.prepared_rounds = 0
 
     @property
     def wanted(self) -> bool:
-        """Whether this run refines at all."""
+        """True if this run refines at all."""
         return self.model.config.refine_steps > 0
 
     def check_masks(self) -> None:
-        """Raise ``UserError`` at the start of a run that would find no mask when it comes to refine."""
+        """Raise ``UserError`` if no training view has a mask to refine with."""
         masks = self.datamanager.train_dataset.metadata["mask_filenames"]
         if self.wanted and all(path is None for path in masks):
             raise UserError(
@@ -66,7 +67,7 @@ class RefinementSwitch:
             )
 
     def check_options(self) -> None:
-        """Raise ``UserError`` at the start of a run whose options would stop it when it comes to refine."""
+        """Raise ``UserError`` for options that would stop the run when it begins to refine."""
         if self.wanted:
             rounds, steps = self.model.config.refine_rounds, self.model.config.refine_steps
             if not 1 <= rounds <= steps:
@@ -75,16 +76,16 @@ class RefinementSwitch:
             self.model.config.split.check()
 
     def state(self) -> dict[str, Any]:
-        """How many rounds have been prepared, and whether nerfstudio has evaluated the step; see ``Resumable``."""
+        """Return the number of prepared rounds, and whether nerfstudio has evaluated the step; see ``Resumable``."""
         return {"rounds": self.rounds, "evaluated": not self._switching}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on in the round in which the run that gave ``state`` was."""
+        """Go on in the round of ``state``."""
         self.rounds = state["rounds"]
         self._evaluation_due = not state["evaluated"]
 
     def before_step(self, step: int) -> None:
-        """Take up refinement that a checkpoint was in, or start it where no base step precedes it."""
+        """Restore refinement from a checkpoint, or start it where no base step precedes it."""
         model = self.model
         if not self.wanted or not model.schedule.refining(step):
             return
@@ -92,7 +93,7 @@ class RefinementSwitch:
         if not self.ready:
             self.rounds = max(self.rounds, sum(start < done for start in self._round_starts()))
             if self.rounds > 0:
-                self._take_up()
+                self._restore_files()
         if sum(start <= done for start in self._round_starts()) > self.rounds:
             self._prepare(step - 1)
         if self._evaluation_due:
@@ -112,15 +113,15 @@ class RefinementSwitch:
         return self.model.schedule.round_starts(self.model.config.refine_rounds)
 
     def _prepare(self, step: int) -> None:
-        """Prepare a round from the scene as it is and the masks as the data has them. step: the last one done."""
+        """Prepare a round from the scene as it is and the masks of the data. step: the last one done."""
         model, first = self.model, self.rounds == 0
         CONSOLE.rule("Preparing refinement" if first else "Preparing refinement again, with the refined depth")
         start = time.perf_counter()
         with self.trainer.long_stage(step):
             views = self.datamanager.views("train", original=True)
             with _bar("Reading masks", passing=True) as progress:
-                masks = LabelMaps(view.stored_labels for view in counted(views, len(views), progress))
-            with released(self.trainer.train_lock):  # minutes, which read the scene only: a viewer may draw it
+                masks = LabelMaps(view.labels for view in counted(views, len(views), progress))
+            with released(self.trainer.train_lock):  # minutes, which only read the scene: a viewer may render it
                 prepared = prepare(
                     model.surfels(),
                     [view.camera for view in views],
@@ -138,7 +139,7 @@ class RefinementSwitch:
             for finding in prepared.summary:
                 CONSOLE.print(f"  {finding}", highlight=False, markup=False)
             self._take_classes(prepared.assignment)
-            if first:  # the snapshot first: what save_prepared writes last says that everything is there
+            if first:  # before save_prepared, whose last file marks everything as there
                 snapshot = self.trainer.base_dir / BASE_SNAPSHOT
                 write_run(self.trainer.config, snapshot, model.state_dict(), max(step, 0))
                 CONSOLE.print(f"  base kept in {snapshot}", highlight=False, markup=False, soft_wrap=True)
@@ -159,15 +160,14 @@ class RefinementSwitch:
         self.model.assigned.fill_(True)
 
     def _start(self, grid: VisibilityGrid | None, labels: LabelMaps) -> None:
-        more_rounds = self.rounds < self.model.config.refine_rounds  # which need the masks as the data has them
-        self.datamanager.replace_labels(labels, keep=more_rounds)
+        self.datamanager.replace_labels(labels)
         self.model.grid = None if grid is None else grid.to(self.model.device)
         self.model.frozen = not self.refiner.trains
         self.model.prepared_rounds = self.rounds
         self.ready = True
 
-    def _take_up(self) -> None:
-        """Go on with the masks and grids of the run that the checkpoint came from, and keep them with this one."""
+    def _restore_files(self) -> None:
+        """Read the masks and the grid of the run that the checkpoint came from, and copy them into this one."""
         folder = round_folder(self.trainer.base_dir, self.rounds - 1)
         former = self.trainer.loaded_run
         if former is not None and former != self.trainer.base_dir:
@@ -198,12 +198,12 @@ class RefinementSwitch:
 
 
 def _bar(name: str, passing: bool = False) -> AbstractContextManager[Callable[[int, int], None]]:
-    """A progress bar, in the first of several processes."""
+    """Open a progress bar, in the first of several processes."""
     return progress_bar(name, passing) if processes.rank() == 0 else nullcontext(lambda done, total: None)
 
 
 def _prepared_labels(path: Path, camera: Camera) -> torch.Tensor:
-    """[H, W] int32 of the mask that refinement was prepared with for a view of this camera."""
+    """Read the labels [H, W] int32 of a prepared mask; raises ``UserError`` if it does not fit the camera."""
     if not path.is_file():
         raise UserError(
             f"the prepared mask {path} is missing: restore it, or refine again from base/nerfstudio_models."
@@ -218,7 +218,7 @@ def _prepared_labels(path: Path, camera: Camera) -> torch.Tensor:
 
 
 def save_prepared(prepared: Preparation, names: list[str], folder: Path) -> None:
-    """Keep what refinement needs; grid.pt is written last, so its presence says that all is there."""
+    """Write what a resumed refinement needs; grid.pt comes last, as its presence marks the rest as complete."""
     with writing(folder):
         (folder / "grid.pt").unlink(missing_ok=True)  # an earlier run's
         if folder.name == PREPARED:
@@ -230,7 +230,9 @@ def save_prepared(prepared: Preparation, names: list[str], folder: Path) -> None
             labels = prepared.labels[index]
             write_mask(folder / "masks" / f"{name}.png", labels.cpu().numpy().astype(np.uint16))
             if prepared.confidence is not None:
-                _write_grey(folder / "confidence" / f"{name}.png", prepared.confidence[index])
+                path = folder / "confidence" / f"{name}.png"
+                with writing(path):  # cv2 would ignore a full disk
+                    Image.fromarray(prepared.confidence[index].cpu().numpy()).save(path)
     report = {"summary": prepared.summary, "seconds": prepared.seconds, "peak_memory_mb": peak_memory_mb()}
     write_text_atomically(json.dumps(report, indent=2), folder / "report.json")
     state = {} if prepared.grid is None else prepared.grid.state_dict()
@@ -238,23 +240,16 @@ def save_prepared(prepared: Preparation, names: list[str], folder: Path) -> None
 
 
 def _clear(folder: Path) -> None:
-    """Remove what another run into the same folder prepared, later rounds too."""
+    """Remove the files of another run in the same folder, later rounds too."""
     for path in folder.glob("*"):
         shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 @contextmanager
 def released(lock: Lock) -> Iterator[None]:
-    """Let others have a lock that is held, and take it back."""
+    """Release a held lock inside the block."""
     lock.release()
     try:
         yield
     finally:
         lock.acquire()
-
-
-def _write_grey(path: Path, values: torch.Tensor) -> None:
-    from PIL import Image
-
-    with writing(path):  # cv2 would say nothing of a full disk
-        Image.fromarray(values.cpu().numpy()).save(path)

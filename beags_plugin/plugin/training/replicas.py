@@ -1,13 +1,12 @@
 """A training in several processes, each with a replica of the scene: see docs/cuda.md.
 
-Each step, every process draws a view of its own, and the gradients are averaged; whatever else changes the scene is
-computed alike in all of them. Only the first one writes: the others write into a folder that goes when they end.
+Each step, every process renders a view of its own, and the gradients are averaged; all else that changes the scene is
+computed alike in all. Only the first process writes the run: the others write into a folder that they remove.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable
 from pathlib import Path
 
 import torch
@@ -22,9 +21,8 @@ from beags_plugin.system import processes
 class Replica:
     """One process of a training.
 
-    config: the run's; in processes other than the first it is changed to write elsewhere, to show nothing, and to
-    measure nothing. local_rank: number of this process, and of its GPU, on its machine.
-    run: the folder of the run, which the first process alone writes to.
+    config: the run's; in processes other than the first it is changed to write elsewhere, and to show and measure
+    nothing. local_rank: number of this process, and of its GPU, on its machine. run: the folder of the run.
     """
 
     def __init__(self, config: BeagsTrainerConfig, local_rank: int) -> None:
@@ -41,15 +39,10 @@ class Replica:
             CONSOLE.quiet = True
 
     def start_alike(self, scene: nn.Module) -> None:
-        """Let all processes begin with the scene of the first."""
+        """Copy the scene of the first process to all."""
         processes.take_from_first(value.detach() for value in (*scene.parameters(), *scene.buffers()))
 
     def end(self) -> None:
-        """Remove what another process than the first has written."""
+        """Remove the folder of a process other than the first."""
         if self._folder is not None:
             self._folder.cleanup()
-
-
-def average_gradients(parameters: Iterable[torch.Tensor]) -> None:
-    """The mean over the views that the processes have drawn."""
-    processes.average(value.grad for value in parameters if value.grad is not None)

@@ -1,4 +1,4 @@
-"""State that a checkpoint keeps besides the scene and its optimizers: all that decides the rest of a run."""
+"""State that a checkpoint keeps besides the scene and its optimizers."""
 
 from __future__ import annotations
 
@@ -18,17 +18,15 @@ from beags_plugin.plugin.training.optimizers import SceneOptimizer
 from beags_plugin.plugin.training.timing import StageSeconds
 from beags_plugin.system.errors import UserError
 
-STATE = "beags"
-"""Key of a checkpoint, beside nerfstudio's own."""
-VERSION = 1
-"""Of what lies there; another version is not read."""
+STATE = "beags"  # key of a checkpoint, beside nerfstudio's own
+VERSION = 1  # of the state there
 
 
 class Resumable(Protocol):
     """A part of the training whose state a checkpoint holds: tensors and plain values, as ``torch.load`` allows."""
 
     def state(self) -> dict[str, Any]:
-        """What decides how the part goes on."""
+        """Return what decides how the part goes on."""
         ...
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -75,16 +73,16 @@ class TrainingRun(Protocol):
 
 
 class GlobalRandom:
-    """The generators that programs share. This package draws from none of them; losses of other packages may."""
+    """The process's shared generators, which losses of other packages may use; this package does not."""
 
     def state(self) -> dict[str, Any]:
-        """See ``Resumable``."""
-        numpy_state: Any = np.random.get_state()  # noqa: NPY002  (that of others, not one to draw from)
+        """Return the generators' states; see ``Resumable``."""
+        numpy_state: Any = np.random.get_state()  # noqa: NPY002  (that of others)
         name, keys, *rest = numpy_state
         return {"torch": torch.get_rng_state(), "python": random.getstate(), "numpy": (name, keys.tolist(), *rest)}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """See ``Resumable``."""
+        """Set the generators to ``state``."""
         torch.set_rng_state(state["torch"])
         random.setstate(state["python"])
         name, keys, *rest = state["numpy"]
@@ -92,7 +90,7 @@ class GlobalRandom:
 
 
 def training_state(checkpoint: dict[str, Any], path: Path) -> dict[str, Any]:
-    """The states of all parts of the training by name; says so if there are none to go on from bit for bit.
+    """Return the states of all parts of the training by name; none, with a note, for an older checkpoint.
 
     Raises ``UserError`` for a checkpoint of a newer version, or a damaged one.
     """

@@ -10,7 +10,7 @@ from beags_plugin.plugin.training.scene_model import SceneModel
 
 
 def edit_scene(model: SceneModel, adam: Adam, edited: Densified) -> None:
-    """Put the edited surfels into the model and its optimizer; their classes are reset."""
+    """Put the edited Gaussians into the model and its optimizer; their classes are reset."""
     former = dict(model.gauss_params.items())
     model.replace_surfels(edited.surfels)
     for group in adam.param_groups:
@@ -19,9 +19,9 @@ def edit_scene(model: SceneModel, adam: Adam, edited: Densified) -> None:
 
 
 def move_adam_state(adam: Adam, former: Tensor, parameter: Tensor, source: Tensor, fresh: Tensor) -> None:
-    """Put ``parameter`` in place of ``former`` in the optimizer; Adam's moments follow their surfels.
+    """Put ``parameter`` in place of ``former`` in the optimizer; Adam's moments follow their Gaussians.
 
-    source: [M] int64, the former index of each surfel; fresh: [M] bool, new ones, whose moments start at 0.
+    source: [M] int64, the former index of each Gaussian; fresh: [M] bool, new ones, whose moments start at 0.
     """
     state = adam.state.pop(former, {})
     for name in ("exp_avg", "exp_avg_sq"):

@@ -1,4 +1,4 @@
-"""The scene as nerfstudio's models hold one, and the state that a run changes."""
+"""The scene as a nerfstudio model, and the state that a run changes."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ FLATNESS = 1e-3  # exported third scale, relative to the smaller of the two: fla
 class LastRender:
     """The render of the last training step.
 
-    screen_shift: [N, 2] of ``SurfelInputs``, whose gradient densification reads. labels: [H, W] int32 M', against which
-    the boundary was rendered; None without a boundary.
+    screen_shift: [N, 2] of ``SurfelInputs``, whose gradient densification reads. labels: [H, W] int32 of the view, from
+    ``BeagsDataManager``; None if the data gives none.
     """
 
     camera: Camera
@@ -39,10 +39,10 @@ class LastRender:
 
 
 class SceneModel(SplatfactoModel):
-    """N surfels as parameters, their classes as buffers, and the state of the run that trains them.
+    """N Gaussians as parameters, their classes as buffers, and the state of the run that trains them.
 
-    It derives from nerfstudio's ``SplatfactoModel`` because ns-export and the viewer ask for that type, but shares
-    none of its training.
+    It derives from nerfstudio's ``SplatfactoModel``, whose type ns-export and the viewer ask for; its training is not
+    used.
 
     classes: id to name. step, seed: of the run. grid: voxels of the classes; None before refinement. growing: whether
     this step gathers gradients for densification. frozen: whether the refiner leaves the scene as it is. last_render:
@@ -61,16 +61,7 @@ class SceneModel(SplatfactoModel):
 
     def hold(self, surfels: Surfels, classes: Mapping[int, str]) -> None:
         """Make the parameters and buffers of a scene whose Gaussians have no classes yet; called once."""
-        self.gauss_params = nn.ParameterDict(
-            {
-                "means": nn.Parameter(surfels.means),
-                "features_dc": nn.Parameter(surfels.sh_dc),
-                "features_rest": nn.Parameter(surfels.sh_rest),
-                "opacities": nn.Parameter(surfels.opacity_logits[:, None].contiguous()),
-                "scales": nn.Parameter(surfels.log_scales),
-                "quats": nn.Parameter(surfels.quats),
-            }
-        )
+        self.gauss_params = nn.ParameterDict({name: nn.Parameter(value) for name, value in _by_group(surfels).items()})
         self.register_buffer("class_ids", torch.zeros(len(surfels), dtype=torch.int32))
         self.register_buffer("class_margin", torch.zeros(len(surfels)))
         self.register_buffer("assigned", torch.tensor(False))
@@ -112,7 +103,7 @@ class SceneModel(SplatfactoModel):
         return RasterSettings(self.config.near * extent, self.config.far * extent, geometry, distortion)
 
     def active_sh_degree(self) -> int:
-        """Return the degree to render: degrees grow one by one while the base trains; other scenes show them all."""
+        """Return the SH degree to render: it grows one by one while the base trains; else all are rendered."""
         if not self.training or self.schedule.warm or self.schedule.refining(self.step):
             return self.config.sh_degree
         interval = max(self.schedule.scaled(self.config.sh_degree_interval), 1)
@@ -125,14 +116,14 @@ class SceneModel(SplatfactoModel):
         return {name: loss for name, loss in self.losses.items() if loss.active(self.step)}
 
     def generator(self, step: int) -> torch.Generator:
-        """Return a generator seeded by (seed, step), so that a resumed run draws what the uninterrupted one drew."""
+        """Return a generator seeded by (seed, step), so that a resumed run samples as the uninterrupted one."""
         return torch.Generator().manual_seed(self.seed * 1_000_003 + step)
 
-    # -- surfels -----------------------------------------------------------------------------------------------------
+    # -- Gaussians ---------------------------------------------------------------------------------------------------
 
     @property
     def scales(self) -> Tensor:
-        """[N, 3] logs of the scales as exporters want them: the third is thin; the parameter itself has two."""
+        """[N, 3] logs of the scales for exporters: the third is thin; the parameter itself has two."""
         flat = self.gauss_params["scales"]
         thin = flat.min(dim=-1, keepdim=True).values + torch.log(flat.new_tensor(FLATNESS))
         return torch.cat([flat, thin], dim=-1)
@@ -149,39 +140,31 @@ class SceneModel(SplatfactoModel):
         )
 
     def replace_surfels(self, surfels: Surfels) -> None:
-        """Put new parameters in place of all, of any number and degree; classes are reset.
-
-        New ones, since autograd still knows the size of those that the last step's graph holds.
-        """
-        values = {
-            "means": surfels.means,
-            "features_dc": surfels.sh_dc,
-            "features_rest": surfels.sh_rest,
-            "opacities": surfels.opacity_logits[:, None],
-            "scales": surfels.log_scales,
-            "quats": surfels.quats,
-        }
+        """Replace all parameters, in any number and SH degree; classes are reset."""
         self.config.sh_degree = surfels.sh_degree
-        for name, value in values.items():
+        for name, value in _by_group(
+            surfels
+        ).items():  # new ones: autograd keeps the size of those in the last step's graph
             self.gauss_params[name] = nn.Parameter(value.detach().to(self.device).contiguous())
-        self.class_ids = torch.zeros(len(surfels), dtype=torch.int32, device=self.device)
-        self.class_margin = torch.zeros(len(surfels), device=self.device)
+        self._reset_classes(len(surfels))
+
+    def _reset_classes(self, count: int) -> None:
+        self.class_ids = torch.zeros(count, dtype=torch.int32, device=self.device)
+        self.class_margin = torch.zeros(count, device=self.device)
 
     # -- checkpoints -------------------------------------------------------------------------------------------------
 
     def load_state_dict(self, state: Mapping[str, Any], **kwargs) -> Any:
-        """Load a checkpoint of any number of surfels; parameters are resized in place (optimizers hold them)."""
-        count = state["gauss_params.means"].shape[0]
-        # colours are shown as they were trained, whatever degree this config asks for
+        """Load a checkpoint of any number of Gaussians; parameters are resized in place (optimizers hold them)."""
+        # colours are rendered as they were trained, whatever SH degree this config asks for
         self.config.sh_degree = round((state["gauss_params.features_rest"].shape[1] + 1) ** 0.5) - 1
         for name, parameter in self.gauss_params.items():
             parameter.data = torch.zeros_like(state[f"gauss_params.{name}"], device=self.device)
-        self.class_ids = torch.zeros(count, dtype=torch.int32, device=self.device)
-        self.class_margin = torch.zeros(count, device=self.device)
+        self._reset_classes(len(state["gauss_params.means"]))
         return nn.Module.load_state_dict(self, state, **kwargs)  # type: ignore[arg-type]
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return what a checkpoint keeps besides tensors: the class names."""
+        """Return the class names, which a checkpoint keeps besides tensors."""
         return {"classes": dict(self.classes)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -191,3 +174,9 @@ class SceneModel(SplatfactoModel):
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return one optimizer group per kind of parameter."""
         return {name: [self.gauss_params[name]] for name in PARAMETER_GROUPS}
+
+
+def _by_group(surfels: Surfels) -> dict[str, Tensor]:
+    """Return the Gaussians' values by the names of splatfacto's groups of parameters."""
+    values = (surfels.means, surfels.sh_dc, surfels.sh_rest, surfels.opacity_logits[:, None])
+    return dict(zip(PARAMETER_GROUPS, (*values, surfels.log_scales, surfels.quats), strict=True))

@@ -8,12 +8,12 @@ from typing import Any
 from nerfstudio.utils.rich_utils import CONSOLE
 
 QUICKER = "Quicker: ns-train beags-tiny, or end the command with: beags-data --downscale-factor 2."
-LONG_RUN_SECONDS = 20 * 60  # a run that is expected to take longer says which preset is quicker
-ESTIMATE_STEPS = (20, 120)  # the estimate is the mean step between these: after warm-up, soon enough to matter
+LONG_RUN_SECONDS = 20 * 60  # an expected time above this prints which preset is quicker
+ESTIMATE_STEPS = (20, 120)  # the estimate is the mean step between these, after warm-up
 
 
 class Estimate:
-    """Print once how long ``steps`` steps of a method will take."""
+    """The expected time of ``steps`` steps of a method, printed once."""
 
     def __init__(self, method: str, steps: int) -> None:
         self._steps = steps
@@ -24,14 +24,14 @@ class Estimate:
         )
 
     def before_step(self, done: int) -> None:
-        """Take, before every step, how many steps this process has done."""
+        """Take the time before a step. done: steps of this process so far."""
         first, last = ESTIMATE_STEPS
         if done == first:
             self._from = time.perf_counter()
         if done == last:
-            self._say((time.perf_counter() - self._from) / (last - first))
+            self._report((time.perf_counter() - self._from) / (last - first))
 
-    def _say(self, seconds_per_step: float) -> None:
+    def _report(self, seconds_per_step: float) -> None:
         left = self._steps * seconds_per_step
         message = (
             f"About {_duration(left)} for {self._steps} steps at the present speed "
@@ -43,7 +43,7 @@ class Estimate:
 
 
 class StageSeconds:
-    """Measure the wall time of base training, each preparation stage and refinement; a resumed run counts on."""
+    """The wall times of base training, each preparation stage and refinement; a resumed run counts on."""
 
     def __init__(self) -> None:
         self._started = time.perf_counter()
@@ -80,16 +80,16 @@ class StageSeconds:
         return {name: self._former.get(name, 0.0) + own.get(name, 0.0) for name in [*names, "refinement"]}
 
     def state(self) -> dict[str, Any]:
-        """See ``resumable.Resumable``."""
+        """Return the seconds by name; see ``resumable.Resumable``."""
         return self.total()
 
     def restore(self, state: dict[str, Any]) -> None:
-        """See ``resumable.Resumable``."""
+        """Count on from ``state``."""
         self._former = dict(state)
 
 
 class StepClock:
-    """Measure the seconds per part of a step: each lasts from the mark before to its own."""
+    """The seconds per part of a step: each lasts from the mark before to its own."""
 
     def __init__(self) -> None:
         self._last = time.perf_counter()

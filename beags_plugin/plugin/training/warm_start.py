@@ -1,11 +1,11 @@
-"""A run that starts from a scene that is there already, instead of seed points."""
+"""A run that starts from a trained scene instead of seed points."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,12 +14,11 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from beags_plugin.core.cameras import camera_extent
-from beags_plugin.core.flattening import Flattening, flatten, without_empty_bands
+from beags_plugin.core.flattening import flatten, without_empty_bands
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.extraction.frames import from_input_frame, to_input_frame
 from beags_plugin.importers.base import ImportedScene, find_importer
 from beags_plugin.losses.photometric import psnr
-from beags_plugin.plugin.options.model_options import BeagsModelConfig
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.plugin.views.views import View
@@ -28,40 +27,19 @@ from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
 
-START_REPORT = "start.json"  # in a run that started from a scene: what that was, and how well it fits
+START_REPORT = "start.json"  # file of a run that started from a scene: the scene, and how well it fits
 StartFrame = Literal["auto", "world", "normalised"]
-_MOST_VIEWS = 48  # drawn to measure; of more, so many at even distances
-_POOR_DB = 2.0  # a scene that fits draws the photos better than one flat colour does by more than this
+_MOST_VIEWS = 48  # rendered to measure the fit
+_POOR_DB = 2.0  # a scene that fits is better than one flat colour by more than this
 _BETTER_DB = 3.0  # by which another frame must fit better to be proposed
 
 Normalization = tuple[Tensor, float]
 
 
-@dataclass(frozen=True)
-class Fit:
-    """How well the scene draws the photos, mean over training views, dB; flat: what one flat colour reaches."""
-
-    psnr: float
-    flat: float
-    views: int
-
-    @property
-    def poor(self) -> bool:
-        """Whether the scene is hardly better than a flat colour."""
-        return self.psnr < self.flat + _POOR_DB
-
-
-def check_start(config: BeagsModelConfig) -> None:
-    """Raise ``UserError`` for a start that cannot be read, before the data are."""
-    if config.start_from is not None:
-        find_importer(Path(config.start_from))
-
-
 def start_from_scene(model: SceneModel, datamanager: BeagsDataManager, run: Path) -> None:
-    """Put the scene of ``start_from`` in place of the seed points; says what it was and how well it fits.
+    """Put the scene of ``start_from`` in place of the seed points, and report the scene and how well it fits.
 
-    run: folder of the run, where ``start.json`` keeps what was said. Raises ``UserError`` for a scene that cannot be
-    used.
+    run: folder of the run, for ``start.json``. Raises ``UserError`` for a scene that cannot be used.
     """
     config = model.config
     assert config.start_from is not None
@@ -75,13 +53,12 @@ def start_from_scene(model: SceneModel, datamanager: BeagsDataManager, run: Path
     outputs = datamanager.train_dataparser_outputs
     ours = (outputs.dataparser_transform, float(outputs.dataparser_scale))
     views = datamanager.views("train")
-    candidates: dict[StartFrame, Surfels] = {
-        name: _moved(surfels, scene, name, ours) for name in _frames(config.start_frame)
-    }
-    frame = _frames(config.start_frame)[0]
-    moved = candidates[frame]
-    fit = _measure(model, moved, views)
-    model.replace_surfels(moved)
+    frames: Sequence[StartFrame] = ("auto", "world", "normalised")
+    frames = frames if config.start_frame == "auto" else (config.start_frame,)
+    candidates: dict[StartFrame, Surfels] = {name: _moved(surfels, scene, name, ours) for name in frames}
+    frame = frames[0]
+    fit = _measure(model, candidates[frame], views)
+    model.replace_surfels(candidates[frame])
     report = {
         "from": str(path.absolute()),
         "kind": scene.kind,
@@ -89,20 +66,13 @@ def start_from_scene(model: SceneModel, datamanager: BeagsDataManager, run: Path
         "gaussians": len(surfels),
         "dropped": int((~usable).sum()),
         "flattening": None if lost is None else vars(lost),
-        "psnr": fit.psnr,
-        "flat_psnr": fit.flat,
-        "views": fit.views,
+        **fit,
     }
-    for line in _told(path, scene, report, lost, fit):
+    for line in _description(path, scene, report):
         CONSOLE.print(f"  {line}", markup=False, highlight=False, soft_wrap=True)
-    if fit.poor:
-        _say_poor(model, path, fit, candidates, views)
+    if fit["psnr"] < fit["flat_psnr"] + _POOR_DB:
+        _warn_of_poor_fit(model, path, fit, candidates, views)
     write_text_atomically(json.dumps(report, indent=2), run / START_REPORT)
-
-
-def _frames(wanted: StartFrame) -> Sequence[StartFrame]:
-    """The frames that come into question, the one to take first."""
-    return ("auto", "world", "normalised") if wanted == "auto" else (wanted,)
 
 
 def _frame_name(frame: StartFrame, scene: ImportedScene) -> str:
@@ -114,7 +84,7 @@ def _frame_name(frame: StartFrame, scene: ImportedScene) -> str:
 
 
 def _moved(surfels: Surfels, scene: ImportedScene, frame: StartFrame, ours: Normalization) -> Surfels:
-    """The surfels in the frame of this run, x' = scale (R x + t) of the input's x."""
+    """Return the Gaussians in the frame of this run, x' = scale (R x + t) of the input's x."""
     theirs = scene.normalization
     if frame == "normalised" or (frame == "auto" and (scene.note or _same(theirs, ours))):
         return surfels
@@ -126,63 +96,63 @@ def _moved(surfels: Surfels, scene: ImportedScene, frame: StartFrame, ours: Norm
 
 
 def _same(theirs: Normalization | None, ours: Normalization) -> bool:
-    """Whether two runs normalised alike; the file keeps float32 in decimal."""
+    """Return whether two runs normalised alike; the file keeps float32 in decimal."""
     return theirs is not None and torch.equal(theirs[0].float(), ours[0].float()) and math.isclose(theirs[1], ours[1])
 
 
 @torch.no_grad()
-def _measure(model: SceneModel, surfels: Surfels, views: Sequence[View], most: int = _MOST_VIEWS) -> Fit:
-    """Draw training views of the surfels and compare them with the photos."""
+def _measure(model: SceneModel, surfels: Surfels, views: Sequence[View], most: int = _MOST_VIEWS) -> dict[str, Any]:
+    """Return the mean PSNR of the rendered Gaussians and of one flat colour over some training views, dB."""
     device = model.device
     surfels = Surfels(**{field.name: getattr(surfels, field.name).to(device) for field in fields(surfels)})
     poses = torch.stack([torch.linalg.inv(view.camera.viewmat) for view in views])
     model.extent = camera_extent(poses).to(device)
     settings = model.settings(geometry=False)
-    chosen = [
-        views[index] for index in torch.linspace(0, len(views) - 1, min(most, len(views))).round().long().unique()
-    ]
+    spread = torch.linspace(0, len(views) - 1, min(most, len(views))).round().long().unique()
+    chosen = [views[index] for index in spread]
     found = []
     with progress_bar("drawing the start") as progress:
         for number, view in enumerate(chosen):
             image = view.image_on(model.background_color).to(device)
-            drawn = model.rasterizer.rasterize(
+            color = model.rasterizer.rasterize(
                 surfel_inputs(surfels, view.camera), view.camera, settings, model.background_color.to(device)
             ).color.clamp(0.0, 1.0)
             flat = image.mean(dim=(0, 1))
-            found.append([float(psnr(drawn, image)), float(psnr(flat, image))])
+            found.append([float(psnr(color, image)), float(psnr(flat, image))])
             progress(number + 1, len(chosen))
     scene_psnr, flat_psnr = (sum(values) / len(values) for values in zip(*found, strict=True))
-    return Fit(scene_psnr, flat_psnr, len(chosen))
+    return {"psnr": scene_psnr, "flat_psnr": flat_psnr, "views": len(chosen)}
 
 
-def _told(path: Path, scene: ImportedScene, report: dict[str, Any], lost: Flattening | None, fit: Fit) -> list[str]:
-    """What the user should know of the start, a line each."""
+def _description(path: Path, scene: ImportedScene, report: dict[str, Any]) -> list[str]:
+    """Describe the start for the user, a line each."""
     dropped = report["dropped"]
     counted = f"{report['gaussians']:,} Gaussians" + (f" ({dropped:,} dropped: not finite)" if dropped else "")
     lines = [f"start: {path} ({scene.kind}), {counted}, frame: {report['frame']}"]
     if scene.note:
         lines.append(scene.note)
-    if lost is not None:
+    if (lost := report["flattening"]) is not None:
         lines.append(
-            f"flattened along the thinnest axis, which is {lost.median_ratio:.3f} of the second (median); "
-            f"above half of it for {100 * lost.round_share:.0f} % of the Gaussians"
+            f"flattened along the thinnest axis, which is {lost['median_ratio']:.3f} of the second (median); "
+            f"above half of it for {100 * lost['round_share']:.0f} % of the Gaussians"
         )
     lines.append(
-        f"PSNR of {fit.views} training views as it starts: {fit.psnr:.2f} dB (one flat colour: {fit.flat:.2f})"
+        f"PSNR of {report['views']} training views as it starts: {report['psnr']:.2f} dB "
+        f"(one flat colour: {report['flat_psnr']:.2f})"
     )
     return lines
 
 
-def _say_poor(
-    model: SceneModel, path: Path, fit: Fit, candidates: dict[StartFrame, Surfels], views: Sequence[View]
+def _warn_of_poor_fit(
+    model: SceneModel, path: Path, fit: dict[str, Any], candidates: dict[StartFrame, Surfels], views: Sequence[View]
 ) -> None:
-    """Say that the frame or the scale probably does not fit, and which frame does, if one does."""
+    """Warn that the frame or the scale probably does not fit, and name the frame that does, if one does."""
     sentence = (
-        f"{path} draws the training views with {fit.psnr:.1f} dB, hardly better than one flat colour "
-        f"({fit.flat:.1f} dB): its frame or scale probably does not fit these poses"
+        f"{path} draws the training views with {fit['psnr']:.1f} dB, hardly better than one flat colour "
+        f"({fit['flat_psnr']:.1f} dB): its frame or scale probably does not fit these poses"
     )
-    tried = {name: _measure(model, moved, views, most=8).psnr for name, moved in candidates.items()}
+    tried = {name: _measure(model, moved, views, most=8)["psnr"] for name, moved in candidates.items()}
     best = max(tried, key=lambda name: tried[name])
-    if tried[best] > fit.psnr + _BETTER_DB:
+    if tried[best] > fit["psnr"] + _BETTER_DB:
         sentence += f"; it fits better with --pipeline.model.start-frame {best} ({tried[best]:.1f} dB)"
     CONSOLE.print(f"{sentence}.", style="yellow", markup=False, highlight=False, soft_wrap=True)

@@ -1,10 +1,11 @@
-"""From nerfstudio's cameras to the method's, and resizing that keeps pixel centres where they are."""
+"""nerfstudio's cameras: checked, joined, resized with fixed pixel centres, and converted to the method's."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
@@ -15,10 +16,9 @@ from beags_plugin.system.errors import UserError
 
 
 def camera_from_nerfstudio(cameras: Cameras, index: int = 0) -> Camera:
-    """The method's camera for one of nerfstudio's (any batch shape, ``index`` into the flattened batch).
+    """Return the method's camera for one of nerfstudio's (any batch shape, ``index`` into the flattened batch).
 
-    Full K with cx, cy; float32, on the device of ``cameras``; differentiable in the pose. Lens distortion is not part
-    of it: the data manager has removed it from the images before.
+    Float32, on the device of ``cameras``, differentiable in the pose; without lens distortion.
     """
     pose = cameras.camera_to_worlds.reshape(-1, 3, 4)[index].float()
     fx, fy, cx, cy = (getattr(cameras, name).reshape(-1)[index].float() for name in ("fx", "fy", "cx", "cy"))
@@ -32,8 +32,8 @@ def resize_cameras(cameras: Cameras, widths: Tensor, heights: Tensor) -> None:
     """Set the cameras' sizes to ``widths`` x ``heights`` ([N, 1] integer pixels) in place and scale K to match.
 
     An image resized from W to W' pixels maps x to x W' / W in coordinates whose pixel centres are at + 0.5, so focal
-    length and principal point take exactly that factor, each axis its own (nerfstudio uses one factor and rounds the
-    size, which shifts the image by up to a pixel at its far edge).
+    length and principal point take exactly that factor, each axis its own. (nerfstudio's one factor shifts the image
+    by up to a pixel at its far edge.)
     """
     x_factor, y_factor = widths / cameras.width, heights / cameras.height
     cameras.fx, cameras.cx = cameras.fx * x_factor, cameras.cx * x_factor
@@ -42,27 +42,15 @@ def resize_cameras(cameras: Cameras, widths: Tensor, heights: Tensor) -> None:
 
 
 def downscaled_size(sizes: Tensor, factor: float) -> Tensor:
-    """Integer pixels after dividing ``sizes`` by ``factor``: rounded, at least 1."""
+    """Divide ``sizes``, pixels, by ``factor``: rounded, at least 1."""
     return torch.floor(sizes / factor + 0.5).clamp(min=1).to(torch.int64)
 
 
 def concatenate_cameras(parts: Sequence[Cameras]) -> Cameras:
-    """One batch [N] from several one-dimensional batches."""
-
-    def joined(name: str) -> Tensor:
-        return torch.cat([getattr(part, name) for part in parts])
-
-    return Cameras(
-        camera_to_worlds=joined("camera_to_worlds"),
-        fx=joined("fx"),
-        fy=joined("fy"),
-        cx=joined("cx"),
-        cy=joined("cy"),
-        width=joined("width"),
-        height=joined("height"),
-        distortion_params=joined("distortion_params"),
-        camera_type=joined("camera_type"),
-    )
+    """Join several one-dimensional batches into one [N]."""
+    names = ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height", "distortion_params", "camera_type")
+    joined: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+    return Cameras(**joined)
 
 
 def check_cameras(cameras: Cameras, images: Sequence[Path]) -> None:

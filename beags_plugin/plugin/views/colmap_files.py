@@ -16,10 +16,10 @@ from beags_plugin.system.errors import UserError
 
 
 def read_lens(file: Path, size: Sequence[int], focal: float) -> Tensor:
-    """[6] float32, the lens distortion k1, k2, k3, k4, p1, p2 of the only camera in cameras.bin or cameras.txt.
+    """Read the lens distortion k1, k2, k3, k4, p1, p2 [6] float32 of the only camera in cameras.bin or cameras.txt.
 
-    size, focal: width, height and focal length in pixels of the camera that is meant: zeros if the file's is another
-    one, if there are several, or if it has no such lens. Raises ``UserError`` if it cannot be read.
+    size, focal: width, height and focal length in pixels of the expected camera. Zeros if the file has another one,
+    several, or one without such a lens. Raises ``UserError`` if it cannot be read.
     """
     readers = {".bin": colmap.read_cameras_binary, ".txt": colmap.read_cameras_text}
     cameras = _read(readers[file.suffix], file)
@@ -36,7 +36,7 @@ def read_lens(file: Path, size: Sequence[int], focal: float) -> Tensor:
 
 
 def read_colmap_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [N, 3] float32 and colours [N, 3] uint8 of points3D.bin or points3D.txt."""
+    """Read positions [N, 3] float32 and colours [N, 3] uint8 of points3D.bin or points3D.txt."""
     readers = {".bin": colmap.read_points3D_binary, ".txt": colmap.read_points3D_text}
     points = _read(readers[file.suffix], file).values()
     xyz = np.array([point.xyz for point in points], np.float32).reshape(-1, 3)

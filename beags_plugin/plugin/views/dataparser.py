@@ -1,4 +1,4 @@
-"""Data parser ``beags-data``: the images, poses and class masks of a scene in any registered layout.
+"""Data parser ``beags-data``: the images, poses and masks of a scene in any registered layout.
 
 Nothing here may import a data manager: nerfstudio loads this module while it is importing its own.
 """
@@ -93,18 +93,17 @@ class BeagsDataParserConfig(DataParserConfig):
 
 
 def absolute(path: object) -> object:
-    """A given path as an absolute one; None and the empty path (not given) stay."""
+    """Return a given path as an absolute one; None and the empty path (not given) stay."""
     return Path(path).expanduser().absolute() if isinstance(path, (str, Path)) and Path(path) != Path() else path
 
 
 class BeagsDataParser(DataParser):
-    """Parser behind ``beags-data``; see ``BeagsDataParserConfig`` for its options.
+    """Parser behind ``beags-data``; every user error is a ``UserError``.
 
-    Metadata of what it returns, per view of the split where it is a list: ``points3D_xyz`` [P, 3] float32 in the world
+    Metadata of its outputs, per view of the split where it is a list: ``points3D_xyz`` [P, 3] float32 in the world
     of the cameras, ``points3D_rgb`` [P, 3] uint8, ``points3D_random`` bool, ``classes`` dict id -> name,
     ``mask_filenames`` list of Path or None, ``mask_kind`` (see ``data.dataset.MaskKind``), ``ignore_ids``,
     ``ground_truth`` (see ``data.ground_truth.GroundTruth``) or None.
-    Every user's mistake is a ``UserError``.
     """
 
     config: BeagsDataParserConfig
@@ -118,9 +117,8 @@ class BeagsDataParser(DataParser):
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
         if self._views is None:  # train and eval share one parser: the poses are read once
             self._read()
-        views = self._views
-        assert views is not None
-        chosen = self._views_of_split(views, split)
+        assert (views := self._views) is not None
+        chosen = self.views_of_split(views, split)
         metadata = dict(self._metadata)
         metadata["mask_filenames"] = [metadata["mask_filenames"][i] for i in chosen]
         if metadata["ground_truth"] is not None:
@@ -135,7 +133,7 @@ class BeagsDataParser(DataParser):
         )
 
     def posed_views(self) -> tuple[Dataset, PosedViews]:
-        """The scene and all its views, before anything is asked of masks."""
+        """Read the scene and all its views; masks are not read."""
         config = self.config
         config.check()
         self._scene = scene = read_dataset(Path(config.data).absolute(), config.layout, config.images_path)
@@ -145,15 +143,13 @@ class BeagsDataParser(DataParser):
         return scene, views
 
     def mask_files(self, scene: Dataset, views: PosedViews) -> tuple[list[Path | None], Path, MaskKind]:
-        """Of each view the file of its mask or None; the folder where masks are looked for; and what they are."""
-        folder, kind = self._masks(scene)
-        if self.config.masks_path is None and scene.mask_files is not None:
+        """Return the mask file of each view or None, the folder of the masks, and their kind."""
+        folder, kind = scene.root / scene.masks, scene.mask_kind
+        if self.config.masks_path is not None:
+            folder, kind = scene.root / self.config.masks_path, "ids"
+        elif scene.mask_files is not None:
             return [scene.mask_files.get(image.stem) for image in views.images], folder, kind
         return files_of_views(folder, views.images, _images_root(scene)), folder, kind
-
-    def training_views(self, views: PosedViews) -> list[int]:
-        """Indices of the views that are trained on."""
-        return self._views_of_split(views, "train")
 
     def _read(self) -> None:
         scene, views = self.posed_views()
@@ -163,11 +159,10 @@ class BeagsDataParser(DataParser):
         self._views = views
 
     def _read_metadata(self, scene: Dataset, views: PosedViews) -> dict[str, Any]:
-        """Checks of files against each other, and what all splits share."""
+        """Check the files against each other and return the metadata that all splits share."""
         config = self.config
         sizes = [image_size(path) for path in views.images]
         self.fit_cameras(views, sizes)
-        images_root = _images_root(scene)
         masks, folder, kind = self.mask_files(scene, views)
         if not any(masks) and any(folder.glob("**/*.png")):
             raise UserError(
@@ -185,7 +180,9 @@ class BeagsDataParser(DataParser):
             "mask_filenames": masks,
             "mask_kind": kind,
             "ignore_ids": tuple(config.ignore_ids),
-            "ground_truth": find_ground_truth(scene.root / config.ground_truth_path, scene, views.images, images_root),
+            "ground_truth": find_ground_truth(
+                scene.root / config.ground_truth_path, scene, views.images, _images_root(scene)
+            ),
         }
 
     def _check_named(self, masks: Path, classes: Path) -> None:
@@ -196,14 +193,8 @@ class BeagsDataParser(DataParser):
         if classes.is_dir() or not (usual or classes.is_file()):
             raise UserError(f"the class names {classes} are no file: correct classes_path.")
 
-    def _masks(self, scene: Dataset) -> tuple[Path, MaskKind]:
-        """The folder of the masks, and what they are."""
-        if self.config.masks_path is not None:
-            return scene.root / self.config.masks_path, "ids"
-        return scene.root / scene.masks, scene.mask_kind
-
     def fit_cameras(self, views: PosedViews, sizes: Sequence[tuple[int, int]]) -> None:
-        """Cameras of the size the images will have once loaded: that of the files, divided by the downscale factor."""
+        """Resize the cameras in place to the loaded images: the files' sizes divided by the downscale factor."""
         cameras = views.cameras
         camera_sizes = torch.cat([cameras.width, cameras.height], 1).tolist()
         for path, (width, height), (camera_width, camera_height) in zip(views.images, sizes, camera_sizes, strict=True):
@@ -223,7 +214,8 @@ class BeagsDataParser(DataParser):
             )
         resize_cameras(cameras, size[:, :1], size[:, 1:])
 
-    def _views_of_split(self, views: PosedViews, split: str) -> list[int]:
+    def views_of_split(self, views: PosedViews, split: str) -> list[int]:
+        """Return the indices of the views of "train", "val" or "test"."""
         if split not in ("train", "val", "test"):
             raise ValueError(f"unknown split {split!r}")
         if views.members is not None:
@@ -237,14 +229,15 @@ class BeagsDataParser(DataParser):
         return train if split == "train" else held_out
 
     def _recognised(self, scene: Dataset, views: PosedViews) -> list[str]:
-        """What the data was taken for, in a line, and what the user should know."""
+        """Describe in a line how the data was understood, and add notes for the user."""
         stems = set().union(*views.stems)
         absent = [name for name in scene.split.held_out if name not in stems]
         notes = [
             f"The protocol holds out {name}, which no image here is called: name that view with beags-data --held-out."
             for name in absent
         ]
-        if unknown := sorted(self._scored_names() - set(self._metadata["classes"].values())):
+        truth = self._metadata["ground_truth"] or {"visible": {}, "silhouettes": {}}
+        if unknown := sorted({*truth["visible"], *truth["silhouettes"]} - set(self._metadata["classes"].values())):
             notes.append(
                 f"Exact masks of {', '.join(map(repr, unknown))} do not count, as no class is called so: "
                 f'name the classes in {scene.root / self.config.classes_path}, {{"id": "name"}}.'
@@ -258,15 +251,10 @@ class BeagsDataParser(DataParser):
         )
         return [line, *notes, *scene.notes]
 
-    def _scored_names(self) -> set[str]:
-        """Names of the objects that have exact masks of their own."""
-        truth = self._metadata["ground_truth"]
-        return set() if truth is None else {name for kind in ("visible", "silhouettes") for name in truth[kind]}
-
     def _split_in_words(self, views: PosedViews, scene: Dataset) -> str:
         if views.members is not None:
             return "splits named by the data"
-        train, out = (self._views_of_split(views, split) for split in ("train", "test"))
+        train, out = (self.views_of_split(views, split) for split in ("train", "test"))
         if train == out:
             return "none held out"
         named = [name for name in scene.split.held_out if any(name in views.stems[i] for i in out)]
@@ -275,7 +263,7 @@ class BeagsDataParser(DataParser):
 
 
 def _images_root(scene: Dataset) -> Path:
-    """The folder below which images and masks have the same paths."""
+    """Return the folder below which images and masks have the same paths."""
     if isinstance(scene.poses, TransformsFile):
         return scene.poses.images or scene.root / "images"
     return scene.poses.images if isinstance(scene.poses, ColmapModel) else scene.poses.images[0].parent

@@ -1,4 +1,4 @@
-"""Images and class maps at the size the cameras say."""
+"""Images and labels at the size of the cameras."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 
 from beags_plugin.labels.class_ids import IGNORE, resize_nearest
+from beags_plugin.labels.classes import read_mask
 from beags_plugin.plugin.views.cameras import downscaled_size, resize_cameras
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.images import read_image
@@ -18,8 +19,8 @@ from beags_plugin.system.reading.images import read_image
 class BeagsDataset(InputDataset):
     """Views of one split: ``image`` [H, W, 3] and ``labels`` [H, W] uint16, all IGNORE where a view has no mask.
 
-    Images with alpha are put on black; ``get_alpha`` gives the alpha. Images are averaged over the area of each new
-    pixel, class maps take the id at its centre; both cover the camera's image from edge to edge.
+    Images with alpha are put on black. Images are averaged over the area of each new pixel, labels take the id at its
+    centre; both cover the camera's image from edge to edge.
 
     scale_factor: of the data manager's ``camera_res_scale_factor``, on top of the parser's downscale factor.
     """
@@ -38,7 +39,7 @@ class BeagsDataset(InputDataset):
         self.file_sizes = torch.cat([self.cameras.width, self.cameras.height], 1).tolist()
 
     def get_numpy_image(self, image_idx: int) -> np.ndarray:
-        """The image [H, W, 3] uint8, sRGB, before undistortion."""
+        """Read the image [H, W, 3] uint8, sRGB, before undistortion."""
         path = self._dataparser_outputs.image_filenames[image_idx]
 
         def read(image: Image.Image) -> np.ndarray:
@@ -52,7 +53,7 @@ class BeagsDataset(InputDataset):
         return resize_area(read_image(path, read), *self.file_sizes[image_idx])
 
     def get_alpha(self, image_idx: int) -> np.ndarray | None:
-        """The image's alpha [H, W] uint8, before undistortion; None if it is opaque everywhere."""
+        """Read the image's alpha [H, W] uint8, before undistortion; None if it is opaque everywhere."""
 
         def read(image: Image.Image) -> np.ndarray | None:
             return np.array(image.convert("RGBA").getchannel("A")) if image.has_transparency_data else None
@@ -61,9 +62,7 @@ class BeagsDataset(InputDataset):
         return None if alpha is None or (alpha == 255).all() else resize_area(alpha, *self.file_sizes[image_idx])
 
     def get_metadata(self, data: dict) -> dict:
-        """The class map that belongs to ``data["image_idx"]``."""
-        from beags_plugin.labels.classes import read_mask
-
+        """Read the labels of view ``data["image_idx"]``, before undistortion."""
         index = data["image_idx"]
         width, height = self.file_sizes[index]
         path = self.metadata["mask_filenames"][index]

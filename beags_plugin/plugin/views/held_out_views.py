@@ -1,4 +1,4 @@
-"""The held-out views of a run's data, with all that is known of them, as the nerfstudio-free evaluation wants them."""
+"""The held-out views of a run's data, as evaluation takes them."""
 
 from __future__ import annotations
 
@@ -22,17 +22,16 @@ _NO_TRUTH = GroundTruth(masks=[], visible={}, silhouettes={}, seen={})
 
 
 class HeldOutViews(Sequence[EvalView]):
-    """The test views of the data; masks and silhouettes are read when a view is asked for, at the size of their files.
+    """The test views of the data; masks are read when a view is asked for, at the size of their files.
 
-    Visible masks come from ``ground_truth/visible``, else from ``ground_truth/masks``, else from the data's own masks;
-    silhouettes from ``ground_truth/silhouettes``, and what training photos show of them from ``ground_truth/seen``;
-    or from where the data's layout has them. All are undistorted like the photographs. Photographs with alpha stand on
-    the background that the run was trained on.
-    Asking for a view raises ``UserError`` for a mask that cannot be read or has other proportions than its photograph.
+    Masks of all visible objects come from ``ground_truth/masks``, else from the data's own; those of single objects
+    from ``ground_truth/visible``, silhouettes from ``ground_truth/silhouettes``, and what training photos show of them
+    from ``ground_truth/seen``, or from where the layout has them. All are undistorted like the photographs.
+    Indexing raises ``UserError`` for a mask that cannot be read or has other proportions than its photograph.
     """
 
     def __init__(self, manager: BeagsDataManager, classes: Mapping[int, str], background: Tensor) -> None:
-        """manager: of the data. classes: id to name. background: [3], shown behind photographs with alpha."""
+        """Open the views. classes: id to name. background: [3], behind photographs with alpha, as in training."""
         self.manager = manager
         self.classes = classes
         self.background = background.cpu()
@@ -52,7 +51,7 @@ class HeldOutViews(Sequence[EvalView]):
         return self._view(chosen) if isinstance(chosen, int) else [self._view(i) for i in chosen]
 
     def trained_on(self) -> int:
-        """How many of these views are training views too."""
+        """Return the number of these views that are training views too."""
         trained = set(self.manager.train_dataset.image_filenames)
         return sum(path in trained for path in self.manager.eval_dataset.image_filenames)
 
@@ -79,7 +78,7 @@ class HeldOutViews(Sequence[EvalView]):
         )
 
     def _per_object(self, files: Mapping[str, Sequence[Path | None]], view: int) -> dict[int, Tensor]:
-        """Object id to its [h, w] bool mask in a view, for those that have one."""
+        """Read the [h, w] bool masks of a view by object id."""
         masks = {}
         for class_id, name in self.classes.items():
             file = files[name][view] if name in files else None
@@ -89,7 +88,7 @@ class HeldOutViews(Sequence[EvalView]):
         return masks
 
     def _straight(self, file: Path, ids: np.ndarray, view: int) -> np.ndarray:
-        """Ids without lens distortion; raises ``UserError`` if they have other proportions than the photograph."""
+        """Undistort ids; raises ``UserError`` if they have other proportions than the photograph."""
         photo = self.manager.eval_dataset.image_filenames[view]
         (width, height), (mask_height, mask_width) = image_size(photo), ids.shape
         expected = mask_width * height / width  # a smaller copy rounds each side by up to a pixel
@@ -98,7 +97,7 @@ class HeldOutViews(Sequence[EvalView]):
                 f"the mask {file} is {mask_width}x{mask_height} pixels but its image is {width}x{height}: "
                 f"make it in the proportions of the image."
             )
-        return self.manager.undistort_eval_map(ids, view)
+        return self.manager.undistorted(ids, view, "eval")
 
 
 def _of_size(mask: Tensor, other: Tensor) -> Tensor:

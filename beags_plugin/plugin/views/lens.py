@@ -1,20 +1,92 @@
-"""Where points of the world lie in a photograph as its file has it, lens distortion included."""
+"""Lens distortion: removed from images of any size as nerfstudio does, put back, and applied to points."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 
 _MARGIN = 0.5  # of the image on each side: farther out, a lens model may fold back into the image
 
 
-def project_through_lens(points: np.ndarray, cameras: Cameras, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels [P, 2] (centres at + 0.5) and depths [P] of world points [P, 3] float64 in a distorted view.
+def has_lens(cameras: Cameras, index: int) -> bool:
+    """Return whether a view has lens distortion."""
+    return cameras.distortion_params is not None and bool(cameras.distortion_params[index].any())
 
-    cameras: as read, before nerfstudio undistorts. A point that is not near the image has the depth 0.
+
+def undistort_image(image: np.ndarray, distorted: Cameras, index: int) -> np.ndarray:
+    """Remove the lens distortion from an image [H, W, C] and crop it, as nerfstudio does; for a view with a lens."""
+    return _by_nerfstudio(image, distorted, index)[1]
+
+
+def straighten(cameras: Cameras) -> None:
+    """Give cameras the K and size that their images have once undistorted, in place; no image is read for it."""
+    known: dict[tuple, tuple] = {}  # most scenes have one camera for all views
+    for index in range(len(cameras)):
+        if not has_lens(cameras, index):
+            continue
+        parts = (cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height, cameras.camera_type)
+        assert cameras.distortion_params is not None
+        key = (*(float(part[index]) for part in parts), *cameras.distortion_params[index].tolist())
+        if key not in known:
+            blank = np.zeros((int(cameras.height[index]), int(cameras.width[index]), 3), np.uint8)
+            K, image = _by_nerfstudio(blank, cameras, index)
+            known[key] = (K, image.shape[:2])
+        K, (height, width) = known[key]
+        cameras.fx[index], cameras.fy[index] = float(K[0, 0]), float(K[1, 1])
+        cameras.cx[index], cameras.cy[index] = float(K[0, 2]), float(K[1, 2])
+        cameras.width[index], cameras.height[index] = width, height
+
+
+def undistort_labels(labels: np.ndarray, distorted: Cameras, straight: Cameras, index: int) -> np.ndarray:
+    """Remove the lens distortion from labels; the nearest id is taken, as ids never blend.
+
+    labels: [h, w], the whole distorted image at any size. distorted, straight: the cameras before and after
+    ``straighten``. Returns [h', w'], the whole straight image at the same scale; IGNORE outside the lens.
+    """
+    maps = _lens_maps(distorted, straight, index, labels.shape)
+    return labels if maps is None else _nearest(labels, *maps, IGNORE)
+
+
+def undistort_alpha(alpha: np.ndarray, distorted: Cameras, straight: Cameras, index: int) -> np.ndarray:
+    """Remove the lens distortion from an alpha channel [h, w] uint8, interpolated; 0 outside the lens."""
+    maps = _lens_maps(distorted, straight, index, alpha.shape)
+    return alpha if maps is None else cv2.remap(alpha, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+
+
+def redistort_labels(
+    labels: np.ndarray, distorted: Cameras, straight: Cameras, index: int, shape: tuple[int, int], border: int
+) -> np.ndarray:
+    """Put the lens distortion back into labels: the inverse of ``undistort_labels``.
+
+    labels: [h', w'], the whole straight image. shape: (h, w) of the distorted image at the same scale. Returns [h, w],
+    the nearest id of each pixel; ``border`` where the straight image does not reach.
+    """
+    if not has_lens(distorted, index):
+        return labels
+    height, width = shape
+    K = _intrinsics(distorted, index, width, height)
+    new_K = _intrinsics(straight, index, labels.shape[1], labels.shape[0])
+    columns, rows = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    pixels = np.stack([columns, rows], axis=2).reshape(-1, 1, 2)
+    fisheye, lens = _opencv_lens(distorted, index)
+    if fisheye:
+        found = cv2.fisheye.undistortPoints(pixels, K, lens, None, new_K)
+    else:
+        exact = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-4)
+        found = cv2.undistortPointsIter(pixels, K, lens, np.eye(3), new_K, exact)
+    maps = found.reshape(height, width, 2).astype(np.float32)
+    return _nearest(labels, maps[..., 0], maps[..., 1], border)
+
+
+def project_through_lens(points: np.ndarray, cameras: Cameras, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return pixels [P, 2] (centres at + 0.5) and depths [P] of world points [P, 3] float64 in a distorted view.
+
+    cameras: before ``straighten``. A point that is not near the image has the depth 0.
     """
     camera = camera_from_nerfstudio(cameras, index)
     rotation, translation = (part.double().numpy() for part in (camera.rotation, camera.translation))
@@ -24,19 +96,59 @@ def project_through_lens(points: np.ndarray, cameras: Cameras, index: int) -> tu
     with np.errstate(divide="ignore", invalid="ignore"):
         xy = (local @ K.T)[:, :2] / z[:, None]
         outside = np.abs(xy / [camera.width, camera.height] - 0.5).max(1) > 0.5 + _MARGIN
-    parameters = cameras.distortion_params
-    if parameters is None or not parameters[index].any():
+    if not has_lens(cameras, index):
         return xy, z
     z[(z <= 0) | outside] = 0.0
     kept = np.flatnonzero(z > 0)
     if len(kept):
-        lens = parameters[index].double().numpy()
-        at_one = np.ascontiguousarray(local[kept, None])
-        none = np.zeros(3)
-        if int(cameras.camera_type[index]) == CameraType.FISHEYE.value:
-            found = cv2.fisheye.projectPoints(at_one, none, none, K, lens[:4])[0]
-        else:
-            k1, k2, k3, _, p1, p2 = lens  # nerfstudio's order; OpenCV wants k1, k2, p1, p2, k3
-            found = cv2.projectPoints(at_one, none, none, K, np.array([k1, k2, p1, p2, k3]))[0]
-        xy[kept] = found[:, 0]
+        fisheye, lens = _opencv_lens(cameras, index)
+        project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
+        xy[kept] = project(np.ascontiguousarray(local[kept, None]), np.zeros(3), np.zeros(3), K, lens)[0][:, 0]
     return xy, z
+
+
+def _by_nerfstudio(image: np.ndarray, distorted: Cameras, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the K [3, 3] and the image [H', W', C] that nerfstudio's undistortion gives."""
+    camera = distorted[index].reshape(())
+    assert camera.distortion_params is not None
+    K = camera.get_intrinsics_matrices().numpy()
+    K, image, _ = _undistort_image(camera, camera.distortion_params.numpy(), {}, image, K)
+    return K, image
+
+
+def _lens_maps(
+    distorted: Cameras, straight: Cameras, index: int, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return x and y [h', w'] float32 of each straight pixel in the distorted image of ``shape`` [h, w]; None
+    without distortion."""
+    if not has_lens(distorted, index):
+        return None
+    height, width = shape
+    new_size = (
+        max(1, round(int(straight.width[index]) * width / int(distorted.width[index]))),
+        max(1, round(int(straight.height[index]) * height / int(distorted.height[index]))),
+    )
+    K, new_K = _intrinsics(distorted, index, width, height), _intrinsics(straight, index, *new_size)
+    fisheye, lens = _opencv_lens(distorted, index)
+    make = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
+    return make(K, lens, np.eye(3), new_K, new_size, cv2.CV_32FC1)
+
+
+def _opencv_lens(cameras: Cameras, index: int) -> tuple[bool, np.ndarray]:
+    """Return whether a view has a fisheye lens, and its coefficients float64 in OpenCV's order."""
+    assert cameras.distortion_params is not None
+    k1, k2, k3, k4, p1, p2 = cameras.distortion_params[index].double().numpy()
+    fisheye = int(cameras.camera_type[index]) == CameraType.FISHEYE.value
+    return fisheye, np.array([k1, k2, k3, k4] if fisheye else [k1, k2, p1, p2, k3])
+
+
+def _intrinsics(cameras: Cameras, index: int, width: int, height: int) -> np.ndarray:
+    """Return K [3, 3] float64 of the view's image at this size, for OpenCV, whose pixel centres are whole numbers."""
+    K = cameras.get_intrinsics_matrices()[index].double().numpy()
+    K = np.diag([width / int(cameras.width[index]), height / int(cameras.height[index]), 1.0]) @ K
+    K[:2, 2] -= 0.5
+    return K
+
+
+def _nearest(labels: np.ndarray, x: np.ndarray, y: np.ndarray, border: int) -> np.ndarray:
+    return cv2.remap(labels, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=(border,))

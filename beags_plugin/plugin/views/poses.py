@@ -1,4 +1,4 @@
-"""Poses of all views of a scene in nerfstudio's normalised world, from whichever source the layout names.
+"""Poses of all views of a scene in nerfstudio's normalised world, from the source that the layout names.
 
 Nothing here may import a data manager: nerfstudio loads this module while it is importing its own.
 """
@@ -46,9 +46,9 @@ class Normalization:
 class PosedViews:
     """All views of a scene, sorted by name, before they are split.
 
-    stems: of each view that of its file, the one that the poses give it, and its path below the folder of all files.
-    members: split name to indices of its views, where the poses name splits themselves; else None. outputs: of
-    nerfstudio's parser, for the scene box, the transform and the seed points.
+    stems: of each view that of its file, that in the poses, and its path below the folder of all files. members: split
+    name to indices of its views; None where the poses name no splits. outputs: of nerfstudio's parser, for the scene
+    box, the transform and the seed points.
     """
 
     images: list[Path]
@@ -59,17 +59,15 @@ class PosedViews:
 
 
 def read_poses(poses: Poses, root: Path, normalization: Normalization) -> PosedViews:
-    """The views of a scene in ``root``; raises ``UserError`` if they cannot be read or there are none."""
+    """Read the views of a scene in ``root``; raises ``UserError`` if they cannot be read or there are none."""
     named: list[str] = []
     if isinstance(poses, PoseTable):
         file, parts = poses.file, [_table_outputs(poses, normalization)]
-    elif isinstance(poses, TransformsFile):
-        file = poses.file
-        parser, named = _transforms_parser(poses, root, normalization)
-        parts = [_delegate(parser, split, file) for split in named or ("train",)]
     else:
-        file = poses.folder
-        parser, named = _colmap_parser(poses, root, normalization)
+        if isinstance(poses, TransformsFile):
+            file, (parser, named) = poses.file, _transforms_parser(poses, root, normalization)
+        else:
+            file, (parser, named) = poses.folder, _colmap_parser(poses, root, normalization)
         parts = [_delegate(parser, split, file) for split in named or ("train",)]
     if any(part.mask_filenames for part in parts):
         CONSOLE.print("[yellow]mask_path of transforms.json is not used: beags-data reads class maps only.")
@@ -126,7 +124,7 @@ class _Transforms(Nerfstudio):
 
 
 def _transforms_parser(poses: TransformsFile, root: Path, normalization: Normalization) -> tuple[DataParser, list[str]]:
-    """nerfstudio's parser, and the splits that transforms.json names."""
+    """Return nerfstudio's parser, and the splits that transforms.json names."""
     file = poses.file
     meta = read_transforms(file)
     parser = _Transforms(
@@ -143,7 +141,7 @@ def _transforms_parser(poses: TransformsFile, root: Path, normalization: Normali
 
 
 def _colmap_parser(poses: ColmapModel, root: Path, normalization: Normalization) -> tuple[DataParser, list[str]]:
-    """nerfstudio's COLMAP parser, and the splits named by ``<split>_list.txt``."""
+    """Return nerfstudio's COLMAP parser, and the splits named by ``<split>_list.txt``."""
     parser = ColmapDataParser(
         ColmapDataParserConfig(
             data=root,
@@ -160,7 +158,7 @@ def _colmap_parser(poses: ColmapModel, root: Path, normalization: Normalization)
 
 
 def _delegate(parser: DataParser, split: str, file: Path) -> DataparserOutputs:
-    """What nerfstudio's own parser reads; its failures told in one sentence."""
+    """Read one split by nerfstudio's own parser; raises ``UserError`` for its failures."""
     try:
         return parser.get_dataparser_outputs(split)
     except UserError:
@@ -176,7 +174,7 @@ def _delegate(parser: DataParser, split: str, file: Path) -> DataparserOutputs:
 
 
 def _table_outputs(table: PoseTable, normalization: Normalization) -> DataparserOutputs:
-    """Poses that a layout has read, normalised as nerfstudio's parsers do it."""
+    """Normalise poses that a layout has read as nerfstudio's parsers do it."""
     given = torch.eye(4).repeat(len(table.images), 1, 1)
     given[:, :3] = torch.from_numpy(table.camera_to_world)
     poses, transform = camera_utils.auto_orient_and_center_poses(

@@ -1,9 +1,9 @@
-"""Points from which training starts: read from a file, or drawn where the cameras look."""
+"""Seed points of training: read from a file, or sampled where the cameras look."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,21 +13,18 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.data.dataset import Dataset, PoseTable
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.colmap_files import read_colmap_points
+from beags_plugin.plugin.views.poses import PosedViews
 from beags_plugin.system.reading.ply import read_ply_points
 
-if TYPE_CHECKING:
-    from beags_plugin.plugin.views.poses import PosedViews
-
-SEED = 0
-"""Of the points that are drawn where the data brings none."""
+SEED = 0  # of the sampled points
 
 
 def starting_points(scene: Dataset, views: PosedViews, count: int) -> dict[str, Any]:
-    """The seed points of a scene in the world of its cameras, or ``count`` drawn ones where it has none.
+    """Return the seed points of a scene in the world of its cameras, or ``count`` sampled ones where it has none.
 
     Returns ``points3D_xyz`` [P, 3] float32, ``points3D_rgb`` [P, 3] uint8 and ``points3D_random``, whether they are
-    drawn: between the depths that the poses come with, if they do. Points of a file are taken only if they are where
-    these depths say. Raises ``UserError`` for a file that cannot be read.
+    sampled: between the depths of the poses, if these have any. Points of a file are taken only if they lie between
+    those depths. Raises ``UserError`` for a file that cannot be read.
     """
     given = views.outputs.metadata
     found = {name: given.get(name) for name in ("points3D_xyz", "points3D_rgb")}
@@ -53,43 +50,38 @@ def starting_points(scene: Dataset, views: PosedViews, count: int) -> dict[str, 
 
 
 def random_points(cameras: Sequence[Camera], count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points in the cameras' common view, for scenes without seed points.
+    """Sample points uniformly in the ball around the cameras' point of interest (see ``_point_of_interest``).
 
-    Drawn uniformly in the ball around the cameras' point of interest (see ``_point_of_interest``) whose radius is half
-    the cameras' median distance from it, and kept where at least half of the views see them (or as many views as
-    see the best tenth, where frusta overlap less than that).
-
+    Its radius is half the cameras' median distance from that point. Kept are points that at least half of the views
+    see (or as many as see the best tenth, where frusta overlap less).
     Returns positions [count, 3] float32 and colours [count, 3] uint8, mid-grey.
     """
-    rotations = np.stack([camera.rotation.double().numpy() for camera in cameras])
-    centers = np.stack([camera.center.double().numpy() for camera in cameras])
+    rotations, centers = _poses(cameras)
     focus = _point_of_interest(rotations, centers)
     radius = 0.5 * float(np.median(np.linalg.norm(centers - focus, axis=1)))
     generator = np.random.default_rng(SEED)
     batch = 1 << 14
 
-    def draw() -> tuple[np.ndarray, np.ndarray]:
+    def sample() -> tuple[np.ndarray, np.ndarray]:
         directions = generator.normal(size=(batch, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         points = focus + radius * directions * np.cbrt(generator.uniform(size=(batch, 1)))
         return points, _share_of_views(points, rotations, centers, cameras)
 
-    return _seen_by_many(draw, count)
+    return _seen_by_many(sample, count)
 
 
 def points_between(cameras: Sequence[Camera], bounds: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points in the cameras' common view and within their depths, uniform in each image and in inverse depth.
+    """Sample points within the cameras' depths, uniform in each image and in inverse depth.
 
-    bounds: [V, 2] nearest and farthest depth of each view. Kept are points that at least half of the views see (or as
-    many as see the best tenth). Returns positions [count, 3] float32 and colours [count, 3] uint8, mid-grey.
+    bounds: [V, 2] nearest and farthest depth of each view. Points are kept, and returned, as in ``random_points``.
     """
-    rotations = np.stack([camera.rotation.double().numpy() for camera in cameras])
-    centers = np.stack([camera.center.double().numpy() for camera in cameras])
+    rotations, centers = _poses(cameras)
     to_rays = np.stack([np.linalg.inv(camera.K.double().numpy()) for camera in cameras])
     sizes = np.array([(camera.width, camera.height) for camera in cameras], float)
     generator = np.random.default_rng(SEED)
 
-    def draw() -> tuple[np.ndarray, np.ndarray]:
+    def sample() -> tuple[np.ndarray, np.ndarray]:
         view = generator.integers(len(cameras), size=1 << 14)
         pixel = np.append(generator.uniform(size=(len(view), 2)) * sizes[view], np.ones((len(view), 1)), axis=1)
         near, far = bounds[view].T
@@ -98,23 +90,29 @@ def points_between(cameras: Sequence[Camera], bounds: np.ndarray, count: int) ->
         points = np.einsum("nji,nj->ni", rotations[view], local) + centers[view]
         return points, _share_of_views(points, rotations, centers, cameras)
 
-    return _seen_by_many(draw, count)
+    return _seen_by_many(sample, count)
 
 
-def _seen_by_many(draw: Callable[[], tuple[np.ndarray, np.ndarray]], count: int) -> tuple[np.ndarray, np.ndarray]:
-    """``count`` of the points that ``draw`` gives with their share of views, those of large share; mid-grey colours."""
-    points, share = draw()
+def _poses(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rotations [V, 3, 3], world to camera, and the centres [V, 3]; float64."""
+    rotations = np.stack([camera.rotation.double().numpy() for camera in cameras])
+    return rotations, np.stack([camera.center.double().numpy() for camera in cameras])
+
+
+def _seen_by_many(sample: Callable[[], tuple[np.ndarray, np.ndarray]], count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``count`` of the points that ``sample`` returns with their share of views, those of large share."""
+    points, share = sample()
     threshold = min(0.5, float(np.quantile(share, 0.9)))
     kept = [points[share >= threshold]]
     while sum(map(len, kept)) < count:
-        points, share = draw()
+        points, share = sample()
         kept.append(points[share >= threshold])
     xyz = np.concatenate(kept)[:count].astype(np.float32)
     return xyz, np.full((count, 3), 128, np.uint8)
 
 
 def _within_bounds(points: np.ndarray, cameras: Sequence[Camera], bounds: np.ndarray) -> float:
-    """Share of the points [P, 3] that some view has in its image and within its depths [V, 2], give or take a tenth."""
+    """Return the share of points [P, 3] inside some view's image and, to a tenth, its depths (bounds [V, 2])."""
     found = np.zeros(len(points), bool)
     for camera, (near, far) in zip(cameras, bounds, strict=True):
         local = (points - camera.center.double().numpy()) @ camera.rotation.double().numpy().T
@@ -125,10 +123,10 @@ def _within_bounds(points: np.ndarray, cameras: Sequence[Camera], bounds: np.nda
 
 
 def _point_of_interest(rotations: np.ndarray, centers: np.ndarray) -> np.ndarray:
-    """The point [3] closest to all optical axes in the least-squares sense.
+    """Return the point [3] closest to all optical axes in the least-squares sense.
 
-    Where that point says nothing (axes almost parallel, or it lies behind half of the cameras, as for views that look
-    outwards) it is put in front of the cameras' mean, at 4 times the radius of the set of cameras.
+    Where the axes are almost parallel, or the point lies behind half of the cameras, as for views that look outwards,
+    return a point in front of the cameras' mean instead, at 4 times the radius of the set of cameras.
     """
     axes = rotations[:, 2]
     projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -147,7 +145,7 @@ def _point_of_interest(rotations: np.ndarray, centers: np.ndarray) -> np.ndarray
 def _share_of_views(
     points: np.ndarray, rotations: np.ndarray, centers: np.ndarray, cameras: Sequence[Camera]
 ) -> np.ndarray:
-    """Share [P] of the cameras in whose image a point [P, 3] falls."""
+    """Return the share [P] of the cameras in whose image a point [P, 3] falls."""
     seen = np.zeros(len(points))
     for rotation, center, camera in zip(rotations, centers, cameras, strict=True):
         x, y, w = camera.K.double().numpy() @ rotation @ (points - center).T

@@ -14,16 +14,15 @@ Load = Callable[[int], dict[str, Any]]
 class StreamedViews(Sequence[dict[str, Any]]):
     """The data of V views, none of which is kept: each is loaded when it is asked for, or before, if it is expected.
 
-    load: gives the data of a view; it is called in threads. ahead: how many views are loaded before their use;
-    workers: by how many threads. ``labels`` replaces what is loaded where it is not None.
-    What a view holds does not depend on who loads it when.
+    load: returns the data of a view; threads call it. ahead: number of views that are loaded before their use.
+    workers: number of threads. labels: of all views, take the place of those that are loaded, once they are there.
     """
 
     def __init__(self, load: Load, count: int, ahead: int, workers: int) -> None:
         self._load, self._count, self.ahead = load, count, ahead
         self._pool = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="beags-views")
         self._coming: dict[int, Future[dict[str, Any]]] = {}
-        self.labels: list[CompressedMap | None] = [None] * count
+        self.labels: list[CompressedMap] = []
 
     def __len__(self) -> int:
         return self._count
@@ -36,9 +35,8 @@ class StreamedViews(Sequence[dict[str, Any]]):
         index %= self._count
         coming = self._coming.pop(index, None)
         data = dict(self._load(index) if coming is None else coming.result())
-        replaced = self.labels[index]
-        if replaced is not None:
-            data["labels"] = replaced.unpacked()
+        if self.labels:
+            data["labels"] = self.labels[index].unpacked()
         return data
 
     def expect(self, indices: Iterable[int]) -> None:

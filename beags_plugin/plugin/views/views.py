@@ -1,4 +1,4 @@
-"""One view of a scene as the data manager gives it, and what views are called."""
+"""One view of a scene as the data manager gives it, and the names of views."""
 
 from __future__ import annotations
 
@@ -12,66 +12,48 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.labels.label_maps import to_int32
 
 
 @dataclass(frozen=True)
 class View:
     """One undistorted view, on the data manager's device.
 
-    It shares the data manager's memory, or reads the files where images are streamed; what is asked of it is computed
-    anew: of all views at once, the images in float would take six times as much as their files, opened.
+    It shares the data manager's memory, or reads the files where images are streamed. Its properties are computed anew
+    each time: the images of all views in float would take four times the memory of those in bytes.
 
-    name: the stem of the image file; where several share it, with the folders that tell them apart, joined by "_".
-    data: gives what batches hold of it. labels_of: gives its labels, as ``label_maps.to_compact`` does, or None.
+    name: the stem of the image file; where several share it, with the folders that differ, joined by "_".
+    data: returns ``image`` [H, W, 3 or more], uint8 or float32 in 0..1, and ``alpha`` [H, W] uint8 if there is any.
+    labels_of: returns [H, W] int32 class ids or IGNORE; None if the view has no mask.
     """
 
     camera: Camera
     name: str
     data: Callable[[], dict[str, Tensor]]
-    labels_of: Callable[[], Tensor] | None
-
-    @property
-    def pixels(self) -> Tensor:
-        """[H, W, 3 or more], uint8 or float32 in 0..1."""
-        return self.data()["image"]
-
-    @property
-    def stored_labels(self) -> Tensor | None:
-        """[H, W] class ids in the narrowest type; None if the view has no mask."""
-        return None if self.labels_of is None else self.labels_of()
-
-    @property
-    def opacity(self) -> Tensor | None:
-        """[H, W] uint8, or None."""
-        return self.data().get("alpha")
-
-    @property
-    def image(self) -> Tensor:
-        """[H, W, 3] float32 in 0..1, on black where it has alpha."""
-        pixels = self.pixels[..., :3]
-        return pixels.float() / 255.0 if pixels.dtype == torch.uint8 else pixels
+    labels_of: Callable[[], Tensor | None]
 
     @property
     def labels(self) -> Tensor | None:
         """[H, W] int32 class ids or IGNORE; None if the view has no mask."""
-        stored = self.stored_labels
-        return None if stored is None else to_int32(stored)
+        return self.labels_of()
 
     @property
-    def alpha(self) -> Tensor | None:
-        """[H, W] float32 in 0..1, the image's alpha; None if it is opaque."""
-        opacity = self.opacity
-        return None if opacity is None else opacity.float() / 255.0
+    def image(self) -> Tensor:
+        """[H, W, 3] float32 in 0..1, on black where it has alpha."""
+        return _in_unit_range(self.data()["image"])
 
     def image_on(self, background: Tensor) -> Tensor:
-        """The image [H, W, 3] with ``background`` [3] behind what is transparent."""
-        alpha = self.alpha
-        return self.image if alpha is None else self.image + (1.0 - alpha)[..., None] * background
+        """Return the image [H, W, 3] with ``background`` [3] behind what is transparent."""
+        held = self.data()
+        image, alpha = _in_unit_range(held["image"]), held.get("alpha")
+        return image if alpha is None else image + (1.0 - alpha.float() / 255.0)[..., None] * background
+
+
+def _in_unit_range(pixels: Tensor) -> Tensor:
+    return pixels[..., :3].float() / 255.0 if pixels.dtype == torch.uint8 else pixels[..., :3]
 
 
 def unique_names(files: Sequence[Path]) -> list[str]:
-    """For each file its stem; stems that several share get their folders before them, and a number if need be."""
+    """Return the stem of each file; a stem that several share gets their folders before it, and a number if need be."""
     parts = [Path(file).with_suffix("").parts for file in files]
     depth = 1
     while len({path[-depth:] for path in parts}) < len(set(parts)):

@@ -26,16 +26,16 @@ def test_a_reprojection_of_another_package_that_does_not_load(monkeypatch):
         PreparationConfig(reprojection="theirs").check()
 
 
-@pytest.mark.parametrize("samples", [0, -3, 2.5, math.nan])
-def test_samples_of_the_occupancy_loss(samples):
-    with pytest.raises(UserError, match=f"samples = {samples}: it must be a whole number, 1 or more"):
-        OccupancyLoss(samples=samples)
-
-
-@pytest.mark.parametrize("weight", [-0.1, 1.5, math.nan])
-def test_the_weight_of_ssim(weight):
-    with pytest.raises(UserError, match=f"ssim_weight = {weight}: it must lie in 0..1"):
-        PhotometricLoss(ssim_weight=weight)
+@pytest.mark.parametrize(
+    ("kind", "name", "value", "limits"),
+    [
+        *((OccupancyLoss, "samples", samples, "be a whole number, 1 or more") for samples in (0, -3, 2.5, math.nan)),
+        *((PhotometricLoss, "ssim_weight", weight, "lie in 0..1") for weight in (-0.1, 1.5, math.nan)),
+    ],
+)
+def test_wrong_options_of_a_loss(kind, name, value, limits):
+    with pytest.raises(UserError, match=f"{name} = {value}: it must {limits}"):
+        kind(**{name: value})
 
 
 @pytest.mark.parametrize("refine_steps", [0, 10])
@@ -52,12 +52,3 @@ def test_a_run_is_refused_at_its_start_only_if_it_refines(refine_steps):
             switch.check_options()
     else:
         switch.check_options()
-
-
-def test_a_loss_with_a_wrong_option_is_refused_where_it_is_built():
-    pytest.importorskip("nerfstudio")
-    from beags_plugin.plugin.options.loss_spec import LossSpec
-    from beags_plugin.plugin.options.schedule import PhaseSchedule
-
-    with pytest.raises(UserError, match="samples = 0"):
-        LossSpec(phase="refine", options={"samples": 0}).build("occupancy", PhaseSchedule(10, 10))

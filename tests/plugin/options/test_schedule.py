@@ -10,6 +10,7 @@ import torch
 pytest.importorskip("nerfstudio")
 
 from beags_plugin.core.densification import DensifyConfig
+from beags_plugin.plugin.options.loss_spec import LossSpec
 from beags_plugin.plugin.options.schedule import PhaseSchedule, log_linear
 from beags_plugin.plugin.training.callbacks import camera_extent
 from beags_plugin.plugin.training.scene_edits import move_adam_state
@@ -21,6 +22,11 @@ def test_refinement_repeats_the_last_tenth_of_the_base_schedule():
     assert schedule.progress(27_000) == pytest.approx(schedule.progress(30_000))
     assert schedule.progress(29_999) == pytest.approx(schedule.progress(32_999), abs=1e-4)
     assert schedule.refining(30_000) and not schedule.refining(29_999)
+
+
+def test_the_schedule_of_a_polished_base_is_the_second_half():
+    warm = PhaseSchedule(100, 10, 30_000, warm=True)
+    assert [warm.progress(step) for step in (0, 50, 100, 105)] == [0.5, 0.75, 0.9, 0.95]
 
 
 def test_positions_learn_log_linearly():
@@ -36,7 +42,7 @@ def test_extent_is_a_tenth_more_than_the_farthest_camera():
     assert float(camera_extent(poses[:1])) == 1.0
 
 
-def test_adam_moments_follow_their_surfels():
+def test_adam_moments_follow_their_gaussians():
     parameter = torch.nn.Parameter(torch.arange(3.0))
     optimizer = torch.optim.Adam([parameter], lr=0.1)
     parameter.grad = torch.tensor([1.0, 2.0, 3.0])
@@ -83,8 +89,8 @@ def test_the_official_steps_of_growth_and_resets():
 def test_a_shorter_run_has_the_same_proportions_but_no_shorter_intervals_than_it_can_bear():
     half = DensifyConfig().scaled(0.5)
     assert (half.every, half.start, half.stop, half.reset_every, half.prune_scale_after) == (50, 250, 7500, 1500, 1500)
-    tenth = DensifyConfig().scaled(0.1)
-    assert (tenth.every, tenth.start, tenth.stop, tenth.reset_every, tenth.prune_scale_after) == (
+    short = DensifyConfig().scaled(0.1)
+    assert (short.every, short.start, short.stop, short.reset_every, short.prune_scale_after) == (
         50,
         50,
         1500,
@@ -101,17 +107,12 @@ def test_stated_steps_are_scaled_with_the_length_of_the_base():
     assert PhaseSchedule(3_000, 300).scaled(7_000) == 7_000  # stated for this run
     assert PhaseSchedule(0, 3_000, 30_000).scaled(7_000) == 7_000  # no base to scale by
     assert PhaseSchedule(30, 0, 30_000).scaled(100) == 1 and PhaseSchedule(30, 0, 30_000).scaled(0) == 0
-
-
-def test_losses_start_at_their_share_of_the_base():
-    from beags_plugin.plugin.options.loss_spec import LossSpec
-
     short = PhaseSchedule(3_000, 300, 30_000)
     assert LossSpec(start=7_000).build("normal", short).start == 700
     assert LossSpec(start=50, phase="refine").build("boundary", short).start == 3_050
 
 
-def test_the_degree_of_the_colours_grows_by_one_every_thousand_steps(model):
+def test_the_sh_degree_grows_by_one_every_thousand_steps(model):
     def degree(step, base_steps=30_000):
         model.step, model.schedule = step, PhaseSchedule(base_steps, 0, 30_000)
         return model.active_sh_degree()
@@ -156,7 +157,7 @@ def test_official_learning_rates(model):
     assert rates(30_000) == pytest.approx({"means": 2.5 * 1.6e-4 * 100**-0.9 * 10, **constant})
 
 
-def test_only_steps_of_growth_are_drawn_with_what_growth_looks_at(model):
+def test_only_steps_of_growth_gather_gradients(model):
     from types import SimpleNamespace
 
     from nerfstudio.cameras.cameras import Cameras

@@ -19,11 +19,8 @@ def state(**changed) -> dict:
     made = {f"gauss_params.{name}": torch.ones(shape) for name, shape in shapes.items()}
     made["gauss_params.features_rest"] = torch.zeros(2, 3, 3)
     made |= {"class_ids": torch.zeros(2, dtype=torch.int32), "class_margin": torch.ones(2)}
-    made |= {
-        "assigned": torch.tensor(True),
-        "extent": torch.tensor(1.0),
-        "_extra_state": {"classes": {0: "background"}},
-    }
+    made |= {"assigned": torch.tensor(True), "extent": torch.tensor(1.0)}
+    made["_extra_state"] = {"classes": {0: "background"}}
     return {**made, **{name.replace("__", "."): value for name, value in changed.items()}}
 
 

@@ -19,10 +19,12 @@ from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.evaluation.violations import boundary_errors, occupancy_violations
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.plugin.trainer import BeagsTrainer
 from beags_plugin.plugin.training.timing import StepClock
+from beags_plugin.preparation import pipeline as preparation
 
 LAST = sum(STEPS) - 1
-TOLD: list[tuple[str, list[tuple[int, int]]]] = []  # what the bars of ``run`` were told
+BARS: list[tuple[str, list[tuple[int, int]]]] = []  # names and steps of the progress bars of ``run``
 
 
 def resume_in_another_second(run):
@@ -56,7 +58,7 @@ def run(data, tmp_path_factory):
     def bar(name, passing=False):
         assert passing
         steps: list[tuple[int, int]] = []
-        TOLD.append((name, steps))
+        BARS.append((name, steps))
         yield lambda *step: steps.append(step)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -68,7 +70,7 @@ def run(data, tmp_path_factory):
 def test_the_objects_have_a_bar(run):
     """Two objects in two held-out views, and a picture of each."""
     whole = [(done, 6) for done in range(1, 7)]
-    objects = [done for name, done in TOLD if name == "Measuring objects"]
+    objects = [done for name, done in BARS if name == "Measuring objects"]
     assert len(objects) == 4 and all(done == whole for done in objects)
 
 
@@ -108,50 +110,38 @@ def test_the_last_iou_is_that_of_the_evaluation(run):
         )
 
 
+def killed(*_, **__):
+    raise Killed
+
+
+def kill_and_resume(config, monkeypatch, where):
+    """Train to a step, or the preparation, and resume from there to the end."""
+    train = BeagsTrainer.train_iteration
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        if where == "preparation":
+            patch.setattr(preparation, "assign_classes", killed)
+        patch.setattr(
+            BeagsTrainer, "train_iteration", lambda self, step: killed() if step == where else train(self, step)
+        )
+        run_to_end(config)
+    resume_in_another_second(config.run_dir)
+
+
 @pytest.mark.parametrize("at", [5, 26])  # before the first checkpoint, after it
 def test_a_resumed_run_has_each_step_once(data, tmp_path, monkeypatch, at):
-    from beags_plugin.plugin.trainer import BeagsTrainer
-
-    run, train = tmp_path / "run", BeagsTrainer.train_iteration
+    run = tmp_path / "run"
     config = short_config(data, run)
     config.logging.steps_per_log = 1
-
-    def iteration(self, step):
-        if step == at:
-            raise Killed
-        return train(self, step)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(BeagsTrainer, "train_iteration", iteration)
-        with pytest.raises(Killed):
-            run_to_end(config)
-    resume_in_another_second(run)
+    kill_and_resume(config, monkeypatch, at)
     assert [event.step for event in events_of(run).Scalars("Train Loss")] == list(range(LAST + 1))
 
 
 @pytest.mark.parametrize("where", ["preparation", 53])
 def test_a_resumed_run_has_the_iou_of_the_whole_one(data, run, tmp_path, monkeypatch, where):
-    from beags_plugin.plugin.trainer import BeagsTrainer
-    from beags_plugin.preparation import pipeline as preparation
-
-    broken, train = tmp_path / "run", BeagsTrainer.train_iteration
-
-    def killed(*_, **__):
-        raise Killed
-
-    def iteration(self, step):
-        return killed() if step == where else train(self, step)
-
-    with monkeypatch.context() as patch:
-        if where == "preparation":
-            patch.setattr(preparation, "assign_classes", killed)
-        patch.setattr(BeagsTrainer, "train_iteration", iteration)
-        with pytest.raises(Killed):
-            run_to_end(short_config(data, broken, steps_per_objects=5))
-    resume_in_another_second(broken)
+    kill_and_resume(short_config(data, tmp_path / "run", steps_per_objects=5), monkeypatch, where)
     whole, resumed = (
         {(event.step, event.value) for event in events_of(folder).Scalars("Extracted IoU/mean")}
-        for folder in (run, broken)
+        for folder in (run, tmp_path / "run")
     )
     assert resumed == whole
 
@@ -230,10 +220,8 @@ def test_occupancy_violations_are_the_share_of_matter_outside():
     found = occupancy_violations(surfels, ids, grid, seed=1, step=2, samples=400)
     assert found[2] == pytest.approx(1.0)  # its class was never seen
     g = torch.Generator().manual_seed(5)
-    radius, angle = (
-        3 * torch.rand(len(ids), 4000, generator=g).sqrt(),
-        6.2831853 * torch.rand(len(ids), 4000, generator=g),
-    )
+    radius = 3 * torch.rand(len(ids), 4000, generator=g).sqrt()
+    angle = 6.2831853 * torch.rand(len(ids), 4000, generator=g)
     u, v = radius * angle.cos(), radius * angle.sin()
     axes = surfels.log_scales.exp()[:, None, :] * rotation_from_quat(surfels.quats)[..., :2]
     points = surfels.means[:, None] + u[..., None] * axes[:, None, :, 0] + v[..., None] * axes[:, None, :, 1]

@@ -22,7 +22,7 @@ from beags_plugin.system.errors import UserError
 from beags_plugin.system.memory import available_mb, memory_mb, peak_memory_mb
 
 
-def test_the_system_tells_what_is_left():
+def test_the_system_reports_what_is_left():
     assert 0 < available_mb() < psutil.virtual_memory().total / 1e6
     assert 0 < memory_mb() <= peak_memory_mb() < psutil.virtual_memory().total / 1e6
 
@@ -45,7 +45,7 @@ def test_groups_limit_what_is_left(tmp_path, monkeypatch):
     assert available_mb() == pytest.approx(250.0)
 
 
-def test_the_watch_speaks_only_when_little_is_left(monkeypatch):
+def test_the_watch_reports_only_when_little_is_left(monkeypatch):
     watch = MemoryWatch("cpu")
     for left, speaks in ((memory_guard.LEAST_FREE_MB + 1, False), (memory_guard.LEAST_FREE_MB - 1, True)):
         monkeypatch.setattr(memory_guard, "available_mb", lambda left=left: left)
@@ -67,8 +67,8 @@ def test_a_training_stops_and_saves_when_memory_runs_out_and_goes_on_later(tmp_p
         patch.setattr(MemoryWatch, "short_of", lambda self, step: "2 MB are left" if step == 20 else None)
         with pytest.raises(UserError) as stopped:
             run_to_end(short_config(data, run))
-    told = f"2 MB are left: saved and stopped after step 19. Close other programs and go on with beags resume {run}"
-    assert told in str(stopped.value)
+    message = f"2 MB are left: saved and stopped after step 19. Close other programs and go on with beags resume {run}"
+    assert message in str(stopped.value)
     assert checkpoint_of(run)["step"] == 19
     resume_to_end(run)
     run_to_end(short_config(data, tmp_path / "whole"))
@@ -76,7 +76,7 @@ def test_a_training_stops_and_saves_when_memory_runs_out_and_goes_on_later(tmp_p
 
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])
-def test_a_training_that_gets_no_memory_says_so_and_keeps_its_checkpoint(tmp_path, monkeypatch, error):
+def test_a_training_that_gets_no_memory_reports_it_and_keeps_its_checkpoint(tmp_path, monkeypatch, error):
     data, run = write_scene(tmp_path / "data"), tmp_path / "run"
     save = BeagsTrainer.save_checkpoint
 
@@ -92,16 +92,16 @@ def test_a_training_that_gets_no_memory_says_so_and_keeps_its_checkpoint(tmp_pat
 
 
 @pytest.mark.parametrize(
-    "name, told",
+    "name, message",
     [
         ("available_mb", "the machine has 20 MB of memory left: .*downscale-factor 2.*--no-check-memory"),
         ("free_disk_mb", "the disk of .*run has 20 MB left: free some space, or choose another folder with --run-dir"),
     ],
 )
-def test_a_run_without_room_is_refused_before_its_first_step(tmp_path, monkeypatch, name, told):
+def test_a_run_without_room_is_refused_before_its_first_step(tmp_path, monkeypatch, name, message):
     data, run = write_scene(tmp_path / "data"), tmp_path / "run"
     monkeypatch.setattr(memory_guard, name, lambda *_: 20.0)
-    with pytest.raises(UserError, match=told):
+    with pytest.raises(UserError, match=message):
         run_to_end(short_config(data, run))
     assert not list(run.rglob("*.ckpt"))
 

@@ -54,7 +54,7 @@ class Data:
 
     def views(self, split):
         greys = {"train": (0.1, 0.2, 0.3), "eval": (0.4, 0.6)}[split]
-        return [View(CAMERA, "view", lambda g=grey: {"image": torch.full((20, 24, 3), g)}, None) for grey in greys]
+        return [View(CAMERA, "v", lambda g=grey: {"image": torch.full((20, 24, 3), g)}, lambda: None) for grey in greys]
 
 
 def test_it_measures_all_held_out_views_at_the_given_steps_and_where_phases_end(tmp_path):
@@ -64,17 +64,17 @@ def test_it_measures_all_held_out_views_at_the_given_steps_and_where_phases_end(
         curve.after_step(step)
     records = json.loads((tmp_path / "held_out.json").read_text())
     assert [record["step"] for record in records] == [10, 20, 25, 28]
-    drawn = model.rasterizer.rasterize(
+    color = model.rasterizer.rasterize(
         surfel_inputs(model.scene, CAMERA, 1), CAMERA, model.settings(False), torch.zeros(3)
     ).color.clamp(0, 1)
 
     def psnr(grey):
-        return float(-10 * torch.log10((drawn - grey).square().mean()))
+        return float(-10 * torch.log10((color - grey).square().mean()))
 
     last = records[-1]
     assert last["psnr"] == pytest.approx((psnr(0.4) + psnr(0.6)) / 2, rel=1e-5)
     assert last["train_psnr"] == pytest.approx((psnr(0.1) + psnr(0.2)) / 2, rel=1e-5)  # as many views as are held out
     greys = [torch.full((20, 24, 3), grey) for grey in (0.4, 0.6)]
-    assert last["ssim"] == pytest.approx(sum(float(ssim(drawn, grey)) for grey in greys) / 2, rel=1e-5)
+    assert last["ssim"] == pytest.approx(sum(float(ssim(color, grey)) for grey in greys) / 2, rel=1e-5)
     assert last["gaussians"] == 9
     assert all(0 <= records[0][clock] <= last[clock] for clock in ("seconds", "cpu_seconds"))

@@ -64,7 +64,11 @@ def kill_at(monkeypatch, step, after=False):
     monkeypatch.setattr(BeagsTrainer, "train_iteration", iteration)
 
 
-def broken_off(data, run, monkeypatch, kill, **overrides):
+def killed(*_, **__):
+    raise Killed
+
+
+def interrupted(data, run, monkeypatch, kill, **overrides):
     """Start a run and let ``kill`` end it."""
     with monkeypatch.context() as patch:
         kill(patch)
@@ -86,7 +90,7 @@ def test_the_run_grows_splits_and_prepares_twice(whole):
 @pytest.mark.parametrize(("step", "after"), [(36, True), (44, True), (45, False)])
 def test_a_killed_run_ends_as_the_whole_one(data, whole, tmp_path, monkeypatch, step, after):
     run = tmp_path / "run"
-    broken_off(data, run, monkeypatch, lambda patch: kill_at(patch, step, after))
+    interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, step, after))
     resume_to_end(run)
     assert_same_run(run, whole)
     assert not list(run.rglob("*.part"))
@@ -94,7 +98,7 @@ def test_a_killed_run_ends_as_the_whole_one(data, whole, tmp_path, monkeypatch, 
 
 def test_a_run_that_is_killed_again_and_again(data, whole, tmp_path, monkeypatch):
     run = tmp_path / "run"
-    broken_off(data, run, monkeypatch, lambda patch: kill_at(patch, 15))
+    interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, 15))
     for step in (30, 46, 52):
         with monkeypatch.context() as patch:
             kill_at(patch, step)
@@ -119,32 +123,23 @@ def test_a_kill_in_the_preparation_ends_as_the_whole_one(data, whole, tmp_path, 
     run, calls = tmp_path / "run", []
     compute = getattr(stage_module(name), name)
 
-    def killed(*args, **options):
+    def stage(*args, **options):
         calls.append(name)
-        if len(calls) == round_:
-            raise Killed
-        return compute(*args, **options)
+        return killed() if len(calls) == round_ else compute(*args, **options)
 
-    broken_off(data, run, monkeypatch, lambda patch: patch.setattr(stage_module(name), name, killed))
+    interrupted(data, run, monkeypatch, lambda patch: patch.setattr(stage_module(name), name, stage))
     resume_to_end(run)
     assert_same_run(run, whole)
 
 
-def test_a_kill_while_the_base_or_the_masks_are_written(data, whole, tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", ["write_run", "write_mask"])
+def test_a_kill_while_the_base_or_the_masks_are_written(data, whole, tmp_path, monkeypatch, name):
     from beags_plugin.plugin.training import refinement
 
-    for name in ("write_run", "write_mask"):
-        run = tmp_path / name
-
-        def kill(patch, name=name):
-            def killed(*_, **__):
-                raise Killed
-
-            patch.setattr(refinement, name, killed)
-
-        broken_off(data, run, monkeypatch, kill)
-        resume_to_end(run)
-        assert_same_run(run, whole)
+    run = tmp_path / "run"
+    interrupted(data, run, monkeypatch, lambda patch: patch.setattr(refinement, name, killed))
+    resume_to_end(run)
+    assert_same_run(run, whole)
 
 
 @pytest.mark.parametrize("at", [14, 44, LAST])
@@ -160,7 +155,7 @@ def test_a_kill_in_the_middle_of_a_checkpoint_leaves_the_former_one(data, whole,
 
         patch.setattr(torch, "save", half)
 
-    broken_off(data, run, monkeypatch, kill, steps_per_save=7)
+    interrupted(data, run, monkeypatch, kill, steps_per_save=7)
     assert [path.suffix for path in run.glob(".*.part")] == [".part"]
     assert all(torch.load(path, weights_only=True)["step"] < at for path in run.glob("nerfstudio_models/*"))
     resume_to_end(run)
@@ -170,7 +165,7 @@ def test_a_kill_in_the_middle_of_a_checkpoint_leaves_the_former_one(data, whole,
 
 def test_resuming_by_load_dir_into_another_folder(data, whole, tmp_path, monkeypatch):
     first, second = tmp_path / "first", tmp_path / "second"
-    broken_off(data, first, monkeypatch, lambda patch: kill_at(patch, 53))
+    interrupted(data, first, monkeypatch, lambda patch: kill_at(patch, 53))
     config = short_config(data, second)
     config.load_dir = first / "nerfstudio_models"
     run_to_end(config)
@@ -181,16 +176,13 @@ def test_refinement_of_a_loaded_base_is_resumed(data, whole, tmp_path, monkeypat
     base = whole / "base" / "nerfstudio_models"
     options = {"pipeline.model.base_steps": 0}
     runs = [tmp_path / name for name in ("whole", "killed")]
-    for run in runs:
-        config = short_config(data, run, **options)
+    configs = [short_config(data, run, **options) for run in runs]
+    for config in configs:
         config.load_dir = base
-        with monkeypatch.context() as patch:
-            if run == runs[1]:
-                kill_at(patch, 9, after=True)
-                with pytest.raises(Killed):
-                    run_to_end(config)
-            else:
-                run_to_end(config)
+    run_to_end(configs[0])
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        kill_at(patch, 9, after=True)
+        run_to_end(configs[1])
     resume_to_end(runs[1])
     assert differences(*(without_clocks(checkpoint_of(run)) for run in runs)) == []
 
@@ -223,9 +215,7 @@ def test_ctrl_c_saves_the_step_and_a_resume_goes_on(data, whole, tmp_path, monke
 
 def test_a_run_of_a_gpu_goes_on_without_one_if_asked(data, tmp_path, monkeypatch):
     run = tmp_path / "run"
-    with monkeypatch.context() as patch, pytest.raises(Killed):
-        kill_at(patch, 20)
-        run_to_end(short_config(data, run))
+    interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, 20))
     config = run / "config.yml"
     config.write_text(config.read_text().replace("device_type: cpu", "device_type: cuda"))
     assert "device_type: cuda" in config.read_text()
@@ -238,7 +228,7 @@ def test_a_run_of_a_gpu_goes_on_without_one_if_asked(data, tmp_path, monkeypatch
 
 def test_a_kill_before_the_first_checkpoint_starts_again(data, whole, tmp_path, monkeypatch, capsys):
     run = tmp_path / "run"
-    broken_off(data, run, monkeypatch, lambda patch: kill_at(patch, 5))
+    interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, 5))
     assert not (run / "nerfstudio_models").exists()
     resume_to_end(run)
     assert "starts from the beginning" in capsys.readouterr().out
@@ -248,8 +238,8 @@ def test_a_kill_before_the_first_checkpoint_starts_again(data, whole, tmp_path, 
 def test_a_new_run_into_the_folder_of_another_is_not_taken_for_it(data, whole, tmp_path, monkeypatch):
     run = tmp_path / "run"
     run_to_end(short_config(data, run, **{"machine.seed": 7}))
-    broken_off(data, run, monkeypatch, lambda patch: kill_at(patch, 5))
-    assert checkpoint_of_folder(run / "replaced_models")["step"] == LAST
+    interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, 5))
+    assert [path.name for path in (run / "replaced_models").iterdir()] == [f"step-{LAST:09d}.ckpt"]
     resume_to_end(run)
     assert_same_run(run, whole)
     assert not (run / "replaced_models").exists()
@@ -267,46 +257,31 @@ def test_a_failed_start_in_the_folder_of_another_run_is_not_mixed_with_it(data, 
         run_to_end(config)
     assert not (run / "training.json").exists() and not (run / "nerfstudio_models").exists()
     assert any((run / "replaced_models").glob("*.ckpt"))
-    broken_off(data, run, monkeypatch, lambda patch: kill_at(patch, 5), **keep_all)
+    interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, 5), **keep_all)
     resume_to_end(run)
     assert not (run / "replaced_models").exists()
-
-
-def test_a_run_that_is_training_cannot_be_resumed(whole, tmp_path):
-    from beags_plugin.system.lock import run_lock
-
-    whole = shutil.copytree(whole, tmp_path / "run")
-    before = checkpoint_of(whole)["step"]
-    part = whole / ".half.part"
-    part.touch()
-    lock = run_lock(whole)
-    try:
-        with pytest.raises(UserError, match="being trained by another process"):
-            resume_to_end(whole)
-        assert part.exists() and checkpoint_of(whole)["step"] == before
-    finally:
-        lock.release()
-        part.unlink()
-    run_lock(whole).release()
 
 
 def contents(folder):
     return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.rglob("*") if path.is_file()}
 
 
-def test_ns_train_into_the_folder_of_a_run_that_is_training_changes_nothing_there(data, whole, tmp_path):
-    """config.yml is the first that ns-train writes."""
+@pytest.mark.parametrize("again", ["resume", "ns-train"])
+def test_a_run_that_is_training_is_left_alone(data, whole, tmp_path, again):
+    """Also by ns-train, which writes config.yml first."""
     import fcntl
 
-    from beags_plugin.system.lock import LOCK
+    from beags_plugin.system.lock import LOCK, run_lock
 
-    whole = shutil.copytree(whole, tmp_path / "run")
-    before = contents(whole)
-    with open(whole / LOCK, "ab") as file:
+    run = shutil.copytree(whole, tmp_path / "run")
+    (run / ".half.part").touch()
+    before = contents(run)
+    with open(run / LOCK, "ab") as file:
         fcntl.flock(file, fcntl.LOCK_EX)  # as another process would
         with pytest.raises(UserError, match="being trained by another process"):
-            run_to_end(short_config(data, whole, steps_per_save=99))
-    assert contents(whole) == before
+            resume_to_end(run) if again == "resume" else run_to_end(short_config(data, run, steps_per_save=99))
+    assert contents(run) == before
+    run_lock(run).release()
 
 
 @pytest.mark.parametrize("devices", [1, 2])
@@ -359,11 +334,6 @@ def test_ctrl_c_ends_a_training_that_the_viewer_has_paused(data, tmp_path, monke
     assert checkpoint_of(run)["step"] == 4
 
 
-def checkpoint_of_folder(folder):
-    (path,) = folder.iterdir()
-    return torch.load(path, weights_only=True)
-
-
 def edit_checkpoint(run, edit):
     (path,) = (run / "nerfstudio_models").iterdir()
     content = torch.load(path, weights_only=True)
@@ -372,7 +342,7 @@ def edit_checkpoint(run, edit):
     return path
 
 
-def test_what_cannot_be_resumed_is_said_in_one_sentence(data, whole, tmp_path, monkeypatch, capsys):
+def test_what_cannot_be_resumed_is_refused_in_one_sentence(data, whole, tmp_path, monkeypatch, capsys):
     with pytest.raises(UserError, match="complete run"):
         resume_to_end(whole)
     with pytest.raises(UserError, match="without the state of its training"):
@@ -380,7 +350,7 @@ def test_what_cannot_be_resumed_is_said_in_one_sentence(data, whole, tmp_path, m
     with pytest.raises(UserError, match="cannot be read"):
         resume_to_end(tmp_path / "nowhere")
     run = tmp_path / "run"
-    broken_off(data, run, monkeypatch, lambda patch: kill_at(patch, 50))
+    interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, 50))
     path = edit_checkpoint(run, lambda content: content["beags"].update(version=99))
     with pytest.raises(UserError, match="newer version of beags: update"):
         resume_to_end(run)
@@ -399,14 +369,7 @@ def test_what_cannot_be_resumed_is_said_in_one_sentence(data, whole, tmp_path, m
 
 def test_a_kill_between_the_last_checkpoint_and_the_report(data, whole, tmp_path, monkeypatch):
     run = tmp_path / "run"
-
-    def kill(patch):
-        def killed(_):
-            raise Killed
-
-        patch.setattr(BeagsTrainer, "_write_report", killed)
-
-    broken_off(data, run, monkeypatch, kill)
+    interrupted(data, run, monkeypatch, lambda patch: patch.setattr(BeagsTrainer, "_write_report", killed))
     assert checkpoint_of(run)["step"] == LAST and not (run / "training.json").exists()
     resume_to_end(run)
     assert json.loads((run / "training.json").read_text())["seconds"]["refinement"] > 0

@@ -1,4 +1,4 @@
-"""Runs that start from a trained scene: frames, flattening, and what they say of how well it fits."""
+"""Runs that start from a trained scene: frames, flattening, and the report of how well it fits."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ pytest.importorskip("nerfstudio")
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.extraction.ply import write_ply
-from beags_plugin.plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.presets import preset_config
 from beags_plugin.system.errors import UserError
 
@@ -34,7 +33,7 @@ def config_of(scene, run, preset="beags-refine", **options):
 
 
 def started(scene, run, start, **options):
-    """A trainer that has been set up from ``start``, and what it says of it."""
+    """A trainer that has been set up from ``start``, and its report of the start."""
     config = config_of(scene, run, start_from=start, **options)
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
@@ -64,8 +63,8 @@ def same_pictures(trainer, surfels: Surfels) -> float:
 
 
 @pytest.mark.parametrize("kind", ["2dgs", "3dgs", "ours", "splatfacto", "run"])
-def test_a_scene_is_drawn_as_it_was_whatever_file_it_comes_from(scene, tmp_path, kind):
-    """The photos are drawings of the discs: what reaches their rounding to bytes has frame, shape and colour right."""
+def test_a_scene_is_rendered_as_it_was_whatever_file_it_comes_from(scene, tmp_path, kind):
+    """The photos are renders of the discs: what reaches their rounding to bytes has frame, shape and colour right."""
     start = tmp_path / "scene.ply"
     if kind == "2dgs":
         write_ply(start, scene.surfels, layout="2dgs")
@@ -123,17 +122,16 @@ def test_a_base_is_exported_whole_and_started_from_again(scene, tmp_path, form):
     assert again.pipeline.model.config.sh_degree == 1
 
 
-def test_a_wrong_frame_is_said_with_the_figure_and_the_frame_that_fits(scene, tmp_path, capsys):
-    trainer, _ = started(
-        scene, tmp_path / "right", write_splatfacto(tmp_path / "a", scene.surfels, (torch.eye(4)[:3], 1.0))
-    )
+def test_a_wrong_frame_is_reported_with_the_figure_and_the_frame_that_fits(scene, tmp_path, capsys):
+    right = write_splatfacto(tmp_path / "a", scene.surfels, (torch.eye(4)[:3], 1.0))
+    trainer, _ = started(scene, tmp_path / "right", right)
     capsys.readouterr()
     normalised = tmp_path / "normalised.ply"  # as ns-export writes them
     write_ply(normalised, trainer.pipeline.model.surfels().detach())
     _, report = started(scene, tmp_path / "wrong", normalised)
-    said = " ".join(capsys.readouterr().out.split())
-    assert f"with {report['psnr']:.1f} dB, hardly better than one flat colour" in said
-    assert "it fits better with --pipeline.model.start-frame normalised" in said
+    output = " ".join(capsys.readouterr().out.split())
+    assert f"with {report['psnr']:.1f} dB, hardly better than one flat colour" in output
+    assert "it fits better with --pipeline.model.start-frame normalised" in output
     _, report = started(scene, tmp_path / "better", normalised, start_frame="normalised")
     assert report["psnr"] > 45 and "hardly better" not in capsys.readouterr().out
 
@@ -182,11 +180,6 @@ def test_base_steps_polish_a_scene_without_growth(scene, tmp_path):
     assert trainer.pipeline.model.train().active_sh_degree() == 1  # all of it, from the first step
 
 
-def test_the_schedule_of_a_polished_base_is_the_second_half():
-    warm = PhaseSchedule(100, 10, 30_000, warm=True)
-    assert [warm.progress(step) for step in (0, 50, 100, 105)] == [0.5, 0.75, 0.9, 0.95]
-
-
 @pytest.mark.parametrize(
     ("name", "words"),
     [
@@ -194,7 +187,7 @@ def test_the_schedule_of_a_polished_base_is_the_second_half():
         ("notes.txt", "notes.txt is nothing to start from: name one of these: a run of splatfacto or beags"),
     ],
 )
-def test_what_is_no_scene_is_told_before_the_data_are_read(scene, tmp_path, name, words):
+def test_what_is_no_scene_is_refused_before_the_data_are_read(scene, tmp_path, name, words):
     (tmp_path / "notes.txt").write_text("hello")
     trainer = config_of(scene, tmp_path / "run", start_from=tmp_path / name).setup(local_rank=0, world_size=1)
     with pytest.raises(SystemExit) as end:

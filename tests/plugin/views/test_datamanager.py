@@ -13,7 +13,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_imag
 
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.plugin.views.datamanager import BeagsDataManagerConfig
-from beags_plugin.plugin.views.undistortion import undistort_labels
+from beags_plugin.plugin.views.lens import undistort_labels
 from beags_plugin.plugin.views.views import unique_names
 
 
@@ -29,7 +29,7 @@ def test_class_map_is_undistorted_like_its_image(tmp_path, model):
         known = labels != IGNORE
         return float((((labels > 0) & known) != (view.image[..., 0] > 0.5))[known].float().mean())
 
-    assert differing(view.labels) < 0.005  # the discs' rims, where the image is interpolated
+    assert differing(view.labels) < 0.005  # the discs' boundaries, where the image is interpolated
     assert differing(view.labels.roll(1, dims=1)) > 4 * differing(view.labels)
     if view.labels.shape == distorted.shape:
         assert differing(torch.from_numpy(distorted).int()) > 4 * differing(view.labels)
@@ -55,7 +55,9 @@ def test_class_map_is_undistorted_like_its_image(tmp_path, model):
 def test_every_label_comes_from_the_pixel_that_the_image_came_from(tmp_path, model):
     write_distorted(tmp_path, model, [])
     rows, columns = np.mgrid[:LARGE_H, :LARGE_W].astype(np.float32)
-    cameras = manager(tmp_path).train_dataparser_outputs.cameras  # those of the dataset are straightened
+    data = manager(tmp_path)
+    assert data.train_dataset[0]["image"].shape == (LARGE_H, LARGE_W, 3)  # files keep their size, for the viewer
+    cameras = data.train_dataparser_outputs.cameras  # those of the dataset are straightened
     camera, K = cameras[0].reshape(()), cameras[0].get_intrinsics_matrices().numpy()
     ramps = np.stack([columns, rows, columns], axis=2)
     straight = deepcopy(cameras)
@@ -66,19 +68,12 @@ def test_every_label_comes_from_the_pixel_that_the_image_came_from(tmp_path, mod
     labels = undistort_labels((rows * LARGE_W + columns).astype(np.uint16), cameras, straight, 0)
     assert labels.shape == ramps.shape[:2]
     known = labels != IGNORE
-    inside = known & (ramps[..., 0] > 1) & (ramps[..., 1] > 1)  # at the rim the ramp blends with black
+    inside = known & (ramps[..., 0] > 1) & (ramps[..., 1] > 1)  # at the border the ramp blends with black
     inside &= (ramps[..., 0] < LARGE_W - 2) & (ramps[..., 1] < LARGE_H - 2)
     assert inside.mean() > 0.9
     # OpenCV interpolates at 1/32 pixel, so the nearest pixel is within 0.5 + 1/64 of the ramp.
     assert np.abs(labels % LARGE_W - ramps[..., 0])[inside].max() < 0.52
     assert np.abs(labels // LARGE_W - ramps[..., 1])[inside].max() < 0.52
-
-
-def test_undistorted_cameras_stay_readable_by_the_viewer(tmp_path):
-    write_distorted(tmp_path, "OPENCV", [(0.1, 0.1)])
-    data = manager(tmp_path)
-    data.views("train")
-    assert data.train_dataset[0]["image"].shape == (LARGE_H, LARGE_W, 3)  # files keep their size
 
 
 def test_views_without_distortion_are_the_files(tmp_path):
@@ -129,30 +124,29 @@ def test_order_of_views_follows_the_seed_alone(tmp_path):
     assert all(sorted(first[0][i : i + 7]) == list(range(7)) for i in (0, 7, 14))
 
 
-def test_replaced_class_maps_reach_batches_and_views(tmp_path):
+@pytest.mark.parametrize("stream", ["never", "always"])
+def test_replaced_labels_reach_batches_and_views(tmp_path, stream):
     write_transforms(tmp_path)
     write_image(tmp_path / "masks/v01.png", np.full((HEIGHT, WIDTH), 1, np.uint8))
-    data = manager(tmp_path)
+    data = manager(tmp_path, stream=stream)
+    assert "present" not in data.next_train(0)[1]  # the host knows the objects of labels that it is given
+    assert (data.views("train")[0].labels == 1).all() and data.views("train")[1].labels is None
     new = [torch.full((HEIGHT, WIDTH), 5 + index, dtype=torch.int32) for index in range(7)]
-    assert "present" not in data.next_train(0)[1]  # the host knows those of the maps that it is given
+    new[2][0], new[3][1] = IGNORE, 300
     data.replace_labels(new)
     for step in range(1, 8):
         camera, batch = data.next_train(step)
-        assert (batch["labels"].int() == 5 + batch["image_idx"]).all()
-        assert batch["present"] == [5 + batch["image_idx"]]
-        assert torch.equal(camera.metadata["labels"], batch["labels"])
+        assert torch.equal(batch["labels"], new[batch["image_idx"]])
+        assert batch["present"] == [5 + batch["image_idx"], *([300] if batch["image_idx"] == 3 else [])]
+        assert camera.metadata["labels"] is batch["labels"]
     assert all(torch.equal(view.labels, labels) for view, labels in zip(data.views("train"), new, strict=True))
-    originals = [view.labels for view in data.views("train", original=True)]
-    assert (originals[0] == 1).all() and originals[1:] == [None] * 6
 
     new[0].fill_(9)  # the manager keeps its own copy
-    data.replace_labels([labels + 1 for labels in new])
-    assert (data.views("train", original=True)[0].labels == 1).all()
+    assert (data.views("train")[0].labels == 5).all()
+    data.replace_labels([labels + 1 for labels in new[:2]] + new[2:])
     assert (data.views("train")[0].labels == 10).all()
-    data.replace_labels(new, keep=False)
-    assert (data.views("train")[1].labels == 6).all()
-    with pytest.raises(ValueError, match="were not kept"):
-        data.views("train", original=True)
+    originals = [view.labels for view in data.views("train", original=True)]
+    assert (originals[0] == 1).all() and originals[1:] == [None] * 6
 
 
 @pytest.mark.parametrize(
@@ -173,10 +167,13 @@ def test_paths_of_the_configuration_are_absolute(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_transforms(tmp_path / "scene")
     config = BeagsDataManagerConfig()
+    assert config.dataparser.data == Path()  # "not given" is no path
     config.data = "scene"
     assert config.data == tmp_path / "scene"
     config.setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
     assert config.dataparser.data == tmp_path / "scene"
+    outputs = config.dataparser.setup().get_dataparser_outputs("train")
+    assert all(path.is_absolute() for path in outputs.image_filenames)
 
 
 def test_checkpoints_with_numpy_scalars_load(tmp_path):

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import threading
 
-import numpy as np
 import pytest
 import torch
-from data_folders import HEIGHT, WIDTH, write_image, write_transforms
+from data_folders import HEIGHT, WIDTH, write_transforms
 from distorted_views import manager, write_distorted
 
 from beags_plugin.labels.class_ids import IGNORE
@@ -41,25 +40,6 @@ def test_batches_and_views_are_the_same_bit_for_bit(tmp_path, model, kind):
     batches = zip(cached.fixed_indices_eval_dataloader, streamed.fixed_indices_eval_dataloader, strict=True)
     assert all(same(a, b) for (_, a), (_, b) in batches)
     assert same(cached.next_eval_image(0)[1], streamed.next_eval_image(0)[1])
-
-
-def test_replaced_class_maps_of_streamed_views(tmp_path):
-    write_transforms(tmp_path)
-    write_image(tmp_path / "masks/v01.png", np.full((HEIGHT, WIDTH), 1, np.uint8))
-    cached, streamed = both(tmp_path)
-    new = [torch.full((HEIGHT, WIDTH), 5 + index, dtype=torch.int32) for index in range(7)]
-    new[2][0] = IGNORE
-    new[3][1] = 300
-    for data in (cached, streamed):
-        data.replace_labels(new)
-    for step in range(7):
-        assert same(cached.next_train(step)[1], streamed.next_train(step)[1])
-    assert all(torch.equal(view.labels, labels) for view, labels in zip(streamed.views("train"), new, strict=True))
-    originals = [view.labels for view in streamed.views("train", original=True)]
-    assert (originals[0] == 1).all() and originals[1:] == [None] * 6
-    streamed.replace_labels(new, keep=False)
-    with pytest.raises(ValueError, match="were not kept"):
-        streamed.views("train", original=True)
 
 
 def test_it_is_chosen_by_the_size_of_the_images(tmp_path):
