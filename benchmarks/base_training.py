@@ -11,8 +11,8 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from beags_plugin.bench.commands import ExperimentOptions
 from beags_plugin.bench.experiment import Experiment, Variant, load_experiment
+from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.report import (
     new_figure,
     number,

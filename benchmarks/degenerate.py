@@ -24,7 +24,7 @@ _WORLD_SHIFTS = (0.0, 0.0, 0.0, 1e5)
 
 @dataclass(frozen=True)
 class Scene:
-    """What ``Rasterizer.rasterize`` takes, in float64, and what was done to it.
+    """Inputs of ``Rasterizer.rasterize`` in float64, and the ways in which they are spoilt.
 
     target: [H, W] int32 class ids, or IGNORE. num_classes: ids lie below it. spoilt: of each surfel, what is wrong
     with it; "" nothing. world: (scale, shift) of the world's unit and origin.
@@ -40,13 +40,13 @@ class Scene:
     world: tuple[float, float]
 
     def to(self, dtype: torch.dtype) -> Scene:
-        """The same scene in another precision, in which a number may become 0 or infinite."""
+        """Return the scene in another precision, in which a number may become 0 or infinite."""
         camera, background = self.camera.to(dtype), self.background.to(dtype)
         return replace(self, inputs=self.inputs.to(dtype), camera=camera, background=background)
 
 
 def degenerate_scene(seed: int) -> Scene:
-    """Scene number ``seed``: always the same, whatever was made before it."""
+    """Return scene number ``seed``, which does not depend on scenes made before it."""
     dice = random.Random(seed)
     width, height = dice.choice(_SIZES)
     count, num_classes = dice.choice(_COUNTS), dice.choice(_CLASSES)

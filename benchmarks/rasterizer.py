@@ -27,7 +27,7 @@ QUICK_SIZE = "300/64x48"
 
 @dataclass
 class Arguments:
-    """Time native, torch reference and gsplat's torch functions in turn, and check the goals; always ends with 0."""
+    """Measure native, torch reference and gsplat's torch functions in turn, and check the goals; always ends with 0."""
 
     sizes: tuple[str, ...] = tuple(size.name for size in SIZES)
     """Of 1k 10k 50k 200k, or N/WIDTHxHEIGHT."""
@@ -55,7 +55,7 @@ class Arguments:
     """File to write everything to."""
 
     def options(self) -> Options:
-        """What to measure; raises ``UserError`` for a size or number that cannot be."""
+        """Return the things to measure; raises ``UserError`` for a size or number that cannot be."""
         if self.quick:
             small = parse_size(QUICK_SIZE)
             return Options(

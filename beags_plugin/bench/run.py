@@ -8,8 +8,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from beags_plugin.bench.commands import ExperimentOptions
 from beags_plugin.bench.experiment import Experiment, Variant, check_keys, load_experiment
+from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.provenance import busy_note
 from beags_plugin.bench.report import provenance, write_csv, write_json
 from beags_plugin.bench.results import ResultRow, make_row, report_json, table_rows

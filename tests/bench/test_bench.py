@@ -13,8 +13,8 @@ pytest.importorskip("nerfstudio")
 from experiment_files import written
 
 from beags_plugin.bench import runner
-from beags_plugin.bench.commands import ExperimentOptions
 from beags_plugin.bench.experiment import load_experiment
+from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.run import run_experiment
 
 MINIATURE = """

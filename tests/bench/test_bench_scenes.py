@@ -13,8 +13,8 @@ pytest.importorskip("nerfstudio")
 
 from experiment_files import GOOD, masks_of, scene, written
 
-from beags_plugin.bench.commands import ExperimentOptions
 from beags_plugin.bench.experiment import load_experiment
+from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.run import adapted, scenes_of
 from beags_plugin.bench.scenes import TrialScene, damaged_masks, given_scenes
 from beags_plugin.bench.trials import plan, steps_of
