@@ -100,7 +100,7 @@ class Rendering:
 
 
 class GsplatRendering(Rendering):
-    """gsplat's ``rasterization_2dgs``: colour with expected depth, alpha, normal; and the depth's normals, unasked."""
+    """gsplat's ``rasterization_2dgs``: colour with expected depth, alpha, normal; always also the depth's normals."""
 
     mode = "RGB+ED"
 
@@ -232,7 +232,7 @@ def failure(error: Exception) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run it; exit code 1 without a GPU, where a number is not finite, and where one of our own rows failed."""
+    """Run the benchmark; returns exit code 1 without a GPU, for numbers that are not finite, and if our rows fail."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="the smallest sizes only")
     parser.add_argument("--smoke", action="store_true", help="run every kernel once, time nothing")

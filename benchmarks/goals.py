@@ -49,7 +49,7 @@ def check_goals(result: Result, isa: str | None) -> list[Goal]:
 
 
 class _Table:
-    """Rows by what they measure."""
+    """Rows by the thing that they measure."""
 
     def __init__(self, rows: list[dict[str, Any]], isa: str | None) -> None:
         self.isa = isa

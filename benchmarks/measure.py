@@ -71,7 +71,10 @@ class Series:
 
 @dataclass
 class Result:
-    """rows: one per (size, backend, isa, threads); scenes: per size; step: see ``measure_step``; notes: sentences."""
+    """All measurements.
+
+    rows: one per (size, backend, isa, threads). scenes: per size. step: see ``measure_step``. notes: sentences.
+    """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
     scenes: list[dict[str, Any]] = field(default_factory=list)
@@ -177,7 +180,7 @@ def measure_sizes(session: Session, options: Options, result: Result, advance: A
 def _interleave(
     session: Session, size: Size, entries: list, options: Options, advance: Advance
 ) -> dict[Any, dict[str, Series]]:
-    """Rounds in which every entry has its turn; a slow one drops out when its budget is spent."""
+    """Run rounds in which every entry has its turn; a slow one drops out when its budget is spent."""
     timed = {entry: {stage: Series(entry[2]) for stage in ("forward", "backward")} for entry in entries}
     spent = dict.fromkeys(entries, 0.0)
     for turn in range(options.rounds):
@@ -205,7 +208,7 @@ def _peak(size: Size, entry, session: Session, options: Options, notes: list[str
 
 
 def peak_in_new_process(notes: list[str], what: str, **arguments: Any) -> float | None:
-    """MB; None, with a note, where the process did not get through."""
+    """Return the MB, or None and a note if the process failed."""
     try:
         with Worker() as worker:
             return worker.ask("peak", **arguments)
@@ -215,7 +218,7 @@ def peak_in_new_process(notes: list[str], what: str, **arguments: Any) -> float 
 
 
 def _add_stages(session: Session, size: Size, options: Options, scene: dict[str, Any]) -> None:
-    """projection_binning_ms, same_bits: whether 1, 2 and 4 threads give the same bits."""
+    """Return {"projection_binning_ms", "same_bits"}; same_bits: 1, 2 and 4 threads give the same bits."""
     threads = options.threads[0]
     frame = session.best.ask("stages", size=size.name, threads=threads, seconds=options.seconds)
     scene["projection_binning_ms"] = Series(threads, frame).best

@@ -71,7 +71,7 @@ def take_batches(root: Path, stream: str) -> None:
 
 
 def main(views: int) -> None:
-    """Both ways, and what is chosen by itself."""
+    """Measure both ways, and print the automatic choice."""
     with tempfile.TemporaryDirectory() as folder:
         write_views(Path(folder), views)
         found = {}

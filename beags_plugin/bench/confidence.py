@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from beags_plugin.plugin.runs.prepared import TrainingMasks
 
 SHOWN_DAMAGE = 2.0  # the degree that is shown, or the one nearest to it
-VIEWS = 2  # of each scene: the one that changed most, and one that had no mask
+VIEWS = 2  # of each scene: the view that changed most, and one that had no mask
 _WRONG, _MENDED, _SPOILT, _UNKNOWN = (230, 75, 45), (60, 160, 90), (200, 0, 200), (170, 170, 170)
 
 

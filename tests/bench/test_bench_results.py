@@ -115,7 +115,7 @@ def test_json_and_csv_hold_every_row_and_the_same_figures(rows, tmp_path, experi
             assert line[name] == ("" if row[name] is None else str(row[name]))
 
 
-def test_tables_say_what_failed_and_whose_figures_the_papers_are(rows):
+def test_tables_list_failures_and_mark_the_papers_figures(rows):
     from rich.console import Console
 
     console = Console(width=200, file=io.StringIO())
@@ -149,7 +149,7 @@ def test_the_front_is_what_nothing_beats(tmp_path):
     assert (tmp_path / "front.png").stat().st_size > 10_000
 
 
-def test_the_picture_is_drawn_with_failures_and_without(rows, tmp_path):
+def test_the_plot_has_failures_or_none(rows, tmp_path):
     from PIL import Image
 
     variants = tuple({row.variant.name: row.variant for row in rows}.values())

@@ -79,7 +79,7 @@ def test_a_damaged_stamp_means_not_trained(tmp_path):
 
 
 def test_a_demo_that_was_killed_goes_on(tmp_path, monkeypatch):
-    """Killed in the training, it resumes; after the training, it measures; with another request, it starts anew."""
+    """A demo killed in the training resumes; after the training, it measures; with another request, it starts anew."""
     data, output = write_scene(tmp_path / "data"), tmp_path / "out"
     run, commands, measured = output / "run", [], []
 

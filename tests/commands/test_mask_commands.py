@@ -95,7 +95,7 @@ class Scripted(MaskSource):
         def maps():
             for index in range(len(scene.photos)):
                 if index == self.breaks:
-                    raise UserError("broken off")
+                    raise UserError("interrupted")
                 yield truth(0).astype(np.uint16)
 
         return MadeMasks({0: "background", 1: "cup", 2: "box"}, maps(), [], frozenset(self.aside))
@@ -113,7 +113,7 @@ def test_masks_to_look_at_are_guarded_and_whole_as_the_others(tmp_path):
     with pytest.raises(UserError, match=r"already \(masks_to_look_at/v00.png\): add --overwrite"):
         make_masks(data, Scripted())
     kept = {path: path.read_bytes() for path in aside.iterdir()}
-    with pytest.raises(UserError, match="broken off"):
+    with pytest.raises(UserError, match="interrupted"):
         make_masks(data, Scripted(aside=(0, 1), breaks=4), overwrite=True)
     assert {path: path.read_bytes() for path in aside.iterdir()} == kept and not list((tmp_path / "masks").iterdir())
     make_masks(data, Scripted(), overwrite=True)
