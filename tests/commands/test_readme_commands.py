@@ -72,7 +72,6 @@ ELSEWHERE = {
     "make test": "runs these tests",
     "make lint": "looks at the code, not at what it does",
     "make format": "changes the files of this clone",
-    "make fuzz COUNT=1000 SEED=0": "minutes; test_fuzz.py runs the script, what make calls is looked at below",
     "make soak": "an hour; tests/soak/ tests each script",
     "scripts/sanitize.sh": "compiles everything anew",
     "pip install -c constraints.txt -e .": "make setup has done it in the environment that runs this test",
