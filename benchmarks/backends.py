@@ -1,4 +1,4 @@
-"""What is measured, each as two steps over one scene: forward (to images), backward (to gradients of all inputs)."""
+"""Backends to measure over one scene: forward (to images) and backward (to gradients of all inputs)."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ LEAVES = ("means", "quats", "log_scales", "opacity_logits", "colors", "backgroun
 
 
 class Backend(ABC):
-    """Something that draws a scene, differentiably."""
+    """A differentiable renderer of a scene."""
 
     @abstractmethod
     def unavailable(self) -> str | None:
-        """None if it can run here, else one sentence: why not."""
+        """Return None if it can run here, else the reason in a sentence."""
 
     @abstractmethod
-    def draw(self, scene: Scene, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
-        """The images by name, made from ``leaves`` (``LEAVES`` by name, with gradients)."""
+    def render(self, scene: Scene, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return images by name, rendered from ``leaves`` (``LEAVES`` by name, with gradients)."""
 
 
 class OwnBackend(Backend):
@@ -39,21 +39,21 @@ class OwnBackend(Backend):
         return RASTERIZERS.get(self.name).unavailable()
 
     def rasterizer(self) -> Rasterizer:
-        """One that keeps within a quarter of the memory that is free."""
+        """Return a rasterizer that keeps within a quarter of the memory that is free."""
         if self.name == "torch":
             return RASTERIZERS.get("torch")(memory_limit=min(4e9, 0.25 * free_bytes()))
         return RASTERIZERS.get(self.name)()
 
-    def draw(self, scene: Scene, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
+    def render(self, scene: Scene, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
         floats = {name: leaves[name] for name in LEAVES if name != "background"}
-        render = self.rasterizer().rasterize(
+        found = self.rasterizer().rasterize(
             SurfelInputs(**floats, class_ids=scene.class_ids),
             scene.camera,
             scene.settings,
             leaves["background"],
             scene.target,
         )
-        return {name: getattr(render, name) for name in OUTPUTS}
+        return {name: getattr(found, name) for name in OUTPUTS}
 
 
 class GsplatBackend(Backend):
@@ -66,38 +66,38 @@ class GsplatBackend(Backend):
             return f"gsplat's torch functions are not installed ({error})"
         return None
 
-    def draw(self, scene: Scene, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
-        from benchmarks.gsplat_torch import draw
+    def render(self, scene: Scene, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
+        from benchmarks.gsplat_torch import render
 
-        return draw(leaves, scene.camera, scene.settings.near, scene.settings.far)
+        return render(leaves, scene.camera, scene.settings.near, scene.settings.far)
 
 
 def make_backend(name: str) -> Backend:
-    """native, torch or gsplat."""
+    """Return the backend native, torch or gsplat."""
     return GsplatBackend() if name == "gsplat" else OwnBackend(name)
 
 
 def make_leaves(scene: Scene) -> dict[str, Tensor]:
-    """Fresh leaves of the scene's float inputs, sharing its storage."""
+    """Return fresh leaves of the scene's float inputs, sharing its storage."""
     values = {**vars(scene.surfels), "colors": scene.colors, "background": scene.background}
     return {name: values[name].detach().requires_grad_() for name in LEAVES}
 
 
 def run(backend: Backend, scene: Scene) -> tuple[Seconds, Seconds, dict[str, Tensor], dict[str, Tensor]]:
-    """One forward and backward: how long each takes, images and gradients by name."""
+    """Run forward and backward; returns the time of each, and images and gradients by name."""
     leaves = make_leaves(scene)
     start = Seconds.now()
-    images = backend.draw(scene, leaves)
-    drawn = Seconds.now()
+    images = backend.render(scene, leaves)
+    rendered = Seconds.now()
     loss = _Loss.apply([scene.gradients[name] for name in images], *images.values())
     found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
     done = Seconds.now()
     gradients = {name: g for name, g in zip(leaves, found, strict=True) if g is not None}
-    return drawn - start, done - drawn, images, gradients
+    return rendered - start, done - rendered, images, gradients
 
 
 class _Loss(torch.autograd.Function):
-    """A number with the gradients that it is given: handing them to autograd itself has costs that a loss has not."""
+    """A number with given gradients: to hand them to autograd itself costs more than a loss does."""
 
     @staticmethod
     def forward(ctx, gradients: list[Tensor], *images: Tensor) -> Tensor:
@@ -110,7 +110,7 @@ class _Loss(torch.autograd.Function):
 
 
 def digest(*tensors: Tensor) -> str:
-    """A hash of every bit of the tensors."""
+    """Return a hash of every bit of the tensors."""
     total = hashlib.sha256()
     for tensor in tensors:
         total.update(tensor.detach().contiguous().numpy().tobytes())
@@ -118,7 +118,7 @@ def digest(*tensors: Tensor) -> str:
 
 
 def free_bytes() -> float:
-    """Memory that can still be used; infinite where the system does not say."""
+    """Return the free memory; infinite where the system does not report it."""
     try:
         with open("/proc/meminfo") as lines:
             return next(1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
@@ -127,7 +127,7 @@ def free_bytes() -> float:
 
 
 def work_counts(scene: Scene) -> dict[str, int] | None:
-    """lanes, contributing, tile_pairs, box_pairs of one view; None without the compiled rasterizer."""
+    """Return {"lanes", "contributing", "tile_pairs", "box_pairs"} of one view; None without the compiled rasterizer."""
     if native.NativeRasterizer.unavailable() is not None:
         return None
     return asdict(native.work_counts(surfel_inputs(scene), scene.camera, scene.settings))

@@ -1,4 +1,4 @@
-"""python -m benchmarks.base_training: how well held-out views are drawn, against steps and number of Gaussians."""
+"""python -m benchmarks.base_training: quality of held-out views over steps and number of Gaussians."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from beags_plugin.bench.commands import Trainings
 from beags_plugin.bench.experiment import Experiment, Variant, load_experiment
+from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.report import (
     new_figure,
     number,
@@ -22,9 +22,9 @@ from beags_plugin.bench.report import (
     write_csv,
     write_json,
 )
-from beags_plugin.bench.run import TABLE_WIDTH, Options, adapted, scenes_of
+from beags_plugin.bench.run import TABLE_WIDTH, adapted, scenes_of
 from beags_plugin.bench.runner import Outcome, run_trials
-from beags_plugin.bench.scenes import Scene
+from beags_plugin.bench.scenes import TrialScene
 from beags_plugin.bench.trials import MODEL, Trial, steps_of
 from beags_plugin.plugin.training.monitor import CURVE
 from beags_plugin.system.digests import code_digest
@@ -37,7 +37,7 @@ Curve = Sequence[Mapping[str, float]]
 
 
 @dataclass(frozen=True)
-class Row:
+class CurveRow:
     """A variant's base on a scene.
 
     curve: records of ``plugin.training.monitor``; empty with the reason in ``failed``.
@@ -51,7 +51,7 @@ class Row:
     failed: str | None = None
 
     def figures(self, best: float | None) -> dict[str, Any]:
-        """One line of the table. best: PSNR of the reference variant on this scene, dB."""
+        """Return one line of the table. best: PSNR of the reference variant on this scene, dB."""
         last = self.curve[-1] if self.curve else {}
         psnr = last.get("psnr")
         return {
@@ -71,10 +71,10 @@ class Row:
         }
 
 
-def run_base(name: str, options: Options) -> list[Row]:
-    """Train what is not done yet, print a table and write its files; returns the rows.
+def run_base(name: str, options: ExperimentOptions) -> list[CurveRow]:
+    """Run the trials that are not done, print a table and write its files; returns the rows.
 
-    name: of an experiment, whose variants' overrides of the base count alone. Raises ``UserError`` for a mistake in it
+    name: of an experiment; its overrides of the refinement do not count. Raises ``UserError`` for a mistake in it
     or in the options.
     """
     experiment = adapted(load_experiment(name), options)
@@ -86,22 +86,18 @@ def run_base(name: str, options: Options) -> list[Row]:
     lines = report_lines(rows, experiment.reference)
     wide = Console(width=max(CONSOLE.width, TABLE_WIDTH), highlight=False, markup=False)
     wide.print(plain_table(f"{experiment.name}, {experiment.preset}", _COLUMNS, [cells(line) for line in lines]))
-    files = {kind: getattr(options, kind) or options.output / f"{experiment.name}.{end}" for kind, end in _FILES}
-    content = {"experiment": experiment.name, "description": experiment.description, "preset": experiment.preset}
+    files = options.files(experiment.name)
     curves = [{"scene": row.scene, "seed": row.seed, "variant": row.variant, "curve": row.curve} for row in rows]
-    write_json(files["json"], {**content, **source, "rows": lines, "curves": curves})
+    write_json(files["json"], {**experiment.header(), **source, "rows": lines, "curves": curves})
     write_csv(files["csv"], lines)
-    draw(files["picture"], rows)
+    plot(files["picture"], rows)
     for kind, path in files.items():
         CONSOLE.print(f"{kind}: {path}")
     return rows
 
 
-_FILES = (("json", "json"), ("csv", "csv"), ("picture", "png"))
-
-
-def plan(experiment: Experiment, scenes: Sequence[Scene], code: str) -> list[tuple[Variant, Trial]]:
-    """Every variant's base on every scene with every seed, measured ``MEASUREMENTS`` times on the way."""
+def plan(experiment: Experiment, scenes: Sequence[TrialScene], code: str) -> list[tuple[Variant, Trial]]:
+    """Return every variant's base on every scene with every seed, measured ``MEASUREMENTS`` times on the way."""
     trials = []
     for scene in scenes:
         for seed in experiment.seeds:
@@ -113,17 +109,17 @@ def plan(experiment: Experiment, scenes: Sequence[Scene], code: str) -> list[tup
     return trials
 
 
-def read_row(variant: Variant, trial: Trial, outcome: Outcome) -> Row:
-    """What a trial left behind."""
+def read_row(variant: Variant, trial: Trial, outcome: Outcome) -> CurveRow:
+    """Return the row of a trial's outcome."""
     place = (trial.scene.name, trial.seed, variant.name)
     if outcome.result is None:
-        return Row(*place, (), failed=outcome.failed)
+        return CurveRow(*place, (), failed=outcome.failed)
     curve = json.loads((outcome.folder / "run" / CURVE).read_text())
-    return Row(*place, curve, outcome.result["peak_memory_mb"])
+    return CurveRow(*place, curve, outcome.result["peak_memory_mb"])
 
 
-def report_lines(rows: Sequence[Row], reference: str | None) -> list[dict[str, Any]]:
-    """``Row.figures`` of every row, compared with the reference variant of its scene and seed."""
+def report_lines(rows: Sequence[CurveRow], reference: str | None) -> list[dict[str, Any]]:
+    """Return ``CurveRow.figures`` of every row, compared with the reference variant of its scene and seed."""
     best = {(row.scene, row.seed): row.curve[-1]["psnr"] for row in rows if row.variant == reference and row.curve}
     return [row.figures(best.get((row.scene, row.seed))) for row in rows]
 
@@ -135,15 +131,15 @@ _COLUMNS = (
 
 
 def cells(line: Mapping[str, Any]) -> list[str]:
-    """One line of the table as text."""
+    """Return one line of the table as text."""
     figures = (("steps", 0), ("gaussians", 0), ("psnr", 2), ("ssim", 3), ("behind", 2), ("train_psnr", 2))
     costs = (("minutes", 1), ("cpu_minutes", 1), ("peak_memory_mb", 0))
     name = line["variant"] if line["failed"] is None else f"{line['variant']} failed: {line['failed']}"
     return [line["scene"], name, *(number(line[key], digits) for key, digits in (*figures, *costs))]
 
 
-def draw(path: Path, rows: Sequence[Row]) -> None:
-    """Per scene PSNR of the held-out views (dotted: of training views) and number of Gaussians over steps."""
+def plot(path: Path, rows: Sequence[CurveRow]) -> None:
+    """Plot, for each scene, PSNR of held-out views (dotted: training views) and number of Gaussians over steps."""
     scenes = list(dict.fromkeys(row.scene for row in rows))
     variants = list(dict.fromkeys(row.variant for row in rows))
     figure, axes = new_figure(len(scenes), 2)
@@ -172,15 +168,15 @@ def _minutes(seconds: float | None) -> float | None:
 
 
 @dataclass
-class Arguments(Trainings):
-    """How well bases render held-out views, against steps and number of Gaussians."""
+class Arguments(ExperimentOptions):
+    """Measure how well bases render held-out views, over steps and number of Gaussians."""
 
     file: tyro.conf.Positional[str] = "base"
     """base (bases of different lengths), or a TOML file."""
 
     def run(self) -> None:
         """Train and report."""
-        run_base(self.file, Options(**{name: value for name, value in vars(self).items() if name != "file"}))
+        run_base(self.file, self)
 
 
 if __name__ == "__main__":

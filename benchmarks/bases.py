@@ -15,7 +15,7 @@ STAMP = "trained.json"
 
 
 def trained_base(data: Path, run: Path, preset: str) -> Path:
-    """The config.yml of the preset's base phase on ``data``, trained into ``run`` unless it lies there already.
+    """Return the config.yml of the preset's base phase on ``data``; train it into ``run`` unless it is there.
 
     Raises ``UserError`` if the training fails.
     """

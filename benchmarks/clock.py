@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Seconds:
-    """wall: of the clock on the wall; cpu: of all of this process's threads, whatever else the machine does."""
+    """Seconds of two clocks. wall: elapsed time. cpu: time of all threads of this process, whatever else runs."""
 
     wall: float
     cpu: float
@@ -24,5 +24,5 @@ class Seconds:
         return Seconds(self.wall + other.wall, self.cpu + other.cpu)
 
     def ms(self) -> tuple[float, float]:
-        """Wall and CPU time in milliseconds."""
+        """Return wall and CPU time in milliseconds."""
         return 1e3 * self.wall, 1e3 * self.cpu

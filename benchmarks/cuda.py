@@ -1,4 +1,4 @@
-"""Times the CUDA backend on a GPU, beside gsplat's 2DGS where it is installed.
+"""Measure the CUDA backend on a GPU, beside gsplat's 2DGS where it is installed.
 
     python -m benchmarks.cuda [--quick | --smoke] [--json FILE] [--seconds 500] [--gsplat-seconds 150]
 
@@ -41,12 +41,12 @@ PAIR_BYTES = 2 * (2 * 8 + 4 + 80)
 
 
 def case(count: int, width: int, height: int) -> Size:
-    """Surfels of such a width that every pixel has about ``LAYERS``, or more where they would be too small."""
+    """Return surfels wide enough that every pixel has about ``LAYERS``, or more where they would be too small."""
     return Size(count, width, height, max(LEAST_WIDTH, 17.0 * (50_000 / (640 * 480) * width * height / count) ** 0.5))
 
 
 def milliseconds(call: Callable[[], Any], repeats: int, warm: int = 3) -> float:
-    """Median time of a call on the GPU."""
+    """Return the median time of a call on the GPU."""
     for _ in range(warm):
         call()
     times = []
@@ -61,7 +61,7 @@ def milliseconds(call: Callable[[], Any], repeats: int, warm: int = 3) -> float:
 
 
 def peak_mb(call: Callable[[], Any]) -> float:
-    """Memory that a call takes from torch's allocator beyond what is held before it."""
+    """Return the memory that a call takes from torch's allocator beyond what is held before it."""
     torch.cuda.synchronize()
     before = torch.cuda.memory_allocated()
     torch.cuda.reset_peak_memory_stats()
@@ -75,7 +75,7 @@ def make_cuda() -> CudaRasterizer:
     return CudaRasterizer()
 
 
-class Drawing:
+class Rendering:
     """Forward and backward of one backend over one scene, towards all parameters and colours."""
 
     def __init__(self, scene: Scene) -> None:
@@ -86,21 +86,21 @@ class Drawing:
         self.rasterizer = make_cuda()
 
     def images(self) -> dict[str, Tensor]:
-        """What both backends draw: colour, alpha, normal, expected and median depth."""
-        drawn = self.rasterizer.rasterize(
+        """Return the images of both backends: colour, alpha, normal, expected and median depth."""
+        rendered = self.rasterizer.rasterize(
             SurfelInputs(**self.leaves), self.scene.camera, self.settings, self.scene.background
         )
-        return {name: getattr(drawn, name) for name in ("color", "alpha", "depth", "normal")}
+        return {name: getattr(rendered, name) for name in ("color", "alpha", "depth", "normal")}
 
     def both(self) -> None:
-        """A forward and a backward from fixed gradients."""
+        """Run a forward and a backward from fixed gradients."""
         images = self.images()
         gradients = [self.scene.gradients[name].view_as(image) for name, image in images.items()]
         torch.autograd.grad(list(images.values()), list(self.leaves.values()), gradients, allow_unused=True)
 
 
-class GsplatDrawing(Drawing):
-    """gsplat's ``rasterization_2dgs``: colour with expected depth, alpha, normal; and the depth's normals, unasked."""
+class GsplatRendering(Rendering):
+    """gsplat's ``rasterization_2dgs``: colour with expected depth, alpha, normal; always also the depth's normals."""
 
     mode = "RGB+ED"
 
@@ -118,41 +118,44 @@ class GsplatDrawing(Drawing):
         return images | ({"depth": color[0, ..., 3]} if self.mode == "RGB+ED" else {})
 
 
-class GsplatWithoutDepth(GsplatDrawing):
-    """Less than the others draw: no depth."""
+class GsplatWithoutDepth(GsplatRendering):
+    """gsplat without depth, which renders less than the others."""
 
     mode = "RGB"
 
 
-BACKENDS = (("beags", Drawing), ("gsplat", GsplatDrawing), ("gsplat RGB", GsplatWithoutDepth))
+BACKENDS = (("beags", Rendering), ("gsplat", GsplatRendering), ("gsplat RGB", GsplatWithoutDepth))
 
 
-def drawing_row(scene: Scene, drawing: Drawing, name: str, repeats: int) -> dict[str, Any]:
-    """How long a backend takes, and its memory."""
+def rendering_row(scene: Scene, rendering: Rendering, name: str, repeats: int) -> dict[str, Any]:
+    """Return the times of a backend, and its memory."""
     with torch.no_grad():
-        forward = milliseconds(drawing.images, repeats)
-    both = milliseconds(drawing.both, repeats)
+        forward = milliseconds(rendering.images, repeats)
+    both = milliseconds(rendering.both, repeats)
     size = scene.size
-    row = {**size_of(size), "backend": name, "forward_ms": forward, "both_ms": both, "peak_mb": peak_mb(drawing.both)}
+    row = {**size_of(size), "backend": name, "forward_ms": forward, "both_ms": both, "peak_mb": peak_mb(rendering.both)}
     if name == "beags":
-        row["pairs"] = drawing.rasterizer.pairs()
-        row["least_mb"] = least_bytes(size, drawing.rasterizer.pairs()) / 2**20
+        row["pairs"] = rendering.rasterizer.pairs()
+        row["least_mb"] = least_bytes(size, rendering.rasterizer.pairs()) / 2**20
     return row
 
 
 def size_of(size: Size) -> dict[str, Any]:
-    """What names a row."""
+    """Return the figures that name a row."""
     return {"n": size.n, "width": size.width, "height": size.height}
 
 
 def least_bytes(size: Size, pairs: int) -> int:
-    """What forward and backward must move at the very least, were nothing read twice: parameters read twice, their
-    gradients written once, images written and their gradients read, and what each pair of a tile and a surfel needs."""
+    """Return the bytes that forward and backward must move at least.
+
+    Parameters are read twice and their gradients written once; images are written and their gradients read; each pair
+    of a tile and a surfel has its share.
+    """
     return 3 * PARAMETER_BYTES * size.n + 2 * PIXEL_BYTES * size.width * size.height + PAIR_BYTES * pairs
 
 
 def against_the_copy_rate(rows: list[dict[str, Any]], rate: float) -> None:
-    """Into each of our rows: how long ``least_mb`` takes at the rate of a copy (GB/s), as a share of what it took."""
+    """Add to our rows the time of ``least_mb`` at the rate of a copy (GB/s), and its share of the row's time."""
     for row in rows:
         if "least_mb" in row:
             row["least_ms"] = row["least_mb"] * 2**20 / (rate * 1e6)
@@ -163,8 +166,11 @@ PROBE = "from gsplat.rendering import rasterization_2dgs; from gsplat.cuda._back
 
 
 def gsplat_missing(seconds: float) -> str | None:
-    """None if gsplat's CUDA kernels can be used, else why not. It compiles them when it is first imported, which may
-    take many minutes: it is given so many seconds, in a process of its own."""
+    """Return None if gsplat's CUDA kernels can be used, else the reason.
+
+    gsplat compiles them on its first import, which may take many minutes. A process of its own limits this to
+    ``seconds``.
+    """
     if seconds <= 0:
         return "left out: --gsplat-seconds is 0"
     try:
@@ -178,14 +184,14 @@ def gsplat_missing(seconds: float) -> str | None:
 
 
 def copy_rate() -> float:
-    """GB/s of a large copy on the device, bytes read and written: the ceiling of what only moves memory."""
+    """Return the GB/s of a large copy on the device, bytes read and written: the limit for moving memory."""
     source = torch.rand(1 << 28, device=DEVICE)
     target = torch.empty_like(source)
     return 2 * source.numel() * 4 / milliseconds(lambda: target.copy_(source), 10) / 1e6
 
 
 def step_rows(size: Size, repeats: int) -> list[dict[str, Any]]:
-    """A training step without and with the two losses; Z from 1 to 1000. A row that fails holds the reason."""
+    """Measure a training step without and with the two losses, Z from 1 to 1000; a row that fails holds the reason."""
     rows: list[dict[str, Any]] = []
     scene: Scene | None = None
     for samples in (None, *SAMPLES):
@@ -204,14 +210,14 @@ def step_rows(size: Size, repeats: int) -> list[dict[str, Any]]:
     return rows
 
 
-def drawing_rows(size: Size, repeats: int, gsplat: bool) -> list[dict[str, Any]]:
-    """Both backends on one scene; where one fails (no memory, say), the reason stands in its row."""
+def rendering_rows(size: Size, repeats: int, gsplat: bool) -> list[dict[str, Any]]:
+    """Measure both backends on one scene; a row that fails (without memory, say) holds the reason."""
     rows: list[dict[str, Any]] = []
     scene: Scene | None = None
     for name, kind in BACKENDS[: None if gsplat else 1]:
         try:
             scene = scene or on_device(make_scene(size), DEVICE)
-            rows.append(drawing_row(scene, kind(scene), name, repeats))
+            rows.append(rendering_row(scene, kind(scene), name, repeats))
         except Exception as error:  # of another library too: what is measured already must not be lost
             rows.append({**size_of(size), "backend": name, "failed": failure(error)})
         print(rows[-1], flush=True)
@@ -220,13 +226,13 @@ def drawing_rows(size: Size, repeats: int, gsplat: bool) -> list[dict[str, Any]]
 
 
 def failure(error: Exception) -> str:
-    """What went wrong, in a line."""
+    """Return the error in a line."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run it; exit code 1 without a GPU, where a number is not finite, and where one of our own rows failed."""
+    """Run the benchmark; returns exit code 1 without a GPU, for numbers that are not finite, and if our rows fail."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="the smallest sizes only")
     parser.add_argument("--smoke", action="store_true", help="run every kernel once, time nothing")
@@ -246,7 +252,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def describe_gpu() -> dict[str, Any]:
-    """What was measured, on what."""
+    """Return the machine and the versions of a measurement."""
     properties = torch.cuda.get_device_properties(0)
     names = ("multi_processor_count", "total_memory", "L2_cache_size", "clock_rate", "memory_clock_rate")
     return {
@@ -261,7 +267,7 @@ def describe_gpu() -> dict[str, Any]:
 
 
 def measure(machine: dict[str, Any], chosen: argparse.Namespace, end: float) -> int:
-    """All rows that can be begun before ``end`` (of ``time.monotonic``); the exit code."""
+    """Measure the rows that can begin before ``end`` (of ``time.monotonic``); returns the exit code."""
     missing = gsplat_missing(chosen.gsplat_seconds)
     out: dict[str, Any] = {**machine, "gsplat": missing or "used", "copy_gb_per_s": copy_rate(), "left_out": []}
     print(out, flush=True)
@@ -281,7 +287,7 @@ def measure(machine: dict[str, Any], chosen: argparse.Namespace, end: float) -> 
         if time.monotonic() > end:
             out["left_out"].append(size_of(size))
             continue
-        out["rows"] += drawing_rows(size, repeats, gsplat=missing is None)
+        out["rows"] += rendering_rows(size, repeats, gsplat=missing is None)
         save()
     save()
     print(table(out), flush=True)
@@ -290,7 +296,7 @@ def measure(machine: dict[str, Any], chosen: argparse.Namespace, end: float) -> 
 
 
 def table(out: dict[str, Any]) -> str:
-    """The rows for a reader."""
+    """Return the rows as text."""
     lines = [f"{out.get('gpu')}, a copy moves {out['copy_gb_per_s']:.0f} GB/s, gsplat: {out['gsplat']}"]
     lines.append("surfels    image        backend    forward   both ms   MB   of copy rate")
     for row in out["rows"]:

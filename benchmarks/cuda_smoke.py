@@ -1,4 +1,4 @@
-"""Every CUDA kernel once, on a small scene: what a memory checker is run on."""
+"""Every CUDA kernel once, on a small scene, for a memory checker."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ VARIANTS = (  # geometry, distortion, boundary: each has kernels of its own in f
 
 
 def smoke(rasterizer: Rasterizer, device: str = "cuda", size: Size = SMALL) -> list[str]:
-    """The names of the results that are not finite; empty if all is well. float32 and float64, forward and backward."""
+    """Return the names of results that are not finite, in float32 and float64, forward and backward."""
     scene = on_device(make_scene(size), device)
     grid = visibility_grid(scene)
     wrong = []
@@ -51,7 +51,7 @@ def _results(
     inputs = SurfelInputs(**leaves, class_ids=scene.class_ids)
     shift = torch.zeros(len(inputs.means), 2, dtype=dtype, device=inputs.means.device, requires_grad=True)
     for variant in VARIANTS:
-        yield f"drawing {variant}", _drawn(rasterizer, scene, replace(inputs, screen_shift=shift), variant)
+        yield f"rendering {variant}", _rendered(rasterizer, scene, replace(inputs, screen_shift=shift), variant)
     plain = SurfelInputs(**{name: leaf.detach() for name, leaf in leaves.items()}, class_ids=scene.class_ids)
     camera, settings = scene.camera, scene.settings
     yield "contributions", [rasterizer.class_contributions(plain, camera, settings, scene.target, CLASSES)]
@@ -74,10 +74,10 @@ def _results(
 
 
 def _reprojected(rasterizer: Rasterizer, scene: Scene, inputs: SurfelInputs) -> Iterator[Tensor]:
-    """Confidences of both kinds, from two views with different depths and masks."""
+    """Yield confidences of both kinds, from two views with different depths and masks."""
     settings, background = replace(scene.settings, geometry=True), scene.background.to(inputs.means.dtype)
-    drawn = rasterizer.rasterize(inputs, scene.camera, settings, background)
-    depths = [image for image in (drawn.depth, drawn.median_depth) if image is not None]
+    rendered = rasterizer.rasterize(inputs, scene.camera, settings, background)
+    depths = [image for image in (rendered.depth, rendered.median_depth) if image is not None]
     masks = [scene.target, scene.target.flip(0).contiguous()]
     for reproject in (reproject_pairwise, reproject_voxel):
         for voted in reproject(depths, [scene.camera] * 2, masks, CLASSES):
@@ -85,25 +85,28 @@ def _reprojected(rasterizer: Rasterizer, scene: Scene, inputs: SurfelInputs) -> 
 
 
 def _compared(rasterizer: Rasterizer, scene: Scene, inputs: SurfelInputs) -> list[Tensor]:
-    """L1 with SSIM, and normal consistency, of a view; with their gradients."""
+    """Return L1 with SSIM and normal consistency of a view, with their gradients."""
     settings, background = replace(scene.settings, geometry=True), scene.background.to(inputs.means.dtype)
-    drawn = rasterizer.rasterize(inputs, scene.camera, settings, background)
-    images = [image.requires_grad_() for image in (drawn.color, drawn.depth, drawn.normal) if image is not None]
+    rendered = rasterizer.rasterize(inputs, scene.camera, settings, background)
+    images = [
+        image.requires_grad_() for image in (rendered.color, rendered.depth, rendered.normal) if image is not None
+    ]
     color, depth, normal = images
     likeness = photometric(color, color.detach().flip(0).contiguous(), 0.8, -0.2, 1e-4, 9e-4)
-    smoothness = normal_consistency(depth, normal, drawn.alpha, scene.camera.host.K)
+    smoothness = normal_consistency(depth, normal, rendered.alpha, scene.camera.host.K)
     return [likeness, smoothness, *_gradients(likeness + smoothness, images)]
 
 
-def _drawn(
+def _rendered(
     rasterizer: Rasterizer, scene: Scene, inputs: SurfelInputs, variant: tuple[bool, bool, bool]
 ) -> list[Tensor]:
     geometry, distortion, boundary = variant
     settings = RasterSettings(0.05, 100.0, geometry=geometry, distortion=distortion)
     background = scene.background.to(inputs.means.dtype)
-    drawn = rasterizer.rasterize(inputs, scene.camera, settings, background, scene.target if boundary else None)
+    rendered = rasterizer.rasterize(inputs, scene.camera, settings, background, scene.target if boundary else None)
     found = (
-        drawn.color, drawn.alpha, drawn.depth, drawn.normal, drawn.median_depth, drawn.distortion, drawn.boundary,
+        rendered.color, rendered.alpha, rendered.depth, rendered.normal, rendered.median_depth, rendered.distortion,
+        rendered.boundary,
     )  # fmt: skip
     images = [image for image in found if image is not None]
     leaves = [getattr(inputs, name) for name in (*LEAVES, "screen_shift")]

@@ -24,7 +24,7 @@ _WORLD_SHIFTS = (0.0, 0.0, 0.0, 1e5)
 
 @dataclass(frozen=True)
 class Scene:
-    """What ``Rasterizer.rasterize`` takes, in float64, and what was done to it.
+    """Inputs of ``Rasterizer.rasterize`` in float64, and the ways in which they are spoilt.
 
     target: [H, W] int32 class ids, or IGNORE. num_classes: ids lie below it. spoilt: of each surfel, what is wrong
     with it; "" nothing. world: (scale, shift) of the world's unit and origin.
@@ -40,13 +40,13 @@ class Scene:
     world: tuple[float, float]
 
     def to(self, dtype: torch.dtype) -> Scene:
-        """The same scene in another precision, in which a number may become 0 or infinite."""
+        """Return the scene in another precision, in which a number may become 0 or infinite."""
         camera, background = self.camera.to(dtype), self.background.to(dtype)
         return replace(self, inputs=self.inputs.to(dtype), camera=camera, background=background)
 
 
 def degenerate_scene(seed: int) -> Scene:
-    """Scene number ``seed``: always the same, whatever was made before it."""
+    """Return scene number ``seed``, which does not depend on scenes made before it."""
     dice = random.Random(seed)
     width, height = dice.choice(_SIZES)
     count, num_classes = dice.choice(_COUNTS), dice.choice(_CLASSES)
@@ -113,7 +113,7 @@ def _target(dice: random.Random, height: int, width: int, num_classes: int) -> T
 
 
 def _ordinary(dice: random.Random) -> dict[str, list[float]]:
-    """A surfel near the middle of the picture."""
+    """Return a surfel near the middle of the picture."""
     return {
         "means": [dice.gauss(0, 0.8) for _ in range(3)],
         "quats": [dice.gauss(0, 1) for _ in range(4)],
@@ -130,7 +130,7 @@ def _in_camera(camera: Camera, point: list[float]) -> list[float]:
 
 
 def _edge_on(dice: random.Random, surfel, camera: Camera, others) -> None:
-    """The disc's plane holds the camera, but for an angle of 0.1 down to nothing."""
+    """Turn the disc's plane to the camera, up to an angle of 0.1 down to 0."""
     ray = torch.tensor(surfel["means"], dtype=torch.float64) - camera.center
     ray = ray / ray.norm()
     side = torch.linalg.cross(ray, torch.tensor([dice.gauss(0, 1) for _ in range(3)], dtype=torch.float64))
@@ -143,7 +143,7 @@ def _edge_on(dice: random.Random, surfel, camera: Camera, others) -> None:
 
 
 def _quat(rotation: Tensor) -> list[float]:
-    """wxyz of a rotation matrix, by the largest of the four components."""
+    """Return the quaternion wxyz of a rotation matrix, by the largest of the four components."""
     m = rotation.tolist()
     squares = [
         1 + m[0][0] + m[1][1] + m[2][2], 1 + m[0][0] - m[1][1] - m[2][2],
@@ -157,7 +157,7 @@ def _quat(rotation: Tensor) -> list[float]:
 
 
 def _crossing(dice: random.Random, surfel, camera: Camera, others) -> None:
-    """The disc reaches through the camera's plane."""
+    """Let the disc reach through the camera's plane."""
     surfel["means"] = _in_camera(camera, [dice.gauss(0, 0.3), dice.gauss(0, 0.3), 10.0 ** -dice.uniform(0, 8)])
     surfel["log_scales"] = [dice.uniform(-1, 1), dice.uniform(-1, 1)]
 
@@ -171,7 +171,7 @@ def _at_camera(dice: random.Random, surfel, camera: Camera, others) -> None:
 
 
 def _size(dice: random.Random, surfel, camera: Camera, others) -> None:
-    """Scales from 1e-12 to 1e8, each for itself, so that ratios go far beyond 1e9."""
+    """Draw each scale from 1e-12 to 1e8, so that ratios go far beyond 1e9."""
     surfel["log_scales"] = [math.log(10.0) * dice.uniform(-12, 8) for _ in range(2)]
 
 
@@ -180,13 +180,13 @@ def _opacity(dice: random.Random, surfel, camera: Camera, others) -> None:
 
 
 def _quaternion(dice: random.Random, surfel, camera: Camera, others) -> None:
-    """Of no length, of a denormal one, of a tiny or of an enormous one."""
+    """Give the quaternion a length of 0, or a denormal, tiny or enormous one."""
     factor = dice.choice((0.0, 5e-324, 1e-310, 1e-170, 1e-40, 1e-20, 1e20, 1e40, 1e160, 1e300))
     surfel["quats"] = [factor * value for value in surfel["quats"]]
 
 
 def _coincident(dice: random.Random, surfel, camera: Camera, others) -> None:
-    """The same centre, and perhaps the same plane, as a former surfel's."""
+    """Take the centre, and perhaps the plane, of an earlier surfel."""
     if others:
         other = dice.choice(others)
         for name in dice.choice((("means",), ("means", "quats"), ("means", "quats", "log_scales"))):
@@ -194,12 +194,12 @@ def _coincident(dice: random.Random, surfel, camera: Camera, others) -> None:
 
 
 def _far(dice: random.Random, surfel, camera: Camera, others) -> None:
-    """Beyond the far plane, out to where squares overflow float32."""
+    """Move the surfel beyond the far plane, as far as squares overflow float32."""
     surfel["means"] = [value * 10.0 ** dice.uniform(2, 25) for value in surfel["means"]]
 
 
 def _broken(dice: random.Random, surfel, camera: Camera, others) -> None:
-    """One number is no number."""
+    """Make one number NaN or infinite."""
     name = dice.choice(FLOATS)
     surfel[name] = list(surfel[name])
     surfel[name][dice.randrange(len(surfel[name]))] = dice.choice((math.nan, math.inf, -math.inf))

@@ -1,4 +1,4 @@
-"""The goals that the compiled rasterizer is held to, each checked against what was measured."""
+"""The goals of the compiled rasterizer, checked against its measurements."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ MEMORY_SLACK_MB = 8.0  # what two runs of the same thing differ by
 
 @dataclass(frozen=True)
 class Goal:
-    """name: what is compared. bound: the requirement, in words. measured: in words, or why there is no figure.
+    """A goal and its measurement.
+
+    name: of the comparison. bound: the requirement. measured: the figure in words, or the reason that it lacks.
 
     met: None where it was not measured.
     """
@@ -27,13 +29,13 @@ class Goal:
     met: bool | None
 
     def line(self) -> str:
-        """As it is printed."""
+        """Return the line to print."""
         word = {True: "met", False: "NOT MET", None: "not measured"}[self.met]
         return f"goal {word}: {self.name}: {self.measured} ({self.bound})"
 
 
 def check_goals(result: Result, isa: str | None) -> list[Goal]:
-    """All goals, in the order of the specification; those that lack a measurement say so."""
+    """Return all goals in the order of the specification, also those without a measurement."""
     table = _Table(result.rows, isa)
     return [
         *_against_reference(table),
@@ -47,7 +49,7 @@ def check_goals(result: Result, isa: str | None) -> list[Goal]:
 
 
 class _Table:
-    """Rows by what they measure."""
+    """Rows by the thing that they measure."""
 
     def __init__(self, rows: list[dict[str, Any]], isa: str | None) -> None:
         self.isa = isa
@@ -166,5 +168,5 @@ def _step(step: dict[str, Any]) -> Iterator[Goal]:
 
 
 def as_json(goals: list[Goal]) -> list[dict[str, Any]]:
-    """The goals as plain values."""
+    """Return the goals as plain values."""
     return [asdict(goal) for goal in goals]

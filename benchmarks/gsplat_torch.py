@@ -19,8 +19,11 @@ TILE = 16
 MIN_ALPHA, MIN_TRANSMITTANCE = 1 / 255, 1e-4  # gsplat's
 
 
-def draw(leaves: dict[str, Tensor], camera: Camera, near: float, far: float) -> dict[str, Tensor]:
-    """color [H, W, 3], alpha [H, W], normal [H, W, 3]; differentiable in ``leaves`` (named as ``SurfelInputs``)."""
+def render(leaves: dict[str, Tensor], camera: Camera, near: float, far: float) -> dict[str, Tensor]:
+    """Render color [H, W, 3], alpha [H, W] and normal [H, W, 3], differentiable in ``leaves``.
+
+    leaves: named as in ``SurfelInputs``.
+    """
     width, height = camera.width, camera.height
     scales = leaves["log_scales"].exp()
     scales = torch.cat([scales, torch.ones_like(scales[:, :1])], dim=-1)  # the third scales the normal
@@ -37,7 +40,7 @@ def draw(leaves: dict[str, Tensor], camera: Camera, near: float, far: float) -> 
     ):
         color, alpha, normal = _torch_impl_2dgs._rasterize_to_pixels_2dgs(
             means2d,
-            transforms.transpose(-1, -2),  # the projection returns columns where the drawing wants rows
+            transforms.transpose(-1, -2),  # the projection returns columns where rendering wants rows
             leaves["colors"][None],
             normals,
             torch.sigmoid(leaves["opacity_logits"])[None],
@@ -55,7 +58,7 @@ def draw(leaves: dict[str, Tensor], camera: Camera, near: float, far: float) -> 
 def contributing_pairs(
     start, stop, transmittances, means2d, transforms, opacities, width, height, tile, offsets, ids
 ):  # fmt: skip
-    """The pairs of batches start..stop that add to a pixel: surfels, pixels, cameras, [M] int64 each.
+    """Return the pairs of batches start..stop that add to a pixel: surfels, pixels, cameras, [M] int64 each.
 
     Replaces a CUDA kernel of the same arguments. Tile by tile: alpha of every surfel at every pixel, the transmittance
     as a running product, and what survives both thresholds.

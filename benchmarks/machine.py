@@ -1,4 +1,4 @@
-"""Where, of what and how a measurement was made: what every published figure has to name."""
+"""The source of a measurement, which every published figure has to name."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ __all__ = ["busy_note", "command", "commit", "describe_machine"]
 
 
 def command(arguments: list[str]) -> str:
-    """The command line, as typed after ``python``."""
+    """Return the command line, as typed after ``python``."""
     return shlex.join(["benchmarks/rasterizer.py", *arguments])

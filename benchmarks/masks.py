@@ -1,10 +1,10 @@
-"""What checking and snapping masks does: python -m benchmarks.masks swaps|rims [SCENE ...].
+"""Effects of checking and snapping masks: python -m benchmarks.masks swaps|rims [SCENE ...].
 
-A SCENE is a folder, or sample-mild or sample-strong: what `beags sample` writes with such damage, made anew in a
+A SCENE is a folder, or sample-mild or sample-strong: written anew by `beags sample` with that damage, in a
 temporary folder; these two if none is named.
-swaps: exchanges ids in some views of scenes with good masks and counts how many of these views the check names, and how
-many others; a row of a table in Markdown for each scene. rims: makes the rims of exact masks ragged, snaps them to
-edges of the photo, and compares both with the exact ones.
+swaps: exchanges ids in some views of scenes with good masks, and counts these views and others that the check names; a
+row of a table in Markdown for each scene. rims: makes the boundaries of exact masks ragged, snaps them to edges of the
+photo, and compares both with the exact ones.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SAMPLES = ("sample-mild", "sample-strong")
 
 @contextmanager
 def folder_of(scene: str) -> Iterator[Path]:
-    """The folder of a scene; a sample goes again."""
+    """Yield the folder of a scene; a sample is deleted afterwards."""
     if scene not in SAMPLES:
         yield Path(scene).absolute()
         return
@@ -72,7 +72,7 @@ def swaps(data: Path) -> None:
 
 
 def rims(data: Path) -> None:
-    """IoU and BIoU of ragged and of snapped masks, mean over objects and views."""
+    """Print IoU and BIoU of ragged and of snapped masks, mean over objects and views."""
     from beags_plugin.evaluation.metrics import mask_metrics, mean_metrics
     from beags_plugin.labels.classes import read_id_mask
     from beags_plugin.masks.snapping import snap_to_edges
@@ -110,7 +110,7 @@ def main(what: str, scenes: Sequence[str]) -> None:
 
 
 def read_photo(path: Path) -> np.ndarray:
-    """[H, W, 3] uint8."""
+    """Return a photo as [H, W, 3] uint8."""
     from PIL import Image
 
     with Image.open(path) as image:

@@ -1,4 +1,4 @@
-"""Asks the workers, case after case, everything in turn within a case, and gathers one result."""
+"""The measurements of the rasterizers: workers take turns, case after case, and give one result."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LARGEST_SLOW = 100_000  # surfels; larger cases are for the native rasterizer al
 
 @dataclass
 class Options:
-    """What to measure; see ``rasterizer.py``."""
+    """The things to measure; see ``rasterizer.py``."""
 
     sizes: list[Size]
     threads: list[int]
@@ -45,7 +45,7 @@ class Options:
 
 @dataclass
 class Series:
-    """All timings of one thing, milliseconds of wall and CPU time.
+    """Timings of one thing, milliseconds of wall and CPU time.
 
     With one thread what counts is CPU time, which other programs disturb little; with more it is wall time.
     """
@@ -71,7 +71,10 @@ class Series:
 
 @dataclass
 class Result:
-    """rows: one per (size, backend, isa, threads); scenes: per size; step: see ``measure_step``; notes: sentences."""
+    """All measurements.
+
+    rows: one per (size, backend, isa, threads). scenes: per size. step: see ``measure_step``. notes: sentences.
+    """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
     scenes: list[dict[str, Any]] = field(default_factory=list)
@@ -107,7 +110,7 @@ class Session:
                 notes.append(f"not measured: instruction set {isa}, it cannot run here ({found['reasons']['native']})")
 
     def entries(self, size: Size, options: Options, notes: list[str]) -> Iterator[tuple[str, str | None, int]]:
-        """(backend, isa, threads) of everything that is timed at a size."""
+        """Yield (backend, isa, threads) of everything that is timed at a size."""
         for name in self.backends:
             if name != "native" and size.n > LARGEST_SLOW and not (name == "torch" and options.torch_large):
                 notes.append(f"not measured: {name} at {size.name}, where a call takes minutes and gigabytes")
@@ -124,12 +127,12 @@ class Session:
 
 
 def work(size: Size) -> float:
-    """About the number of pixels times layers."""
+    """Return about the number of pixels times layers."""
     return size.n * 0.96 * size.diameter**2
 
 
 def total_work(options: Options) -> float:
-    """What ``advance`` is called with, summed up, roughly; for the time left."""
+    """Return about the sum of the work that ``advance`` gets, for the time left."""
     kinds = 4 + _COST["torch"] * options.torch + _COST["gsplat"] * options.gsplat
     cases = sum(work(size) * (kinds if size.n <= LARGEST_SLOW else 4) for size in options.sizes)
     return cases * len(options.threads) * 2 + work(options.step_size) * 100 * options.step
@@ -177,7 +180,7 @@ def measure_sizes(session: Session, options: Options, result: Result, advance: A
 def _interleave(
     session: Session, size: Size, entries: list, options: Options, advance: Advance
 ) -> dict[Any, dict[str, Series]]:
-    """Rounds in which every entry has its turn; a slow one drops out when its budget is spent."""
+    """Run rounds in which every entry has its turn; a slow one drops out when its budget is spent."""
     timed = {entry: {stage: Series(entry[2]) for stage in ("forward", "backward")} for entry in entries}
     spent = dict.fromkeys(entries, 0.0)
     for turn in range(options.rounds):
@@ -196,7 +199,7 @@ def _interleave(
 
 
 def _peak(size: Size, entry, session: Session, options: Options, notes: list[str], advance: Advance) -> float | None:
-    """Of the best instruction set and the first number of threads: the others take the same."""
+    """Return the memory of the best instruction set and the first number of threads; the others take the same."""
     backend, isa, threads = entry
     if backend not in options.memory or isa not in (None, session.isa) or threads != options.threads[0]:
         return None
@@ -205,7 +208,7 @@ def _peak(size: Size, entry, session: Session, options: Options, notes: list[str
 
 
 def peak_in_new_process(notes: list[str], what: str, **arguments: Any) -> float | None:
-    """MB; None, with a note, where the process did not get through."""
+    """Return the MB, or None and a note if the process failed."""
     try:
         with Worker() as worker:
             return worker.ask("peak", **arguments)
@@ -215,7 +218,7 @@ def peak_in_new_process(notes: list[str], what: str, **arguments: Any) -> float 
 
 
 def _add_stages(session: Session, size: Size, options: Options, scene: dict[str, Any]) -> None:
-    """projection_binning_ms, same_bits: whether 1, 2 and 4 threads give the same bits."""
+    """Return {"projection_binning_ms", "same_bits"}; same_bits: 1, 2 and 4 threads give the same bits."""
     threads = options.threads[0]
     frame = session.best.ask("stages", size=size.name, threads=threads, seconds=options.seconds)
     scene["projection_binning_ms"] = Series(threads, frame).best
@@ -261,7 +264,7 @@ def measure_step(session: Session, options: Options, result: Result, advance: Ad
 
 
 def _overhead(session: Session, options: Options, rounds: int) -> dict[str, Any]:
-    """Of a small scene: the same work with next to nothing to do, over the work itself; rasterizer and whole step."""
+    """Measure a small scene and an almost empty one, for the rasterizer and a whole step."""
     threads = options.threads[0]
     found: dict[str, Series] = {}
     for _ in range(rounds):

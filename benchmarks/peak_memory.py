@@ -1,4 +1,4 @@
-"""How much memory a call takes at its peak, beyond what the process already holds."""
+"""The peak memory of a call beyond the memory that the process holds before it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 def peak_mb_of(call: Callable[[], object]) -> float:
-    """MB (2^20 bytes) of resident memory that ``call`` adds at its peak.
+    """Return the MB (2^20 bytes) of resident memory that ``call`` adds at its peak.
 
     On Linux the kernel's high-water mark is reset first: the one that getrusage reports keeps what imports once took,
     and what the parent process held when it started this one, and would hide a small case. Elsewhere it is getrusage's.
@@ -29,7 +29,7 @@ def peak_mb_of(call: Callable[[], object]) -> float:
 
 
 def _status(name: str) -> int:
-    """Bytes, of a line of /proc/self/status."""
+    """Return the bytes in a line of /proc/self/status."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(name + ":"):
             return 1024 * int(line.split()[1])
@@ -42,6 +42,6 @@ def _most_so_far() -> int:
 
 
 def _give_back_free_memory() -> None:
-    """Without this the call could live on memory that the C library kept from earlier, and seem to take none."""
+    """Return free memory to the system, so that a call cannot use memory that the C library kept."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)

@@ -62,7 +62,7 @@ def measure(reprojection: str, views: int) -> None:
 
 
 def main(reprojection: str, counts: list[int]) -> None:
-    """One line per number of views."""
+    """Print a line per number of views."""
     for views in counts:
         command = [sys.executable, "-m", "benchmarks.preparation", "--one", reprojection, str(views)]
         text = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout

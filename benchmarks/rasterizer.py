@@ -27,10 +27,10 @@ QUICK_SIZE = "300/64x48"
 
 @dataclass
 class Arguments:
-    """Time native, torch reference and gsplat's torch functions in turn, and check the goals; always ends with 0."""
+    """Measure native, torch reference and gsplat's torch functions in turn, and check the goals; always ends with 0."""
 
     sizes: tuple[str, ...] = tuple(size.name for size in SIZES)
-    """Of 1k 10k 50k 200k, or N/WIDTHxHEIGHT."""
+    """Sizes of 1k 10k 50k 200k, or N/WIDTHxHEIGHT."""
     threads: tuple[int, ...] = (1, 2)
     """Numbers of threads."""
     rounds: int = 7
@@ -50,12 +50,12 @@ class Arguments:
     memory: bool = True
     """Measure peak memory, each case in a process of its own."""
     quick: bool = False
-    """One tiny size, two short rounds, a small step: a test that all of it works."""
+    """Measure one tiny size in two short rounds, and a small step, to test the benchmark."""
     json: Path | None = None
     """File to write everything to."""
 
     def options(self) -> Options:
-        """What to measure; raises ``UserError`` for a size or number that cannot be."""
+        """Return the things to measure; raises ``UserError`` for a size or number that cannot be."""
         if self.quick:
             small = parse_size(QUICK_SIZE)
             return Options(

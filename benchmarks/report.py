@@ -1,4 +1,4 @@
-"""The tables that are printed."""
+"""Tables of a measurement."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from benchmarks.measure import RASTERIZER_PARTS, Result
 
 
 def print_result(result: Result, goals: list[Goal], about: dict[str, Any], console: Console) -> None:
-    """Everything that was measured, then each goal on a line of its own."""
+    """Print all measurements, then each goal on a line of its own."""
     machine = about["machine"]
     console.print(
         f"{machine['cpu']}, {machine['cores']} cores, {machine['memory_mb']} MB; torch {about['torch']}; commit "

@@ -36,7 +36,7 @@ AS_GIVEN = "masks as given"
 
 
 @dataclass(frozen=True)
-class Options:
+class ReprojectionOptions:
     """Time and accuracy of the mask reprojections against the number of views, on the sample.
 
     views: numbers of training views; a base is trained for each. depths: what is lifted, the trained base's depth or
@@ -71,7 +71,7 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Scene:
+class VotedScene:
     """Training views of a sample.
 
     cameras: V. labels: V x [H, W] int32 as given, None for views without a mask. exact: V x [H, W] int32, the truth.
@@ -86,7 +86,7 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Row:
+class MethodRow:
     """One method on one scene.
 
     seconds, cpu_seconds: least of all calls. iou, biou: against the exact masks, mean over views and objects; equal:
@@ -104,7 +104,7 @@ class Row:
     equal: float | None
 
 
-def run_reprojection(options: Options) -> list[Row]:
+def run_reprojection(options: ReprojectionOptions) -> list[MethodRow]:
     """Make samples, train a base for each, measure, print a table and write the files; returns the rows."""
     options.check()
     rows = []
@@ -119,7 +119,7 @@ def run_reprojection(options: Options) -> list[Row]:
     files = {kind: getattr(options, kind) or options.output / f"reprojection.{end}" for kind, end in _FILES}
     write_json(files["json"], content)
     write_csv(files["csv"], [asdict(row) for row in rows])
-    draw(files["picture"], rows)
+    plot_quality(files["picture"], rows)
     for kind, path in files.items():
         CONSOLE.print(f"{kind}: {path}")
     return rows
@@ -130,12 +130,12 @@ _COLUMNS = ("views, depth", "method", "wall, s", "CPU, s", "times as fast", "IoU
 
 
 def plain(options: Any) -> dict[str, Any]:
-    """Options as JSON holds them, without the paths."""
+    """Return the options as JSON holds them, without the paths."""
     return {name: value for name, value in asdict(options).items() if not isinstance(value, Path | None)}
 
 
-def load_views(options: Options, views: int) -> Scene:
-    """The sample with so many training views, and its depth as a base trained on it shows it."""
+def load_views(options: ReprojectionOptions, views: int) -> VotedScene:
+    """Return the sample with this number of training views, and the depth of a base trained on it."""
     from beags_plugin.labels.classes import read_id_mask
     from beags_plugin.plugin.runs.read import raster_settings, read_run, read_transform
     from beags_plugin.rasterizers import make_rasterizer
@@ -163,16 +163,18 @@ def load_views(options: Options, views: int) -> Scene:
             surface_depth(rasterizer.rasterize(surfels, view.camera, settings, torch.zeros(3)), kind) for view in found
         ]
     depths = {"trained": trained, "exact": of_sample}
-    return Scene([view.camera for view in found], [view.labels for view in found], exact, depths, len(scene.classes))
+    return VotedScene(
+        [view.camera for view in found], [view.labels for view in found], exact, depths, len(scene.classes)
+    )
 
 
-def measure(scene: Scene, depth: str, methods: Sequence[str], calls: int) -> list[Row]:
-    """The masks as they are, then each method; the methods take turns, ``calls`` times each."""
+def measure(scene: VotedScene, depth: str, methods: Sequence[str], calls: int) -> list[MethodRow]:
+    """Measure the masks as they are, then each method; the methods take turns, ``calls`` times each."""
     depths = scene.depths[depth]
     views = len(scene.cameras)
     blank = [torch.zeros_like(mask) for mask in scene.exact]  # a view without a mask shows no object
     given = [zeros if mask is None else mask for mask, zeros in zip(scene.labels, blank, strict=True)]
-    rows = [Row(views, depth, AS_GIVEN, None, None, *quality(given, scene.exact, scene.num_classes), None)]
+    rows = [MethodRow(views, depth, AS_GIVEN, None, None, *quality(given, scene.exact, scene.num_classes), None)]
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in methods}
     labels: dict[str, list[Tensor]] = {}
     for _ in range(calls):
@@ -185,7 +187,9 @@ def measure(scene: Scene, depth: str, methods: Sequence[str], calls: int) -> lis
     for name in methods:
         wall, cpu = min(t[0] for t in times[name]), min(t[1] for t in times[name])
         equal = same_share(labels[name], labels[REFERENCE]) if REFERENCE in labels else None
-        rows.append(Row(views, depth, name, wall, cpu, *quality(labels[name], scene.exact, scene.num_classes), equal))
+        rows.append(
+            MethodRow(views, depth, name, wall, cpu, *quality(labels[name], scene.exact, scene.num_classes), equal)
+        )
     return rows
 
 
@@ -206,8 +210,8 @@ def same_share(a: Sequence[Tensor], b: Sequence[Tensor]) -> float:
     return equal / sum(x.numel() for x in a)
 
 
-def cells(row: Row, rows: Sequence[Row]) -> list[str]:
-    """A line of the table."""
+def cells(row: MethodRow, rows: Sequence[MethodRow]) -> list[str]:
+    """Return a line of the table."""
     place = (row.views, row.depth)
     reference = next((r for r in rows if (r.views, r.depth) == place and r.method == REFERENCE), None)
     faster = None
@@ -221,8 +225,8 @@ def cells(row: Row, rows: Sequence[Row]) -> list[str]:
     ]  # fmt: skip
 
 
-def draw(path: Path, rows: Sequence[Row]) -> None:
-    """Time, IoU and BIoU over views, a line for each method and depth."""
+def plot_quality(path: Path, rows: Sequence[MethodRow]) -> None:
+    """Plot time, IoU and BIoU over views, a line for each method and depth."""
     figure, axes = new_figure(3)
     shown = (("cpu_seconds", "CPU seconds", 1.0), ("iou", "IoU, %", 100.0), ("biou", "BIoU, %", 100.0))
     for axis, (name, title, factor) in zip(axes[0], shown, strict=True):
@@ -245,4 +249,4 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
 
 if __name__ == "__main__":
     print_user_errors_plainly()
-    run_reprojection(tyro.cli(Options))
+    run_reprojection(tyro.cli(ReprojectionOptions))

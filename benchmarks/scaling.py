@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -13,7 +14,6 @@ import tyro
 from rich.console import Console
 
 from beags_plugin.bench.report import (
-    log_slope,
     new_figure,
     number,
     plain_table,
@@ -37,11 +37,11 @@ QUICK = {
 
 
 @dataclass(frozen=True)
-class Options:
+class ScalingOptions:
     """Time and memory of a refinement step and of each stage before it against classes, views, Gaussians and pixels.
 
-    channels: up to so many classes, the step of methods that render a channel per class is measured beside ours. calls:
-    how often each is timed, in turn; the median counts. quick: tiny sizes, in seconds; the figures mean nothing.
+    channels: largest number of classes at which a step that renders a channel per class is measured too. calls:
+    number of timings of each stage, in turn; the median counts. quick: tiny sizes, in seconds; figures mean nothing.
     output: folder of results. json, csv, picture: files; <output>/scaling.json and so on if left out.
     """
 
@@ -71,7 +71,7 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Row:
+class StageRow:
     """One stage at one size: median of the wall times, peak growth of the process (None where it is unknown)."""
 
     axis: str
@@ -91,14 +91,14 @@ class Slope:
     memory: float | None
 
 
-def run_scaling(options: Options) -> list[Row]:
+def run_scaling(options: ScalingOptions) -> list[StageRow]:
     """Measure, print the tables of slopes, write the files; returns the rows."""
     options.check()
     base = Sizes()
     if options.quick:
         base = QUICK["base"]
         options = replace(options, **{name: value for name, value in QUICK.items() if name != "base"})
-    rows: list[Row] = []
+    rows: list[StageRow] = []
     for axis in AXES:
         rows += measure(axis, getattr(options, axis), base, options.channels, options.calls)
     found = slopes(rows)
@@ -113,7 +113,7 @@ def run_scaling(options: Options) -> list[Row]:
         },
     )  # fmt: skip
     write_csv(files["csv"], [asdict(row) for row in rows])
-    draw(files["picture"], rows)
+    plot_scaling(files["picture"], rows)
     for kind, path in files.items():
         CONSOLE.print(f"{kind}: {path}")
     return rows
@@ -122,9 +122,12 @@ def run_scaling(options: Options) -> list[Row]:
 _FILES = (("json", "json"), ("csv", "csv"), ("picture", "png"))
 
 
-def measure(axis: str, sizes: Sequence[int], base: Sizes, channels: int, calls: int) -> list[Row]:
-    """All stages at all sizes along one axis. They take turns, ``calls`` times each, so that what else the machine
-    does meets all alike; a channel per class is drawn up to ``channels`` classes."""
+def measure(axis: str, sizes: Sequence[int], base: Sizes, channels: int, calls: int) -> list[StageRow]:
+    """Measure all stages at all sizes along one axis.
+
+    Stages take turns, ``calls`` times each, so that other load of the machine affects all alike. A channel per class
+    is rendered up to ``channels`` classes.
+    """
     from beags_plugin.rasterizers import make_rasterizer
 
     rasterizer = make_rasterizer()
@@ -145,11 +148,13 @@ def measure(axis: str, sizes: Sequence[int], base: Sizes, channels: int, calls: 
                     call()
                     times[key].append(time.perf_counter() - start)
             progress(turn + 1, calls + 1)
-    return [Row(axis, size, stage, statistics.median(times[size, stage]), memory[size, stage]) for size, stage in work]
+    return [
+        StageRow(axis, size, stage, statistics.median(times[size, stage]), memory[size, stage]) for size, stage in work
+    ]
 
 
-def slopes(rows: Sequence[Row]) -> list[Slope]:
-    """One for each axis and stage."""
+def slopes(rows: Sequence[StageRow]) -> list[Slope]:
+    """Return the slopes of each axis and stage."""
     found = []
     for axis in dict.fromkeys(row.axis for row in rows):
         for stage in STAGES:
@@ -161,8 +166,18 @@ def slopes(rows: Sequence[Row]) -> list[Slope]:
     return found
 
 
-def tables(rows: Sequence[Row], found: Sequence[Slope]):
-    """Slopes of time and of memory, then both at each number of classes."""
+def log_slope(x: Sequence[float], y: Sequence[float]) -> float | None:
+    """Return the least-squares slope of log y over log x, or None with fewer than two positive points."""
+    points = [(math.log(a), math.log(b)) for a, b in zip(x, y, strict=True) if a > 0 and b > 0]
+    if len({a for a, _ in points}) < 2:
+        return None
+    mean_x, mean_y = (math.fsum(column) / len(points) for column in zip(*points, strict=True))
+    above = math.fsum((a - mean_x) * (b - mean_y) for a, b in points)
+    return above / math.fsum((a - mean_x) ** 2 for a, _ in points)
+
+
+def tables(rows: Sequence[StageRow], found: Sequence[Slope]):
+    """Yield tables of the slopes of time and of memory, then of both at each number of classes."""
     by_place = {(slope.axis, slope.stage): slope for slope in found}
     axes = list(dict.fromkeys(slope.axis for slope in found))
     for kind in ("time", "memory"):
@@ -175,11 +190,11 @@ def tables(rows: Sequence[Row], found: Sequence[Slope]):
         for stage in STAGES:
             known = [getattr(line[size, stage], name) if (size, stage) in line else None for size in sizes]
             cells.append([stage, *(number(None if value is None else factor * value, 1) for value in known)])
-        yield plain_table(f"{title} at so many classes", ("stage", *map(str, sizes)), cells)
+        yield plain_table(f"{title} by number of classes", ("stage", *map(str, sizes)), cells)
 
 
-def draw(path: Path, rows: Sequence[Row]) -> None:
-    """Time above, memory below, a column for each axis, a line for each stage."""
+def plot_scaling(path: Path, rows: Sequence[StageRow]) -> None:
+    """Plot time above and memory below, a column for each axis, a line for each stage."""
     from matplotlib.ticker import LogLocator, StrMethodFormatter
 
     axes = list(dict.fromkeys(row.axis for row in rows))
@@ -219,4 +234,4 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
 
 if __name__ == "__main__":
     print_user_errors_plainly()
-    run_scaling(tyro.cli(Options))
+    run_scaling(tyro.cli(ScalingOptions))

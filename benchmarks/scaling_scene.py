@@ -21,7 +21,7 @@ _BACKDROP = 4.0  # radius of the sphere around all
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much of everything there is. classes: objects, without the background; pixels: of one view (4 x 3)."""
+    """Sizes of a scene. classes: objects, without the background; pixels: of one view (4 x 3)."""
 
     classes: int = 8
     views: int = 8
@@ -31,7 +31,10 @@ class Sizes:
 
 @dataclass(frozen=True)
 class SyntheticScene:
-    """surfels: N. class_ids: [N] int32. cameras: V. images: V x [H, W, 3] in 0..1. labels: V x [H, W] int32."""
+    """A generated scene.
+
+    surfels: N. class_ids: [N] int32. cameras: V. images: V x [H, W, 3] in 0..1. labels: V x [H, W] int32.
+    """
 
     surfels: Surfels
     class_ids: Tensor
@@ -42,7 +45,7 @@ class SyntheticScene:
 
 
 def make_scene(sizes: Sizes, rasterizer: Rasterizer, seed: int = 0) -> SyntheticScene:
-    """The ball's patches are the classes, so that their number changes neither shapes nor pictures."""
+    """Make a ball whose patches are the classes: their number changes neither shapes nor pictures."""
     g = torch.Generator().manual_seed(seed)
     on_ball = sizes.gaussians * 3 // 4
     ball, backdrop = _sphere(on_ball), _sphere(sizes.gaussians - on_ball)
@@ -62,15 +65,15 @@ def make_scene(sizes: Sizes, rasterizer: Rasterizer, seed: int = 0) -> Synthetic
     images, labels = [], []
     with torch.no_grad():
         for camera in cameras:
-            drawn = rasterizer.rasterize(surfel_inputs(surfels, camera), camera, SETTINGS, torch.zeros(3))
-            images.append(0.9 * drawn.color.clamp(0, 1) + 0.05)  # not what is drawn: there is something to learn
+            rendered = rasterizer.rasterize(surfel_inputs(surfels, camera), camera, SETTINGS, torch.zeros(3))
+            images.append(0.9 * rendered.color.clamp(0, 1) + 0.05)  # differs from the render, to leave a loss
             inputs = geometry_inputs(surfels, class_ids)
             labels.append(rasterizer.class_map(inputs, camera, SETTINGS, sizes.classes + 1)[0])
     return SyntheticScene(surfels, class_ids, cameras, images, labels, sizes.classes + 1)
 
 
 def _sphere(count: int) -> Tensor:
-    """[count, 3] float32 unit vectors, evenly spread (a Fibonacci spiral)."""
+    """Return [count, 3] float32 unit vectors, evenly spread (a Fibonacci spiral)."""
     i = torch.arange(count, dtype=torch.float64) + 0.5
     z = 1 - 2 * i / max(count, 1)
     angle = math.pi * (1 + math.sqrt(5)) * i
@@ -79,13 +82,13 @@ def _sphere(count: int) -> Tensor:
 
 
 def _turned(normals: Tensor) -> Tensor:
-    """[N, 4] wxyz quaternions that turn the z axis to the normals [N, 3]."""
+    """Return [N, 4] wxyz quaternions that turn the z axis to the normals [N, 3]."""
     x, y, z = normals.unbind(1)
     return torch.stack([(1 + z).clamp_min(1e-4), -y, x, torch.zeros_like(x)], dim=1)
 
 
 def _camera(index: int, count: int, width: int, height: int) -> Camera:
-    """One of a ring that looks at the middle; every other one from above."""
+    """Return a camera of a ring that looks at the middle; every other one from above."""
     turn, rise = 2 * math.pi * index / count, 0.5 * (index % 2)
     center = _DISTANCE * torch.tensor(
         [math.cos(turn) * math.cos(rise), math.sin(turn) * math.cos(rise), math.sin(rise)], dtype=torch.float64

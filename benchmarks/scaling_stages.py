@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
-from torch.optim import Adam
 
 from beags_plugin.assignment.assignment import assign_classes
-from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.boundary import BoundaryLoss
 from beags_plugin.losses.occupancy import OccupancyLoss
@@ -21,6 +19,7 @@ from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth, surfel_inputs
 from benchmarks.scaling_scene import SETTINGS, SyntheticScene
+from benchmarks.training_step import Training
 
 STEP = "refinement step"
 CHANNELS = "step, a channel per class"
@@ -32,7 +31,7 @@ _RATE = 1e-9  # of learning: every call shall find the same scene
 
 
 def stages(scene: SyntheticScene, rasterizer: Rasterizer, channels: bool) -> dict[str, Callable[[], object]]:
-    """Name to call. What a stage needs of another one is made here; channels: whether ``CHANNELS`` is wanted."""
+    """Return calls by name, and make the inputs that stages need of others. channels: also return ``CHANNELS``."""
     depths = _depths(scene, rasterizer)
     grid = _grid(scene, rasterizer)
     labels = scene.labels
@@ -58,8 +57,8 @@ def stages(scene: SyntheticScene, rasterizer: Rasterizer, channels: bool) -> dic
 def _depths(scene: SyntheticScene, rasterizer: Rasterizer) -> list[Tensor]:
     inputs = geometry_inputs(scene.surfels)
     with torch.no_grad():
-        drawn = (rasterizer.rasterize(inputs, camera, SETTINGS, torch.zeros(3)) for camera in scene.cameras)
-        return [surface_depth(view, "median") for view in drawn]
+        rendered = (rasterizer.rasterize(inputs, camera, SETTINGS, torch.zeros(3)) for camera in scene.cameras)
+        return [surface_depth(view, "median") for view in rendered]
 
 
 def _grid(scene: SyntheticScene, rasterizer: Rasterizer) -> VisibilityGrid:
@@ -68,15 +67,12 @@ def _grid(scene: SyntheticScene, rasterizer: Rasterizer) -> VisibilityGrid:
     )
 
 
-class _Training:
+class _Training(Training):
     """Steps of Adam on a scene, the views in turn."""
 
     def __init__(self, scene: SyntheticScene, rasterizer: Rasterizer) -> None:
+        super().__init__(scene.surfels, _RATE)
         self.scene, self.rasterizer = scene, rasterizer
-        values = {field.name: getattr(scene.surfels, field.name) for field in fields(Surfels)}
-        self.parameters = {name: value.clone().requires_grad_() for name, value in values.items()}
-        self.adam = Adam(self.parameters.values(), lr=_RATE, eps=1e-15, fused=True)
-        self.step = 0
 
     def loss(self, view: int) -> Tensor:
         raise NotImplementedError
@@ -89,17 +85,16 @@ class _Training:
         self.step += 1
         return float(loss.detach())
 
-    def losses(self, view: int, drawn: RasterOutputs, grid: VisibilityGrid | None) -> LossInputs:
-        surfels = Surfels(**self.parameters)
+    def losses(self, view: int, rendered: RasterOutputs, grid: VisibilityGrid | None) -> LossInputs:
         scene = self.scene
         return LossInputs(
-            self.step, 0, surfels, scene.cameras[view], drawn, scene.images[view], scene.labels[view], scene.class_ids,
-            grid,
+            self.step, 0, self.surfels(), scene.cameras[view], rendered, scene.images[view], scene.labels[view],
+            scene.class_ids, grid,
         )  # fmt: skip
 
 
 class _Step(_Training):
-    """Photometric, boundary and occupancy loss: what every step of refinement has."""
+    """A step of refinement with photometric, boundary and occupancy loss."""
 
     def __init__(self, scene: SyntheticScene, rasterizer: Rasterizer, grid: VisibilityGrid) -> None:
         super().__init__(scene, rasterizer)
@@ -108,16 +103,18 @@ class _Step(_Training):
     def loss(self, view: int) -> Tensor:
         scene = self.scene
         camera = scene.cameras[view]
-        inputs = surfel_inputs(Surfels(**self.parameters), camera, class_ids=scene.class_ids)
-        drawn = self.rasterizer.rasterize(inputs, camera, _NO_GEOMETRY, torch.zeros(3), scene.labels[view])
-        found = self.losses(view, drawn, self.grid)
+        inputs = surfel_inputs(self.surfels(), camera, class_ids=scene.class_ids)
+        rendered = self.rasterizer.rasterize(inputs, camera, _NO_GEOMETRY, torch.zeros(3), scene.labels[view])
+        found = self.losses(view, rendered, self.grid)
         terms = (PhotometricLoss(), BoundaryLoss(), OccupancyLoss())
         return sum((term.weight * term.value(found) for term in terms), torch.zeros(()))
 
 
 class _ChannelStep(_Training):
-    """What methods do that learn a vector of class scores for each Gaussian: as many channels are drawn, three at a
-    time as colours, and compared with the mask by cross-entropy."""
+    """A step of methods that learn a vector of class scores for each Gaussian.
+
+    The scores are rendered as channels, three at a time as colours, and compared with the labels by cross-entropy.
+    """
 
     def __init__(self, scene: SyntheticScene, rasterizer: Rasterizer) -> None:
         super().__init__(scene, rasterizer)
@@ -127,13 +124,15 @@ class _ChannelStep(_Training):
 
     def loss(self, view: int) -> Tensor:
         scene = self.scene
-        camera, surfels = scene.cameras[view], Surfels(**self.parameters)
-        drawn = self._draw(surfel_inputs(surfels, camera), camera)
-        classes = [self._draw(surfel_inputs(surfels, camera), camera, colors).color for colors in self.scores.unbind()]
+        camera, surfels = scene.cameras[view], self.surfels()
+        rendered = self._render(surfel_inputs(surfels, camera), camera)
+        classes = [
+            self._render(surfel_inputs(surfels, camera), camera, colors).color for colors in self.scores.unbind()
+        ]
         logits = torch.cat(classes, dim=-1)[..., : scene.num_classes].reshape(-1, scene.num_classes)
         entropy = torch.nn.functional.cross_entropy(logits, scene.labels[view].reshape(-1).long())
-        return PhotometricLoss().value(self.losses(view, drawn, None)) + entropy
+        return PhotometricLoss().value(self.losses(view, rendered, None)) + entropy
 
-    def _draw(self, inputs, camera, colors: Tensor | None = None) -> RasterOutputs:
+    def _render(self, inputs, camera, colors: Tensor | None = None) -> RasterOutputs:
         inputs = inputs if colors is None else replace(inputs, colors=colors)
         return self.rasterizer.rasterize(inputs, camera, _NO_GEOMETRY, torch.zeros(3))

@@ -1,4 +1,4 @@
-"""The scenes that are measured: seeded clouds of surfels of a stated width on the screen, in front of one camera."""
+"""Scenes to measure: seeded clouds of surfels of a stated width on the screen, in front of one camera."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MARGIN = 0.03  # the cloud reaches over the image's border by this share of its 
 
 @dataclass(frozen=True)
 class Size:
-    """One case: n surfels on width x height pixels, their screen boxes ``diameter`` pixels wide at the median."""
+    """A case: n surfels on width x height pixels, their screen boxes ``diameter`` pixels wide at the median."""
 
     n: int
     width: int
@@ -32,7 +32,7 @@ class Size:
 
     @property
     def name(self) -> str:
-        """As it is written on the command line: 50k/640x480."""
+        """Return the name on the command line: 50k/640x480."""
         count = f"{self.n // 1000}k" if self.n % 1000 == 0 else str(self.n)
         return f"{count}/{self.width}x{self.height}"
 
@@ -43,7 +43,7 @@ SIZES = (Size(1_000, 128, 96), Size(10_000, 320, 240), Size(50_000, 640, 480), S
 
 
 def parse_size(text: str) -> Size:
-    """``1k``, ``50k`` or another of ``SIZES``, or N/WIDTHxHEIGHT; raises ``UserError`` for anything else."""
+    """Parse ``1k``, ``50k`` or another of ``SIZES``, or N/WIDTHxHEIGHT; raises ``UserError`` for anything else."""
     for size in SIZES:
         if text in (size.name, size.name.split("/")[0]):
             return size
@@ -62,7 +62,7 @@ def parse_size(text: str) -> Size:
 
 @dataclass(frozen=True)
 class Scene:
-    """What is drawn, all float32.
+    """A scene to render, all float32.
 
     surfels: N, with spherical harmonics of degree 3. class_ids: [N] int32. colors: [N, 3].
     target: [H, W] int32, a class map of the same classes. image: [H, W, 3], a picture to compare with.
@@ -82,7 +82,7 @@ class Scene:
 
 
 def make_scene(size: Size, seed: int = 0) -> Scene:
-    """Surfels of random place, slant and opacity; the same for the same size and seed."""
+    """Make surfels of random place, slant and opacity; the same for the same size and seed."""
     g = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
@@ -129,7 +129,7 @@ def make_scene(size: Size, seed: int = 0) -> Scene:
 
 
 def on_device(scene: Scene, device: str) -> Scene:
-    """The same scene, all of it there."""
+    """Return the scene on another device."""
     values = {name: value.to(device) for name, value in vars(scene).items() if isinstance(value, Tensor | Camera)}
     surfels = Surfels(**{name: value.to(device) for name, value in vars(scene.surfels).items()})
     gradients = {name: value.to(device) for name, value in scene.gradients.items()}
@@ -137,17 +137,17 @@ def on_device(scene: Scene, device: str) -> Scene:
 
 
 def classes_at(across: Tensor, down: Tensor) -> Tensor:
-    """Classes in slanted bands, whose borders follow no tile border: int32; 0 is left and top, 1 right and bottom."""
+    """Return int32 classes in slanted bands across tiles. across, down: 0 is left and top, 1 right and bottom."""
     return ((across + SLANT * down) / (1 + SLANT) * 2 * CLASSES).clamp(0, 2 * CLASSES - 1).int() % CLASSES
 
 
 def surfel_inputs(scene: Scene) -> SurfelInputs:
-    """What is drawn, without gradients."""
+    """Return the inputs of the rasterizer, without gradients."""
     s = scene.surfels
     return SurfelInputs(s.means, s.quats, s.log_scales, s.opacity_logits, scene.colors, scene.class_ids)
 
 
 def median_width(scene: Scene) -> float:
-    """Pixels: median width of the surfels' screen boxes, where alpha can reach 1/255."""
+    """Return the median width in pixels of the surfels' screen boxes, where alpha can reach 1/255."""
     box = project(surfel_inputs(scene), scene.camera, scene.settings).box
     return float((box[:, 2] - box[:, 0]).median())

@@ -20,7 +20,7 @@ WIDTH, HEIGHT, STEPS, WORK_SECONDS = 1000, 750, 100, 0.06
 
 
 def write_views(root: Path, views: int) -> None:
-    """A ring of cameras; photos of smooth noise, which JPEG codes about as well as photographs; masks of rectangles."""
+    """Write a ring of cameras, photos of smooth noise, which JPEG codes like photographs, and masks of rectangles."""
     import cv2
 
     generator = np.random.default_rng(0)
@@ -71,7 +71,7 @@ def take_batches(root: Path, stream: str) -> None:
 
 
 def main(views: int) -> None:
-    """Both ways, and what is chosen by itself."""
+    """Measure both ways, and print the automatic choice."""
     with tempfile.TemporaryDirectory() as folder:
         write_views(Path(folder), views)
         found = {}

@@ -1,12 +1,11 @@
-"""One whole training step, in parts: SH colours, drawing, losses, the way back, Adam. Without nerfstudio."""
+"""A training step without nerfstudio: SH colours, rendering, losses, backward, Adam."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import reduce
 
 import torch
-from torch import Tensor
 
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.base import Loss, LossInputs
@@ -22,10 +21,25 @@ from benchmarks.clock import Seconds
 from benchmarks.scenes import CLASSES, Scene
 
 VOXELS_PER_SPACING = 0.6  # voxel size over the mean spacing of the surfels: a fifth of them take samples
-_OUTPUTS = ("color", "alpha", "depth", "normal", "boundary")  # what the losses look at
+_OUTPUTS = ("color", "alpha", "depth", "normal", "boundary")  # inputs of the losses
 
 
-class TrainingStep:
+class Training:
+    """Gaussians as parameters of Adam. step: number of steps so far."""
+
+    def __init__(self, surfels: Surfels, rate: float) -> None:
+        values = {field.name: getattr(surfels, field.name) for field in fields(Surfels)}
+        self.parameters = {name: torch.nn.Parameter(value.clone().contiguous()) for name, value in values.items()}
+        groups = [{"params": [value]} for value in self.parameters.values()]
+        self.adam = torch.optim.Adam(groups, lr=rate, eps=1e-15, fused=True)
+        self.step = 0
+
+    def surfels(self) -> Surfels:
+        """Return the parameters as Gaussians."""
+        return Surfels(**self.parameters)
+
+
+class TrainingStep(Training):
     """The step of the preset ``beags`` on one scene: L1 + SSIM and normal losses; in refinement two more.
 
     samples: Z of the occupancy loss, in a refinement step with boundary and occupancy losses; None: a base step.
@@ -33,6 +47,7 @@ class TrainingStep:
     """
 
     def __init__(self, scene: Scene, samples: int | None = None, rasterizer: Rasterizer | None = None) -> None:
+        super().__init__(scene.surfels, rate=0.0)  # all the work of a step, and every step the same
         self.scene = scene
         self.rasterizer = rasterizer or make_rasterizer("auto")
         self.settings = replace(scene.settings, distortion=False)  # the preset's weight of the distortion is 0
@@ -43,28 +58,12 @@ class TrainingStep:
             self.losses["boundary loss"] = BoundaryLoss()
             self.losses["occupancy loss"] = OccupancyLoss(samples=samples)
         self.grid = visibility_grid(scene) if self.refining else None
-        surfels = scene.surfels
-        self.parameters = {
-            "means": surfels.means,
-            "features_dc": surfels.sh_dc,
-            "features_rest": surfels.sh_rest,
-            "opacities": surfels.opacity_logits,
-            "scales": surfels.log_scales,
-            "quats": surfels.quats,
-        }
-        self.parameters = {
-            name: torch.nn.Parameter(value.clone().contiguous()) for name, value in self.parameters.items()
-        }
-        # A rate of 0: all the work of a step, and every step the same.
-        groups = [{"params": [value]} for value in self.parameters.values()]
-        self.adam = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
-        self.step = 0
 
     def run(self) -> Seconds:
-        """One step; how long it takes."""
+        """Run a step; returns its time."""
         start = Seconds.now()
         self.adam.zero_grad()
-        surfels = self._surfels()
+        surfels = self.surfels()
         class_ids = self.scene.class_ids if self.refining else None
         render = self._rasterize(surfel_inputs(surfels, self.scene.camera, class_ids=class_ids))
         inputs = self._loss_inputs(surfels, render)
@@ -75,7 +74,7 @@ class TrainingStep:
         return Seconds.now() - start
 
     def run_parts(self) -> dict[str, Seconds]:
-        """One step with its graph cut between the parts; how long each takes, a loss there and back."""
+        """Run a step with its graph cut between the parts; returns the time of each, a loss forward and backward."""
         seconds: dict[str, Seconds] = {}
         clock = Seconds.now()
 
@@ -85,7 +84,7 @@ class TrainingStep:
             clock = Seconds.now()
 
         self.adam.zero_grad()
-        surfels = self._surfels()
+        surfels = self.surfels()
         class_ids = self.scene.class_ids if self.refining else None
         inputs = surfel_inputs(surfels, self.scene.camera, class_ids=class_ids)
         stop("SH colours")
@@ -113,7 +112,7 @@ class TrainingStep:
         return seconds
 
     def sampled_share(self) -> float:
-        """The share of the surfels that do not lie wholly in valid voxels, so that the occupancy loss samples them."""
+        """Return the share of surfels outside valid voxels at least in part, which the occupancy loss samples."""
         from beags_plugin.losses import occupancy
 
         if self.grid is None or not hasattr(occupancy, "_outside"):
@@ -121,11 +120,6 @@ class TrainingStep:
         s = self.scene.surfels
         chosen = occupancy._outside(s.means, s.quats, s.log_scales, s.opacity_logits, self.scene.class_ids, self.grid)
         return len(chosen) / len(s)
-
-    def _surfels(self) -> Surfels:
-        p = self.parameters
-        rest = (p["features_dc"], p["features_rest"])
-        return Surfels(p["means"], p["quats"], p["scales"], p["opacities"], *rest)
 
     def _rasterize(self, inputs: SurfelInputs) -> RasterOutputs:
         target = self.scene.target if self.refining else None
@@ -146,12 +140,10 @@ class TrainingStep:
 
 
 def visibility_grid(scene: Scene) -> VisibilityGrid:
-    """Voxels around the surfels' own centres: most surfels lie in valid ones, as in a scene that is well trained."""
+    """Return voxels around the surfels' own centres: most surfels lie in valid ones, as in a well-trained scene."""
     means = scene.surfels.means
     extent = means.amax(dim=0) - means.amin(dim=0) + 1e-3
     spacing = float((extent.prod() / len(means)) ** (1 / 3))
-    return VisibilityGrid.from_points([(means, scene.class_ids)], VOXELS_PER_SPACING * spacing, _corner(means), CLASSES)
-
-
-def _corner(means: Tensor) -> Tensor:
-    return means.amin(dim=0).double()
+    return VisibilityGrid.from_points(
+        [(means, scene.class_ids)], VOXELS_PER_SPACING * spacing, means.amin(dim=0).double(), CLASSES
+    )

@@ -26,7 +26,7 @@ WIDTH, HEIGHT, STEPS = 1000, 750, 40
 
 
 def write_data(root: Path, views: int) -> None:
-    """<root>/data with photos, masks and poses, and <root>/scene.ply, what the photos show."""
+    """Write <root>/data with photos, masks and poses, and <root>/scene.ply with the scene of the photos."""
     import cv2
 
     from beags_plugin.core.cameras import Camera

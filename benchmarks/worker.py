@@ -1,4 +1,4 @@
-"""A process that measures what it is asked: one JSON request a line in, one JSON answer a line out.
+"""A process that measures on request: one JSON request a line in, one JSON answer a line out.
 
 The instruction set is chosen once a process (environment variable BEAGS_ISA), so each one needs a process of its own;
 peak memory needs a fresh process for each case.
@@ -24,7 +24,7 @@ SMALL = "64/32x32"  # a case that only loads code and starts threads
 
 
 class Worker:
-    """The asking side. ``isa``: forced instruction set, or None for the best one."""
+    """The client of a worker process. isa: forced instruction set, or None for the best one."""
 
     def __init__(self, isa: str | None = None) -> None:
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
@@ -39,7 +39,7 @@ class Worker:
         )  # fmt: skip
 
     def ask(self, do: str, **arguments: Any) -> Any:
-        """The answer; raises ``RuntimeError`` with the worker's own message, or if it died."""
+        """Return the answer; raises ``RuntimeError`` with the worker's own message, or if it died."""
         assert self._process.stdin is not None and self._process.stdout is not None
         try:
             print(json.dumps({"do": do, **arguments}), file=self._process.stdin, flush=True)
@@ -81,7 +81,7 @@ def main() -> None:
 
 
 def _hello(names: list[str]) -> dict[str, Any]:
-    """What this process can measure: instruction set(s), and per backend None or why it cannot run."""
+    """Return what this process can measure: instruction sets, and per backend None or the reason that it cannot run."""
     import torch
 
     from beags_plugin.rasterizers import native
@@ -101,7 +101,7 @@ def _hello(names: list[str]) -> dict[str, Any]:
 
 
 def _time(size: str, backend: str, threads: int, seconds: float) -> dict[str, Timings]:
-    """Forward and backward, call by call, for about ``seconds`` and at least once."""
+    """Measure forward and backward, call by call, for about ``seconds`` and at least once."""
     from benchmarks import backends
 
     _set_threads(threads)
@@ -115,7 +115,7 @@ def _time(size: str, backend: str, threads: int, seconds: float) -> dict[str, Ti
 
 
 def _stages(size: str, threads: int, seconds: float) -> Timings:
-    """The native forward's first stage alone: projection and binning."""
+    """Measure the native forward's first stage alone: projection and binning."""
     from beags_plugin.rasterizers import native
     from benchmarks import backends
     from benchmarks.clock import Seconds
@@ -144,7 +144,7 @@ def _step(
 
 
 def _digest(size: str, threads: int) -> str:
-    """A hash of all images and gradients of the native rasterizer."""
+    """Return a hash of all images and gradients of the native rasterizer."""
     from benchmarks import backends
 
     _set_threads(threads)
@@ -153,7 +153,7 @@ def _digest(size: str, threads: int) -> str:
 
 
 def _describe(size: str) -> dict[str, Any]:
-    """The scene: median width of its surfels in pixels; the native rasterizer's work, or None."""
+    """Return the median width of the scene's surfels in pixels, and the native rasterizer's work, or None."""
     from benchmarks import backends, scenes
 
     scene = _scene(size)
@@ -165,7 +165,7 @@ def _sampled(size: str) -> float:
 
 
 def _peak(size: str, threads: int, backend: str | None = None, samples: int | None = None) -> float:
-    """MB that one forward and backward (or, without a backend, one training step) takes beyond scene and libraries."""
+    """Return the MB of a forward and backward (without a backend: a training step) beyond scene and libraries."""
     from benchmarks import backends
     from benchmarks.peak_memory import peak_mb_of
     from benchmarks.training_step import TrainingStep
@@ -182,7 +182,7 @@ def _peak(size: str, threads: int, backend: str | None = None, samples: int | No
 
 
 def _calls(seconds: float):
-    """Counts calls until the time is over, at least one."""
+    """Yield the number of each call until the time is over, at least one."""
     end = time.perf_counter() + seconds
     gc.collect()
     for call in range(MAX_CALLS):

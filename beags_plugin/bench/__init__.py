@@ -1,1 +1,1 @@
-"""Experiments: trials that share trained bases, run one after the other, told as tables, files and pictures."""
+"""Experiments: trials that share trained bases, run one after the other, reported as tables, files and pictures."""

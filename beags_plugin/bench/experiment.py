@@ -1,4 +1,4 @@
-"""An experiment as its TOML file describes it: scenes, a preset, and variants of its config."""
+"""Experiments as TOML files describe them: scenes, a preset, and variants of its config."""
 
 from __future__ import annotations
 
@@ -13,18 +13,20 @@ from beags_plugin.system.shipped import read_toml, shipped_folder
 
 PHASES = ("base", "refine", "both")
 DAMAGE = "damage"  # the axis that is no config key: the degree of mask damage
-_ENTRIES = {"description", "preset", "seeds", "sample", "variant", "sweep", "paper", *PHASES}
-_ENTRIES |= {"reference", "confidence", "front"}
+_ENTRIES = {
+    "description", "preset", "seeds", "sample", "variant", "sweep", "paper", "reference", "confidence", "front",
+    *PHASES,
+}  # fmt: skip
 _VARIANT = {"name", DAMAGE, *PHASES}
 _SWEEP = {"name", "key", "values", "phase", "lines", "relative_to_pixels"}
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to train: what it changes of the preset, for the base and for the refinement.
+    """One way to train: its changes to the preset.
 
-    base, refine: dotted config keys and their values. damage: degree of mask damage, None: masks as they are.
-    sweep, line, x: of a variant that is a point of a sweep: its name, its curve, its place on the axis.
+    base, refine: dotted config keys and their values. damage: degree of mask damage; None leaves the masks as they are.
+    sweep, line, x: name of the sweep, its curve and the place on its axis, if the variant is a point of a sweep.
     """
 
     name: str
@@ -37,8 +39,8 @@ class Variant:
 
 
 @dataclass(frozen=True)
-class Paper:
-    """Figures of the paper, for comparison: variant name to (IoU, BIoU) in percent per data set."""
+class PaperFigures:
+    """Figures of the paper, for comparison. rows: by variant, (IoU, BIoU) in percent for each column."""
 
     source: str
     columns: tuple[str, ...]
@@ -47,12 +49,11 @@ class Paper:
 
 @dataclass(frozen=True)
 class Experiment:
-    """What ``experiments/<name>.toml`` says.
+    """The content of ``experiments/<name>.toml``.
 
-    sample_seeds, sample: the generated scenes, and other options of ``SampleConfig`` for them.
-    seeds: of the training. reference: the variant whose errors the others' are compared with.
-    confidence: whether a picture of the masks' confidence belongs to it; front: whether one of the Pareto front does.
-    relative_to_pixels: sweeps whose axis is also told per million pixels of the training views.
+    sample_seeds, sample: seeds of the generated scenes, and other options of ``SampleConfig``. seeds: of the training.
+    reference: the variant that the others' errors are compared with. confidence, front: also plot the masks'
+    confidence, or the Pareto front. relative_to_pixels: sweeps whose axis is also given per million training pixels.
     """
 
     name: str
@@ -66,23 +67,28 @@ class Experiment:
     confidence: bool = False
     front: bool = False
     relative_to_pixels: frozenset[str] = frozenset()
-    paper: Paper | None = None
+    paper: PaperFigures | None = None
+
+    def header(self) -> dict[str, str]:
+        """Return what begins every report: {"experiment", "description", "preset"}."""
+        return {"experiment": self.name, "description": self.description, "preset": self.preset}
 
     @property
     def sweeps(self) -> tuple[str, ...]:
-        """Names of the sweeps, in order."""
+        """Return the names of the sweeps, in order."""
         return tuple(dict.fromkeys(variant.sweep for variant in self.variants if variant.sweep))
 
 
 def experiment_names() -> list[str]:
-    """Names of the experiments that ship with the package."""
+    """Return the names of the experiments that ship with the package."""
     return sorted(path.stem for path in shipped_folder("experiments").glob("*.toml"))
 
 
 def load_experiment(name: str) -> Experiment:
-    """The experiment of that name, or of the TOML file at that path; raises ``UserError`` for what is neither or wrong.
+    """Read the experiment of that name, or the TOML file at that path.
 
-    Every config key is tried on the preset, so that a typo shows before anything is trained.
+    Every config key is tried on the preset, so that a typo shows before anything is trained. Raises ``UserError`` if
+    there is no such experiment, or its file has a mistake.
     """
     path = Path(name) if name.endswith(".toml") else shipped_folder("experiments") / f"{name}.toml"
     if not name.endswith(".toml") and name not in experiment_names():
@@ -108,7 +114,7 @@ def check_keys(experiment: Experiment, source: Path) -> None:
 
 
 class _Reader:
-    """Reads one file; every mistake is a ``UserError`` that names the file and the entry."""
+    """A reader of one file. Every mistake is a ``UserError`` that names the file and the entry."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -154,7 +160,7 @@ class _Reader:
         return Variant(name, *_by_phase(common, own), damage=None if damage is None else self.degree(damage))
 
     def points(self, sweep: dict[str, Any], common: dict[str, dict[str, Any]]) -> list[Variant]:
-        """The variants of a sweep: every value on every line."""
+        """Return the variants of a sweep: every value on every line."""
         name = self.value(sweep, "name", str)
         where = f"sweep {name!r}: "
         self.known(sweep, _SWEEP, where)
@@ -170,15 +176,15 @@ class _Reader:
         variants = []
         for line, overrides in lines.items():
             for value in values:
-                own: dict[str, dict[str, Any]] = {**{p: {} for p in PHASES}, "refine": dict(overrides)}
+                own = {**{p: {} for p in PHASES}, "refine": dict(overrides)}
                 if key != DAMAGE:
-                    own[phase] = {**own[phase], key: value}
+                    own[phase][key] = value
                 title = f"{name} = {value:g}" + (f", {line}" if line else "")
                 damage = self.degree(value) if key == DAMAGE else None
                 variants.append(Variant(title, *_by_phase(common, own), damage, name, line, float(value)))
         return variants
 
-    def paper(self) -> Paper | None:
+    def paper(self) -> PaperFigures | None:
         if "paper" not in self.content:
             return None
         table = self.table(self.content, "paper", "")
@@ -188,10 +194,10 @@ class _Reader:
             raise self.wrong("paper: columns must be a list of names.")
         rows = {}
         for name, pairs in self.table(table, "rows", "paper: ").items():
-            if not (isinstance(pairs, list) and len(pairs) == len(columns) and all(_is_pair(p) for p in pairs)):
+            if not (isinstance(pairs, list) and len(pairs) == len(columns) and all(map(_is_pair, pairs))):
                 raise self.wrong(f"paper: the row {name!r} must have a pair [IoU, BIoU] for each of the columns.")
             rows[name] = tuple((float(iou), float(biou)) for iou, biou in pairs)
-        return Paper(self.value(table, "source", str, where="paper: "), tuple(columns), rows)
+        return PaperFigures(self.value(table, "source", str, where="paper: "), tuple(columns), rows)
 
     def checked_sample(self, options: dict[str, Any]) -> dict[str, Any]:
         from beags_plugin.sample.writer import SampleConfig
@@ -247,12 +253,12 @@ class _Reader:
 
 
 def _by_phase(common: dict[str, dict[str, Any]], own: dict[str, dict[str, Any]]) -> tuple[dict, dict]:
-    """What base and refinement override: what is common to all variants first, then the variant's own."""
+    """Return the overrides of base and refinement; a variant's own come after those of all variants."""
     return tuple({**common["both"], **common[p], **own["both"], **own[p]} for p in ("base", "refine"))  # type: ignore[return-value]
 
 
 def _is_number(value: Any) -> bool:
-    """Whether it is one that a float can hold, which not every whole number is."""
+    """Return whether a value is a number that a float can hold; large integers are not."""
     return type(value) in (int, float) and -sys.float_info.max <= value <= sys.float_info.max
 
 

@@ -1,4 +1,4 @@
-"""What a refined run has to show: photo and mask metrics before and after refinement."""
+"""Figures of a refined run: photo and mask metrics before and after refinement."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 
 def measure_run(config_path: Path) -> dict[str, Any]:
-    """{"evaluation", "mask_error_given", "mask_error_used"} of a refined run.
+    """Return {"evaluation", "mask_error_given", "mask_error_used"} of a refined run.
 
-    evaluation: ``RunMetrics.to_json`` without its single masks and views; its "before" is the base with the classes of
-    this very run, which is what assignment alone gives. mask_error_...: see ``mask_errors``.
+    evaluation: ``RunMetrics.to_json`` without its single masks and views. Its "before" is the base with the classes of
+    this run, which is the result of assignment alone. mask_error_...: see ``mask_error``.
     """
     from beags_plugin.plugin.objects.evaluate import evaluate_run
     from beags_plugin.plugin.runs.prepared import training_masks
@@ -24,22 +24,21 @@ def measure_run(config_path: Path) -> dict[str, Any]:
 
     found = evaluate_run(config_path).to_json()
     evaluation = {name: value for name, value in found.items() if name not in ("masks", "views")}
-    return {"evaluation": evaluation, **mask_errors(training_masks(load_run_config(config_path)))}
+    views = training_masks(load_run_config(config_path))
+    return {"evaluation": evaluation, **{f"mask_error_{kind}": mask_error(views, kind) for kind in ("given", "used")}}
 
 
-def mask_errors(views: Sequence[TrainingMasks]) -> dict[str, float | None]:
-    """{"mask_error_given", "mask_error_used"}: shares in 0..1 of wrong pixels in the training masks, as the data has
-    them and after reprojection; over the pixels that are labelled in both the mask and the truth; None without truth.
+def mask_error(views: Sequence[TrainingMasks], kind: str) -> float | None:
+    """Return the share of wrong pixels in the training masks, 0..1, or None without exact masks.
+
+    kind: "given", the masks of the data, or "used", those after reprojection. Pixels count that are labelled in both
+    the mask and the exact mask.
     """
-
-    def error(kind: str) -> float | None:
-        wrong = counted = 0
-        for view in views:
-            mask = getattr(view, kind)
-            if mask is not None and view.exact is not None:
-                known = (mask != IGNORE) & (view.exact != IGNORE)
-                wrong += int(((mask != view.exact) & known).sum())
-                counted += int(known.sum())
-        return wrong / counted if counted else None
-
-    return {f"mask_error_{kind}": error(kind) for kind in ("given", "used")}
+    wrong = counted = 0
+    for view in views:
+        mask = getattr(view, kind)
+        if mask is not None and view.exact is not None:
+            known = (mask != IGNORE) & (view.exact != IGNORE)
+            wrong += int(((mask != view.exact) & known).sum())
+            counted += int(known.sum())
+    return wrong / counted if counted else None

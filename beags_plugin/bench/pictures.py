@@ -1,14 +1,14 @@
-"""An experiment's rows as a picture: bars of variants, curves of sweeps."""
+"""Plots of an experiment's rows: bars of variants, curves of sweeps."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from beags_plugin.bench.experiment import Experiment
 from beags_plugin.bench.report import new_figure, save_figure
-from beags_plugin.bench.results import Row, means
+from beags_plugin.bench.results import ResultRow, means
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,8 +27,8 @@ _BAR_HEIGHT = 0.22  # so that the names of many bars do not touch
 _LOGARITHMIC = 20.0  # an axis that spans more than this factor is logarithmic
 
 
-def draw(path: Path, experiment: Experiment, rows: Sequence[Row]) -> None:
-    """Write the picture as PNG (or what the suffix says): a row of bars for the variants, one of curves per sweep."""
+def plot_experiment(path: Path, experiment: Experiment, rows: Sequence[ResultRow]) -> None:
+    """Plot a row of bars for the variants and a row of curves per sweep; the suffix of ``path`` gives the format."""
     variants = [row for row in rows if not row.variant.sweep]
     height = 1 if variants else 0
     names = len({row.variant.name for row in variants})
@@ -48,9 +48,10 @@ def draw(path: Path, experiment: Experiment, rows: Sequence[Row]) -> None:
 
 
 def _bars(
-    axes: Axes, experiment: Experiment, rows: Sequence[Row], metric: str, title: str, paper: int | None, labels: bool
-) -> None:
-    """Bars of the means, a dot per scene, and the paper's figures as hollow marks; paper: index in its pairs."""
+    axes: Axes, experiment: Experiment, rows: Sequence[ResultRow], metric: str, title: str, paper: int | None,
+    labels: bool,
+) -> None:  # fmt: skip
+    """Plot bars of the means, a dot per scene, and the paper's figures as hollow marks. paper: index in its pairs."""
     factor = 100.0 if title.endswith("%") else 1.0
     names = list(dict.fromkeys(row.variant.name for row in rows))
     place = {name: len(names) - 1 - index for index, name in enumerate(names)}
@@ -78,10 +79,11 @@ def _bars(
     axes.set_title(title)
 
 
-def _curves(axes: Axes, rows: Sequence[Row], sweep: str, metric: str, title: str, factor: float) -> None:
-    """Thick lines: means; dashed: of assignment alone; thin: scenes; a colour per line of the sweep."""
+def _curves(axes: Axes, rows: Sequence[ResultRow], sweep: str, metric: str, title: str, factor: float) -> None:
+    """Plot means as thick lines, assignment alone dashed, scenes thin, with a colour per line of the sweep."""
     lines = list(dict.fromkeys(row.variant.line for row in rows))
-    for line, color in zip(lines, _colors(len(lines)), strict=True):
+    for index, line in enumerate(lines):
+        color = f"C{index % 10}"
         of_line = [row for row in rows if row.variant.line == line]
         for scene, seed in dict.fromkeys((row.scene, row.seed) for row in of_line):
             points = _points([row for row in of_line if (row.scene, row.seed) == (scene, seed)], metric, factor)
@@ -104,13 +106,7 @@ def _curves(axes: Axes, rows: Sequence[Row], sweep: str, metric: str, title: str
     axes.set_title(title)
 
 
-def _points(rows: Sequence[Row], metric: str, factor: float) -> tuple[list[float], list[float]]:
+def _points(rows: Sequence[ResultRow], metric: str, factor: float) -> tuple[list[float], list[float]]:
     pairs = [(row.variant.x, row.figures[metric]) for row in rows]
     known = sorted((x, factor * y) for x, y in pairs if x is not None and y is not None)
     return [x for x, _ in known], [y for _, y in known]
-
-
-def _colors(count: int) -> list[Any]:
-    from matplotlib import colormaps
-
-    return [colormaps["tab10"](index % 10) for index in range(count)]

@@ -1,4 +1,4 @@
-"""Where, of what and how a measurement was made: what every published figure has to name."""
+"""The machine and the commit of a measurement, which every published figure has to name."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]  # where git is asked
 
 
 def describe_machine() -> dict[str, str | int]:
-    """CPU name, cores that this process may use, memory in MB, system."""
+    """Return the CPU's name, the cores that this process may use, the memory in MB and the system."""
     try:
         cores = len(os.sched_getaffinity(0))
     except AttributeError:  # not on macOS
@@ -24,7 +24,7 @@ def describe_machine() -> dict[str, str | int]:
 
 
 def busy_note(cores: int) -> str | None:
-    """A sentence if other programs were at work in the last minute; None if not, or where the system does not say."""
+    """Return a sentence if other programs were at work in the last minute, else None."""
     try:
         load = os.getloadavg()[0]
     except (AttributeError, OSError):
@@ -48,7 +48,7 @@ def _cpu_name() -> str:
 
 
 def commit() -> str:
-    """The commit that is measured, with "+" if files differ from it; "unknown" outside a git clone of this package."""
+    """Return the measured commit, with "+" if files differ from it; "unknown" outside a clone of this package."""
     found = _git("rev-parse", "--short", "HEAD")
     if found is None or _git("ls-files", "--error-unmatch", str(Path(__file__))) is None:
         return "unknown"

@@ -1,4 +1,4 @@
-"""From the outcomes of an experiment's trials to rows and means over scenes, as plain values."""
+"""Rows of an experiment's results, and their means over scenes, as plain values."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ COLUMNS = (*_PLACE, *FIGURES)
 
 
 @dataclass(frozen=True)
-class Row:
+class ResultRow:
     """A variant on a scene, or its mean over scenes.
 
-    figures: name (of ``FIGURES``) to value, None where it does not exist; mask metrics in 0..1. objects: the same of
-    each object. failed: why there are no figures, in a sentence. count: scenes and seeds that a mean is over;
-    failures: those that it lacks.
+    figures: values by the names of ``FIGURES``, None where there is none; mask metrics in 0..1. objects: the same of
+    each object. failed: the reason for missing figures, in a sentence. count: number of scenes and seeds in a mean;
+    failures: number of those that it lacks.
     """
 
     variant: Variant
@@ -48,24 +48,23 @@ class Row:
 def make_row(
     variant: Variant, scene: str, seed: int, base: Mapping[str, Any] | None, result: Mapping[str, Any] | None,
     failed: str | None,
-) -> Row:  # fmt: skip
-    """The row of one trial. base, result: what the worker wrote for the base and for the refinement, if it did."""
+) -> ResultRow:  # fmt: skip
+    """Return the row of one trial. base, result: the worker's results for the base and the refinement, if there are."""
     if base is None or result is None:
-        return Row(variant, scene, seed, dict.fromkeys(FIGURES), {}, failed or "it has no result")
-    figures: dict[str, float | None] = dict.fromkeys(FIGURES)
+        return ResultRow(variant, scene, seed, dict.fromkeys(FIGURES), {}, failed or "it has no result")
     evaluation = result["evaluation"]
-    figures |= _masks(evaluation["mean"])
+    figures: dict[str, float | None] = {**dict.fromkeys(FIGURES), **_masks(evaluation["mean"])}
     figures |= {f"{metric}_{m}": evaluation[metric][m] for metric in ("psnr", "ssim") for m in MOMENTS}
     seconds = {**result["seconds"], "base training": base["seconds"]["base training"]}
     figures |= {f"seconds {stage}": seconds.get(stage) for stage in STAGES}
     figures |= {name: result[name] for name in (*_COSTS, *_MASKS, *_SCALE)}
     figures[_TOTAL] = base["cpu_seconds"] + result["cpu_seconds"]
     objects = {name: _masks(found) for name, found in evaluation["objects"].items()}
-    return Row(variant, scene, seed, figures, objects)
+    return ResultRow(variant, scene, seed, figures, objects)
 
 
 def _masks(found: Mapping[str, Any]) -> dict[str, float | None]:
-    """Mask figures of ``RunMetrics.to_json``, {kind: {moment: {metric: value}}}, by their names here."""
+    """Return the mask figures of ``RunMetrics.to_json``, {kind: {moment: {metric: value}}}, by names of ``FIGURES``."""
     return {
         f"{kind}_{metric}_{moment}": found[kind][moment][metric]
         for kind in KINDS
@@ -74,13 +73,13 @@ def _masks(found: Mapping[str, Any]) -> dict[str, float | None]:
     }
 
 
-def means(rows: Sequence[Row]) -> list[Row]:
-    """Per variant, in order, the mean of every figure over its scenes and seeds; trials that failed are left out.
+def means(rows: Sequence[ResultRow]) -> list[ResultRow]:
+    """Return each variant's mean of every figure over its scenes and seeds, without failed trials.
 
     A figure that some scene lacks is averaged over those that have it. A variant whose trials all failed keeps the
     first reason.
     """
-    of_variant: dict[str, list[Row]] = {}
+    of_variant: dict[str, list[ResultRow]] = {}
     for row in rows:
         of_variant.setdefault(row.variant.name, []).append(row)
     averaged = []
@@ -89,7 +88,7 @@ def means(rows: Sequence[Row]) -> list[Row]:
         figures = {name: _mean(row.figures[name] for row in good) for name in FIGURES}
         failures = len(group) - len(good)
         reason = None if good else group[0].failed
-        averaged.append(Row(group[0].variant, MEAN, None, figures, {}, reason, len(good), failures))
+        averaged.append(ResultRow(group[0].variant, MEAN, None, figures, {}, reason, len(good), failures))
     return averaged
 
 
@@ -98,20 +97,21 @@ def _mean(values: Iterable[float | None]) -> float | None:
     return math.fsum(known) / len(known) if known else None
 
 
-def error_left(row: Row, reference: Row | None, metric: str = "extracted_biou_after") -> float | None:
-    """(1 - metric) of a row over (1 - metric) of the reference: what is left of its error; None if unknown."""
+def error_left(row: ResultRow, reference: ResultRow | None) -> float | None:
+    """Return (1 - extracted BIoU) of a row over that of the reference, or None if one is unknown."""
+    metric = "extracted_biou_after"
     if reference is None or (value := row.figures[metric]) is None or (start := reference.figures[metric]) is None:
         return None
     return (1.0 - value) / (1.0 - start) if start < 1.0 else None
 
 
-def find_reference(rows: Sequence[Row], experiment: Experiment, scene: str) -> Row | None:
-    """The row of the experiment's reference variant on that scene."""
+def find_reference(rows: Sequence[ResultRow], experiment: Experiment, scene: str) -> ResultRow | None:
+    """Return the row of the experiment's reference variant on that scene."""
     return next((row for row in rows if row.variant.name == experiment.reference and row.scene == scene), None)
 
 
-def flat(row: Row) -> list[dict[str, Any]]:
-    """The row as ``COLUMNS``, and a line for each object (quality only)."""
+def flat(row: ResultRow) -> list[dict[str, Any]]:
+    """Return the row as ``COLUMNS``, and a line for each object (quality only)."""
     variant = row.variant
     place = {
         "scene": row.scene,
@@ -128,18 +128,15 @@ def flat(row: Row) -> list[dict[str, Any]]:
     return lines + [{**empty, **place, "object": name, **figures} for name, figures in row.objects.items()]
 
 
-def report_json(experiment: Experiment, rows: Sequence[Row], provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """{"experiment", "description", "preset", "reference", provenance ..., "rows": [...], "means": [...], "paper"}.
+def report_json(experiment: Experiment, rows: Sequence[ResultRow], provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """Return {"experiment", "description", "preset", "reference", provenance ..., "rows": [], "means": [], "paper"}.
 
-    Every row has ``COLUMNS``; rows of ``means`` have "count", "failures" and "error_left" besides.
+    Every row has ``COLUMNS``; "means" adds "count", "failures" and "error_left".
     """
     averaged = means(rows)
     reference = find_reference(averaged, experiment, MEAN)
-    paper = experiment.paper
     return {
-        "experiment": experiment.name,
-        "description": experiment.description,
-        "preset": experiment.preset,
+        **experiment.header(),
         "reference": experiment.reference,
         **provenance,
         "rows": [line for row in rows for line in flat(row)],
@@ -147,10 +144,10 @@ def report_json(experiment: Experiment, rows: Sequence[Row], provenance: Mapping
             {**flat(row)[0], "count": row.count, "failures": row.failures, "error_left": error_left(row, reference)}
             for row in averaged
         ],
-        "paper": paper and {"source": paper.source, "columns": list(paper.columns), "rows": dict(paper.rows)},
+        "paper": experiment.paper and vars(experiment.paper),
     }
 
 
-def table_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Every row, objects included, then the means (scene "mean"), each with ``COLUMNS``."""
+def table_rows(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
+    """Return every row, objects included, then the means (scene "mean"), each with ``COLUMNS``."""
     return [line for row in [*rows, *means(rows)] for line in flat(row)]

@@ -4,52 +4,37 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
 
 from beags_plugin.bench.experiment import Experiment, Variant, check_keys, load_experiment
+from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.provenance import busy_note
 from beags_plugin.bench.report import provenance, write_csv, write_json
-from beags_plugin.bench.results import Row, make_row, report_json, table_rows
+from beags_plugin.bench.results import ResultRow, make_row, report_json, table_rows
 from beags_plugin.bench.runner import Outcome, run_trials
-from beags_plugin.bench.scenes import Scene, damaged_masks, given_scenes, sample_scene
-from beags_plugin.bench.trials import MODEL, Run, plan, steps_of
+from beags_plugin.bench.scenes import TrialScene, damaged_masks, given_scenes, sample_scene
+from beags_plugin.bench.trials import MODEL, VariantTrial, plan, steps_of
 from beags_plugin.system.digests import code_digest
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import progress_bar
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
-TABLE_WIDTH = 170  # cells that are cut short say nothing: rather let a narrow terminal break the lines
+TABLE_WIDTH = 170  # a narrow terminal breaks the lines, which is better than cells that are cut short
 QUICK_SAMPLE = {"width": 96, "height": 72, "num_train": 16, "num_test": 3}
 QUICK_BASE = {"base_steps": 220, "schedule_steps": 0, "densify.start": 50, "densify.stop": 180}
 QUICK_REFINE = {"refine_steps": 10}
 
 
-@dataclass(frozen=True)
-class Options:
-    """What the command line asks for; see ``cli.Bench``."""
+def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
+    """Run the trials of an experiment that are not done, print its tables and write its files; returns the rows.
 
-    data: tuple[Path, ...] = ()
-    scenes: int | None = None
-    preset: str | None = None
-    downscale: float | None = None
-    quick: bool = False
-    output: Path = Path("outputs/bench")
-    json: Path | None = None
-    csv: Path | None = None
-    picture: Path | None = None
-
-
-def run_experiment(name: str, options: Options) -> list[Row]:
-    """Run what is not done yet of an experiment, print its tables and write its files; returns the rows.
-
-    Raises ``UserError`` for a mistake in the experiment or the options; a trial that fails is a row that says so.
+    Raises ``UserError`` for a mistake in the experiment or the options. A trial that fails is a row with the reason.
     """
-    from beags_plugin.bench.confidence import draw_confidence
-    from beags_plugin.bench.front import draw_front
-    from beags_plugin.bench.pictures import draw
+    from beags_plugin.bench.confidence import plot_confidence
+    from beags_plugin.bench.front import plot_front
+    from beags_plugin.bench.pictures import plot_experiment
     from beags_plugin.bench.tables import tables
 
     experiment = adapted(load_experiment(name), options)
@@ -70,26 +55,24 @@ def run_experiment(name: str, options: Options) -> list[Row]:
     wide = Console(width=max(CONSOLE.width, TABLE_WIDTH), highlight=False, markup=False)
     for table in tables(experiment, rows):
         wide.print(table)
-    files = {kind: getattr(options, kind) or options.output / f"{experiment.name}.{end}" for kind, end in _FILES}
+    files = options.files(experiment.name)
+    picture = files["picture"]
     write_json(files["json"], report_json(experiment, rows, {**source, "busy": busy, "quick": options.quick}))
     write_csv(files["csv"], table_rows(rows))
-    draw(files["picture"], experiment, rows)
+    plot_experiment(picture, experiment, rows)
     if experiment.confidence:
-        files["confidence"] = files["picture"].with_stem(files["picture"].stem + "-confidence")
-        draw_confidence(files["confidence"], runs, outcomes)
+        files["confidence"] = picture.with_stem(f"{picture.stem}-confidence")
+        plot_confidence(files["confidence"], runs, outcomes)
     if experiment.front:
-        files["front"] = files["picture"].with_stem(files["picture"].stem + "-front")
-        draw_front(files["front"], experiment, rows)
+        files["front"] = picture.with_stem(f"{picture.stem}-front")
+        plot_front(files["front"], experiment, rows)
     for kind, path in files.items():
         CONSOLE.print(f"{kind}: {path}")
     return rows
 
 
-_FILES = (("json", "json"), ("csv", "csv"), ("picture", "png"))
-
-
-def adapted(experiment: Experiment, options: Options) -> Experiment:
-    """The experiment with another preset or, for --quick, so small that its figures mean nothing."""
+def adapted(experiment: Experiment, options: ExperimentOptions) -> Experiment:
+    """Return the experiment with another preset or, for --quick, so small that its figures mean nothing."""
     if options.preset is not None:
         experiment = dataclasses.replace(experiment, preset=options.preset)
         check_keys(experiment, Path(f"{experiment.name}.toml"))
@@ -97,24 +80,16 @@ def adapted(experiment: Experiment, options: Options) -> Experiment:
         return experiment
     base = {MODEL + key: value for key, value in QUICK_BASE.items()}
     refine = {MODEL + key: value for key, value in QUICK_REFINE.items()}
-    variants = [
-        dataclasses.replace(
-            variant,
-            base={**variant.base, **base},
-            refine={**refine, **variant.refine},
-        )
+    variants = tuple(
+        dataclasses.replace(variant, base={**variant.base, **base}, refine={**refine, **variant.refine})
         for variant in _thinned(experiment.variants)
-    ]
-    return dataclasses.replace(
-        experiment,
-        variants=tuple(variants),
-        sample={**experiment.sample, **QUICK_SAMPLE},
-        sample_seeds=experiment.sample_seeds[:1],
     )
+    sample = {**experiment.sample, **QUICK_SAMPLE}
+    return dataclasses.replace(experiment, variants=variants, sample=sample, sample_seeds=experiment.sample_seeds[:1])
 
 
 def _thinned(variants: Sequence[Variant]) -> list[Variant]:
-    """All plain variants, and of each line of a sweep the first and the last."""
+    """Return all plain variants, and of each line of a sweep the first and the last."""
     lines: dict[tuple[str, str], list[Variant]] = {}
     for variant in variants:
         key = (variant.sweep, variant.line) if variant.sweep else (variant.name, "")
@@ -122,8 +97,8 @@ def _thinned(variants: Sequence[Variant]) -> list[Variant]:
     return [variant for line in lines.values() for variant in [*line[:1], *line[1:][-1:]]]
 
 
-def scenes_of(experiment: Experiment, options: Options) -> list[Scene]:
-    """The experiment's samples (none by default where the user gives data) and the user's folders.
+def scenes_of(experiment: Experiment, options: ExperimentOptions) -> list[TrialScene]:
+    """Return the experiment's samples (none by default if the user gives data) and the user's folders.
 
     Raises ``UserError`` if there are none at all, or fewer samples than asked for.
     """
@@ -140,8 +115,8 @@ def scenes_of(experiment: Experiment, options: Options) -> list[Scene]:
     return samples + given
 
 
-def rows_of(runs: Sequence[Run], outcomes: dict[str, Outcome]) -> list[Row]:
-    """A row for every run, in order."""
+def rows_of(runs: Sequence[VariantTrial], outcomes: dict[str, Outcome]) -> list[ResultRow]:
+    """Return a row for every run, in order."""
     rows = []
     for run in runs:
         assert run.trial.base is not None

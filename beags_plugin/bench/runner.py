@@ -1,4 +1,4 @@
-"""Runs trials one after the other, each in a process of its own, and keeps what is done."""
+"""The runner of trials: one after the other, each in a process of its own, with results that are kept."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from filelock import AcquireReturnProxy, FileLock
+from filelock import FileLock
 
 from beags_plugin.bench.trials import Trial
 from beags_plugin.system.errors import writing
 
 Progress = Callable[[int, int], None]
+PROGRAM = [sys.executable, "-m", "beags_plugin.bench.worker"]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a trial: the content of result.json, or why it failed, in a sentence."""
+    """The outcome of a trial: the content of result.json, or the reason of its failure in a sentence."""
 
     folder: Path
     result: dict[str, Any] | None
@@ -33,10 +34,10 @@ class Outcome:
 def run_trials(
     trials: Sequence[Trial], folder: Path, weight: Callable[[Trial], int], progress: Progress | None = None
 ) -> dict[str, Outcome]:
-    """Run every trial, and its base before it, unless it is done already; outcome by digest.
+    """Run every trial, and its base before it, unless it is done; returns outcomes by digest.
 
-    folder: where each trial has a folder of its own. weight: of a trial in the progress, e.g. its number of steps.
-    A trial that fails leaves its reason and the others go on; what was interrupted is run again by the next call.
+    folder: holds a folder for each trial. weight: share of a trial in the progress, e.g. its number of steps. The
+    other trials run although one fails. The next call runs again what failed or was interrupted.
     """
     queue = {trial.digest: trial for wanted in trials for trial in (wanted.base, wanted) if trial is not None}
     total = sum(weight(trial) for trial in queue.values())
@@ -55,11 +56,14 @@ def run_trials(
 def _run(trial: Trial, folder: Path, base: Outcome | None, worker: Worker) -> Outcome:
     if base is not None and base.failed is not None:
         return Outcome(folder, None, f"its base failed: {base.failed}")
-    with _lock(folder):
+    with writing(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(folder.parent / f".{folder.name}.lock").acquire()
+    with lock:  # the second of two programs that want the same trial waits, and finds it done
         if (result := _read(folder / "result.json")) is not None:
             return Outcome(folder, result)
         if folder.exists():
-            shutil.rmtree(folder)  # what an interrupted or failed trial left
+            shutil.rmtree(folder)  # left by an interrupted or failed trial
         request = {
             "preset": trial.preset,
             "data": str(trial.scene.data.absolute()),
@@ -82,19 +86,21 @@ def _run(trial: Trial, folder: Path, base: Outcome | None, worker: Worker) -> Ou
 
 
 class Worker:
-    """The program that runs trials, ``worker.serve``; started with the first trial, ended by leaving the context."""
+    """The program that runs trials, ``worker.serve``; the first trial starts it, leaving the context ends it."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[str] | None = None
-        self._complaints = tempfile.TemporaryFile()  # noqa: SIM115  (what the program itself says; trials have logs)
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (of the program itself; trials have logs)
 
     def run(self, folder: Path) -> int:
         """Run the trial in ``folder``; returns the exit code of its process, negative for a signal."""
         if self._process is None:
+            package = str(Path(__file__).resolve().parents[2])  # the worker imports this very package
+            paths = os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH")]))
+            environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ, "PYTHONPATH": paths, "COLUMNS": "160"}
             self._process = subprocess.Popen(
-                _command(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._complaints, text=True,
-                env=_environment(),
-            )  # fmt: skip
+                PROGRAM, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True, env=environment
+            )
         assert self._process.stdin is not None and self._process.stdout is not None
         try:
             print(folder.absolute(), file=self._process.stdin, flush=True)
@@ -103,9 +109,9 @@ class Worker:
             process, self._process = self._process, None
             process.stdin = None
             code = process.wait()
-            self._complaints.seek(0)
+            self._errors.seek(0)
             with open(folder / "log.txt", "ab") as log:
-                log.write(self._complaints.read())
+                log.write(self._errors.read())
             return code
 
     def __enter__(self) -> Worker:
@@ -115,25 +121,7 @@ class Worker:
         if self._process is not None:
             self._process.terminate()
             self._process.wait()
-        self._complaints.close()
-
-
-def _command() -> list[str]:
-    return [sys.executable, "-m", "beags_plugin.bench.worker"]
-
-
-def _environment() -> dict[str, str]:
-    """Of the worker: it imports the package that this process runs, wherever the user stands."""
-    package = str(Path(__file__).resolve().parents[2])
-    paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
-    return {"OMP_WAIT_POLICY": "PASSIVE", **os.environ, "PYTHONPATH": os.pathsep.join(paths), "COLUMNS": "160"}
-
-
-def _lock(folder: Path) -> AcquireReturnProxy:
-    """Make the second of two programs that want the same trial wait, and find it done."""
-    with writing(folder):
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        return FileLock(folder.parent / f".{folder.name}.lock").acquire()
+        self._errors.close()
 
 
 def _read(path: Path) -> dict[str, Any] | None:

@@ -1,12 +1,11 @@
-"""The scenes of an experiment on disk: generated samples, folders of the user's, and copies of masks with damage."""
+"""Scenes of an experiment on disk: generated samples, the user's folders, and copies of masks with damage."""
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import io
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,8 +20,8 @@ from beags_plugin.system.progress import progress_bar
 
 
 @dataclass(frozen=True)
-class Scene:
-    """Something to train on. data: its folder. digest: changes with its content. seed: of damage done to its masks."""
+class TrialScene:
+    """A scene to train on. digest: changes with the content of ``data``. seed: of the damage to its masks."""
 
     name: str
     data: Path
@@ -31,8 +30,8 @@ class Scene:
     seed: int = 0
 
 
-def sample_scene(folder: Path, seed: int, options: Mapping[str, Any]) -> Scene:
-    """The generated scene of that seed, written into ``folder`` unless it lies there already."""
+def sample_scene(folder: Path, seed: int, options: Mapping[str, Any]) -> TrialScene:
+    """Return the generated scene of that seed; write it into ``folder`` unless it is there."""
     from beags_plugin.sample.writer import SampleConfig, is_sample, write_sample
 
     config = SampleConfig(**{**options, "seed": seed})
@@ -41,11 +40,11 @@ def sample_scene(folder: Path, seed: int, options: Mapping[str, Any]) -> Scene:
     if not is_sample(target, config):
         with progress_bar(f"Tracing sample {seed}") as progress:
             write_sample(target, config, progress)
-    return Scene(f"sample {seed}", target, 1.0, digest, seed)
+    return TrialScene(f"sample {seed}", target, 1.0, digest, seed)
 
 
-def given_scenes(folders: Sequence[Path], downscale: float | None) -> list[Scene]:
-    """The user's scenes, scaled down for a quick run unless ``downscale`` says otherwise.
+def given_scenes(folders: Sequence[Path], downscale: float | None) -> list[TrialScene]:
+    """Return the user's scenes, scaled down for a quick run unless ``downscale`` is given.
 
     Raises ``UserError`` for a folder that does not exist, and for two of one name.
     """
@@ -58,22 +57,23 @@ def given_scenes(folders: Sequence[Path], downscale: float | None) -> list[Scene
         name = folder.resolve().name
         if any(scene.name == name for scene in scenes):
             raise UserError(f"two of the given folders are called {name}: rename one of them.")
-        scenes.append(Scene(name, folder.resolve(), downscale or quick_downscale(folder), folder_digest(folder)))
+        scenes.append(TrialScene(name, folder.resolve(), downscale or quick_downscale(folder), folder_digest(folder)))
     return scenes
 
 
-def damaged_masks(scene: Scene, degree: float, folder: Path) -> Path:
-    """A folder with the scene's masks, those of the training views damaged to ``degree`` (1 is mild, 2 strong).
+def damaged_masks(scene: TrialScene, degree: float, folder: Path) -> Path:
+    """Return a folder with the scene's masks, those of the training views damaged to ``degree`` (1 is mild, 2 strong).
 
-    Damage is done to exact masks where the scene has them (``ground_truth/masks``), else to the masks that it has, and
-    is decided by the scene's seed and the view's name. At degree 1 a sample gets the masks that it has by default.
-    The masks of held-out views stay as they are. An existing folder of the same damage is used again.
+    Exact masks (``ground_truth/masks``) are damaged where the scene has them, else its own masks. The scene's seed and
+    the view's name decide the damage. At degree 1 a sample gets its default masks. Masks of held-out views stay as
+    they are. An existing folder of the same damage is used again.
     """
     from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
-    from beags_plugin.sample.degrade import degradation_of_degree, degrade_mask, dropped_views
+    from beags_plugin.sample import degrade
 
-    degradation = degradation_of_degree(degree)
-    target = folder / f"masks-{value_digest([scene.digest, scene.seed, degree, _own_code()])[:12]}"
+    degradation = degrade.degradation_of_degree(degree)
+    code = [Path(str(file)).read_text("utf8") for file in (degrade.__file__, __file__)]
+    target = folder / f"masks-{value_digest([scene.digest, scene.seed, degree, code])[:12]}"
     if (target / "complete").exists():
         return target
     shutil.rmtree(target, ignore_errors=True)
@@ -83,7 +83,7 @@ def damaged_masks(scene: Scene, degree: float, folder: Path) -> Path:
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
         splits = {split: parser.get_dataparser_outputs(split) for split in ("test", "train")}
     stems = [Path(file).stem for file in splits["train"].image_filenames]
-    dropped = dropped_views(stems, scene.seed, degradation.dropped)
+    dropped = degrade.dropped_views(stems, scene.seed, degradation.dropped)
     for split, outputs in splits.items():  # a view in both is for training
         classes = np.array(sorted(outputs.metadata["classes"]))
         masks = _best_masks(outputs.metadata, split)
@@ -93,31 +93,20 @@ def damaged_masks(scene: Scene, degree: float, folder: Path) -> Path:
             labels = read_mask(mask, kind, outputs.metadata["ignore_ids"])
             if split == "train":
                 ranks = np.where(labels == IGNORE, len(classes), np.searchsorted(classes, labels))
-                ranks = degrade_mask(ranks, len(classes), degradation, scene.seed, image.stem)
+                ranks = degrade.degrade_mask(ranks, len(classes), degradation, scene.seed, image.stem)
                 labels = np.append(classes, IGNORE)[ranks]
-            path = target / _below(image, scene.data / "images").with_suffix(".png")
+            root = scene.data / "images"  # the data parser looks for masks by the path below it
+            path = target / (image.relative_to(root) if image.is_relative_to(root) else image.name)
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_mask(path, labels.astype(np.uint16))
+            write_mask(path.with_suffix(".png"), labels.astype(np.uint16))
     (target / "complete").touch()
     return target
 
 
 def _best_masks(metadata: dict[str, Any], split: str) -> list[tuple[Path | None, str]]:
-    """Per view its exact mask, in training views only; else the one it has. With each, what kind it is."""
+    """Return each view's mask and its kind: the exact one for a training view that has it, else the given one."""
     given: list[Path | None] = metadata["mask_filenames"]
     truth = metadata["ground_truth"]
     exact = truth["masks"] if truth and split == "train" else [None] * len(given)
     kind: str = metadata["mask_kind"]
     return [(best, "ids") if best else (mask, kind) for best, mask in zip(exact, given, strict=True)]
-
-
-def _below(image: Path, root: Path) -> Path:
-    """Where the data parser looks for the mask of ``image``."""
-    return image.relative_to(root) if image.is_relative_to(root) else Path(image.name)
-
-
-def _own_code() -> str:
-    from beags_plugin.sample import degrade
-
-    sources: list[Callable[[], bytes]] = [Path(str(module)).read_bytes for module in (degrade.__file__, __file__)]
-    return hashlib.sha256(b"".join(read() for read in sources)).hexdigest()

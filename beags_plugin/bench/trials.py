@@ -1,4 +1,4 @@
-"""Trials: one training each, told apart by a digest of all that decides its result."""
+"""Trials: one training each, identified by a digest of everything that decides its result."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from beags_plugin.bench.experiment import Experiment, Variant
-from beags_plugin.bench.scenes import Scene
+from beags_plugin.bench.scenes import TrialScene
 from beags_plugin.system.digests import value_digest
 
 MODEL = "pipeline.model."
@@ -19,11 +19,11 @@ MODEL = "pipeline.model."
 class Trial:
     """One training: of a base, or (with ``base``) of the refinement that starts from that base.
 
-    overrides: dotted config keys and their values. masks: folder that replaces the scene's masks.
-    code: digest of the code that it is run with.
+    overrides: dotted config keys and their values. masks: folder that replaces the scene's masks. code: digest of the
+    code that runs it.
     """
 
-    scene: Scene
+    scene: TrialScene
     preset: str
     overrides: Mapping[str, Any] = field(hash=False)
     seed: int
@@ -33,12 +33,14 @@ class Trial:
 
     @cached_property
     def digest(self) -> str:
-        """Equal for trials whose results are equal; the data's place and the names of variants do not matter."""
+        """Return a digest that trials share if their results are equal, wherever the data lie."""
+        from beags_plugin.plugin.presets import preset_folder
+
         return value_digest(
             {
                 "scene": self.scene.digest,
                 "downscale": self.scene.downscale,
-                "preset": self.preset_content,
+                "preset": (preset_folder() / f"{self.preset}.toml").read_text("utf8"),
                 "overrides": {key: repr(value) for key, value in self.overrides.items()},  # repr: JSON has no infinity
                 "seed": self.seed,
                 "code": self.code,
@@ -47,55 +49,45 @@ class Trial:
             }
         )
 
-    @cached_property
-    def preset_content(self) -> str:
-        """The text of the preset's file."""
-        from beags_plugin.plugin.presets import preset_folder
-
-        return (preset_folder() / f"{self.preset}.toml").read_text("utf8")
-
     @property
     def folder_name(self) -> str:
-        """Of its folder among the trials."""
+        """Return the name of its folder among the trials."""
         scene = "".join(c if c.isalnum() or c in "._-" else "-" for c in self.scene.name)
         return f"{scene}-{'base' if self.base is None else 'refined'}-{self.digest[:12]}"
 
 
 @dataclass(frozen=True)
-class Run:
+class VariantTrial:
     """A trial in its part in an experiment: that variant on that scene with that seed."""
 
     variant: Variant
-    scene: Scene
+    scene: TrialScene
     seed: int
     trial: Trial
 
 
 def plan(
-    experiment: Experiment, scenes: Sequence[Scene], masks: Mapping[tuple[str, float], Path], code: str
-) -> list[Run]:
-    """Every variant on every scene with every seed, scene after scene; variants share bases where they can.
+    experiment: Experiment, scenes: Sequence[TrialScene], masks: Mapping[tuple[str, float], Path], code: str
+) -> list[VariantTrial]:
+    """Return every variant on every scene with every seed, scene after scene; variants share bases where they can.
 
     masks: folder of damaged masks by scene name and degree. code: digest of the code.
     """
-    runs = []
+    planned = []
     for scene in scenes:
         for seed in experiment.seeds:
             for variant in experiment.variants:
-                # no damage to the masks makes another base: it is trained from photos alone
-                base = Trial(
-                    scene, experiment.preset, {**variant.base, MODEL + "refine_steps": 0}, seed, code, masks=None
-                )
+                # damaged masks do not change the base: it is trained from photos alone
+                base = Trial(scene, experiment.preset, {**variant.base, MODEL + "refine_steps": 0}, seed, code)
                 damaged = None if variant.damage is None else masks[scene.name, variant.damage]
                 refine = {**variant.refine, MODEL + "base_steps": 0}
-                runs.append(
-                    Run(variant, scene, seed, Trial(scene, experiment.preset, refine, seed, code, damaged, base))
-                )
-    return runs
+                refined = Trial(scene, experiment.preset, refine, seed, code, damaged, base)
+                planned.append(VariantTrial(variant, scene, seed, refined))
+    return planned
 
 
 def steps_of(trial: Trial) -> int:
-    """How many steps it trains; raises ``UserError`` for overrides that the config does not take."""
+    """Return the number of training steps; raises ``UserError`` for overrides that the config does not take."""
     from beags_plugin.plugin.presets import preset_config
 
     model = preset_config(trial.preset, trial.overrides, Path(trial.scene.name)).model_config

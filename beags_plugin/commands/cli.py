@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import warnings
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Literal, NoReturn
+from typing import Literal, NoReturn
 
 import tyro
 from rich.console import Console
@@ -18,6 +19,7 @@ from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.pictures.options import RenderOptions
 from beags_plugin.system.errors import UserError, refused
+from beags_plugin.system.whole_files import write_text_atomically
 
 CONSOLE = Console(soft_wrap=True, highlight=False)
 
@@ -47,13 +49,13 @@ class Demo:
 
 @dataclass
 class Resume:
-    """Go on with a training that was broken off, in its own folder; it ends as it would have without the break."""
+    """Continue an interrupted training in its own folder; it ends as it would have without the interruption."""
 
     run_folder: tyro.conf.Positional[Path]
     """Folder of the run (or its config.yml)."""
 
     device: Literal["cpu", "cuda"] | None = None
-    """Go on here instead of where it was begun; the result is then no longer the same in every bit."""
+    """Continue here instead of where it was begun; the result is then no longer the same in every bit."""
 
     check_memory: bool = True
     """Do not begin where hardly any memory or disk is free; save and stop when memory runs out."""
@@ -149,16 +151,9 @@ class Export:
         options = {name: asdict(self.mesh) for name in ("glb", "obj")}
         with progress_bar("exporting") as progress:
             exported = export_run(
-                self.load_config,
-                self.object,
-                self.all,
-                self.format,
-                self.frame,
-                self.output,
-                options,
-                progress,
+                self.load_config, self.object, self.all, self.format, self.frame, self.output, options, progress,
                 whole=self.whole,
-            )
+            )  # fmt: skip
         write_json(self.json, [asdict(one) for one in exported])
         for one in exported:
             CONSOLE.print(f"{one.name}: {one.gaussians} Gaussians", markup=False)
@@ -168,7 +163,7 @@ class Export:
 
 @dataclass
 class Render:
-    """Draw objects alone: a turntable video, a contact sheet, or assignment alone beside the refined object."""
+    """Render objects alone: a turntable video, a contact sheet, or assignment alone beside the refined object."""
 
     load_config: Path
     """config.yml of a trained run."""
@@ -229,7 +224,7 @@ class Bench:
 
 @dataclass
 class Doctor:
-    """Say what this installation can do, what is missing, and the one command that repairs each.
+    """Report what this installation can do, what is missing, and the one command that repairs each.
 
     With --data: whether the scene can be read too, and how much memory and disk are free to train on it.
     """
@@ -245,57 +240,41 @@ class Doctor:
         from beags_plugin.commands.doctor.diagnosis import checks_of_data, diagnose
 
         checks = diagnose() + (checks_of_data(self.data) if self.data is not None else [])
-        write_json(self.json, [check.to_json() for check in checks])
+        write_json(self.json, [asdict(check) for check in checks])
         print_report(checks)
 
 
 def write_json(path: Path | None, content: object) -> None:
-    """Write plain values, and paths as text; None writes nothing. Raises ``UserError`` if it cannot be written."""
-    import json
-
-    from beags_plugin.extraction.files import whole_file
-
+    """Write plain values, and paths as text, unless ``path`` is None; raises ``UserError`` if that fails."""
     if path is not None:
-        with whole_file(path) as part:
-            part.write_text(json.dumps(content, indent=2, default=str) + "\n", "utf8")
+        write_text_atomically(json.dumps(content, indent=2, default=str) + "\n", path)
 
 
-Command = (
-    Annotated[Demo, tyro.conf.subcommand(name="demo")]
-    | Annotated[Resume, tyro.conf.subcommand(name="resume")]
-    | Annotated[Sample, tyro.conf.subcommand(name="sample")]
-    | Annotated[Masks, tyro.conf.subcommand(name="masks")]
-    | Annotated[Extract, tyro.conf.subcommand(name="extract")]
-    | Annotated[Export, tyro.conf.subcommand(name="export")]
-    | Annotated[Render, tyro.conf.subcommand(name="render")]
-    | Annotated[Eval, tyro.conf.subcommand(name="eval")]
-    | Annotated[Bench, tyro.conf.subcommand(name="bench")]
-    | Annotated[Doctor, tyro.conf.subcommand(name="doctor")]
-)
+Command = Demo | Resume | Sample | Masks | Extract | Export | Render | Eval | Bench | Doctor
 
 
-def say(error: UserError) -> NoReturn:
-    """Print a user's mistake and end with exit code 2."""
+def exit_with(error: UserError) -> NoReturn:
+    """Print a user error, unless the trainer has, and end with exit code 2."""
     if not error.told:
         CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}")
     sys.exit(2)
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point of the command ``beags``; a user's mistake prints one sentence and ends with exit code 2."""
+    """Run the command ``beags``; a user error prints one sentence and ends with exit code 2."""
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
     description = "BEA-GS: clean objects out of Gaussian-splat scenes."
-    # What torch says to nerfstudio's authors, who wrote for an older one.
+    # torch's deprecation warnings are meant for nerfstudio's authors.
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|nerfstudio)\.")
     try:
         command = tyro.cli(Command, args=arguments, description=description, config=config)
         command.run()
     except UserError as error:
-        say(error)
+        exit_with(error)
     except OSError as error:
-        if (told := refused(error)) is None:
+        if (described := refused(error)) is None:
             raise
-        say(told)
+        exit_with(described)
     except KeyboardInterrupt:
         CONSOLE.print("[bold red]beags:[/bold red] interrupted.")
         sys.exit(130)

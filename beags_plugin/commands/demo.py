@@ -8,7 +8,8 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -19,21 +20,21 @@ from beags_plugin.system.digests import code_digest, folder_digest, value_digest
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.lock import run_lock
 from beags_plugin.system.progress import progress_bar
-from beags_plugin.system.whole_files import write_whole
+from beags_plugin.system.whole_files import write_text_atomically
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.options.model_options import BeagsModelConfig
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
-STAMP = "trained.json"  # beside the run: what it was made from
-STARTED = "started"  # in there, as long as that is not done
+STAMP = "trained.json"  # beside the run: the request that it was made from
+STARTED = "started"  # in there, holds the request until the training ends
 SHEET_VIEWS = 3  # held-out views in the picture
 
 
 def run_demo(
     data: Path | None, output: Path | None, preset: str, downscale: float | None, seed: int, fresh: bool
 ) -> None:
-    """Do the whole job in ``output`` and print the table; see ``cli.Demo`` for the arguments."""
+    """Run the whole demo in ``output`` and print the table; see ``cli.Demo`` for the arguments."""
     from beags_plugin.data.layout import read_dataset
     from beags_plugin.data.quick import quick_downscale
     from beags_plugin.sample.writer import make_sample
@@ -45,13 +46,13 @@ def run_demo(
     if data is None:
         output = output or Path("outputs/demo")
         data = output / "sample"
-        with _Timer(seconds, "sample"):
+        with timed(seconds, "sample"):
             make_sample(data, seed, 256, 192, "mild")
         downscale = downscale or 1.0
     elif not data.is_dir():
         raise UserError(f"{data} is no folder: name one with images, poses and masks.")
     else:
-        read_dataset(data)  # which says what is missing, before a training is started
+        read_dataset(data)  # reports what is missing before a training starts
         output = output or Path("outputs") / data.resolve().name
         downscale = downscale or quick_downscale(data)
     run = output / "run"
@@ -59,13 +60,14 @@ def run_demo(
     if not fresh and _trained(output, request):
         CONSOLE.print(f"Trained before: {run} (add --fresh to train again).")
     else:
+        if run.exists() and not (output / STAMP).exists():
+            raise UserError(f"{run} is not the demo's: choose another --output, or move it away.")
         if run.is_dir():
-            _check_own(output)  # before anything is written there
-            run_lock(run).release()  # says so if the same demo is being trained
-        if not fresh and _broken_off(output, request):
+            run_lock(run).release()  # refuses if the same demo is being trained
+        if not fresh and _interrupted(output, request):
             resume(run)
         else:
-            _clear(output)
+            shutil.rmtree(run, ignore_errors=True)
             write_stamp(output, {STARTED: request})
             train(data, run, preset, downscale)
         write_stamp(output, request)
@@ -84,15 +86,15 @@ def check_preset(preset: str) -> None:
 
 
 def _digest(data: Path, preset: str) -> str:
-    """Changes with the preset, the package's code and any file of the data (by name, size and time)."""
+    """Return what changes with the preset, the package's code and any file of the data (by name, size and time)."""
     from beags_plugin.plugin.presets import preset_folder
 
     return value_digest([folder_digest(data), code_digest(), (preset_folder() / f"{preset}.toml").read_text("utf8")])
 
 
 def write_stamp(output: Path, content: dict[str, Any]) -> None:
-    """Say what the run in ``output`` was made from, or, under ``STARTED``, is being made from."""
-    write_whole(output / STAMP, lambda file: file.write(json.dumps(content).encode()))
+    """Write the request that the run in ``output`` was made from, or, under ``STARTED``, is being made from."""
+    write_text_atomically(json.dumps(content), output / STAMP)
 
 
 def _read_stamp(output: Path) -> dict[str, Any]:
@@ -104,27 +106,14 @@ def _read_stamp(output: Path) -> dict[str, Any]:
 
 
 def _trained(output: Path, request: dict[str, Any]) -> bool:
-    """Whether the same was trained before, to its end."""
+    """Return whether the same request was trained before, to its end."""
     former = _read_stamp(output)
     return request in (former, former.get(STARTED)) and (output / "run" / "training.json").exists()
 
 
-def _broken_off(output: Path, request: dict[str, Any]) -> bool:
-    """Whether the same was being trained, and can go on."""
+def _interrupted(output: Path, request: dict[str, Any]) -> bool:
+    """Return whether a training of the same request was interrupted and can resume."""
     return _read_stamp(output).get(STARTED) == request and (output / "run" / "config.yml").exists()
-
-
-def _check_own(output: Path) -> None:
-    """Raise ``UserError`` if ``run`` is there and something else's."""
-    run = output / "run"
-    if run.exists() and not (output / STAMP).exists():
-        raise UserError(f"{run} is not the demo's: choose another --output, or move it away.")
-
-
-def _clear(output: Path) -> None:
-    """Remove the demo's own former run; raises ``UserError`` if ``run`` is something else's."""
-    _check_own(output)
-    shutil.rmtree(output / "run", ignore_errors=True)
 
 
 def train(data: Path, run: Path, preset: str, downscale: float) -> None:
@@ -138,7 +127,7 @@ def train(data: Path, run: Path, preset: str, downscale: float) -> None:
 
 
 def resume(run: Path) -> None:
-    """Go on with a training that was broken off, in a process of its own."""
+    """Resume an interrupted training in a process of its own."""
     CONSOLE.print(f"Going on with the training that was broken off (add --fresh to start anew).\n$ beags resume {run}")
     _finish([sys.executable, "-m", "beags_plugin.commands.cli", "resume", str(run)])
 
@@ -157,13 +146,13 @@ def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
     from beags_plugin.plugin.objects.evaluate import EvaluatedRun
     from beags_plugin.plugin.objects.extract import extract_objects
 
-    with _Timer(seconds, "evaluation"), progress_bar("Evaluating") as progress:
+    with timed(seconds, "evaluation"), progress_bar("Evaluating") as progress:
         evaluated = EvaluatedRun(run / "config.yml")
         metrics = evaluated.metrics(progress=progress)
-    with _Timer(seconds, "extraction"), progress_bar("Extracting") as progress:
+    with timed(seconds, "extraction"), progress_bar("Extracting") as progress:
         extracted = extract_objects(run / "config.yml", progress=progress)
     picture = output / "contact_sheet.png"
-    with _Timer(seconds, "picture"), progress_bar("Drawing the picture") as progress:
+    with timed(seconds, "picture"), progress_bar("Drawing the picture") as progress:
         views, classes = evaluated.views, evaluated.classes
         shown = views[:: max(1, len(views) // SHEET_VIEWS)][:SHEET_VIEWS]
         objects = [index for index in classes if index != 0]
@@ -177,8 +166,7 @@ def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
     training = json.loads((run / "training.json").read_text())
     stages = {"sample": seconds.pop("sample", 0.0), **training["seconds"], **seconds}
     memory = training["peak_memory_mb"]
-    summary = json.dumps(summary_json(metrics, stages, memory), indent=2)
-    write_whole(output / "summary.json", lambda file: file.write(summary.encode()))
+    write_text_atomically(json.dumps(summary_json(metrics, stages, memory), indent=2), output / "summary.json")
     CONSOLE.print(render_run(metrics, stages, memory))
     CONSOLE.print(f"objects: {', '.join(str(item.ply) for item in extracted)}")
     CONSOLE.print(f"figures: {output / 'summary.json'}")
@@ -186,13 +174,9 @@ def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
     CONSOLE.print(f"look:    ns-viewer --load-config {run / 'config.yml'}")
 
 
-@dataclass
-class _Timer:
-    seconds: dict[str, float]
-    name: str
-
-    def __enter__(self) -> None:
-        self.start = time.perf_counter()
-
-    def __exit__(self, *_: object) -> None:
-        self.seconds[self.name] = time.perf_counter() - self.start
+@contextmanager
+def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Measure the wall time of the block into ``seconds[name]``."""
+    start = time.perf_counter()
+    yield
+    seconds[name] = time.perf_counter() - start

@@ -1,4 +1,4 @@
-"""``beags eval``: figures of one run or several, as tables, JSON, CSV and a picture of the worst views."""
+"""``beags eval``: figures of runs as tables, JSON, CSV and a picture of the worst views."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 
 from rich.console import Console
@@ -14,7 +15,7 @@ from rich.console import Console
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.progress import progress_bar
-from beags_plugin.system.whole_files import write_whole
+from beags_plugin.system.whole_files import write_text_atomically
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 PICTURES = (".png", ".jpg", ".jpeg")
@@ -22,7 +23,7 @@ PICTURES = (".png", ".jpg", ".jpeg")
 
 @dataclass(frozen=True)
 class Outputs:
-    """Files to write; None leaves one out. worst: masks of each kind in the picture."""
+    """Files to write, each of them optional. worst: number of masks of each kind in the picture."""
 
     json: Path | None = None
     csv: Path | None = None
@@ -35,9 +36,7 @@ class Outputs:
             raise UserError(f"the picture {self.picture} is no .png or .jpg: give it such a name.")
         if self.worst < 1:
             raise UserError(f"worst is {self.worst}: give the number of masks in the picture, at least 1.")
-        for path in (self.json, self.csv, self.picture):
-            if path is None:
-                continue
+        for path in filter(None, (self.json, self.csv, self.picture)):
             with writing(path):
                 path.parent.mkdir(parents=True, exist_ok=True)
             if path.is_dir():
@@ -45,11 +44,11 @@ class Outputs:
 
 
 def run_evaluation(configs: Sequence[Path], data_set_name: str, protocol: Protocol, outputs: Outputs) -> None:
-    """Evaluate runs, print their tables and write what was asked for; see ``cli.Eval`` for the arguments.
+    """Evaluate runs, print their tables and write the files; see ``cli.Eval`` for the arguments.
 
     Raises ``UserError`` for a run, data, a choice or a file that cannot be used.
     """
-    from beags_plugin.evaluation.report import data_set
+    from beags_plugin.evaluation.report import CSV_COLUMNS, data_set
     from beags_plugin.evaluation.table import render_data_set, render_protocol, render_run
     from beags_plugin.pictures.cells import write_picture
     from beags_plugin.pictures.worst_views import worst_views_picture
@@ -74,7 +73,9 @@ def run_evaluation(configs: Sequence[Path], data_set_name: str, protocol: Protoc
     if outputs.json is not None:
         _write(outputs.json, json.dumps(found.to_json(), indent=1, allow_nan=False))
     if outputs.csv is not None:
-        _write_csv(outputs.csv, found.csv_rows())
+        text = StringIO()
+        csv.writer(text, lineterminator="\n").writerows([CSV_COLUMNS, *found.csv_rows()])
+        _write(outputs.csv, text.getvalue().rstrip("\n"))
     if outputs.picture is not None and worst:
         write_picture(outputs.picture, worst_views_picture(worst, outputs.worst))
         CONSOLE.print(f"picture: {outputs.picture}")
@@ -83,7 +84,7 @@ def run_evaluation(configs: Sequence[Path], data_set_name: str, protocol: Protoc
 
 
 def scene_names(configs: Sequence[Path]) -> list[str]:
-    """Of each run the name of its data folder; where two are the same, with the run's folder.
+    """Return the name of each run's data folder, with the run's folder where names would be equal.
 
     Raises ``UserError`` for a file that is no run's config, and for a run given twice.
     """
@@ -104,15 +105,5 @@ def scene_names(configs: Sequence[Path]) -> list[str]:
 
 
 def _write(path: Path, text: str) -> None:
-    write_whole(path, lambda file: file.write(f"{text}\n".encode()))
+    write_text_atomically(f"{text}\n", path)
     CONSOLE.print(f"figures: {path}")
-
-
-def _write_csv(path: Path, rows: Sequence[Sequence[object]]) -> None:
-    from io import StringIO
-
-    from beags_plugin.evaluation.report import CSV_COLUMNS
-
-    text = StringIO()
-    csv.writer(text, lineterminator="\n").writerows([CSV_COLUMNS, *rows])
-    _write(path, text.getvalue().rstrip("\n"))

@@ -1,13 +1,11 @@
-"""The commands of ``beags masks``: check, reproject and make the masks of a scene."""
+"""``beags masks``: check, make and reproject the masks of a scene."""
 
 from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
-import tyro
 from rich.console import Console
 
 from beags_plugin.system.errors import UserError
@@ -122,7 +120,7 @@ class Make:
     overwrite: bool = False
     """Replace masks that are there already."""
     snap: int = 0
-    """Move rims to edges of the photo that are at most so many pixels away; 0 leaves them."""
+    """Move boundaries to edges of the photo, by at most this many pixels; 0 leaves them."""
     layout: str = "auto"
     """How the data set lays out its files (docs/data.md); auto recognises it."""
     images_path: Path | None = None
@@ -140,18 +138,11 @@ class Make:
             CONSOLE.print(line)
 
 
-Action = (
-    Annotated[Check, tyro.conf.subcommand(name="check")]
-    | Annotated[Make, tyro.conf.subcommand(name="make")]
-    | Annotated[Reproject, tyro.conf.subcommand(name="reproject")]
-)
-
-
 @dataclass
 class Masks:
     """Check the masks of a scene, make them consistent, or make them in the first place."""
 
-    action: Action
+    action: Check | Make | Reproject
 
     def run(self) -> None:
         self.action.run()

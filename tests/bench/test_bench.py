@@ -14,7 +14,8 @@ from experiment_files import written
 
 from beags_plugin.bench import runner
 from beags_plugin.bench.experiment import load_experiment
-from beags_plugin.bench.run import Options, run_experiment
+from beags_plugin.bench.options import ExperimentOptions
+from beags_plugin.bench.run import run_experiment
 
 MINIATURE = """
 description = "a miniature"
@@ -49,14 +50,14 @@ values = [0.0, 2.0]
 
 @pytest.fixture(scope="module")
 def miniature(tmp_path_factory):
-    """Options of a finished miniature experiment, its file and its rows."""
+    """ExperimentOptions of a finished miniature experiment, its file and its rows."""
     folder = tmp_path_factory.mktemp("bench")
-    options = Options(output=folder / "out", json=folder / "figures.json", csv=folder / "figures.csv")
+    options = ExperimentOptions(output=folder / "out", json=folder / "figures.json", csv=folder / "figures.csv")
     path = written(folder, MINIATURE)
     return path, options, run_experiment(path, options)
 
 
-def test_trials_are_trained_measured_and_told(miniature):
+def test_trials_are_trained_measured_and_reported(miniature):
     _, options, rows = miniature
     by_name = {row.variant.name: row for row in rows}
     assert list(by_name) == ["alone", "broken", "damage = 0", "damage = 2"]
@@ -93,18 +94,9 @@ def test_a_second_call_trains_only_what_failed(miniature, monkeypatch):
     assert [row.figures for row in again] == [row.figures for row in rows]
 
 
-def test_the_command_tells_a_mistake_in_one_sentence(capsys, tmp_path):
-    from beags_plugin.commands.cli import main
-
-    with pytest.raises(SystemExit) as end:
-        main(["bench", "file", "ablatoin", "--output", str(tmp_path)])
-    assert end.value.code == 2
-    assert "there is no experiment 'ablatoin'" in capsys.readouterr().out
-
-
 def test_the_file_in_the_documentation_is_an_experiment(tmp_path):
     text = (ROOT / "docs/results.md").read_text()
-    block = text.split("## The file")[1].split("Keys are")[0]
+    block = text.split("### The file")[1].split("Keys are")[0]
     path = written(tmp_path, "\n".join(line.strip() for line in block.splitlines()))
     found = load_experiment(path)
     assert [variant.name for variant in found.variants][:2] == ["as it is", "worse masks"]

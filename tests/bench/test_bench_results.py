@@ -1,36 +1,29 @@
-"""What is told of an experiment: means, tables, files, pictures."""
+"""Reports of an experiment: means, tables, files, pictures."""
 
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("nerfstudio")
 
-from pathlib import Path
-
 from experiment_files import GOOD, masks_of, scene, written
 
 from beags_plugin.bench.experiment import Variant, load_experiment
+from beags_plugin.bench.front import pareto_front, plot_front
+from beags_plugin.bench.pictures import plot_experiment
 from beags_plugin.bench.report import write_csv, write_json
-from beags_plugin.bench.results import (
-    COLUMNS,
-    FIGURES,
-    Row,
-    error_left,
-    make_row,
-    means,
-    report_json,
-    table_rows,
-)
+from beags_plugin.bench.results import COLUMNS, FIGURES, ResultRow, error_left, make_row, means, report_json, table_rows
 from beags_plugin.bench.run import rows_of
 from beags_plugin.bench.runner import Outcome
 from beags_plugin.bench.tables import memory_line, per_million_pixels, tables
-from beags_plugin.bench.trials import Run, plan
+from beags_plugin.bench.trials import VariantTrial, plan
 
 
 @pytest.fixture
@@ -100,8 +93,6 @@ def test_means_are_over_the_scenes_that_finished(rows):
 
 
 def test_json_and_csv_hold_every_row_and_the_same_figures(rows, tmp_path, experiment):
-    import dataclasses
-
     experiment = dataclasses.replace(experiment, variants=(Variant("none"), Variant("k = 8", sweep="k", x=8.0)))
     report = report_json(experiment, rows, {"commit": "abc", "quick": False})
     write_json(tmp_path / "deep/r.json", report)
@@ -124,7 +115,7 @@ def test_json_and_csv_hold_every_row_and_the_same_figures(rows, tmp_path, experi
             assert line[name] == ("" if row[name] is None else str(row[name]))
 
 
-def test_tables_say_what_failed_and_whose_figures_the_papers_are(rows):
+def test_tables_list_failures_and_mark_the_papers_figures(rows):
     from rich.console import Console
 
     console = Console(width=200, file=io.StringIO())
@@ -135,46 +126,36 @@ def test_tables_say_what_failed_and_whose_figures_the_papers_are(rows):
     assert "the paper's figures, not ours" in text and "92.0 / 85.8 (52)" in text  # (100 - 85.8) / (100 - 72.8)
 
 
-def test_memory_along_a_sweep_is_told_in_a_sentence(rows):
+def test_a_sweep_has_a_sentence_of_its_memory_and_an_axis_per_pixels(rows, experiment):
+    assert per_million_pixels(rows[1], experiment) == "2"  # 8 of 4 million
+    assert per_million_pixels(rows[0], experiment) == "–"
     assert memory_line(means(rows), "k") == "Along k the peak memory moves from 900 to 900 MB (own: 100 to 100)."
     assert memory_line(means(rows[3:]), "k") is None
 
 
 def test_the_front_is_what_nothing_beats(tmp_path):
-    from beags_plugin.bench.front import draw_front, pareto_front
-
     points = [tuple(point) for point in np.random.default_rng(0).integers(0, 6, (40, 2)).tolist()]
     rows = [
-        Row(Variant(str(i)), "a", 0, {**dict.fromkeys(FIGURES), "cpu_seconds total": x, "psnr_after": y}, {})
+        ResultRow(Variant(str(i)), "a", 0, {**dict.fromkeys(FIGURES), "cpu_seconds total": x, "psnr_after": y}, {})
         for i, (x, y) in enumerate(points)
     ]
-    rows.append(Row(Variant("unknown"), "a", 0, dict.fromkeys(FIGURES), {}))
+    rows.append(ResultRow(Variant("unknown"), "a", 0, dict.fromkeys(FIGURES), {}))
     found = {row.variant.name for row in pareto_front(rows, "cpu_seconds total", "psnr_after")}
     better = {
         (x, y): any(c <= x and q >= y and (c, q) != (x, y) for c, q in points) for x, y in points
     }  # by definition, pair by pair
     assert found == {str(i) for i, point in enumerate(points) if not better[point]}
-    draw_front(tmp_path / "front.png", load_experiment("ablation"), rows)
+    plot_front(tmp_path / "front.png", load_experiment("ablation"), rows)
     assert (tmp_path / "front.png").stat().st_size > 10_000
 
 
-def test_the_axis_is_told_relative_to_the_pixels(rows, experiment):
-    assert per_million_pixels(rows[1], experiment) == "2"  # 8 of 4 million
-    assert per_million_pixels(rows[0], experiment) == "–"
-
-
-def test_the_picture_is_drawn_with_failures_and_without(rows, tmp_path):
-    import dataclasses
-
+def test_the_plot_has_failures_or_none(rows, tmp_path):
     from PIL import Image
 
-    from beags_plugin.bench.pictures import draw
-
-    pytest.importorskip("matplotlib")
     variants = tuple({row.variant.name: row.variant for row in rows}.values())
     experiment = dataclasses.replace(load_experiment("ablation"), variants=variants)
-    draw(tmp_path / "p.png", experiment, rows)
-    draw(tmp_path / "failed.png", experiment, [rows[3]])
+    plot_experiment(tmp_path / "p.png", experiment, rows)
+    plot_experiment(tmp_path / "failed.png", experiment, [rows[3]])
     for name in ("p.png", "failed.png"):
         with Image.open(tmp_path / name) as image:
             assert image.width > 1000 and len(image.convert("L").getcolors()) > 20
@@ -183,9 +164,6 @@ def test_the_picture_is_drawn_with_failures_and_without(rows, tmp_path):
 def test_rows_come_from_outcomes_in_order(experiment):
     variant = experiment.variants[0]
     trial = plan(experiment, [scene()], masks_of(scene()), "code")[0].trial
-    outcomes = {
-        trial.base.digest: Outcome(Path("x"), BASE),
-        trial.digest: Outcome(Path("y"), result(0.5)),
-    }
-    (row,) = rows_of([Run(variant, scene(), 42, trial)], outcomes)
+    outcomes = {trial.base.digest: Outcome(Path("x"), BASE), trial.digest: Outcome(Path("y"), result(0.5))}
+    (row,) = rows_of([VariantTrial(variant, scene(), 42, trial)], outcomes)
     assert row.scene == "a" and row.seed == 42 and row.figures["seconds base training"] == 60.0

@@ -1,4 +1,4 @@
-"""Trials run once, go on after an interruption, and say why they failed."""
+"""Trials run once, resume after an interruption, and report why they failed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from beags_plugin.bench.trials import Trial
 
 
 class FakeWorker:
-    """Writes what the real one would, without training; fails for overrides that say so."""
+    """A worker that writes results without training, and fails where the overrides ask for it."""
 
     def __init__(self) -> None:
         self.ran: list[dict] = []
@@ -57,16 +57,16 @@ def trials(*overrides: dict) -> list[Trial]:
     return [Trial(scene(), "beags-tiny", own, 0, "code", base=base) for own in overrides]
 
 
-def test_an_interrupted_experiment_goes_on_where_it_was(tmp_path, worker):
+def test_an_interrupted_experiment_resumes(tmp_path, worker):
     wanted = trials({"x": 1}, {"x": 2}, {"x": 3})
     worker.interrupt_at = 2  # the base, the first, and then no more
     with pytest.raises(KeyboardInterrupt):
         run_trials(wanted, tmp_path, lambda _: 1)
     worker.interrupt_at = -1
-    told = []
-    outcomes = run_trials(wanted, tmp_path, lambda _: 1, lambda done, total: told.append((done, total)))
+    reported = []
+    outcomes = run_trials(wanted, tmp_path, lambda _: 1, lambda done, total: reported.append((done, total)))
     assert [request["overrides"] for request in worker.ran] == [{"base": True}, {"x": 1}, {"x": 2}, {"x": 3}]
-    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert reported == [(1, 4), (2, 4), (3, 4), (4, 4)]
     for trial in wanted:
         outcome = outcomes[trial.digest]
         assert outcome.failed is None and outcome.result == {"digest": trial.digest}
@@ -74,7 +74,7 @@ def test_an_interrupted_experiment_goes_on_where_it_was(tmp_path, worker):
     assert worker.ran[1]["base"] == str(outcomes[wanted[0].base.digest].folder / "run")
 
 
-def test_a_failed_trial_says_why_and_is_tried_again(tmp_path, worker):
+def test_a_failed_trial_has_a_reason_and_is_tried_again(tmp_path, worker):
     wanted = trials({"fail": 1}, {"x": 1}, {"die": 1})
     for _ in range(2):
         outcomes = run_trials(wanted, tmp_path, lambda _: 1)
@@ -92,7 +92,7 @@ def test_a_failed_base_fails_what_starts_from_it(tmp_path, worker):
 
 def test_a_program_that_cannot_start_leaves_its_complaint_in_the_log(tmp_path, monkeypatch):
     complaint = "import sys; sys.exit('no such preset')"
-    monkeypatch.setattr(runner, "_command", lambda: [sys.executable, "-c", complaint])
+    monkeypatch.setattr(runner, "PROGRAM", [sys.executable, "-c", complaint])
     with runner.Worker() as worker:
         for trial in ("a", "b"):  # it is started anew for the next one
             (tmp_path / trial).mkdir()

@@ -10,13 +10,13 @@ from pathlib import Path
 sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed
 
 from benchmarks import scaling
-from benchmarks.scaling import Options, run_scaling
+from benchmarks.scaling import ScalingOptions, run_scaling
 from benchmarks.scaling_stages import STAGES
 
 
 def test_files_and_tables(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(scaling.CONSOLE, "_width", 120)
-    rows = run_scaling(Options(quick=True, output=tmp_path, json=tmp_path / "deep" / "s.json"))
+    rows = run_scaling(ScalingOptions(quick=True, output=tmp_path, json=tmp_path / "deep" / "s.json"))
     report = json.loads((tmp_path / "deep" / "s.json").read_text())
     assert report["rows"] == [vars(row) for row in rows] and report["commit"] and report["machine"]
     assert {(row.axis, row.size) for row in rows} == {
@@ -29,4 +29,4 @@ def test_files_and_tables(tmp_path, capsys, monkeypatch):
         assert len(list(csv.DictReader(file))) == len(rows)
     assert (tmp_path / "scaling.png").stat().st_size > 10_000
     printed = capsys.readouterr().out
-    assert "Slope of time" in printed and "Milliseconds at so many classes" in printed
+    assert "Slope of time" in printed and "Milliseconds by number of classes" in printed

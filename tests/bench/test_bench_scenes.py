@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -13,8 +14,9 @@ pytest.importorskip("nerfstudio")
 from experiment_files import GOOD, masks_of, scene, written
 
 from beags_plugin.bench.experiment import load_experiment
-from beags_plugin.bench.run import Options, adapted, scenes_of
-from beags_plugin.bench.scenes import Scene, damaged_masks, given_scenes
+from beags_plugin.bench.options import ExperimentOptions
+from beags_plugin.bench.run import adapted, scenes_of
+from beags_plugin.bench.scenes import TrialScene, damaged_masks, given_scenes
 from beags_plugin.bench.trials import plan, steps_of
 from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.sample.writer import SampleConfig, write_sample
@@ -32,7 +34,7 @@ SMALL = {"width": 48, "height": 36, "num_train": 8, "num_test": 2, "num_points":
 @pytest.fixture(scope="module")
 def sample(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene") / "sample"
-    return Scene("sample 5", write_sample(folder, SampleConfig(seed=5, **SMALL)), 1.0, "digest", seed=5)
+    return TrialScene("sample 5", write_sample(folder, SampleConfig(seed=5, **SMALL)), 1.0, "digest", seed=5)
 
 
 def read_all(folder: Path) -> dict[str, np.ndarray]:
@@ -63,31 +65,29 @@ def test_more_damage_is_more_wrong_and_spares_held_out_views(sample, tmp_path):
 
 
 def test_scenes_are_the_samples_or_the_users_or_both(sample, tmp_path, experiment, monkeypatch):
-    import dataclasses
-
     experiment = dataclasses.replace(experiment, sample=SMALL, sample_seeds=(5, 6))
-    options = Options(output=tmp_path)
+    options = ExperimentOptions(output=tmp_path)
     assert [s.name for s in scenes_of(experiment, options)] == ["sample 5", "sample 6"]
-    assert [s.name for s in scenes_of(experiment, Options(data=(sample.data,), output=tmp_path))] == ["sample"]
-    both = scenes_of(experiment, Options(data=(sample.data,), scenes=1, output=tmp_path, downscale=2.0))
+    given = ExperimentOptions(data=(sample.data,), output=tmp_path)
+    assert [s.name for s in scenes_of(experiment, given)] == ["sample"]
+    both = scenes_of(experiment, ExperimentOptions(data=(sample.data,), scenes=1, output=tmp_path, downscale=2.0))
     assert [(s.name, s.downscale) for s in both] == [("sample 5", 1.0), ("sample", 2.0)]
     for wrong, words in [
-        (Options(scenes=3, output=tmp_path), "--scenes is 3"),
-        (Options(scenes=0, output=tmp_path), "no scene to train on"),
-        (Options(data=(tmp_path / "absent",), output=tmp_path), "is no folder"),
-        (Options(data=(sample.data, sample.data), output=tmp_path), "two of the given folders are called sample"),
+        ({"scenes": 3}, "--scenes is 3"),
+        ({"scenes": 0}, "no scene to train on"),
+        ({"data": (sample.data, sample.data)}, "two of the given folders are called sample"),
     ]:
         with pytest.raises(UserError, match=words):
-            scenes_of(experiment, wrong)
+            scenes_of(experiment, ExperimentOptions(output=tmp_path, **wrong))
     assert given_scenes([sample.data], None)[0].downscale == 1.0
 
 
 def test_quick_keeps_the_ends_of_sweeps_and_trains_a_few_steps(experiment):
-    quick = adapted(experiment, Options(quick=True))
+    quick = adapted(experiment, ExperimentOptions(quick=True))
     assert [v.name for v in quick.variants] == [v.name for v in experiment.variants]  # two points a line are its ends
-    longer = adapted(load_experiment("sensitivity"), Options(quick=True))
+    longer = adapted(load_experiment("sensitivity"), ExperimentOptions(quick=True))
     assert [v.x for v in longer.variants] == [5.0, 5000.0, 1.0, 1000.0]
     trial = plan(quick, [scene()], masks_of(scene()), "code")[1].trial
     assert steps_of(trial) == 7 and steps_of(trial.base) < 300
     with pytest.raises(UserError, match="no preset 'beags-huge'"):
-        adapted(experiment, Options(preset="beags-huge"))
+        adapted(experiment, ExperimentOptions(preset="beags-huge"))

@@ -1,4 +1,4 @@
-"""The benchmark of rasterizers runs end to end, and names what it measured."""
+"""The benchmark of rasterizers runs end to end."""
 
 from __future__ import annotations
 

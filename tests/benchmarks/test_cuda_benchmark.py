@@ -1,4 +1,4 @@
-"""The benchmark for GPUs runs on the emulation; the check for GPUs says what is missing."""
+"""The benchmark for GPUs runs on the emulation; the check for GPUs reports a missing GPU."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from benchmarks.scenes import Size
 SCRIPT = ROOT / "scripts" / "gpu_check.sh"
 
 
-def test_rows_of_drawings_and_steps(monkeypatch, tmp_path, capsys):
+def test_rows_of_renderings_and_steps(monkeypatch, tmp_path, capsys):
     """On the CPU, of tiny scenes; the clock only calls what it is given."""
     if (reason := EmulatedCudaRasterizer.unavailable()) or (reason := extension.status()[1]):
         pytest.skip(reason)
@@ -44,7 +44,7 @@ def test_rows_of_drawings_and_steps(monkeypatch, tmp_path, capsys):
 
 
 @pytest.mark.skipif(shutil.which("nvidia-smi") is not None, reason="it looks for a GPU, and may find one here")
-def test_the_check_says_what_is_missing(tmp_path):
+def test_the_check_reports_a_missing_gpu(tmp_path):
     command = ["bash", str(SCRIPT), "--out", str(tmp_path), "tests"]
     done = subprocess.run(command, capture_output=True, text=True, env={"PATH": "/usr/bin:/bin"}, timeout=60)
     assert done.returncode == 1

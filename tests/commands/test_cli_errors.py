@@ -1,4 +1,4 @@
-"""What ``beags`` says of a user's mistakes, word for word: one sentence, exit code 2, and no traceback.
+"""Errors of users of ``beags``, word for word: one sentence, exit code 2, and no traceback.
 
 ``{tmp}`` is the test's folder, with: ``run`` (refined), ``plain`` (a base without classes), ``alone`` (refined, but its
 base is gone), the data ``lab``, a file ``file`` and ``notes.yml``, a YAML file that is no run.
@@ -6,7 +6,9 @@ base is gone), the data ``lab``, a file ``file`` and ``notes.yml``, a YAML file 
 
 from __future__ import annotations
 
+import dataclasses
 import io
+import typing
 
 import pytest
 from rich.console import Console
@@ -14,7 +16,7 @@ from run_folders import write_scene, write_trained
 
 pytest.importorskip("nerfstudio")
 
-from beags_plugin.commands import cli
+from beags_plugin.commands import cli, masks
 
 RUN = "{tmp}/run/config.yml"
 PRESETS = "beags, beags-accurate, beags-base, beags-fast, beags-paper, beags-refine, beags-tiny"
@@ -102,6 +104,8 @@ SENTENCES = {
     f"one of {PRESETS}.",
     "bench file {tmp}/absent.toml --output {tmp}/bench": "the experiment {tmp}/absent.toml cannot be read (No such "
     "file or directory): name an existing file of that kind.",
+    "bench file ablatoin --output {tmp}/bench": "there is no experiment 'ablatoin': choose one of ablation, base, "
+    "depth, improvements, masks, presets, sensitivity, tradeoff, or name a .toml file.",
     # doctor
     "doctor --json {tmp}/file/x.json": "{tmp}/file/x.json cannot be written (File exists): choose another place.",
 }
@@ -119,7 +123,7 @@ def folder(tmp_path_factory):
 
 
 @pytest.mark.parametrize("arguments", SENTENCES)
-def test_a_mistake_is_told_in_this_sentence(folder, monkeypatch, arguments):
+def test_an_error_prints_this_sentence(folder, monkeypatch, arguments):
     from beags_plugin.commands.doctor import diagnosis
 
     out = io.StringIO()
@@ -129,21 +133,14 @@ def test_a_mistake_is_told_in_this_sentence(folder, monkeypatch, arguments):
     with pytest.raises(SystemExit) as end:
         cli.main(arguments.replace("{tmp}", str(folder)).split())
     assert end.value.code == 2
-    said = out.getvalue().replace(str(folder), "{tmp}")
-    assert said == f"beags: {SENTENCES[arguments]}\n"
+    assert out.getvalue().replace(str(folder), "{tmp}") == f"beags: {SENTENCES[arguments]}\n"
 
 
 def test_every_subcommand_has_a_sentence():
-    import typing
-
-    from beags_plugin.commands.masks import Action
-
-    def names(union) -> set[str]:
-        return {info.name for one in typing.get_args(union) for info in typing.get_args(one)[1:]}
-
     words = [arguments.split() for arguments in SENTENCES]
-    assert {first for first, *_ in words} == names(cli.Command)
-    assert {second for first, second, *_ in words if first == "masks"} == names(Action)
+    assert {first for first, *_ in words} == {command.__name__.lower() for command in typing.get_args(cli.Command)}
+    actions = typing.get_args(typing.get_type_hints(masks.Masks)["action"])
+    assert {second for first, second, *_ in words if first == "masks"} == {one.__name__.lower() for one in actions}
 
 
 def test_an_interrupt_is_no_traceback(monkeypatch, capsys):
@@ -158,12 +155,8 @@ def test_an_interrupt_is_no_traceback(monkeypatch, capsys):
 
 def test_subcommands_read_alike():
     """A flag that several subcommands have is of the same kind in all of them, and runs are named by one flag."""
-    import dataclasses
-    import typing
-
     kinds: dict[str, set[str]] = {}
-    for one in typing.get_args(cli.Command):
-        command = typing.get_args(one)[0]
+    for command in typing.get_args(cli.Command):
         for field in dataclasses.fields(command):
             kinds.setdefault(field.name, set()).add(str(field.type))
     assert kinds["json"] == {"Path | None"} and kinds["object"] == {"tuple[str, ...]"}

@@ -1,4 +1,4 @@
-"""What ``beags demo`` decides before and around the training."""
+"""``beags demo`` before and around the training."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from run_folders import write_scene
 
 from beags_plugin.commands import demo
 from beags_plugin.commands.cli import main
-from beags_plugin.commands.demo import STAMP, _clear, _trained, check_preset
+from beags_plugin.commands.demo import STAMP, _trained, check_preset
 from beags_plugin.data.quick import quick_downscale
 from beags_plugin.plugin.objects.extract import folder_names
 from beags_plugin.plugin.options.config import base_config
@@ -23,14 +23,11 @@ from beags_plugin.system.errors import UserError
 
 def test_large_images_are_scaled_down_by_a_whole_factor(tmp_path):
     assert quick_downscale(tmp_path) == 1.0
-    write_image(tmp_path / "images/left/a.png", np.zeros((300, 400), np.uint8))
-    assert quick_downscale(tmp_path) == 2.0  # 200 x 150 are 30,000 pixels
-
-
-def test_images_elsewhere_are_found_through_the_poses(tmp_path):
-    write_image(tmp_path / "photos/a.png", np.zeros((300, 400), np.uint8))
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [{"file_path": "photos/a.png"}]}))
-    assert quick_downscale(tmp_path) == 2.0
+    for folder, file in (("below", "images/left/a.png"), ("posed", "photos/a.png")):
+        write_image(tmp_path / folder / file, np.zeros((300, 400), np.uint8))
+    (tmp_path / "posed/transforms.json").write_text(json.dumps({"frames": [{"file_path": "photos/a.png"}]}))
+    assert quick_downscale(tmp_path / "below") == 2.0  # 200 x 150 are 30,000 pixels
+    assert quick_downscale(tmp_path / "posed") == 2.0
 
 
 def test_the_images_that_the_layout_takes_decide(tmp_path):
@@ -43,7 +40,7 @@ def test_the_images_that_the_layout_takes_decide(tmp_path):
     assert quick_downscale(tmp_path) == 2.0  # 250 x 187 are 46,750 pixels
 
 
-def test_an_image_that_cannot_be_read_is_told_in_a_sentence(tmp_path):
+def test_an_image_that_cannot_be_read_is_a_user_error(tmp_path):
     (tmp_path / "images").mkdir()
     (tmp_path / "images/a.png").write_text("no picture")
     with pytest.raises(UserError, match="cannot be read as an image"):
@@ -60,17 +57,6 @@ def test_only_presets_of_both_phases_make_a_demo():
 
 
 def test_a_run_that_is_not_the_demos_is_kept(tmp_path):
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run/notes.txt").write_text("mine")
-    with pytest.raises(UserError, match="is not the demo's"):
-        _clear(tmp_path)
-    assert (tmp_path / "run/notes.txt").exists()
-    (tmp_path / STAMP).write_text("{}")
-    _clear(tmp_path)
-    assert not (tmp_path / "run").exists()
-
-
-def test_nothing_is_written_into_a_folder_that_is_not_the_demos(tmp_path):
     data, run = write_scene(tmp_path / "data"), tmp_path / "out/run"
     run.mkdir(parents=True)
     (run / "notes.txt").write_text("mine")
@@ -93,7 +79,7 @@ def test_a_damaged_stamp_means_not_trained(tmp_path):
 
 
 def test_a_demo_that_was_killed_goes_on(tmp_path, monkeypatch):
-    """Killed in the training, it resumes; after the training, it measures; with another request, it starts anew."""
+    """A demo killed in the training resumes; after the training, it measures; with another request, it starts anew."""
     data, output = write_scene(tmp_path / "data"), tmp_path / "out"
     run, commands, measured = output / "run", [], []
 
@@ -150,12 +136,7 @@ def test_brackets_in_a_path_are_no_markup(tmp_path, capsys):
 
 
 def test_objects_never_share_a_folder():
-    assert folder_names({1: "cup 1", 2: "cup_1", 3: "Box", 4: "ring"}) == {
-        1: "cup_1_1",
-        2: "cup_1_2",
-        3: "Box",
-        4: "ring",
-    }
+    assert folder_names({1: "cup 1", 2: "cup_1", 3: "Box"}) == {1: "cup_1_1", 2: "cup_1_2", 3: "Box"}
     assert folder_names({1: "cup", 2: "Cup"}) == {1: "cup_1", 2: "Cup_2"}
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import typing
 from importlib import import_module
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from beags_plugin.extraction.ply import write_ply
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 PROGRAMS = re.compile(r"^(?:[A-Z_]+=\S+ )*(beags|ns-[a-z-]+|make|pip|python) ")
-SUBSTITUTES = {  # what a document calls it: what it is in the test's folder
+SUBSTITUTES = {  # path in the documents: path in the test's folder
     "outputs/.../extracted/cup/config.yml": "run/extracted/cup/config.yml",
     "outputs/.../config.yml": "run/config.yml",
     "outputs/.../nerfstudio_models": "run/nerfstudio_models",
@@ -34,7 +35,7 @@ SUBSTITUTES = {  # what a document calls it: what it is in the test's folder
     "RUN_A/config.yml": "run/config.yml",
     "RUN_B/config.yml": "other/config.yml",
 }
-RUN = {  # command of beags: what is appended to make it quick
+RUN = {  # command of beags: flags appended to make it quick
     "extract": [],
     "eval": [],
     "export": ["--resolution", "24", "--min-views", "1"],
@@ -51,7 +52,7 @@ PARSERS = {
 
 
 def code_lines(text: str) -> list[str]:
-    """The lines of fenced and indented code blocks; those that end in a backslash are joined with the next."""
+    """Return the lines of fenced and indented code blocks, continued lines joined."""
     lines, fenced = [], False
     for line in text.replace("\\\n", " ").splitlines():
         if line.startswith("```"):
@@ -62,7 +63,7 @@ def code_lines(text: str) -> list[str]:
 
 
 def commands_of(document: Path) -> list[str]:
-    """The commands that a document's code blocks show; a synopsis (with brackets) is none."""
+    """Return the commands of a document's code blocks, without synopses (which have brackets)."""
     return [
         line
         for line in code_lines(document.read_text("utf8"))
@@ -83,7 +84,7 @@ def words_of(line: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A folder with what the documents speak of: two runs of the data my_scene, and a scene to start from."""
+    """Return a folder with two runs of the data my_scene, and a scene to start from."""
     root = tmp_path_factory.mktemp("reader")
     write_scene(root / "my_scene")
     for name in ("run", "other"):
@@ -104,7 +105,7 @@ def parsed_by_tyro(kind, words: list[str], **options):
 
 
 def training_config(words: list[str]):
-    """The config that ns-train makes of ``words``."""
+    """Return the config that ns-train makes of ``words``."""
     from beags_plugin.plugin.options.config import BeagsTrainerConfig
     from beags_plugin.plugin.presets import load_preset, preset_names
 
@@ -167,10 +168,8 @@ def test_the_training_of_the_quick_start_runs(folder, monkeypatch):
 
 
 def test_commands_in_the_text_exist():
-    """What the text calls `beags NAME` is a subcommand."""
-    import typing
-
-    known = {info.name for one in typing.get_args(cli.Command) for info in typing.get_args(one)[1:]}
+    """Every `beags NAME` in the text is a subcommand."""
+    known = {command.__name__.lower() for command in typing.get_args(cli.Command)}
     for document in DOCUMENTS:
         named = set(re.findall(r"`beags ([a-z-]+)", document.read_text("utf8")))
         assert named <= known, f"{document.name}: {named - known}"

@@ -1,9 +1,9 @@
-"""The commands of README.md, run one after the other as a reader would, in a folder of their own.
+"""The commands of README.md, run one after the other in a folder of their own.
 
 Programs are started, but for most commands of beags, which run in this process.
 
-``RUN`` says how each is run: as it stands, but for the reader's own names (``OWN``), with a few flags appended that
-make it quick. ``ELSEWHERE`` lists the others, each with the reason. Together they must be all of README.md.
+``RUN`` lists commands with flags that make them quick; ``OWN`` replaces the reader's names. ``ELSEWHERE`` lists the
+other commands, each with the reason. Together they must be all of README.md.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SHORT = (
     "--pipeline.model.prepare.k 20 --steps-per-save 20"
 )
 CONFIG = "--load-config outputs/.../config.yml"
-RUN = {  # in this order; the command in README.md: what is appended
+RUN = {  # in this order; the command in README.md: flags that are appended
     "beags sample": "--output my_scene --width 64 --height 48 --views 12",
     "beags doctor [--data X]": "--data my_scene",
     "beags masks make --data X --source NAME": "--options folder=masks --output made",
@@ -75,7 +75,7 @@ ELSEWHERE = {
     "scripts/sanitize.sh": "compiles everything anew",
     "pip install -c constraints.txt -e .": "make setup has done it in the environment that runs this test",
 }
-OWN = {  # what README.md calls it: what it is here
+OWN = {  # name in README.md: name here
     r" \[.*\]": "",
     r"outputs/\.\.\.": "{run}",
     r"RUN$": "{run}",
@@ -86,7 +86,7 @@ OWN = {  # what README.md calls it: what it is here
 
 
 def commands() -> set[str]:
-    """Those in code blocks, without their comments, and those in the first column of tables."""
+    """Return the commands in code blocks, without comments, and in the first column of tables."""
     blocks = [line.partition("  ")[0].partition(" #")[0].strip() for line in code_lines(README)]
     tables = re.findall(r"^\| `([^`]+)` \|", README, re.MULTILINE)
     return {line for line in (*blocks, *tables) if PROGRAM.match(line)}
@@ -111,7 +111,7 @@ def test_make_calls_the_commands():
 
 
 class Reader:
-    """Somebody at a terminal in ``folder``."""
+    """A user at a terminal in ``folder``."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -122,7 +122,7 @@ class Reader:
 
     @property
     def run(self) -> Path:
-        """The run of ns-train that was begun last."""
+        """Return the run of ns-train that was begun last."""
         return max((path.parent for path in self.folder.glob("outputs/my_scene/beags-*/*/config.yml")), key=_changed)
 
     def words(self, line: str, more: str) -> list[str]:
@@ -133,7 +133,7 @@ class Reader:
 
     @contextmanager
     def started(self, line: str, more: str) -> Iterator[subprocess.Popen[bytes]]:
-        """The program, which ends with this block at the latest."""
+        """Start the program, which ends with this block at the latest."""
         command = bound(self.words(line, more), signal.SIGKILL)
         with open(self.folder / "log.txt", "w") as log:
             process = subprocess.Popen(
@@ -161,7 +161,7 @@ class Reader:
             time.sleep(0.02)
 
     def trains_and_is_killed(self, line: str, more: str) -> None:
-        """After the first checkpoint."""
+        """Kill the training after its first checkpoint."""
         with self.started(line, more) as process:
             self.waits(process, lambda: any(self.folder.glob("outputs/my_scene/*/*/nerfstudio_models/step-*.ckpt")))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from beags_plugin.bench.scenes import Scene
+from beags_plugin.bench.scenes import TrialScene
 
 GOOD = """
 description = "d"
@@ -44,9 +44,9 @@ def written(folder: Path, text: str) -> str:
     return str(path)
 
 
-def scene(name: str = "a", digest: str = "1") -> Scene:
-    return Scene(name, Path("/nowhere"), 1.0, digest)
+def scene(name: str = "a", digest: str = "1") -> TrialScene:
+    return TrialScene(name, Path("/nowhere"), 1.0, digest)
 
 
-def masks_of(*scenes: Scene) -> dict[tuple[str, float], Path]:
+def masks_of(*scenes: TrialScene) -> dict[tuple[str, float], Path]:
     return {(s.name, degree): Path(f"masks-{s.name}-{degree}") for s in scenes for degree in (0.0, 1.5)}

@@ -1,1 +1,1 @@
-"""``beags doctor``: what works here, what is missing, and the one command that repairs each."""
+"""``beags doctor``: checks of the installation, and the one command that repairs each failure."""

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from beags_plugin.commands.doctor.check import Check, first_line
 
 REBUILD = "pip install --force-reinstall --no-deps ."
-"""In the folder of the clone: builds the compiled backend anew."""
+"""Builds the compiled backend anew; to run in the folder of the clone."""
 
 
 def rasterizers() -> list[Callable[[], Check]]:
@@ -25,7 +25,7 @@ def rasterizers() -> list[Callable[[], Check]]:
 
 
 def rasterizer(name: str) -> Check:
-    """Render with a backend in a process of its own, which may die without ending the doctor."""
+    """Check a backend by rendering in a process of its own, which may die without ending the doctor."""
     title, required = f"rasterizer {name}", name == "torch"
     done = subprocess.run(
         [sys.executable, "-c", TRIAL, json.dumps(sys.path), name], capture_output=True, text=True, timeout=120
@@ -43,7 +43,7 @@ def rasterizer(name: str) -> Check:
     return Check(title, False, sentence + avoided, required, REBUILD)
 
 
-_AVOIDED = {  # how to do without a backend that fails
+_AVOIDED = {  # ways to run without a backend that fails
     "native": "BEAGS_NATIVE=0 in the environment avoids it",
     "cuda": "training with --machine.device-type cpu avoids it",
 }
@@ -69,11 +69,11 @@ try:
     inputs = SurfelInputs(values[0].requires_grad_(), *values[1:])
     render = rasterizer.rasterize(inputs, Camera(torch.eye(4), K, 8, 8), RasterSettings(0.1, 9.0), background)
     render.color.sum().backward()
-    assert render.alpha.max() > 0.1, "it draws nothing"
+    assert render.alpha.max() > 0.1, "it renders nothing"
     native = sys.modules.get("beags_plugin._native") if name == "native" else None
     kernels = f", with {native.instruction_set()} kernels" if native else ""
     print(json.dumps([True, "can run here" + kernels, False]))
 except UserError as error:
-    # with a reason "auto" draws with another backend; an instruction set that was asked for in vain stops everything
+    # with a reason "auto" takes another backend; an instruction set that is requested in vain stops everything
     print(json.dumps([False, reason or str(error), reason is not None]))
 """

@@ -1,8 +1,8 @@
-"""The result of one check of the doctor, and the table of all of them."""
+"""Results of the doctor's checks, and their table."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -11,10 +11,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Check:
-    """One thing looked at.
+    """The result of one check.
 
-    name: what. ok: whether it is there. sentence: what was found, or what to do. required: whether beags cannot
-    run without it. repair: the one command that mends it, or "" where it is there or no command does.
+    name: of the thing that is checked. ok: it is there and works. sentence: the finding, or advice. required: beags
+    cannot run without it. repair: the one command that repairs it; "" if it works or no command repairs it.
     """
 
     name: str
@@ -22,10 +22,6 @@ class Check:
     sentence: str
     required: bool = True
     repair: str = ""
-
-    def to_json(self) -> dict[str, object]:
-        """Plain values by name."""
-        return asdict(self)
 
 
 def first_line(error: BaseException) -> str:
@@ -37,7 +33,7 @@ def first_line(error: BaseException) -> str:
 def print_report(checks: list[Check], console: Console | None = None) -> None:
     """Print the checks as a table: "ok", "missing" (beags cannot run) or "absent" (something optional).
 
-    Below what does not work stands the one command that repairs it.
+    The command that repairs a failed check stands below it.
     """
     from rich.console import Console
     from rich.table import Column, Table

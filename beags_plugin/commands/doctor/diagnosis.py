@@ -1,4 +1,4 @@
-"""Checks of what works here and what is missing."""
+"""Checks of the installation and of a scene."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from beags_plugin.commands.doctor.backends import rasterizers
 from beags_plugin.commands.doctor.check import Check, first_line
 
 _OPENCV = "pip install --force-reinstall --no-deps opencv-contrib-python-headless==4.10.0.84"
-_REPAIRS = {  # by the name of what cannot even be looked at
+_REPAIRS = {  # by the name of a check that raises
     "torch": "pip install torch",
     "nerfstudio": "pip install nerfstudio==1.1.5",
     "opencv": _OPENCV,
@@ -21,7 +21,7 @@ _REPAIRS = {  # by the name of what cannot even be looked at
 
 
 def diagnose() -> list[Check]:
-    """Look at everything beags uses; never fails, whatever is missing or broken."""
+    """Check everything that beags uses; never fails, whatever is missing or broken."""
     checks = [_python, _torch, _nerfstudio, _presets, _opencv, _open3d, _cuda, _nvcc, *rasterizers()]
     return [_safely(check) for check in checks]
 

@@ -1,0 +1,35 @@
+"""Options of every experiment, which are flags of its command."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass
+class ExperimentOptions:
+    """Run an experiment: many short trainings on common bases. An interrupted experiment continues."""
+
+    data: tuple[Path, ...] = ()
+    """Folders with images, poses and masks to train on, instead of the experiment's samples."""
+    scenes: int | None = None
+    """How many of the experiment's sample scenes; all if left out, none where --data is given."""
+    preset: str | None = None
+    """What to train with: a preset of method_configs/; the experiment's own if left out."""
+    downscale: float | None = None
+    """Divide the image size of --data by this; chosen for a quick run if left out."""
+    quick: bool = False
+    """Try the experiment out in a minute or two: tiny scenes, few steps, figures that mean nothing."""
+    output: Path = Path("outputs/bench")
+    """Folder of scenes, trials and results."""
+    json: Path | None = None
+    """File for all figures; <output>/<experiment>.json if left out."""
+    csv: Path | None = None
+    """File for all figures as a table; <output>/<experiment>.csv if left out."""
+    picture: Path | None = None
+    """File for the picture; <output>/<experiment>.png if left out."""
+
+    def files(self, experiment: str) -> dict[str, Path]:
+        """Return the files to write, by "json", "csv" and "picture"."""
+        suffixes = {"json": ".json", "csv": ".csv", "picture": ".png"}
+        return {kind: getattr(self, kind) or self.output / f"{experiment}{end}" for kind, end in suffixes.items()}
