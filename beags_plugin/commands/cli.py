@@ -276,7 +276,7 @@ Command = (
 
 def say(error: UserError) -> NoReturn:
     """Print a user's mistake and end with exit code 2."""
-    if not error.told:
+    if not error.reported:
         CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}")
     sys.exit(2)
 

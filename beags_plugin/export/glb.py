@@ -20,7 +20,7 @@ _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 
 
 def glb_bytes(mesh: Mesh, name: str) -> bytes:
-    """The file's content: one node, one mesh, one unlit material; places as float32, colours as 16 bits, linear."""
+    """Return the file's content: one node, one mesh, one unlit material; float32 places, linear 16-bit colours."""
     positions = mesh.vertices.astype("<f4")
     colors = np.full((len(positions), 4), 65535, dtype="<u2")
     colors[:, :3] = np.round(linear_from_srgb(mesh.colors) * 65535)
@@ -79,6 +79,6 @@ def glb_bytes(mesh: Mesh, name: str) -> bytes:
 
 
 def linear_from_srgb(colors: np.ndarray) -> np.ndarray:
-    """Light intensities 0..1 of sRGB values 0..1 (IEC 61966-2-1)."""
+    """Return light intensities 0..1 of sRGB values 0..1 (IEC 61966-2-1)."""
     colors = np.clip(np.asarray(colors, dtype=np.float64), 0.0, 1.0)
     return np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)

@@ -14,7 +14,7 @@ from beags_plugin.core.sh import MAX_DEGREE, num_sh_bases
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.frames import to_input_frame
-from beags_plugin.extraction.splat_file import read_splat_file
+from beags_plugin.extraction.splat_file import numbered, read_splat_file
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.ply import write_vertices
 
@@ -67,21 +67,17 @@ def _columns(surfels: Surfels, layout: str) -> dict[str, np.ndarray]:
     blocks = {
         ("x", "y", "z"): surfels.means.detach(),
         ("nx", "ny", "nz"): normals,
-        _numbered("f_dc", 3): surfels.sh_dc.detach(),
-        _numbered("f_rest", rest.shape[1]): rest,
+        numbered("f_dc", 3): surfels.sh_dc.detach(),
+        numbered("f_rest", rest.shape[1]): rest,
         ("opacity",): surfels.opacity_logits.detach()[:, None],
-        _numbered("scale", scales.shape[1]): scales,
-        _numbered("rot", 4): quats,
+        numbered("scale", scales.shape[1]): scales,
+        numbered("rot", 4): quats,
     }
     return {
         name: values[:, i].cpu().numpy().astype("<f4")
         for names, values in blocks.items()
         for i, name in enumerate(names)
     }
-
-
-def _numbered(prefix: str, count: int) -> tuple[str, ...]:
-    return tuple(f"{prefix}_{i}" for i in range(count))
 
 
 def read_ply(path: str | Path) -> tuple[Surfels, Tensor | None]:

@@ -84,7 +84,7 @@ class OccupancyLoss(Loss):
 
 @torch.no_grad()
 def _outside(means, quats, log_scales, opacity_logits, class_ids: Tensor, grid: VisibilityGrid) -> Tensor:
-    """Indices [M] int64 of the Gaussians whose disc is not wholly in valid voxels; the others' loss is exactly 0."""
+    """Return [M] int64, the Gaussians whose disc is not wholly in valid voxels; the others' loss is exactly 0."""
     scales = log_scales.exp()
     half_axes = RADIUS * scales[:, None, :] * rotation_from_quat(quats)[..., :2]  # [N, 3, 2]
     inside = grid.disc_inside(means, half_axes[..., 0], half_axes[..., 1], class_ids)
@@ -128,7 +128,7 @@ def _sums(
     means: Tensor, axes_u: Tensor, axes_v: Tensor, class_ids: Tensor, grid: VisibilityGrid,
     seed: int, step: int, gaussians: Tensor, num_samples: int,
 ) -> Tensor:  # fmt: skip
-    """Sums over the samples of G Q times 1, u, v, u^2, v^2, u v: [6, M]."""
+    """Return sums over the samples of G Q times 1, u, v, u^2, v^2, u v: [6, M]."""
     total = means.new_zeros(6, len(means))
     block = min(max(len(means), 1), _CHUNK_POINTS)
     per_chunk = max(1, _CHUNK_POINTS // block)

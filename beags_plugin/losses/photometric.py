@@ -23,7 +23,7 @@ _BLOCK = 32  # pixels filtered by one small matrix product; measured best of 16,
 
 @dataclass(frozen=True)
 class PhotometricLoss(Loss):
-    """(1 - ssim_weight) L1 + ssim_weight (1 - SSIM) between the drawn image and the photograph."""
+    """(1 - ssim_weight) L1 + ssim_weight (1 - SSIM) between the rendered image and the photograph."""
 
     ssim_weight: float = 0.2
 
@@ -43,7 +43,7 @@ class PhotometricLoss(Loss):
 
 
 def ssim(image: Tensor, reference: Tensor) -> Tensor:
-    """Mean structural similarity: Gaussian window of 11 pixels, sigma 1.5, zeros outside the image as in 3DGS.
+    """Return the mean structural similarity: Gaussian window of 11 pixels, sigma 1.5, zeros outside as in 3DGS.
 
     image, reference: [H, W, C] float of one dtype, in 0..1. Returns a scalar in -1..1; its gradient goes to ``image``
     only. Raises ``ValueError`` if the shapes differ or ``reference`` wants a gradient.
@@ -121,7 +121,7 @@ def blur(maps: Tensor) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _band(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """[42, 32]: column o holds the normalised window from row o on."""
+    """Return [42, 32]: column o holds the normalised window from row o on."""
     offsets = torch.arange(WINDOW, dtype=torch.float64) - _REACH
     window = torch.exp(-0.5 * (offsets / SIGMA) ** 2)
     window /= window.sum()

@@ -45,7 +45,7 @@ class FiledTensors(Sequence[Tensor]):
         return self._count
 
     def __getitem__(self, index: int | slice) -> Any:
-        """One tensor; of a slice, a list."""
+        """Read one tensor, or for a slice a list."""
         chosen = range(self._count)[index]
         return self._read(chosen) if isinstance(chosen, int) else [self._read(each) for each in chosen]
 
@@ -71,7 +71,7 @@ def write_tensors(file: BinaryIO, tensors: Iterable[Tensor]) -> None:
 
 
 def filed(tensors: Iterable[Tensor], device: torch.device | str = "cpu") -> FiledTensors:
-    """Tensors moved to a temporary file as they come; it goes with the last reference to what is returned.
+    """Move tensors to a temporary file as they come; it goes with the last reference to what is returned.
 
     Raises ``UserError`` if the folder of temporary files is full.
     """

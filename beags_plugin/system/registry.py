@@ -46,7 +46,7 @@ class Registry:
             )
 
     def names(self) -> list[str]:
-        """The registered names, sorted; imports none of them."""
+        """Return the registered names, sorted; imports none of them."""
         self._discover()
         return sorted(self._specs)
 

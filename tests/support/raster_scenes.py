@@ -124,7 +124,8 @@ def _losses(render) -> dict[str, Tensor]:
     g = torch.Generator().manual_seed(1)
     losses = {}
     for name in OUTPUTS:
-        image = getattr(render, name)
+        if (image := getattr(render, name)) is None:
+            continue
         weight = torch.randn(image.shape, generator=g, dtype=torch.float64).to(image)
         losses[name] = (image * weight).sum()
     return losses
