@@ -57,7 +57,7 @@ def resources(source: Path, architecture: int, folder: Path) -> dict[str, dict[s
 
 @needs_nvcc
 @pytest.mark.parametrize("source", ["cuda/rasterizer/forward.cu", "cuda/rasterizer/backward.cu"])
-def test_kernels_that_draw_in_float32_fit_into_registers(source, tmp_path):
+def test_kernels_that_render_in_float32_fit_into_registers(source, tmp_path):
     # Of the supported GPUs, sm_75 has the least shared memory; a multiprocessor shall hold two blocks of 256 threads.
     in_float32 = re.compile(r"kernelI(L[ij]\d+E)?fE")
     kernels = {

@@ -213,7 +213,7 @@ def test_surfels_too_large_or_too_far_for_float32_are_dropped_and_counted(raster
     assert all(torch.isfinite(value.grad).all() and not value.grad[:2].any() for value in leaves.values())
 
 
-def test_nothing_to_draw_gives_the_background_with_finite_gradients(rasterizer):
+def test_nothing_to_render_gives_the_background_with_finite_gradients(rasterizer):
     scene = SCENES["empty"]()
     background = scene.background.clone().requires_grad_()
     drawn = scene.draw(rasterizer, background=background)

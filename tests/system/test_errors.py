@@ -1,4 +1,4 @@
-"""A user's mistake is told in one sentence, also in programs that are not ours."""
+"""A user error is one sentence, also in programs that are not ours."""
 
 from __future__ import annotations
 
@@ -79,9 +79,9 @@ def refusal(code: int, *file) -> OSError:
 @pytest.mark.parametrize(
     "code", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM]
 )
-def test_what_a_disk_refuses_is_told_of_the_path(tmp_path, code):
-    told = error_in(tmp_path / "a.png", refusal(code))
-    assert isinstance(told, UserError) and f"{tmp_path}/a.png cannot be written ({os.strerror(code)})" in str(told)
+def test_what_a_disk_refuses_is_reported_with_the_path(tmp_path, code):
+    error = error_in(tmp_path / "a.png", refusal(code))
+    assert isinstance(error, UserError) and f"{tmp_path}/a.png cannot be written ({os.strerror(code)})" in str(error)
     part = refusal(code, tmp_path / ".a.png.part")
     assert isinstance(error_in(tmp_path / "a.png", part), UserError)
 
