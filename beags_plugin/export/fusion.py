@@ -25,8 +25,7 @@ from beags_plugin.rasterizers.rendering import surfel_inputs
 BLOCK = 16
 """Voxels along a side of the blocks that Open3D allocates as a whole."""
 PIXELS_PER_VOXEL = 2
-"""Of the renders: discs smaller than a pixel are rendered a pixel wide at the depth of their middle, which on slanted
-surfaces comes out too near."""
+"""Of the renders: discs smaller than a pixel are rendered a pixel wide, on slanted surfaces too near."""
 _VOXEL_BYTES = 20  # distance, weight and three colours, float32 each
 _SOLID = 0.5  # the median depth exists where more light than this is stopped
 
@@ -76,11 +75,10 @@ def fuse(
 ) -> Mesh:
     """Fuse the surface that at least ``min_views`` of the views show of an object rendered alone.
 
-    surfels: N surfels, in the frame of the views. resolution: voxels along the longest side of their box; the renders
-    are close-ups of the box, ``PIXELS_PER_VOXEL`` times as many pixels long. truncation: voxels on either side of the
-    surface that a view changes. memory_mb: bound of the grid, 10^6 bytes. on_render: takes the number of views done,
-    after each. Returns a mesh, maybe of no face, its vertices and faces in an order that does not depend on the number
-    of threads.
+    surfels: N surfels, in the frame of the views. resolution: voxels along the longest side of their box; renders are
+    close-ups of it, ``PIXELS_PER_VOXEL`` times as many pixels long. truncation: voxels on either side of the surface
+    that a view changes. memory_mb: bound of the grid, 10^6 bytes. on_render: takes the number of views done. Returns a
+    mesh, maybe of no face, whose order does not depend on the number of threads.
     """
     low, high = bounding_box(surfels)
     voxel = voxel_size(low, high, resolution, truncation, memory_mb)

@@ -1,8 +1,7 @@
 """A vertex-coloured mesh as binary glTF 2.0.
 
-Written here since no library at hand writes what a photographed colour needs: unlit, and finer than 8 bits, for glTF's
-vertex colours are linear and 8 bits of those leave too few dark tones. (glTF 2.0, sections 3.7.2, 4.4;
-KHR_materials_unlit)
+No library at hand writes what photographed colours need: unlit, and finer than 8 bits, since 8 bits of glTF's linear
+vertex colours leave too few dark tones. (glTF 2.0, sections 3.7.2, 4.4; KHR_materials_unlit)
 """
 
 from __future__ import annotations

@@ -33,8 +33,8 @@ _COLOR_SCALE = 0.15  # the format's: bytes hold 0.5 + 0.15 dc, so that colours a
 class SpzExporter(Exporter):
     """Niantic's .spz: Scaniverse, SuperSplat, Babylon.js. It has no place for class ids.
 
-    Like the tools that make .spz of .ply, it takes the axes of splat .ply files (y down, z forward) for the world's and
-    turns them to the format's own (y up, z backward), half a turn about x; readers turn them back.
+    Like the tools that make .spz of .ply, it turns the axes of splat .ply files (y down, z forward) to the format's own
+    (y up, z backward), half a turn about x; readers turn them back.
 
     first_band_bits, other_bands_bits: of the SH degrees; fewer compress better.
     """

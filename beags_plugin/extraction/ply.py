@@ -31,10 +31,10 @@ def write_ply(
 ) -> None:
     """Write surfels as a binary splat .ply: 3DGS's or 2DGS's columns, then ``class_id`` (int32) if there are class ids.
 
-    Columns: x y z; nx ny nz, the surfel's normal; f_dc_0..2; f_rest_* channel-major (all red coefficients, then
-    green, then blue); opacity as a logit; scale_0..2 as logs, the third ``THICKNESS`` times the smaller of the two (a
-    viewer for 3D Gaussians needs one; a surfel has none); rot_0..3 wxyz, unit length. 2DGS's layout has two scales, and
-    always 45 f_rest columns, the rest 0: the official code asks for as many as its degree, 3 unless told.
+    Columns: x y z; nx ny nz, the surfel's normal; f_dc_0..2; f_rest_* channel-major (red, then green, then blue);
+    opacity as a logit; scale_0..2 as logs, the third ``THICKNESS`` times the smaller of the two for viewers of 3D
+    Gaussians; rot_0..3 wxyz, unit length. 2DGS's layout has two scales and always 45 f_rest columns, padded with 0, as
+    the official code expects for its default SH degree 3.
 
     surfels: N surfels. class_ids: [N] integer, phi. transform: the dataparser's ([3, 4], scale); with it the
     file is in the frame of the input poses, without it in the surfels' own. Raises ``UserError`` if the file cannot be

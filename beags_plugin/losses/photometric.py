@@ -45,8 +45,8 @@ class PhotometricLoss(Loss):
 def ssim(image: Tensor, reference: Tensor) -> Tensor:
     """Return the mean structural similarity: Gaussian window of 11 pixels, sigma 1.5, zeros outside as in 3DGS.
 
-    image, reference: [H, W, C] float of one dtype, in 0..1. Returns a scalar in -1..1; its gradient goes to ``image``
-    only. Raises ``ValueError`` if the shapes differ or ``reference`` wants a gradient.
+    image, reference: [H, W, C] float of one dtype, in 0..1. Returns a scalar in -1..1, with a gradient for ``image``.
+    Raises ``ValueError`` if the shapes differ or ``reference`` wants a gradient.
     """
     if image.ndim != 3 or image.shape != reference.shape:
         raise ValueError(f"two images [H, W, C] are needed, not {list(image.shape)} and {list(reference.shape)}")
@@ -95,8 +95,7 @@ class _Ssim(torch.autograd.Function):
 def blur(maps: Tensor) -> Tensor:
     """Filter with the SSIM window, zeros outside; [M, H, W] float.
 
-    Rows and columns are cut into blocks of 32 and each is multiplied by a banded 42 x 32 matrix: 4 times the arithmetic
-    of a convolution, but as matrix products, which makes it 3 times faster on a CPU than a library's convolution.
+    Blocks of 32 rows or columns are multiplied by a banded 42 x 32 matrix: on a CPU 3 times faster than a convolution.
     """
     count, height, width = maps.shape
     band = _band(maps.dtype, maps.device)

@@ -18,8 +18,8 @@ class VoxelTally:
     """Two hash tables, which grow: voxels with one class each, and further classes of voxels. Counts are exact.
 
     Memory is linear in the voxels: 20 bytes a slot, 16 for one of a further class, at least twice as many slots as are
-    used or as one call may add. A call that may need more memory waits for the GPU, to see how many are used. In what
-    order classes lie in memory depends on chance; no result does.
+    used or as one call may add. A call that may need more memory waits for the GPU, to see how many slots are used. The
+    order of classes in memory depends on chance; no result does.
 
     module: ``cuda_extension.load()``. device: where the memory lies.
     """

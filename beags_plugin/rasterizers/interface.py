@@ -43,9 +43,8 @@ class SurfelInputs:
     means [N, 3], quats [N, 4] wxyz, log_scales [N, 2], opacity_logits [N]: as in ``core.surfels.Surfels``.
     colors: [N, 3] linear RGB as seen from this view.
     class_ids: [N] int32, phi, or None; needed with ``target``.
-    screen_shift: [N, 2] zeros, or None. A shift of each disc across the screen, in halves of the image's width and
-        height, while its low-pass filter stays in place. Nothing is ever shifted; its gradient is what the official
-        densification looks at. Surfels too small for the disc to show have none.
+    screen_shift: [N, 2] zeros, or None. A shift of each disc (not of its low-pass filter) across the screen, in halves
+        of the image's width and height. Nothing is ever shifted; the official densification uses its gradient.
     """
 
     means: Tensor

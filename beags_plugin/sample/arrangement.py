@@ -107,9 +107,8 @@ def _textures(names: list[str], hue: float, noise: Noise, generator: np.random.G
 def make_still(seed: int) -> Still:
     """Make the scene of a seed, which decides sizes, places, turn, handedness, colours, textures and light.
 
-    All stand on flat faces, which no photo shows: nothing but their class keeps their Gaussians out of what is below.
-    It is built about a box at the origin (its faces are x = +-hx and y = +-hy), then moved to the middle, mirrored or
-    not, and turned.
+    All objects stand on flat faces, which no photo shows: only their class keeps their Gaussians out of what is below.
+    The scene is built about a box at the origin, then moved to the middle, mirrored or not, and turned.
     """
     generator = np.random.default_rng([seed, 1])
 

@@ -102,9 +102,8 @@ def rim_amplitude(strength: float, height: int, width: int) -> float:
 def roughen_rims(labels: np.ndarray, amplitude: float, seed: int, view: str) -> np.ndarray:
     """Move every boundary by a smooth random displacement of at most ``amplitude`` pixels.
 
-    labels: [H, W] ids. Returns the same shape and type; each pixel takes the id found at its centre plus a displacement
-    whose two components are noise with a wavelength of a few amplitudes, so changes stay within
-    ``amplitude`` + 0.71 pixels (the nearest pixel's centre) of a boundary.
+    labels: [H, W] ids. Returns the same shape and type. Each pixel takes the id at a displacement of smooth noise, so
+    changes stay within ``amplitude`` + 0.71 pixels (the nearest pixel's centre) of a boundary.
     """
     if amplitude <= 0.0:
         return labels.copy()

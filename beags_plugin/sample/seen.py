@@ -1,7 +1,7 @@
 """The part of an object's silhouette that rests on surface which the training photos show.
 
-Where an object touches another, or lies in one, photos show its surface nowhere or only through a gap. What it looks
-like there cannot be known, so an evaluation may leave those pixels of the silhouette out.
+Where objects touch, photos show their surfaces nowhere or only through a gap. An evaluation may leave such pixels of
+the silhouette out.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
 """Processes that end with the one that started them, however that ends (Linux; elsewhere nothing is done).
 
-Without this, a training, a viewer or a browser would go on when whoever waits for it has ended.
 ``python system/child_processes.py PARENT SIGNAL COMMAND...`` asks the kernel for the signal at the parent's end and
 becomes the command.
 """

@@ -11,7 +11,7 @@ from raster_scenes import (
     make_scene,
 )
 
-from beags_plugin.ops import extension
+from beags_plugin.ops import cuda_extension, extension
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.native import NativeRasterizer
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
@@ -71,33 +71,36 @@ def test_inputs_changed_before_the_backward_are_noticed():
         render.color.sum().backward()
 
 
+@pytest.fixture
+def asked_anew():
+    """Forget what is known of the compiled modules, before and after."""
+    statuses = (extension.status, cuda_extension.status)
+    for status in statuses:
+        status.cache_clear()
+    yield
+    for status in statuses:
+        status.cache_clear()
+
+
+@pytest.mark.usefixtures("asked_anew")
 def test_a_missing_module_is_reported_in_a_sentence(monkeypatch):
     def missing(name):
         raise ModuleNotFoundError(f"No module named {name!r}")
 
-    extension.status.cache_clear()
     monkeypatch.setattr(extension, "import_module", missing)
-    try:
-        reason = NativeRasterizer.unavailable()
-        assert reason is not None
-        assert "was not built" in reason
-        with pytest.raises(UserError, match="'native' cannot run here"):
-            make_rasterizer("native")
-        assert isinstance(make_rasterizer("auto"), TorchRasterizer)
-        scene = make_scene()
-        with pytest.raises(UserError, match="was not built"):
-            scene.draw(NativeRasterizer())
-    finally:
-        extension.status.cache_clear()
+    reason = NativeRasterizer.unavailable()
+    assert reason is not None
+    assert "was not built" in reason
+    with pytest.raises(UserError, match="'native' cannot run here"):
+        make_rasterizer("native")
+    assert isinstance(make_rasterizer("auto"), TorchRasterizer)
+    with pytest.raises(UserError, match="was not built"):
+        make_scene().draw(NativeRasterizer())
 
 
+@pytest.mark.usefixtures("asked_anew")
 def test_the_compiled_module_can_be_turned_off(monkeypatch):
     monkeypatch.setenv("BEAGS_NATIVE", "0")
-    extension.status.cache_clear()
-    try:
-        assert "turns the compiled module off" in str(NativeRasterizer.unavailable())
-        assert extension.load() is None
-        assert isinstance(make_rasterizer("auto"), TorchRasterizer)
-    finally:
-        monkeypatch.undo()
-        extension.status.cache_clear()
+    assert "turns the compiled module off" in str(NativeRasterizer.unavailable())
+    assert extension.load() is None
+    assert isinstance(make_rasterizer("auto"), TorchRasterizer)

@@ -32,14 +32,19 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
             check_members(archive, path.stat().st_size)
             found = {}
             for member in archive.infolist():
-                with archive.open(member) as file:
-                    check_header(file, member.file_size)
-                with archive.open(member) as file:
-                    found[member.filename.removesuffix(".npy")] = npy.read_array(file, allow_pickle=False)
+                found[member.filename.removesuffix(".npy")] = read_member(archive, member)
             return found
     # what zipfile and zlib raise for archives that are damaged, have passwords or ask for what Python lacks
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OverflowError, zlib.error) as error:
         raise ValueError(str(error) or type(error).__name__) from None
+
+
+def read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    """Read an array of an archive, after checking that the member can hold it; raises as zipfile and ``load_array``."""
+    with archive.open(member) as file:
+        check_header(file, member.file_size)
+    with archive.open(member) as file:
+        return npy.read_array(file, allow_pickle=False)
 
 
 def check_header(file: BinaryIO | Any, size: int) -> None:
