@@ -31,7 +31,7 @@ class Viewpoints:
 
 @dataclass(frozen=True)
 class ExportItem:
-    """What is exported: an object, or the background; all of it in the frame of the file.
+    """An object or the background to export, in the frame of the file.
 
     name: as the user calls it. surfels: N surfels. class_ids: [N] int32, phi.
     views: of the training photos; None unless an exporter ``needs_views``.

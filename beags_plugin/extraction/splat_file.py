@@ -17,7 +17,7 @@ from beags_plugin.system.reading.text import reason
 
 @dataclass(frozen=True)
 class SplatFile:
-    """What a .ply holds: N Gaussians with two or three scales, in float32, and class_ids [N] int32 if it has them."""
+    """Content of a .ply: N Gaussians with two or three scales, in float32, and class_ids [N] int32 if it has them."""
 
     gaussians: Gaussians
     class_ids: Tensor | None

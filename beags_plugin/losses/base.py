@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LossInputs:
-    """All that a loss may look at in one training step; each uses what it needs.
+    """Inputs of all losses in one training step; each uses what it needs.
 
     step: training step, from 0.
     seed: of the run; with the step it decides every random number.

@@ -78,7 +78,7 @@ class SilhouetteLoss(Loss):
         alone = inputs.draw(surfel_inputs(part, inputs.camera, 0), inputs.camera)
         assert alone.depth is not None and alone.median_depth is not None
         assert inputs.render.median_depth is not None
-        # thin parts have no median: their expected depth tells where they are
+        # thin parts have no median: their expected depth shows where they are
         depth = torch.where(alone.median_depth > 0, alone.median_depth, alone.depth).detach()
         shown = inputs.render.median_depth.detach()
         hidden = (shown > 0) & (depth > (1.0 + TAU) * shown)

@@ -149,7 +149,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.rasterizer, ctx.state = rasterizer, state
         ctx.call = (call.camera, call.settings, call.target)  # not the inputs: they would live as long
         ctx.mark_non_differentiable(visible)
-        ctx.set_materialize_grads(False)  # None tells the kernel what it need not compute
+        ctx.set_materialize_grads(False)  # None: the kernel need not compute these
         return *images, visible, num_nonfinite
 
     @staticmethod

@@ -22,7 +22,7 @@ FLOATS = ("means", "quats", "log_scales", "opacity_logits", "colors")
 
 @dataclass(frozen=True)
 class RasterSettings:
-    """What to compute, and the scene's depth range.
+    """Choice of images to compute, and the scene's depth range.
 
     near, far: world units; they scale with the scene. Hits nearer than ``near`` are skipped; both enter the
         distortion's depth mapping m(d) = far / (far - near) * (1 - near / d).
@@ -38,7 +38,7 @@ class RasterSettings:
 
 @dataclass(frozen=True)
 class SurfelInputs:
-    """What is rendered: N surfels with one colour each, for one view; all floats of one dtype (float32 or float64).
+    """N surfels to render, with one colour each, for one view; all floats of one dtype (float32 or float64).
 
     means [N, 3], quats [N, 4] wxyz, log_scales [N, 2], opacity_logits [N]: as in ``core.surfels.Surfels``.
     colors: [N, 3] linear RGB as seen from this view.
@@ -101,7 +101,7 @@ def map_ids(inputs: SurfelInputs, num_classes: int) -> Tensor:
 
 @dataclass(frozen=True)
 class RasterOutputs:
-    """What is seen (E4). H, W are the camera's; floats have the inputs' dtype.
+    """Images of one view (E4). H, W are the camera's; floats have the inputs' dtype.
 
     color: [H, W, 3] sum_i w_i c_i + T_end * background.
     alpha: [H, W] A = sum_i w_i.

@@ -81,7 +81,7 @@ def _turn_z(angle: float) -> np.ndarray:
 
 
 def _textures(names: list[str], hue: float, noise: Noise, generator: np.random.Generator) -> dict[str, Texture]:
-    # Related hues, dealt out at random: colour alone does not tell where one object ends and the next begins.
+    # Related hues, dealt out at random: colour alone does not show where one object ends and the next begins.
     hues = hue + HUE_RANGE * (generator.permutation(len(names)) / len(names) - 0.5)
     patterns = {
         "box": checks(6.5),

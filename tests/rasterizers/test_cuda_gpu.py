@@ -1,4 +1,4 @@
-"""What only a GPU can show of the CUDA backend: streams, graphs, waiting, devices."""
+"""Parts of the CUDA backend that only a GPU can show: streams, graphs, waiting, devices."""
 
 from __future__ import annotations
 

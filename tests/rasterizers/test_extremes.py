@@ -1,4 +1,4 @@
-"""How much of anything: ten thousand layers on a pixel, a million Gaussians, every class id that there is."""
+"""Extremes: ten thousand layers on a pixel, a million Gaussians, every class id that there is."""
 
 from __future__ import annotations
 

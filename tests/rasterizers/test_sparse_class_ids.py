@@ -176,7 +176,7 @@ def test_the_occupancy_loss_is_the_same(background, ops):
 
 
 def test_a_grid_saved_by_a_former_run_loads(ops):
-    """What was on disk before: exactly these five tensors, with the ids themselves as classes."""
+    """Exactly these five tensors were on disk before, with the ids themselves as classes."""
     near, far = make_grids()
     state = {
         "voxel_size": torch.tensor(0.3, dtype=torch.float64),

@@ -66,7 +66,7 @@ def test_a_full_disk_under_curves_prints_no_traceback_of_their_thread(tmp_path, 
 
 
 def error_in(path, cause: BaseException) -> BaseException:
-    """What comes out of a block that writes ``path`` and in which ``cause`` is raised."""
+    """Return the error that leaves a block which writes ``path`` and raises ``cause``."""
     with pytest.raises(BaseException) as raised, writing(path):
         raise cause
     return raised.value
