@@ -255,7 +255,7 @@ Command = Demo | Resume | Sample | Masks | Extract | Export | Render | Eval | Be
 
 def exit_with(error: UserError) -> NoReturn:
     """Print a user error, unless the trainer has, and end with exit code 2."""
-    if not error.told:
+    if not error.reported:
         CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}")
     sys.exit(2)
 

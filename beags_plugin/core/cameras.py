@@ -26,39 +26,39 @@ class Camera:
 
     @property
     def rotation(self) -> Tensor:
-        """[3, 3] world-to-camera rotation W."""
+        """Return the [3, 3] world-to-camera rotation W."""
         return self.viewmat[:3, :3]
 
     @property
     def translation(self) -> Tensor:
-        """[3] world-to-camera translation t."""
+        """Return the [3] world-to-camera translation t."""
         return self.viewmat[:3, 3]
 
     @property
     def focal(self) -> float:
-        """The focal length in pixels, the geometric mean of both axes': at depth z a pixel covers (z / focal)^2."""
+        """Return the geometric mean of both axes' focal lengths, pixels: at depth z a pixel covers (z / focal)^2."""
         K = self.host.K
         return (float(K[0, 0]) * float(K[1, 1])) ** 0.5
 
     @property
     def center(self) -> Tensor:
-        """[3] the camera's position in the world."""
+        """Return the camera's position in the world, [3]."""
         if self.viewmat.requires_grad or not self.viewmat.is_cpu:
             return -self.rotation.T @ self.translation
-        # The same in Python's numbers: half the time of seven operations of torch, which every step would pay.
+        # in Python's numbers: half the time of seven operations of torch
         rows = self.viewmat.tolist()
         return self.viewmat.new_tensor([-sum(rows[k][axis] * rows[k][3] for k in range(3)) for axis in range(3)])
 
     @property
     def host(self) -> Camera:
-        """The same camera on the CPU, if this one was made from it by ``to``, else itself.
+        """Return the same camera on the CPU, if this one was made from it by ``to``, else itself.
 
         Its numbers can be read without waiting for a GPU. Cameras are not changed in place.
         """
         return self.__dict__.get("_host", self)
 
     def to(self, *args) -> Camera:
-        """As ``Tensor.to``, for both matrices."""
+        """Move both matrices as ``Tensor.to`` does."""
         moved = Camera(self.viewmat.to(*args), self.K.to(*args), self.width, self.height)
         if not moved.viewmat.is_cpu and self.host.viewmat.is_cpu:
             moved.__dict__["_host"] = self.host
@@ -66,7 +66,7 @@ class Camera:
 
 
 def viewmat_from_opengl(camera_to_world: Tensor) -> Tensor:
-    """World-to-camera matrix in OpenCV axes from a camera-to-world matrix in OpenGL axes (nerfstudio's).
+    """Return the world-to-camera matrix, OpenCV axes, of a camera-to-world matrix, OpenGL axes (nerfstudio's).
 
     This is the one place where the two conventions meet.
 
@@ -83,7 +83,7 @@ def viewmat_from_opengl(camera_to_world: Tensor) -> Tensor:
 
 
 def camera_extent(camera_to_worlds: Tensor) -> Tensor:
-    """Size of the scene: 1.1 x the largest distance of a camera [V, 3, 4] from the mean of all; 1 for a single one."""
+    """Return the scene's size: 1.1 x the largest distance of a camera [V, 3, 4] from their mean; 1 for a single one."""
     centers = camera_to_worlds[..., :3, 3].float()
     extent = EXTENT_MARGIN * (centers - centers.mean(dim=0)).norm(dim=-1).max()
     return extent if float(extent) > 0 else torch.ones(())

@@ -1,4 +1,4 @@
-"""How a scene grows and thins out while its base trains (method, section 1)."""
+"""Densification and pruning while the base trains (method, section 1)."""
 
 from __future__ import annotations
 
@@ -29,17 +29,16 @@ COINCIDENT = 1e-7  # smallest initial scale relative to the cloud's size: coinci
 
 @dataclass(frozen=True)
 class DensifyConfig:
-    """When and how the scene grows; scales are relative to the scene's extent.
+    """Options of densification; scales are relative to the scene's extent.
 
     every, start, stop: densify at multiples of ``every`` between ``start`` and ``stop``, both excluded (as officially).
     prune_scale_after: surfels larger than ``PRUNE_SCALE`` go after this step.
-    far_limits: ``CLONE_SCALE`` and ``PRUNE_SCALE`` are relative to the distance of the nearest camera where that
-        exceeds the scene's extent; False, as officially: to the extent alone, which far backgrounds and forward-facing
-        captures do not fit.
-    reset_every: opacities are set to at most ``RESET_OPACITY`` so often; 0 never.
-    max_surfels: the scene grows no further than this; 0 sets no bound.
-    pixels_per_surfel: nor further than one surfel for so many pixels of all training images, so that what few images
-        show is not learned by heart; 0, as officially, sets no bound.
+    far_limits: ``CLONE_SCALE`` and ``PRUNE_SCALE`` are relative to the distance of the nearest camera if that exceeds
+        the scene's extent, for far backgrounds and forward-facing captures; False, as officially: to the extent alone.
+    reset_every: steps between resets of opacities to at most ``RESET_OPACITY``; 0 never.
+    max_surfels: bound of the number of surfels; 0 sets none.
+    pixels_per_surfel: training pixels that each surfel needs at least, against overfitting of few images; 0, as
+        officially, sets no bound.
     """
 
     every: int = 100
@@ -52,7 +51,7 @@ class DensifyConfig:
     pixels_per_surfel: float = 0.0
 
     def scaled(self, factor: float) -> DensifyConfig:
-        """The same for a run ``factor`` times as long: its steps are scaled, within the smallest intervals."""
+        """Return the same for a run ``factor`` times as long: its steps are scaled, within the smallest intervals."""
 
         def steps(stated: int, least: int = 0) -> int:
             return max(round(stated * factor), min(least, stated)) if stated > 0 else stated
@@ -67,18 +66,18 @@ class DensifyConfig:
         )
 
     def bounded(self, pixels: int) -> DensifyConfig:
-        """The same with ``max_surfels`` for this many training pixels."""
+        """Return the same with ``max_surfels`` for this many training pixels."""
         if not self.pixels_per_surfel > 0:
             return self
         by_pixels = max(int(pixels / self.pixels_per_surfel), 1)
         return replace(self, max_surfels=min(by_pixels, self.max_surfels) if self.max_surfels > 0 else by_pixels)
 
     def grows_at(self, done: int) -> bool:
-        """Whether the scene is densified after ``done`` steps."""
+        """Return whether the scene is densified after ``done`` steps."""
         return self.start < done < self.stop and done % self.every == 0
 
     def resets_at(self, done: int) -> bool:
-        """Whether opacities are reset after ``done`` steps."""
+        """Return whether opacities are reset after ``done`` steps."""
         return self.reset_every > 0 and done < self.stop and done % self.reset_every == 0
 
 
@@ -92,12 +91,12 @@ class Densified:
 
     @classmethod
     def unchanged(cls, surfels: Surfels) -> Densified:
-        """Before any edit."""
+        """Return a scene before any edit."""
         count, device = len(surfels), surfels.means.device
         return cls(surfels, torch.arange(count, device=device), torch.zeros(count, dtype=torch.bool, device=device))
 
     def then(self, edited: Densified) -> Densified:
-        """This edit, and after it ``edited``, whose sources are this one's surfels."""
+        """Return this edit followed by ``edited``, whose sources are this one's surfels."""
         return Densified(edited.surfels, self.source[edited.source], self.fresh[edited.source] | edited.fresh)
 
 
@@ -115,12 +114,12 @@ class GradientStatistics:
         self.views += seen.to(self.views)
 
     def mean(self) -> Tensor:
-        """[N]; 0 for a surfel that no view saw."""
+        """Return [N]; 0 for a surfel that no view saw."""
         return self.total / self.views.clamp_min(1.0)
 
 
 def length_units(means: Tensor, camera_centers: Tensor, extent: float, config: DensifyConfig) -> Tensor:
-    """[N] world units in which ``CLONE_SCALE`` and ``PRUNE_SCALE`` of surfels at ``means`` [N, 3] are stated.
+    """Return [N] world units in which ``CLONE_SCALE`` and ``PRUNE_SCALE`` of surfels at ``means`` [N, 3] are stated.
 
     camera_centers: [V, 3]. The scene's extent, or with ``far_limits`` the distance of the nearest camera if larger.
     """
@@ -167,7 +166,7 @@ def densify(
 
 
 def _within_budget(chosen: Tensor, gradient: Tensor, max_surfels: int) -> Tensor:
-    """At most so many chosen, largest gradients first, that the scene stays within ``max_surfels`` (0: no bound)."""
+    """Restrict the chosen to those of largest gradient that ``max_surfels`` leaves room for (0: no bound)."""
     room = max(max_surfels - chosen.shape[0], 0)
     if max_surfels <= 0 or int(chosen.sum()) <= room:
         return chosen
@@ -178,7 +177,7 @@ def _within_budget(chosen: Tensor, gradient: Tensor, max_surfels: int) -> Tensor
 
 
 def _offsets(surfels: Surfels, generator: torch.Generator) -> Tensor:
-    """[M, 3] a draw from each surfel's own Gaussian, in its plane."""
+    """Sample each surfel's own Gaussian in its plane, [M, 3]."""
     normal = torch.randn(len(surfels), 2, generator=generator).to(surfels.means)
     local = normal * surfels.log_scales.exp()
     axes = rotation_from_quat(surfels.quats)[:, :, :2]
@@ -186,13 +185,13 @@ def _offsets(surfels: Surfels, generator: torch.Generator) -> Tensor:
 
 
 def reset_opacity(surfels: Surfels) -> Tensor:
-    """[N] opacity logits, lowered to at most ``RESET_OPACITY``."""
+    """Return [N] opacity logits, lowered to at most ``RESET_OPACITY``."""
     ceiling = math.log(RESET_OPACITY / (1.0 - RESET_OPACITY))
     return surfels.opacity_logits.clamp_max(ceiling)
 
 
 def initial_surfels(points: Tensor, colors: Tensor, sh_degree: int, generator: torch.Generator) -> Surfels:
-    """One surfel per seed point: as large as its neighbours are far, faint, turned at random.
+    """Make one surfel per seed point: as large as its neighbours are far, faint, turned at random.
 
     points: [N, 3] world. colors: [N, 3] in 0..1. Returns N surfels in float32 without gradients.
     """

@@ -35,11 +35,11 @@ class Gaussians:
         return self.means.shape[0]
 
     def __getitem__(self, selection) -> Gaussians:
-        """Those that a mask [N] bool or an index [M] int64 selects."""
+        """Return those that a mask [N] bool or an index [M] int64 selects."""
         return Gaussians(**{field.name: getattr(self, field.name)[selection] for field in fields(self)})
 
     def usable(self) -> Tensor:
-        """[N] bool: every value is finite, and the quaternion is not zero. An infinite opacity logit is usable."""
+        """Return [N] bool: every value is finite and the quaternion not zero. An infinite opacity logit is usable."""
         usable = self.quats.norm(dim=-1) > 0
         for field in fields(self):
             values = getattr(self, field.name)
@@ -50,7 +50,7 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class Flattening:
-    """How much N > 0 Gaussians lost of their volume.
+    """Volume that N > 0 Gaussians lost.
 
     median_ratio: median of thinnest over second scale; 0 is flat already, 1 a disc turned into one of its sections.
     round_share: share of the Gaussians whose ratio is above 0.5.
@@ -61,7 +61,7 @@ class Flattening:
 
 
 def flatten(gaussians: Gaussians) -> tuple[Surfels, Flattening | None]:
-    """Surfels in the plane of each Gaussian's two larger axes, with its opacity and colour.
+    """Return surfels in the plane of each Gaussian's two larger axes, with its opacity and colour.
 
     Those whose thinnest axis is the third keep their quaternion as it is. Returns (N surfels, what was lost; None of
     Gaussians that are surfels already, or of none). Infinite opacity logits become 30, which is opaque.
@@ -79,7 +79,7 @@ def flatten(gaussians: Gaussians) -> tuple[Surfels, Flattening | None]:
 
 
 def without_empty_bands(surfels: Surfels) -> Surfels:
-    """The same surfels without the highest colour bands that are 0 in all of them, which some formats pad with."""
+    """Lower the SH degree while its coefficients are 0 in all surfels, as some formats pad with."""
     degree = surfels.sh_degree
     while degree > 0 and not bool(surfels.sh_rest[:, degree**2 - 1 : (degree + 1) ** 2 - 1].any()):
         degree -= 1
@@ -87,7 +87,7 @@ def without_empty_bands(surfels: Surfels) -> Surfels:
 
 
 def flattening(log_scales: Tensor) -> Flattening | None:
-    """What flattening takes from Gaussians of these scales [N, 3]; None of none."""
+    """Measure what flattening takes from Gaussians of these scales [N, 3]; None of none."""
     if len(log_scales) == 0:
         return None
     ordered = log_scales.double().sort(dim=1).values

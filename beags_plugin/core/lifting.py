@@ -9,7 +9,7 @@ from beags_plugin.core.cameras import Camera
 
 
 def pixel_rays(camera: Camera, like: Tensor) -> Tensor:
-    """Camera-space points at depth 1 under the pixel centres: K^-1 (i + 0.5, j + 0.5, 1).
+    """Return camera-space points at depth 1 under the pixel centres: K^-1 (i + 0.5, j + 0.5, 1).
 
     like: any tensor; gives dtype and device. Returns [H, W, 3]; the last component is 1.
     """
@@ -22,7 +22,7 @@ def pixel_rays(camera: Camera, like: Tensor) -> Tensor:
 
 
 def lift(depth: Tensor, camera: Camera) -> Tensor:
-    """World points of all pixels of a view.
+    """Return the world points of all pixels of a view.
 
     depth: [H, W] float, world units along z (not along the ray). Returns [H, W, 3] of the same dtype;
     a pixel without depth (0) gives the camera's position.
@@ -34,7 +34,7 @@ def lift(depth: Tensor, camera: Camera) -> Tensor:
 
 
 def project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Pixel coordinates and depths of world points.
+    """Return pixel coordinates and depths of world points.
 
     points: [P, 3] float. Returns (xy [P, 2] pixels, z [P] world units along z) of the same dtype. Only where z > 0
     does xy mean anything (at z = 0 it is not finite).
@@ -46,7 +46,8 @@ def project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def _times(rows: Tensor, matrix: Tensor) -> Tensor:
-    """[..., 3] rows times [3, 3], in a fixed order of operations: a library's product may differ between machines
-    and numbers of threads."""
+    """Multiply [..., 3] rows by [3, 3].
+
+    Determinism: a library's product may differ between machines and numbers of threads."""
     x, y, z = rows.unbind(-1)
     return torch.stack([x * matrix[0, c] + y * matrix[1, c] + z * matrix[2, c] for c in range(3)], dim=-1)

@@ -13,13 +13,13 @@ Their gradient is the rotation's divided by the length, and would overflow in fl
 
 
 def usable_quats(quats: Tensor) -> Tensor:
-    """[...] bool: which of quats [..., 4] have a length that can be divided by; NaN has none. No gradient."""
+    """Return [...] bool: whether quats [..., 4] have a length that can be divided by; NaN has none. No gradient."""
     length = quats.detach().double().norm(dim=-1)
     return (length >= 1.0 / LONGEST_QUAT) & (length <= LONGEST_QUAT)
 
 
 def rotation_from_quat(quats: Tensor) -> Tensor:
-    """Rotation matrices of quaternions, which are normalised here (so the gradient includes it, once).
+    """Return rotation matrices of quaternions, which are normalised here (so the gradient includes it, once).
 
     quats: [..., 4] wxyz, not zero. Returns [..., 3, 3].
     """
@@ -33,7 +33,7 @@ def rotation_from_quat(quats: Tensor) -> Tensor:
 
 
 def quat_product(first: Tensor, second: Tensor) -> Tensor:
-    """The quaternion of "second, then first": first [..., 4] and second [..., 4], wxyz; broadcast. Returns [..., 4]."""
+    """Return the quaternion [..., 4] of "second, then first": first and second [..., 4], wxyz; broadcast."""
     w1, x1, y1, z1 = first.unbind(-1)
     w2, x2, y2, z2 = second.unbind(-1)
     return torch.stack(

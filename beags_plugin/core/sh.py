@@ -25,12 +25,12 @@ _C3 = (
 
 
 def num_sh_bases(degree: int) -> int:
-    """Number of coefficients per channel up to ``degree``."""
+    """Return the number of coefficients per channel up to ``degree``."""
     return (degree + 1) ** 2
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """The basis functions at unit ``directions`` [N, 3]: [N, (degree + 1)^2]; degree 0..3."""
+    """Return the basis functions at unit ``directions`` [N, 3]: [N, (degree + 1)^2]; degree 0..3."""
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"the degree of spherical harmonics must be 0..{MAX_DEGREE}, not {degree}")
     x, y, z = directions.unbind(-1)
@@ -59,9 +59,9 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def sh_colors(sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_center: Tensor, degree: int) -> Tensor:
-    """Colour of each surfel as seen from ``camera_center``: SH + 0.5, clamped at 0.
+    """Return the colour of each surfel as seen from ``camera_center``: SH + 0.5, clamped at 0.
 
-    sh_dc: [N, 3], band 0. sh_rest: [N, K, 3], the others, K >= (degree + 1)^2 - 1. means: [N, 3] world.
+    sh_dc: [N, 3], degree 0. sh_rest: [N, K, 3], the others, K >= (degree + 1)^2 - 1. means: [N, 3] world.
     camera_center: [3] world, on any device. Returns [N, 3]. Computed by the compiled op where it can be.
     """
     compiles = extension.supports(sh_dc, sh_rest, means, camera_center)

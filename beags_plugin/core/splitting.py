@@ -16,10 +16,9 @@ def split_in_two(surfels: Surfels, chosen: Tensor) -> Densified:
     """Replace each chosen surfel by two along its longer axis that together look nearly as it did.
 
     surfels: N surfels without gradients. chosen: [N] bool. The others keep their order; the halves follow them.
-    Two discs of opacity o' cover 1 - (1 - o' g1)(1 - o' g2). Fitted to o g over the disc by least squares, with the
-    halves half a scale from the former centre, the former opacity o decides their shape: opacity o (0.58 + 0.2 o),
-    scale times 0.85 - 0.09 o along the axis and times 1 - 0.06 o across. What is left differs by 1.5 % (o = 0.1) to
-    7.5 % (o = 0.99) of the disc's own root mean square.
+    Two discs of opacity o' cover 1 - (1 - o' g1)(1 - o' g2). The least-squares fit to o g over the disc gives halves of
+    opacity o (0.58 + 0.2 o), scale times 0.85 - 0.09 o along the axis and times 1 - 0.06 o across. They differ by 1.5 %
+    (o = 0.1) to 7.5 % (o = 0.99) of the disc's own root mean square.
     """
     kept, split = (~chosen).nonzero()[:, 0], chosen.nonzero()[:, 0]
     source = torch.cat([kept, split, split])

@@ -16,9 +16,8 @@ class Surfels:
     quats: [N, 4] wxyz, of any length but zero; normalised where they are used.
     log_scales: [N, 2] logs of the two scales, world units.
     opacity_logits: [N] logits of the opacity.
-    sh_dc: [N, 3] spherical-harmonic coefficients of the colour, band 0. Apart from the others, for it learns at a rate
-        of its own, and joining them would copy the largest parameter in every step.
-    sh_rest: [N, (degree + 1)^2 - 1, 3] those of the higher bands.
+    sh_dc: [N, 3] spherical-harmonic coefficients of the colour, degree 0. They learn at a rate of their own.
+    sh_rest: [N, (degree + 1)^2 - 1, 3] those of the higher degrees; joining both would copy it in every step.
     """
 
     means: Tensor
@@ -30,37 +29,37 @@ class Surfels:
 
     @classmethod
     def of(cls, means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: Tensor, sh: Tensor) -> Surfels:
-        """From all coefficients in one tensor: sh [N, (degree + 1)^2, 3], which is not copied."""
+        """Make surfels from all coefficients in one tensor: sh [N, (degree + 1)^2, 3], which is not copied."""
         return cls(means, quats, log_scales, opacity_logits, sh[:, 0], sh[:, 1:])
 
     @property
     def sh(self) -> Tensor:
-        """[N, (degree + 1)^2, 3] a copy of all coefficients, band 0 first; differentiable."""
+        """Return a copy of all coefficients, [N, (degree + 1)^2, 3], degree 0 first; differentiable."""
         return torch.cat([self.sh_dc[:, None], self.sh_rest], dim=1)
 
     @property
     def sh_degree(self) -> int:
-        """Highest degree of the spherical harmonics, 0..3."""
+        """Return the highest degree of the spherical harmonics, 0..3."""
         return round((1 + self.sh_rest.shape[1]) ** 0.5) - 1
 
     def __len__(self) -> int:
         return self.means.shape[0]
 
     def __getitem__(self, selection) -> Surfels:
-        """The surfels that a mask [N] bool, an index [M] int64 or a slice selects."""
+        """Return the surfels that a mask [N] bool, an index [M] int64 or a slice selects."""
         return Surfels(**{field.name: getattr(self, field.name)[selection] for field in fields(self)})
 
     def detach(self) -> Surfels:
-        """The same values, without gradients."""
+        """Return the same values, without gradients."""
         return Surfels(**{field.name: getattr(self, field.name).detach() for field in fields(self)})
 
     def clone(self) -> Surfels:
-        """A copy in memory of its own, without gradients."""
+        """Return a copy in memory of its own, without gradients."""
         return Surfels(**{field.name: getattr(self, field.name).detach().clone() for field in fields(self)})
 
 
 def opacities(logits: Tensor) -> Tensor:
-    """Opacities 0..1 of logits of any shape; differentiable, with a gradient of 0 below logits of -80.
+    """Return opacities 0..1 of logits of any shape; differentiable, with a gradient of 0 below logits of -80.
 
     Determinism: torch.sigmoid rounds the ends of each thread's share differently; exp does not. Below -80, where the
     opacity is 1e-35, 1 / (1 + exp) would have no finite gradient.

@@ -1,4 +1,4 @@
-"""What an exporter is given, and what it does."""
+"""The interface of exporters."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from beags_plugin.system.errors import UserError
 
 
 class NothingToExport(UserError):
-    """A item has nothing of what a format holds; with --all the other items are written all the same."""
+    """An item has nothing of what a format holds; with --all the other items are written all the same."""
 
 
 @dataclass(frozen=True)
 class Viewpoints:
-    """Where the photos were taken, and what draws the item from there; all in the frame of the file."""
+    """The training cameras, and the rasterizer for views from there; all in the frame of the file."""
 
     cameras: Sequence[Camera]
     rasterizer: Rasterizer
@@ -31,12 +31,12 @@ class Viewpoints:
 
 @dataclass(frozen=True)
 class ExportItem:
-    """What is exported: an object, or the background; all of it in the frame of the file.
+    """An object or the background to export, in the frame of the file.
 
     name: as the user calls it. surfels: N surfels. class_ids: [N] int32, phi.
     views: of the training photos; None unless an exporter ``needs_views``.
     shared: what exporters of one item keep for each other, such as the mesh that two file types hold.
-    on_render: is told, by an exporter that ``needs_views``, how many of them it has drawn so far.
+    on_render: is called, by an exporter that ``needs_views``, with the number of views rendered so far.
     """
 
     name: str
@@ -50,7 +50,7 @@ class ExportItem:
 class Exporter(ABC):
     """One file format. Subclasses are frozen dataclasses; their own fields, all with defaults, are their options.
 
-    suffix: how the files' names end. needs_views: whether it draws the item from the views of the training photos.
+    suffix: how the files' names end. needs_views: whether it renders the item from the views of the training photos.
     """
 
     suffix: ClassVar[str]
@@ -58,19 +58,19 @@ class Exporter(ABC):
 
     @classmethod
     def unavailable(cls) -> str | None:
-        """None if this exporter can run here, else one sentence: why not and what to install."""
+        """Return None if this exporter can run here, else one sentence: why not and what to install."""
         return None
 
     @abstractmethod
     def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
-        """Write ``item`` to ``path``; returns what the manifest says of the file (plain values by name).
+        """Write ``item`` to ``path``; return the manifest's entries about the file (plain values by name).
 
         Raises ``UserError`` if the file cannot be written, ``NothingToExport`` if the item has nothing for it.
         """
 
 
 def make_exporter(name: str, **options: Any) -> Exporter:
-    """The exporter called ``name``; raises ``UserError`` for an unknown name, or if it cannot run here."""
+    """Return the exporter called ``name``; raises ``UserError`` for an unknown name, or if it cannot run here."""
     from beags_plugin.export import EXPORTERS
 
     exporter = EXPORTERS.get(name)

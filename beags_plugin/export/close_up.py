@@ -10,15 +10,15 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.lifting import project
 
-_RIM = 2  # pixels around the box: an ellipse of one standard deviation is not all that a surfel shows
+_MARGIN = 2  # pixels around the box: an ellipse of one standard deviation is not all that a surfel shows
 
 
 def close_up(camera: Camera, low: Tensor, high: Tensor, near: float, pixels: int) -> Camera:
-    """The part of a view that holds a box, its longer side ``pixels`` long.
+    """Return the part of a view that holds a box, its longer side ``pixels`` long.
 
-    low, high: [3] corners of the box, in the camera's world. near: depth, world units; where a corner of the box is
-    nearer, the camera is in or beside the box, and sees what the photo saw. Returns a camera of at most
-    ``pixels`` x ``pixels``; float32.
+    low, high: [3] corners of the box, in the camera's world. near: depth, world units; if a corner is nearer, the
+    camera is in or beside the box and keeps the photo's view. Returns a camera of at most ``pixels`` x ``pixels``;
+    float32.
     """
     corners = torch.cartesian_prod(*torch.stack([low, high], dim=1).double())
     xy, z = project(corners, camera)
@@ -26,11 +26,11 @@ def close_up(camera: Camera, low: Tensor, high: Tensor, near: float, pixels: int
     first = torch.zeros(2, dtype=torch.float64) if whole else xy.amin(dim=0)
     last = torch.tensor([camera.width, camera.height], dtype=torch.float64) if whole else xy.amax(dim=0)
     size = (last - first).clamp(min=1e-9)
-    rim = 0 if whole else min(_RIM, (pixels - 1) // 2)
-    zoom = (pixels - 2 * rim) / float(size.max())
+    margin = 0 if whole else min(_MARGIN, (pixels - 1) // 2)
+    zoom = (pixels - 2 * margin) / float(size.max())
     K = camera.K.double().clone()
     K[:2] *= zoom
-    K[:2, 2] += rim - zoom * first
+    K[:2, 2] += margin - zoom * first
     # rounded before it is rounded up: the longer side must be ``pixels``, not one more for the last bit
-    width, height = (min(pixels, math.ceil(round(zoom * side, 6)) + 2 * rim) for side in size.tolist())
+    width, height = (min(pixels, math.ceil(round(zoom * side, 6)) + 2 * margin) for side in size.tolist())
     return Camera(camera.viewmat.float(), K.float(), max(1, width), max(1, height))

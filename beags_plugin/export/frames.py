@@ -17,7 +17,7 @@ from beags_plugin.extraction.frames import to_input_frame
 from beags_plugin.system.errors import UserError
 
 Placement = Literal["world", "object"]
-_BULK = 0.01  # share of the surfels at each side that say nothing of how large the thing is: some are strays
+_BULK = 0.01  # share of the surfels at each side that do not count for the size of the item: some are strays
 _FENCE = 0.5  # how far beyond the bulk, as a share of its longest side, thin parts are looked for
 
 
@@ -33,20 +33,20 @@ class Frame:
 
     @classmethod
     def of_run(cls) -> Frame:
-        """The run's own frame."""
+        """Return the run's own frame."""
         return cls(torch.eye(4, dtype=torch.float64)[:3], 1.0)
 
     def centred(self, center: Tensor) -> Frame:
-        """The same, shifted: ``center`` [3], a point of this frame, becomes the origin."""
+        """Return this frame shifted: ``center`` [3], a point of it, becomes the origin."""
         rotation, shift = self.transform[:, :3], self.transform[:, 3:]
         return replace(self, transform=torch.cat([rotation, shift + rotation @ center.double()[:, None]], dim=1))
 
     def surfels(self, surfels: Surfels) -> Surfels:
-        """Surfels of the run's frame in this one."""
+        """Return surfels of the run's frame in this one."""
         return to_input_frame(surfels, self.transform, self.scale)
 
     def camera(self, camera: Camera) -> Camera:
-        """A camera of the run's frame in this one: it sees the same, with depths divided by ``scale``."""
+        """Return a camera of the run's frame in this one: it sees the same, with depths divided by ``scale``."""
         viewmat, rotation, shift = camera.viewmat.double(), self.transform[:, :3], self.transform[:, 3]
         moved = viewmat.clone()
         moved[:3, :3] = viewmat[:3, :3] @ rotation
@@ -54,12 +54,12 @@ class Frame:
         return replace(camera, viewmat=moved.to(camera.viewmat.dtype))
 
     def views(self, views: Viewpoints) -> Viewpoints:
-        """Viewpoints of the run's frame in this one."""
+        """Return viewpoints of the run's frame in this one."""
         settings = replace(views.settings, near=views.settings.near / self.scale, far=views.settings.far / self.scale)
         return Viewpoints([self.camera(camera) for camera in views.cameras], views.rasterizer, settings)
 
     def to_run(self) -> list[list[float]]:
-        """The 4 x 4 matrix that takes points of this frame to the run's."""
+        """Return the 4 x 4 matrix that takes points of this frame to the run's."""
         matrix = torch.eye(4, dtype=torch.float64)
         matrix[:3] = self.scale * self.transform.double()
         return matrix.tolist()
@@ -72,7 +72,7 @@ def check_placement(placement: str) -> None:
 
 
 def bounding_box(surfels: Surfels) -> tuple[Tensor, Tensor]:
-    """The box about the ellipses of one standard deviation of N surfels, but for strays far from all others.
+    """Return the box about the ellipses of one standard deviation of N surfels, without strays far from the others.
 
     It reaches at most half the bulk's longest side beyond the bulk, which is all but 1 % at each side. Surfels that are
     not finite are left out; the box of none is the origin. Returns (low [3], high [3]) float64, in the surfels' frame.

@@ -1,6 +1,6 @@
 """A surface from an object's own depth: truncated signed distances of many views, averaged in a sparse voxel grid.
 
-The fusing is Open3D's (``VoxelBlockGrid``); what is here chooses the voxels and draws the views.
+The fusing is Open3D's (``VoxelBlockGrid``); what is here chooses the voxels and renders the views.
 """
 
 from __future__ import annotations
@@ -25,8 +25,7 @@ from beags_plugin.rasterizers.rendering import surfel_inputs
 BLOCK = 16
 """Voxels along a side of the blocks that Open3D allocates as a whole."""
 PIXELS_PER_VOXEL = 2
-"""Of the drawings: discs smaller than a pixel are drawn a pixel wide at the depth of their middle, which on slanted
-surfaces comes out too near."""
+"""Of the renders: discs smaller than a pixel are rendered a pixel wide, on slanted surfaces too near."""
 _VOXEL_BYTES = 20  # distance, weight and three colours, float32 each
 _SOLID = 0.5  # the median depth exists where more light than this is stopped
 
@@ -46,7 +45,7 @@ class Mesh:
 
 
 def voxel_size(low: Tensor, high: Tensor, resolution: int, truncation: float, memory_mb: float) -> float:
-    """The longest side of a box in ``resolution`` parts, or more where its grid might need more than ``memory_mb``.
+    """Return the longest side over ``resolution``, or more where the grid might need more than ``memory_mb``.
 
     The bound counts every block that the box and the truncation around it touch, as if all were filled; a surface
     fills a small part of them. low, high: [3], world units. Returns world units.
@@ -74,13 +73,12 @@ def fuse(
     min_views: int,
     on_render: Callable[[int], None] = lambda done: None,
 ) -> Mesh:
-    """The surface that at least ``min_views`` of the views show of an object drawn alone.
+    """Fuse the surface that at least ``min_views`` of the views show of an object rendered alone.
 
-    surfels: N surfels, in the frame of the views. resolution: voxels along the longest side of their box; the renders
-    are close-ups of the box, ``PIXELS_PER_VOXEL`` times as many pixels long. truncation: voxels on either side of the
-    surface that a view changes. memory_mb: bound of the grid, 10^6 bytes. on_render: takes the number of views done,
-    after each. Returns a mesh, maybe of no face, its vertices and faces in an order that does not depend on the number
-    of threads.
+    surfels: N surfels, in the frame of the views. resolution: voxels along the longest side of their box; renders are
+    close-ups of it, ``PIXELS_PER_VOXEL`` times as many pixels long. truncation: voxels on either side of the surface
+    that a view changes. memory_mb: bound of the grid, 10^6 bytes. on_render: takes the number of views done. Returns a
+    mesh, maybe of no face, whose order does not depend on the number of threads.
     """
     low, high = bounding_box(surfels)
     voxel = voxel_size(low, high, resolution, truncation, memory_mb)
@@ -101,7 +99,7 @@ def fuse(
 
 
 def _new_grid() -> Any:
-    """An empty ``VoxelBlockGrid`` of Open3D, whose unit is a voxel."""
+    """Return an empty ``VoxelBlockGrid`` of Open3D, whose unit is a voxel."""
     import open3d
 
     core = open3d.core
@@ -117,7 +115,7 @@ def _new_grid() -> Any:
 
 
 def _draw(surfels: Surfels, camera: Camera, views: Viewpoints, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Median depth [H, W], 0 where nothing solid is or outside of the box low, high; and the colour [H, W, 3] there."""
+    """Render median depth [H, W], 0 where nothing solid is or outside the box low, high, and colour [H, W, 3]."""
     black = torch.zeros(3, dtype=surfels.means.dtype)
     drawn = views.rasterizer.rasterize(surfel_inputs(surfels, camera), camera, views.settings, black)
     assert drawn.median_depth is not None  # geometry is on unless the settings turn it off
@@ -129,7 +127,7 @@ def _draw(surfels: Surfels, camera: Camera, views: Viewpoints, low: Tensor, high
 
 
 def _in_voxels(camera: Camera, low: Tensor, voxel: float) -> tuple[np.ndarray, np.ndarray]:
-    """(K [3, 3], viewmat [4, 4]) float64 of a camera in a world whose origin is ``low`` and whose unit is ``voxel``.
+    """Return (K [3, 3], viewmat [4, 4]) float64 of a camera in a world of origin ``low`` and unit ``voxel``.
 
     Open3D has pixel centres at whole numbers.
     """
@@ -151,7 +149,7 @@ def _integrate(grid: Any, depth: Tensor, color: Tensor, pose: tuple[np.ndarray, 
 
 
 def sorted_mesh(mesh: Mesh) -> Mesh:
-    """The same mesh, its vertices in the order of their places and its faces in that of their vertices.
+    """Return the mesh with vertices in the order of their places and faces in that of their vertices.
 
     Determinism: Open3D's threads number both as they come.
     """
@@ -165,7 +163,7 @@ def sorted_mesh(mesh: Mesh) -> Mesh:
 
 
 def without_small_parts(mesh: Mesh, share: float) -> Mesh:
-    """The mesh without connected parts of fewer faces than ``share`` of the largest one's."""
+    """Return the mesh without connected parts of fewer faces than ``share`` of the largest one's."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

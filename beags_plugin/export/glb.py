@@ -1,8 +1,7 @@
 """A vertex-coloured mesh as binary glTF 2.0.
 
-Written here since no library at hand writes what a photographed colour needs: unlit, and finer than 8 bits, for glTF's
-vertex colours are linear and 8 bits of those leave too few dark tones. (glTF 2.0, sections 3.7.2, 4.4;
-KHR_materials_unlit)
+No library at hand writes what photographed colours need: unlit, and finer than 8 bits, since 8 bits of glTF's linear
+vertex colours leave too few dark tones. (glTF 2.0, sections 3.7.2, 4.4; KHR_materials_unlit)
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 
 
 def glb_bytes(mesh: Mesh, name: str) -> bytes:
-    """The file's content: one node, one mesh, one unlit material; places as float32, colours as 16 bits, linear."""
+    """Return the file's content: one node, one mesh, one unlit material; float32 places, linear 16-bit colours."""
     positions = mesh.vertices.astype("<f4")
     colors = np.full((len(positions), 4), 65535, dtype="<u2")
     colors[:, :3] = np.round(linear_from_srgb(mesh.colors) * 65535)
@@ -79,6 +78,6 @@ def glb_bytes(mesh: Mesh, name: str) -> bytes:
 
 
 def linear_from_srgb(colors: np.ndarray) -> np.ndarray:
-    """Light intensities 0..1 of sRGB values 0..1 (IEC 61966-2-1)."""
+    """Return light intensities 0..1 of sRGB values 0..1 (IEC 61966-2-1)."""
     colors = np.clip(np.asarray(colors, dtype=np.float64), 0.0, 1.0)
     return np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)

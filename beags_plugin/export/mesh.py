@@ -17,7 +17,7 @@ from beags_plugin.extraction.files import whole_file
 
 @dataclass(frozen=True)
 class MeshExporter(MeshOptions, Exporter):
-    """The surface that the training views see of a item drawn alone; both file types hold the same mesh."""
+    """The surface that the training views see of an item rendered alone; both file types hold the same mesh."""
 
     needs_views: ClassVar[bool] = True
 
@@ -30,7 +30,7 @@ class MeshExporter(MeshOptions, Exporter):
         return None
 
     def mesh(self, item: ExportItem) -> Mesh:
-        """The mesh of ``item``, made once per item and options; raises ``NothingToExport`` if no view shows one."""
+        """Return the mesh of ``item``, made once for each set of options; raise ``NothingToExport`` without a face."""
         key = ("mesh", *astuple(self))
         if key not in item.shared:
             item.shared[key] = self._mesh(item)
@@ -51,7 +51,7 @@ class MeshExporter(MeshOptions, Exporter):
 
     @staticmethod
     def facts(mesh: Mesh) -> dict[str, Any]:
-        """What the manifest says of a mesh."""
+        """Return the manifest's entries about a mesh."""
         return {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "voxel": mesh.voxel}
 
 

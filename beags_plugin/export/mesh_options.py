@@ -12,7 +12,7 @@ MOST_VOXELS = 4096  # along a side; memory_mb bounds their number besides
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """How a mesh is made of the depth that the training views see."""
+    """Options of making a mesh from the depth that the training views see."""
 
     resolution: int = 128
     """Meshes: voxels along the object's longest side."""

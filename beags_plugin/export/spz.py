@@ -33,10 +33,10 @@ _COLOR_SCALE = 0.15  # the format's: bytes hold 0.5 + 0.15 dc, so that colours a
 class SpzExporter(Exporter):
     """Niantic's .spz: Scaniverse, SuperSplat, Babylon.js. It has no place for class ids.
 
-    Like the tools that make .spz of .ply, it takes the axes of splat .ply files (y down, z forward) for the world's and
-    turns them to the format's own (y up, z backward), half a turn about x; readers turn them back.
+    Like the tools that make .spz of .ply, it turns the axes of splat .ply files (y down, z forward) to the format's own
+    (y up, z backward), half a turn about x; readers turn them back.
 
-    first_band_bits, other_bands_bits: of the colour bands; fewer compress better.
+    first_band_bits, other_bands_bits: of the SH degrees; fewer compress better.
     """
 
     suffix: ClassVar[str] = "spz"
@@ -72,7 +72,7 @@ class SpzExporter(Exporter):
         parts = (
             struct.pack("<IIIBBBB", MAGIC, VERSION, len(turned), degree, bits, 0, 0),
             np.ascontiguousarray(fixed).view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),
-            # 255 would be read as an infinite logit; nothing is drawn with an alpha above 0.99 anyway
+            # 255 would be read as an infinite logit; nothing is rendered with an alpha above 0.99 anyway
             _bytes(255.0 * opacities(turned.opacity_logits.double()), most=254),
             _bytes(255.0 * (0.5 + _COLOR_SCALE * turned.sh_dc.double())),
             _bytes(16.0 * (torch.cat([log_scales, thin], dim=1) + 10.0)),
@@ -82,7 +82,7 @@ class SpzExporter(Exporter):
         return b"".join(parts), {"version": VERSION, "fractional_bits": bits, "sh_degree": degree}
 
     def _sh_bytes(self, rest: torch.Tensor) -> bytes:
-        """Coefficients -1..1 as 0..255 with 0 at 128, rounded to the bits wanted; colour is the inner axis."""
+        """Encode coefficients -1..1 as 0..255 with 0 at 128, rounded to the bits wanted; colour is the inner axis."""
         bits = torch.full((rest.shape[1], 1), float(self.other_bands_bits), dtype=rest.dtype)
         bits[:3] = self.first_band_bits
         step = 2.0 ** (8.0 - bits)
@@ -90,7 +90,7 @@ class SpzExporter(Exporter):
 
 
 def fractional_bits(reach: float) -> int:
-    """The most bits after the point, 0..23, with which coordinates up to ``reach`` fit; ``UserError`` if none do."""
+    """Return the most bits after the point, 0..23, for coordinates up to ``reach``; raise ``UserError`` if none fit."""
     if reach > _MOST:
         raise UserError(f"the scene reaches {reach:.3g} units from the origin, but .spz holds {_MOST}: scale it down.")
     bits = 23
@@ -100,7 +100,7 @@ def fractional_bits(reach: float) -> int:
 
 
 def _rotation_bytes(quats: torch.Tensor) -> bytes:
-    """x, y, z of unit quaternions with w >= 0, each -1..1 as 0..255."""
+    """Encode x, y, z of unit quaternions with w >= 0, each -1..1 as 0..255."""
     unit = torch.nn.functional.normalize(quats, dim=1)
     unit = torch.where(unit[:, :1] < 0, -unit, unit)
     return _bytes(127.5 + 127.5 * unit[:, 1:])

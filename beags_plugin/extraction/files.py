@@ -1,4 +1,4 @@
-"""Files that are made for a user: there whole or not at all, or one sentence says why not."""
+"""Files made for a user: whole or not at all, or a user error."""
 
 from __future__ import annotations
 

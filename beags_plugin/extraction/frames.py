@@ -31,7 +31,7 @@ def to_input_frame(surfels: Surfels, transform: Tensor, scale: float) -> Surfels
 
 
 def from_input_frame(surfels: Surfels, transform: Tensor, scale: float) -> Surfels:
-    """The same surfels, seen the same, in the frame of x' = scale (R x + t): undoes ``to_input_frame``.
+    """Return the same surfels in the frame of x' = scale (R x + t): undo ``to_input_frame``.
 
     surfels: N surfels in the frame of the input poses; the rest as of ``to_input_frame``.
     """
@@ -41,7 +41,7 @@ def from_input_frame(surfels: Surfels, transform: Tensor, scale: float) -> Surfe
 
 
 def _checked(transform: Tensor, scale: float, like: Tensor) -> tuple[Tensor, Tensor]:
-    """R [3, 3] and t [3] in float64, on the device of ``like``."""
+    """Return R [3, 3] and t [3] in float64, on the device of ``like``."""
     matrix = transform.detach().to(device=like.device, dtype=torch.float64)
     if matrix.shape != (3, 4):
         raise ValueError(f"transform must be [3, 4], not {list(matrix.shape)}")
@@ -57,7 +57,7 @@ def _checked(transform: Tensor, scale: float, like: Tensor) -> tuple[Tensor, Ten
 
 
 def _turned(surfels: Surfels, means: Tensor, rotation: Tensor, factor: float) -> Surfels:
-    """Surfels at ``means`` [N, 3] float64, turned by ``rotation`` [3, 3] and ``factor`` times as large."""
+    """Return surfels at ``means`` [N, 3] float64, turned by ``rotation`` [3, 3] and ``factor`` times as large."""
     dtype = surfels.means.dtype
     return Surfels.of(
         means=means.to(dtype),
@@ -69,7 +69,7 @@ def _turned(surfels: Surfels, means: Tensor, rotation: Tensor, factor: float) ->
 
 
 def quat_from_rotation(rotation: Tensor) -> Tensor:
-    """The unit quaternion [4] wxyz of a rotation matrix [3, 3].
+    """Return the unit quaternion [4] wxyz of a rotation matrix [3, 3].
 
     q q^T is linear in the matrix, so q is the column of largest diagonal, normalised: no division by a small number.
     """
@@ -87,7 +87,7 @@ def quat_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def rotate_sh(sh: Tensor, rotation: Tensor, degree: int) -> Tensor:
-    """Coefficients of the turned colour function g(r d) = f(d), r = ``rotation``.
+    """Return coefficients of the turned colour function g(r d) = f(d), r = ``rotation``.
 
     Each band maps to itself linearly; its matrix is the least-squares solution over many directions (exact up to
     rounding, since the turned band lies in the span of the band).
@@ -107,7 +107,7 @@ def rotate_sh(sh: Tensor, rotation: Tensor, degree: int) -> Tensor:
 
 
 def _sphere(count: int) -> Tensor:
-    """[count, 3] float64 unit directions on a spiral: evenly spread, so that the fit is well conditioned."""
+    """Return [count, 3] float64 unit directions, evenly spread on a spiral for a well-conditioned fit."""
     step = torch.arange(count, dtype=torch.float64) + 0.5
     z = 1 - 2 * step / count
     angle = step * (torch.pi * (3 - 5**0.5))
@@ -116,7 +116,7 @@ def _sphere(count: int) -> Tensor:
 
 
 def _basis(directions: Tensor, degree: int) -> Tensor:
-    """[D, (degree + 1)^2] the basis functions at unit directions [D, 3], taken from the renderer's own colours.
+    """Return the basis functions at unit directions [D, 3], [D, (degree + 1)^2], from the renderer's own colours.
 
     Read off ``sh_colors`` so that order and signs are the renderer's. The factor 0.1 keeps the
     colour, 0.1 * basis + 0.5, off the clamp at 0.

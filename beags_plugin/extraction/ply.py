@@ -14,7 +14,7 @@ from beags_plugin.core.sh import MAX_DEGREE, num_sh_bases
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.frames import to_input_frame
-from beags_plugin.extraction.splat_file import read_splat_file
+from beags_plugin.extraction.splat_file import numbered, read_splat_file
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.ply import write_vertices
 
@@ -31,10 +31,10 @@ def write_ply(
 ) -> None:
     """Write surfels as a binary splat .ply: 3DGS's or 2DGS's columns, then ``class_id`` (int32) if there are class ids.
 
-    Columns: x y z; nx ny nz, the surfel's normal; f_dc_0..2; f_rest_* channel-major (all red coefficients, then
-    green, then blue); opacity as a logit; scale_0..2 as logs, the third ``THICKNESS`` times the smaller of the two (a
-    viewer for 3D Gaussians needs one; a surfel has none); rot_0..3 wxyz, unit length. 2DGS's layout has two scales, and
-    always 45 f_rest columns, the rest 0: the official code asks for as many as its degree, 3 unless told.
+    Columns: x y z; nx ny nz, the surfel's normal; f_dc_0..2; f_rest_* channel-major (red, then green, then blue);
+    opacity as a logit; scale_0..2 as logs, the third ``THICKNESS`` times the smaller of the two for viewers of 3D
+    Gaussians; rot_0..3 wxyz, unit length. 2DGS's layout has two scales and always 45 f_rest columns, padded with 0, as
+    the official code expects for its default SH degree 3.
 
     surfels: N surfels. class_ids: [N] integer, phi. transform: the dataparser's ([3, 4], scale); with it the
     file is in the frame of the input poses, without it in the surfels' own. Raises ``UserError`` if the file cannot be
@@ -67,21 +67,17 @@ def _columns(surfels: Surfels, layout: str) -> dict[str, np.ndarray]:
     blocks = {
         ("x", "y", "z"): surfels.means.detach(),
         ("nx", "ny", "nz"): normals,
-        _numbered("f_dc", 3): surfels.sh_dc.detach(),
-        _numbered("f_rest", rest.shape[1]): rest,
+        numbered("f_dc", 3): surfels.sh_dc.detach(),
+        numbered("f_rest", rest.shape[1]): rest,
         ("opacity",): surfels.opacity_logits.detach()[:, None],
-        _numbered("scale", scales.shape[1]): scales,
-        _numbered("rot", 4): quats,
+        numbered("scale", scales.shape[1]): scales,
+        numbered("rot", 4): quats,
     }
     return {
         name: values[:, i].cpu().numpy().astype("<f4")
         for names, values in blocks.items()
         for i, name in enumerate(names)
     }
-
-
-def _numbered(prefix: str, count: int) -> tuple[str, ...]:
-    return tuple(f"{prefix}_{i}" for i in range(count))
 
 
 def read_ply(path: str | Path) -> tuple[Surfels, Tensor | None]:

@@ -8,7 +8,7 @@ from beags_plugin.core.surfels import Surfels
 
 
 def select_class(surfels: Surfels, class_ids: Tensor, class_id: int) -> tuple[Surfels, Tensor]:
-    """The Gaussians of one class: all parameters with phi_i = class_id.
+    """Return the Gaussians of one class: all parameters with phi_i = class_id.
 
     surfels: N surfels. class_ids: [N] integer, phi.
     Returns (M surfels, [M] int64 their indices among the N, ascending). Raises ``ValueError`` on a wrong length.
@@ -17,7 +17,7 @@ def select_class(surfels: Surfels, class_ids: Tensor, class_id: int) -> tuple[Su
 
 
 def remove_class(surfels: Surfels, class_ids: Tensor, class_id: int) -> tuple[Surfels, Tensor]:
-    """The scene without one class: the complement of ``select_class``, with the same arguments and returns."""
+    """Return the scene without one class: the complement of ``select_class``, with its arguments and returns."""
     return _select(surfels, class_ids, class_ids != class_id)
 
 

@@ -17,7 +17,7 @@ from beags_plugin.system.reading.text import reason
 
 @dataclass(frozen=True)
 class SplatFile:
-    """What a .ply holds: N Gaussians with two or three scales, in float32, and class_ids [N] int32 if it has them."""
+    """Content of a .ply: N Gaussians with two or three scales, in float32, and class_ids [N] int32 if it has them."""
 
     gaussians: Gaussians
     class_ids: Tensor | None
@@ -44,8 +44,8 @@ def read_splat_file(path: str | Path) -> SplatFile:
         raise UserError(
             f"{path} has {rest_count} f_rest columns, but 0, 9, 24 or 45 make whole colour bands: export it again."
         )
-    blocks = [("x", "y", "z"), _numbered("f_dc", 3), ("opacity",), _numbered("scale", scale_count)]
-    blocks += [_numbered("rot", 4), _numbered("f_rest", rest_count)]
+    blocks = [("x", "y", "z"), numbered("f_dc", 3), ("opacity",), numbered("scale", scale_count)]
+    blocks += [numbered("rot", 4), numbered("f_rest", rest_count)]
     if missing := sorted({name for block in blocks for name in block} - present):
         raise UserError(f"{path} is not a splat .ply file (it has no column {missing[0]!r}): name one.")
 
@@ -61,5 +61,6 @@ def read_splat_file(path: str | Path) -> SplatFile:
     return SplatFile(Gaussians(means, quats, scales, opacity[:, 0], dc, rest), ids)
 
 
-def _numbered(prefix: str, count: int) -> tuple[str, ...]:
+def numbered(prefix: str, count: int) -> tuple[str, ...]:
+    """Return the names prefix_0, prefix_1, .."""
     return tuple(f"{prefix}_{i}" for i in range(count))

@@ -1,4 +1,4 @@
-"""What an importer is: it reads a scene that another program, or another run, has trained."""
+"""The interface of importers, which read a scene that another program, or another run, has trained."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from beags_plugin.system.errors import UserError
 class ImportedScene:
     """A scene as a file holds it.
 
-    kind: what to call it, as in "3DGS .ply". gaussians: N, flat or with volume; not yet checked for odd values.
+    kind: its name for users, as in "3DGS .ply". gaussians: N, flat or with volume; not yet checked for odd values.
     normalization: None if the file lies in the world of the input poses; else ([3, 4] float64 R | t, scale) of the
     frame x' = scale (R x + t) that it lies in.
     note: a sentence that the user should read, or "".
@@ -32,18 +32,18 @@ class ImportedScene:
 class Importer(ABC):
     """One kind of file or folder.
 
-    marks: what it reads, for messages.
+    marks: the files that it reads, for messages.
     """
 
     marks: ClassVar[str]
 
     @abstractmethod
     def recognises(self, path: Path) -> bool:
-        """Whether to take ``path``, which exists, where the user named no importer; reads as little as it can."""
+        """Return whether to take the existing ``path`` where the user named no importer; reads as little as it can."""
 
     @abstractmethod
     def read(self, path: Path) -> ImportedScene:
-        """The scene in ``path``; raises ``UserError`` if it cannot be read. Counts and sizes are not to be trusted."""
+        """Read the scene in ``path``; raise ``UserError`` if it cannot be read. Trust no counts and sizes."""
 
 
 def find_importer(path: Path) -> Importer:

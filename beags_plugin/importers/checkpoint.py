@@ -45,7 +45,7 @@ class CheckpointImporter(Importer):
 
 
 def _newest(path: Path) -> Path | None:
-    """The checkpoint that ``path`` means: itself, or the newest of a run; None if it means none."""
+    """Return the checkpoint that ``path`` means: itself, or the newest of a run; None if it means none."""
     if path.is_file() and path.suffix == ".ckpt":
         return path
     run = path.parent if path.name == "config.yml" else path
@@ -69,7 +69,7 @@ def _normalization(file: Path) -> tuple[Tensor, float] | None:
 
 
 def _gaussians(checkpoint: Path) -> Gaussians:
-    """The Gaussians of a checkpoint; tensors only are loaded, from a file that is mapped, not read into memory."""
+    """Read the Gaussians of a checkpoint: tensors only, from a file that is mapped into memory."""
     try:
         content = load_tensors(checkpoint, mmap=True)
         if not isinstance(content, dict) or not isinstance(content.get("pipeline"), dict):
@@ -89,7 +89,7 @@ def _gaussians(checkpoint: Path) -> Gaussians:
 
 
 def _checked(checkpoint: Path, found: dict[str, Any]) -> dict[str, Tensor]:
-    """Copies of the tensors in float32, of shapes that fit together and no larger than the file can hold."""
+    """Copy the tensors to float32; raise ``UserError`` for shapes that do not fit together or into the file."""
     means = found.get("means")
     count = means.shape[0] if isinstance(means, Tensor) and means.dim() == 2 else -1
     shapes: dict[str, tuple[tuple[int, ...], ...]] = {

@@ -1,4 +1,4 @@
-"""What a loss is: a name, a weight, the steps it is active in, and pure maths."""
+"""The interface of losses: a name, a weight, the steps it is active in, and pure maths."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LossInputs:
-    """All that a loss may look at in one training step; each uses what it needs.
+    """Inputs of all losses in one training step; each uses what it needs.
 
     step: training step, from 0.
     seed: of the run; with the step it decides every random number.
     surfels: the scene, N surfels, with gradients.
-    camera: the view that was drawn.
-    render: what was drawn (with what ``Loss.needs`` names).
+    camera: the view that was rendered.
+    render: the images, with what ``Loss.needs`` names.
     image: [H, W, 3] the photograph, in 0..1.
     labels: [H, W] int32 class ids M' of the view, or IGNORE; None if the view has none.
     class_ids: [N] int32, phi; None before assignment.
     grid: the visibility voxel grids; None before refinement.
-    draw: draws other surfels than the render's, with geometry, on black; for losses that need a drawing of their own.
-    members: which surfels each class has, and present: ids of the objects that ``labels`` shows, ascending, where the
-        host knows them; None: a loss that needs them looks at ``class_ids`` and ``labels``, for which a GPU must wait.
+    draw: renders other surfels than the render's, with geometry, on black; for losses that need a render of their own.
+    members: the surfels of each class; present: ids of the objects in ``labels``, ascending. None where the host does
+        not know them: a loss that needs them reads ``class_ids`` and ``labels``, for which a GPU must wait.
     """
 
     step: int
@@ -67,18 +67,18 @@ class Loss(ABC):
 
     @property
     def asks_grid_about_background(self) -> bool:
-        """Whether it looks up background's voxels; where no term does, the grid goes without them, its largest part."""
+        """Return whether it looks up the background's voxels; where no term does, the grid is made without them."""
         return False
 
     def active(self, step: int) -> bool:
-        """Whether the term counts at this step."""
+        """Return whether the term counts at this step."""
         return self.weight != 0.0 and self.start <= step and (self.stop is None or step < self.stop)
 
     def weighted(self, inputs: LossInputs) -> Tensor:
-        """The term as it enters the sum. A loss with a compiled op has the op scale it, there and back, for nothing."""
+        """Return the term as it enters the sum; compiled ops scale value and gradients at no cost."""
         value = self.value(inputs)
         return value if self.weight == 1.0 else self.weight * value
 
     @abstractmethod
     def value(self, inputs: LossInputs) -> Tensor:
-        """The unweighted term: a scalar with gradients towards what it supervises."""
+        """Return the unweighted term: a scalar with gradients towards what it supervises."""

@@ -1,4 +1,4 @@
-"""Which Gaussians a class has and which objects a mask shows, as the host knows them: a step need not ask a GPU."""
+"""The Gaussians of each class, known on the host, so that a step need not wait for a GPU."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from torch import Tensor
 class ClassMembers:
     """The Gaussians of every class.
 
-    class_ids: [N] int class ids. They are looked at when a class is asked for first, and must be as they are now: ask
-    ``current``.
+    class_ids: [N] int. They are read when a class is first asked for, and must not change until then (``current``).
     """
 
     def __init__(self, class_ids: Tensor) -> None:
@@ -19,12 +18,13 @@ class ClassMembers:
         self._spans: dict[int, tuple[int, int]] | None = None
 
     def current(self, class_ids: Tensor) -> bool:
-        """Whether these are the ids that are looked at, unchanged by torch's operations in place (of what is written
-        through ``.data`` or numpy, torch keeps no count)."""
+        """Return whether these are the same ids, unchanged by torch's operations in place.
+
+        torch does not count writes through ``.data`` or numpy."""
         return class_ids is self._source and class_ids._version == self._version
 
     def of(self, class_id: int) -> Tensor:
-        """[M] int64, ascending: the places of the class's Gaussians, on the device of the ids."""
+        """Return [M] int64, ascending: the places of the class's Gaussians, on the device of the ids."""
         if self._spans is None:
             ordered, self._order = torch.sort(self._source, stable=True)
             ids, counts = torch.unique_consecutive(ordered, return_counts=True)

@@ -1,4 +1,4 @@
-"""Normal consistency: the drawn normals agree with the slope of the drawn depth (method, section 1)."""
+"""Normal consistency: the rendered normals agree with the slope of the rendered depth (method, section 1)."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from beags_plugin.ops.normal_consistency import normal_consistency
 class NormalConsistencyLoss(Loss):
     """Mean over the inner pixels of A (1 - n . n_depth), with A held constant.
 
-    n is the drawn normal sum w n (not normalised) in camera space. The 2DGS paper has sum w (1 - n . n_depth); holding
-    A constant, as its authors' program does, keeps the term from thinning out surfaces just to lower the loss. Pixels
-    at the border, and those that lack depth themselves or at one of their four neighbours, count as 0.
+    n is the rendered normal sum w n (not normalised) in camera space. The 2DGS paper has sum w (1 - n . n_depth). As in
+    its authors' program, A is constant, so that the term does not thin out surfaces. Pixels at the border, and those
+    without depth at themselves or at one of their four neighbours, count as 0.
     """
 
     needs: ClassVar[frozenset[str]] = frozenset({"geometry"})
@@ -49,7 +49,7 @@ class NormalConsistencyLoss(Loss):
 
 
 def depth_normals(depth: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Normals of a depth image, from central differences of the points under the pixel centres.
+    """Return normals of a depth image, from central differences of the points under the pixel centres.
 
     depth: [H, W] float, along z, 0 where unknown. Returns (normals [H-2, W-2, 3], of unit length, camera space, turned
     towards the camera; known [H-2, W-2] bool). Gradients are finite everywhere; where unknown, the normal is constant.

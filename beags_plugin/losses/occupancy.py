@@ -24,14 +24,12 @@ _CHUNK_POINTS = 1 << 16  # points looked up at a time: their temporaries stay in
 class OccupancyLoss(Loss):
     """L = 1 / (N Z) sum_i sum_r o_i G_i(x_r) Q_i(x_r), Q = 1 where D_occ(x_r, V_phi_i) = 0, else 0 (E9).
 
-    It does not pass through the rasterizer, so Gaussians that no ray sees learn too. Surfels with a parameter that is
-    not finite, or with a scale of 0, count as 0. Memory does not depend on ``samples``. The compiled op computes it
-    where it can; what follows here is its reference.
+    Gaussians that no ray sees learn too. Surfels with a parameter that is not finite, or with a scale of 0, count as 0.
+    Memory does not depend on ``samples``. The compiled op computes it where it can; the code here is its reference.
 
     samples: Z, points per Gaussian and step, uniform in its UV disc of radius 3.
-    background: whether the background's Gaussians are held to its voxels too, as in the paper. Its far parts are
-        sampled thinly, so that one voxel size for all leaves holes there; without it the background keeps its look,
-        and steps are quicker (our choice for short runs).
+    background: hold the background's Gaussians to its voxels too, as in the paper. Its far parts are sampled thinly, so
+        that its grid has holes there; without it the background keeps its look (our choice for short runs).
     """
 
     weight: float = 10.0
@@ -84,7 +82,7 @@ class OccupancyLoss(Loss):
 
 @torch.no_grad()
 def _outside(means, quats, log_scales, opacity_logits, class_ids: Tensor, grid: VisibilityGrid) -> Tensor:
-    """Indices [M] int64 of the Gaussians whose disc is not wholly in valid voxels; the others' loss is exactly 0."""
+    """Return [M] int64, the Gaussians whose disc is not wholly in valid voxels; the others' loss is exactly 0."""
     scales = log_scales.exp()
     half_axes = RADIUS * scales[:, None, :] * rotation_from_quat(quats)[..., :2]  # [N, 3, 2]
     inside = grid.disc_inside(means, half_axes[..., 0], half_axes[..., 1], class_ids)
@@ -128,7 +126,7 @@ def _sums(
     means: Tensor, axes_u: Tensor, axes_v: Tensor, class_ids: Tensor, grid: VisibilityGrid,
     seed: int, step: int, gaussians: Tensor, num_samples: int,
 ) -> Tensor:  # fmt: skip
-    """Sums over the samples of G Q times 1, u, v, u^2, v^2, u v: [6, M]."""
+    """Return sums over the samples of G Q times 1, u, v, u^2, v^2, u v: [6, M]."""
     total = means.new_zeros(6, len(means))
     block = min(max(len(means), 1), _CHUNK_POINTS)
     per_chunk = max(1, _CHUNK_POINTS // block)

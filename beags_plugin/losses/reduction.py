@@ -9,7 +9,7 @@ _ROW = 1024  # a whole-tensor sum splits its range by the number of threads; sum
 
 
 def ordered_sum(values: Tensor) -> Tensor:
-    """Sum of all elements, bit for bit the same for any number of threads; differentiable.
+    """Return the sum of all elements, bit for bit the same for any number of threads; differentiable.
 
     values: any shape, float. Returns a scalar of the same dtype.
     """
@@ -22,5 +22,5 @@ def ordered_sum(values: Tensor) -> Tensor:
 
 
 def ordered_mean(values: Tensor) -> Tensor:
-    """Mean of all elements (0 of none), as ``ordered_sum``."""
+    """Return the mean of all elements (0 of none), as ``ordered_sum``."""
     return ordered_sum(values) / max(values.numel(), 1)

@@ -1,7 +1,7 @@
-"""The silhouette loss: an object drawn alone covers its mask and nothing else that could be seen (our extension).
+"""The silhouette loss: an object rendered alone covers its mask and nothing else that could be seen (our extension).
 
-The boundary loss (E7) looks at the composed picture, where a Gaussian that others cover weighs next to nothing; once
-the object is cut out, nothing covers it any more, and it shows. This term looks at the object as extraction draws it.
+In the boundary loss (E7), a Gaussian that others cover weighs next to nothing; once the object is extracted, nothing
+covers it, and it shows. This term looks at the object as extraction renders it.
 """
 
 from __future__ import annotations
@@ -28,15 +28,14 @@ TAU = 0.02
 class SilhouetteLoss(Loss):
     """Mean over the labelled pixels of |A_c - [M' = c]|, summed over the objects c of the view.
 
-    A_c is the alpha of the Gaussians of class c drawn alone. Where M' is of another class and the object lies behind
+    A_c is the alpha of the Gaussians of class c rendered alone. Where M' is of another class and the object lies behind
     what the whole scene shows there, it may be hidden rightly, and the pixel does not count.
 
-    objects: how many objects of the view are drawn each step, chosen at random and counted in proportion; each costs
-        a drawing of its Gaussians.
-    seen: near a contact the surface of what stands below goes on close behind the other object's, too close for TAU to
-        tell. Pixels of other objects do not count where the drawn surface lies behind what the scene shows, and so many
-        of the 27 voxels around it were seen as this object's (D_occ >= seen, section 5); a plane fills 9 of them. 0:
-        they all count.
+    objects: how many objects of the view are rendered each step, chosen at random and counted in proportion; each costs
+        a render of its Gaussians.
+    seen: near a contact the object below goes on behind the other one, too close for TAU. Pixels of other objects do
+        not count where the rendered surface lies behind what the scene shows and D_occ >= seen there (method, section
+        5): that many of the 27 voxels around it were seen as this object's. A plane fills 9. 0: they all count.
     """
 
     needs: ClassVar[frozenset[str]] = frozenset({"geometry"})
@@ -70,7 +69,7 @@ class SilhouetteLoss(Loss):
         return torch.stack(terms).sum() * share.to(nothing)
 
     def _of_object(self, class_id: int, members: Tensor, known: Tensor, inputs: LossInputs) -> Tensor:
-        """Sum over the pixels that count."""
+        """Return the sum over the pixels that count."""
         assert inputs.draw is not None and inputs.labels is not None
         if len(members) == 0:
             return inputs.render.color.new_zeros(())
@@ -79,7 +78,7 @@ class SilhouetteLoss(Loss):
         alone = inputs.draw(surfel_inputs(part, inputs.camera, 0), inputs.camera)
         assert alone.depth is not None and alone.median_depth is not None
         assert inputs.render.median_depth is not None
-        # thin parts have no median: their expected depth tells where they are
+        # thin parts have no median: their expected depth shows where they are
         depth = torch.where(alone.median_depth > 0, alone.median_depth, alone.depth).detach()
         shown = inputs.render.median_depth.detach()
         hidden = (shown > 0) & (depth > (1.0 + TAU) * shown)
@@ -91,7 +90,7 @@ class SilhouetteLoss(Loss):
         return ordered_sum(wrong)
 
     def _seen_from_elsewhere(self, asked: Tensor, depth: Tensor, class_id: int, inputs: LossInputs) -> Tensor:
-        """[H, W] bool: the pixels of ``asked`` [H, W] bool at whose ``depth`` [H, W] some view saw the object."""
+        """Return the pixels of ``asked`` at whose ``depth`` [H, W] some view saw the object, both [H, W] bool."""
         if inputs.grid is None:
             raise ValueError("the silhouette loss needs a visibility grid where seen > 0")
         points = lift(depth, inputs.camera).reshape(-1, 3)
@@ -101,6 +100,6 @@ class SilhouetteLoss(Loss):
 
 
 def _chosen(count: int, wanted: int, seed: int, step: int) -> list[int]:
-    """Ranks of the objects that are drawn, from (seed, step) alone."""
+    """Choose the ranks of the objects to render, from (seed, step) alone."""
     generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
     return torch.randperm(count, generator=generator)[:wanted].tolist()

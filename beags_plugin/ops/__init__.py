@@ -1,7 +1,6 @@
 """Fronts of the compiled ops: each checks its arguments once, by name, and allocates; ``native/`` computes.
 
 An op has one name: its module here, the function or class inside it and in C++, its files in ``native/ops`` and
-``native/cuda/ops``, and its test, but for those of the two image losses (``test_image_ops.py``) and of the voxel votes
-(``test_reprojection_votes.py``). All of them have a torch version beside their user, which is the reference and runs
+``native/cuda/ops``, and mostly its test. All have a torch version beside their user, which is the reference and runs
 where ``extension.load()`` gives None.
 """

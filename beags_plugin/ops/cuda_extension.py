@@ -14,7 +14,7 @@ from beags_plugin.ops import extension
 
 @cache
 def status() -> tuple[ModuleType | None, str | None]:
-    """``beags_plugin._native.cuda``, or one sentence on why it cannot be used here."""
+    """Return ``beags_plugin._native.cuda``, or one sentence on why it cannot be used here."""
     module, reason = extension.status()
     if module is None:
         return None, reason
@@ -41,12 +41,12 @@ def _dotted(version: int) -> str:
 
 
 def load() -> ModuleType | None:
-    """The module, or None where CUDA kernels cannot run."""
+    """Return the module, or None where CUDA kernels cannot run."""
     return status()[0]
 
 
 def module_for(*tensors: Tensor) -> ModuleType | None:
-    """The module if it takes these float tensors (on one GPU, all float32 or all float64), else None."""
+    """Return the module if it takes these float tensors (on one GPU, all float32 or all float64), else None."""
     first = tensors[0]
     if not first.is_cuda or first.dtype not in (torch.float32, torch.float64):
         return None
@@ -56,12 +56,12 @@ def module_for(*tensors: Tensor) -> ModuleType | None:
 
 
 def supports(*tensors: Tensor) -> bool:
-    """Whether the compiled ops take these float tensors: all float32 or all float64, on the CPU or on one GPU."""
+    """Return whether the compiled ops take these tensors: all float32 or all float64, on the CPU or on one GPU."""
     return extension.supports(*tensors) or module_for(*tensors) is not None
 
 
 def stream(device: torch.device) -> int:
-    """torch's current stream there; 0, the emulation's, for the CPU."""
+    """Return torch's current stream there; 0, the emulation's, for the CPU."""
     return torch.cuda.current_stream(device).cuda_stream if device.type == "cuda" else 0
 
 
@@ -81,7 +81,7 @@ class on_device:
 
 
 def call(module: ModuleType, name: str, like: Tensor, *arguments: Any) -> Any:
-    """``name`` of the module for the dtype and on the device of ``like``; its last argument is the stream."""
+    """Call ``name`` of the module for the dtype and on the device of ``like``, with the stream as the last argument."""
     suffix = "f32" if like.dtype == torch.float32 else "f64"
     with on_device(like.device):
         return getattr(module, f"{name}_{suffix}")(*arguments, stream(like.device))

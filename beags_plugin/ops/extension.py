@@ -17,7 +17,7 @@ _SUFFIXES = {torch.float32: "f32", torch.float64: "f64"}
 
 @cache
 def status() -> tuple[ModuleType | None, str | None]:
-    """``beags_plugin._native``, or one sentence on why it is not there.
+    """Return ``beags_plugin._native``, or one sentence on why it is not there.
 
     Raises ``UserError`` if the instruction set that the environment asks for cannot run: nothing may hide that.
     """
@@ -40,12 +40,12 @@ def status() -> tuple[ModuleType | None, str | None]:
 
 
 def load() -> ModuleType | None:
-    """``beags_plugin._native``, or None where it was not built or does not load (``beags doctor`` says why)."""
+    """Return ``beags_plugin._native``, or None where it was not built or does not load (``beags doctor`` says why)."""
     return status()[0]
 
 
 def supports(*tensors: Tensor) -> bool:
-    """Whether the compiled ops are there and take these float tensors: on the CPU, all float32 or all float64."""
+    """Return whether the compiled ops are there and take these tensors: on the CPU, all float32 or all float64."""
     dtype = tensors[0].dtype
     for value in tensors:
         if not value.is_cpu or value.dtype != dtype:
@@ -53,20 +53,27 @@ def supports(*tensors: Tensor) -> bool:
     return dtype in _SUFFIXES and load() is not None
 
 
+def module() -> ModuleType:
+    """Return the compiled module for a caller that knows from ``load`` or ``supports`` that it is there."""
+    found = load()
+    assert found is not None, "the caller asks extension.load() first"
+    return found
+
+
 def function(name: str, like: Tensor, owner: object | None = None):
-    """``name`` of the compiled module (or of ``owner``, one of its objects) for the dtype of ``like``."""
-    return getattr(load() if owner is None else owner, f"{name}_{_SUFFIXES[like.dtype]}")
+    """Return ``name`` of the compiled module (or of ``owner``, one of its objects) for the dtype of ``like``."""
+    return getattr(module() if owner is None else owner, f"{name}_{_SUFFIXES[like.dtype]}")
 
 
 def scaled(gradient: Tensor, factor: Tensor) -> Tensor:
-    """``gradient`` times the scalar ``factor``; itself, not a copy, where that is 1, as it is for most losses."""
+    """Return ``gradient`` times the scalar ``factor``; itself, not a copy, where that is 1, as for most losses."""
     if factor.is_cuda:  # looking at the number would make the host wait
         return gradient * factor
     return gradient if factor.item() == 1.0 else gradient * factor
 
 
 def threads() -> int:
-    """How many threads an op may use; none of their results depends on it."""
+    """Return the number of threads that an op may use; no result depends on it."""
     return torch.get_num_threads()
 
 
@@ -77,6 +84,6 @@ def check(name: str, value: Tensor, shape: tuple[int, ...], dtype: torch.dtype) 
 
 
 def plain(name: str, value: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-    """``value``, contiguous and without gradient; raises ``ValueError`` unless it has this shape and dtype."""
+    """Return ``value``, contiguous and without gradient; raise ``ValueError`` unless it has this shape and dtype."""
     check(name, value, shape, dtype)
     return value.detach().contiguous()

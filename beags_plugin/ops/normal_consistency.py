@@ -1,4 +1,4 @@
-"""Normal consistency of a drawn view, with its gradient in closed form (method, section 1)."""
+"""Normal consistency of a rendered view, with its gradient in closed form (method, section 1)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from beags_plugin.ops import cuda_extension, extension
 
 
 def normal_consistency(depth: Tensor, normal: Tensor, alpha: Tensor, K: Tensor, weight: float = 1.0) -> Tensor:
-    """weight * mean over the inner pixels of A (1 - n . n_depth): a scalar.
+    """Return weight * mean over the inner pixels of A (1 - n . n_depth): a scalar.
 
     It is differentiable, once, in ``depth`` and ``normal``.
 
@@ -55,7 +55,7 @@ class _NormalConsistency(torch.autograd.Function):
 
 
 def _on_gpu(module, images: tuple[Tensor, ...], numbers: tuple[float, ...], found: tuple[Tensor | None, ...]) -> Tensor:
-    """The value as a scalar on the GPU, which the host does not wait for; fills the gradients in ``found``."""
+    """Return the value as a scalar on the GPU, which the host does not wait for; fills the gradients in ``found``."""
     depth = images[0]
     shares = None if found[0] is None else depth.new_empty(4, *depth.shape)
     blocks = -(-depth.numel() // module.NORMAL_THREADS)

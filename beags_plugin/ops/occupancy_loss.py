@@ -22,7 +22,7 @@ def occupancy_loss(
     background: bool = True,
     weight: float = 1.0,
 ) -> Tensor:
-    """weight * L_occ (E9), a scalar; differentiable, once, in the four parameters.
+    """Return weight * L_occ (E9), a scalar; differentiable, once, in the four parameters.
 
     Its memory does not depend on ``samples``.
 
@@ -70,7 +70,7 @@ class _OccupancyLoss(torch.autograd.Function):
 
 
 def _on_gpu(module, plain: list[Tensor], arguments: list, gradients: list, weight: float) -> Tensor:
-    """The value as a scalar on the GPU, which the host does not wait for; fills ``gradients``."""
+    """Return the value as a scalar on the GPU, which the host does not wait for; fills ``gradients``."""
     blocks = -(-len(plain[0]) // module.OCCUPANCY_THREADS)
     partial = torch.empty(blocks, dtype=torch.float64, device=plain[0].device)
     value = plain[0].new_empty(1)

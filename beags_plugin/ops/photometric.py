@@ -12,7 +12,9 @@ from beags_plugin.ops import cuda_extension, extension
 def photometric(
     image: Tensor, reference: Tensor, l1_weight: float, ssim_weight: float, c1: float, c2: float, offset: float = 0.0
 ) -> Tensor:
-    """offset + l1_weight * mean |x - y| + ssim_weight * mean SSIM: a scalar, differentiable, once, in ``image``.
+    """Return offset + l1_weight * mean |x - y| + ssim_weight * mean SSIM: a scalar.
+
+    It is differentiable, once, in ``image``.
 
     image, reference: [H, W, 3], both float32 or both float64, on the CPU or on one GPU. c1, c2: the constants of SSIM.
     The window has 11 pixels, sigma 1.5, and zeros outside the image. Bit for bit the same for any number of threads,
@@ -48,7 +50,7 @@ class _Photometric(torch.autograd.Function):
 
 
 def _on_gpu(module, x: Tensor, y: Tensor, numbers: tuple[float, ...], gradient: Tensor | None) -> Tensor:
-    """The value as a scalar on the GPU, which the host does not wait for; fills ``gradient``."""
+    """Return the value as a scalar on the GPU, which the host does not wait for; fills ``gradient``."""
     height, width, _ = x.shape
     tiles = -(-height // module.PHOTOMETRIC_TILE) * -(-width // module.PHOTOMETRIC_TILE)
     slopes = None if gradient is None else x.new_empty(3, *x.shape)

@@ -20,7 +20,7 @@ def reprojection_votes(
     tau: float,
     ignore: int,
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Labels and confidence of the views first .. first + T - 1; the winner of each pixel's votes, or what it was.
+    """Vote on the labels of the views first .. first + T - 1; a pixel without votes keeps its label.
 
     depths: V x [H, W], float32 or float64, on the CPU or a GPU, all of one dtype. labels: V x [H, W] int32 or uint8,
         None: no mask; ids that are not 0 .. num_classes - 1 do not vote, nor does 255 of a uint8 map.

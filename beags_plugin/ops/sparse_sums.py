@@ -17,9 +17,7 @@ class SparseSums:
     """
 
     def __init__(self) -> None:
-        module = extension.load()
-        assert module is not None, "the caller asks extension.load() first"
-        self._native: Any = module.SparseSums()
+        self._native: Any = extension.module().SparseSums()
 
     def add(self, keys: Tensor, values: Tensor) -> None:
         """Add ``values`` [M] float32 or float64 to the sums of ``keys`` [M] int64, ascending, each at most once."""
@@ -28,7 +26,7 @@ class SparseSums:
         extension.function("add", values, self._native)(keys, values)
 
     def found(self) -> tuple[Tensor, Tensor]:
-        """The keys [K] int64, ascending, and their sums [K] float64."""
+        """Return the keys [K] int64, ascending, and their sums [K] float64."""
         keys = torch.empty(self._native.count, dtype=torch.int64)
         sums = torch.empty(len(keys), dtype=torch.float64)
         self._native.write(keys, sums)

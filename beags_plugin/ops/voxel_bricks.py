@@ -20,7 +20,7 @@ _FIRST = (0xFFFF, 0x000F000F000F000F, 0x1111111111111111)
 
 
 def tables(module: ModuleType, keys: Tensor, ranks: Tensor, classes: int) -> tuple[list[Any], list[Any]] | None:
-    """The tables of the occupied voxels and of the corners of cubes of 1, 2 and 3 valid voxels, and their memory.
+    """Make tables of occupied voxels and of the corners of cubes of 1, 2 and 3 valid voxels; return their memory too.
 
     The same sets as ``VoxelLookup`` of ``native/`` makes, bit for bit. None where the box about the voxels is too large
     for bricks to be numbered in 63 bits.
@@ -64,7 +64,7 @@ class _Bricks:
         return torch.div(self.numbers, self.size[0] * self.stride(0), rounding_mode="floor")
 
     def places(self) -> Tensor:
-        """[B, 3] coordinates, as keys hold them."""
+        """Return [B, 3] coordinates, as keys hold them."""
         along = [torch.div(self.numbers, self.stride(a), rounding_mode="floor") % self.size[a] for a in range(3)]
         return torch.stack(along, dim=1) + torch.tensor(self.base, device=self.numbers.device)
 
@@ -88,7 +88,7 @@ def _occupied(keys: Tensor, ranks: Tensor, classes: int) -> _Bricks | None:
 
 
 def _each_axis(bricks: _Bricks, change: Any) -> _Bricks:
-    """``change(bricks, axis)`` along one axis after the other, without the bricks that become empty."""
+    """Apply ``change(bricks, axis)`` along one axis after the other, without the bricks that become empty."""
     for axis in range(3):
         numbers, bits = change(bricks, axis)
         kept = bits != 0
@@ -97,7 +97,7 @@ def _each_axis(bricks: _Bricks, change: Any) -> _Bricks:
 
 
 def _spread(bricks: _Bricks, axis: int) -> tuple[Tensor, Tensor]:
-    """The voxels and the next ones on both sides."""
+    """Return the voxels and the next ones on both sides."""
     step, first, stride = _STEPS[axis], _FIRST[axis], bricks.stride(axis)
     last, bits = _signed(first << 3 * step), bricks.bits
     parts = (  # shifts to the right copy the sign, which the masks then remove
@@ -113,7 +113,7 @@ def _spread(bricks: _Bricks, axis: int) -> tuple[Tensor, Tensor]:
 
 
 def _corners(bricks: _Bricks, axis: int) -> tuple[Tensor, Tensor]:
-    """The voxels whose next one is there too."""
+    """Return the voxels whose next one is there too."""
     step, first = _STEPS[axis], _FIRST[axis]
     last, bits = _signed(first << 3 * step), bricks.bits
     if len(bits) == 0:
@@ -125,7 +125,7 @@ def _corners(bricks: _Bricks, axis: int) -> tuple[Tensor, Tensor]:
 
 
 def _dense(bricks: _Bricks) -> tuple[list[int], list[int], Tensor | None]:
-    """The base and the size of an array over the bricks, and the array where it is small enough."""
+    """Return the base and the size of an array over the bricks, and the array where it is small enough."""
     places = bricks.places()
     low, high = ([1 << 20] * 3, [0] * 3) if len(places) == 0 else torch.stack([places.amin(0), places.amax(0)]).tolist()
     base, size = [at - 2 for at in low], [max(b - a, 0) + 5 for a, b in zip(low, high, strict=True)]
@@ -141,7 +141,7 @@ def _dense(bricks: _Bricks) -> tuple[list[int], list[int], Tensor | None]:
 
 
 def _hashed(module: ModuleType, bricks: _Bricks) -> tuple[Tensor, Tensor]:
-    """The slots of all classes [S, 2] and where each class has its own [classes, 3], as ``BrickRange``."""
+    """Return the slots of all classes [S, 2] and where each class has its own [classes, 3], as ``BrickRange``."""
     ranks, places = bricks.ranks(), bricks.places()
     first, rows = 0, []
     for count in torch.bincount(ranks, minlength=bricks.classes).tolist():
@@ -159,6 +159,6 @@ def _hashed(module: ModuleType, bricks: _Bricks) -> tuple[Tensor, Tensor]:
 
 
 def _signed(bits: int) -> int:
-    """64 bits as the int64 that has them."""
+    """Return 64 bits as the int64 that has them."""
     bits &= (1 << 64) - 1
     return bits - (1 << 64) if bits >> 63 else bits

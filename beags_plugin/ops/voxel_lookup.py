@@ -26,8 +26,6 @@ class VoxelLookup:
         keys = extension.plain("keys", keys, (len(keys),), torch.int64)
         classes = extension.plain("classes", classes, (len(keys),), torch.int32)
         origin = extension.plain("origin", origin, (3,), torch.float64)
-        module = extension.load()
-        assert module is not None, "the caller asks extension.load() first"
         self._ranks = ClassRanks(classes)
         self._occupied = (keys, self._ranks.ranks(classes), len(self._ranks))
         self._place = (origin.tolist(), voxel_size)
@@ -36,17 +34,15 @@ class VoxelLookup:
 
     @property
     def native(self) -> Any:
-        """The tables as the CPU's module holds them."""
+        """Return the tables as the CPU's module holds them."""
         if self._native is None:
-            module = extension.load()
-            assert module is not None, "the caller asks extension.load() first"
             keys, ranks, count = self._occupied
             origin = torch.tensor(self._place[0], dtype=torch.float64)
-            self._native = module.VoxelLookup(keys.cpu(), ranks.cpu(), count, origin, self._place[1])
+            self._native = extension.module().VoxelLookup(keys.cpu(), ranks.cpu(), count, origin, self._place[1])
         return self._native
 
     def voxels(self, module: ModuleType, device: torch.device) -> Any:
-        """The tables as the CUDA module takes them, in the memory of ``device``."""
+        """Return the tables as the CUDA module takes them, in the memory of ``device``."""
         key = (module.__name__, device)
         if key not in self._voxels:
             keys, ranks, count = self._occupied
@@ -56,7 +52,7 @@ class VoxelLookup:
         return self._voxels[key][0]
 
     def _copied(self, module: ModuleType, device: torch.device) -> tuple[list[Any], list[Any]]:
-        """The CPU's tables there, for voxels too far apart to be numbered."""
+        """Return the CPU's tables there, for voxels too far apart to be numbered."""
         memory, tables = [], []
         for classes, base, size, *parts in self.native.tables():
             there = [
@@ -67,24 +63,24 @@ class VoxelLookup:
         return tables, memory
 
     def ranks(self, class_ids: Tensor) -> Tensor:
-        """The classes as ``native`` numbers them: [N] int32, background 0. class_ids: [N] int32."""
+        """Return the classes as ``native`` numbers them: [N] int32, background 0. class_ids: [N] int32."""
         return self._ranks.ranks(class_ids)
 
     @property
     def bytes(self) -> int:
-        """Memory of the CPU's tables."""
+        """Return the memory of the CPU's tables."""
         return self.native.bytes
 
     def count(self, points: Tensor, class_ids: Tensor) -> Tensor:
-        """D_occ: [P] int64 in 0..27. points: [P, 3] float32 or float64, world; class_ids: [P] int."""
+        """Return D_occ, [P] int64 in 0..27. points: [P, 3] float32 or float64, world; class_ids: [P] int."""
         return self._ask("count", torch.int64, class_ids, points=points)
 
     def valid(self, points: Tensor, class_ids: Tensor) -> Tensor:
-        """Whether D_occ > 0: [P] bool. points: [P, 3] float32 or float64, world; class_ids: [P] int."""
+        """Return D_occ > 0, [P] bool; arguments as of ``count``."""
         return self._ask("valid", torch.bool, class_ids, points=points)
 
     def disc_inside(self, means: Tensor, axes_u: Tensor, axes_v: Tensor, class_ids: Tensor) -> Tensor:
-        """Discs that surely lie in valid voxels: [N] bool; arguments as ``VisibilityGrid.disc_inside``."""
+        """Return the discs that surely lie in valid voxels, [N] bool; arguments as ``VisibilityGrid.disc_inside``."""
         return self._ask("disc_inside", torch.bool, class_ids, means=means, axes_u=axes_u, axes_v=axes_v)
 
     def _ask(self, name: str, dtype: torch.dtype, class_ids: Tensor, **vectors: Tensor) -> Tensor:

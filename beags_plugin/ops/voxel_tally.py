@@ -18,8 +18,8 @@ class VoxelTally:
     """Two hash tables, which grow: voxels with one class each, and further classes of voxels. Counts are exact.
 
     Memory is linear in the voxels: 20 bytes a slot, 16 for one of a further class, at least twice as many slots as are
-    used or as one call may add. A call that may need more memory waits for the GPU, to see how many are used. In what
-    order classes lie in memory depends on chance; no result does.
+    used or as one call may add. A call that may need more memory waits for the GPU, to see how many slots are used. The
+    order of classes in memory depends on chance; no result does.
 
     module: ``cuda_extension.load()``. device: where the memory lies.
     """
@@ -31,12 +31,12 @@ class VoxelTally:
         self._make(_LEAST, _LEAST)
 
     def add_pixels(self, depth: Tensor, to_voxels: Tensor, labels: Tensor, ignore: int) -> None:
-        """One vote of each pixel; arguments as ``voxel_votes.VoxelVotes.add``, all but ``to_voxels`` on the GPU."""
+        """Add one vote of each pixel; arguments as ``voxel_votes.VoxelVotes.add``, all but ``to_voxels`` on the GPU."""
         self._reserve(depth.numel())
         cuda_extension.call(self._module, "vote_pixels", depth, self._tally, depth, to_voxels, labels, ignore)
 
     def add_points(self, points: Tensor, class_ids: Tensor, origin: Tensor, size: float) -> None:
-        """One vote of each point [P, 3] float for its class [P] int32, in the voxel floor((point - origin) / size).
+        """Add one vote of each point [P, 3] float for its class [P] int32, in the voxel floor((point - origin) / size).
 
         Points that are not finite, or 2^20 voxels or more from the origin along an axis, do not vote: ``all_near``.
         """
@@ -47,25 +47,25 @@ class VoxelTally:
         cuda_extension.call(self._module, "vote_points", points, self._tally, points, class_ids, where, size)
 
     def all_near(self) -> bool:
-        """Whether every point had a voxel."""
+        """Return whether every point had a voxel."""
         return int(self._used[2]) == 0
 
     def pure(self) -> tuple[Tensor, Tensor]:
-        """The voxels with votes for one class alone: keys [M] int64, sorted, 21 bits an axis, and classes [M] int32."""
+        """Return the voxels with votes for one class: sorted keys [M] int64, 21 bits an axis, and classes [M] int32."""
         keys, labels, _, further = self._memory[:4]
         alone = (keys != _NONE) & (further == _NONE)
         keys, order = torch.sort(keys[alone])
         return keys, labels[alone][order]
 
     def decide(self) -> None:
-        """All votes are in; now and only now ``read`` may be asked."""
+        """End the votes; ``read`` may be called from now on."""
         slots = len(self._memory[0])
         self._decided = [torch.empty(slots, dtype=torch.int32, device=self._device) for _ in range(2)]
         self._tally = self._module.VoxelTally(*self._memory, *self._decided)
         self._call("decide_votes", self._tally)
 
     def read(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> Tensor:
-        """The confidence, [H, W] float32; sets ``labels`` [H, W] int32. See ``voxel_votes.VoxelVotes.read``."""
+        """Return the confidence, [H, W] float32; sets ``labels`` [H, W] int32. See ``voxel_votes.VoxelVotes.read``."""
         confidence = torch.empty(tuple(depth.shape), dtype=torch.float32, device=depth.device)
         cuda_extension.call(self._module, "read_votes", depth, self._tally, depth, to_voxels, labels, confidence)
         return confidence
@@ -81,7 +81,7 @@ class VoxelTally:
         self._tally = self._module.VoxelTally(*self._memory, None, None)
 
     def _reserve(self, votes: int) -> None:
-        """Room for so many more voxels and further classes."""
+        """Make room for ``votes`` more voxels and further classes."""
         slots = (len(self._memory[0]), len(self._memory[4]))
         if any(2 * (most + votes) > there for most, there in zip(self._most, slots, strict=True)):
             self._most = self._used[:2].tolist()

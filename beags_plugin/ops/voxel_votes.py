@@ -14,35 +14,35 @@ from beags_plugin.ops.voxel_tally import VoxelTally
 
 
 class VoxelVotes:
-    """Counts votes per (voxel, class), then tells each pixel who leads about its point.
+    """Counts votes per (voxel, class), then gives each pixel the class that leads about its point.
 
     A pixel (x, y) at depth d lies at d A (x, y, 1) + b, in voxels; ``to_voxels`` [13] is A row by row, b, and the depth
-    of one of the ``masks.pooled_votes.LOOKS``' steps. Pixels whose depth is not positive and finite, or whose
-    point is 2^20 - 8 voxels or more from 0 along an axis, neither vote nor are told. ``masks.voxel_reprojection`` says
-    how votes are read. Memory is linear in the voxels; neither time nor memory depends on how many classes there are.
+    of one of the ``masks.pooled_votes.LOOKS``' steps. Pixels whose depth is not positive and finite, or whose point is
+    2^20 - 8 voxels or more from 0 along an axis, neither vote nor get an answer. For the reading of votes see
+    ``masks.voxel_reprojection``. Memory is linear in the voxels; the number of classes costs neither time nor memory.
 
     ignore: the label that does not vote.
     """
 
     def __init__(self, ignore: int) -> None:
-        module = extension.load()
-        assert module is not None, "the caller asks extension.load() first"
-        self._native: Any = module.VoxelVotes(extension.threads())
+        self._native: Any = extension.module().VoxelVotes(extension.threads())
         self._ignore = ignore
 
     def add(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> None:
-        """One vote of each pixel. depth: [H, W] float32 or float64; labels: [H, W] int32, 0 or more."""
+        """Add one vote of each pixel. depth: [H, W] float32 or float64; labels: [H, W] int32, 0 or more."""
         depth, to_voxels = _view(depth, to_voxels)
         labels = extension.plain("labels", labels, tuple(depth.shape), torch.int32)
         extension.function("add", depth, self._native)(depth, to_voxels, labels, self._ignore)
 
     def decide(self) -> None:
-        """All votes are in; now and only now ``read`` may be asked."""
+        """End the votes; ``read`` may be called from now on."""
         self._native.decide()
 
     def read(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """The winner about each pixel's point (its label where several lead or nobody voted), and its share of votes:
-        of those in the voxel of the point, or of those that were read, if nobody voted there.
+        """Return the winner about each pixel's point, and its share of the votes.
+
+        A pixel keeps its label where several classes lead or nobody voted. The share is of the votes in the voxel of
+        the point, or if nobody voted there of those that were read.
 
         depth: [H, W] float. labels: [H, W] int32.
         Returns [H, W] int32 and [H, W] float32 (0 where nobody voted).
@@ -78,15 +78,16 @@ class CudaVoxelVotes:
 
 
 def brick_sample(depth: Tensor, to_voxels: Tensor, part: int) -> Tensor:
-    """What ``masks.spatial_chunks.torch_brick_sample`` tells of depth [H, W] on the CPU; the caller asks
-    ``extension.supports(depth)`` first."""
+    """Sample depth [H, W] on the CPU as ``masks.spatial_chunks.torch_brick_sample``.
+
+    The caller asks ``extension.supports(depth)`` first."""
     depth, to_voxels = _view(depth, to_voxels)
     found = extension.function("brick_sample", depth)(depth, to_voxels, part)
     return torch.tensor(found, dtype=torch.int64).reshape(-1, 3)
 
 
 def votes_for(depths: Sequence[Tensor], ignore: int) -> VoxelVotes | CudaVoxelVotes | None:
-    """What counts the votes of pixels with these depths, compiled for where they lie; None: nothing was."""
+    """Return the compiled counter of votes for depths on this device; None if there is none."""
     if (module := cuda_extension.module_for(*depths)) is not None:
         return CudaVoxelVotes(ignore, module, depths[0].device)
     return VoxelVotes(ignore) if extension.supports(*depths) else None

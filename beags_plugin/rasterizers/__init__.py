@@ -19,11 +19,10 @@ _PREFERENCE = ("native", "torch")  # what "auto" tries, best first; on a GPU fir
 
 
 def make_rasterizer(name: str = "auto") -> Rasterizer:
-    """The backend called ``name``. Raises ``UserError`` if it cannot run here.
+    """Return the backend called ``name``; raises ``UserError`` if it cannot run here.
 
-    "auto" takes the best one present; where there is a GPU, it draws tensors that lie there with the CUDA backend, or
-    where that cannot run with the torch one (nerfstudio's commands load a run onto any GPU), and others with the best
-    one for the CPU.
+    "auto" takes the best one for the CPU. Where there is a GPU, tensors that lie there go to the CUDA backend, or if
+    that cannot run to the torch one, for nerfstudio's commands load a run onto any GPU.
     """
     if name != "auto":
         backend = RASTERIZERS.get(name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings, SurfelInputs
+from beags_plugin.rasterizers.interface import FLOATS, Rasterizer, RasterOutputs, RasterSettings, SurfelInputs
 
 
 class Images(NamedTuple):
@@ -38,21 +39,9 @@ class InputGradients(NamedTuple):
     background: Tensor | None
 
 
-class Needed(NamedTuple):
-    """Which fields of ``InputGradients`` are needed."""
-
-    means: bool
-    quats: bool
-    log_scales: bool
-    opacity_logits: bool
-    colors: bool
-    screen_shift: bool
-    background: bool
-
-
 @dataclass(frozen=True)
-class Drawing:
-    """What one call draws; tensors are checked and contiguous, and nothing that is done with them is recorded.
+class RenderCall:
+    """One render: tensors are checked and contiguous, and autograd records nothing that is done with them.
 
     inputs, camera, settings: as in ``Rasterizer.rasterize``.
     background: [3] of the inputs' dtype.
@@ -67,9 +56,27 @@ class Drawing:
     target: Tensor | None
     differentiable: bool
 
+    def empty_image(self, wanted: bool, *channels: int, dtype: torch.dtype | None = None) -> Tensor | None:
+        """Return memory for an image [H, W, *channels], of the inputs' dtype by default; None if not wanted."""
+        shape = (self.camera.height, self.camera.width, *channels)
+        return self.inputs.means.new_empty(shape, dtype=dtype) if wanted else None
+
+    def empty_images(self) -> Images:
+        """Return memory for the images that the settings and the target ask for."""
+        geometry = self.settings.geometry
+        return Images(
+            color=self.empty_image(True, 3),
+            alpha=self.empty_image(True),
+            depth=self.empty_image(geometry),
+            median_depth=self.empty_image(geometry),
+            normal=self.empty_image(geometry, 3),
+            distortion=self.empty_image(self.settings.distortion),
+            boundary=self.empty_image(self.target is not None),
+        )
+
 
 class Forward(NamedTuple):
-    """What a forward kernel returns: the images, visible [N] bool, num_nonfinite, and a state for its own backward."""
+    """A forward kernel's result: the images, visible [N] bool, num_nonfinite, and a state for its own backward."""
 
     images: Images
     visible: Tensor
@@ -78,7 +85,7 @@ class Forward(NamedTuple):
 
 
 def check_image(name: str, value: Tensor, camera: Camera) -> Tensor:
-    """``value``, contiguous, if it is an int32 class map of the camera's size; else raises ``ValueError``."""
+    """Return ``value``, contiguous; raise ``ValueError`` unless it is an int32 class map of the camera's size."""
     shape = (camera.height, camera.width)
     if tuple(value.shape) != shape or value.dtype != torch.int32:
         raise ValueError(f"{name} must be {list(shape)} int32, not {list(value.shape)} {value.dtype}")
@@ -92,12 +99,17 @@ class KernelRasterizer(Rasterizer):
     """
 
     @abstractmethod
-    def forward_kernel(self, drawing: Drawing) -> Forward:
-        """Draw. depth, median_depth and normal are None without ``settings.geometry``, and so on."""
+    def forward_kernel(self, call: RenderCall) -> Forward:
+        """Render. Images that neither the settings nor the target ask for are None."""
 
     @abstractmethod
-    def backward_kernel(self, drawing: Drawing, state: Any, gradients: Images, needed: Needed) -> InputGradients:
-        """The way back. None among ``gradients`` means zero; the others are contiguous."""
+    def backward_kernel(
+        self, call: RenderCall, state: Any, gradients: Images, needed: Sequence[bool]
+    ) -> InputGradients:
+        """Compute the gradients that are ``needed``, one bool for each field of ``InputGradients``.
+
+        None among ``gradients`` means zero; the others are contiguous.
+        """
 
     def rasterize(
         self,
@@ -116,38 +128,38 @@ class KernelRasterizer(Rasterizer):
             target = check_image("target", target, camera)
             if inputs.class_ids is None:
                 raise ValueError("class_ids must be given together with target")
-        floats = (inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits, inputs.colors)
+        floats = [getattr(inputs, name) for name in FLOATS]
         watched = [value for value in (*floats, inputs.screen_shift, background) if value is not None]
         differentiable = torch.is_grad_enabled() and any(value.requires_grad for value in watched)
-        drawing = Drawing(inputs, camera, settings, background.contiguous(), target, differentiable)
+        call = RenderCall(inputs, camera, settings, background.contiguous(), target, differentiable)
         if not differentiable:
-            images, visible, num_nonfinite, _ = self.forward_kernel(drawing)
+            images, visible, num_nonfinite, _ = self.forward_kernel(call)
         else:
-            found: Any = _Rasterize.apply(self, drawing, *floats, inputs.screen_shift, background)
+            found: Any = _Rasterize.apply(self, call, *floats, inputs.screen_shift, background)
             *images, visible, num_nonfinite = found
         return RasterOutputs(*images, visible=visible, num_nonfinite=num_nonfinite)  # type: ignore
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, rasterizer, drawing, *floats):
-        images, visible, num_nonfinite, state = rasterizer.forward_kernel(drawing)
+    def forward(ctx, rasterizer, call, *floats):
+        images, visible, num_nonfinite, state = rasterizer.forward_kernel(call)
         # The inputs are saved through autograd, which notices it if they are changed in place before the backward.
         ctx.save_for_backward(*floats)
         ctx.rasterizer, ctx.state = rasterizer, state
-        ctx.drawing = (drawing.camera, drawing.settings, drawing.target)  # not the inputs: they would live as long
+        ctx.call = (call.camera, call.settings, call.target)  # not the inputs: they would live as long
         ctx.mark_non_differentiable(visible)
-        ctx.set_materialize_grads(False)  # None tells the kernel what it need not compute
+        ctx.set_materialize_grads(False)  # None: the kernel need not compute these
         return *images, visible, num_nonfinite
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *gradients):
         *floats, _, background = ctx.saved_tensors
-        camera, settings, target = ctx.drawing
-        drawing = Drawing(SurfelInputs(*floats), camera, settings, background, target, True)
+        camera, settings, target = ctx.call
+        call = RenderCall(SurfelInputs(*floats), camera, settings, background, target, True)
         images = Images(*[None if g is None else g.contiguous() for g in gradients[:-2]])
         if all(g is None for g in images):
             return (None,) * 9
-        found = ctx.rasterizer.backward_kernel(drawing, ctx.state, images, Needed(*ctx.needs_input_grad[2:]))
+        found = ctx.rasterizer.backward_kernel(call, ctx.state, images, ctx.needs_input_grad[2:])
         return None, None, *found

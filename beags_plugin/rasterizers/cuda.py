@@ -1,14 +1,15 @@
 """The CUDA rasterizer: checks and allocates here, computes in ``beags_plugin._native.cuda``.
 
 All memory is torch's, all kernels run on torch's current stream. The number of pairs (of a tile and a surfel that
-reaches it) is known on the GPU only, so that their memory is guessed from the drawings before. All kernels of a drawing
-are launched on that guess; then the host waits for the number, which the GPU knew long before the image, and launches
-the last ones again in the rare case that the guess was too small. The GPU never waits for the host. In a CUDA graph the
-host does not wait either: there, such a drawing has no gradients.
+reaches it) is known on the GPU only, so that their memory is guessed from earlier renders. All kernels of a render are
+launched on that guess. Then the host waits for the number, which the GPU knew long before the image, and launches the
+last kernels again in the rare case that the guess was too small. The GPU never waits for the host. In a CUDA graph the
+host does not wait either: there, such a render has no gradients.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Any
@@ -20,23 +21,21 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.ops import cuda_extension
 from beags_plugin.rasterizers.autograd import (
-    Drawing,
     Forward,
     Images,
     InputGradients,
     KernelRasterizer,
-    Needed,
+    RenderCall,
     check_image,
 )
-from beags_plugin.rasterizers.interface import RasterSettings, SurfelInputs, map_ids
+from beags_plugin.rasterizers.interface import FLOATS, RasterSettings, SurfelInputs, map_ids
 from beags_plugin.rasterizers.pair_counts import PairCounts, capacity_for
 from beags_plugin.system.errors import UserError
 
-_FLOATS = ("means", "quats", "log_scales", "opacity_logits", "colors")
 _GEOMETRY, _DISTORTION, _BOUNDARY = 1, 2, 4  # Parts of native/rasterizer/types.h
 _TILE = 16
 UNKNOWN = -1
-"""``num_nonfinite`` of a drawing in a CUDA graph, which the host does not wait for."""
+"""``num_nonfinite`` of a render in a CUDA graph, which the host does not wait for."""
 
 
 @dataclass
@@ -58,8 +57,8 @@ class _Frame:
 class CudaRasterizer(KernelRasterizer):
     """Float32 and float64 on one GPU; the same bits in every run (there are no atomic additions of floats).
 
-    In a CUDA graph (``torch.cuda.graph``) nothing is waited for: draw the same scene once before the capture, so that
-    the memory for its pairs is known, and ask ``overflowed`` after replays.
+    In a CUDA graph (``torch.cuda.graph``) nothing is waited for. Render the same scene once before the capture, so
+    that the memory for its pairs is known, and ask ``overflowed`` after replays.
     """
 
     def __init__(self) -> None:
@@ -73,70 +72,54 @@ class CudaRasterizer(KernelRasterizer):
         return cuda_extension.status()[1]
 
     def overflowed(self) -> bool:
-        """Whether a drawing in a CUDA graph had more pairs than memory in its last replay; its image is then wrong."""
+        """Return whether the last replay of a CUDA graph had more pairs than memory; its image is then wrong."""
         return any(int(totals[0]) > capacity for totals, capacity in self._captured)
 
     def pairs(self) -> int:
-        """How many pairs of a tile and a surfel the largest drawing of late had, on any GPU; 0 before the first."""
+        """Return the number of pairs of the largest recent render on any GPU; 0 before the first."""
         return self._counts.largest()
 
-    def forward_kernel(self, drawing: Drawing) -> Forward:
+    def forward_kernel(self, call: RenderCall) -> Forward:
         """See ``KernelRasterizer.forward_kernel``."""
-        inputs, camera, settings = drawing.inputs, drawing.camera, drawing.settings
-        geometry, distortion, boundary = settings.geometry, settings.distortion, drawing.target is not None
-        like = inputs.means
-
-        def image(wanted: bool, *channels: int, dtype: torch.dtype | None = None) -> Tensor | None:
-            if not wanted:
-                return None
-            return torch.empty(camera.height, camera.width, *channels, dtype=dtype or like.dtype, device=like.device)
-
-        images = Images(
-            color=image(True, 3),
-            alpha=image(True),
-            depth=image(geometry),
-            median_depth=image(geometry),
-            normal=image(geometry, 3),
-            distortion=image(distortion),
-            boundary=image(boundary),
-        )
-        keep = drawing.differentiable
+        like, images = call.inputs.means, call.empty_images()
+        geometry = call.differentiable and call.settings.geometry
         kept = (
-            image(keep),
-            image(keep, dtype=torch.int32),
-            image(keep and geometry),
-            image(keep and geometry, dtype=torch.int32),
-            *(image(keep and distortion) for _ in range(3)),
+            call.empty_image(call.differentiable),
+            call.empty_image(call.differentiable, dtype=torch.int32),
+            call.empty_image(geometry),
+            call.empty_image(geometry, dtype=torch.int32),
+            *(call.empty_image(call.differentiable and call.settings.distortion) for _ in range(3)),
         )
 
-        def draw(frame: _Frame) -> None:
-            frame.native.forward(drawing.background, drawing.target, *images, *kept, self._stream(like))
+        def render(frame: _Frame) -> None:
+            frame.native.forward(call.background, call.target, *images, *kept, self._stream(like))
 
-        frame = self._frame(inputs, camera, settings, draw)
+        frame = self._frame(call.inputs, call.camera, call.settings, render)
         frame.kept = kept
         return Forward(images, frame.visible, frame.num_nonfinite, frame)
 
-    def backward_kernel(self, drawing: Drawing, state: Any, gradients: Images, needed: Needed) -> InputGradients:
+    def backward_kernel(
+        self, call: RenderCall, state: Any, gradients: Images, needed: Sequence[bool]
+    ) -> InputGradients:
         """See ``KernelRasterizer.backward_kernel``."""
-        inputs, camera = drawing.inputs, drawing.camera
-        like, n = inputs.means, len(inputs.means)
-        wanted = dict(zip(Needed._fields, needed, strict=True))
-        shapes = [getattr(inputs, name).shape for name in _FLOATS] + [(n, 2)]
-        names = (*_FLOATS, "screen_shift")
-        found = [like.new_empty(shape) if wanted[name] else None for name, shape in zip(names, shapes, strict=True)]
+        floats = [getattr(call.inputs, name) for name in FLOATS]
+        like, n = call.inputs.means, len(call.inputs.means)
+        *of_inputs, of_background = needed
+        shapes = [*(value.shape for value in floats), (n, 2)]  # the last: of screen_shift
+        found = [like.new_empty(shape) if wanted else None for shape, wanted in zip(shapes, of_inputs, strict=True)]
         parts = _GEOMETRY * any(g is not None for g in (gradients.depth, gradients.median_depth, gradients.normal))
         parts |= _DISTORTION * (gradients.distortion is not None) | _BOUNDARY * (gradients.boundary is not None)
         frame: _Frame = state
         capacity = len(frame.pairs[0])
         records = like.new_empty(capacity * frame.native.record_size(parts))
         sums = torch.empty(n, 20, dtype=torch.float64, device=like.device)
-        g_background = like.new_empty(_tiles(camera), 3)
+        g_background = like.new_empty(_tiles(call.camera), 3)
         with cuda_extension.on_device(like.device):
             frame.native.backward(
-                *(getattr(inputs, name) for name in _FLOATS), drawing.background, drawing.target, *gradients,
-                *frame.kept, *found, g_background, records, sums, parts, self._stream(like),
+                *floats, call.background, call.target, *gradients, *frame.kept, *found, g_background, records, sums,
+                parts, self._stream(like),
             )  # fmt: skip
-        background = g_background.sum(0, dtype=torch.float64).to(like.dtype) if wanted["background"] else None
+        background = g_background.sum(0, dtype=torch.float64).to(like.dtype) if of_background else None
         return InputGradients(*found, background)  # type: ignore[call-arg]
 
     @torch.no_grad()
@@ -144,16 +127,16 @@ class CudaRasterizer(KernelRasterizer):
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, labels: Tensor, num_classes: int
     ) -> Tensor:
         """See ``Rasterizer.class_contributions``."""
-        inputs = _detached(inputs.checked())
+        inputs = inputs.checked().detached()
         labels = check_image("labels", labels, camera)
         like = inputs.means
         sums = torch.zeros(len(like), num_classes, dtype=torch.int64, device=like.device)
 
-        def draw(frame: _Frame) -> None:
+        def render(frame: _Frame) -> None:
             sums.zero_()
             frame.native.class_contributions(labels, num_classes, sums, self._stream(like))
 
-        self._frame(inputs, camera, settings, draw)
+        self._frame(inputs, camera, settings, render)
         return (sums.double() * self._native().WEIGHT_UNIT).to(like.dtype)
 
     @torch.no_grad()
@@ -161,22 +144,22 @@ class CudaRasterizer(KernelRasterizer):
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
     ) -> tuple[Tensor, Tensor]:
         """See ``Rasterizer.class_map``."""
-        inputs = _detached(inputs.checked())
+        inputs = inputs.checked().detached()
         map_ids(inputs, min(num_classes, IGNORE))
         like = inputs.means
         classes = torch.empty(camera.height, camera.width, dtype=torch.int32, device=like.device)
         share = like.new_empty(camera.height, camera.width)
 
-        def draw(frame: _Frame) -> None:
+        def render(frame: _Frame) -> None:
             frame.native.class_map(min(num_classes, IGNORE), classes, share, self._stream(like))
 
-        self._frame(inputs, camera, settings, draw)
+        self._frame(inputs, camera, settings, render)
         return classes, share
 
     @torch.no_grad()
     def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
         """See ``Rasterizer.dominant_gaussian``."""
-        inputs = _detached(inputs.checked())
+        inputs = inputs.checked().detached()
         indices = torch.empty(camera.height, camera.width, dtype=torch.int32, device=inputs.means.device)
         stream = self._stream(inputs.means)
         self._frame(inputs, camera, settings, lambda frame: frame.native.dominant_gaussian(indices, stream))
@@ -194,8 +177,10 @@ class CudaRasterizer(KernelRasterizer):
     def _stream(like: Tensor) -> int:
         return cuda_extension.stream(like.device)
 
-    def _frame(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, draw: Any) -> _Frame:
-        """Project, sort into tiles and draw with ``draw(frame)``, which may be called twice."""
+    def _frame(
+        self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, render: Callable[[_Frame], None]
+    ) -> _Frame:
+        """Project, sort into tiles and render with ``render(frame)``, which may be called twice."""
         module, means = self._native(), inputs.means
         device, n = means.device, len(means)
         if device.type != ("cpu" if module.EMULATED else "cuda"):
@@ -218,7 +203,7 @@ class CudaRasterizer(KernelRasterizer):
                 counts.learn(place, first)
                 guess = float(first)
             capacity = self._bin(frame, camera, guess, n)
-            draw(frame)
+            render(frame)
             if sent is None:
                 self._captured.append((totals, capacity))
                 frame.num_nonfinite = UNKNOWN
@@ -227,7 +212,7 @@ class CudaRasterizer(KernelRasterizer):
                 counts.learn(place, pairs)
                 if pairs > capacity:
                     self._bin(frame, camera, float(pairs), n)
-                    draw(frame)
+                    render(frame)
         return frame
 
     def _project(
@@ -244,7 +229,7 @@ class CudaRasterizer(KernelRasterizer):
         counts, order = memory(n), memory(n)
         pair_start, totals = memory(n + 1, dtype=torch.int64), memory(2, dtype=torch.int64)
         owned = [visible, splats, counts, order, pair_start, totals]
-        floats = [getattr(inputs, name) for name in _FLOATS]
+        floats = [getattr(inputs, name) for name in FLOATS]
         matrices = (camera.host.viewmat.tolist(), camera.host.K.tolist())
         native = make(
             *floats, inputs.class_ids, *matrices, camera.width, camera.height, settings.near, settings.far, *owned
@@ -255,7 +240,7 @@ class CudaRasterizer(KernelRasterizer):
         return _Frame(native, visible, owned), totals
 
     def _bin(self, frame: _Frame, camera: Camera, pairs: float, n: int) -> int:
-        """Sort the pairs into tiles; returns for how many there is memory."""
+        """Sort the pairs into tiles; return the number that there is memory for."""
         capacity = capacity_for(pairs)
         if capacity > 2**31 - 1 or n > 2**31 - 1:
             raise UserError("over 1.7 billion pairs of a tile and a surfel: draw fewer surfels or smaller images.")
@@ -273,7 +258,3 @@ class CudaRasterizer(KernelRasterizer):
 
 def _tiles(camera: Camera) -> int:
     return -(-camera.width // _TILE) * -(-camera.height // _TILE)
-
-
-def _detached(inputs: SurfelInputs) -> SurfelInputs:
-    return SurfelInputs(*(getattr(inputs, name).detach() for name in _FLOATS), class_ids=inputs.class_ids)

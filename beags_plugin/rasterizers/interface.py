@@ -1,4 +1,4 @@
-"""What every rasterizer takes and returns (method, sections 1 and 4; E1 to E4, E6, E7)."""
+"""The interface of rasterizers: what they take and return (method, sections 1 and 4; E1 to E4, E6, E7)."""
 
 from __future__ import annotations
 
@@ -16,14 +16,17 @@ LARGEST = 1e18  # world units: surfels larger, or further off in depth, count as
 MAX_ALPHA = 0.99  # keeps 1 - alpha, a divisor in the backward, away from 0
 MIN_TRANSMITTANCE = 1e-4  # compositing stops before the surfel that would take T below this
 
+FLOATS = ("means", "quats", "log_scales", "opacity_logits", "colors")
+"""Fields of ``SurfelInputs`` that are always there, in the order in which kernels take them."""
+
 
 @dataclass(frozen=True)
 class RasterSettings:
-    """What to compute, and the scene's depth range.
+    """Choice of images to compute, and the scene's depth range.
 
     near, far: world units; they scale with the scene. Hits nearer than ``near`` are skipped; both enter the
         distortion's depth mapping m(d) = far / (far - near) * (1 - near / d).
-    geometry: whether depth, median depth and normal are wanted; left out, they are None and cost nothing.
+    geometry: whether depth, median depth and normal are wanted; if not, they are None and cost nothing.
     distortion: whether the distortion is wanted.
     """
 
@@ -35,14 +38,13 @@ class RasterSettings:
 
 @dataclass(frozen=True)
 class SurfelInputs:
-    """What is drawn: N surfels with one colour each, for one view; all floats of one dtype (float32 or float64).
+    """N surfels to render, with one colour each, for one view; all floats of one dtype (float32 or float64).
 
     means [N, 3], quats [N, 4] wxyz, log_scales [N, 2], opacity_logits [N]: as in ``core.surfels.Surfels``.
     colors: [N, 3] linear RGB as seen from this view.
     class_ids: [N] int32, phi, or None; needed with ``target``.
-    screen_shift: [N, 2] zeros, or None. A shift of each disc across the screen, in halves of the image's width and
-        height, while its low-pass filter stays in place. Nothing is ever shifted; its gradient is what the official
-        densification looks at. Surfels too small for the disc to show have none.
+    screen_shift: [N, 2] zeros, or None. A shift of each disc (not of its low-pass filter) across the screen, in halves
+        of the image's width and height. Nothing is ever shifted; the official densification uses its gradient.
     """
 
     means: Tensor
@@ -53,14 +55,18 @@ class SurfelInputs:
     class_ids: Tensor | None = None
     screen_shift: Tensor | None = None
 
+    def detached(self) -> SurfelInputs:
+        """Return them without gradients and ``screen_shift``."""
+        return SurfelInputs(*(getattr(self, name).detach() for name in FLOATS), class_ids=self.class_ids)
+
     def to(self, dtype: torch.dtype) -> SurfelInputs:
-        """The same with all floats in another precision."""
+        """Return them with all floats in another precision."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         changed = {name: value.to(dtype) for name, value in values.items() if name != "class_ids" and value is not None}
         return replace(self, **changed)
 
     def checked(self) -> SurfelInputs:
-        """Itself, contiguous, after checking shapes and dtypes by name; raises ``ValueError``."""
+        """Return itself, contiguous; raise ``ValueError`` for a field of a wrong shape or dtype."""
         n, dtype = self.means.shape[0], self.means.dtype
         if dtype not in (torch.float32, torch.float64):
             raise ValueError(f"means must be float32 or float64, not {dtype}")
@@ -84,7 +90,7 @@ class SurfelInputs:
 
 
 def map_ids(inputs: SurfelInputs, num_classes: int) -> Tensor:
-    """The class ids [N] int32 that a class map is drawn of; raises ``ValueError`` if any is no class."""
+    """Return the class ids [N] int32 for a class map; raise ``ValueError`` if any is no class."""
     ids = inputs.class_ids
     if ids is None:
         raise ValueError("class_ids must be given for a class map")
@@ -95,7 +101,7 @@ def map_ids(inputs: SurfelInputs, num_classes: int) -> Tensor:
 
 @dataclass(frozen=True)
 class RasterOutputs:
-    """What is seen (E4). H, W are the camera's; floats have the inputs' dtype.
+    """Images of one view (E4). H, W are the camera's; floats have the inputs' dtype.
 
     color: [H, W, 3] sum_i w_i c_i + T_end * background.
     alpha: [H, W] A = sum_i w_i.
@@ -120,7 +126,7 @@ class RasterOutputs:
 
 
 class Rasterizer(ABC):
-    """One backend. Every method draws the same surfels with the same weights w_i.
+    """One backend. All its methods render surfels with the same weights w_i.
 
     Instances hold no scene; they may be kept for the life of the program.
     """
@@ -128,7 +134,7 @@ class Rasterizer(ABC):
     @classmethod
     @abstractmethod
     def unavailable(cls) -> str | None:
-        """None if this backend can run here, else one sentence: why not and what to install."""
+        """Return None if this backend can run here, else one sentence: why not and what to install."""
 
     @abstractmethod
     def rasterize(
@@ -139,7 +145,7 @@ class Rasterizer(ABC):
         background: Tensor,  # [3]
         target: Tensor | None = None,  # [H, W] int32 class ids M', or IGNORE
     ) -> RasterOutputs:
-        """Draw; differentiable in all float inputs and ``background``. Raises ``ValueError`` on a wrong shape."""
+        """Render, differentiably in all float inputs and ``background``; raises ``ValueError`` for a wrong shape."""
 
     @abstractmethod
     def class_contributions(
@@ -150,14 +156,18 @@ class Rasterizer(ABC):
         labels: Tensor,  # [H, W] int32 class ids, or IGNORE
         num_classes: int,
     ) -> Tensor:
-        """C[i, c] of this view: [N, num_classes], sum of w_i(u) over pixels u with labels(u) = c (E6). No gradient."""
+        """Return C[i, c] of this view, [N, num_classes]: the sum of w_i(u) over pixels u with labels(u) = c (E6).
+
+        No gradient.
+        """
 
     def sparse_class_contributions(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, labels: Tensor, num_classes: int
     ) -> tuple[Tensor, Tensor]:
-        """What is not zero of ``class_contributions``: keys [M] int64, ascending, i * num_classes + c, and values [M].
+        """Return what is not zero of ``class_contributions``, as keys [M] int64 and values [M].
 
-        A backend that can should not make a table of all classes; this one makes one of those that ``labels`` hold.
+        The keys are i * num_classes + c, ascending. A backend should make no table of all classes if it can; this
+        method makes one of the classes that ``labels`` hold.
         """
         present = torch.unique(labels[(labels >= 0) & (labels < num_classes)])
         if len(present) == 0:
@@ -173,11 +183,12 @@ class Rasterizer(ABC):
     def class_map(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
     ) -> tuple[Tensor, Tensor]:
-        """Class of every pixel: argmax_c sum_i w_i [phi_i = c] (section 5), ties to the lower id. No gradient.
+        """Return the class of every pixel, argmax_c sum_i w_i [phi_i = c] (method, section 5), ties to the lower id.
 
-        Returns ([H, W] int32, background 0 where nothing is drawn; [H, W] float, the winner's share of A, 0 there).
+        Returns ([H, W] int32, background 0 where nothing is; [H, W] float, the winner's share of A, 0 there). No
+        gradient.
         """
 
     @abstractmethod
     def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
-        """[H, W] int32, index of the surfel with the largest w_i (ties to the nearer); -1 where none. For picking."""
+        """Return [H, W] int32, the index of the surfel with the largest w_i (ties to the nearer); -1 where none is."""

@@ -1,6 +1,6 @@
-"""How many pairs, of a tile and a surfel that reaches it, drawings on GPUs have.
+"""Numbers of pairs, of a tile and a surfel that reaches it, in renders on GPUs.
 
-Only the GPU knows; the host guesses from the drawings before, so that there is memory before it is told.
+Only the GPU knows them. The host guesses from earlier renders, so that there is memory before the number arrives.
 """
 
 from __future__ import annotations
@@ -12,46 +12,46 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_FADING = 0.98  # of the largest number of pairs so far, a drawing
-_SPARE = 1.25  # memory for so many times as many pairs as the largest drawing so far had
+_FADING = 0.98  # of the largest number of pairs so far, in each render
+_SPARE = 1.25  # memory for this many times the pairs of the largest render so far
 _STEP = 1 << 14  # pairs, or an eighth of the power of two below: few different sizes leave torch's allocator no holes
 
-Place = tuple[torch.device, int]  # a GPU and a thread: what a viewer draws meanwhile changes nothing of a training
+Place = tuple[torch.device, int]  # a GPU and a thread: a viewer's renders change nothing of a training
 
 
 @dataclass
 class Sent:
-    """A drawing's numbers on their way to the host: of pairs, and of surfels that are not finite."""
+    """A render's numbers on their way to the host: of pairs, and of surfels that are not finite."""
 
     numbers: Tensor
     event: Any
 
 
 class PairCounts:
-    """Remembers the largest number of pairs so far, which fades with each drawing."""
+    """Remembers the largest number of pairs so far, which fades with each render."""
 
     def __init__(self) -> None:
         self._largest: dict[Place, float] = {}
 
     def largest(self) -> int:
-        """Of any GPU and thread; 0 before the first drawing."""
+        """Return the largest number of any GPU and thread; 0 before the first render."""
         return int(max(self._largest.values(), default=0))
 
     @staticmethod
     def place(device: torch.device) -> Place:
-        """This thread's on a GPU."""
+        """Return this thread's place on a GPU."""
         return device, get_ident()
 
     def guess(self, place: Place) -> float | None:
-        """None before the first drawing there."""
+        """Return the number to expect; None before the first render there."""
         return self._largest.get(place)
 
     def learn(self, place: Place, pairs: int) -> None:
-        """How many pairs a drawing had."""
+        """Note the number of pairs that a render had."""
         self._largest[place] = max(self._largest.get(place, 0.0) * _FADING, float(pairs))
 
     def send(self, totals: Tensor) -> Sent:
-        """Start to copy the two numbers of a drawing to the host."""
+        """Start to copy the two numbers of a render to the host."""
         if not totals.is_cuda:
             return Sent(totals, None)
         numbers = torch.empty(2, dtype=torch.int64, pin_memory=True)  # torch keeps such memory for the next ones
@@ -69,7 +69,7 @@ class PairCounts:
 
 
 def capacity_for(pairs: float) -> int:
-    """For how many pairs there shall be memory, where so many are expected."""
+    """Return the number of pairs to allocate memory for, where ``pairs`` are expected."""
     wanted = int(pairs * _SPARE)
     step = max(1 << max(wanted.bit_length() - 4, 0), _STEP)
     return (wanted // step + 1) * step

@@ -49,7 +49,7 @@ class Hits:
 
 
 def finite_surfels(inputs: SurfelInputs) -> Tensor:
-    """[N] bool: all parameters are finite, the quaternion can be divided by its length, the disc is not too large."""
+    """Return [N] bool: all parameters are finite, the quaternion has a usable length, the disc is not too large."""
     floats = (inputs.means, inputs.quats, inputs.log_scales, inputs.colors, inputs.opacity_logits[:, None])
     finite = torch.stack([torch.isfinite(value.detach()).all(dim=-1) for value in floats]).all(dim=0)
     return finite & usable_quats(inputs.quats) & (inputs.log_scales <= math.log(LARGEST)).all(dim=-1)
@@ -72,7 +72,7 @@ def project(inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> P
 
 
 def _is_finite(projected: ProjectedSurfels) -> Tensor:
-    """[K] bool: nothing overflowed on the way to the screen; the box may be infinite."""
+    """Return [K] bool: nothing overflowed on the way to the screen; the box may be infinite."""
     fields = (projected.A, projected.B, projected.C, projected.center, projected.det[:, None], projected.depth[:, None])
     return torch.isfinite(torch.cat(fields, dim=-1)).all(dim=-1)
 
@@ -113,7 +113,7 @@ def _project(inputs: SurfelInputs, index: Tensor, camera: Camera) -> ProjectedSu
 
 
 def _screen_box(M: Tensor, center: Tensor, opacity: Tensor, camera: Camera) -> Tensor:
-    """[K, 4] pixels: where alpha can reach 1/255, the disc's conic united with the low-pass disc."""
+    """Return [K, 4] pixels where alpha can reach 1/255, the disc's conic united with the low-pass disc."""
     level = 2.0 * torch.log(opacity / MIN_ALPHA)
     signs = torch.stack([level, level, -torch.ones_like(level)], dim=-1)
     d = (signs * M[:, 2] ** 2).sum(dim=-1)
@@ -130,13 +130,13 @@ def _screen_box(M: Tensor, center: Tensor, opacity: Tensor, camera: Camera) -> T
 
 
 def on_screen(projected: ProjectedSurfels, x0: float, y0: float, x1: float, y1: float) -> Tensor:
-    """[K] bool: the surfel's box touches the rectangle (pixels)."""
+    """Return [K] bool: the surfel's box touches the rectangle (pixels)."""
     low, high = projected.box[:, :2], projected.box[:, 2:]
     return (low[:, 0] < x1) & (high[:, 0] > x0) & (low[:, 1] < y1) & (high[:, 1] > y0)
 
 
 def hits(projected: ProjectedSurfels, chosen: Tensor, pixels: Tensor, near: float, smooth_cutoff: bool) -> Hits:
-    """Alpha and depth of the chosen surfels [S] at pixel centres [P, 2].
+    """Return alpha and depth of the chosen surfels [S] at pixel centres [P, 2].
 
     smooth_cutoff: fade alpha out above 1/255 instead of cutting it there, so that finite differences hold (tests).
     """
@@ -156,5 +156,5 @@ def hits(projected: ProjectedSurfels, chosen: Tensor, pixels: Tensor, near: floa
     if smooth_cutoff:
         fade = ((alpha - MIN_ALPHA) / MIN_ALPHA).clamp(0.0, 1.0)
         alpha = alpha * fade * fade * (3.0 - 2.0 * fade)
-    drawn = (depth >= near) & (alpha >= (0.0 if smooth_cutoff else MIN_ALPHA))
-    return Hits(torch.where(drawn, alpha, torch.zeros_like(alpha)), torch.where(drawn, depth, center_depth))
+    counted = (depth >= near) & (alpha >= (0.0 if smooth_cutoff else MIN_ALPHA))
+    return Hits(torch.where(counted, alpha, torch.zeros_like(alpha)), torch.where(counted, depth, center_depth))

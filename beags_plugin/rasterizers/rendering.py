@@ -1,4 +1,4 @@
-"""From a scene to what a rasterizer draws."""
+"""Prepare a scene for a rasterizer, and read what it renders."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SURFACE_DEPTHS = ("median", "expected")
 def surfel_inputs(
     surfels: Surfels, camera: Camera, sh_degree: int | None = None, class_ids: Tensor | None = None
 ) -> SurfelInputs:
-    """The scene with its colours as ``camera`` sees them; differentiable.
+    """Return the scene with its colours as ``camera`` sees them; differentiable.
 
     surfels: N surfels. sh_degree: degrees to use, all if None. class_ids: [N] int32, phi, or None.
     """
@@ -29,7 +29,7 @@ def surfel_inputs(
 
 
 def geometry_inputs(surfels: Surfels, class_ids: Tensor | None = None) -> SurfelInputs:
-    """The scene without colours and gradients: for depth and the gradient-free products."""
+    """Return the scene without colours and gradients: for depth and the products that have no gradient."""
     bare = surfels.detach()
     colors = torch.zeros_like(bare.means)
     return SurfelInputs(bare.means, bare.quats, bare.log_scales, bare.opacity_logits, colors, class_ids)
@@ -38,7 +38,9 @@ def geometry_inputs(surfels: Surfels, class_ids: Tensor | None = None) -> Surfel
 def render_class_map(
     rasterizer: Rasterizer, surfels: Surfels, class_ids: Tensor, camera: Camera, settings: RasterSettings
 ) -> tuple[Tensor, Tensor]:
-    """``Rasterizer.class_map`` of class ids that may lie far apart; the rasterizer is given their ranks.
+    """Render the ``Rasterizer.class_map`` of class ids that may lie far apart.
+
+    The rasterizer gets their ranks.
 
     surfels: N surfels. class_ids: [N] int32, phi. Returns ([H, W] int32 class ids, [H, W] float share), no gradient.
     """
@@ -54,15 +56,15 @@ def check_surface_depth(kind: str) -> None:
         raise UserError(f"there is no surface depth {kind!r}: choose one of {', '.join(SURFACE_DEPTHS)}.")
 
 
-def surface_depth(drawn: RasterOutputs, kind: str) -> Tensor:
-    """[H, W] depth of the surface that each pixel shows, world units; 0 where nothing (solid) is.
+def surface_depth(render: RasterOutputs, kind: str) -> Tensor:
+    """Return [H, W] depth of the surface that each pixel shows, world units; 0 where nothing (solid) is.
 
     kind: "median", the hit at which half of the light is stopped: always on a surface; or "expected", the mean over
-    all hits (the D of E5): at an object's rim it lies in the air between the object and what is behind.
+    all hits (the D of E5): at an object's boundary it lies in the air between the object and what is behind.
     Raises ``UserError`` for another kind.
     """
     check_surface_depth(kind)
-    surface = drawn.median_depth if kind == "median" else drawn.depth
+    surface = render.median_depth if kind == "median" else render.depth
     if surface is None:
         raise ValueError("the settings must ask for geometry")
     return surface

@@ -23,7 +23,7 @@ from beags_plugin.rasterizers.interface import (
 from beags_plugin.rasterizers.reference_geometry import ProjectedSurfels, hits, on_screen, project
 
 KEPT_PER_PAIR = 40  # numbers that autograd keeps per pixel and surfel, as measured
-BLOCK = 16  # pixels are drawn in squares of this side, each with the surfels that reach it
+BLOCK = 16  # pixels are rendered in squares of this side, each with the surfels that reach it
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class TorchRasterizer(Rasterizer):
     """Autograd through dense blocks: slow, exact in float64, on any device.
 
     smooth_cutoff: fade alpha out at 1/255 instead of cutting it, so that finite differences hold; for tests.
-    memory_limit: bytes; a drawing that would keep more for its backward computes each block twice instead.
+    memory_limit: bytes; a render that would keep more for its backward computes each block twice instead.
     """
 
     def __init__(self, smooth_cutoff: bool = False, memory_limit: float = 4e9) -> None:
@@ -73,8 +73,8 @@ class TorchRasterizer(Rasterizer):
         if target is not None and inputs.class_ids is None:
             raise ValueError("a target needs class_ids")
         projected = project(inputs, camera, settings)
-        images = self._draw(projected, inputs, camera, settings, background, target)
-        visible = torch.zeros(inputs.means.shape[0], dtype=torch.bool, device=inputs.means.device)
+        images = self._render(projected, inputs, camera, settings, background, target)
+        visible = torch.zeros(len(inputs.means), dtype=torch.bool, device=inputs.means.device)
         visible[projected.index] = on_screen(projected, 0, 0, camera.width, camera.height)
         return RasterOutputs(
             color=images["color"],
@@ -134,7 +134,7 @@ class TorchRasterizer(Rasterizer):
             image[block.rows, block.columns] = winner.reshape(image[block.rows, block.columns].shape)
         return image
 
-    def _draw(
+    def _render(
         self,
         projected: ProjectedSurfels,
         inputs: SurfelInputs,
@@ -143,21 +143,21 @@ class TorchRasterizer(Rasterizer):
         background: Tensor,
         target: Tensor | None,
     ) -> dict[str, Tensor]:
-        """All images, differentiable, block by block."""
+        """Render all images block by block, differentiably."""
 
-        def draw_block(rows: slice, columns: slice) -> dict[str, Tensor]:
+        def render_block(rows: slice, columns: slice) -> dict[str, Tensor]:
             block = self._block(projected, rows, columns, settings)
             return _composite(block, inputs, projected, settings, background, target)
 
-        # What autograd keeps grows with the scene: beyond the limit each block is drawn again in the backward instead.
+        # What autograd keeps grows with the scene: beyond the limit the backward renders each block again.
         again = torch.is_grad_enabled() and _kept_bytes(projected, camera) > self.memory_limit
         images = _Rows(camera.height, camera.width)
         for rows, columns in _squares(camera):
             if again:
-                drawn = checkpoint(draw_block, rows, columns, use_reentrant=False, preserve_rng_state=False)
+                images_here = checkpoint(render_block, rows, columns, use_reentrant=False, preserve_rng_state=False)
             else:
-                drawn = draw_block(rows, columns)
-            images.put(rows, columns, drawn)
+                images_here = render_block(rows, columns)
+            images.put(rows, columns, images_here)
         return images.join()
 
     def _blocks(self, projected: ProjectedSurfels, camera: Camera, settings: RasterSettings) -> Iterator[_Block]:
@@ -174,22 +174,22 @@ class TorchRasterizer(Rasterizer):
         after = torch.cumprod(1.0 - hit.alpha, dim=-1)
         before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=-1)[:, : after.shape[1]]
         # `after` never grows, so all surfels from the one that would take it below the bound on are left out
-        drawn = after.detach() >= MIN_TRANSMITTANCE
-        weights = torch.where(drawn, hit.alpha * before, torch.zeros_like(before))
-        remaining = torch.where(drawn, 1.0 - hit.alpha, torch.ones_like(before)).prod(dim=-1)
-        after = torch.where(drawn, after, torch.ones_like(after))
+        counted = after.detach() >= MIN_TRANSMITTANCE
+        weights = torch.where(counted, hit.alpha * before, torch.zeros_like(before))
+        remaining = torch.where(counted, 1.0 - hit.alpha, torch.ones_like(before)).prod(dim=-1)
+        after = torch.where(counted, after, torch.ones_like(after))
         return _Block(rows, columns, projected.index[chosen], chosen, weights, hit.depth, remaining, before, after)
 
 
 def _squares(camera: Camera) -> Iterator[tuple[slice, slice]]:
-    """The image cut into squares, row by row: slices of its rows and columns."""
+    """Yield the image cut into squares, row by row: slices of its rows and columns."""
     for y in range(0, camera.height, BLOCK):
         for x in range(0, camera.width, BLOCK):
             yield slice(y, min(y + BLOCK, camera.height)), slice(x, min(x + BLOCK, camera.width))
 
 
 def _kept_bytes(projected: ProjectedSurfels, camera: Camera) -> float:
-    """About how much autograd keeps of a drawing: numbers per pixel and surfel in the blocks that a box meets."""
+    """Estimate what autograd keeps of a render: numbers per pixel and surfel in the blocks that a box meets."""
     low, high = projected.box.clamp_min(0.0).unflatten(1, (2, 2)).unbind(1)
     high = torch.minimum(high, high.new_tensor([camera.width, camera.height]))
     sides = ((high / BLOCK).ceil() - (low / BLOCK).floor()).clamp_min(0.0) * BLOCK
@@ -205,7 +205,7 @@ def _composite(
     background: Tensor,
     target: Tensor | None,
 ) -> dict[str, Tensor]:
-    """All outputs of a block's P pixels, [P, channels] each (E4)."""
+    """Return all outputs of a block's P pixels, [P, channels] each (E4)."""
     w = block.weights
     alpha = w.sum(dim=-1, keepdim=True)
     images = {
@@ -233,7 +233,7 @@ def _composite(
 
 
 def _sum_before(values: Tensor) -> Tensor:
-    """[P, S] sum over the entries before each along the last axis."""
+    """Return [P, S] sums over the entries before each along the last axis."""
     return torch.cumsum(values, dim=-1) - values
 
 
@@ -254,5 +254,5 @@ class _Rows:
             lines[-1].append(image.reshape(shape))
 
     def join(self) -> dict[str, Tensor]:
-        """[H, W, channels] each."""
+        """Return the images, [H, W, channels] each."""
         return {name: torch.cat([torch.cat(row, dim=1) for row in rows]) for name, rows in self._rows.items()}

@@ -39,11 +39,11 @@ class Thing:
     texture: Texture
 
     def to_local(self, points: np.ndarray) -> np.ndarray:
-        """World points [N, 3] in the object's frame."""
+        """Return world points [N, 3] in the object's frame."""
         return turned(points - self.position, self.rotation)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """[N] bound of the signed distance of world points [N, 3] (sign and zeros exact)."""
+        """Return [N] bound of the signed distance of world points [N, 3] (sign and zeros exact)."""
         return self.solid.distance(self.to_local(points))
 
 
@@ -71,7 +71,7 @@ class Still:
 
     @property
     def class_names(self) -> dict[int, str]:
-        """Class id to name, the background included."""
+        """Return class id to name, the background included."""
         return {0: "background", **{i: thing.name for i, thing in enumerate(self.things, start=1)}}
 
 
@@ -81,7 +81,7 @@ def _turn_z(angle: float) -> np.ndarray:
 
 
 def _textures(names: list[str], hue: float, noise: Noise, generator: np.random.Generator) -> dict[str, Texture]:
-    # Related hues, dealt out at random: colour alone does not tell where one object ends and the next begins.
+    # Related hues, dealt out at random: colour alone does not show where one object ends and the next begins.
     hues = hue + HUE_RANGE * (generator.permutation(len(names)) / len(names) - 0.5)
     patterns = {
         "box": checks(6.5),
@@ -105,11 +105,10 @@ def _textures(names: list[str], hue: float, noise: Noise, generator: np.random.G
 
 
 def make_still(seed: int) -> Still:
-    """The scene of a seed: sizes, places, turn, handedness, colours, textures and light all depend on it.
+    """Make the scene of a seed, which decides sizes, places, turn, handedness, colours, textures and light.
 
-    All stand on flat faces, which no photo shows: nothing but their class keeps their Gaussians out of what is below.
-    It is built about a box at the origin (its faces are x = +-hx and y = +-hy), then moved to the middle, mirrored or
-    not, and turned.
+    All objects stand on flat faces, which no photo shows: only their class keeps their Gaussians out of what is below.
+    The scene is built about a box at the origin, then moved to the middle, mirrored or not, and turned.
     """
     generator = np.random.default_rng([seed, 1])
 
@@ -129,7 +128,7 @@ def make_still(seed: int) -> Still:
 
     def upright(name: str, outline: tuple[Primitive, ...], cut: tuple[Primitive, ...], reach: float, half: float,
                 position: tuple[float, float, float], on: str) -> None:  # fmt: skip
-        """A solid about its own z axis, 2 half high and within ``reach`` of it, with its foot at ``position``."""
+        """Place a solid about its own z axis, 2 half high and within ``reach`` of it, with its foot at ``position``."""
         x, y, z = position
         solid = Solid((*outline, *slab(2, -half, half)), cut, bound=float(np.hypot(reach, half)))
         place(name, solid, [x, y, z + half], _turn_z(generator.uniform(0.0, 2.0 * np.pi)))
@@ -178,7 +177,7 @@ def _finish(
     contacts: list[tuple[str, str, np.ndarray]],
     generator: np.random.Generator,
 ) -> Still:
-    """Moves the scene to the middle, mirrors and turns it, and gives it colours and light."""
+    """Move the scene to the middle, mirror and turn it, and give it colours and light."""
     # All solids are symmetric about their own y = 0, so mirroring a pose (M R M, M t) mirrors the object exactly.
     mirror = np.diag([1.0, generator.choice([-1.0, 1.0]), 1.0])
     turn = _turn_z(generator.uniform(0.0, 2.0 * np.pi))

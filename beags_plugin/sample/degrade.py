@@ -1,4 +1,4 @@
-"""Masks made as wrong as real ones are: ragged rims, swapped pieces, views left out.
+"""Degraded masks, as wrong as real ones: ragged boundaries, swapped pieces, views left out.
 
 Everything is decided by the seed and the view's name, so one view's mask does not depend on the others.
 """
@@ -18,7 +18,7 @@ from beags_plugin.system.errors import UserError
 
 @dataclass(frozen=True)
 class Degradation:
-    """How wrong the masks are.
+    """Amounts by which masks are wrong.
 
     rim: farthest a boundary moves, as a fraction of the image diagonal (0.0075 is 3 pixels at 320 x 240).
     dropped: fraction of the train views that have no mask.
@@ -47,7 +47,7 @@ class Swap:
 
 
 def degradation_of_degree(degree: float) -> Degradation:
-    """Masks wrong to any degree: 0 is "none", 1 "mild", 2 "strong", straight lines between and beyond them.
+    """Interpolate the presets: degree 0 is "none", 1 "mild", 2 "strong", with straight lines between and beyond.
 
     Raises ``UserError`` for a degree below 0, or so high that a share would exceed 1.
     """
@@ -63,7 +63,7 @@ def degradation_of_degree(degree: float) -> Degradation:
 
 
 def resolve_degradation(degradation: str | Degradation) -> Degradation:
-    """A preset or a degree (a number) by name, or a checked custom one; raises ``UserError`` for what is neither."""
+    """Return a preset or a degree (a number) by name, or a custom one; raise ``UserError`` for an invalid one."""
     if isinstance(degradation, str):
         if degradation in PRESETS:
             return PRESETS[degradation]
@@ -88,30 +88,29 @@ def _generator(seed: int, view: str, purpose: int) -> np.random.Generator:
 
 
 def dropped_views(names: Sequence[str], seed: int, fraction: float) -> set[str]:
-    """Those ``round(fraction * len(names))`` names, but never all, whose lot (by seed and name) is lowest."""
+    """Return the ``round(fraction * len(names))`` names, but never all, whose lot (by seed and name) is lowest."""
     count = min(round(fraction * len(names)), len(names) - 1)
     lots = sorted((float(_generator(seed, name, 3).random()), name) for name in names)
     return {name for _, name in lots[: max(count, 0)]}
 
 
 def rim_amplitude(strength: float, height: int, width: int) -> float:
-    """Farthest displacement in pixels of an image of this size, for a ``Degradation.rim``."""
+    """Return the farthest displacement in pixels for a ``Degradation.rim`` in an image of this size."""
     return strength * math.hypot(height, width)
 
 
 def roughen_rims(labels: np.ndarray, amplitude: float, seed: int, view: str) -> np.ndarray:
-    """Moves every boundary by a smooth random displacement of at most ``amplitude`` pixels.
+    """Move every boundary by a smooth random displacement of at most ``amplitude`` pixels.
 
-    labels: [H, W] ids. Returns the same shape and type; each pixel takes the id found at its centre plus a displacement
-    whose two components are noise with a wavelength of a few amplitudes, so changes stay within
-    ``amplitude`` + 0.71 pixels (the nearest pixel's centre) of a boundary.
+    labels: [H, W] ids. Returns the same shape and type. Each pixel takes the id at a displacement of smooth noise, so
+    changes stay within ``amplitude`` + 0.71 pixels (the nearest pixel's centre) of a boundary.
     """
     if amplitude <= 0.0:
         return labels.copy()
     height, width = labels.shape
     noise = Noise(_generator(seed, view, 4))
     y, x = np.meshgrid(np.arange(height) + 0.5, np.arange(width) + 0.5, indexing="ij")
-    cell = max(3.0 * amplitude, 4.0)  # pixels per lattice cell: at least 4, or the rim turns to salt and pepper
+    cell = max(3.0 * amplitude, 4.0)  # pixels per lattice cell: at least 4, or the boundary turns to salt and pepper
     points = np.stack([x.ravel() / cell, y.ravel() / cell, np.zeros(x.size)], axis=1)
     # Planes 10 lattice cells apart are unrelated; the noise is stretched, as middle values are the most frequent.
     shift = [np.clip(3.0 * (noise(points + [0.0, 0.0, plane]) - 0.5), -1.0, 1.0) for plane in (0.0, 10.0)]
@@ -125,7 +124,7 @@ def roughen_rims(labels: np.ndarray, amplitude: float, seed: int, view: str) -> 
 def swap_pieces(
     labels: np.ndarray, num_classes: int, probability: float, seed: int, view: str
 ) -> tuple[np.ndarray, list[Swap]]:
-    """Gives one connected piece of some objects another object's id or the background's.
+    """Give one connected piece of some objects another object's id or the background's.
 
     labels: [H, W] ids in 0..num_classes - 1. Each object present is hit with ``probability``; the piece is the largest
     connected part of what a random line cuts off (15 to 60 percent of the visible object).
@@ -157,7 +156,7 @@ def swap_pieces(
 
 
 def degrade_mask(labels: np.ndarray, num_classes: int, degradation: Degradation, seed: int, view: str) -> np.ndarray:
-    """Swapped pieces, then ragged rims; views left out are ``dropped_views``'s business.
+    """Swap pieces, then make boundaries ragged; ``dropped_views`` leaves views out.
 
     labels: [H, W] ids. Returns the same shape and type.
     """

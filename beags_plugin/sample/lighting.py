@@ -18,7 +18,7 @@ MAP_EXTENT, MAP_CELLS = 2.0, 160
 
 
 def _sun_directions(sun: np.ndarray, count: int) -> np.ndarray:
-    """[count, 3] unit vectors spread evenly (a golden-angle spiral) over the sun's disc."""
+    """Return [count, 3] unit vectors, spread evenly over the sun's disc on a golden-angle spiral."""
     side = np.cross(sun, [0.0, 0.0, 1.0])
     side /= np.linalg.norm(side)
     up = np.cross(side, sun)
@@ -29,7 +29,7 @@ def _sun_directions(sun: np.ndarray, count: int) -> np.ndarray:
 
 
 def _sky_directions(count: int) -> np.ndarray:
-    """[count, 3] unit vectors about +z, their density proportional to the cosine."""
+    """Return [count, 3] unit vectors about +z, their density proportional to the cosine."""
     radius = np.sqrt((np.arange(count) + 0.5) / count)
     angle = 2.399963 * np.arange(count)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - radius**2)], axis=1)
@@ -49,7 +49,7 @@ class Light:
         self._sky_map = seen_share(still, points, _sky_directions(2 * ground_samples)).reshape(x.shape)
 
     def _read(self, table: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Bilinear lookup of the baked map; the border's value outside it."""
+        """Read the baked map bilinearly; outside it, its border."""
         place = np.clip((points[:, :2] / MAP_EXTENT + 1.0) * 0.5 * (MAP_CELLS - 1), 0.0, MAP_CELLS - 1.001)
         low = place.astype(np.int64)
         fx, fy = (place - low).T
@@ -62,7 +62,7 @@ class Light:
         return albedo * (sun[:, None] * SUN + sky[:, None] * SKY)
 
     def _ground(self, points: np.ndarray) -> np.ndarray:
-        """Tiles of mottled stone; their pattern fades outwards, where small images would alias."""
+        """Colour tiles of mottled stone, whose pattern fades outwards, where small images would alias."""
         palette, noise = self.still.palette, self.still.noise
         tile = points[:, :2] * TILES
         cell = np.floor(tile)
@@ -84,7 +84,7 @@ class Light:
         return self._lit(albedo, sun, sky)
 
     def _dome(self, points: np.ndarray) -> np.ndarray:
-        """A curtain of soft folds with clouds of colour; it shines by itself, so it has no shading."""
+        """Colour a curtain of soft folds with clouds of colour, which shines by itself and has no shading."""
         palette, noise = self.still.palette, self.still.noise
         height = points[:, 2] / DOME_RADIUS
         cloud = noise(points * 1.1) * 0.6 + noise(points * 2.7 + 5.0) * 0.4
@@ -108,7 +108,7 @@ class Light:
         return self._lit(thing.texture(local), sun, sky)
 
     def colours(self, points: np.ndarray, surface: np.ndarray) -> np.ndarray:
-        """[N, 3] linear RGB (may exceed 1) of world points [N, 3] on surfaces [N] as ``Hits.surface`` names them."""
+        """Return [N, 3] linear RGB (may exceed 1) of world points [N, 3] on surfaces [N], as in ``Hits.surface``."""
         colours = np.empty_like(points)
         for which in np.unique(surface):
             chosen = np.flatnonzero(surface == which)

@@ -1,8 +1,6 @@
-"""Seed points such as structure from motion would give, and the .ply that carries them."""
+"""Seed points such as structure from motion would give."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 
@@ -10,7 +8,7 @@ from beags_plugin.sample.views import Picture, View
 
 
 def seed_points(view: View, picture: Picture, count: int, noise: float, generator: np.random.Generator) -> np.ndarray:
-    """``count`` visible surface points of a view with noise; half of them on objects, where there are any.
+    """Sample ``count`` visible surface points of a view with noise, half of them on objects, where there are any.
 
     noise: standard deviation, world units. Returns [count] records of x, y, z (float32, world) and red, green, blue.
     """
@@ -30,11 +28,3 @@ def seed_points(view: View, picture: Picture, count: int, noise: float, generato
     for channel, name in enumerate(("red", "green", "blue")):
         records[name] = picture.image.reshape(-1, 3)[pixels, channel]
     return records
-
-
-def write_ply(path: Path, records: np.ndarray) -> None:
-    """A binary little-endian .ply of one ``vertex`` element with the records' fields."""
-    kinds = {"f4": "float", "u1": "uchar"}
-    properties = [f"property {kinds[records.dtype[n].str[1:]]} {n}" for n in records.dtype.names or ()]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(records)}", *properties, "end_header", ""]
-    path.write_bytes("\n".join(header).encode("ascii") + records.tobytes())

@@ -1,7 +1,7 @@
-"""Which part of an object's silhouette rests on surface that the training photos show.
+"""The part of an object's silhouette that rests on surface which the training photos show.
 
-Where an object touches another, or lies in one, photos show its surface nowhere or only through a gap. What it looks
-like there cannot be known, so an evaluation may leave those pixels of the silhouette out.
+Where objects touch, photos show their surfaces nowhere or only through a gap. An evaluation may leave such pixels of
+the silhouette out.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ GAP = 1  # pixels: points of neighbouring pixels of one photo lie at most so far
 
 
 def visible_surface(view: View, picture: Picture) -> list[np.ndarray]:
-    """World points [P, 3] of each object's surface that ``view`` shows, one per pixel."""
+    """Return world points [P, 3] of each object's surface that ``view`` shows, one per pixel."""
     rows, columns = np.indices(picture.labels.shape)
     directions = view.directions(columns.ravel() + 0.5, rows.ravel() + 0.5)
     points = view.center + picture.depth.reshape(-1, 1) * directions
@@ -26,7 +26,7 @@ def visible_surface(view: View, picture: Picture) -> list[np.ndarray]:
 
 
 def well_seen(parts: list[np.ndarray], min_views: int = MIN_VIEWS) -> np.ndarray:
-    """Points [P, 3] of all ``parts`` ([P_i, 3], one per photo) whose patch at least ``min_views`` photos show."""
+    """Return points [P, 3] of ``parts`` ([P_i, 3], one per photo) whose patch at least ``min_views`` photos show."""
     points = np.concatenate(parts)
     photo = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     cells = np.floor(points / PATCH).astype(np.int64)
@@ -38,7 +38,7 @@ def well_seen(parts: list[np.ndarray], min_views: int = MIN_VIEWS) -> np.ndarray
 
 
 def seen_part(view: View, surface: np.ndarray, silhouette: np.ndarray) -> np.ndarray:
-    """[H, W] bool, the pixels of ``silhouette`` whose ray meets the object's seen surface, on the near or far side.
+    """Return [H, W] bool, the pixels of ``silhouette`` whose ray meets the object's seen surface, near or far.
 
     surface: [P, 3] world points of the object, as ``well_seen`` gives them. silhouette: [H, W] bool.
     """
@@ -53,5 +53,5 @@ def seen_part(view: View, surface: np.ndarray, silhouette: np.ndarray) -> np.nda
     hit = np.zeros(silhouette.shape, dtype=bool)
     hit[y[inside], x[inside]] = True
     # Points of neighbouring pixels of one photo lie up to a pixel apart in another: closing fills the gaps between
-    # them and leaves the rim where it is.
+    # them and leaves the boundary where it is.
     return ndimage.binary_closing(np.pad(hit, GAP), np.ones((3, 3)), GAP)[GAP:-GAP, GAP:-GAP] & silhouette

@@ -20,20 +20,20 @@ class Primitive(Protocol):
     """A convex body."""
 
     def interval(self, origins: np.ndarray, directions: np.ndarray) -> Interval:
-        """The part of each ray inside; origins [N, 3], directions [N, 3], either of which may be [1, 3]."""
+        """Return the part of each ray inside; origins [N, 3], directions [N, 3], either of which may be [1, 3]."""
         ...
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """[N] signed distance to the (infinite) surface, negative inside; points [N, 3]."""
+        """Return [N] signed distance to the (infinite) surface, negative inside; points [N, 3]."""
         ...
 
     def normal(self, points: np.ndarray) -> np.ndarray:
-        """[N, 3] outward unit normals of the surface at points on it."""
+        """Return [N, 3] outward unit normals of the surface at points on it."""
         ...
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[N] row-wise products of [N, k] and [N, k], either of which may be [1, k].
+    """Return [N] row-wise products of [N, k] and [N, k], either of which may be [1, k].
 
     Determinism: written out, since a BLAS product may differ in its last bit with the number of threads.
     """
@@ -44,12 +44,12 @@ def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def turned(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """[N, 3] ``points @ matrix``, without BLAS as in ``dot``."""
+    """Return [N, 3] ``points @ matrix``, without BLAS as in ``dot``."""
     return np.stack([dot(points, matrix[None, :, j]) for j in range(3)], axis=1)
 
 
 def _quadratic(a: np.ndarray, half_b: np.ndarray, c: np.ndarray) -> Interval:
-    """Where a t^2 + 2 half_b t + c <= 0 for a > 0; for a = 0 (a ray along a tube) everywhere or nowhere."""
+    """Return where a t^2 + 2 half_b t + c <= 0 for a > 0; for a = 0 (a ray along a tube) everywhere or nowhere."""
     discriminant = half_b * half_b - a * c
     with np.errstate(divide="ignore", invalid="ignore"):
         root = np.sqrt(np.maximum(discriminant, 0.0))
@@ -166,7 +166,7 @@ class Cone:
 
 
 def slab(axis: int, low: float, high: float) -> tuple[HalfSpace, HalfSpace]:
-    """The two half-spaces of low <= x[axis] <= high."""
+    """Return the two half-spaces of low <= x[axis] <= high."""
     return HalfSpace(axis, -1.0, -low), HalfSpace(axis, 1.0, high)
 
 
@@ -190,7 +190,7 @@ class Solid:
     bound: float = 1.0
 
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """[N] smallest t > 0 at which rays from outside enter the solid, infinity if none."""
+        """Return [N] smallest t > 0 at which rays from outside enter the solid, infinity if none."""
         near, far = _meet(self.add, origins, directions)
         near = np.where((near < far) & (near > 0.0), near, np.inf)
         if not self.cut:
@@ -201,7 +201,7 @@ class Solid:
         return np.where(hollow, np.where(cut_far < far, cut_far, np.inf), near)
 
     def occludes(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """[N] bool: does any material lie at t > 0; origins may be anywhere outside, also in the hollow."""
+        """Return [N] bool, whether material lies at t > 0; origins may be anywhere outside, also in the hollow."""
         near, far = _meet(self.add, origins, directions)
         near = np.maximum(near, 0.0)
         if not self.cut:
@@ -211,14 +211,14 @@ class Solid:
         return (near < far) & (cut_empty | (near < cut_near) | (cut_far < far))
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """[N] a lower bound of the signed distance: its sign and zeros are exact; points [N, 3]."""
+        """Return [N] a lower bound of the signed distance: its sign and zeros are exact; points [N, 3]."""
         value = np.max([p.distance(points) for p in self.add], axis=0)
         if self.cut:
             value = np.maximum(value, -np.max([p.distance(points) for p in self.cut], axis=0))
         return value
 
     def normals(self, points: np.ndarray) -> np.ndarray:
-        """[N, 3] outward unit normals at surface points [N, 3]: that of the primitive whose surface is nearest."""
+        """Return [N, 3] outward unit normals at surface points [N, 3], of the primitive with the nearest surface."""
         parts = [(p, 1.0) for p in self.add] + [(p, -1.0) for p in self.cut]
         nearest = np.argmin([np.abs(p.distance(points)) for p, _ in parts], axis=0)
         normals = np.zeros_like(points)

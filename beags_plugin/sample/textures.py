@@ -26,7 +26,7 @@ class Noise:
         self._values = generator.random(LATTICE**3).astype(np.float32)
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """[N] in 0..1; points [N, 3] in lattice cells."""
+        """Return [N] in 0..1; points [N, 3] in lattice cells."""
         floor = np.floor(points)
         f = (points - floor).astype(np.float32)
         f = f * f * (3.0 - 2.0 * f)
@@ -48,17 +48,17 @@ class Noise:
 
 
 def _edge(value: np.ndarray, sharpness: float) -> np.ndarray:
-    """A smooth step from 0 to 1 about value = 0."""
+    """Return a smooth step from 0 to 1 about value = 0."""
     return 0.5 + 0.5 * np.tanh(sharpness * value)
 
 
 def checks(cells: float) -> Pattern:
-    """A three-dimensional checkerboard with ``cells`` per unit."""
+    """Return a three-dimensional checkerboard with ``cells`` per unit."""
     return lambda p: _edge(np.prod(np.sin(np.pi * (cells * p + 0.25)), axis=1), 12.0)
 
 
 def bands(per_unit: float, twist: float = 0.0) -> Pattern:
-    """Bands stacked along z, ``per_unit`` pairs; ``twist`` turns (a whole number) make them a helix."""
+    """Return ``per_unit`` pairs of bands along z; ``twist`` turns (a whole number) make them a helix."""
     return lambda p: _edge(
         np.sin(2.0 * np.pi * per_unit * p[:, 2] + twist * np.arctan2(p[:, 1], p[:, 0])),
         3.0,
@@ -66,17 +66,17 @@ def bands(per_unit: float, twist: float = 0.0) -> Pattern:
 
 
 def sectors(count: int, slant: float = 0.0) -> Pattern:
-    """``count`` pairs of stripes about the z axis, leaning by ``slant`` radians per unit of z."""
+    """Return ``count`` pairs of stripes about the z axis, leaning by ``slant`` radians per unit of z."""
     return lambda p: _edge(np.sin(count * np.arctan2(p[:, 1], p[:, 0]) + slant * p[:, 2]), 3.0)
 
 
 def blotches(noise: Noise, cells: float) -> Pattern:
-    """Irregular spots, ``cells`` lattice cells per unit."""
+    """Return irregular spots, ``cells`` lattice cells per unit."""
     return lambda p: _edge(noise(cells * p) - 0.5, 9.0)
 
 
 def marble(noise: Noise, per_unit: float) -> Pattern:
-    """Wavy veins, ``per_unit`` pairs along a slanting axis."""
+    """Return wavy veins, ``per_unit`` pairs along a slanting axis."""
     axis = np.array([[0.6, 0.35, 0.72]])
 
     def pattern(p: np.ndarray) -> np.ndarray:
@@ -101,7 +101,7 @@ class Texture:
     contrast: float = 0.35
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """[N, 3] albedo, linear RGB in 0..1; points [N, 3] in the object's frame."""
+        """Return [N, 3] albedo, linear RGB in 0..1; points [N, 3] in the object's frame."""
         weight = self.pattern(points)[:, None]
         colour = self.dark + weight * (self.light - self.dark)
         mottle = self.noise(self.cells * points + 7.3)
@@ -111,5 +111,5 @@ class Texture:
 
 
 def linear_from_hsv(hue: float, saturation: float, value: float) -> np.ndarray:
-    """[3] linear RGB of a display colour given as hue (in turns), saturation and value."""
+    """Return [3] linear RGB of a display colour given as hue (in turns), saturation and value."""
     return np.array(colorsys.hsv_to_rgb(hue % 1.0, saturation, value)) ** 2.2

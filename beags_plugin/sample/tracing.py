@@ -1,4 +1,4 @@
-"""Exact ray casting of the still life: what each ray hits first, and each object's own silhouette."""
+"""Exact ray casting of the still life: first hits, and each object's own silhouette."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Hits:
 
 
 def object_hits(thing: Thing, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which rays hit the object, were it alone, and where.
+    """Find the rays that hit the object, were it alone, and where.
 
     origin: [3] outside of all objects; directions: [N, 3]. Returns indices [M] and their t [M].
     """
@@ -37,7 +37,7 @@ def object_hits(thing: Thing, origin: np.ndarray, directions: np.ndarray) -> tup
 
 
 def _surround(origin: np.ndarray, directions: np.ndarray) -> Hits:
-    """Hits of the ground or, beyond its rim, of the dome; the origin must lie inside."""
+    """Return hits of the ground or, beyond its edge, of the dome; the origin must lie inside."""
     a = dot(directions, directions)
     half_b = dot(directions, origin[None])
     t = (-half_b + np.sqrt(half_b * half_b - a * (origin @ origin - DOME_RADIUS**2))) / a
@@ -47,7 +47,7 @@ def _surround(origin: np.ndarray, directions: np.ndarray) -> Hits:
 
 
 def first_hits(still: Still, origin: np.ndarray, directions: np.ndarray) -> tuple[Hits, list[np.ndarray]]:
-    """First hits of rays from one point, and for each object the indices of the rays that would hit it alone.
+    """Find first hits of rays from one point, and for each object the rays that would hit it alone.
 
     origin: [3], world, inside the dome and outside of all objects; directions: [N, 3], any length.
     """
@@ -64,7 +64,7 @@ def first_hits(still: Still, origin: np.ndarray, directions: np.ndarray) -> tupl
 
 
 def seen_share(still: Still, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """[N] fraction of the unit ``directions`` [K, 3] that no object blocks, from ``origins`` [N, 3] outside of them."""
+    """Return the fraction [N] of unit ``directions`` [K, 3] that no object blocks, from ``origins`` [N, 3] outside."""
     blocked = np.zeros((len(directions), len(origins)), dtype=bool)
     for thing in still.things:
         offset = origins - thing.position

@@ -36,18 +36,18 @@ class View:
 
     @property
     def center(self) -> np.ndarray:
-        """[3] the camera's position in the world."""
+        """Return the camera's position in the world, [3]."""
         return self.camera_to_world[:3, 3]
 
     def directions(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """[N, 3] world directions through image points x, y [N] (pixels), of depth 1 along the optical axis."""
+        """Return [N, 3] world directions through image points x, y [N] (pixels), of depth 1 along the optical axis."""
         camera = np.stack([(x - self.cx) / self.focal, -(y - self.cy) / self.focal, -np.ones_like(x)], axis=1)
         return turned(camera, self.camera_to_world[:3, :3].T)
 
 
 @dataclass(frozen=True)
 class Picture:
-    """What a view sees.
+    """The images that a view sees.
 
     image: [H, W, 3] uint8 sRGB, antialiased by supersampling. The rest is exact at the pixel centres:
     labels: [H, W] uint8 visible class ids. depth: [H, W] float32 z along the optical axis (there is always a hit).
@@ -61,7 +61,7 @@ class Picture:
 
 
 def make_views(seed: int, width: int, height: int, num_train: int, num_test: int) -> list[View]:
-    """Three rounds about the scene at rising height, jittered, test views spread evenly between the train views."""
+    """Make three jittered rounds about the scene at rising height, with test views spread evenly."""
     generator = np.random.default_rng([seed, 2])
     total = num_train + num_test
     tests = {int((i + 0.5) * total / num_test) for i in range(num_test)}
@@ -104,7 +104,7 @@ def _look_at(position: np.ndarray, target: np.ndarray, roll: float) -> np.ndarra
 
 
 def _grid(view: View, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Image points [H * W * samples^2]: per pixel, row by row, the centres of samples x samples equal squares."""
+    """Return image points [H W samples^2]: per pixel, row by row, the centres of samples x samples equal squares."""
     offset = (np.arange(samples) + 0.5) / samples
     x = (np.arange(view.width)[:, None] + offset).ravel()
     y = (np.arange(view.height)[:, None] + offset).ravel()
@@ -114,7 +114,7 @@ def _grid(view: View, samples: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def render_image(still: Still, light: Light, view: View, samples: int) -> np.ndarray:
-    """[H, W, 3] uint8 sRGB, the mean in linear light over samples x samples rays per pixel."""
+    """Render [H, W, 3] uint8 sRGB, the mean in linear light over samples x samples rays per pixel."""
     x, y = _grid(view, samples)
     per_pixel = samples * samples
     chunk = CHUNK // per_pixel * per_pixel
@@ -129,7 +129,7 @@ def render_image(still: Still, light: Light, view: View, samples: int) -> np.nda
 
 
 def render_view(still: Still, light: Light, view: View, samples: int = 2) -> Picture:
-    """The picture of a view, with ``samples`` x ``samples`` rays per pixel for the image."""
+    """Render the picture of a view, with ``samples`` x ``samples`` rays per pixel for the image."""
     x, y = _grid(view, 1)
     hits, silhouettes = first_hits(still, view.center, view.directions(x, y))
     masks = np.zeros((len(still.things), len(x)), dtype=bool)

@@ -1,4 +1,4 @@
-"""Writes the sample scene as a nerfstudio folder with masks and ground truth."""
+"""Write the sample scene as a nerfstudio folder with masks and ground truth."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ import numpy as np
 from beags_plugin.sample.arrangement import make_still
 from beags_plugin.sample.degrade import Degradation, degrade_mask, dropped_views, resolve_degradation
 from beags_plugin.sample.lighting import Light
-from beags_plugin.sample.points import seed_points, write_ply
+from beags_plugin.sample.points import seed_points
 from beags_plugin.sample.seen import seen_part, visible_surface, well_seen
 from beags_plugin.sample.views import Picture, View, make_views, render_view
 from beags_plugin.system.errors import UserError, unwritable, writing
 from beags_plugin.system.progress import progress_bar
+from beags_plugin.system.reading.ply import write_vertices
 
 VERSION = 8
 """Raise it whenever the same config would give other files: older samples are then rebuilt."""
@@ -32,7 +33,7 @@ SAMPLE_FILE = "sample.json"
 
 @dataclass(frozen=True)
 class SampleConfig:
-    """What decides every byte of the sample.
+    """Options that decide every byte of the sample.
 
     seed: of arrangement, sizes, colours, textures, light, camera jitter, mask degradation.
     width, height: pixels. num_train, num_test: views.
@@ -50,7 +51,7 @@ class SampleConfig:
     antialias: int = 2
 
     def check(self) -> None:
-        """Raises ``UserError`` for a value that makes no scene."""
+        """Raise ``UserError`` for a value that makes no scene."""
         least = {"seed": 0, "width": 16, "height": 16, "num_train": 1, "num_test": 1, "num_points": 1, "antialias": 1}
         for name, low in least.items():
             if getattr(self, name) < low:
@@ -61,17 +62,17 @@ class SampleConfig:
         resolve_degradation(self.degradation)
 
     def as_dict(self) -> dict[str, Any]:
-        """The content of sample.json; presets are written out, so that a changed preset is another sample."""
+        """Return the content of sample.json; presets are written out, so that a changed preset is another sample."""
         return {"version": VERSION, **asdict(self), "degradation": asdict(resolve_degradation(self.degradation))}
 
 
 def is_sample(folder: Path, config: SampleConfig) -> bool:
-    """Whether ``folder`` holds the complete sample of this very config."""
+    """Return whether ``folder`` holds the complete sample of this very config."""
     return _read_config(folder) == config.as_dict()
 
 
 def _read_config(folder: Path) -> Any:
-    """What sample.json says; None if there is none or it is damaged."""
+    """Read sample.json; None if there is none or it is damaged."""
     try:
         return json.loads((folder / SAMPLE_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -128,7 +129,8 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
     degradation = resolve_degradation(config.degradation)
     train = [view.name for view in views if view.split == "train"]
     dropped = dropped_views(train, config.seed, degradation.dropped)
-    shares = dict(zip(train, _even_shares(config.num_points, len(train)), strict=True))
+    ends = [config.num_points * i // len(train) for i in range(len(train) + 1)]
+    shares = {name: end - first for name, first, end in zip(train, ends[:-1], ends[1:], strict=True)}
     names = still.class_names
     for sub in ("images", "masks", *_truth_folders(names)):
         (folder / sub).mkdir(parents=True)
@@ -157,14 +159,15 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
     for view in views:
         if view.name in silhouettes:
             _write_seen(folder, view, whole, silhouettes[view.name], names)
-    write_ply(folder / "seed_points.ply", np.concatenate(points))
+    with open(folder / "seed_points.ply", "wb") as file:
+        write_vertices(file, np.concatenate(points))
     _write_json(folder / "classes.json", {str(i): name for i, name in names.items()})
     _write_json(folder / "transforms.json", transforms(views))
     _write_json(folder / SAMPLE_FILE, config.as_dict())
 
 
 def transforms(views: list[View]) -> dict[str, Any]:
-    """nerfstudio's transforms.json: one lens, frames sorted by name, and which of them are for training."""
+    """Return nerfstudio's transforms.json: one lens, frames sorted by name, and which of them are for training."""
     lens = views[0]
 
     def of(split: str) -> list[str]:
@@ -191,10 +194,6 @@ def transforms(views: list[View]) -> dict[str, Any]:
     }
 
 
-def _even_shares(total: int, parts: int) -> list[int]:
-    return [total * (i + 1) // parts - total * i // parts for i in range(parts)]
-
-
 def _truth_folders(names: dict[int, str]) -> list[str]:
     kinds = ("silhouettes", "seen")
     objects = [f"ground_truth/{kind}/{name}" for kind in kinds for class_id, name in names.items() if class_id]
@@ -218,7 +217,7 @@ def _write_seen(
 
 
 def _write_png(path: Path, pixels: np.ndarray) -> None:
-    """[H, W] uint8 grey or [H, W, 3] uint8 RGB."""
+    """Write [H, W] uint8 grey or [H, W, 3] uint8 RGB."""
     from PIL import Image
 
     Image.fromarray(pixels).save(path)

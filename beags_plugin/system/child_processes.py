@@ -1,6 +1,5 @@
 """Processes that end with the one that started them, however that ends (Linux; elsewhere nothing is done).
 
-A training, a viewer or a browser that has lost who waits for it would go on by itself.
 ``python system/child_processes.py PARENT SIGNAL COMMAND...`` asks the kernel for the signal at the parent's end and
 becomes the command.
 """
@@ -32,7 +31,7 @@ def end_with_parent(kind: signal.Signals = signal.SIGTERM, parent: int | None = 
 
 
 def bound(command: Sequence[object], kind: signal.Signals = signal.SIGTERM) -> list[str]:
-    """A command line that does the same, in a process that gets a signal when this thread ends."""
+    """Return a command line that does the same in a process that gets a signal when this thread ends."""
     words = [str(word) for word in command]
     if sys.platform != "linux":
         return words

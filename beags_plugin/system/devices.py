@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def to_device_async(value: Tensor, device: torch.device | str) -> Tensor:
-    """``value``, of the CPU, on ``device``; the host does not wait until it is there."""
+    """Copy ``value`` from the CPU to ``device``; the host does not wait until it is there."""
     if torch.device(device).type != "cuda":
         return value.to(device)
     return value.pin_memory().to(device, non_blocking=True)  # what is not pinned would be copied while the host waits

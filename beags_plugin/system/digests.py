@@ -1,4 +1,4 @@
-"""Digests that tell whether something made earlier would come out the same again."""
+"""Digests that show whether something made earlier would come out the same again."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from pathlib import Path
 from typing import Any
 
 _PACKAGE = Path(__file__).parents[1]
-_TELLING = ("commands", "bench")  # print and draw what the rest has computed
+_SHOWING = ("commands", "bench")  # print and draw what the rest has computed
 
 
 def code_digest() -> str:
-    """Changes with every file of the package that can change a result, the compiled extension included."""
+    """Digest every file of the package that can change a result, the compiled extension included."""
     digest = hashlib.sha256()
     for path in sorted([*_PACKAGE.rglob("*.py"), *_PACKAGE.glob("_native*"), *_PACKAGE.glob("native/**/*")]):
-        if path.is_file() and path.relative_to(_PACKAGE).parts[0] not in _TELLING:
+        if path.is_file() and path.relative_to(_PACKAGE).parts[0] not in _SHOWING:
             digest.update(path.read_bytes())
     digest.update((_PACKAGE / "bench" / "measure.py").read_bytes())
     return digest.hexdigest()
 
 
 def folder_digest(folder: Path) -> str:
-    """Changes with any file of ``folder``, by path, size and time."""
+    """Digest path, size and time of every file of ``folder``."""
     digest = hashlib.sha256(str(folder.resolve()).encode())
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         stat = path.stat()
@@ -32,7 +32,7 @@ def folder_digest(folder: Path) -> str:
 
 
 def content_digest(files: Iterable[Path]) -> str:
-    """Changes with the name or the content of any of the files."""
+    """Digest name and content of every file."""
     digest = hashlib.sha256()
     for path in files:
         content = path.read_bytes()
@@ -41,5 +41,5 @@ def content_digest(files: Iterable[Path]) -> str:
 
 
 def value_digest(value: Any) -> str:
-    """Of plain values (JSON), whatever the order of a dict's keys."""
+    """Digest plain values (JSON), whatever the order of a dict's keys."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()

@@ -20,10 +20,10 @@ class UserError(Exception):
 
     Command lines print the sentence alone, without a traceback, and end with exit code 2.
 
-    told: whether the trainer has printed it already, for the command that started it.
+    reported: the trainer has printed it already; the command that started it need not.
     """
 
-    told = False
+    reported = False
 
 
 def system_error(error: BaseException) -> OSError | None:
@@ -111,8 +111,8 @@ def print_user_errors_plainly() -> None:
     former_of_threads = threading.excepthook
 
     def thread_hook(args: threading.ExceptHookArgs) -> None:
-        told_elsewhere = type(args.thread).__module__ == "tensorboard.summary.writer.event_file_writer"
-        if not (told_elsewhere and isinstance(args.exc_value, OSError) and is_of_disk(args.exc_value)):
+        reported_elsewhere = type(args.thread).__module__ == "tensorboard.summary.writer.event_file_writer"
+        if not (reported_elsewhere and isinstance(args.exc_value, OSError) and is_of_disk(args.exc_value)):
             former_of_threads(args)
 
     threading.excepthook = thread_hook

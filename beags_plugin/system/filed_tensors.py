@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.reading.arrays import check_header, check_members
+from beags_plugin.system.reading.arrays import check_members, read_member
 
 
 class FiledTensors(Sequence[Tensor]):
@@ -45,17 +45,13 @@ class FiledTensors(Sequence[Tensor]):
         return self._count
 
     def __getitem__(self, index: int | slice) -> Any:
-        """One tensor; of a slice, a list."""
+        """Read one tensor, or for a slice a list."""
         chosen = range(self._count)[index]
         return self._read(chosen) if isinstance(chosen, int) else [self._read(each) for each in chosen]
 
     def _read(self, index: int) -> Tensor:
-        member = f"{index}.npy"
         try:
-            with self._held.open(member) as file:
-                check_header(file, self._held.getinfo(member).file_size)
-            with self._held.open(member) as file:
-                return torch.from_numpy(np.lib.format.read_array(file, allow_pickle=False)).to(self.device)
+            return torch.from_numpy(read_member(self._held, self._held.getinfo(f"{index}.npy"))).to(self.device)
         # what zipfile raises for members that are damaged, and torch for numbers that it does not know
         except (zipfile.BadZipFile, NotImplementedError, RuntimeError, KeyError, TypeError, EOFError) as error:
             raise ValueError(f"tensor {index} cannot be read: {error}") from None
@@ -71,7 +67,7 @@ def write_tensors(file: BinaryIO, tensors: Iterable[Tensor]) -> None:
 
 
 def filed(tensors: Iterable[Tensor], device: torch.device | str = "cpu") -> FiledTensors:
-    """Tensors moved to a temporary file as they come; it goes with the last reference to what is returned.
+    """Move tensors to a temporary file as they come; it goes with the last reference to what is returned.
 
     Raises ``UserError`` if the folder of temporary files is full.
     """

@@ -1,4 +1,4 @@
-"""Early ends of a training: Ctrl-C and SIGTERM, after the step is finished and saved; an error of the user's."""
+"""Early ends of a training: Ctrl-C and SIGTERM, after the step is finished and saved; user errors."""
 
 from __future__ import annotations
 
@@ -57,5 +57,5 @@ class Interrupts:
 def stop(error: UserError) -> NoReturn:
     """End the program with the sentence of a user's error, and exit code 2."""
     get_console().print(f"[bold red]beags:[/bold red] {escape(str(error))}", highlight=False, soft_wrap=True)
-    error.told = True
+    error.reported = True
     raise SystemExit(2) from error  # the cause is for callers from Python

@@ -18,10 +18,9 @@ def load(spec: str) -> Any:
 class Registry:
     """Names mapped to ``"module:attribute"`` specs; a spec is imported only when it is asked for.
 
-    Args:
-        kind: what is registered, as a user would call it ("rasterizer"); used in messages.
-        group: the entry-point group in which other packages add their own, e.g. ``beags.rasterizers``.
-        builtin: name to spec of what this package supplies; an entry point of the same name is refused.
+    kind: the user's word for an entry ("rasterizer"). group: the entry-point group in which other packages add their
+    own, e.g. ``beags.rasterizers``. builtin: name to spec of this package's own; an entry point of the same name is
+    refused.
     """
 
     def __init__(self, kind: str, group: str, builtin: dict[str, str]) -> None:
@@ -46,7 +45,7 @@ class Registry:
             )
 
     def names(self) -> list[str]:
-        """The registered names, sorted; imports none of them."""
+        """Return the registered names, sorted; imports none of them."""
         self._discover()
         return sorted(self._specs)
 

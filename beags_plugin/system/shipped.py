@@ -12,17 +12,17 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def shipped_folder(name: str) -> Path:
-    """Where ``name`` (method_configs, experiments) lies: in the installed package, or beside it in a checkout."""
+    """Return the folder ``name`` (method_configs, experiments) in the installed package, or beside it in a checkout."""
     installed = _PACKAGE / name
     return installed if installed.is_dir() else _PACKAGE.parent / name
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
-    """The content of a TOML file; raises ``UserError`` if it cannot be read. what: for the sentence, e.g. "preset"."""
+    """Read a TOML file; raises ``UserError`` if it cannot be read. what: for the sentence, e.g. "preset"."""
     try:
         return load_toml(path)
     except OSError as error:
-        told = f"the {what} {path} cannot be read ({reason(error)}): name an existing file of that kind."
-        raise UserError(told) from error
+        message = f"the {what} {path} cannot be read ({reason(error)}): name an existing file of that kind."
+        raise UserError(message) from error
     except ValueError as error:
         raise UserError(f"the {what} {path} is no TOML ({reason(error)}): correct the file.") from error

@@ -39,7 +39,7 @@ def write_text_atomically(text: str, path: Path) -> None:
 
 
 def unfinished(path: Path, beside: Path | None = None) -> Path:
-    """Where what becomes ``path`` is written first; beside: see ``write_whole``."""
+    """Return the path where ``path`` is written first; beside: see ``write_whole``."""
     return (beside or path.parent) / f".{path.name}{PART}"
 
 

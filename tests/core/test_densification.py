@@ -1,4 +1,4 @@
-"""How the scene grows and thins out, on a handful of surfels whose fate is known."""
+"""Densification and pruning of a handful of surfels whose fate is known."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ def test_an_empty_selection_is_still_a_ply(tmp_path):
     assert len(surfels) == 0 and len(ids) == 0
 
 
-def test_reading_tells_what_is_wrong(tmp_path):
+def test_reading_reports_what_is_wrong(tmp_path):
     with pytest.raises(UserError, match="absent.ply cannot be read"):
         read_ply(tmp_path / "absent.ply")
     (tmp_path / "text.ply").write_text("not a ply")

@@ -108,7 +108,7 @@ def expected() -> np.ndarray:
 
 
 @pytest.mark.parametrize("thin_axis", [0, 1, 2, None], ids=["3dgs-first", "3dgs-second", "3dgs-third", "2dgs"])
-def test_an_official_file_is_drawn_as_its_numbers_say(tmp_path, thin_axis):
+def test_an_official_file_is_rendered_as_its_numbers_say(tmp_path, thin_axis):
     write_official(tmp_path / "point_cloud.ply", thin_axis)
     scene = PlyImporter().read(tmp_path / "point_cloud.ply")
     surfels, lost = flatten(scene.gaussians)

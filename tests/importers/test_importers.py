@@ -1,4 +1,4 @@
-"""Files of strangers: what is read, what is dropped, and what is refused before anything of its size is made."""
+"""Files of any origin: what is read, what is dropped, and what is refused before anything of its size is made."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_surfels_and_gaussians_thin_along_the_third_axis_keep_their_numbers():
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_bands_that_are_padding_are_left_out(degree):
+def test_degrees_that_are_padding_are_left_out(degree):
     surfels = random_surfels(degree=degree)
     padded = Surfels(**{**vars(surfels), "sh_rest": torch.zeros(7, 15, 3)})
     padded.sh_rest[:, : surfels.sh_rest.shape[1]] = surfels.sh_rest
@@ -85,7 +85,7 @@ def test_a_sphere_keeps_its_axes():
     assert torch.equal(surfels.quats, ball.quats) and lost.median_ratio == 1.0 and lost.round_share == 1.0
 
 
-def test_odd_values_are_told_apart():
+def test_odd_values_are_recognised():
     given = gaussians(6)
     given.means[0, 1], given.sh_rest[1, 3, 2], given.log_scales[2, 0] = torch.nan, torch.inf, -torch.inf
     given.quats[3] = 0.0
@@ -276,10 +276,13 @@ def test_the_transform_of_a_run_is_checked(tmp_path):
 # -- choosing ----------------------------------------------------------------------------------------------------------
 
 
-def test_importers_are_chosen_by_name_or_by_what_the_file_is(tmp_path):
+def test_importers_are_chosen_by_what_the_file_is(tmp_path):
     assert IMPORTERS.names() == ["checkpoint", "ply"]
     write_ply(tmp_path / "scene.PLY", random_surfels())
     assert isinstance(find_importer(tmp_path / "scene.PLY"), PlyImporter)
+    (tmp_path / "scene.spz").touch()
+    with pytest.raises(UserError, match="is nothing to start from: name one of these"):
+        find_importer(tmp_path / "scene.spz")
     with pytest.raises(UserError, match="holds no checkpoint"):
         CheckpointImporter().read(tmp_path)
 

@@ -1,4 +1,4 @@
-"""What the host knows of classes and masks is what the tensors say, until they change."""
+"""The host's knowledge of classes and labels equals the tensors', until they change."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The silhouette loss: an object drawn alone against its mask, with what may be hidden left out."""
+"""The silhouette loss: an object rendered alone against its mask, with what may be hidden left out."""
 
 from __future__ import annotations
 
@@ -68,10 +68,10 @@ def test_equals_the_alpha_of_each_object_against_its_mask():
 def test_what_the_host_knows_changes_no_bit():
     surfels, class_ids = scene([3.0, 3.0, 3.2]), [1, 2, 1]
     asked = inputs_of(surfels, class_ids, columns((1, 8), (2, 6), (IGNORE, 2), (0, 8)))
-    told = replace(asked, members=ClassMembers(asked.class_ids), present=objects_in(asked.labels))
+    known_on_host = replace(asked, members=ClassMembers(asked.class_ids), present=objects_in(asked.labels))
     for loss in (SilhouetteLoss(), SilhouetteLoss(objects=2)):
-        assert torch.equal(loss.value(told), loss.value(asked)) and float(loss.value(told)) > 0.0
-    assert float(SilhouetteLoss().value(replace(told, present=[]))) == 0.0
+        assert torch.equal(loss.value(known_on_host), loss.value(asked)) and float(loss.value(known_on_host)) > 0.0
+    assert float(SilhouetteLoss().value(replace(known_on_host, present=[]))) == 0.0
 
 
 def test_what_lies_behind_another_surface_may_be_covered(monkeypatch):
@@ -127,7 +127,7 @@ def test_objects_take_turns_and_their_mean_is_the_whole():
     assert sum(sorted({round(turn, 6) for turn in turns})) / 3 == pytest.approx(whole, rel=1e-4)
 
 
-def test_views_that_say_nothing_and_wrong_options():
+def test_views_without_objects_and_wrong_options():
     surfels = scene([3.0])
     assert float(SilhouetteLoss().value(inputs_of(surfels, [1], None))) == 0.0
     assert float(SilhouetteLoss().value(inputs_of(surfels, [1], columns((0, 12), (IGNORE, 12))))) == 0.0

@@ -1,4 +1,4 @@
-"""Whether the CUDA part can be used, and the sentence where it cannot."""
+"""The CUDA part is used where it can be, and a sentence explains where it cannot."""
 
 from __future__ import annotations
 

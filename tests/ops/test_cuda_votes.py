@@ -106,7 +106,7 @@ def test_grids_of_points_are_the_cpus(dtype, device, cpu_version, monkeypatch):
 
 
 @pytest.mark.parametrize("bad", [1e9, math.nan, math.inf])
-def test_points_without_a_voxel_are_told(bad, device):
+def test_points_without_a_voxel_are_reported(bad, device):
     points = torch.zeros(5, 3, device=device)
     points[3, 1] = bad
     origin, ids = torch.zeros(3, dtype=torch.float64, device=device), torch.zeros(5, dtype=torch.int32, device=device)

@@ -141,7 +141,7 @@ def test_growth_and_adam_wait_for_nothing(gpu):
 
 
 @pytest.mark.parametrize("missing", ["members", "present"])
-def test_a_loss_that_is_not_told_what_the_host_knows_waits(gpu, missing):
+def test_a_loss_without_what_the_host_knows_waits(gpu, missing):
     known = {"members": members_of_two(), "present": [1, 3]}
     with pytest.raises(Exception, match="item|local_scalar|unique|bincount|nonzero"):
         SilhouetteLoss().weighted(inputs(Surfels(*parameters()), **{**known, missing: None}))

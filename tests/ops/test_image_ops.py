@@ -141,18 +141,6 @@ def test_normal_consistency_of_a_scaled_scene_is_the_same():
     assert values[0] == values[1] == values[2]
 
 
-def test_gradients_by_finite_differences():
-    camera, depth, normal, alpha = _view((6, 7), torch.float64)
-    depth = depth.clamp_min(2.9)  # no holes: at one the loss jumps
-    loss = NormalConsistencyLoss()
-    assert torch.autograd.gradcheck(
-        lambda d, n: loss.value(_loss_inputs(camera, depth=d, normal=n, alpha=alpha)),
-        (depth.requires_grad_(), normal.requires_grad_()),
-    )
-    photo, drawn = _random(6, 7, 3), _random(6, 7, 3, seed=1).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: PhotometricLoss().value(_loss_inputs(image=photo, color=x)), drawn)
-
-
 def test_any_number_of_threads_gives_the_same_bits():
     size, dtype = (180, 200), torch.float32
     before, runs = torch.get_num_threads(), []

@@ -189,7 +189,7 @@ def test_classes_that_the_grid_does_not_know_have_no_voxels():
     assert all(torch.equal(a, b) for a, b in zip(unknown, none, strict=True))
 
 
-def test_wrong_arguments_are_told_by_name():
+def test_wrong_arguments_are_named():
     surfels, lookup = make_surfels(5), make_grid().lookup()
     arguments = [getattr(surfels, name) for name in FLOATS]
     for place, name in enumerate(FLOATS):

@@ -7,11 +7,11 @@ import math
 
 import pytest
 import torch
-from voted_views import METHODS, SIZES, larger_scene, reprojection_scene, same
+from voted_views import METHODS, larger_scene, reprojection_scene, same
 
 from beags_plugin.core.lifting import lift
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.masks import REPROJECTIONS, voxel_reprojection
+from beags_plugin.masks import voxel_reprojection
 from beags_plugin.masks.voxel_reprojection import reproject_voxel
 from beags_plugin.ops import extension
 
@@ -151,8 +151,3 @@ def test_too_distant_points_neither_vote_nor_change():
     depths[0][2, 3] = 1e9
     results = list(reproject_voxel(depths, cameras, labels, 3))
     assert int(results[0].labels[2, 3]) == int(labels[0][2, 3]) and float(results[0].confidence[2, 3]) == 0.0
-
-
-def test_voxel_is_registered():
-    assert REPROJECTIONS.get("voxel") is reproject_voxel
-    assert len(SIZES) == 4

@@ -24,7 +24,7 @@ def scene(count: int, bases: int, dtype=torch.float64):
 
 
 def parts(sh):
-    """Leaves: band 0 and the others."""
+    """Return leaves: degree 0 and the others."""
     return [value.detach().clone().requires_grad_() for value in (sh[:, 0], sh[:, 1:])]
 
 
@@ -100,7 +100,7 @@ def test_no_surfels_and_unneeded_gradients():
     assert not sh_colors(dc.detach(), rest.detach(), means.detach(), center, 1).requires_grad
 
 
-def test_bands_that_are_not_shown_have_no_gradient():
+def test_degrees_that_are_not_shown_have_no_gradient():
     sh, means, center, weight = scene(9, 16)
     dc, rest = parts(sh)
     (sh_colors(dc, rest, means, center, 1) * weight).sum().backward()
@@ -117,7 +117,7 @@ def test_a_strided_view_is_taken(without_extension):
         torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-12)
 
 
-def test_wrong_arguments_are_told_by_name():
+def test_wrong_arguments_are_named():
     sh, means, center, _ = scene(5, 4)
     dc, rest = parts(sh)
     with pytest.raises(ValueError, match="sh_rest must be"):

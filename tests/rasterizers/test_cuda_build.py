@@ -1,4 +1,4 @@
-"""What nvcc makes of the CUDA kernels, on machines without a GPU too."""
+"""The kernels as nvcc compiles them, on machines without a GPU too."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_the_module_has_the_kernels_that_nvcc_compiled():
 
 
 def resources(source: Path, architecture: int, folder: Path) -> dict[str, dict[str, int]]:
-    """What each kernel of a file takes: bytes that registers spill, registers a thread, shared bytes a block."""
+    """Return what each kernel of a file takes: bytes that registers spill, registers a thread, shared bytes a block."""
     done = subprocess.run(
         [str(nvcc()), "-std=c++17", "-O3", "--fmad=false", "--expt-relaxed-constexpr", f"-arch=sm_{architecture}"]
         + ["-cubin", "-Xptxas", "-v", "-I", str(KERNELS), "-o", str(folder / "kernels.cubin"), str(source)],
@@ -57,7 +57,7 @@ def resources(source: Path, architecture: int, folder: Path) -> dict[str, dict[s
 
 @needs_nvcc
 @pytest.mark.parametrize("source", ["cuda/rasterizer/forward.cu", "cuda/rasterizer/backward.cu"])
-def test_kernels_that_draw_in_float32_fit_into_registers(source, tmp_path):
+def test_kernels_that_render_in_float32_fit_into_registers(source, tmp_path):
     # Of the supported GPUs, sm_75 has the least shared memory; a multiprocessor shall hold two blocks of 256 threads.
     in_float32 = re.compile(r"kernelI(L[ij]\d+E)?fE")
     kernels = {

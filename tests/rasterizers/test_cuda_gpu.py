@@ -1,4 +1,4 @@
-"""What only a GPU can show of the CUDA backend: streams, graphs, waiting, devices."""
+"""Parts of the CUDA backend that only a GPU can show: streams, graphs, waiting, devices."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def on_gpu(scene):
     )
 
 
-def test_auto_draws_where_the_surfels_lie_cuda():
+def test_auto_renders_where_the_surfels_lie_cuda():
     scene = make_scene().to(torch.float32)
     rasterizer = make_rasterizer("auto")
     assert isinstance(rasterizer, DeviceDispatchRasterizer)

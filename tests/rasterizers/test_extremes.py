@@ -1,4 +1,4 @@
-"""How much of anything: ten thousand layers on a pixel, a million Gaussians, every class id that there is."""
+"""Extremes: ten thousand layers on a pixel, a million Gaussians, every class id that there is."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_one_class_and_as_many_as_there_are_ids(rasterizer, num_classes):
         assert not boundary.any()
 
 
-def test_masks_that_say_nothing_give_no_boundary_and_the_background(rasterizer):
+def test_unlabelled_masks_give_no_boundary(rasterizer):
     scene = make_scene()
     target = torch.full_like(scene.target, IGNORE)
     opacity = scene.inputs.opacity_logits.clone().requires_grad_()

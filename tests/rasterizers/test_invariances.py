@@ -1,4 +1,4 @@
-"""Properties of any drawing: what a change of unit, place, order, names or window must not change (hypothesis)."""
+"""Properties of any render: what a change of unit, place, order, names or window must not change (hypothesis)."""
 
 from __future__ import annotations
 

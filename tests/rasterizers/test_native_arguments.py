@@ -1,4 +1,4 @@
-"""What the compiled module refuses by itself: a tensor that is not what a kernel reads is an error, never a crash."""
+"""The compiled module refuses tensors that a kernel does not read: an error, never a crash."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The compiled rasterizer on each instruction set: forced by name, equal in what it draws, safe to load."""
+"""The compiled rasterizer on each instruction set: forced by name, equal in what it renders, safe to load."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def error(a, b):
 
 @needs_native
 @pytest.mark.parametrize("name", NAMES)
-def test_every_instruction_set_draws_the_same(name, tmp_path):
+def test_every_instruction_set_renders_the_same(name, tmp_path):
     if name not in native.instruction_sets():
         pytest.skip(f"{name} is not built or not in this processor")
     done = run(name, DRAW, name, tmp_path / "drawn.pt", HERE, SUPPORT)
@@ -72,7 +72,7 @@ def test_every_instruction_set_draws_the_same(name, tmp_path):
 
 
 @needs_native
-def test_a_forced_instruction_set_that_cannot_run_is_told_in_a_sentence():
+def test_a_forced_instruction_set_that_cannot_run_is_reported_in_a_sentence():
     names = [name for name in (*NAMES, "mmx") if name not in native.instruction_sets()]
     program = """
 import os, sys
@@ -87,9 +87,9 @@ for name in sys.argv[1:]:
 """
     done = run(names[0], program, *names)
     assert done.returncode == 0, done.stderr
-    told = done.stdout.splitlines()
-    assert len(told) == len(names)
-    for name, sentence in zip(names, told, strict=True):
+    reported = done.stdout.splitlines()
+    assert len(reported) == len(names)
+    for name, sentence in zip(names, reported, strict=True):
         assert re.fullmatch(rf"BEAGS_ISA asks for the instruction set '{name}', which .* or unset it\.", sentence)
 
 

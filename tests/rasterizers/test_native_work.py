@@ -11,6 +11,7 @@ from raster_scenes import FLOATS, OUTPUTS, gradients, make_scene
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.rasterizers import native
+from beags_plugin.rasterizers.autograd import InputGradients
 from beags_plugin.rasterizers.native import NativeRasterizer
 from beags_plugin.rasterizers.reference_geometry import project
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
@@ -64,12 +65,12 @@ class Watched(NativeRasterizer):
         super().__init__()
         self.differentiable, self.backwards = [], []
 
-    def forward_kernel(self, drawing):
-        self.differentiable.append(drawing.differentiable)
-        return super().forward_kernel(drawing)
+    def forward_kernel(self, call):
+        self.differentiable.append(call.differentiable)
+        return super().forward_kernel(call)
 
-    def backward_kernel(self, drawing, state, gradients, needed):
-        found = super().backward_kernel(drawing, state, gradients, needed)
+    def backward_kernel(self, call, state, gradients, needed):
+        found = super().backward_kernel(call, state, gradients, needed)
         self.backwards.append((needed, found))
         return found
 
@@ -94,7 +95,7 @@ def test_needed_gradients_alone_are_made_and_have_the_same_bits(wanted, only):
     found = gradients(rasterizer, scene, only, wanted)
     assert all(found[name].any() and torch.equal(found[name], everything[name]) for name in wanted)
     [(needed, made)] = rasterizer.backwards
-    assert {name for name, value in needed._asdict().items() if value} == set(wanted)
+    assert {name for name, asked in zip(InputGradients._fields, needed, strict=True) if asked} == set(wanted)
     assert {name for name, value in made._asdict().items() if value is not None} == set(wanted)
 
 

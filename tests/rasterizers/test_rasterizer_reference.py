@@ -182,40 +182,6 @@ def test_weight_is_the_derivative_of_the_image_by_the_colour(rasterizer):
     torch.testing.assert_close(colors.grad, total[:, None].expand(-1, 3), rtol=1e-8, atol=1e-10)
 
 
-@pytest.mark.parametrize("factor", [1e-4, 1e6])
-def test_scale_of_the_scene_changes_nothing(rasterizer, factor):
-    scene = make_scene()
-    before = scene.draw(rasterizer)
-    viewmat = scene.camera.viewmat.clone()
-    viewmat[:3, 3] *= factor
-    scaled = replace(
-        scene,
-        camera=replace(scene.camera, viewmat=viewmat),
-        settings=replace(scene.settings, near=scene.settings.near * factor, far=scene.settings.far * factor),
-    )
-    after = scaled.draw(
-        rasterizer, means=scene.inputs.means * factor, log_scales=scene.inputs.log_scales + math.log(factor)
-    )
-    for name in ("color", "alpha", "normal", "distortion", "boundary"):
-        torch.testing.assert_close(getattr(after, name), getattr(before, name), rtol=1e-6, atol=1e-8)
-    torch.testing.assert_close(after.depth / factor, before.depth, rtol=1e-6, atol=1e-8)
-
-
-def test_order_of_surfels_and_names_of_classes_change_nothing(rasterizer):
-    scene = make_scene()
-    before = scene.draw(rasterizer)
-    order = torch.randperm(len(scene.inputs.means), generator=torch.Generator().manual_seed(2))
-    shuffled = {name: getattr(scene.inputs, name)[order] for name in (*FLOATS, "class_ids")}
-    names = torch.tensor([2, 0, 3, 1], dtype=torch.int32)
-    shuffled["class_ids"] = names[shuffled["class_ids"].long()]
-    known = scene.target != IGNORE
-    target = torch.where(known, names[torch.where(known, scene.target, 0).long()], scene.target)
-    after = replace(scene, target=target).draw(rasterizer, **shuffled)
-    for name in OUTPUTS:
-        torch.testing.assert_close(getattr(after, name), getattr(before, name), rtol=1e-9, atol=1e-10)
-    assert torch.equal(after.visible, before.visible[order])
-
-
 def test_nonfinite_surfels_are_dropped_and_counted(rasterizer):
     scene = make_scene()
     clean = scene.draw(rasterizer, **{n: getattr(scene.inputs, n)[3:] for n in (*FLOATS, "class_ids")})
@@ -247,7 +213,7 @@ def test_surfels_too_large_or_too_far_for_float32_are_dropped_and_counted(raster
     assert all(torch.isfinite(value.grad).all() and not value.grad[:2].any() for value in leaves.values())
 
 
-def test_nothing_to_draw_gives_the_background_with_finite_gradients(rasterizer):
+def test_nothing_to_render_gives_the_background_with_finite_gradients(rasterizer):
     scene = SCENES["empty"]()
     background = scene.background.clone().requires_grad_()
     drawn = scene.draw(rasterizer, background=background)

@@ -111,14 +111,14 @@ def test_preparation_gives_the_same_bits(method, rasterizer, monkeypatch):
     assert torch.equal(renamed(near.grid.classes, FAR), far.grid.classes)
 
 
-def test_an_unnamed_id_below_the_last_keeps_its_voice(rasterizer):
+def test_an_unnamed_id_below_the_last_keeps_its_votes(rasterizer):
     names = {0: "background", 65534: "cup"}
     unnamed, asked = prepared(rasterizer, FAR, names)
     assert torch.equal(unnamed.assignment.class_ids, prepared(rasterizer, FAR)[0].assignment.class_ids)
     assert 7 in unnamed.assignment.class_ids.tolist() and max(asked) == 3
 
 
-def test_an_id_above_the_last_named_one_is_told(rasterizer):
+def test_an_id_above_the_last_named_one_is_refused(rasterizer):
     with pytest.raises(UserError, match=r"view 0 holds class ids 0\.\.65534, but only 0\.\.900 are known"):
         prepared(rasterizer, FAR, {0: "background", 7: "cup", 900: "box"}, reprojection="none")
 
@@ -176,7 +176,7 @@ def test_the_occupancy_loss_is_the_same(background, ops):
 
 
 def test_a_grid_saved_by_a_former_run_loads(ops):
-    """What was on disk before: exactly these five tensors, with the ids themselves as classes."""
+    """Exactly these five tensors were on disk before, with the ids themselves as classes."""
     near, far = make_grids()
     state = {
         "voxel_size": torch.tensor(0.3, dtype=torch.float64),

@@ -1,4 +1,4 @@
-"""Which part of a silhouette rests on surface that photos show."""
+"""The part of a silhouette that rests on surface which photos show."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ def forked(call: Callable[[], object], log: Path) -> int:
 
 
 def ended(child: int) -> int | None:
-    """The exit code of a child, negative for a signal; None while it runs. Asked once after the end."""
+    """Return the exit code of a child, negative for a signal; None while it runs. Call it once after the end."""
     found, status = os.waitpid(child, os.WNOHANG)
     return os.waitstatus_to_exitcode(status) if found else None
 
@@ -60,7 +60,7 @@ def run(call: Callable[[], object], log: Path) -> int:
 
 
 def kill_after(call: Callable[[], object], log: Path, cpu_seconds: float) -> tuple[int, float]:
-    """Start ``call`` and kill it once it has had so much CPU time; returns its exit code (-9: killed) and CPU time."""
+    """Start ``call`` and kill it after some CPU time; return its exit code (-9: killed) and CPU time."""
     child, used = forked(call, log), 0.0
     while (code := ended(child)) is None:
         used = max(used, cpu_time(child))
@@ -73,7 +73,7 @@ def kill_after(call: Callable[[], object], log: Path, cpu_seconds: float) -> tup
 
 
 def cpu_time(child: int) -> float:
-    """Seconds of CPU time that a process has had: a moment in a run, however busy the machine is."""
+    """Return the seconds of CPU time that a process has had: a moment in a run, however busy the machine is."""
     try:
         fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
     except OSError:
@@ -83,7 +83,7 @@ def cpu_time(child: int) -> float:
 
 @contextmanager
 def killed_in_call(owner: type, name: str, number: int, seconds: float) -> Iterator[None]:
-    """Let this process end by SIGKILL so many seconds after the ``number``-th call, from 1, of a method begins."""
+    """Let this process end by SIGKILL some seconds after the ``number``-th call, from 1, of a method begins."""
     method, calls = getattr(owner, name), itertools.count(1)
 
     def called(*args: Any, **options: Any) -> Any:

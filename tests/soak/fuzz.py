@@ -47,7 +47,7 @@ CANCELLED = 1e-4  # or of this share of the largest output: gradients are sums o
 NUDGE = 1e-13  # relative change of every number of a scene, to see how far its own result moves
 NUDGE_OF_BOUND = 1e-10  # of the T at which compositing stops: T is a product of differences of nearly equal numbers
 NUDGES = 12  # an edge-on normal turns over in half of them: all alike is one case in 4,096
-FARTHER = 10.0  # the compiled code may differ by so many times what the reference moves by
+FARTHER = 10.0  # the compiled code may differ by this many times what the reference moves by
 CHUNK = 25  # scenes that a process is handed at a time
 
 
@@ -62,7 +62,7 @@ class Finding:
 
 
 def examine(number: int) -> Finding:
-    """Everything that is asked of scene ``number``."""
+    """Run every check on scene ``number``."""
     scene = degenerate_scene(number)
     finding = Finding(number, spoilt=tuple(way for ways in scene.spoilt for way in ways.split("+") if way))
     native, reference = make_rasterizer("native"), make_rasterizer("torch")
@@ -83,7 +83,7 @@ def examine(number: int) -> Finding:
 
 
 def everything(rasterizer: Rasterizer, scene: Scene) -> dict[str, Tensor]:
-    """All outputs, their gradients, contributions and class map, by name."""
+    """Return all outputs, their gradients, contributions and class map, by name."""
     leaves = {name: getattr(scene.inputs, name).clone().requires_grad_() for name in FLOATS}
     leaves["background"] = scene.background.clone().requires_grad_()
     inputs = replace(scene.inputs, **{name: leaves[name] for name in FLOATS})
@@ -110,7 +110,7 @@ def everything(rasterizer: Rasterizer, scene: Scene) -> dict[str, Tensor]:
 
 
 def nudged_reference(scene: Scene, index: int) -> dict[str, Tensor]:
-    """``everything`` of the reference, with the bound of T moved up or down in turn.
+    """Return ``everything`` of the reference, with the bound of T moved up or down in turn.
 
     Two surfels whose alpha is cut to 0.99 leave T = 1e-4, which is that bound: rounding alone decides about the second,
     and no change of their numbers shows it.
@@ -128,7 +128,7 @@ class _PlainGrid(VisibilityGrid):
 
 
 def occupancy(scene: Scene, compiled: bool) -> dict[str, Tensor]:
-    """The occupancy loss and its gradients; the voxels are those of the finite centres of every second surfel."""
+    """Return the occupancy loss and its gradients; voxels are those of the finite centres of every second surfel."""
     inputs, unit = scene.inputs, scene.world[0]
     centres, ids = inputs.means[::2].detach(), inputs.class_ids[::2]
     near = (
@@ -152,7 +152,7 @@ def occupancy(scene: Scene, compiled: bool) -> dict[str, Tensor]:
 
 
 def _clean(what: str, scene: Scene, results: dict[str, Tensor], finding: Finding) -> None:
-    """No NaN and no infinity anywhere; broken surfels are counted and learn nothing."""
+    """Check that nothing is NaN or infinite, and that broken surfels are counted and learn nothing."""
     finding.failures += [
         f"{what}: {name} is not finite" for name, value in results.items() if not value.isfinite().all()
     ]
@@ -174,7 +174,7 @@ def _clean(what: str, scene: Scene, results: dict[str, Tensor], finding: Finding
 
 
 def _compare(scene: Scene, expected, found, again, finding: Finding) -> None:
-    """Name by name; what differs is held against how far the reference itself moves for changes in the last bits."""
+    """Compare name by name; allow what the reference itself moves by for changes in the last bits."""
     least = max(1.0, CANCELLED * max(_largest(expected[name]) for name in expected if name in (*OUTPUTS, "occupancy")))
     apart = {name: _error(found[name], value, least) for name, value in expected.items()}
     apart = {name: error for name, error in apart.items() if not error <= TOLERANCE}
@@ -192,7 +192,7 @@ def _compare(scene: Scene, expected, found, again, finding: Finding) -> None:
 
 
 def _error(found: Tensor, expected: Tensor, least: float) -> float:
-    """Largest difference, in units of the largest number expected, or of ``least``; NaN where any is NaN."""
+    """Return the largest difference, in units of the largest number expected, or of ``least``; NaN where any is NaN."""
     if expected.numel() == 0:
         return 0.0
     return float((found.double() - expected.double()).abs().max() / max(_largest(expected), least))

@@ -1,8 +1,8 @@
-"""Changed files for everything that reads files of strangers: it must take them, or refuse them in one sentence.
+"""Changed files for everything that reads files of any origin: it must take them, or refuse them in one sentence.
 
     python tests/soak/fuzz_parsers.py --seconds 600                      # every parser for 10 minutes
     python tests/soak/fuzz_parsers.py --target ply mask --seconds 60     # some of them
-    python tests/soak/fuzz_parsers.py --count 300 --seed 0               # so many files each, always the same
+    python tests/soak/fuzz_parsers.py --count 300 --seed 0               # 300 files each, always the same
 
 With --seconds, atheris (``pip install atheris``) chooses what to change by which lines a file reaches; where it is not
 installed, and with --count, files are changed at random. A parser that raises anything but ``UserError``, takes more
@@ -75,7 +75,7 @@ def main() -> int:
 
 
 def at_random(name: str, options: argparse.Namespace) -> dict:
-    """Files changed at random, until their number or the time is over, or one fails."""
+    """Try files changed at random, until their number or the time is over, or one fails."""
     from parser_targets import TARGETS
 
     start, tried = time.monotonic(), 0
@@ -103,7 +103,7 @@ def keep(folder: Path, name: str, content: bytes) -> Path:
 
 
 def failure_of(name: str, content: bytes) -> str | None:
-    """How a parser fails on a file; None if it takes or refuses it."""
+    """Describe how a parser fails on a file; None if it takes or refuses it."""
     from parser_targets import TARGETS, examine
 
     try:
@@ -131,7 +131,7 @@ def limited() -> Iterator[None]:
 
 
 def changed(seeds: list[bytes], seed: int):
-    """The seeds, then files made of them, without end; the same for the same seed."""
+    """Yield the seeds, then files made of them, without end; the same for the same seed."""
     yield from seeds
     chance = random.Random(seed)
     kept = list(seeds)
@@ -229,7 +229,7 @@ def instrumented() -> None:
 
 
 def guided(name: str, work: Path, options: argparse.Namespace) -> None:
-    """The process of one parser under atheris; never returns."""
+    """Run the process of one parser under atheris; never return."""
     import atheris  # pyright: ignore[reportMissingImports]
     from parser_targets import TARGETS, examine
 

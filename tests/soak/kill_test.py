@@ -90,7 +90,7 @@ class Tester:
             raise RuntimeError(f"the run without a kill ended with exit codes {code}, {export_code}: {log}")
 
     def trial(self, kind: str) -> None:
-        """Kill once or more, go on to the end, compare; what is found goes to ``kills``."""
+        """Kill once or more, go on to the end, compare; findings go to ``kills``."""
         place = self.folder / f"{self.trials}_{kind}"
         self.trials += 1
         found = self._killed_export(kind, place) if kind in EXPORTS else self._killed_run(kind, place)
@@ -117,7 +117,7 @@ class Tester:
         return self._compared(lambda: same_bits.run_differences(self.whole, run))
 
     def _kill(self, kind: str, run: Path, log: Path) -> int:
-        """The exit code of a run that is killed, if its moment comes."""
+        """Kill a run, if its moment comes; return its exit code."""
         if kind == "checkpoint":
             number, share = self.moments.randint(1, CHECKPOINTS), self.moments.uniform(0.0, 1.2)
 
@@ -159,7 +159,7 @@ class Tester:
         return found + self._compared(lambda: same_bits.export_differences(self.exported, folder))
 
     def _kill_export(self, kind: str, call: Callable[[], None], log: Path) -> int:
-        """The exit code of an export that is killed, if its moment comes."""
+        """Kill an export, if its moment comes; return its exit code."""
         if kind == ANY_TIME:
             return forked.kill_after(call, log, self.moments.uniform(0.0, self.export_seconds))[0]
         files = sum(path.is_file() for path in self.exported.rglob("*"))
@@ -172,7 +172,7 @@ class Tester:
         return forked.run(ending, log)
 
     def _compared(self, call: Callable[[], list[str]]) -> list[str]:
-        """What ``call`` finds, in a process of its own."""
+        """Return what ``call`` finds, in a process of its own."""
         answer, log = self.folder / "answer.json", self.folder / "compare.log"
         code = forked.run(lambda: answer.write_text(json.dumps(call())), log)
         return json.loads(answer.read_text()) if code == 0 else [f"the comparison failed: {log}"]
@@ -225,14 +225,14 @@ def import_everything() -> None:
 
 
 def write_data(folder: Path) -> None:
-    """The sample at a quarter of its size."""
+    """Write the sample at a quarter of its size."""
     from beags_plugin.sample.writer import SampleConfig, write_sample
 
     write_sample(folder, SampleConfig(seed=3, width=96, height=72, num_train=10, num_test=2))
 
 
 def train(data: Path, run: Path) -> None:
-    """What ns-train does, once it has read its arguments."""
+    """Train as ns-train does once it has read its arguments."""
     from beags_plugin.plugin.presets import preset_config
     from beags_plugin.plugin.runs.launch import train
 
@@ -252,19 +252,19 @@ def go_on(data: Path, run: Path) -> None:
 
 
 def export(run: Path, folder: Path) -> None:
-    """What ``beags export`` does."""
+    """Export as ``beags export`` does."""
     from beags_plugin.commands.cli import main
 
     main(["export", "--load-config", str(run / "config.yml"), "--output", str(folder), *EXPORT])
 
 
 def is_complete(run: Path) -> bool:
-    """Whether a run has ended by itself."""
+    """Return whether a run has ended by itself."""
     return (run / "training.json").exists()
 
 
 def state_of(run: Path) -> str:
-    """Where a killed run was, as far as its files tell."""
+    """Return where a killed run was, as far as its files show."""
     if not (run / "config.yml").exists():
         return "before the run began"
     saved = sorted(path.stem for path in run.glob("nerfstudio_models/*.ckpt"))

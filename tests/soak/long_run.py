@@ -67,7 +67,7 @@ def main() -> int:
 
 
 def trained(folder: Path, base_steps: int, steps: int, every: int, *options: str) -> list[dict[str, Any]]:
-    """What a training in ``folder`` held: ``observed_training``'s lines; more options of ns-train may follow.
+    """Return what a training in ``folder`` held: ``observed_training``'s lines; more options of ns-train may follow.
 
     Raises ``RuntimeError`` if it fails, or leaves a process behind.
     """
@@ -89,7 +89,7 @@ def trained(folder: Path, base_steps: int, steps: int, every: int, *options: str
 
 
 def in_session(leader: int) -> list[str]:
-    """Names of the processes of a session."""
+    """Return the names of the processes of a session."""
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -102,7 +102,7 @@ def in_session(leader: int) -> list[str]:
 
 
 def judged(record: list[dict[str, Any]]) -> tuple[float, list[str]]:
-    """MB by which memory grows over the second half of refinement, and what is wrong, in sentences."""
+    """Return the MB by which memory grows over the second half of refinement, and sentences on what is wrong."""
     refinement = [line for line in record if line["phase"] == "refinement"]
     half = refinement[len(refinement) // 2 :]
     growth = slope([line["step"] for line in half], [line["memory_mb"] for line in half])
@@ -123,13 +123,13 @@ def judged(record: list[dict[str, Any]]) -> tuple[float, list[str]]:
 
 
 def slope(x: list[float], y: list[float]) -> float:
-    """Median of the slopes between any two points (Theil 1950, Sen 1968): a jump of one point does not tilt it."""
+    """Return the median slope between any two points (Theil 1950, Sen 1968): a jump of one point does not tilt it."""
     pairs = ((i, j) for i in range(len(x)) for j in range(i))
     return median((y[i] - y[j]) / (x[i] - x[j]) for i, j in pairs)
 
 
 def draw(record: list[dict[str, Any]], base_steps: int, path: Path) -> None:
-    """Memory above, threads and open files below, over the steps."""
+    """Draw memory above, threads and open files below, over the steps."""
     import matplotlib
 
     matplotlib.use("Agg")

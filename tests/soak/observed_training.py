@@ -21,7 +21,7 @@ from beags_plugin.system.memory import memory_mb
 
 
 def held(step: int | None, phase: str) -> dict[str, Any]:
-    """What this process holds now: resident MB (10^6 bytes), names of threads, open files, ids of child processes."""
+    """Return what this process holds: resident MB (10^6 bytes), names of threads, open files, ids of children."""
     tasks = list(Path("/proc/self/task").iterdir())
     children = [pid for task in tasks for pid in (task / "children").read_text().split()]
     return {
@@ -36,7 +36,7 @@ def held(step: int | None, phase: str) -> dict[str, Any]:
 
 
 def _target(path: Path) -> str | None:
-    """What a descriptor is of; None for the one that looked."""
+    """Return what a descriptor is of; None for the one that looked."""
     try:
         return os.readlink(path)
     except OSError:

@@ -12,7 +12,7 @@ CLOCKS = ("seconds", "cpu_seconds", "clocks")
 
 
 def run_differences(whole: Path, run: Path) -> list[str]:
-    """What of two complete runs differs: checkpoints with all that they hold, base, curve, masks and grids."""
+    """Return what differs between two complete runs: checkpoints and their content, base, curve, masks and grids."""
     found = []
     for pattern in ("nerfstudio_models/*.ckpt", "base/nerfstudio_models/*.ckpt", "prepared/**/grid.pt"):
         found += _name_by_name(whole, run, pattern, _tensor_differences)
@@ -22,18 +22,18 @@ def run_differences(whole: Path, run: Path) -> list[str]:
 
 
 def export_differences(whole: Path, folder: Path) -> list[str]:
-    """What of two finished exports differs."""
+    """Return what differs between two finished exports."""
     return _name_by_name(whole, folder, "**/*", _byte_differences) + unfinished(folder)
 
 
 def half_written(whole: Path, folder: Path) -> list[str]:
-    """What of an export that was killed is neither absent nor as it should be; hidden files do not count."""
+    """Return what of a killed export is neither absent nor as it should be; hidden files do not count."""
     files = [path for path in folder.rglob("*") if path.is_file() and not path.name.startswith(".")]
     return [str(path) for path in files if _byte_differences(whole / path.relative_to(folder), path)]
 
 
 def unfinished(folder: Path) -> list[str]:
-    """Files that were begun and left."""
+    """Return files that were begun and left."""
     return [f"left behind: {path}" for path in folder.rglob("*.part")]
 
 
@@ -60,14 +60,14 @@ def _json_differences(one: Path, other: Path) -> list[str]:
 
 
 def _without_clocks(value: Any) -> Any:
-    """The same without what a clock said."""
+    """Return the same without the times of clocks."""
     if isinstance(value, dict):
         return {name: _without_clocks(item) for name, item in value.items() if name not in CLOCKS}
     return [_without_clocks(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 def compare(one: Any, other: Any, where: str) -> list[str]:
-    """Where two nested values are not the same bits."""
+    """Return the places where two nested values differ in a bit."""
     if isinstance(one, torch.Tensor) and isinstance(other, torch.Tensor):
         same = one.dtype == other.dtype and one.shape == other.shape
         return [] if same and one.numpy().tobytes() == other.numpy().tobytes() else [where]

@@ -83,7 +83,7 @@ def test_a_process_ends_in_the_write_that_is_chosen(tmp_path, share, part):
 
 
 def test_a_training_leaves_nothing_behind(tmp_path):
-    """150 steps, with curves, checkpoints, pictures and held-out measurements among them."""
+    """Train 150 steps, with curves, checkpoints, pictures and held-out measurements among them."""
     options = ("--steps-per-save", "40", "--steps-per-eval-image", "30", "--steps-per-held-out", "50")
     record = long_run.trained(tmp_path, 60, 90, 5, *options)
     _, failures = long_run.judged(record)

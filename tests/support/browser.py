@@ -40,7 +40,7 @@ SECONDS = 120.0  # after which a wait has failed; on a busy machine, most end lo
 
 
 def _labelled(label: str) -> str:
-    """JavaScript for the control that a label belongs to."""
+    """Return JavaScript for the control that a label belongs to."""
     labels = "[...document.querySelectorAll('label')]"
     return f"document.getElementById({labels}.find(l => l.innerText.trim() == {json.dumps(label)})?.htmlFor)"
 
@@ -106,25 +106,25 @@ class Page:
                 return reply["result"]
 
     def evaluate(self, script: str):
-        """The value of a JavaScript expression."""
+        """Return the value of a JavaScript expression."""
         found = self._send("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         if "exceptionDetails" in found:
             raise RuntimeError(found["exceptionDetails"])
         return found["result"].get("value")
 
     def text(self) -> str:
-        """All text that the page shows."""
+        """Return all text that the page shows."""
         return self.evaluate("document.body?.innerText") or ""
 
     def wait(self, true, seconds: float = SECONDS) -> None:
-        """Wait until a function says so."""
+        """Wait until a function returns true."""
         end = time.monotonic() + seconds
         while not true():
             assert time.monotonic() < end, self.text()
             time.sleep(0.3)
 
     def wait_for_text(self, wanted: str, seconds: float = SECONDS) -> str:
-        """The page's text, once ``wanted`` is part of it."""
+        """Return the page's text, once ``wanted`` is part of it."""
         self.wait(lambda: wanted in self.text(), seconds)
         return self.text()
 
@@ -164,11 +164,11 @@ class Page:
         self.wait(done)
 
     def chosen(self, label: str) -> str | None:
-        """What the drop-down list called ``label`` shows; None while there is none."""
+        """Return the choice that the drop-down list called ``label`` shows; None while there is none."""
         return self.evaluate(f"{_labelled(label)}?.value")
 
     def _wait_for_control(self, label: str) -> None:
-        """A panel that is put together anew lacks its controls for a moment."""
+        """Wait for a control, which a panel lacks for a moment while it is put together anew."""
         self.wait(lambda: self.evaluate(f"Boolean({_labelled(label)})"))
 
     def slide(self, label: str, value: float) -> None:
@@ -181,5 +181,5 @@ class Page:
         )
 
     def picture(self) -> bytes:
-        """The page as a PNG file's content."""
+        """Return the page as a PNG file's content."""
         return base64.b64decode(self._send("Page.captureScreenshot", format="png")["data"])

@@ -27,7 +27,7 @@ def camera_of(view: View) -> Camera:
 
 
 def hits(thing: Thing, camera: Camera) -> np.ndarray:
-    """World points of the thing's surface under the pixels of a view, [P, 3]; computed by ray casting."""
+    """Return world points of the thing's surface under the pixels of a view, [P, 3]; computed by ray casting."""
     rays = pixel_rays(camera, torch.zeros(1, dtype=torch.float64)).reshape(-1, 3).numpy()
     directions = rays @ camera.rotation.double().numpy()
     origin = camera.center.double().numpy()[None]
@@ -36,12 +36,12 @@ def hits(thing: Thing, camera: Camera) -> np.ndarray:
 
 
 def color_at(points: np.ndarray) -> np.ndarray:
-    """A colour for each place, sRGB 0..1."""
+    """Return a colour for each place, sRGB 0..1."""
     return 0.5 + 0.35 * np.sin(7.0 * points + np.array([0.0, 1.0, 2.0]))
 
 
 def covered(thing: Thing, cameras: Sequence[Camera], radius: float = 0.003) -> Surfels:
-    """The thing covered evenly with small opaque discs where the views see it, in ``color_at``'s colours.
+    """Cover the thing evenly with small opaque discs where the views see it, in ``color_at``'s colours.
 
     radius: one sigma of a disc; there is one in each cube of this size, and a bit, that the surface passes through.
     """

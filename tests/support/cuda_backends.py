@@ -16,7 +16,7 @@ from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, Surfel
 
 
 def emulation() -> ModuleType | None:
-    """``beags_plugin._cuda_emulation``: the kernels' sources, run on the CPU; None where it was not built."""
+    """Return ``beags_plugin._cuda_emulation``: the kernels' sources, run on the CPU; None where it was not built."""
     try:
         return import_module("beags_plugin._cuda_emulation")
     except ImportError:
@@ -24,7 +24,7 @@ def emulation() -> ModuleType | None:
 
 
 def cuda_device(request, monkeypatch) -> torch.device:
-    """A fixture's body: where the CUDA ops take their tensors from; a GPU, or for the emulation the CPU.
+    """Return the device of the CUDA ops' tensors, as a fixture's body: a GPU, or for the emulation the CPU.
 
     ``request.param``: "cuda" or "cuda emulated".
     """

@@ -16,7 +16,7 @@ FX, FY, CX, CY = 17.0, 16.0, 8.5, 6.75  # the principal point is off the centre 
 
 
 def look_at(position, target=(0.0, 0.0, 0.0)) -> np.ndarray:
-    """Camera-to-world [4, 4] in OpenGL axes, z up in the world."""
+    """Return camera-to-world [4, 4] in OpenGL axes, z up in the world."""
     back = np.asarray(position, float) - np.asarray(target, float)
     back /= np.linalg.norm(back)
     right = np.cross([0.0, 0.0, 1.0], back)
@@ -27,24 +27,24 @@ def look_at(position, target=(0.0, 0.0, 0.0)) -> np.ndarray:
 
 
 def ring(count: int) -> list[np.ndarray]:
-    """Poses on a circle of radius 3, looking at the origin from slightly above."""
+    """Return poses on a circle of radius 3, looking at the origin from slightly above."""
     angles = 2 * np.pi * np.arange(count) / count
     return [look_at((3 * np.cos(a), 3 * np.sin(a), 0.5 + 0.1 * np.sin(3 * a))) for a in angles]
 
 
 def write_image(path: Path, array: np.ndarray) -> None:
-    """Any uint8 or uint16 array as PNG."""
+    """Write any uint8 or uint16 array as PNG."""
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(array).save(path)
 
 
 def noise(seed: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
-    """[H, W, 3] uint8."""
+    """Return [H, W, 3] uint8."""
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
 
 
 def write_transforms(root: Path, count: int = 9, per_frame: bool = False, poses=None, **extra) -> list[np.ndarray]:
-    """A transforms.json scene with noise images images/v00.png, ...; the frames are stored in reverse name order."""
+    """Write a transforms.json scene with noise images images/v00.png, ...; frames are in reverse name order."""
     poses = ring(count) if poses is None else poses
     intrinsics = {"fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY, "w": WIDTH, "h": HEIGHT}
     frames = []
@@ -58,7 +58,7 @@ def write_transforms(root: Path, count: int = 9, per_frame: bool = False, poses=
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """wxyz of a rotation matrix, as the eigenvector of Bar-Itzhack's symmetric matrix."""
+    """Return wxyz of a rotation matrix, as the eigenvector of Bar-Itzhack's symmetric matrix."""
     (a, b, c), (d, e, f), (g, h, i) = rotation
     matrix = np.array(
         [
@@ -74,7 +74,7 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
 def write_colmap(
     root: Path, count: int = 9, text: bool = False, folder: str = "sparse/0", points=None, names=None
 ) -> np.ndarray:
-    """A COLMAP PINHOLE model whose image ids run against the name order; returns world-to-camera [V, 4, 4], OpenCV.
+    """Write a COLMAP PINHOLE model with image ids against the name order; return world-to-camera [V, 4, 4], OpenCV.
 
     names: of the images, sorted; v00.png, ... if None.
     """

@@ -20,7 +20,7 @@ def manager(root, parser=(), **options) -> BeagsDataManager:
 
 
 def distort(model: str, x: float, y: float) -> tuple[float, float]:
-    """Pixel (centres at + 0.5) of the ray (x, y, 1) in the distorted image, from the lens models' formulas."""
+    """Return the pixel (centres at + 0.5) of the ray (x, y, 1) in the distorted image, by the lens models."""
     r2 = x * x + y * y
     if model == "OPENCV":
         k1, k2, p1, p2 = BROWN.values()
@@ -37,7 +37,7 @@ def distort(model: str, x: float, y: float) -> tuple[float, float]:
 
 
 def write_distorted(root, model: str, rays) -> np.ndarray:
-    """A scene whose view 1 shows a disc at each ray, drawn alike in the image and, with ids 1.., in the class map."""
+    """Write a scene whose view 1 shows a disc at each ray, alike in the image and, with ids 1.., in the class map."""
     lens = {"OPENCV": BROWN, "OPENCV_FISHEYE": FISHEYE, "equidistant": {}}[model]
     kind = "OPENCV" if model == "OPENCV" else "OPENCV_FISHEYE"
     write_transforms(root, **{**LENS, **lens, "camera_model": kind})

@@ -16,7 +16,7 @@ from beags_plugin.rasterizers.rendering import render_class_map
 def labelled_views(
     count: int, step: float
 ) -> tuple[Surfels, list[Camera], list[Tensor | None], Rasterizer, RasterSettings]:
-    """The scene in float32, ``count`` cameras ``step`` apart, their masks, and what draws them."""
+    """Return the scene in float32, ``count`` cameras ``step`` apart, their masks, a rasterizer and its settings."""
     scene = make_scene(count=80, size=-1.0, opacity=2.0).to(torch.float32)
     s = scene.inputs
     surfels = Surfels.of(s.means, s.quats, s.log_scales, s.opacity_logits, torch.zeros(len(s.means), 1, 3))

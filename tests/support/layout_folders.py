@@ -11,26 +11,26 @@ FOCAL = 32.0  # of the original images of LLFF and DTU
 
 
 def ids(class_id: int = 1, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
-    """[height, width] uint8: a rectangle of ``class_id`` on 0."""
+    """Return [height, width] uint8: a rectangle of ``class_id`` on 0."""
     mask = np.zeros((height, width), np.uint8)
     mask[height // 4 : height // 2, width // 4 : width // 2] = class_id
     return mask
 
 
 def write_copies(root: Path, names, *factors: int) -> None:
-    """Smaller copies images_<factor>/<name> of images of 20 x 12 pixels."""
+    """Write smaller copies images_<factor>/<name> of images of 20 x 12 pixels."""
     for factor in factors:
         for index, name in enumerate(names):
             write_image(root / f"images_{factor}" / name, noise(index, round(WIDTH / factor), round(HEIGHT / factor)))
 
 
 def opencv_matrices(count: int) -> list[np.ndarray]:
-    """World-to-camera [4, 4] of ``ring``, OpenCV axes."""
+    """Return world-to-camera [4, 4] of ``ring``, OpenCV axes."""
     return [np.linalg.inv(pose @ np.diag([1.0, -1.0, -1.0, 1.0])) for pose in ring(count)]
 
 
 def write_mipnerf360(root: Path) -> list[str]:
-    """garden-like: DSC*.JPG in images, images_2, images_4, images_8, and sparse/0."""
+    """Write a scene like garden: DSC*.JPG in images, images_2, images_4, images_8, and sparse/0."""
     names = [f"DSC{7956 + index:05d}.JPG" for index in range(10)]
     write_colmap(root, names=names)
     write_copies(root, names, 2, 4, 8)
@@ -38,7 +38,7 @@ def write_mipnerf360(root: Path) -> list[str]:
 
 
 def write_poses_bounds(root: Path, names, factor: int, bounds=(2.0, 5.0)) -> list[np.ndarray]:
-    """poses_bounds.npy of ``ring`` for images of 20 x 12 times ``factor`` pixels; returns world-to-camera matrices."""
+    """Write poses_bounds.npy of ``ring`` for images of 20 x 12 times ``factor`` pixels; return world-to-camera."""
     rows = []
     for pose in ring(len(names)):
         right, up, back, position = pose[:3, :4].T
@@ -50,7 +50,7 @@ def write_poses_bounds(root: Path, names, factor: int, bounds=(2.0, 5.0)) -> lis
 
 
 def write_llff(root: Path, originals: bool = True, factor: int = 4) -> list[str]:
-    """fern: images/IMG_40NN.JPG, images_4/imageNNN.png numbered in their order, poses_bounds.npy in original pixels."""
+    """Write fern: images/IMG_40NN.JPG, images_4/imageNNN.png in their order, poses_bounds.npy in original pixels."""
     names = [f"image{index:03d}.png" for index in range(10)]
     for index, name in enumerate(names):
         write_image(root / "images_4" / name, noise(index))
@@ -61,7 +61,7 @@ def write_llff(root: Path, originals: bool = True, factor: int = 4) -> list[str]
 
 
 def write_lerf_mask(root: Path) -> list[str]:
-    """figurines: images, images_train, object_mask, test_mask/<n>/<prompt>.png, sparse/0."""
+    """Write figurines: images, images_train, object_mask, test_mask/<n>/<prompt>.png, sparse/0."""
     names = [f"frame_{index:05d}.jpg" for index in (1, 2, 41, 90, 105, 152)]
     write_colmap(root, names=names)
     for index, name in enumerate(names):
@@ -75,7 +75,7 @@ def write_lerf_mask(root: Path) -> list[str]:
 
 
 def write_3dovs(root: Path) -> list[str]:
-    """bed: images/NN.jpg, segmentations/classes.txt, segmentations/<NN>/<class>.png, poses_bounds.npy."""
+    """Write bed: images/NN.jpg, segmentations/classes.txt, segmentations/<NN>/<class>.png, poses_bounds.npy."""
     names = [f"{index:02d}.jpg" for index in range(6)]
     for index, name in enumerate(names):
         write_image(root / "images" / name, noise(index))
@@ -89,7 +89,7 @@ def write_3dovs(root: Path) -> list[str]:
 
 
 def write_spin_nerf(root: Path, gone: int = 3) -> list[str]:
-    """A numbered scene: images/*.jpg, images_4/*.png, images_4/label/*.png (0 and 1) of all but the first, sparse/0."""
+    """Write a scene: images/*.jpg, images_4/*.png, images_4/label/*.png (0 and 1) of all but the first, sparse/0."""
     names = [f"20220819_1055{index:02d}.jpg" for index in range(12)]
     write_colmap(root, names=names)
     write_copies(root, [Path(name).with_suffix(".png").name for name in names], 4)
@@ -99,7 +99,7 @@ def write_spin_nerf(root: Path, gone: int = 3) -> list[str]:
 
 
 def write_dtu(root: Path) -> tuple[np.ndarray, np.ndarray]:
-    """scan: image/NNNNNN.png, mask/NNN.png (three channels), cameras_sphere.npz; returns what it was made from.
+    """Write scan: image/NNNNNN.png, mask/NNN.png (three channels), cameras_sphere.npz; returns what it was made from.
 
     Those are the projections [V, 3, 4] from the unit sphere's world to pixels whose centres are whole numbers, and
     ``scale_mat`` [4, 4]. The file's matrices have another scale, half of them a negative one.

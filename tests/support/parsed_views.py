@@ -25,14 +25,14 @@ def names(outputs) -> list[str]:
 
 
 def pixel(outputs, index: int, point) -> np.ndarray:
-    """Where the method's camera of a view sees a point of the outputs' world."""
+    """Return the pixel where the method's camera of a view sees a point of the outputs' world."""
     camera = camera_from_nerfstudio(outputs.cameras, index)
     x, y, w = camera.K.double().numpy() @ (camera.viewmat.double().numpy()[:3] @ [*point, 1.0])
     return np.array([x / w, y / w])
 
 
 def moved(outputs, point) -> np.ndarray:
-    """A point of the file's world in the outputs'."""
+    """Return a point of the file's world in the outputs'."""
     transform = outputs.dataparser_transform.double().numpy()
     return outputs.dataparser_scale * (transform[:, :3] @ point + transform[:, 3])
 

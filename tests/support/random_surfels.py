@@ -34,7 +34,7 @@ SETTINGS = RasterSettings(0.01, 100.0)
 
 
 def camera_at(eye: tuple[float, float, float], target: torch.Tensor | None = None, pixels: int = 48) -> Camera:
-    """A view of ``target`` from ``eye``, float32."""
+    """Return a view of ``target`` from ``eye``, float32."""
     position = torch.tensor(eye, dtype=torch.float64)
     forward = torch.nn.functional.normalize((torch.zeros(3) if target is None else target).double() - position, dim=0)
     right = torch.linalg.cross(forward, torch.tensor([0.1, 0.2, 1.0], dtype=torch.float64))

@@ -17,7 +17,7 @@ CLASSES = 4
 
 @dataclass(frozen=True)
 class Scene:
-    """What ``Rasterizer.rasterize`` takes."""
+    """The arguments of ``Rasterizer.rasterize``."""
 
     inputs: SurfelInputs
     camera: Camera
@@ -26,12 +26,12 @@ class Scene:
     target: Tensor
 
     def to(self, dtype: torch.dtype) -> Scene:
-        """The same scene in another precision."""
+        """Return the same scene in another precision."""
         camera, background = self.camera.to(dtype), self.background.to(dtype)
         return replace(self, inputs=self.inputs.to(dtype), camera=camera, background=background)
 
     def draw(self, rasterizer, **changes):
-        """Draw, with some of the inputs replaced (``background`` among them)."""
+        """Render, with some of the inputs replaced (``background`` among them)."""
         background = changes.pop("background", self.background)
         return rasterizer.rasterize(
             replace(self.inputs, **changes), self.camera, self.settings, background, self.target
@@ -41,7 +41,7 @@ class Scene:
 def make_scene(
     count: int = 40, width: int = 37, height: int = 29, seed: int = 0, opacity: float = 0.0, size: float = -1.4
 ) -> Scene:
-    """Random surfels in float64 in front of an odd-sized camera: three tiles by two."""
+    """Return random surfels in float64 in front of an odd-sized camera: three tiles by two."""
     g = torch.Generator().manual_seed(seed)
 
     def normal(*shape):
@@ -73,12 +73,12 @@ def make_scene(
 
 
 def opaque_layers() -> Scene:
-    """Many opaque surfels behind one another: compositing stops early."""
+    """Return many opaque surfels behind one another: compositing stops early."""
     return make_scene(count=150, seed=5, opacity=4.0, size=-0.9)
 
 
 def awkward() -> Scene:
-    """Surfels edge-on, crossing the camera plane, beside and behind the camera, tiny and huge."""
+    """Return surfels edge-on, crossing the camera plane, beside and behind the camera, tiny and huge."""
     scene = make_scene(count=24, seed=7)
     means, quats, log_scales = (getattr(scene.inputs, name).clone() for name in ("means", "quats", "log_scales"))
     turned = torch.tensor([0.70710678, 0.0, 0.70710678, 0.0], dtype=torch.float64)
@@ -92,7 +92,7 @@ def awkward() -> Scene:
 
 
 def empty() -> Scene:
-    """No surfel at all."""
+    """Return a scene without surfels."""
     scene = make_scene()
     floats = {name: getattr(scene.inputs, name)[:0] for name in FLOATS}
     return replace(scene, inputs=replace(scene.inputs, **floats, class_ids=scene.inputs.class_ids[:0]))
@@ -103,7 +103,7 @@ OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion", "b
 
 
 def gradients_by_output(rasterizer, scene: Scene) -> dict[str, dict[str, Tensor]]:
-    """For each output, the gradients of a fixed random combination of it towards every float input and background."""
+    """Return for each output the gradients of a random combination of it towards float inputs and background."""
     leaves = {name: getattr(scene.inputs, name).clone().requires_grad_() for name in FLOATS}
     leaves["background"] = scene.background.clone().requires_grad_()
     losses = _losses(scene.draw(rasterizer, **leaves))
@@ -113,7 +113,7 @@ def gradients_by_output(rasterizer, scene: Scene) -> dict[str, dict[str, Tensor]
 def gradients(
     rasterizer, scene: Scene, only: tuple[str, ...] | None = None, wanted: tuple[str, ...] = (*FLOATS, "background")
 ) -> dict[str, Tensor]:
-    """The gradients of all these combinations together (or of those of some outputs) towards ``wanted``, at once."""
+    """Return the gradients of all these combinations together (or of some outputs') towards ``wanted``."""
     values = {name: getattr(scene.inputs, name) for name in FLOATS} | {"background": scene.background}
     leaves = {name: values[name].clone().requires_grad_() for name in wanted}
     losses = _losses(scene.draw(rasterizer, **leaves))
@@ -124,7 +124,8 @@ def _losses(render) -> dict[str, Tensor]:
     g = torch.Generator().manual_seed(1)
     losses = {}
     for name in OUTPUTS:
-        image = getattr(render, name)
+        if (image := getattr(render, name)) is None:
+            continue
         weight = torch.randn(image.shape, generator=g, dtype=torch.float64).to(image)
         losses[name] = (image * weight).sum()
     return losses
@@ -139,14 +140,14 @@ def _gradients(loss: Tensor, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def error(found: Tensor, expected: Tensor) -> float:
-    """Largest difference, in units of the largest expected number (or of 1, if that is more)."""
+    """Return the largest difference, in units of the largest expected number (or of 1, if that is more)."""
     if expected.numel() == 0:
         return 0.0
     return ((found.double() - expected.double()).abs().max() / expected.double().abs().max().clamp_min(1.0)).item()
 
 
 def poisoned(scene: Scene) -> Scene:
-    """The scene and as many surfels again that draw nothing: too faint to be seen, but for seven that are broken."""
+    """Return the scene with as many surfels again that do not show: too faint, but for seven that are broken."""
     n = len(scene.inputs.means)
     bad = {name: torch.cat([getattr(scene.inputs, name)] * 2) for name in FLOATS}
     bad["opacity_logits"][n:] = -1e30

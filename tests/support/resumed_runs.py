@@ -15,11 +15,11 @@ STEPS = 45, 12  # of base and refinement
 
 
 class Killed(BaseException):
-    """What no program catches, as a kill is not."""
+    """An end that no program catches, as of a kill."""
 
 
 def short_config(data: Path, run: Path, **overrides):
-    """A run of all phases in a second: growth, two rounds of preparation, a curve, frequent checkpoints."""
+    """Return a run of all phases in a second: growth, two rounds of preparation, a curve, frequent checkpoints."""
     from beags_plugin.plugin.presets import preset_config
 
     values = {
@@ -58,7 +58,7 @@ def run_to_end(config):
 
 
 def resume_to_end(run: Path, device: str | None = None):
-    """What ``beags resume`` does."""
+    """Resume a run as ``beags resume`` does."""
     from beags_plugin.plugin.runs.launch import resume
 
     with splits():
@@ -73,20 +73,20 @@ def splits():
 
 
 def checkpoint_of(run: Path) -> dict:
-    """The only checkpoint of a run."""
+    """Return the only checkpoint of a run."""
     (path,) = (run / "nerfstudio_models").iterdir()
     return torch.load(path, weights_only=True)
 
 
 def without_clocks(value):
-    """The same without what a clock said."""
+    """Return the same without the times of clocks."""
     if isinstance(value, dict):
         return {k: without_clocks(v) for k, v in value.items() if k not in ("seconds", "cpu_seconds", "clocks")}
     return [without_clocks(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 def differences(a, b, where="") -> list[str]:
-    """Where two checkpoints (or other plain values) are not the same bits."""
+    """Return the places where two checkpoints (or other plain values) differ in a bit."""
     if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
         same = a.dtype == b.dtype and torch.equal(a, b)
         return [] if same else [where]
@@ -98,7 +98,7 @@ def differences(a, b, where="") -> list[str]:
 
 
 def assert_same_run(one: Path, other: Path, but_for: str = "nothing"):
-    """Both ended with the same checkpoint, bit for bit, the same curve and the same masks.
+    """Assert that two runs ended with the same checkpoint, bit for bit, curve and masks.
 
     but_for: where in the checkpoint differences are no matter.
     """

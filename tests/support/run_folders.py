@@ -16,7 +16,7 @@ CLASSES = {0: "background", 1: "cup", 2: "box"}
 
 
 def discs(seed: int = 0, shift: float = 0.0) -> tuple[Surfels, torch.Tensor]:
-    """Two clouds of opaque discs, cup and box, and a few of the background; classes [N] int32."""
+    """Return two clouds of opaque discs, cup and box, and a few of the background; classes [N] int32."""
     generator = torch.Generator().manual_seed(seed)
     centers = {1: (-0.5 + shift, 0.0, 0.1), 2: (0.5, 0.1, 0.0), 0: (0.0, 0.0, -0.7)}
     means, ids = [], []
@@ -35,7 +35,7 @@ def discs(seed: int = 0, shift: float = 0.0) -> tuple[Surfels, torch.Tensor]:
 
 
 def write_scene(root: Path, masks: bool = True, truth_factor: int = 1) -> Path:
-    """Nine views with id masks of two rectangles; if ``truth_factor`` > 1, ground truth so many times as large."""
+    """Write nine views with id masks of two rectangles; ``truth_factor`` > 1 enlarges the ground truth."""
     write_transforms(root)
     (root / "classes.json").write_text(json.dumps({str(index): name for index, name in CLASSES.items() if index}))
     ids = np.zeros((HEIGHT, WIDTH), np.uint8)
@@ -51,7 +51,7 @@ def write_scene(root: Path, masks: bool = True, truth_factor: int = 1) -> Path:
 
 
 def write_drawn_scene(root: Path, factor: int = 4) -> Surfels:
-    """Nine photos and masks of the discs, which fit: drawn ``factor`` times as large as other scenes; the discs."""
+    """Write nine fitting photos and masks of the discs, ``factor`` times as large as other scenes; return the discs."""
     from data_folders import CX, CY, FX, FY, ring
 
     from beags_plugin.core.cameras import Camera, viewmat_from_opengl
@@ -80,7 +80,7 @@ def write_drawn_scene(root: Path, factor: int = 4) -> Surfels:
 def write_trained(
     folder: Path, data: Path, assigned: bool = True, base: bool = True, background: str = "black", scale: float = 1.0
 ) -> Path:
-    """config.yml of a run, with its base if asked for, that holds ``discs``; before refinement the cup is off.
+    """Write a run of ``discs``, with its base if asked for; return config.yml. Before refinement the cup is off.
 
     scale: of the world, with its cameras.
     """
@@ -116,9 +116,10 @@ def state_of(surfels: Surfels, class_ids: torch.Tensor, assigned: bool = True, s
 
 
 def write_prepared(run: Path, shift: int = 0, later: str = "", scale: float = 1.0) -> None:
-    """Masks after reprojection, those of the data moved down by ``shift`` rows, and a grid in which all that is left
-    of the middle is valid for the cup, as refinement would keep them. later: folder of a later round;
-    scale: of the world."""
+    """Write masks after reprojection, and a grid in which all left of the middle is valid for the cup.
+
+    Masks are those of the data moved down by ``shift`` rows. later: folder of a later round; scale: of the world.
+    """
     from beags_plugin.labels.classes import write_mask
     from beags_plugin.occupancy.grid import VisibilityGrid
 

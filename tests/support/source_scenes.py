@@ -38,7 +38,7 @@ def make(source, scene) -> tuple[dict[int, str], list[np.ndarray | None]]:
 
 
 def scene_of_folders(root: Path, names=("left/v0", "left/v1", "right/v0", "right/v2")) -> SourceScene:
-    """Photos of two cameras; v0 is the stem of two."""
+    """Write photos of two cameras; v0 is the stem of two."""
     photos = []
     for name in names:
         path = root / f"images/{name}.png"
@@ -57,7 +57,7 @@ def values_of(maps) -> list[int | None]:
 
 
 def coloured(width: int = 90, height: int = 70, left: int = 30) -> tuple[np.ndarray, np.ndarray]:
-    """A photo of a red disc on a textured grey ground, and the disc's mask."""
+    """Return a photo of a red disc on a textured grey ground, and the disc's mask."""
     generator = np.random.default_rng(left)
     row, column = np.mgrid[:height, :width] + 0.5
     disc = (row - 35) ** 2 + (column - left) ** 2 < 15**2

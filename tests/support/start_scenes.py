@@ -28,21 +28,21 @@ class StartScene:
 
 
 def a_frame(seed: int, scale: float = 1.0) -> tuple[torch.Tensor, float]:
-    """Some rotation and shift [3, 4] float64, and the scale."""
+    """Return some rotation and shift [3, 4] float64, and the scale."""
     generator = torch.Generator().manual_seed(seed)
     rotation = rotation_from_quat(torch.randn(4, generator=generator, dtype=torch.float64))
     return torch.cat([rotation, torch.randn(3, 1, generator=generator, dtype=torch.float64)], dim=1), scale
 
 
 def in_frame(surfels: Surfels, frame: tuple[torch.Tensor, float]) -> Surfels:
-    """Surfels of the world in x' = scale (R x + t), by way of float64."""
+    """Return surfels of the world in x' = scale (R x + t), by way of float64."""
     exact = Surfels(**{field.name: getattr(surfels, field.name).double() for field in fields(surfels)})
     moved = from_input_frame(exact, *frame)
     return Surfels(**{field.name: getattr(moved, field.name).float() for field in fields(moved)})
 
 
 def write_start_scene(root: Path) -> StartScene:
-    """Nine photos of the discs of ``run_folders`` and masks of two rectangles; the world is turned and shifted."""
+    """Write nine photos of ``run_folders``' discs and masks of two rectangles; the world is turned and shifted."""
     transform, _ = a_frame(5)
     turn = np.eye(4)
     turn[:3] = transform.numpy()
@@ -61,14 +61,14 @@ def write_start_scene(root: Path) -> StartScene:
 
 
 def drawn(surfels: Surfels, camera: Camera, settings: RasterSettings) -> torch.Tensor:
-    """[H, W, 3] on black."""
+    """Render [H, W, 3] on black."""
     with torch.no_grad():
         render = make_rasterizer("auto").rasterize(surfel_inputs(surfels, camera), camera, settings, torch.zeros(3))
     return render.color
 
 
 def with_volume(surfels: Surfels, thickness: float = 1e-3, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-    """(log_scales [N, 3], quats [N, 4]) of the same discs with a thin third axis, which is any of the three."""
+    """Return (log_scales [N, 3], quats [N, 4]) of the same discs with a thin third axis, which is any of the three."""
     from beags_plugin.extraction.frames import quat_from_rotation
 
     rotations = rotation_from_quat(surfels.quats.double())
@@ -87,7 +87,7 @@ def with_volume(surfels: Surfels, thickness: float = 1e-3, seed: int = 0) -> tup
 
 
 def write_splatfacto(run: Path, surfels: Surfels, frame: tuple[torch.Tensor, float] | None, step: int = 29) -> Path:
-    """A checkpoint as splatfacto writes it, of discs that lie in ``frame``; returns the run's folder."""
+    """Write a checkpoint as splatfacto does, of discs that lie in ``frame``; return the run's folder."""
     import json
 
     log_scales, quats = with_volume(surfels)

@@ -22,7 +22,7 @@ STEPS, VIEWS = 3, 2
 
 
 def trained(rank: int, processes: int) -> list[torch.Tensor]:
-    """The parameters, Adam's moments and the statistics of growth after some steps."""
+    """Return the parameters, Adam's moments and the statistics of growth after some steps."""
     start, cameras, _, rasterizer, settings = labelled_views(STEPS * VIEWS, 0.15)
     leaves = [getattr(start, field.name).clone().requires_grad_() for field in fields(Surfels)]
     adam = torch.optim.Adam(leaves, lr=0.01, eps=1e-15, fused=True)

@@ -23,7 +23,7 @@ if multiprocessing.current_process().name != "MainProcess":
 
 
 def worker(local_rank: int, world_size: int, config, global_rank: int = 0) -> None:
-    """What ``train_loop`` of nerfstudio does, and then: what this process has."""
+    """Train as ``train_loop`` of nerfstudio, then write what this process holds."""
     torch.cuda.is_available, torch.cuda.device_count = _TRUE
     torch.set_num_threads(1)
     from nerfstudio.scripts.train import train_loop

@@ -52,7 +52,7 @@ class ViewerClient(threading.Thread):
         self.join(30)
 
     def wait_for_a_picture(self, seconds: float = 120.0) -> bool:
-        """Whether one comes after this call."""
+        """Return whether a picture comes after this call."""
         self._came.clear()
         return self._came.wait(seconds)
 
@@ -89,7 +89,7 @@ class ViewerClient(threading.Thread):
                 time.sleep(self.pause)
 
     def _look(self, angle: float) -> None:
-        """At the origin, from the circle; viser's world is ten times as large as nerfstudio's."""
+        """Look at the origin from the circle; viser's world is ten times as large as nerfstudio's."""
         from viser.transforms import SO3
 
         place = 10 * self.distance * np.array([math.cos(angle), math.sin(angle), 0.3])

@@ -31,7 +31,7 @@ ENTRY = "from nerfstudio.scripts.viewer.run_viewer import entrypoint; entrypoint
 
 
 def free_port() -> int:
-    """One that nobody listens on."""
+    """Return a port that nobody listens on."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
@@ -39,7 +39,7 @@ def free_port() -> int:
 
 @contextmanager
 def started(command: list[object], log: Path, ready: str) -> Iterator[subprocess.Popen]:
-    """Python with this checkout's package and these arguments, once it has printed ``ready``; ends it.
+    """Yield Python with this checkout's package and these arguments, once it has printed ``ready``; end it.
 
     log: the file that it prints to, which must hold no traceback at the end.
     """
@@ -63,7 +63,7 @@ def started(command: list[object], log: Path, ready: str) -> Iterator[subprocess
 
 @contextmanager
 def viewed(config: Path, log: Path) -> Iterator[str]:
-    """The address of ns-viewer of a run."""
+    """Return the address of ns-viewer of a run."""
     port = free_port()
     options = ("--load-config", config, "--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", port)
     with started(["-c", ENTRY, *options], log, "disabled local writer"):  # the last that it prints
@@ -71,34 +71,34 @@ def viewed(config: Path, log: Path) -> Iterator[str]:
 
 
 def picture(page: Page) -> np.ndarray:
-    """What is left of the panel and below the title, without the cross of axes in the corner; [H, W, 3] int."""
+    """Return the picture left of the panel, below the title, without the cross of axes; [H, W, 3] int."""
     pixels = np.asarray(Image.open(BytesIO(page.picture())).convert("RGB"))
     return pixels[60:340, :310].astype(int)
 
 
 def differing(one: np.ndarray, other: np.ndarray) -> float:
-    """Share of the pixels that differ by more than what JPEG does to them."""
+    """Return the share of the pixels that differ by more than what JPEG does to them."""
     return float((np.abs(one - other).max(axis=2) > 40).mean())
 
 
 def varied(pixels: np.ndarray) -> float:
-    """How much a picture varies over its pixels; 0 for one colour."""
+    """Measure how much a picture varies over its pixels; 0 for one colour."""
     return float(pixels.reshape(-1, 3).std(axis=0).max())
 
 
 def painted(pixels: np.ndarray, name: str) -> float:
-    """Share of the pixels that have the colour of a class."""
+    """Return the share of the pixels that have the colour of a class."""
     return float((np.abs(pixels - np.array(COLORS[name])).max(axis=2) < 30).mean())
 
 
 def sharp(page: Page) -> bool:
-    """Whether the picture is of the full resolution: coarse ones, of which the panel tells too, come before it."""
+    """Return whether the picture has the full resolution; coarse ones, which the panel shows too, come before it."""
     found = re.search(r"Resolution: (\d+)x(\d+)px", page.text())
     return found is not None and max(int(found[1]), int(found[2])) == MAX_RESOLUTION
 
 
 def awaited(page: Page, true, press: str | None = None) -> np.ndarray:
-    """The picture, once it is as asked for and stays so.
+    """Return the picture, once it is as asked for and stays so.
 
     press: the button that makes it so; pressed again after a while, as a panel that is put together anew hears nothing.
     """

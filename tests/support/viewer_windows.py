@@ -22,7 +22,7 @@ ALWAYS = {"rgb", "depth", "normal", "accumulation"}
 
 
 def write_finished(root: Path) -> Path:
-    """config.yml of a run that was prepared."""
+    """Write a run that was prepared; return its config.yml."""
     config = write_trained(root / "run", write_scene(root / "lab"))
     write_prepared(root / "run", shift=1)
     return config
@@ -49,13 +49,13 @@ class Window:
         self.viewer.viser_server.stop()
 
     def look(self, output: str = "rgb") -> dict[str, torch.Tensor]:
-        """Draw and send as the render thread does; the outputs of the model. An error there is raised here."""
+        """Render and send as the render thread does; return the outputs of the model. An error there is raised here."""
         self.viewer.control_panel._output_render.set_options([output])
         # the drop-down keeps the one option
         return self._drawn(lambda machine, outputs: setattr(machine, "output_keys", set(outputs)))
 
     def look_as_it_opens(self) -> dict[str, torch.Tensor]:
-        """The same in full size, with the outputs that nerfstudio chooses itself."""
+        """Look in full size, with the outputs that nerfstudio chooses itself."""
         return self._drawn(lambda machine, outputs: None, "high")
 
     def _drawn(self, before_sending: Callable, state: str = "low_static") -> dict[str, torch.Tensor]:
@@ -99,7 +99,7 @@ class Stand:
         self.panel.attach(viewer, SimpleNamespace(register_pointer_cb=lambda *_: None))
 
     def look(self, output: str = "rgb") -> dict[str, torch.Tensor]:
-        """What the viewer's render thread would be given."""
+        """Return what the viewer's render thread would get."""
         self.controls.output_render = output
         K = torch.tensor([[60.0, 0, 45], [0, 60, 30], [0, 0, 1]])
         with torch.no_grad():
@@ -107,5 +107,5 @@ class Stand:
 
 
 def camera_to_world() -> torch.Tensor:
-    """From 3 along x towards the origin, OpenGL axes, z up."""
+    """Return the pose at 3 along x that looks towards the origin, OpenGL axes, z up."""
     return torch.tensor([[0.0, 0, 1, 3], [1, 0, 0, 0], [0, 1, 0, 0.2]])

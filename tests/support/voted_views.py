@@ -44,7 +44,7 @@ METHODS = [reproject_pairwise, reproject_voxel]
 
 
 def larger_scene(dtype=torch.float32, num_classes: int = 5):
-    """Views of a slanted wall that overlap, with noisy depth, holes and poison; wider than one strip of pixels."""
+    """Return overlapping views of a slanted wall, with noisy depth, holes and poison, wider than a strip of pixels."""
     sizes = [(71, 23), (90, 31), (64, 40), (71, 23), (83, 29)]
     g = torch.Generator().manual_seed(2)
     cameras, depths, labels = [], [], []

@@ -27,7 +27,7 @@ time.sleep(300)
 
 
 def has_ended(pid: int, seconds: float = 120.0) -> bool:
-    """Whether a process is gone, or waits for nothing but to be asked how it ended, before the time is over."""
+    """Return whether a process is gone or a zombie before the time is over."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         try:

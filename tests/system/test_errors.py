@@ -1,4 +1,4 @@
-"""A user's mistake is told in one sentence, also in programs that are not ours."""
+"""A user error is one sentence, also in programs that are not ours."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_a_full_disk_under_curves_prints_no_traceback_of_their_thread(tmp_path, 
 
 
 def error_in(path, cause: BaseException) -> BaseException:
-    """What comes out of a block that writes ``path`` and in which ``cause`` is raised."""
+    """Return the error that leaves a block which writes ``path`` and raises ``cause``."""
     with pytest.raises(BaseException) as raised, writing(path):
         raise cause
     return raised.value
@@ -79,9 +79,9 @@ def refusal(code: int, *file) -> OSError:
 @pytest.mark.parametrize(
     "code", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM]
 )
-def test_what_a_disk_refuses_is_told_of_the_path(tmp_path, code):
-    told = error_in(tmp_path / "a.png", refusal(code))
-    assert isinstance(told, UserError) and f"{tmp_path}/a.png cannot be written ({os.strerror(code)})" in str(told)
+def test_what_a_disk_refuses_is_reported_with_the_path(tmp_path, code):
+    error = error_in(tmp_path / "a.png", refusal(code))
+    assert isinstance(error, UserError) and f"{tmp_path}/a.png cannot be written ({os.strerror(code)})" in str(error)
     part = refusal(code, tmp_path / ".a.png.part")
     assert isinstance(error_in(tmp_path / "a.png", part), UserError)
 

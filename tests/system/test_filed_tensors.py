@@ -76,7 +76,7 @@ def test_a_file_that_is_not_whole_is_refused(tmp_path):
         FiledTensors(path)
 
 
-def test_a_full_disk_is_told(monkeypatch):
+def test_a_full_disk_is_reported(monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -95,7 +95,7 @@ class _FullDisk(io.RawIOBase):
         raise OSError(errno.ENOSPC, "no space left on device")
 
 
-def test_a_full_disk_is_told_also_where_closing_fails_again(monkeypatch):
+def test_a_full_disk_is_reported_also_where_closing_fails_again(monkeypatch):
     monkeypatch.setattr(filed_tensors.tempfile, "TemporaryFile", lambda **_: io.BufferedWriter(_FullDisk()))
     with pytest.raises(UserError, match="is full: free some space there"):
         filed([torch.zeros(10)])

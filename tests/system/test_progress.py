@@ -1,4 +1,4 @@
-"""Bars: drawn where something lasts, and not where it is over before one could read them."""
+"""Bars: shown where something lasts, and not where it is over before one could read them."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ def clock(monkeypatch, seconds_per_call: float) -> None:
     monkeypatch.setattr(progress, "monotonic", lambda: seconds_per_call * next(calls))
 
 
-def test_a_bar_says_what_is_done(capsys):
-    with progress_bar("Counting sheep") as told:
-        told(3, 7)
-    assert "Counting sheep" in (said := capsys.readouterr().out) and "3/7" in said
+def test_a_bar_shows_what_is_done(capsys):
+    with progress_bar("Counting sheep") as update:
+        update(3, 7)
+    assert "Counting sheep" in (printed := capsys.readouterr().out) and "3/7" in printed
 
 
 def test_a_passing_bar_leaves_nothing_where_output_is_no_terminal(capsys, monkeypatch):
     for seconds in (0.4, 3.0):
         clock(monkeypatch, seconds)
-        with progress_bar("Counting sheep", passing=True) as told:
-            assert list(counted("abc", 3, told)) == ["a", "b", "c"]
+        with progress_bar("Counting sheep", passing=True) as update:
+            assert list(counted("abc", 3, update)) == ["a", "b", "c"]
     assert capsys.readouterr().out == ""
 
 
-def test_counted_items_are_told_once_they_are_done():
-    told = []
-    for item in counted("ab", 2, lambda *steps: told.append(steps)):
-        assert len(told) == "ab".index(item)
-    assert told == [(1, 2), (2, 2)]
+def test_counted_items_are_reported_once_they_are_done():
+    reported = []
+    for item in counted("ab", 2, lambda *steps: reported.append(steps)):
+        assert len(reported) == "ab".index(item)
+    assert reported == [(1, 2), (2, 2)]
 
 
 @pytest.mark.parametrize(("seconds", "drawn"), [(0.4, False), (3.0, True)])
@@ -39,15 +39,15 @@ def test_a_passing_bar_is_drawn_only_after_a_moment(capsys, monkeypatch, seconds
     clock(monkeypatch, seconds)
     started = []
     monkeypatch.setattr(progress.Progress, "start", lambda self: started.append(self.live.transient))
-    with progress_bar("Counting sheep", passing=True) as told:
+    with progress_bar("Counting sheep", passing=True) as update:
         for done in range(1, 5):
-            told(done, 4)
+            update(done, 4)
     assert started == [True] * 4 * drawn  # and is removed at the end
     assert "Counting" not in capsys.readouterr().out
 
 
 def test_errors_come_through_and_leave_no_bar(capsys):
     for passing in (False, True):
-        with pytest.raises(ValueError, match="wolf"), progress_bar("Counting sheep", passing) as told:
-            told(1, 2)
+        with pytest.raises(ValueError, match="wolf"), progress_bar("Counting sheep", passing) as update:
+            update(1, 2)
             raise ValueError("wolf")

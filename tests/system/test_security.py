@@ -1,4 +1,4 @@
-"""Files of strangers run nothing, and do not fill the memory; the viewer of a training listens on this machine."""
+"""Files of any origin run nothing, and do not fill the memory; the viewer of a training listens on this machine."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Reading files of strangers: nothing in them runs, and their promises are checked before they are believed."""
+"""Reading files of any origin: nothing in them runs, and the sizes that they state are checked first."""

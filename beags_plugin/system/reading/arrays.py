@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -13,7 +14,7 @@ from numpy.lib import format as npy
 
 
 def load_array(path: Path) -> np.ndarray:
-    """The array of numbers (or plain values) in a .npy file.
+    """Read the array of numbers (or plain values) in a .npy file.
 
     Raises ``OSError`` if the file cannot be read, ``ValueError`` with the reason if it holds none, or objects, or is
     shorter than its header says.
@@ -25,20 +26,25 @@ def load_array(path: Path) -> np.ndarray:
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays in a .npz file by name; raises as ``load_array``."""
+    """Read the arrays in a .npz file by name; raises as ``load_array``."""
     try:
         with zipfile.ZipFile(path) as archive:
             check_members(archive, path.stat().st_size)
             found = {}
             for member in archive.infolist():
-                with archive.open(member) as file:
-                    check_header(file, member.file_size)
-                with archive.open(member) as file:
-                    found[member.filename.removesuffix(".npy")] = npy.read_array(file, allow_pickle=False)
+                found[member.filename.removesuffix(".npy")] = read_member(archive, member)
             return found
     # what zipfile and zlib raise for archives that are damaged, have passwords or ask for what Python lacks
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OverflowError, _zlib_error()) as error:
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OverflowError, zlib.error) as error:
         raise ValueError(str(error) or type(error).__name__) from None
+
+
+def read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    """Read an array of an archive, after checking that the member can hold it; raises as zipfile and ``load_array``."""
+    with archive.open(member) as file:
+        check_header(file, member.file_size)
+    with archive.open(member) as file:
+        return npy.read_array(file, allow_pickle=False)
 
 
 def check_header(file: BinaryIO | Any, size: int) -> None:
@@ -68,9 +74,3 @@ def check_members(archive: zipfile.ZipFile, size: int) -> None:
     stored = sum(m.file_size for m in archive.infolist() if m.compress_type == zipfile.ZIP_STORED)
     if stored > size:
         raise ValueError("its members are longer than the file")
-
-
-def _zlib_error() -> type[Exception]:
-    import zlib
-
-    return zlib.error

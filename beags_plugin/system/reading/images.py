@@ -22,15 +22,15 @@ T = TypeVar("T")
 
 
 def read_image(path: Path | str, read: Callable[[Image], T], what: str = "the image", remedy: str = "replace it") -> T:
-    """What ``read`` makes of an open image.
+    """Open an image and return what ``read`` makes of it.
 
     what, remedy: what the sentence calls it, and what to do. Raises ``UserError`` if the file is missing, no such
     image, cut off, or of too many pixels.
     """
     from PIL import Image, UnidentifiedImageError
 
-    def broken(told: str, error: Exception) -> UserError:
-        return UserError(f"{what} {path} cannot be read as an image ({told}): {remedy}.")
+    def broken(why: str, error: Exception) -> UserError:
+        return UserError(f"{what} {path} cannot be read as an image ({why}): {remedy}.")
 
     try:
         with warnings.catch_warnings():

@@ -44,7 +44,7 @@ class _Element:
         return any(column.length is not None for column in self.properties)
 
     def numbers(self, order: str) -> np.dtype:
-        """The columns of single numbers, one after the other."""
+        """Return the columns of single numbers, one after the other."""
         return np.dtype([(column.name, order + column.type) for column in self.properties if column.length is None])
 
 
@@ -96,7 +96,7 @@ def write_vertices(file: BinaryIO, table: np.ndarray) -> None:
 
 
 def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [N, 3] float32 and colours [N, 3] uint8 (mid-grey where the file has none) of a .ply's vertices.
+    """Read positions [N, 3] float32 and colours [N, 3] uint8 (mid-grey if there are none) of a .ply's vertices.
 
     Raises ``UserError`` if the file is absent or has no vertices with x, y, z.
     """

@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 def load_tensors(path: Path, mmap: bool = False) -> Any:
-    """What a file of ``torch.save`` holds, on the CPU.
+    """Read a file of ``torch.save`` to the CPU.
 
     mmap: leave tensors in the file until they are used. Raises ``FileNotFoundError``; ``ValueError`` with the reason
     for any other file that cannot be read, holds more than tensors and plain values, or tensors that it cannot fill.
@@ -28,8 +28,8 @@ def load_tensors(path: Path, mmap: bool = False) -> Any:
         raise ValueError(error.strerror or "it is cut off") from error
     except Exception as error:  # torch raises many kinds
         words = " ".join(str(error).split())
-        told = "it holds more than tensors and plain values" if "Weights only load failed" in words else words[:120]
-        raise ValueError(told or type(error).__name__) from error
+        message = "it holds more than tensors and plain values" if "Weights only load failed" in words else words[:120]
+        raise ValueError(message or type(error).__name__) from error
 
 
 def _check_archive(path: Path, size: int) -> None:

@@ -15,7 +15,7 @@ else:
 
 
 def load_json(path: Path, object_pairs_hook: Callable[[list], Any] | None = None) -> Any:
-    """The content of a JSON file; raises ``OSError`` if it cannot be read, ``ValueError`` if it is no JSON."""
+    """Read a JSON file; raises ``OSError`` if it cannot be read, ``ValueError`` if it is no JSON."""
     try:
         return json.loads(path.read_bytes().decode("utf-8"), object_pairs_hook=object_pairs_hook)
     except RecursionError:
@@ -23,7 +23,7 @@ def load_json(path: Path, object_pairs_hook: Callable[[list], Any] | None = None
 
 
 def load_toml(path: Path) -> dict[str, Any]:
-    """The content of a TOML file; raises as ``load_json``."""
+    """Read a TOML file; raises as ``load_json``."""
     try:
         return tomllib.loads(path.read_bytes().decode("utf-8"))
     except RecursionError:
@@ -31,7 +31,7 @@ def load_toml(path: Path) -> dict[str, Any]:
 
 
 def reason(error: Exception) -> str:
-    """What was wrong, in a few words on one line, for the brackets of a sentence."""
+    """Describe the error in a few words on one line, for the brackets of a sentence."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     if isinstance(error, UnicodeDecodeError):

@@ -1,4 +1,4 @@
-"""What reads files of strangers, as functions of bytes, with small valid files to begin with: for ``fuzz_parsers``."""
+"""Readers of files of any origin as functions of bytes, with small valid files to begin with: for ``fuzz_parsers``."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ def _png_files() -> list[bytes]:
 
 
 def _as_png(content: bytes) -> bytes:
-    """A PNG with the header that the first 13 bytes give and the rows that the rest give, its sums correct."""
+    """Return a PNG of the header in the first 13 bytes and the rows in the rest, with correct sums."""
 
     def chunk(kind: bytes, body: bytes) -> bytes:
         return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))

@@ -73,7 +73,7 @@ def _good_dtu() -> bytes:
 
 
 def _as_member(content: bytes) -> bytes:
-    """An archive for DTU, one of whose members is these bytes."""
+    """Return an archive for DTU, one of whose members is these bytes."""
     file = io.BytesIO(_good_dtu())
     file.seek(0, io.SEEK_END)
     with zipfile.ZipFile(file, "a") as archive:

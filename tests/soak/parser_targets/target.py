@@ -36,14 +36,14 @@ _FOLDERS: list[tempfile.TemporaryDirectory[str]] = []
 
 @lru_cache(None)
 def folder() -> Path:
-    """Where the files of this process go."""
+    """Return the folder of this process's files."""
     made = tempfile.TemporaryDirectory(prefix="beags-fuzz-", dir=FOLDER)  # removed when the process ends
     _FOLDERS.append(made)
     return Path(made.name)
 
 
 def examine(target: Target, content: bytes) -> str | None:
-    """What the parser says of a file: None if it is taken, else its sentence; anything but that raises."""
+    """Return None if the parser takes a file, else its sentence; anything else raises."""
     path = folder() / target.file
     path.write_bytes(target.wrap(content))
     try:
@@ -59,7 +59,7 @@ def examine(target: Target, content: bytes) -> str | None:
 
 @lru_cache(None)
 def pictures() -> Path:
-    """A folder of three pictures."""
+    """Return a folder of three pictures."""
     images = folder() / "images"
     images.mkdir()
     for name in "abc":

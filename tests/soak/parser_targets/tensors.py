@@ -66,7 +66,7 @@ def _pickle_of(content: Any) -> bytes:
 
 
 def _with_pickle(content: bytes) -> bytes:
-    """A checkpoint whose list of contents is these bytes."""
+    """Return a checkpoint whose list of contents is these bytes."""
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, member in _checkpoint_members().items():
