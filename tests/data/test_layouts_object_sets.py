@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from data_folders import CX, CY, HEIGHT, WIDTH, write_image
 from layout_folders import ids, opencv_matrices, write_3dovs, write_dtu, write_lerf_mask, write_spin_nerf
 from parsed_views import AS_GIVEN, POINT, names, parse, pixel, title
@@ -53,14 +54,12 @@ def test_prompts_of_lerf_mask_are_scored_by_class_name(tmp_path):
 
 def test_the_masks_of_dtu_train_and_evaluate(tmp_path):
     """Three-channel masks as class maps of a data manager, and as silhouettes of the class called object."""
-    from beags_plugin.plugin.options.config import base_config
     from beags_plugin.plugin.views.datamanager import BeagsDataManagerConfig
     from beags_plugin.plugin.views.held_out_views import HeldOutViews
 
     write_dtu(tmp_path)
-    config = base_config()
-    config.pipeline.datamanager = BeagsDataManagerConfig(dataparser=BeagsDataParserConfig(data=tmp_path))
-    views = HeldOutViews(config, {0: "background", 1: "object"})
+    manager = BeagsDataManagerConfig(dataparser=BeagsDataParserConfig(data=tmp_path)).setup(device="cpu")
+    views = HeldOutViews(manager, {0: "background", 1: "object"}, torch.zeros(3))
     labels = views.manager.views("train")[2].labels
     assert labels is not None and (labels.numpy() == ids()).all()
     view = views[1]
