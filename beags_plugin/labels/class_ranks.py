@@ -25,7 +25,7 @@ class ClassRanks:
 
     @property
     def trivial(self) -> bool:
-        """Whether every rank equals its id."""
+        """Return whether every rank equals its id."""
         return int(self.ids[-1]) + 1 == len(self)
 
     def ranks(self, class_ids: Tensor) -> Tensor:

@@ -56,7 +56,7 @@ class Refiner(ABC):
     @property
     @abstractmethod
     def trains(self) -> bool:
-        """Whether the scene's parameters are optimised after assignment; False keeps them bit for bit."""
+        """Return whether the scene's parameters are optimised after assignment; False keeps them bit for bit."""
 
     @abstractmethod
     def build_grid(self, scene: AssignedScene, k: int, progress: Progress | None = None) -> VisibilityGrid | None:

@@ -31,12 +31,6 @@ from beags_plugin.plugin.views.dataset import BeagsDataset
 from beags_plugin.system.errors import UserError
 
 
-def test_the_registry_names_all_layouts():
-    expected = {"3dovs", "colmap", "dtu", "lerf-mask", "llff", "mipnerf360", "nerfstudio", "spin-nerf"}
-    assert set(LAYOUTS.names()) >= expected
-    assert all(issubclass(LAYOUTS.get(name), Layout) for name in expected)
-
-
 @pytest.mark.parametrize(("largest", "factor", "size"), [(1600, 1, (20, 12)), (10, 2, (10, 6)), (5, 4, (5, 3))])
 def test_mipnerf360_takes_the_largest_copies_that_are_small_enough(tmp_path, monkeypatch, largest, factor, size):
     stems = write_mipnerf360(tmp_path)
@@ -86,7 +80,7 @@ def test_nerfstudio_comes_before_colmap(tmp_path):
     assert title(tmp_path, "colmap") == "COLMAP"
 
 
-def test_two_layouts_in_one_folder_are_told(tmp_path):
+def test_two_layouts_in_one_folder_are_refused(tmp_path):
     write_dtu(tmp_path)
     write_poses_bounds(tmp_path, [f"{index:06d}.png" for index in range(9)], 1)
     with pytest.raises(UserError, match=r"cameras_sphere\.npz \(dtu\) and poses_bounds\.npy \(llff\): choose one"):
@@ -95,7 +89,7 @@ def test_two_layouts_in_one_folder_are_told(tmp_path):
     assert len(parse(tmp_path, layout="dtu").image_filenames) == 7
 
 
-def test_an_unknown_folder_is_told_what_was_looked_for(tmp_path):
+def test_an_unknown_folder_or_layout_is_refused(tmp_path):
     with pytest.raises(UserError, match=r"neither transforms\.json nor a COLMAP model .*poses_bounds\.npy \(llff\)"):
         parse(tmp_path)
     with pytest.raises(UserError, match="there is no layout 'llf': choose one of 3dovs, colmap"):
@@ -105,7 +99,7 @@ def test_an_unknown_folder_is_told_what_was_looked_for(tmp_path):
 
 
 class Turntable(Layout):
-    """As another package might add it."""
+    """A layout of another package."""
 
     title = "turntable"
     marks = "turntable.txt"
@@ -150,12 +144,11 @@ EVERY = {
 }
 
 
-def every_layout(test):
-    return pytest.mark.parametrize("layout", EVERY)(test)
+every_layout = pytest.mark.parametrize("layout", EVERY)
 
 
-def enlarged(path: Path) -> None:
-    """The image or mask with twice as many pixels along each side."""
+def enlarge(path: Path) -> None:
+    """Double the width and height of an image or mask."""
     from PIL import Image
 
     with Image.open(path) as image:
@@ -178,7 +171,7 @@ def test_intrinsics_follow_the_size_of_the_images(tmp_path, layout):
         outputs = parse(tmp_path, split, layout=layout, **options)
         for path in (*outputs.image_filenames, *outputs.metadata["mask_filenames"]):
             if path is not None:
-                enlarged(path)
+                enlarge(path)
     after = parse(tmp_path, layout=layout, **options)
     camera = camera_from_nerfstudio(after.cameras, 1)
     assert (camera.width, camera.height) == (2 * factor * WIDTH, 2 * factor * HEIGHT)

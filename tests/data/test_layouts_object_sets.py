@@ -54,15 +54,11 @@ def test_prompts_of_lerf_mask_are_scored_by_class_name(tmp_path):
 
 def test_the_masks_of_dtu_train_and_evaluate(tmp_path):
     """Three-channel masks as class maps of a data manager, and as silhouettes of the class called object."""
-    from beags_plugin.plugin.options.config import base_config
-    from beags_plugin.plugin.runs.read import data_of_run
     from beags_plugin.plugin.views.datamanager import BeagsDataManagerConfig
     from beags_plugin.plugin.views.held_out_views import HeldOutViews
 
     write_dtu(tmp_path)
-    config = base_config()
-    config.pipeline.datamanager = BeagsDataManagerConfig(dataparser=BeagsDataParserConfig(data=tmp_path))
-    manager = data_of_run(config, tmp_path / "config.yml", "test")
+    manager = BeagsDataManagerConfig(dataparser=BeagsDataParserConfig(data=tmp_path)).setup(device="cpu")
     views = HeldOutViews(manager, {0: "background", 1: "object"}, torch.zeros(3))
     labels = views.manager.views("train")[2].labels
     assert labels is not None and (labels.numpy() == ids()).all()

@@ -1,4 +1,4 @@
-"""Label maps in the narrowest type: every id comes back, and what is computed from them is the same bit for bit."""
+"""Label maps in the narrowest type: every id comes back, and votes are the same bit for bit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_255_classes_fit_in_a_byte_and_256_do_not():
     most = torch.arange(255, dtype=torch.int32)[None]
     assert to_compact(torch.cat([most, torch.tensor([[IGNORE]])], 1)).dtype == torch.uint8
     assert to_compact(torch.tensor([[255]])).dtype == torch.uint16
-    assert to_compact(torch.tensor([[IGNORE + 1]])).dtype == torch.int32  # no id; whoever reads it says so
+    assert to_compact(torch.tensor([[IGNORE + 1]])).dtype == torch.int32  # no id, which its reader refuses
     assert to_compact(torch.tensor([[-1]])).dtype == torch.int32
 
 

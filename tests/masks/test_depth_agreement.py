@@ -1,4 +1,4 @@
-"""How far depths of neighbouring views disagree, against loops and known noise."""
+"""Disagreement of depths between neighbouring views, against loops and known noise."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_noise_shows_and_the_scale_of_the_scene_does_not():
     assert disagreement([1e4 * d for d in noisy], large, math.inf, 0.95) == pytest.approx(wrong, rel=1e-9)
 
 
-def test_views_that_share_nothing_say_nothing():
+def test_views_that_share_nothing_give_none():
     depths, cameras = views(2)
     assert disagreement(depths[:1], cameras[:1], 0.02, 0.95) is None
     turned = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))  # looks the other way

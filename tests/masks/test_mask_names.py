@@ -1,4 +1,4 @@
-"""Which photo a mask, an entry or a prompt is about."""
+"""Matching of masks, entries and prompts to photos."""
 
 from __future__ import annotations
 
@@ -27,9 +27,7 @@ def test_names_of_photos_and_what_other_names_mean():
     assert photo_names([Path("/a/images/l/1.jpg"), Path("/a/images/r/1.jpg")]) == ["l/1", "r/1"]
     assert photo_names([Path("/a/images/1.jpg"), Path("/a/images/x.y.png")]) == ["1", "x.y"]
     names = PhotoNames(["left/v0", "left/v1", "right/v0", "x.y"])
-    assert (
-        names.candidates("left/v0") == names.candidates("left\\v0.JPG") == names.candidates("images/left/v0.jpg") == [0]
-    )
+    assert all(names.candidates(name) == [0] for name in ("left/v0", "left\\v0.JPG", "images/left/v0.jpg"))
     assert names.candidates("v0") == names.candidates("v0.png") == [0, 2] and names.candidates("v1") == [1]
     assert names.candidates("elsewhere/v0.png") == names.candidates("right/v1") == []  # another folder, another photo
     assert names.in_other_folders("elsewhere/v0.png") == [0, 2] and names.in_other_folders("right/v1.jpg") == [1]
@@ -61,7 +59,7 @@ def test_masks_of_equal_stems_are_told_apart_by_their_folders(tmp_path):
         make(IdImagesSource(), scene)
 
 
-def test_a_folder_that_contradicts_the_photos_is_told(tmp_path):
+def test_a_folder_that_contradicts_the_photos_is_refused(tmp_path):
     scene = scene_of_folders(tmp_path)
     mask_at(tmp_path / "masks/left/v1.png", 1)
     mask_at(tmp_path / "masks/left/v2.png", 2)  # v2 is a photo of the right camera only
@@ -80,7 +78,7 @@ def test_a_folder_that_contradicts_the_photos_is_told(tmp_path):
     assert names == {0: "background", 1: "v1"} and values_of(maps) == [None, None, 1, None]
 
 
-def test_two_files_of_one_name_are_told(tmp_path):
+def test_two_files_of_one_name_are_refused(tmp_path):
     scene = scene_of(tmp_path)
     for index in range(4):
         mask_at(tmp_path / f"masks/v{index}.png", 1)

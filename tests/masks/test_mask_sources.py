@@ -1,4 +1,4 @@
-"""Mask sources: each file format gives the map that it was written from; bad input is told in one sentence."""
+"""Mask sources: each file format gives the labels that it was written from; bad input is refused."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ def test_langsplat_segments_are_matched_by_features(tmp_path):
         make(LangSplatSource(), scene)
 
 
-def test_prompts_are_read_and_mistakes_told(tmp_path):
+def test_prompts_are_read_and_mistakes_refused(tmp_path):
     path = tmp_path / "prompts.json"
     entry = {"name": "cup", "id": 4, "text": "a cup", "prompts": [
         {"view": "v1", "box": [1, 2, 5, 6], "points": [[2, 3]], "outside": [[9, 9], [8, 8]]}]}  # fmt: skip

@@ -1,4 +1,4 @@
-"""GrabCut from boxes: what it cuts, how labels are carried by depth, and rims that snap to edges."""
+"""GrabCut from boxes: its cuts, labels carried by depth, and outlines that snap to edges."""
 
 from __future__ import annotations
 
@@ -17,11 +17,15 @@ from beags_plugin.masks.sources.prompts import Prompt
 from beags_plugin.system.errors import UserError
 
 
+def overlap(found: np.ndarray, exact: np.ndarray) -> float:
+    return (found & exact).sum() / (found | exact).sum()
+
+
 def test_grabcut_finds_the_object_in_its_box_and_repeats_itself():
     photo, disc = coloured()
     prompt = Prompt((12, 17, 48, 53))
     found = cut_by_box(photo, prompt)
-    assert (found & disc).sum() / (found | disc).sum() > 0.95
+    assert overlap(found, disc) > 0.95
     np.testing.assert_array_equal(found, cut_by_box(photo, prompt))
     with pytest.raises(UserError, match="outside its image"):
         cut_by_box(photo, Prompt((200, 10, 220, 30)))
@@ -42,10 +46,8 @@ def test_grabcut_fills_the_other_views(tmp_path):
     (tmp_path / "prompts.json").write_text(json.dumps(prompts))
     names, maps = make(GrabCutSource(), SourceScene(tmp_path, wall.photos, wall))
     assert names == {0: "background", 7: "disc"}
-    for disc, class_map in zip(wall.discs, maps, strict=True):
-        assert class_map is not None and set(np.unique(class_map)) == {0, 7}
-        found = class_map == 7
-        assert (found & disc).sum() / (found | disc).sum() > 0.95
+    for disc, labels in zip(wall.discs, maps, strict=True):
+        assert labels is not None and set(np.unique(labels)) == {0, 7} and overlap(labels == 7, disc) > 0.95
     held_out = SourceScene(tmp_path, wall.photos, Wall(tmp_path, known=2))
     prompts["objects"][0]["prompts"][0]["view"] = "v2"
     (tmp_path / "prompts.json").write_text(json.dumps(prompts))
@@ -70,12 +72,12 @@ def test_held_out_views_get_masks_to_look_at_that_do_not_vote(tmp_path):
     usual, more = (list(made[held_out].maps) for held_out in (False, True))
     assert made[True].to_look_at == {2} and not made[False].to_look_at
     assert usual[2] is None and more[2] is not None
-    assert ((more[2] == 1) & wall.discs[2]).sum() / ((more[2] == 1) | wall.discs[2]).sum() > 0.95
+    assert overlap(more[2] == 1, wall.discs[2]) > 0.95
     for a, b in zip(usual[:2], more[:2], strict=True):
         np.testing.assert_array_equal(a, b)
 
 
-def test_rims_snap_to_the_edge_of_the_photo():
+def test_outlines_snap_to_the_edge_of_the_photo():
     photo, disc = coloured()
     exact = disc.astype(np.uint16)
     ragged = exact.copy()

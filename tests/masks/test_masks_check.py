@@ -1,4 +1,4 @@
-"""What a check of masks finds: each planted mistake, and nothing in masks without one."""
+"""The check of masks finds each planted mistake, and nothing in good masks."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def poses() -> list[np.ndarray]:
     return [look_at((4 * np.cos(a), 4 * np.sin(a), 1.5)) for a in angles]
 
 
-def draw(pose: np.ndarray) -> np.ndarray:
+def balls_from(pose: np.ndarray) -> np.ndarray:
     """[SIDE, SIDE] uint8 ids of the nearest ball along each pixel's ray."""
     row, column = np.mgrid[:SIDE, :SIDE] + 0.5
     local = np.stack([(column - SIDE / 2) / FOCAL, -(row - SIDE / 2) / FOCAL, -np.ones((SIDE, SIDE))], axis=2)
@@ -54,7 +54,7 @@ def write_balls(root: Path, change=lambda view, ids: ids) -> Path:
     (root / "classes.json").write_text(json.dumps({"1": "left", "2": "right", "3": "top"}))
     for view, pose in enumerate(poses()):
         write_image(root / f"images/v{view:02d}.png", np.full((SIDE, SIDE, 3), 90, np.uint8))
-        if (mask := change(view, draw(pose))) is not None:
+        if (mask := change(view, balls_from(pose))) is not None:
             write_image(root / f"masks/v{view:02d}.png", mask)
     return root
 
@@ -83,7 +83,7 @@ def test_exchanged_ids_are_found_with_the_view(tmp_path):
     pair = next(issue for issue in found["swapped ids"] if issue.views == ("v03",))
     assert "2 (right) instead of 1 (left), 1 (left) instead of 2 (right)" in pair.message
     assert f"1 masks ({tmp_path / 'masks/v03.png'})" in pair.message
-    pixels = int(np.isin(draw(poses()[3]), (1, 2)).sum())
+    pixels = int(np.isin(balls_from(poses()[3]), (1, 2)).sum())
     assert f"{pixels} pixels" in pair.cost
     assert set(found) == {"swapped ids"}
 
@@ -122,16 +122,13 @@ def test_mistakes_in_files_name_file_and_remedy(tmp_path):
     found = issues(root)
     assert str(root / "masks/v02.png") in found["size"][0].message and "48x24" in found["size"][0].message
     assert str(root / "masks/v03.png") in found["type"][0].message and "has colours" in found["type"][0].message
-    assert (
-        "id 255 is in 1 masks" in found["unknown id"][0].message
-        and "--ignore-ids 255" in found["unknown id"][0].message
-    )
+    unknown = found["unknown id"][0].message
+    assert "id 255 is in 1 masks" in unknown and "--ignore-ids 255" in unknown
     assert found["missing"][0].views == ("v04",) and "1 of 10" in found["missing"][0].message
     assert "other.png" in found["unused"][0].message and "3 (top)" in found["unused name"][0].message
     levels = {kind: found[kind][0].level for kind in ("size", "type", "unknown id", "missing", "unused", "unused name")}
     assert list(levels.values()) == ["error"] * 3 + ["warning"] * 3
-    ignoring = issues(root, ignore_ids=(255,))
-    assert "unknown id" not in ignoring
+    assert "unknown id" not in issues(root, ignore_ids=(255,))
 
 
 def test_the_command_writes_its_report_and_ends_with_1_on_errors(tmp_path, capsys):
@@ -141,7 +138,7 @@ def test_the_command_writes_its_report_and_ends_with_1_on_errors(tmp_path, capsy
     assert ended.value.code == 1
     report = json.loads((tmp_path / "out/report.json").read_text())
     assert [issue["kind"] for issue in report["issues"]] == ["size"]
-    assert report["coverage"][0]["pixels"]["1"] == int((draw(poses()[0]) == 1).sum())
+    assert report["coverage"][0]["pixels"]["1"] == int((balls_from(poses()[0]) == 1).sum())
     assert (tmp_path / "out/coverage.png").stat().st_size > 5000
     assert "11 usable masks, 3 objects; 1 errors" in capsys.readouterr().out
 
@@ -152,16 +149,14 @@ def test_unlabelled_masks_are_named(tmp_path):
 
     root = write_balls(tmp_path, change)
     (note,) = issues(root, ignore_ids=(255,))["unlabelled"]
-    assert f"most in {root / 'masks/v02.png'}, v07.png, v10.png: fine" in note.message and note.message.startswith(
-        "25 %"
-    )
+    assert note.message.startswith("25 %")
+    assert f"most in {root / 'masks/v02.png'}, v07.png, v10.png: fine" in note.message
 
 
-def test_an_image_that_is_no_id_image_is_told_and_not_compared(tmp_path):
+def test_an_image_that_is_no_id_image_is_reported_and_not_compared(tmp_path):
     root = write_balls(tmp_path)
     (root / "classes.json").unlink()
-    depth = np.arange(draw(poses()[2]).size, dtype=np.uint16).reshape(draw(poses()[2]).shape)
-    write_mask(root / "masks/v02.png", depth)
+    write_mask(root / "masks/v02.png", np.arange(SIDE * SIDE, dtype=np.uint16).reshape(SIDE, SIDE))
     found = issues(root)
     assert set(found) == {"no id image"} and found["no id image"][0].level == "error"
     assert str(root / "masks/v02.png") in found["no id image"][0].message and found["no id image"][0].views == ("v02",)
@@ -195,11 +190,11 @@ def test_ranks_of_ids():
     assert found.tolist() == [[0, 1], [UNSEEN, UNSEEN]]
 
 
-def test_contradicted_areas_are_more_than_rims():
+def test_contradicted_areas_are_wider_than_outlines():
     given = np.zeros((100, 100), np.int32)
     given[20:60, 20:60] = 1
     voted = given.copy()
-    voted[20:60, 20] = 0  # a rim
+    voted[20:60, 20] = 0  # an outline
     voted[70:90, 70:95] = 2
     sure = np.ones((100, 100), np.float32)
     (area,) = contradicted(given, voted, sure, "v")
@@ -208,7 +203,7 @@ def test_contradicted_areas_are_more_than_rims():
     assert contradicted(np.full_like(given, IGNORE), voted, sure, "v") == []
 
 
-def test_areas_that_a_run_contradicts_are_told_with_what_they_cost(tmp_path):
+def test_areas_that_a_run_contradicts_are_reported_with_their_cost(tmp_path):
     from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
     from beags_plugin.plugin.objects.check_masks import check_scene, check_with_run, data_options
 
@@ -219,8 +214,9 @@ def test_areas_that_a_run_contradicts_are_told_with_what_they_cost(tmp_path):
 
     root = write_balls(tmp_path, change)
     report = check_scene(data_options(root))
-    given = LabelMaps(torch.from_numpy(change(view, draw(pose)).astype(np.int32)) for view, pose in enumerate(poses()))
-    voted = LabelMaps(torch.from_numpy(draw(pose).astype(np.int32)) for pose in poses())
+    good = [balls_from(pose).astype(np.int32) for pose in poses()]
+    given = LabelMaps(torch.from_numpy(change(view, ids)) for view, ids in enumerate(good))
+    voted = LabelMaps(map(torch.from_numpy, good))
     sure = CompressedMaps(torch.full((SIDE, SIDE), 255, dtype=torch.uint8) for _ in poses())
     run = SimpleNamespace(names=report.stems, given=given, voted=voted, confidence=sure, classes=report.names)
     found = check_with_run(report, cast(Any, run))

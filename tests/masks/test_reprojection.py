@@ -12,7 +12,6 @@ from voted_views import reprojection_cameras, reprojection_scene
 import beags_plugin.masks.reprojection as reprojection
 from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.masks.reprojection import reproject_pairwise
 from beags_plugin.system.errors import UserError
 
@@ -140,7 +139,7 @@ def test_depths_that_are_not_finite_do_not_vote():
         assert all(torch.equal(x.labels, y.labels) for x, y in zip(a, b, strict=True))
 
 
-def test_mistakes_are_told():
+def test_mistakes_are_refused():
     depths, cameras, labels = reprojection_scene()
     with pytest.raises(UserError, match="view 0 holds class ids 0..2"):
         list(reproject_pairwise(depths, cameras, labels, 2))
@@ -148,7 +147,3 @@ def test_mistakes_are_told():
         list(reproject_pairwise(depths, cameras, [None, labels[1].T, None, None], 3))
     with pytest.raises(UserError, match="tau"):
         list(reproject_pairwise(depths, cameras, labels, 3, tau=-1.0))
-
-
-def test_is_registered():
-    assert "pairwise" in REPROJECTIONS.names() and REPROJECTIONS.get("pairwise") is reproject_pairwise

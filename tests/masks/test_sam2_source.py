@@ -1,4 +1,4 @@
-"""The SAM2 source on models of random weights and toy sizes: the code that real weights run, and nothing it draws."""
+"""The SAM2 source on toy models of random weights: the code for real weights, without their masks."""
 
 from __future__ import annotations
 
@@ -24,55 +24,32 @@ FRAMES, WIDTH, HEIGHT = 5, 40, 30
 @pytest.fixture(scope="module")
 def sam2(tmp_path_factory):
     """A folder with a tiny Sam2VideoModel and its processor, as save_pretrained writes them."""
-    from transformers import (
-        Sam2HieraDetConfig,
-        Sam2ImageProcessor,
-        Sam2VideoConfig,
-        Sam2VideoModel,
-        Sam2VideoProcessor,
-        Sam2VideoVideoProcessor,
-        Sam2VisionConfig,
-    )
-
     torch.manual_seed(0)
-    backbone = Sam2HieraDetConfig(
-        hidden_size=8,
-        num_attention_heads=1,
-        image_size=[SIDE, SIDE],
-        blocks_per_stage=[1, 1, 2, 1],
-        embed_dim_per_stage=[8, 16, 32, 64],
-        num_attention_heads_per_stage=[1, 1, 1, 1],
-        window_size_per_stage=[4, 4, 4, 4],
-        window_positional_embedding_background_size=[4, 4],
+    backbone = transformers.Sam2HieraDetConfig(
+        hidden_size=8, num_attention_heads=1, image_size=[SIDE, SIDE], blocks_per_stage=[1, 1, 2, 1],
+        embed_dim_per_stage=[8, 16, 32, 64], num_attention_heads_per_stage=[1, 1, 1, 1],
+        window_size_per_stage=[4, 4, 4, 4], window_positional_embedding_background_size=[4, 4],
         global_attention_blocks=[3],
-    )
-    vision = Sam2VisionConfig(
-        backbone_config=backbone,
-        backbone_channel_list=[64, 32, 16, 8],
-        backbone_feature_sizes=[[SIDE // 4] * 2, [SIDE // 8] * 2, [SIDE // 16] * 2],
+    )  # fmt: skip
+    sizes = [[SIDE // 4] * 2, [SIDE // 8] * 2, [SIDE // 16] * 2]
+    vision = transformers.Sam2VisionConfig(
+        backbone_config=backbone, backbone_channel_list=[64, 32, 16, 8], backbone_feature_sizes=sizes,
         fpn_hidden_size=128,
-    )
-    config = Sam2VideoConfig(
+    )  # fmt: skip
+    config = transformers.Sam2VideoConfig(
         vision_config=vision,
         prompt_encoder_config={"hidden_size": 128, "image_size": SIDE, "patch_size": 16, "mask_input_channels": 4},
         mask_decoder_config={"hidden_size": 128, "mlp_dim": 32, "num_attention_heads": 2, "iou_head_hidden_dim": 16},
-        image_size=SIDE,
-        memory_attention_hidden_size=128,
-        memory_attention_num_layers=1,
-        memory_attention_feed_forward_hidden_size=32,
-        memory_attention_rope_feat_sizes=[SIDE // 16] * 2,
-        memory_encoder_hidden_size=128,
-        memory_encoder_output_channels=64,
-        mask_downsampler_embed_dim=128,
-        memory_fuser_embed_dim=128,
-        memory_fuser_intermediate_dim=32,
-        memory_fuser_num_layers=1,
-    )
+        image_size=SIDE, memory_attention_hidden_size=128, memory_attention_num_layers=1,
+        memory_attention_feed_forward_hidden_size=32, memory_attention_rope_feat_sizes=[SIDE // 16] * 2,
+        memory_encoder_hidden_size=128, memory_encoder_output_channels=64, mask_downsampler_embed_dim=128,
+        memory_fuser_embed_dim=128, memory_fuser_intermediate_dim=32, memory_fuser_num_layers=1,
+    )  # fmt: skip
     folder = tmp_path_factory.mktemp("sam2")
-    Sam2VideoModel(config).save_pretrained(folder)
+    transformers.Sam2VideoModel(config).save_pretrained(folder)
     size = {"height": SIDE, "width": SIDE}
-    images = Sam2ImageProcessor(size=size, mask_size={"height": SIDE // 4, "width": SIDE // 4})
-    Sam2VideoProcessor(images, Sam2VideoVideoProcessor(size=size)).save_pretrained(folder)
+    images = transformers.Sam2ImageProcessor(size=size, mask_size={"height": SIDE // 4, "width": SIDE // 4})
+    transformers.Sam2VideoProcessor(images, transformers.Sam2VideoVideoProcessor(size=size)).save_pretrained(folder)
     return folder
 
 
@@ -145,7 +122,7 @@ def test_the_source_makes_a_map_of_every_view(sam2, photos, tmp_path):
     assert set(np.unique(np.stack(maps)).tolist()) <= {0, 1, 7}
 
 
-def test_missing_weights_are_told_plainly(tmp_path):
+def test_missing_weights_are_refused(tmp_path):
     with pytest.raises(UserError, match="cannot be loaded .* name a folder that holds them"):
         load(str(tmp_path / "nothing"), "Sam2VideoModel", local=True)
 
@@ -153,35 +130,27 @@ def test_missing_weights_are_told_plainly(tmp_path):
 @pytest.fixture(scope="module")
 def dino(tmp_path_factory):
     """A tiny Grounding DINO with a vocabulary of a few words."""
-    from transformers import (
-        BertConfig,
-        BertTokenizerFast,
-        GroundingDinoConfig,
-        GroundingDinoForObjectDetection,
-        GroundingDinoImageProcessor,
-        GroundingDinoProcessor,
-        SwinConfig,
-    )
-
     torch.manual_seed(0)
     folder = tmp_path_factory.mktemp("dino")
     words = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "[MASK]", ".", "?", "a", "red", "cup"]
     (folder / "vocab.txt").write_text("\n".join(words))
-    tokenizer = BertTokenizerFast(str(folder / "vocab.txt"))
-    config = GroundingDinoConfig(
-        backbone_config=SwinConfig(
+    tokenizer = transformers.BertTokenizerFast(str(folder / "vocab.txt"))
+    config = transformers.GroundingDinoConfig(
+        backbone_config=transformers.SwinConfig(
             image_size=64, embed_dim=8, depths=[1, 1, 1, 1], num_heads=[1, 1, 2, 2], window_size=4,
             out_features=["stage2", "stage3", "stage4"],
         ),
-        text_config=BertConfig(
+        text_config=transformers.BertConfig(
             vocab_size=len(words), hidden_size=16, num_hidden_layers=1, num_attention_heads=2, intermediate_size=16
         ),
         d_model=32, encoder_layers=1, encoder_ffn_dim=16, encoder_attention_heads=2, decoder_layers=2,
         decoder_ffn_dim=16, decoder_attention_heads=2, num_queries=12, max_text_len=16, num_feature_levels=3,
     )  # fmt: skip
-    GroundingDinoForObjectDetection(config).save_pretrained(folder)
+    transformers.GroundingDinoForObjectDetection(config).save_pretrained(folder)
     size = {"shortest_edge": 64, "longest_edge": 96}
-    GroundingDinoProcessor(GroundingDinoImageProcessor(size=size), tokenizer).save_pretrained(folder)
+    transformers.GroundingDinoProcessor(transformers.GroundingDinoImageProcessor(size=size), tokenizer).save_pretrained(
+        folder
+    )
     return folder
 
 

@@ -19,9 +19,9 @@ from beags_plugin.ops.voxel_votes import brick_sample
 
 @pytest.mark.usefixtures("ops")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_any_number_of_slabs_gives_the_same_bits(monkeypatch, dtype):
+def test_any_number_of_chunks_gives_the_same_bits(monkeypatch, dtype):
     scene = larger_scene(dtype)
-    whole, cut, told = list(reproject_voxel(*scene)), [], []
+    whole, cut, reported = list(reproject_voxel(*scene)), [], []
 
     def observed(*args):
         cut.append(divide_space(*args))
@@ -31,14 +31,14 @@ def test_any_number_of_slabs_gives_the_same_bits(monkeypatch, dtype):
     monkeypatch.setattr(chunks, "_PART", 2)  # there are few bricks
     for most in (10**6, 60, 12):
         monkeypatch.setattr(chunks, "MOST_BRICKS", most)
-        assert same(list(reproject_voxel(*scene, progress=lambda *now: told.append(now))), whole)
-        assert told[-1] == (10 * len(cut[-1]), 10 * len(cut[-1])) and len(told) == told[-1][1]
-        told.clear()
+        assert same(list(reproject_voxel(*scene, progress=lambda *now: reported.append(now))), whole)
+        assert reported[-1] == (10 * len(cut[-1]), 10 * len(cut[-1])) and len(reported) == reported[-1][1]
+        reported.clear()
     counts = [len(each) for each in cut]
     assert counts[0] == 1 and 1 < counts[1] < counts[2]
 
 
-def test_slabs_hold_about_as_many_bricks_as_they_may():
+def test_chunks_hold_about_as_many_bricks_as_they_may():
     """Against a count of all bricks."""
     g = torch.Generator().manual_seed(0)
     cameras = larger_scene()[1][:1] * 4
@@ -52,8 +52,8 @@ def test_slabs_hold_about_as_many_bricks_as_they_may():
     found = divide_space(depths, cameras, lifts, most=1500)
     assert abs(len(found) - len(bricks) / 1500) < 2
     assert (found.axis, found.borders[0], found.borders[-1]) == (2, -math.inf, math.inf)  # depth is the longest
-    in_slab = torch.bucketize(bricks[:, 2].contiguous(), torch.tensor(found.borders[1:-1]) / 4, right=True)
-    sizes = torch.bincount(in_slab, minlength=len(found))
+    in_chunk = torch.bucketize(bricks[:, 2].contiguous(), torch.tensor(found.borders[1:-1]) / 4, right=True)
+    sizes = torch.bincount(in_chunk, minlength=len(found))
     assert len(sizes) == len(found) and int(sizes.max()) < 2 * 1500
 
 
@@ -70,7 +70,7 @@ def test_the_compiled_sample_of_bricks_is_that_of_torch(dtype):
     assert 0 < len(some) < len(every) / 2 and torch.equal(brick_sample(depth, to_voxels, 4), some)
 
 
-def test_each_point_is_in_one_slab_and_what_matters_to_it_is_about():
+def test_each_point_is_in_one_chunk_and_what_matters_to_it_is_about():
     cut = chunks.SpatialChunks(0, (-math.inf, -4.0, 8.0, math.inf), 5.0)
     coordinates = torch.tensor([-1e6, -4.0, -4.001, 7.9, 8.0, math.nan])
     inside = torch.stack([cut.inside(coordinates, chunk) for chunk in range(3)])

@@ -1,4 +1,4 @@
-"""Two-stage retrieval against a scripted predictor and detector: who is prompted where, and what is kept."""
+"""Two-stage retrieval with a scripted predictor and detector: the prompted frames, and the masks."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_a_lost_run_is_prompted_again_more_strictly_and_tracked_in_itself_alone(
     notes, maps = run(tmp_path, [one], predictor, detector)
     assert predictor.calls[2:] == [((7,), (7, 8, 9)), ((7,), (7, 6, 5))]
     assert {threshold for _, threshold in detector.asked} == {0.5} and {f for f, _ in detector.asked} == {5, 6, 7, 8, 9}
-    # broken at 5 from above too: it stays empty and is told, after a second search that finds nothing
+    # broken at 5 from above too: it stays empty and is reported, after a second search that finds nothing
     assert [bool(m.any()) for m in maps] == [True] * 5 + [False] + [True] * 4
     assert len(notes) == 1 and "cup is empty from v5 to v5" in notes[0]
     assert [frame for frame, _ in detector.asked].count(5) == 2
@@ -89,7 +89,7 @@ def test_each_of_two_lost_runs_is_searched_and_the_retries_end(tmp_path):
     assert [bool(m.any()) for m in maps] == [True, True, True, False, True, True, True, True, False, True]
 
 
-def test_without_a_text_the_lost_run_is_told(tmp_path):
+def test_without_a_text_the_lost_run_is_reported(tmp_path):
     notes, _ = run(tmp_path, [PromptedObject(1, "cup", {"v0": Prompt(BOX)})], Scripted({1.0: {6}}))
     assert "cup is empty from v6 to v9" in notes[0] and "add a prompt" in notes[0]
 
