@@ -136,8 +136,8 @@ class RefinementSwitch:
                     seed=model.seed,
                     stage=_bar,
                 )
-            for finding in prepared.summary:
-                CONSOLE.print(f"  {finding}", highlight=False, markup=False)
+            for line in prepared.summary:
+                CONSOLE.print(f"  {line}", highlight=False, markup=False)
             self._take_classes(prepared.assignment)
             if first:  # before save_prepared, whose last file marks everything as there
                 snapshot = self.trainer.base_dir / BASE_SNAPSHOT

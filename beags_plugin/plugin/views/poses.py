@@ -33,7 +33,7 @@ SPLITS = ("train", "val", "test")
 
 @dataclass(frozen=True)
 class Normalization:
-    """How the world is turned, centred and scaled; the data parser's options of these names."""
+    """Options that turn, centre and scale the world: the data parser's, of these names."""
 
     orientation_method: Literal["pca", "up", "vertical", "none"]
     center_method: Literal["poses", "focus", "none"]
