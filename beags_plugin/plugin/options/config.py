@@ -51,16 +51,16 @@ class BeagsTrainerConfig(TrainerConfig):
     run_dir: Path | None = None
     """Folder of this run; None puts it where nerfstudio does (output_dir/experiment/method/timestamp)."""
     max_num_iterations: int = 0
-    """Stop after so many steps of the schedule; 0 runs base_steps + refine_steps."""
+    """Step of the schedule to stop after; 0 runs base_steps + refine_steps."""
     steps_per_held_out: int = 0
-    """Measure all held-out views every so many steps, into held_out.json of the run; 0: never."""
+    """Steps between two measurements of all held-out views, kept in held_out.json of the run; 0: never."""
 
     check_memory: bool = True
     """Do not begin where hardly any memory or disk is free; save and stop when memory runs out (on a CPU)."""
 
     steps_per_objects: int = 500
-    """Once Gaussians have classes: measure extracted masks on four held-out views and draw every object alone, for
-    tensorboard or wandb, every so many steps, and first and last; 0: never."""
+    """Steps between two measurements of extracted masks on four held-out views, with a picture of every object alone, for
+    tensorboard or wandb, once Gaussians have classes; the first and the last step are always measured; 0: never."""
 
     run_format: Suppress[int] = RUN_FORMAT
     """Version of the files of a run that is trained with this config."""

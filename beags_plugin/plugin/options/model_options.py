@@ -32,7 +32,7 @@ class BeagsModelConfig(ModelConfig):
     sh_degree: int = 3
     """Highest degree of the colour's spherical harmonics (0..3)."""
     sh_degree_interval: Suppress[int] = 1000
-    """A degree is added every so many steps."""
+    """Steps between two degrees."""
     background_color: Literal["black", "white", "random"] = "black"
     """Background behind the scene, and behind images with alpha; "random" draws one per training step, and is black
     elsewhere."""

@@ -56,7 +56,7 @@ class BeagsDataParserConfig(DataParserConfig):
     downscale_factor: float = 1.0
     """Divide the images' width and height by this when loading; nothing is written to disk."""
     eval_interval: int = 8
-    """Every so many of the name-sorted views is held out for evaluation; 0: all views serve both.
+    """Of the name-sorted views, one in this many is held out for evaluation; 0: all views serve both.
     Splits that the data or its protocol names come first."""
     held_out: tuple[str, ...] = ()
     """Stems of images to hold out for evaluation besides."""
