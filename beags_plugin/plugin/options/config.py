@@ -59,8 +59,8 @@ class BeagsTrainerConfig(TrainerConfig):
     """Do not begin where hardly any memory or disk is free; save and stop when memory runs out (on a CPU)."""
 
     steps_per_objects: int = 500
-    """Steps between two measurements of extracted masks on four held-out views, with a picture of every object alone, for
-    tensorboard or wandb, once Gaussians have classes; the first and the last step are always measured; 0: never."""
+    """Steps between two measurements of extracted masks on four held-out views, with a picture of every object alone,
+    for tensorboard or wandb, once Gaussians have classes; the first and the last step are measured too; 0: never."""
 
     run_format: Suppress[int] = RUN_FORMAT
     """Version of the files of a run that is trained with this config."""
