@@ -1,7 +1,7 @@
 """ns-train as it is, but that either phase waits before its last step until somebody has seen it.
 
 python watched_training.py FOLDER ARGUMENTS OF NS-TRAIN: the phase "base" or "refine" goes on once the file of that name
-is in FOLDER. Pictures are drawn meanwhile, as between any two steps.
+is in FOLDER. The scene is a tenth of its size, so that all of it is seen from where the viewer's camera is at first. Pictures are drawn meanwhile, as between any two steps.
 """
 
 from __future__ import annotations
@@ -18,7 +18,12 @@ from beags_plugin.plugin.trainer import BeagsTrainer
 def main() -> None:
     """Run ns-train."""
     seen = Path(sys.argv.pop(1))
-    iteration = BeagsTrainer.train_iteration
+    begin, iteration = BeagsTrainer.__init__, BeagsTrainer.train_iteration
+
+    def small(self, config, *arguments, **options) -> None:
+        parser = config.data_config.dataparser
+        parser.center_method, parser.auto_scale_poses, parser.scale_factor = "none", False, 0.1
+        begin(self, config, *arguments, **options)
 
     def waiting(self, step: int):
         phase = {self.schedule.base_steps - 1: "base", self.last_step - 1: "refine"}.get(step)
@@ -31,7 +36,7 @@ def main() -> None:
                 self.train_lock.acquire()
         return iteration(self, step)
 
-    BeagsTrainer.train_iteration = waiting
+    BeagsTrainer.__init__, BeagsTrainer.train_iteration = small, waiting
     entrypoint()
 
 

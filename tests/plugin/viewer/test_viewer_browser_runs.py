@@ -38,8 +38,7 @@ def test_a_training_is_watched_and_goes_on_to_its_end(tmp_path):
         "--machine.device-type", "cpu", "--vis", "viewer+tensorboard", "--viewer.websocket-port", port,
         "--pipeline.model.start-from", tmp_path / "scene.ply", "--pipeline.model.prepare.k", 10,
         "--pipeline.model.base-steps", STEPS[0], "--pipeline.model.refine-steps", STEPS[1],
-        "beags-data", "--orientation-method", "none", "--center-method", "none", "--auto-scale-poses", "False",
-        "--scale-factor", 0.1,  # all of it is seen from where the viewer's camera is at first
+        "beags-data", "--orientation-method", "none",
     )  # fmt: skip
     with (
         started(list(command), tmp_path / "log.txt", "Viewer running locally") as process,
