@@ -1,8 +1,8 @@
 """ns-train as it is, but that either phase waits before its last step until somebody has seen it.
 
 python watched_training.py FOLDER ARGUMENTS OF NS-TRAIN: the phase "base" or "refine" goes on once the file of that name
-is in FOLDER; the viewer renders meanwhile, as between any two steps. The scene is a tenth of its size, so that all of it
-is seen from where the viewer's camera is at first.
+is in FOLDER; the viewer renders meanwhile, as between any two steps. The scene is a tenth of its size, so that it
+is seen whole from where the viewer's camera is at first.
 """
 
 from __future__ import annotations
