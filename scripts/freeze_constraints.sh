@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Rewrite constraints.txt from an environment: scripts/freeze_constraints.sh [environment folder]
-# Only "name==version" lines are kept: no paths, no links, no local version suffix (torch's +cpu, +cu12 resolve nowhere else).
+# Only "name==version" lines are kept: no paths, no links, no local version suffix (torch's +cpu, +cu12 resolve nowhere
+# else).
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 env="${1:-${BEAGS_VENV:-.venv}}"

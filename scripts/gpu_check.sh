@@ -1,12 +1,13 @@
 #!/usr/bin/env bash
-# Everything that needs a GPU: scripts/gpu_check.sh [--out FOLDER] [build] [tests] [memcheck] [racecheck] [synccheck] [benchmark]
-# Without names of stages it runs them all; where a command may only run for a few minutes, name one stage a call (and
-# build in each call, if the machine is a fresh one every time). It needs an NVIDIA GPU, nvcc, CMake, a C++ compiler, and
-# a Python (PYTHON, default python3) with torch for CUDA, nanobind, numpy, scipy and pytest; no nerfstudio. Where gsplat
-# is installed, its kernels may take GSPLAT_SECONDS (150) to compile, else it is left out. The benchmark begins nothing
-# new after BENCHMARK_SECONDS (500). It builds in place, for the GPU that is here, and changes nothing outside the
-# repository. A stage that fails does not stop the others, except that nothing runs after a build that failed; the exit
-# code tells. Logs and cuda.json go to FOLDER (default build/gpu_check).
+# Everything that needs a GPU:
+#   scripts/gpu_check.sh [--out FOLDER] [build] [tests] [memcheck] [racecheck] [synccheck] [benchmark]
+# Without names of stages it runs them all; where a command may only run for a few minutes, name one stage a
+# call (and build in each call, if the machine is a fresh one every time). It needs an NVIDIA GPU, nvcc, CMake, a C++
+# compiler, and a Python (PYTHON, default python3) with torch for CUDA, nanobind, numpy, scipy and pytest; no
+# nerfstudio. Where gsplat is installed, its kernels may take GSPLAT_SECONDS (150) to compile, else it is left out. The
+# benchmark begins nothing new after BENCHMARK_SECONDS (500). It builds in place, for the GPU that is here, and changes
+# nothing outside the repository. A stage that fails does not stop the others, except that nothing runs after a build
+# that failed; the exit code tells. Logs and cuda.json go to FOLDER (default build/gpu_check).
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 python="${PYTHON:-python3}"

@@ -54,8 +54,8 @@ source_now="$(pwd) $({
 packages_before="$(cat "$env/.beags-packages" 2>/dev/null || true)"
 source_before="$(cat "$env/.beags-source" 2>/dev/null || true)"
 
-# The kernels for GPUs are compiled for the GPU that is here; where there is none, for the oldest and the newest that are
-# supported, to see that they compile. Their emulation on the CPU is for the tests.
+# The kernels for GPUs are compiled for the GPU that is here; where there is none, for the oldest and the newest that
+# are supported, to see that they compile. Their emulation on the CPU is for the tests.
 architectures="${BEAGS_CUDA_ARCHITECTURES:-75-real;90}"
 if [ -z "${BEAGS_CUDA_ARCHITECTURES:-}" ] && nvidia-smi -L >/dev/null 2>&1; then architectures=native; fi
 build=(-C "cmake.define.BEAGS_CUDA_ARCHITECTURES=$architectures" -C cmake.define.BEAGS_CUDA_EMULATION=ON)

@@ -66,3 +66,13 @@ def test_links_between_documents_resolve(document: Path):
         if not exists or (anchor and anchor not in anchors(goal.read_text("utf-8"))):
             lost.append(link)
     assert not lost
+
+
+def test_tests_that_scripts_call_exist():
+    """Lists such as tests/ops/test_{a,b}.py, in scripts that nobody runs every day."""
+    for script in sorted((ROOT / "scripts").glob("*.sh")):
+        for pattern in re.findall(r"tests/[\w/]+(?:\{[\w,]+\})?[\w]*\.(?:py|cpp|supp)", script.read_text("utf8")):
+            names = re.search(r"\{([\w,]+)\}", pattern)
+            for name in names[1].split(",") if names else [""]:
+                path = re.sub(r"\{[\w,]+\}", name, pattern)
+                assert (ROOT / path).is_file(), f"{script.name} calls {path}, which is not there"

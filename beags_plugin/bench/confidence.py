@@ -80,7 +80,7 @@ def _plot_view(axes: Sequence[Axes], scene: str, view: TrainingMasks) -> None:
     if view.exact is not None:
         axes[4].imshow(_errors(view))
         axes[4].set_title(
-            "green: mended, red: still wrong,\nmagenta: newly wrong, grey: unlabelled", loc="left", fontsize=8
+            "green: corrected, red: still wrong,\nmagenta: newly wrong, grey: unlabelled", loc="left", fontsize=8
         )
     _plot_mask(axes[5], view.exact, "exact mask", None)
 

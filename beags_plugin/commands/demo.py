@@ -128,7 +128,7 @@ def train(data: Path, run: Path, preset: str, downscale: float) -> None:
 
 def resume(run: Path) -> None:
     """Resume an interrupted training in a process of its own."""
-    CONSOLE.print(f"Going on with the training that was broken off (add --fresh to start anew).\n$ beags resume {run}")
+    CONSOLE.print(f"Resuming the training that was interrupted (add --fresh to start anew).\n$ beags resume {run}")
     _finish([sys.executable, "-m", "beags_plugin.commands.cli", "resume", str(run)])
 
 
@@ -152,7 +152,7 @@ def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
     with timed(seconds, "extraction"), progress_bar("Extracting") as progress:
         extracted = extract_objects(run / "config.yml", progress=progress)
     picture = output / "contact_sheet.png"
-    with timed(seconds, "picture"), progress_bar("Drawing the picture") as progress:
+    with timed(seconds, "picture"), progress_bar("Making the picture") as progress:
         views, classes = evaluated.views, evaluated.classes
         shown = views[:: max(1, len(views) // SHEET_VIEWS)][:SHEET_VIEWS]
         objects = [index for index in classes if index != 0]

@@ -67,7 +67,7 @@ def beags_after(change: Callable[[Place], Any], words: str) -> Callable[[Place],
 
 
 class Templates:
-    """A good scene and a run that was broken off, made once and copied for every mistake."""
+    """A good scene and a run that was interrupted, made once and copied for every mistake."""
 
     def __init__(self, root: Path) -> None:
         self.root = root

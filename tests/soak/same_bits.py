@@ -1,4 +1,4 @@
-"""What of two runs, or of two exports, is not the same bits."""
+"""Compare two runs, or two exports, bit for bit."""
 
 from __future__ import annotations
 

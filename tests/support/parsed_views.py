@@ -1,4 +1,4 @@
-"""What the data parser makes of a scene on disk, and where its cameras see points."""
+"""Scenes on disk as the data parser reads them, and points as its cameras see them."""
 
 from __future__ import annotations
 

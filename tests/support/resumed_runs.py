@@ -1,4 +1,4 @@
-"""Short runs in this process, broken off at chosen moments, and what is left of them on disk."""
+"""Short runs in this process, interrupted at chosen moments, and what is left of them on disk."""
 
 from __future__ import annotations
 

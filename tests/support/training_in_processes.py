@@ -1,4 +1,4 @@
-"""A training in two processes on the CPU, started by nerfstudio's own launcher: for test_several.py.
+"""A training in two processes on the CPU, started by nerfstudio's own launcher: for test_replicas.py.
 
 nerfstudio's worker asks torch for two GPUs before it does anything. A process that it starts imports this module first,
 which says yes, and only until the training begins.

@@ -12,7 +12,7 @@ namespace {
 constexpr uint64_t kNowhere = ~uint64_t(0);  // pixels without a depth, or too far away
 constexpr int kShares = 64;
 constexpr int kBlock = 64;                                       // voxels that are fetched at a time
-constexpr uint32_t kPrimes[3] = {73856093, 19349663, 83492791};  // as in masks/slabs.py
+constexpr uint32_t kPrimes[3] = {73856093, 19349663, 83492791};  // as in masks/spatial_chunks.py
 
 // Combines three bricks in a row along an axis into bits of the middle one: set there or in the next voxel below, or
 // above.

@@ -149,10 +149,10 @@ def _agreement(files: MaskFiles, coverage: Coverage, views: PosedViews, points: 
     with progress_bar("Comparing views") as progress:
         for view in range(len(files.stems)):
             if coverage.usable[view]:
-                class_map = files.read(view)
-                assert class_map is not None
+                mask = files.read(view)
+                assert mask is not None
                 xy, z = project_through_lens(points, views.cameras, view)
-                labels[:, view] = labels_at(xy, z, ranks_of(class_map, coverage.ids, IGNORE))
+                labels[:, view] = labels_at(xy, z, ranks_of(mask, coverage.ids, IGNORE))
             progress(view + 1, len(files.stems))
     return Agreement(labels, len(coverage.ids))
 

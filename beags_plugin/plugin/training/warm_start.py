@@ -111,7 +111,7 @@ def _measure(model: SceneModel, surfels: Surfels, views: Sequence[View], most: i
     spread = torch.linspace(0, len(views) - 1, min(most, len(views))).round().long().unique()
     chosen = [views[index] for index in spread]
     found = []
-    with progress_bar("drawing the start") as progress:
+    with progress_bar("Rendering the start") as progress:
         for number, view in enumerate(chosen):
             image = view.image_on(model.background_color).to(device)
             color = model.rasterizer.rasterize(

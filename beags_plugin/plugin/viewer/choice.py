@@ -14,15 +14,15 @@ from beags_plugin.core.surfels import Surfels, opacities
 class Choice:
     """The parts of a scene to look at; every method returns another choice and leaves the scene alone.
 
-    hidden: class ids that belong to the rest. removed: class ids that are gone, whatever ``rest`` is. isolated: the one
-    class that does not belong to the rest; None: all but the hidden. rest: 0..1, factor of the rest's opacity; 0 leaves
+    hidden: class ids that belong to the rest. removed: class ids that are gone, whatever ``faded_opacity`` is. isolated: the one
+    class that does not belong to the rest; None: all but the hidden. faded_opacity: 0..1, factor of the rest's opacity; 0 leaves
     it out. min_opacity: 0..1, weaker Gaussians are left out.
     """
 
     hidden: frozenset[int] = frozenset()
     removed: frozenset[int] = frozenset()
     isolated: int | None = None
-    rest: float = 0.0
+    faded_opacity: float = 0.0
     min_opacity: float = 0.0
 
     def isolate(self, class_id: int) -> Choice:
@@ -98,7 +98,7 @@ def shown(
     if choice.isolated is not None:
         fades |= class_ids != choice.isolated
     keep &= ~_member(class_ids, choice.removed)
-    left = choice.rest if rest else 0.0
+    left = choice.faded_opacity if rest else 0.0
     if left <= 0.0:
         keep &= ~fades
     index = keep.nonzero()[:, 0]

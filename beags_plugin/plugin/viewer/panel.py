@@ -76,7 +76,7 @@ class ObjectPanel(ViewerElement[None]):
         self.put_away = ViewerButtonGroup("Put it away", "Hide", ["Hide", "Remove"], cb_hook=self._act)
         self.show_all = ViewerButton("Show all objects", lambda _: self.choose(self.viewing.choice.show_all()))
         self.rest = ViewerSlider(
-            "Rest", 0.0, 0.0, 1.0, 0.05, cb_hook=lambda slider: self._slide(rest=slider.value),
+            "Rest", 0.0, 0.0, 1.0, 0.05, cb_hook=lambda slider: self._slide(faded_opacity=slider.value),
             hint="Opacity left to what is hidden, or not isolated; removed objects stay away",
         )  # fmt: skip
         self.min_opacity = ViewerSlider(

@@ -1,4 +1,4 @@
-"""What a run writes for tensorboard, read back from its event files."""
+"""Curves that a run writes for tensorboard, read back from its event files."""
 
 from __future__ import annotations
 

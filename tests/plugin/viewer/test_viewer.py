@@ -48,7 +48,7 @@ def test_every_output_is_a_picture_whatever_is_shown(window):
     """Nerfstudio's render thread dies of any exception: none may come of any output with any choice."""
     panel, model = window.panel, window.model
     assert set(window.look()) == ALWAYS | set(CHANNELS) | {"gl_z_buf_depth"}
-    choices = [Choice(), Choice().isolate(1), Choice(rest=0.3).hide(2), Choice().remove(0).remove(1).remove(2)]
+    choices = [Choice(), Choice().isolate(1), Choice(faded_opacity=0.3).hide(2), Choice().remove(0).remove(1).remove(2)]
     for choice in choices:
         panel.choose(choice)
         for name in (*ALWAYS, *CHANNELS):
@@ -157,10 +157,10 @@ def test_buttons_and_sliders_change_what_is_shown(window):
     assert window.model.viewing.choice == Choice(removed=frozenset({1}), hidden=frozenset({2}))
     panel.follow()
     assert "~~cup~~ removed" in panel._legend.content and "~~box~~ |" in panel._legend.content
-    panel._slide(rest=0.4)
+    panel._slide(faded_opacity=0.4)
     panel._slide(min_opacity=0.1)
     panel.show_all.cb_hook(panel.show_all)
-    assert window.model.viewing.choice == Choice(rest=0.4, min_opacity=0.1)
+    assert window.model.viewing.choice == Choice(faded_opacity=0.4, min_opacity=0.1)
     for _ in range(2):  # pressed as viser does it: the same button twice
         window.model.viewing.choice = Choice()
         panel.look.gui_handle._impl.value = "Isolate"
@@ -170,7 +170,7 @@ def test_buttons_and_sliders_change_what_is_shown(window):
 
 def test_the_export_holds_what_is_shown_in_full(window, finished):
     panel, ids = window.panel, window.model.class_ids
-    panel.choose(Choice(rest=0.5).isolate(1))
+    panel.choose(Choice(faded_opacity=0.5).isolate(1))
     first, second = panel.files.write(), panel.files.write()
     assert first == finished.parent / "exports/shown_cup.ply" and second.name == "shown_cup_2.ply"
     surfels, classes = read_ply(first)

@@ -57,7 +57,7 @@ def joined(*parts: Surfels) -> Surfels:
 
 def test_nothing_chosen_shows_everything_without_copying():
     surfels, ids = discs()
-    scene = shown(surfels, ids, Choice(rest=0.3))
+    scene = shown(surfels, ids, Choice(faded_opacity=0.3))
     assert scene.surfels is surfels and scene.index is None
 
 
@@ -91,14 +91,14 @@ def test_choices_leave_these_classes(choice, classes):
 
 def test_the_rest_fades_and_what_is_removed_stays_away():
     surfels, ids = discs()
-    choice = Choice(rest=0.25).isolate(1).remove(2)
+    choice = Choice(faded_opacity=0.25).isolate(1).remove(2)
     scene = shown(surfels, ids, choice)
     before = opacities(surfels.opacity_logits)[scene.index]
     factor = torch.where(scene.class_ids == 1, 1.0, 0.25)
     assert set(scene.class_ids.tolist()) == {0, 1}
     torch.testing.assert_close(opacities(scene.surfels.opacity_logits), before * factor, rtol=1e-5, atol=1e-6)
     assert set(shown(surfels, ids, choice, rest=False).class_ids.tolist()) == {1}
-    assert shown(surfels, ids, Choice(rest=1.0).hide(1)).surfels.opacity_logits.equal(surfels.opacity_logits)
+    assert shown(surfels, ids, Choice(faded_opacity=1.0).hide(1)).surfels.opacity_logits.equal(surfels.opacity_logits)
 
 
 def test_the_least_opacity_and_a_crop_box_leave_surfels_out():

@@ -1,4 +1,4 @@
-"""What a checkpoint must hold of a scene."""
+"""Checkpoints are checked for what a scene needs."""
 
 from __future__ import annotations
 

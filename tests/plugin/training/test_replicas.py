@@ -1,4 +1,4 @@
-"""Where a run trains by default, and a whole training in two processes through nerfstudio's launcher."""
+"""The default device of a run, and a whole training in two processes through nerfstudio's launcher."""
 
 from __future__ import annotations
 
