@@ -14,9 +14,9 @@ from beags_plugin.core.surfels import Surfels, opacities
 class Choice:
     """The parts of a scene to look at; every method returns another choice and leaves the scene alone.
 
-    hidden: class ids that belong to the rest. removed: class ids that are gone, whatever ``faded_opacity`` is. isolated: the one
-    class that does not belong to the rest; None: all but the hidden. faded_opacity: 0..1, factor of the rest's opacity; 0 leaves
-    it out. min_opacity: 0..1, weaker Gaussians are left out.
+    hidden: class ids that belong to the rest. removed: class ids that are gone, whatever ``faded_opacity`` is.
+    isolated: the one class that does not belong to the rest; None: all but the hidden. faded_opacity: 0..1, factor of
+    the rest's opacity; 0 leaves it out. min_opacity: 0..1, weaker Gaussians are left out.
     """
 
     hidden: frozenset[int] = frozenset()
