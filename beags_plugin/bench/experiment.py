@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from beags_plugin.system.errors import UserError
-from beags_plugin.system.shipped import read_toml, shipped_folder
+from beags_plugin.system.errors import UserError, check_choice
+from beags_plugin.system.shipped import read_toml, shipped_folder, shipped_names
 
 PHASES = ("base", "refine", "both")
 DAMAGE = "damage"  # the axis that is no config key: the degree of mask damage
@@ -81,7 +81,7 @@ class Experiment:
 
 def experiment_names() -> list[str]:
     """Return the names of the experiments that ship with the package."""
-    return sorted(path.stem for path in shipped_folder("experiments").glob("*.toml"))
+    return shipped_names("experiments")
 
 
 def load_experiment(name: str) -> Experiment:
@@ -91,10 +91,8 @@ def load_experiment(name: str) -> Experiment:
     there is no such experiment, or its file has a mistake.
     """
     path = Path(name) if name.endswith(".toml") else shipped_folder("experiments") / f"{name}.toml"
-    if not name.endswith(".toml") and name not in experiment_names():
-        raise UserError(
-            f"there is no experiment {name!r}: choose one of {', '.join(experiment_names())}, or name a .toml file."
-        )
+    if not name.endswith(".toml"):
+        check_choice(name, experiment_names(), "experiment", more=", or name a .toml file")
     experiment = _Reader(path).experiment()
     check_keys(experiment, path)
     return experiment
@@ -104,10 +102,10 @@ def check_keys(experiment: Experiment, source: Path) -> None:
     """Raise ``UserError`` unless the preset exists and takes every override of every variant."""
     from beags_plugin.plugin.presets import preset_config, preset_names
 
-    if experiment.preset not in preset_names():
-        raise UserError(
-            f"{source}: there is no preset {experiment.preset!r}: choose one of {', '.join(preset_names())}."
-        )
+    try:
+        check_choice(experiment.preset, preset_names(), "preset")
+    except UserError as error:
+        raise UserError(f"{source}: {error}") from None
     for variant in experiment.variants:
         for overrides in (variant.base, variant.refine):
             preset_config(experiment.preset, overrides, source)

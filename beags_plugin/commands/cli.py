@@ -6,6 +6,7 @@ import json
 import sys
 import warnings
 from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Literal, NoReturn
 
@@ -15,10 +16,12 @@ from rich.markup import escape
 
 from beags_plugin.bench.commands import Measurement
 from beags_plugin.commands.masks import Masks
+from beags_plugin.commands.starting import starting
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.pictures.options import RenderOptions
 from beags_plugin.system.errors import UserError, refused
+from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
 
 CONSOLE = Console(soft_wrap=True, highlight=False)
@@ -42,8 +45,8 @@ class Demo:
     """Train again even if the same demo has been trained before."""
 
     def run(self) -> None:
-        from beags_plugin.commands.demo import run_demo
-
+        with starting(self):
+            from beags_plugin.commands.demo import run_demo
         run_demo(self.data, self.output, self.preset, self.downscale, self.seed, self.fresh)
 
 
@@ -61,8 +64,8 @@ class Resume:
     """Do not begin where hardly any memory or disk is free; save and stop when memory runs out."""
 
     def run(self) -> None:
-        from beags_plugin.plugin.runs.launch import resume
-
+        with starting(self):
+            from beags_plugin.plugin.runs.launch import resume
         try:
             resume(self.run_folder, self.device, self.check_memory)
         except KeyboardInterrupt:
@@ -87,8 +90,8 @@ class Sample:
     """Views to train on; 12 more are held out."""
 
     def run(self) -> None:
-        from beags_plugin.sample.writer import make_sample
-
+        with starting(self):
+            from beags_plugin.sample.writer import make_sample
         make_sample(self.output, self.seed, self.width, self.height, self.degradation, self.views)
         CONSOLE.print(f"sample: {self.output}", markup=False)
 
@@ -109,9 +112,8 @@ class Extract:
     """File that lists what was written."""
 
     def run(self) -> None:
-        from beags_plugin.plugin.objects.extract import extract_objects
-        from beags_plugin.system.progress import progress_bar
-
+        with starting(self):
+            from beags_plugin.plugin.objects.extract import extract_objects
         with progress_bar("extracting") as progress:
             extracted = extract_objects(self.load_config, self.object, self.remove, self.output, progress)
         write_json(self.json, [vars(done) for done in extracted])
@@ -145,9 +147,8 @@ class Export:
     mesh: tyro.conf.OmitArgPrefixes[MeshOptions] = MeshOptions()
 
     def run(self) -> None:
-        from beags_plugin.plugin.objects.export import export_run
-        from beags_plugin.system.progress import progress_bar
-
+        with starting(self):
+            from beags_plugin.plugin.objects.export import export_run
         options = {name: asdict(self.mesh) for name in ("glb", "obj")}
         with progress_bar("exporting") as progress:
             exported = export_run(
@@ -176,9 +177,8 @@ class Render:
     options: tyro.conf.OmitArgPrefixes[RenderOptions] = RenderOptions()
 
     def run(self) -> None:
-        from beags_plugin.plugin.objects.render import render_run
-        from beags_plugin.system.progress import progress_bar
-
+        with starting(self):
+            from beags_plugin.plugin.objects.render import render_run
         with progress_bar("rendering") as progress:
             path = render_run(self.load_config, self.object, self.format, self.output, self.options, progress)
         CONSOLE.print(f"{self.format}: {path}", markup=False)
@@ -206,8 +206,8 @@ class Eval:
     protocol: tyro.conf.OmitArgPrefixes[Protocol] = Protocol()
 
     def run(self) -> None:
-        from beags_plugin.commands.evaluate import Outputs, run_evaluation
-
+        with starting(self):
+            from beags_plugin.commands.evaluate import Outputs, run_evaluation
         outputs = Outputs(self.json, self.csv, self.picture, self.worst)
         run_evaluation(self.load_config, self.data_set_name, self.protocol, outputs)
 
@@ -236,12 +236,16 @@ class Doctor:
     """File for the same."""
 
     def run(self) -> None:
-        from beags_plugin.commands.doctor.check import print_report
+        from beags_plugin.commands.doctor.check import print_check
         from beags_plugin.commands.doctor.diagnosis import checks_of_data, diagnose
 
-        checks = diagnose() + (checks_of_data(self.data) if self.data is not None else [])
+        with starting(self):
+            pass
+        checks = []
+        for check in chain(diagnose(), checks_of_data(self.data)):
+            print_check(check)
+            checks.append(check)
         write_json(self.json, [asdict(check) for check in checks])
-        print_report(checks)
 
 
 def write_json(path: Path | None, content: object) -> None:

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from beags_plugin.system.child_processes import bound
 from beags_plugin.system.digests import code_digest, folder_digest, value_digest
-from beags_plugin.system.errors import UserError
+from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.lock import run_lock
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
@@ -78,8 +78,7 @@ def check_preset(preset: str) -> None:
     """Raise ``UserError`` unless the preset trains a base and refines it, which is what the demo compares."""
     from beags_plugin.plugin.presets import load_preset, preset_names
 
-    if preset not in preset_names():
-        raise UserError(f"there is no preset {preset!r}: choose one of {', '.join(preset_names())}.")
+    check_choice(preset, preset_names(), "preset")
     model = cast("BeagsModelConfig", load_preset(preset).config.pipeline.model)
     if not (model.base_steps and model.refine_steps):
         raise UserError(f"the demo compares a base with its refinement, and {preset} trains only one: take beags-tiny.")

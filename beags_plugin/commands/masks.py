@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from beags_plugin.commands.starting import starting
 from beags_plugin.system.errors import UserError
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
@@ -41,11 +42,16 @@ class Check:
     """Folder for report.json, coverage.png and contradicted.png."""
 
     def run(self) -> None:
-        from beags_plugin.plugin.objects.check_masks import check_scene, check_with_run, options_beside, write_report
-        from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, reproject_run
-
         if self.data is None and self.load_config is None:
             raise UserError("no scene is named: give --data its folder, or --load-config a run trained on it.")
+        with starting(self):
+            from beags_plugin.plugin.objects.check_masks import (
+                check_scene,
+                check_with_run,
+                options_beside,
+                write_report,
+            )
+            from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, reproject_run
         names = ("layout", "images_path", "masks_path", "classes_path", "ignore_ids")
         parser = options_beside(self.load_config, self.data, **{name: getattr(self, name) for name in names})
         report = check_scene(parser, self.min_views)
@@ -90,10 +96,14 @@ class Reproject:
     """Folder for masks, confidence, classes.json, report.json, before_after.png; reprojected/ beside config.yml."""
 
     def run(self) -> None:
-        from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, reproject_run, write_reprojection
-
         if not 0.0 <= self.min_confidence <= 1.0:
             raise UserError(f"min_confidence is {self.min_confidence}: it must be a share of the votes, 0 to 1.")
+        with starting(self):
+            from beags_plugin.plugin.objects.reproject_masks import (
+                ReprojectionOptions,
+                reproject_run,
+                write_reprojection,
+            )
         options = ReprojectionOptions(
             self.masks_path, self.classes_path, self.method, self.tau, self.depth, self.run_size
         )
@@ -127,11 +137,11 @@ class Make:
     """Folder of the images, if not the layout's own."""
 
     def run(self) -> None:
-        from beags_plugin.plugin.objects.check_masks import data_options
-        from beags_plugin.plugin.objects.make_masks import configured_source, make_masks
-
         if self.snap < 0:
             raise UserError(f"snap is {self.snap}: give a radius in pixels, or 0.")
+        with starting(self):
+            from beags_plugin.plugin.objects.check_masks import data_options
+            from beags_plugin.plugin.objects.make_masks import configured_source, make_masks
         source = configured_source(self.source, self.options)
         data = data_options(self.data, self.layout, self.images_path)
         for line in make_masks(data, source, self.load_config, self.output, self.overwrite, self.snap):

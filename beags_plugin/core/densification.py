@@ -29,26 +29,26 @@ COINCIDENT = 1e-7  # smallest initial scale relative to the cloud's size: coinci
 
 @dataclass(frozen=True)
 class DensifyConfig:
-    """Options of densification; scales are relative to the scene's extent.
-
-    every, start, stop: densify at multiples of ``every`` between ``start`` and ``stop``, both excluded (as officially).
-    prune_scale_after: surfels larger than ``PRUNE_SCALE`` go after this step.
-    far_limits: ``CLONE_SCALE`` and ``PRUNE_SCALE`` are relative to the distance of the nearest camera if that exceeds
-        the scene's extent, for far backgrounds and forward-facing captures; False, as officially: to the extent alone.
-    reset_every: steps between resets of opacities to at most ``RESET_OPACITY``; 0 never.
-    max_surfels: bound of the number of surfels; 0 sets none.
-    pixels_per_surfel: training pixels that each surfel needs at least, against overfitting of few images; 0, as
-        officially, sets no bound.
-    """
+    """Options of densification; steps are stated for a base of schedule_steps."""
 
     every: int = 100
+    """Steps between two rounds of growth and pruning."""
     start: int = 500
+    """They begin after this step."""
     stop: int = 15_000
+    """They end before this step."""
     prune_scale_after: int = 3_000
+    """Gaussians larger than a tenth of the scene's extent go after this step."""
     reset_every: int = 3_000
+    """Steps between resets of all opacities to at most 0.01; 0 never."""
     far_limits: bool = False
+    """Measure the sizes from which Gaussians are split and pruned by the distance of the nearest camera where that
+    exceeds the scene's extent, for far backgrounds; False, as officially, by the extent alone."""
     max_surfels: int = 0
+    """Bound of the number of Gaussians, which bounds time and memory; 0 sets none."""
     pixels_per_surfel: float = 0.0
+    """Training pixels that each Gaussian needs at least, against overfitting of few images; 0, as officially, sets no
+    bound."""
 
     def scaled(self, factor: float) -> DensifyConfig:
         """Return the same for a run ``factor`` times as long: its steps are scaled, within the smallest intervals."""

@@ -14,7 +14,7 @@ from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import Viewpoints
 from beags_plugin.extraction.frames import to_input_frame
-from beags_plugin.system.errors import UserError
+from beags_plugin.system.errors import check_choice
 
 Placement = Literal["world", "object"]
 _BULK = 0.01  # share of the surfels at each side that do not count for the size of the item: some are strays
@@ -67,8 +67,7 @@ class Frame:
 
 def check_placement(placement: str) -> None:
     """Raise ``UserError`` unless ``placement`` is one of ``Placement``."""
-    if placement not in get_args(Placement):
-        raise UserError(f"there is no frame {placement!r}: choose one of {', '.join(get_args(Placement))}.")
+    check_choice(placement, get_args(Placement), "frame")
 
 
 def bounding_box(surfels: Surfels) -> tuple[Tensor, Tensor]:

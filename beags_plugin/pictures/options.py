@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from beags_plugin.system.errors import UserError
+from beags_plugin.system.errors import UserError, check_choice
 
 PictureFormat = Literal["video", "sheet", "before-after"]
 Background = Literal["white", "black", "checker"]
@@ -32,10 +32,7 @@ class RenderOptions:
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that cannot be used."""
-        if self.background not in get_args(Background):
-            raise UserError(
-                f"there is no background {self.background!r}: choose one of {', '.join(get_args(Background))}."
-            )
+        check_choice(self.background, get_args(Background), "background")
         for name, lowest, highest in (("frames", 1, 10_000), ("views", 1, 360), ("fps", 1, 240)):
             if not lowest <= (value := getattr(self, name)) <= highest:
                 raise UserError(f"{name} is {value}: give a number from {lowest} to {highest}.")

@@ -11,7 +11,7 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from beags_plugin.plugin.options.config import BeagsTrainerConfig, base_config
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.shipped import read_toml, shipped_folder
+from beags_plugin.system.shipped import read_toml, shipped_folder, shipped_names
 
 FIRST_OPTIONS = """
 The options that people set first, by what they are about:
@@ -34,7 +34,7 @@ def preset_folder() -> Path:
 
 def preset_names() -> list[str]:
     """Return the names of all presets."""
-    return sorted(path.stem for path in preset_folder().glob("*.toml"))
+    return shipped_names("method_configs")
 
 
 def load_preset(name: str, folder: Path | None = None) -> MethodSpecification:

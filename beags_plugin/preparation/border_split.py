@@ -30,12 +30,10 @@ MIN_SIGMA = 0.7  # pixels that the longer scale of a split Gaussian exceeds in i
 
 @dataclass(frozen=True)
 class BorderSplitConfig:
-    """Options of splitting Gaussians in two, along their longer axis, before refinement.
-
-    rounds: number of splits, before classes are assigned again; 0 in the paper.
-    """
+    """Options of splitting Gaussians in two, along their longer axis, before refinement."""
 
     rounds: int = 0
+    """Times that Gaussians at class borders are split in two, before classes are assigned again; 0 in the paper."""
 
     def check(self) -> None:
         """Raise ``UserError`` for a negative number of rounds."""

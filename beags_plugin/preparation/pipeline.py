@@ -40,30 +40,26 @@ LEAST_K = 10  # nearer neighbours measure the noise of the depth rather than the
 
 @dataclass(frozen=True)
 class PreparationConfig:
-    """Options of the stages between base training and refinement.
-
-    reprojection: "pairwise", "voxel" or another name of ``masks.REPROJECTIONS``; "auto" chooses one of these two
-        (``consistent_masks.chosen_reprojection``); "none" keeps the masks.
-    min_confidence: reprojected pixels with a smaller share of votes for the winner are IGNORE to the losses.
-    tau: pairwise: a vote counts if its point is visible: |z - D| <= tau z; infinity counts every vote (E5).
-    depth: the lifted depth, "median" or "expected": see ``rasterizers.rendering.surface_depth``.
-    k: neighbours that set the voxel size (E8).
-    k_pixels: training pixels for which k is stated; with fewer, k shrinks in proportion, so that voxels keep their
-        size. 0, as in the paper, takes k as it is.
-    """
+    """Options of the stages between base training and refinement."""
 
     reprojection: str = AUTO
+    """How the views' masks are made to agree: pairwise (exact), voxel (quick), auto (the one that fits the number of
+    views), none (the masks stay as they are), or a registered one."""
     min_confidence: float = 0.0
+    """Reprojected pixels whose winner has a smaller share of the votes are left out of the losses."""
     tau: float = 0.02
+    """pairwise: a vote counts if its point is visible, |z - depth| <= tau z; inf counts every vote (E5)."""
     depth: str = "median"
+    """Which depth is lifted: median or expected."""
     k: int = 2000
+    """Neighbours that set the voxel size (E8); more make larger voxels."""
     k_pixels: int = 0
+    """Training pixels for which k is stated; with fewer, k shrinks in proportion, so that voxels keep their size. 0, as
+    in the paper, takes k as it is."""
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that a stage would refuse, hours before that stage."""
-        choices = [AUTO, "none", *REPROJECTIONS.names()]
-        if self.reprojection not in choices:
-            raise UserError(f"there is no reprojection {self.reprojection!r}: choose one of {', '.join(choices)}.")
+        REPROJECTIONS.check(self.reprojection, AUTO, "none")
         if self.reprojection not in (AUTO, "none"):
             REPROJECTIONS.get(self.reprojection)  # that of another package may not load
         if not 0.0 <= self.min_confidence <= 1.0:

@@ -10,7 +10,7 @@ from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings, SurfelInputs
-from beags_plugin.system.errors import UserError
+from beags_plugin.system.errors import check_choice
 
 SURFACE_DEPTHS = ("median", "expected")
 """Which of E4's depths stands for the surface where pixels are lifted into space."""
@@ -52,8 +52,7 @@ def render_class_map(
 
 def check_surface_depth(kind: str) -> None:
     """Raise ``UserError`` unless ``kind`` is one of ``SURFACE_DEPTHS``."""
-    if kind not in SURFACE_DEPTHS:
-        raise UserError(f"there is no surface depth {kind!r}: choose one of {', '.join(SURFACE_DEPTHS)}.")
+    check_choice(kind, SURFACE_DEPTHS, "surface depth")
 
 
 def surface_depth(render: RasterOutputs, kind: str) -> Tensor:

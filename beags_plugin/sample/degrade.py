@@ -8,12 +8,13 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
 from beags_plugin.sample.textures import Noise
-from beags_plugin.system.errors import UserError
+from beags_plugin.system.errors import UserError, check_choice
 
 
 @dataclass(frozen=True)
@@ -65,16 +66,11 @@ def degradation_of_degree(degree: float) -> Degradation:
 def resolve_degradation(degradation: str | Degradation) -> Degradation:
     """Return a preset or a degree (a number) by name, or a custom one; raise ``UserError`` for an invalid one."""
     if isinstance(degradation, str):
-        if degradation in PRESETS:
-            return PRESETS[degradation]
-        try:
-            degree = float(degradation)
-        except ValueError:
-            raise UserError(
-                f"there is no mask degradation {degradation!r}: choose one of {', '.join(PRESETS)}, or a degree from "
-                "0 on (1 is mild, 2 strong)."
-            ) from None
-        return degradation_of_degree(degree)
+        with suppress(ValueError):
+            return degradation_of_degree(float(degradation))
+        more = ", or a degree from 0 on (1 is mild, 2 strong)"
+        check_choice(degradation, PRESETS, "mask degradation", more=more)
+        return PRESETS[degradation]
     for name in ("rim", "dropped", "swapped"):
         value = getattr(degradation, name)
         if not 0.0 <= value <= 1.0:

@@ -6,8 +6,9 @@ import errno
 import os
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from difflib import get_close_matches
 from pathlib import Path
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -24,6 +25,19 @@ class UserError(Exception):
     """
 
     reported = False
+
+
+def check_choice(name: str, choices: Iterable[str], kind: str, where: str = "", more: str = "") -> None:
+    """Raise ``UserError`` unless ``name`` is one of the choices; the sentence names the nearest.
+
+    kind: the user's word for a choice ("preset"). where: stands after the name, more after the choices.
+    """
+    if name in (choices := list(choices)):
+        return
+    folded = {choice.casefold(): choice for choice in choices}
+    near = get_close_matches(name.casefold(), folded, n=1, cutoff=0.75)
+    meant = f" (did you mean {folded[near[0]]}?)" if near else ""
+    raise UserError(f"there is no {kind} {name!r}{where}{meant}: choose one of {', '.join(choices)}{more}.")
 
 
 def system_error(error: BaseException) -> OSError | None:

@@ -6,7 +6,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
 
-from beags_plugin.system.errors import UserError
+from beags_plugin.system.errors import UserError, check_choice
 
 
 def load(spec: str) -> Any:
@@ -49,11 +49,13 @@ class Registry:
         self._discover()
         return sorted(self._specs)
 
+    def check(self, name: str, *besides: str) -> None:
+        """Raise ``UserError`` unless ``name`` is registered, or one of the words ``besides``; imports nothing."""
+        check_choice(name, [*besides, *self.names()], self.kind)
+
     def get(self, name: str) -> Any:
         """Import and return what ``name`` stands for; raises ``UserError`` for an unknown name or a spec that fails."""
-        self._discover()
-        if name not in self._specs:
-            raise UserError(f"there is no {self.kind} {name!r}: choose one of {', '.join(self.names())}.")
+        self.check(name)
         try:
             return load(self._specs[name])
         except (ImportError, AttributeError) as error:

@@ -17,6 +17,11 @@ def shipped_folder(name: str) -> Path:
     return installed if installed.is_dir() else _PACKAGE.parent / name
 
 
+def shipped_names(folder: str) -> list[str]:
+    """Return the names of the TOML files of a shipped folder, without suffix, sorted."""
+    return sorted(path.stem for path in shipped_folder(folder).glob("*.toml"))
+
+
 def read_toml(path: Path, what: str) -> dict[str, Any]:
     """Read a TOML file; raises ``UserError`` if it cannot be read. what: for the sentence, e.g. "preset"."""
     try:

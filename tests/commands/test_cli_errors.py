@@ -24,7 +24,8 @@ NO_FILE = "{tmp}/absent.yml cannot be read (No such file or directory): name the
 NO_DATA = "the data folder {tmp}/nowhere does not exist: give --data the folder that holds the scene."
 SENTENCES = {
     # demo
-    "demo --data {tmp}/nowhere": "{tmp}/nowhere is no folder: name one with images, poses and masks.",
+    "demo --data {tmp}/nowhere": NO_DATA,
+    "demo --data {tmp}/file": "{tmp}/file is no folder: name one with images, poses and masks.",
     "demo --preset beags-huge": f"there is no preset 'beags-huge': choose one of {PRESETS}.",
     "demo --preset beags-base": "the demo compares a base with its refinement, and beags-base trains only one: take "
     "beags-tiny.",
@@ -63,8 +64,8 @@ SENTENCES = {
     "extract --load-config {tmp}/absent.yml": NO_FILE,
     "extract --load-config {tmp}/notes.yml": "{tmp}/notes.yml is not a run of ns-train beags: name the config.yml of "
     "one.",
-    f"extract --load-config {RUN} --object unicorn": "there is no object 'unicorn' in {tmp}/run: choose of background, "
-    "cup, box.",
+    f"extract --load-config {RUN} --object unicorn": "there is no object 'unicorn' in {tmp}/run: choose one of "
+    "background, cup, box.",
     "extract --load-config {tmp}/plain/config.yml": "{tmp}/plain is a base without classes: refine it first (ns-train "
     "beags-refine --load-dir {tmp}/plain/nerfstudio_models).",
     f"extract --load-config {RUN} --output {{tmp}}/file/x": "{tmp}/file/x cannot be written (Not a directory): choose "
@@ -81,8 +82,8 @@ SENTENCES = {
     f"export --load-config {RUN} --object cup --json {{tmp}}/file/x.json": "{tmp}/file/x.json cannot be written (File "
     "exists): choose another place.",
     # render
-    f"render --load-config {RUN} --object unicorn": "there is no object 'unicorn' in {tmp}/run: choose of background, "
-    "cup, box.",
+    f"render --load-config {RUN} --object unicorn": "there is no object 'unicorn' in {tmp}/run: choose one of "
+    "background, cup, box.",
     f"render --load-config {RUN} --format hologram": "there is no format 'hologram': choose one of video, sheet, "
     "before-after.",
     f"render --load-config {RUN} --format sheet --output a.mp4": "the picture a.mp4 is no .png or .jpg: give it such a "
@@ -104,8 +105,8 @@ SENTENCES = {
     f"one of {PRESETS}.",
     "bench file {tmp}/absent.toml --output {tmp}/bench": "the experiment {tmp}/absent.toml cannot be read (No such "
     "file or directory): name an existing file of that kind.",
-    "bench file ablatoin --output {tmp}/bench": "there is no experiment 'ablatoin': choose one of ablation, base, "
-    "depth, improvements, masks, presets, sensitivity, tradeoff, or name a .toml file.",
+    "bench file ablatoin --output {tmp}/bench": "there is no experiment 'ablatoin' (did you mean ablation?): "
+    "choose one of ablation, base, depth, improvements, masks, presets, sensitivity, tradeoff, or name a .toml file.",
     # doctor
     "doctor --json {tmp}/file/x.json": "{tmp}/file/x.json cannot be written (File exists): choose another place.",
 }

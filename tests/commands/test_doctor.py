@@ -14,7 +14,7 @@ pytest.importorskip("nerfstudio")
 from run_folders import write_scene
 
 from beags_plugin.commands.doctor import backends, diagnosis
-from beags_plugin.commands.doctor.check import Check, print_report
+from beags_plugin.commands.doctor.check import Check, print_check
 from beags_plugin.rasterizers import RASTERIZERS
 from beags_plugin.system.errors import UserError
 
@@ -89,9 +89,9 @@ def test_a_scene_is_read_and_free_memory_and_disk_are_reported(tmp_path, monkeyp
     assert found["data"].sentence == "7 views to train on, 2 held out"
     assert found["memory"].ok and "GB are free beside this program" in found["memory"].sentence
     monkeypatch.setattr("beags_plugin.system.memory.available_mb", lambda: 20.0)
-    assert not diagnosis.checks_of_data(tmp_path)[1].ok
+    assert not list(diagnosis.checks_of_data(tmp_path))[1].ok
     with pytest.raises(UserError, match="nowhere"):
-        diagnosis.checks_of_data(tmp_path / "nowhere")
+        list(diagnosis.checks_of_data(tmp_path / "nowhere"))
 
 
 def test_the_native_rasterizer_is_tried_with_its_kernels(checks):
@@ -111,7 +111,9 @@ def test_the_report_marks_missing_and_absent_and_folds_long_sentences():
         Check("c", False, "optional", required=False, repair="apt install c"),
         Check("d", True, "x" * 200),
     ]
-    print_report(found, Console(file=out, width=60))
+    console = Console(file=out, width=60)
+    for check in found:
+        print_check(check, console)
     lines = [" ".join(line.split()) for line in out.getvalue().splitlines()]
     assert lines[:4] == ["ok a fine", "missing b [gone]", "absent c optional", "repair: apt install c"]
     assert out.getvalue().count("x") == 200

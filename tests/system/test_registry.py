@@ -38,7 +38,7 @@ def test_a_spec_that_fails_is_named(spec):
 
 
 def test_an_unknown_name_lists_the_known_ones():
-    with pytest.raises(UserError, match="no thing 'orderd': choose one of a, ordered"):
+    with pytest.raises(UserError, match="no thing 'orderd' .did you mean ordered.*: choose one of a, ordered"):
         _registry(a="math:pi").get("orderd")
 
 

@@ -30,19 +30,17 @@ def first_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {text.splitlines()[0]}" if text else type(error).__name__
 
 
-def print_report(checks: list[Check], console: Console | None = None) -> None:
-    """Print the checks as a table: "ok", "missing" (beags cannot run) or "absent" (something optional).
-
-    The command that repairs a failed check stands below it.
-    """
+def print_check(check: Check, console: Console | None = None) -> None:
+    """Print a check: "ok", "missing" (beags cannot run) or "absent" (something optional), and below it the repair."""
     from rich.console import Console
     from rich.table import Column, Table
     from rich.text import Text
 
-    table = Table("", "", Column(overflow="fold"), show_header=False, box=None, padding=(0, 1))
-    for check in checks:
-        word, style = ("ok", "green") if check.ok else ("missing", "red") if check.required else ("absent", "yellow")
-        table.add_row(Text(word, style=style), Text(check.name), Text(check.sentence))
-        if check.repair:
-            table.add_row("", "", Text(f"repair: {check.repair}", style="bold"))
+    table = Table(
+        Column(width=7), Column(width=18), Column(overflow="fold"), show_header=False, box=None, padding=(0, 1)
+    )
+    word, style = ("ok", "green") if check.ok else ("missing", "red") if check.required else ("absent", "yellow")
+    table.add_row(Text(word, style=style), Text(check.name), Text(check.sentence))
+    if check.repair:
+        table.add_row("", "", Text(f"repair: {check.repair}", style="bold"))
     (console or Console()).print(table)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from beags_plugin.commands.doctor.backends import rasterizers
@@ -20,17 +20,20 @@ _REPAIRS = {  # by the name of a check that raises
 }
 
 
-def diagnose() -> list[Check]:
-    """Check everything that beags uses; never fails, whatever is missing or broken."""
-    checks = [_python, _torch, _nerfstudio, _presets, _opencv, _open3d, _cuda, _nvcc, *rasterizers()]
-    return [_safely(check) for check in checks]
+def diagnose() -> Iterator[Check]:
+    """Check everything that beags uses, the quick ones first; never fails, whatever is missing or broken."""
+    for check in (_python, _nvcc, _presets, _opencv, _torch, _cuda, _nerfstudio, _open3d):
+        yield _safely(check)
+    yield from map(_safely, rasterizers())
 
 
-def checks_of_data(data: Path) -> list[Check]:
-    """Check that a scene can be read, and that memory and disk are free for a training on it.
+def checks_of_data(data: Path | None) -> Iterator[Check]:
+    """Check that a scene can be read, and that memory and disk are free for a training on it; nothing without one.
 
     Raises ``UserError`` for bad data.
     """
+    if data is None:
+        return
     import tempfile
 
     from beags_plugin.plugin.options.config import base_config
@@ -45,13 +48,9 @@ def checks_of_data(data: Path) -> list[Check]:
         "disk": (free_disk_mb(output := base_config().output_dir), f"for {output}"),
         "temporary disk": (free_disk_mb(temporary := Path(tempfile.gettempdir())), f"for {temporary}"),
     }
-    return [
-        Check("data", True, f"{train} views to train on, {held_out} held out"),
-        *(
-            Check(name, amount >= LEAST_FREE_MB, f"{amount / 1000:.1f} GB are free {place}", False)
-            for name, (amount, place) in free.items()
-        ),
-    ]
+    yield Check("data", True, f"{train} views to train on, {held_out} held out")
+    for name, (amount, place) in free.items():
+        yield Check(name, amount >= LEAST_FREE_MB, f"{amount / 1000:.1f} GB are free {place}", False)
 
 
 def _safely(check: Callable[[], Check]) -> Check:

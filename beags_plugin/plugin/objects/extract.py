@@ -21,7 +21,7 @@ from beags_plugin.plugin.runs.read import (
     read_transform,
 )
 from beags_plugin.plugin.runs.write import write_run
-from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.errors import UserError, check_choice, writing
 from beags_plugin.system.whole_files import write_text_atomically
 
 
@@ -80,8 +80,8 @@ def extract_objects(
 def objects_with_gaussians(scene: SavedScene, objects: Sequence[str], run: Path) -> dict[str, int]:
     """Return name to class id of all classes with Gaussians; raises ``UserError`` if one of ``objects`` has none."""
     ids = {name: index for index, name in scene.classes.items()}
-    if unknown := [name for name in objects if name not in ids]:
-        raise UserError(f"there is no object {unknown[0]!r} in {run}: choose of {', '.join(ids)}.")
+    for name in objects:
+        check_choice(name, ids, "object", f" in {run}")
     present = {name: index for name, index in ids.items() if bool((scene.state["class_ids"] == index).any())}
     if absent := [name for name in objects if name not in present]:
         raise UserError(f"no Gaussian belongs to {absent[0]!r}: its masks cover too little of the scene.")

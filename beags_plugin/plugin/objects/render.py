@@ -18,7 +18,7 @@ from beags_plugin.plugin.objects.extract import folder_names, objects_with_gauss
 from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT
 from beags_plugin.plugin.runs.read import SavedScene, raster_settings, read_assigned_run, training_viewpoints
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.system.errors import UserError
+from beags_plugin.system.errors import UserError, check_choice
 
 _PICTURES = (".png", ".jpg", ".jpeg")
 
@@ -40,8 +40,7 @@ def render_run(
     """
     options = options or RenderOptions()
     options.check()
-    if form not in get_args(PictureFormat):
-        raise UserError(f"there is no format {form!r}: choose one of {', '.join(get_args(PictureFormat))}.")
+    check_choice(form, get_args(PictureFormat), "format")
     scene = read_assigned_run(config_path)
     present = objects_with_gaussians(scene, objects, config_path.parent)
     names = list(dict.fromkeys(objects)) or [name for name, class_id in present.items() if class_id != 0]

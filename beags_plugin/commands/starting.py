@@ -1,0 +1,80 @@
+"""What every command does first: refuse what can be refused at once, and show that it has begun.
+
+torch and nerfstudio take seconds to import. What is checked here is checked again, whole, by whoever uses it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, get_args
+
+import yaml
+from rich.console import Console
+
+from beags_plugin.data import LAYOUTS
+from beags_plugin.export import EXPORTERS
+from beags_plugin.masks import REPROJECTIONS
+from beags_plugin.masks.sources import MASK_SOURCES
+from beags_plugin.pictures.options import PictureFormat, RenderOptions
+from beags_plugin.system.errors import UserError, check_choice
+from beags_plugin.system.reading.text import reason
+from beags_plugin.system.shipped import shipped_names
+
+CONFIG_FILE = "config.yml"
+LARGEST_CONFIG = 1 << 20  # bytes; that of a run has some 20,000
+
+
+@contextmanager
+def starting(command: Any) -> Iterator[None]:
+    """Check the arguments of a command; then show a spinner while the block imports what the command needs.
+
+    A run that is named by its folder becomes its config.yml. Raises ``UserError``.
+    """
+    check_arguments(command)
+    with Console(stderr=True).status("starting"):
+        yield
+
+
+def check_arguments(command: Any) -> None:
+    """Raise ``UserError`` for a run, scene or name among the fields of a command that cannot be used."""
+    values = vars(command)
+    if load_config := values.get("load_config"):
+        single = isinstance(load_config, Path)
+        found = tuple(run_config(path) for path in ([load_config] if single else load_config))
+        command.load_config = found[0] if single else found
+    if (run := values.get("run_folder")) is not None:
+        run_config(run)
+    if (data := values.get("data")) is not None and not data.exists():
+        raise UserError(f"the data folder {data} does not exist: give --data the folder that holds the scene.")
+    if (preset := values.get("preset")) is not None:
+        check_choice(preset, shipped_names("method_configs"), "preset")
+    if (method := values.get("method")) not in (None, "auto", "none"):
+        REPROJECTIONS.check(method, "auto", "none")
+    if (layout := values.get("layout")) not in (None, "auto"):
+        LAYOUTS.check(layout, "auto")
+    if (source := values.get("source")) is not None:
+        MASK_SOURCES.check(source)
+    if isinstance(options := values.get("options"), RenderOptions):
+        check_choice(values["format"], get_args(PictureFormat), "format")
+        options.check()
+    else:
+        for name in values.get("format", ()):
+            EXPORTERS.check(name)
+
+
+def run_config(path: Path) -> Path:
+    """Return the config.yml of a run, named by itself or by its folder; raises ``UserError`` for another file."""
+    path = path / CONFIG_FILE if path.is_dir() else path
+    try:
+        with path.open("rb") as file:
+            text = file.read(LARGEST_CONFIG)
+        root = yaml.compose(text)
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({reason(error)}): name the config.yml of a run.") from error
+    except (yaml.YAMLError, ValueError, RecursionError):
+        return path  # its reader has a sentence for it
+    if root is None or not root.tag.startswith("tag:yaml.org,2002:python/object:"):
+        raise UserError(f"{path} is not a run of ns-train beags: name the config.yml of one.")
+    return path

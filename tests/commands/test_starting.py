@@ -1,0 +1,95 @@
+"""Mistakes are refused before torch is imported, and a command shows at once that it has begun."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import subprocess
+import sys
+
+import pytest
+from run_folders import write_scene, write_trained
+
+from beags_plugin.commands.starting import check_arguments, run_config
+from beags_plugin.system.errors import UserError, check_choice
+
+pytest.importorskip("nerfstudio")
+
+RUN = "{tmp}/run"
+AT_ONCE = {  # arguments: the beginning of the sentence
+    "demo --data {tmp}/nowhere": "the data folder {tmp}/nowhere does not exist",
+    "demo --preset beags-fats": "there is no preset 'beags-fats' (did you mean beags-fast?)",
+    "resume {tmp}/absent.yml": "{tmp}/absent.yml cannot be read",
+    "masks check --data {tmp}/nowhere": "the data folder {tmp}/nowhere does not exist",
+    "masks check --data {tmp}/lab --layout colmpa": "there is no layout 'colmpa' (did you mean colmap?)",
+    "masks make --data {tmp}/lab --source grabcat": "there is no mask source 'grabcat' (did you mean grabcut?)",
+    f"masks reproject --load-config {RUN} --method voxle": "there is no reprojection 'voxle' (did you mean voxel?)",
+    "extract --load-config {tmp}/absent.yml": "{tmp}/absent.yml cannot be read",
+    "extract --load-config {tmp}/lab": "{tmp}/lab/config.yml cannot be read",
+    f"export --load-config {RUN} --all --format stl": "there is no exporter 'stl'",
+    "render --load-config {tmp}/notes.yml": "{tmp}/notes.yml is not a run of ns-train beags",
+    f"render --load-config {RUN} --format sheets": "there is no format 'sheets' (did you mean sheet?)",
+    "eval --load-config {tmp}/run {tmp}/notes.yml": "{tmp}/notes.yml is not a run of ns-train beags",
+    "doctor --data {tmp}/nowhere": "the data folder {tmp}/nowhere does not exist",
+}
+SCRIPT = """
+import contextlib, io, json, sys
+from beags_plugin.commands import cli
+said = []
+for arguments in json.load(sys.stdin):
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit):
+        cli.CONSOLE.file = out
+        cli.main(arguments)
+    heavy = sorted({"torch", "nerfstudio", "open3d", "cv2"} & set(sys.modules))
+    said.append([out.getvalue(), heavy])
+json.dump(said, sys.__stdout__)
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    root = tmp_path_factory.mktemp("starting")
+    write_trained(root / "run", write_scene(root / "lab"))
+    (root / "notes.yml").write_text("a: 1")
+    return root
+
+
+def test_mistakes_are_refused_before_anything_heavy_is_imported(folder):
+    arguments = json.dumps([row.replace("{tmp}", str(folder)).split() for row in AT_ONCE])
+    done = subprocess.run([sys.executable, "-c", SCRIPT], input=arguments, capture_output=True, text=True, check=True)
+    for (row, sentence), (said, heavy) in zip(AT_ONCE.items(), json.loads(done.stdout), strict=True):
+        assert said.replace(str(folder), "{tmp}").startswith(f"beags: {sentence}"), f"{row}: {said}"
+        assert not heavy, f"{row} imported {heavy} first"
+
+
+def test_a_terminal_shows_that_the_command_has_begun(folder):
+    controller, terminal = pty.openpty()
+    command = [sys.executable, "-m", "beags_plugin.commands.cli", "extract", "--load-config", str(folder / "run")]
+    with subprocess.Popen(command, stdin=terminal, stdout=terminal, stderr=terminal, cwd=folder) as process:
+        os.close(terminal)
+        first = b""
+        while b"starting" not in first and (more := os.read(controller, 1024)):
+            first += more
+        process.kill()
+    os.close(controller)
+    assert b"extracting" not in first and b"Gaussians" not in first
+
+
+def test_a_run_may_be_named_by_its_folder(folder):
+    assert run_config(folder / "run") == run_config(folder / "run/config.yml") == folder / "run/config.yml"
+
+
+def test_a_command_without_such_arguments_passes():
+    class Sample:
+        width = 256
+
+    check_arguments(Sample())
+
+
+def test_the_nearest_choice_is_named_whatever_its_case():
+    with pytest.raises(
+        UserError, match=r"^there is no object 'Milk' in it \(did you mean milk\?\): choose one of milk, lemon\.$"
+    ):
+        check_choice("Milk", ["milk", "lemon"], "object", " in it")
+    check_choice("milk", ["milk"], "object")
