@@ -13,18 +13,21 @@ from beags_plugin.plugin.options.config import BeagsTrainerConfig, base_config
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.shipped import read_toml, shipped_folder, shipped_names
 
-FIRST_OPTIONS = """
-The options that people set first, by what they are about:
-  data     --data FOLDER; at the end of the command: beags-data --masks-path FOLDER --downscale-factor 2
-  start    --load-dir RUN/nerfstudio_models, or --pipeline.model.start-from SCENE.ply
-  length   --pipeline.model.base-steps 30000, --pipeline.model.refine-steps 3000
-  size     --pipeline.model.densify.max-surfels 200000
-  method   --pipeline.model.refiner bea, --pipeline.model.prepare.reprojection auto
-  output   --run-dir FOLDER, --vis viewer+tensorboard
-
-All options follow; docs/training.md describes the method's own.
-"""
-"""Text above the help of ``ns-train beags``."""
+FIRST_OPTIONS = {
+    "--data FOLDER": "the scene: photos, poses, masks",
+    "--load-dir RUN/nerfstudio_models": "refine, or go on with, a run on the same data",
+    "--pipeline.model.start-from FILE": "refine a scene of another program (.ply)",
+    "--pipeline.model.base-steps N": "length of the base; its schedule is scaled",
+    "--pipeline.model.refine-steps N": "length of the refinement; 0 trains a base only",
+    "--pipeline.model.densify.max-surfels N": "most Gaussians: bounds time and memory",
+    "--run-dir FOLDER": "where the run goes",
+    "--vis viewer+tensorboard": "what to watch it with",
+    "--machine.device-type cpu|cuda": "where it is trained",
+    "beags-data --masks-path FOLDER": "the id images, if not masks/",
+    "beags-data --ignore-ids ID ...": 'ids in the masks that mean "not labelled"',
+    "beags-data --downscale-factor 2": "smaller photos: less time, less detail",
+}
+"""The options that people set first, with their use; those of beags-data stand at the end of the command."""
 
 
 def preset_folder() -> Path:
@@ -51,8 +54,15 @@ def load_preset(name: str, folder: Path | None = None) -> MethodSpecification:
     config.method_name = name
     for key, value in content.get("overrides", {}).items():
         override(config, key, value, path)
-    description = content["description"] + ("\n" + FIRST_OPTIONS if name == "beags" else "")
-    return MethodSpecification(config=config, description=description)
+    return MethodSpecification(config=config, description=_description(name, content["description"]))
+
+
+def _description(name: str, sentence: str) -> str:
+    """Return the text above the help of ``ns-train <name>``; that of beags lists the first options."""
+    if name != "beags":
+        return sentence
+    rows = (f"  {option:<40}{use}" for option, use in FIRST_OPTIONS.items())
+    return "\n".join([sentence, "", "The options that people set first:", *rows, "", "All options follow."])
 
 
 def preset_config(name: str, overrides: Mapping[str, Any], source: Path) -> BeagsTrainerConfig:

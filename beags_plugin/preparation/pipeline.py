@@ -48,7 +48,7 @@ class PreparationConfig:
     min_confidence: float = 0.0
     """Reprojected pixels whose winner has a smaller share of the votes are left out of the losses."""
     tau: float = 0.02
-    """pairwise: a vote counts if its point is visible, |z - depth| <= tau z; inf counts every vote (E5)."""
+    """Of pairwise: a vote counts if its point is visible, |z - depth| <= tau z; inf counts every vote (E5)."""
     depth: str = "median"
     """Which depth is lifted: median or expected."""
     k: int = 2000

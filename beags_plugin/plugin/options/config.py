@@ -40,7 +40,7 @@ def _adam_fuses_on_cpus() -> bool:
 class FusedAdamConfig(AdamOptimizerConfig):
     """Options of one group of parameters in the scene's Adam, which goes over each parameter in one pass."""
 
-    fused: bool = field(default_factory=_adam_fuses_on_cpus)
+    fused: Suppress[bool] = field(default_factory=_adam_fuses_on_cpus)
 
 
 @dataclass
@@ -48,6 +48,7 @@ class BeagsTrainerConfig(TrainerConfig):
     """A nerfstudio trainer config whose paths are absolute once it is saved."""
 
     _target: type = field(default_factory=lambda: load("beags_plugin.plugin.trainer:BeagsTrainer"))
+    prompt: Suppress[str | None] = None  # for fields made from text
     run_dir: Path | None = None
     """Folder of this run; None puts it where nerfstudio does (output_dir/experiment/method/timestamp)."""
     max_num_iterations: int = 0

@@ -28,7 +28,9 @@ class LossSpec:
     """First step of the term: of the run, stated for a base of schedule_steps; or, for phase "refine", of the
     refinement, as it is."""
     options: dict[str, bool | int | float] = field(default_factory=dict)
-    """Options of the loss itself, e.g. ssim_weight or samples."""
+    """Of the loss itself. occupancy: samples, points per Gaussian and step (Z); background, whether the background is
+    held to its voxels too. silhouette: objects, how many are rendered each step; seen, how many of the 27 voxels around
+    what another object covers must have been seen for that pixel to count, 0 for every pixel."""
 
     def build(self, name: str, schedule: PhaseSchedule) -> Loss:
         """Build the loss, with absolute steps; raises ``UserError`` for a wrong value."""

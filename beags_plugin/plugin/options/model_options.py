@@ -27,6 +27,11 @@ class BeagsModelConfig(ModelConfig):
     """Options of the scene and of its two training phases."""
 
     _target: type = field(default_factory=lambda: load("beags_plugin.plugin.model:BeagsModel"))
+    enable_collider: Suppress[bool] = False  # this and the next four are for fields of rays
+    collider_params: Suppress[dict[str, float] | None] = None
+    loss_coefficients: Suppress[dict[str, float]] = field(default_factory=dict)
+    eval_num_rays_per_chunk: Suppress[int] = 4096
+    prompt: Suppress[str | None] = None
     rasterizer: str = "auto"
     """Backend: auto, native, torch, cuda (docs/cuda.md), or one that another package registers."""
     sh_degree: int = 3
