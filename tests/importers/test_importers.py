@@ -11,7 +11,6 @@ import torch
 from random_surfels import a_rotation, random_surfels
 from start_scenes import a_frame, in_frame, write_splatfacto
 
-import beags_plugin.plugin  # noqa: F401  (checkpoints hold numpy scalars)
 from beags_plugin.core.flattening import Gaussians, flatten, flattening, without_empty_bands
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.sh import sh_colors
@@ -25,6 +24,7 @@ from beags_plugin.importers.checkpoint import CheckpointImporter
 from beags_plugin.importers.ply import PlyImporter
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.ply import read_vertices, write_vertices
+from beags_plugin.system.reading.tensors import load_tensors
 
 
 def gaussians(count: int = 40, seed: int = 0) -> Gaussians:
@@ -179,7 +179,7 @@ def test_text_and_doubles_are_read_too(tmp_path):
 def checkpoint(tmp_path, **changes) -> tuple[object, object]:
     run = write_splatfacto(tmp_path / "run", random_surfels(), a_frame(1, 0.5))
     file = next(run.rglob("*.ckpt"))
-    content = torch.load(file, weights_only=True)
+    content = load_tensors(file)
     for name, value in changes.items():
         content["pipeline"][f"_model.gauss_params.{name}"] = value
         if value is None:
@@ -205,7 +205,7 @@ def test_a_checkpoint_is_found_by_its_run_its_folder_and_its_name(tmp_path):
 
 def test_the_newest_checkpoint_counts(tmp_path):
     run, file = checkpoint(tmp_path)
-    newer = torch.load(file, weights_only=True)
+    newer = load_tensors(file)
     newer["pipeline"]["_model.gauss_params.means"] += 1
     torch.save(newer, file.with_name("step-000000100.ckpt"))
     assert torch.equal(CheckpointImporter().read(run).gaussians.means, random_surfels().means + 1)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import zipfile
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,7 +21,8 @@ def load_tensors(path: Path, mmap: bool = False) -> Any:
     try:
         size = path.stat().st_size
         _check_archive(path, size)
-        content = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
+        with _numpy_scalars():
+            content = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
         _check_sizes(content, size)
         return content
     except FileNotFoundError:
@@ -30,6 +33,13 @@ def load_tensors(path: Path, mmap: bool = False) -> Any:
         words = " ".join(str(error).split())
         message = "it holds more than tensors and plain values" if "Weights only load failed" in words else words[:120]
         raise ValueError(message or type(error).__name__) from error
+
+
+def _numpy_scalars() -> AbstractContextManager[None]:
+    """Let torch load numpy's float scalars too: nerfstudio's schedulers leave them in the state of optimizers."""
+    safe = getattr(torch.serialization, "safe_globals", None)  # from torch 2.5 on
+    scalar = np.float64(0).__reduce__()[0]  # numpy moved it between 1.x and 2.x: ask for it instead of naming it
+    return nullcontext() if safe is None else safe([scalar, np.dtype, *(type(np.dtype(one)) for one in ("f4", "f8"))])
 
 
 def _check_archive(path: Path, size: int) -> None:

@@ -176,12 +176,6 @@ def test_paths_of_the_configuration_are_absolute(tmp_path, monkeypatch):
     assert all(path.is_absolute() for path in outputs.image_filenames)
 
 
-def test_checkpoints_with_numpy_scalars_load(tmp_path):
-    state = {"lr": np.float64(0.25), "base": np.float32(0.5)}
-    torch.save(state, tmp_path / "state.ckpt")
-    assert torch.load(tmp_path / "state.ckpt", weights_only=True) == state
-
-
 def test_views_of_equal_stems_have_names_of_their_own():
     files = [Path("images/left/0001.png"), Path("images/right/0001.png"), Path("images/right/0002.png")]
     assert unique_names(files) == ["left_0001", "right_0001", "0002"]
