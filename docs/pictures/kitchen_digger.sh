@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
 # Masks of the LEGO digger in Mip-NeRF 360's "kitchen" (25 views of 779 x 519) from boxes in four views, by GrabCut:
-# scripts/kitchen_digger.sh <folder of the scene> [output]
+# docs/pictures/kitchen_digger.sh <folder of the scene> [output]
 # Trains a base without masks, makes masks with its depth, lets all views vote on them, and writes pictures to look at:
 # made.png (all masks), check/contradicted.png, reprojected/before_after.png. About five minutes of one core.
 set -euo pipefail
 here="$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)"
-scene="${1:?usage: scripts/kitchen_digger.sh <folder of the scene> [output]}"
+scene="${1:?usage: docs/pictures/kitchen_digger.sh <folder of the scene> [output]}"
 output="${2:-outputs/kitchen_digger}"
 
 if [ ! -f "$output/base/training.json" ]; then

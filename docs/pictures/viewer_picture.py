@@ -1,6 +1,6 @@
 """The picture of docs/viewer.md: nerfstudio's viewer with our panel, of a run, in a headless Chromium.
 
-Run ``beags demo`` first; then ``python scripts/viewer_picture.py``. Another run or object: ``--help``. It opens what
+Run ``beags demo`` first; then ``python docs/pictures/viewer_picture.py``. Another run or object: ``--help``. It opens what
 the tests of the viewer open (viewer_pages.py and browser.py in tests/support/), so Chromium must be there.
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 from PIL import Image
 
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
+sys.path.append(str(Path(__file__).parents[2] / "tests"))
 
 from browser import Page  # noqa: E402
 from viewer_pages import viewed  # noqa: E402

@@ -1,6 +1,6 @@
 """The picture of README.md: a photo of the generated sample, its mask, and objects before and after refinement.
 
-Run ``beags demo`` first; then ``python scripts/readme_picture.py``. Another run, view or objects: ``--help``.
+Run ``beags demo`` first; then ``python docs/pictures/readme_picture.py``. Another run, view or objects: ``--help``.
 """
 
 from __future__ import annotations
