@@ -17,7 +17,7 @@ from beags_plugin.labels.class_ids import resize_nearest
 from beags_plugin.pictures.cells import GAP, below, beside, cell, write_picture
 from beags_plugin.pictures.contact_sheet import mask_overlay
 from beags_plugin.pictures.objects import render_alone
-from beags_plugin.pictures.orbit import orbit, orbit_settings, stand_of
+from beags_plugin.pictures.orbit import orbit, orbit_frame, orbit_settings
 from beags_plugin.plugin.objects.evaluate import EvaluatedRun
 from beags_plugin.plugin.runs.read import training_viewpoints
 
@@ -56,7 +56,7 @@ class Picture:
                 for stage, scene in run.stages.items()
                 if scene.class_ids is not None
             }
-            stand = stand_of(*bounding_box(parts["after"]), photos)
+            stand = orbit_frame(*bounding_box(parts["after"]), photos)
             camera = orbit(stand, 12, self.height)[number]
             settings = orbit_settings(stand)
             lines.append(

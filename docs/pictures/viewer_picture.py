@@ -1,7 +1,7 @@
 """The picture of docs/viewer.md: nerfstudio's viewer with our panel, of a run, in a headless Chromium.
 
-Run ``beags demo`` first; then ``python docs/pictures/viewer_picture.py``. Another run or object: ``--help``. It opens what
-the tests of the viewer open (viewer_pages.py and browser.py in tests/support/), so Chromium must be there.
+Run ``beags demo`` first; then ``python docs/pictures/viewer_picture.py``. Another run or object: ``--help``. It opens
+what the tests of the viewer open (viewer_pages.py and browser.py in tests/support/), so Chromium must be there.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 from PIL import Image
 
-sys.path.append(str(Path(__file__).parents[2] / "tests"))
+sys.path.append(str(Path(__file__).parents[2] / "tests/support"))
 
 from browser import Page  # noqa: E402
 from viewer_pages import viewed  # noqa: E402

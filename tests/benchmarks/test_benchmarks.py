@@ -1,12 +1,15 @@
-"""The benchmark of rasterizers runs end to end."""
+"""The benchmark of rasterizers runs end to end; programs outside the package find what they import from it."""
 
 from __future__ import annotations
 
+import ast
+import importlib
 import json
 import os
 import subprocess
 import sys
 
+import pytest
 from places import ROOT
 
 from beags_plugin.system.child_processes import bound
@@ -28,3 +31,18 @@ def test_a_quick_benchmark_measures_rows_and_judges_goals(tmp_path):
         assert row["forward_ms"] > 0 and row["backward_ms"] > 0 and row["ratio_to_torch"] > 0
     lines = [line for line in done.stdout.splitlines() if line.startswith("goal ")]
     assert len(lines) == len(result["goals"]) >= 15
+
+
+PROGRAMS = sorted(
+    path for folder in ("benchmarks", "docs/pictures", "scripts") for path in (ROOT / folder).glob("*.py")
+)
+
+
+@pytest.mark.parametrize("path", PROGRAMS, ids=lambda path: path.name)
+def test_a_program_finds_what_it_imports_from_us(path):
+    """A name that was moved or renamed shows here, and not when somebody needs the program."""
+    for node in ast.walk(ast.parse(path.read_text("utf8"))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in ("beags_plugin", "benchmarks"):
+            module = importlib.import_module(node.module or "")
+            for alias in node.names:
+                assert hasattr(module, alias.name) or importlib.import_module(f"{node.module}.{alias.name}"), alias.name
