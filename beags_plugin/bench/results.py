@@ -19,10 +19,12 @@ _COSTS = ("cpu_seconds", "peak_memory_mb", "own_memory_mb", "steps", "gaussians"
 _QUALITY = tuple(f"{metric}_{moment}" for metric in ("psnr", "ssim") for moment in MOMENTS) + tuple(
     f"{kind}_{metric}_{moment}" for kind in KINDS for metric in METRICS for moment in MOMENTS
 )
+_WORST, _LOST = "worst_biou_after", "lost_biou"
+_OBJECTS = (_WORST, _LOST)  # extracted BIoU of the worst object; the most that an object loses against before
 _MASKS = ("mask_error_given", "mask_error_used")
 _SCALE = ("voxel_size", "training_pixels")
 _TOTAL = "cpu_seconds total"  # of the base and the refinement
-FIGURES = (*_QUALITY, *(f"seconds {stage}" for stage in STAGES), _TOTAL, *_COSTS, *_MASKS, *_SCALE)
+FIGURES = (*_QUALITY, *_OBJECTS, *(f"seconds {stage}" for stage in STAGES), _TOTAL, *_COSTS, *_MASKS, *_SCALE)
 COLUMNS = (*_PLACE, *FIGURES)
 
 
@@ -60,6 +62,11 @@ def make_row(
     figures |= {name: result[name] for name in (*_COSTS, *_MASKS, *_SCALE)}
     figures[_TOTAL] = base["cpu_seconds"] + result["cpu_seconds"]
     objects = {name: _masks(found) for name, found in evaluation["objects"].items()}
+    after, before = "extracted_biou_after", "extracted_biou_before"
+    pairs = [(of[before], of[after]) for of in objects.values()]
+    figures[_WORST] = min((end for _, end in pairs if end is not None), default=None)
+    lost = (start - end for start, end in pairs if start is not None and end is not None)
+    figures[_LOST] = max(lost, default=None)
     return ResultRow(variant, scene, seed, figures, objects)
 
 
@@ -76,8 +83,8 @@ def _masks(found: Mapping[str, Any]) -> dict[str, float | None]:
 def means(rows: Sequence[ResultRow]) -> list[ResultRow]:
     """Return each variant's mean of every figure over its scenes and seeds, without failed trials.
 
-    A figure that some scene lacks is averaged over those that have it. A variant whose trials all failed keeps the
-    first reason.
+    Those of the worst object are the worst of all scenes. A figure that some scene lacks is averaged over those that
+    have it. A variant whose trials all failed keeps the first reason.
     """
     of_variant: dict[str, list[ResultRow]] = {}
     for row in rows:
@@ -86,6 +93,8 @@ def means(rows: Sequence[ResultRow]) -> list[ResultRow]:
     for group in of_variant.values():
         good = [row for row in group if row.failed is None]
         figures = {name: _mean(row.figures[name] for row in good) for name in FIGURES}
+        for name, worst in ((_WORST, min), (_LOST, max)):
+            figures[name] = worst((value for row in good if (value := row.figures[name]) is not None), default=None)
         failures = len(group) - len(good)
         reason = None if good else group[0].failed
         averaged.append(ResultRow(group[0].variant, MEAN, None, figures, {}, reason, len(good), failures))

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 _COLUMNS = (  # head, figure, digits, factor
     ("extracted\nIoU", "extracted_iou_after", 1, 100.0),
     ("\nBIoU", "extracted_biou_after", 1, 100.0),
+    ("worst object\nBIoU", "worst_biou_after", 1, 100.0),
+    ("\nlost", "lost_biou", 1, 100.0),
     ("rendered\nIoU", "rendered_iou_after", 1, 100.0),
     ("\nBIoU", "rendered_biou_after", 1, 100.0),
     ("PSNR, dB\nbefore", "psnr_before", 2, 1.0),
@@ -38,6 +40,7 @@ def tables(experiment: Experiment, rows: Sequence[ResultRow]) -> list[Table | st
         printed += [_table(experiment, [row for row in rows if row.scene == scene], scene) for scene in scenes]
     if experiment.paper is not None:
         printed.append(paper_table(experiment.paper, experiment.reference))
+    printed.append("Worst object: the lowest extracted BIoU; lost: the most that an object loses by refinement.")
     printed.append("Seconds of stages are wall time; CPU: of the whole trial after its base, all threads.")
     printed.append("Memory: the peak of the trial's process, and what of it the loaded program does not take.")
     if experiment.reference is not None:

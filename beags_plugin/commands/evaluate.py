@@ -49,7 +49,7 @@ def run_evaluation(configs: Sequence[Path], data_set_name: str, protocol: Protoc
     Raises ``UserError`` for a run, data, a choice or a file that cannot be used.
     """
     from beags_plugin.evaluation.report import CSV_COLUMNS, data_set
-    from beags_plugin.evaluation.table import render_data_set, render_protocol, render_run
+    from beags_plugin.evaluation.table import render_data_set, render_run
     from beags_plugin.pictures.cells import write_picture
     from beags_plugin.pictures.worst_views import worst_views_picture
     from beags_plugin.plugin.objects.evaluate import EvaluatedRun
@@ -69,7 +69,6 @@ def run_evaluation(configs: Sequence[Path], data_set_name: str, protocol: Protoc
     found = data_set(data_set_name, runs)
     if len(runs) > 1:
         CONSOLE.print(render_data_set(found))
-    CONSOLE.print(render_protocol(protocol))
     if outputs.json is not None:
         _write(outputs.json, json.dumps(found.to_json(), indent=1, allow_nan=False))
     if outputs.csv is not None:

@@ -20,8 +20,8 @@ METRICS = ("acc", "iou", "biou")
 class MaskMetrics:
     """Agreement of one predicted mask with its truth, or a mean of it; each in 0..1, higher is better.
 
-    acc: pixel accuracy. iou: intersection over union. biou: IoU of the inner boundary bands. None: the union is empty
-    and the protocol leaves such a ratio out.
+    acc: pixel accuracy. iou: intersection over union. biou: IoU of the inner boundary bands. None: nothing to compare,
+    as where both masks are empty; it is left out of means.
     """
 
     acc: float | None
@@ -73,20 +73,21 @@ def mask_metrics(prediction: Any, truth: Any, ignore: Any = None, protocol: Prot
     """Return Acc, IoU and BIoU of a mask (method, section 8).
 
     prediction: [H', W'] bool array or tensor. truth: [H, W] bool. ignore: [H, W] bool or None; True pixels count
-    nowhere. Acc is 1 where no pixel counts. Raises ``ValueError`` for masks that are not two-dimensional and for an
-    ``ignore`` of another size than the truth.
+    nowhere. A mask that is empty in truth and prediction is not scored: all three are None. Raises ``ValueError`` for
+    masks that are not two-dimensional and for an ``ignore`` of another size than the truth.
     """
     protocol = protocol or Protocol()
     predicted, true, counted = compared_masks(prediction, truth, ignore, protocol)
 
     def iou(a: np.ndarray, b: np.ndarray) -> float | None:
         union = np.count_nonzero((a | b) & counted)
-        return np.count_nonzero(a & b & counted) / union if union else protocol.empty_value
+        return np.count_nonzero(a & b & counted) / union if union else None
 
-    total = np.count_nonzero(counted)
+    if not ((predicted | true) & counted).any():
+        return MaskMetrics(None, None, None)
     d = band_width(true.shape[0], true.shape[1], protocol.band_share)
     return MaskMetrics(
-        acc=np.count_nonzero((predicted == true) & counted) / total if total else 1.0,
+        acc=np.count_nonzero((predicted == true) & counted) / np.count_nonzero(counted),
         iou=iou(predicted, true),
         biou=iou(boundary_band(predicted, d), boundary_band(true, d)),
     )

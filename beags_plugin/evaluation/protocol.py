@@ -17,16 +17,12 @@ class Protocol:
     """A pixel belongs to a mask where the alpha (extracted) or the drawn value (rendered) is greater."""
     resize: Literal["prediction", "truth"] = "prediction"
     """Which of the two masks is brought to the other's size, by nearest pixel."""
-    empty: Literal["one", "zero", "skip"] = "one"
-    """What an IoU or BIoU counts whose union is empty: 1, 0, or nothing (it is left out of the means)."""
     scene_average: Literal["masks", "objects", "views"] = "masks"
     """Mean of a scene: over all its masks; or over the means of the objects; or over the means of the views."""
     data_set_average: Literal["scenes", "pooled"] = "scenes"
     """Mean of several scenes: over the means of the scenes; or as if all views were of one scene."""
     band_share: float = 0.02
     """Width of the boundary band, as a share of the image diagonal; at least one pixel."""
-    silhouettes: Literal["seen", "whole"] = "seen"
-    """Of occlusion-free silhouettes, score what training photos show (where the data says it), or everything."""
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that cannot be used."""
@@ -43,8 +39,3 @@ class Protocol:
     def to_json(self) -> dict[str, Any]:
         """Return every choice by name."""
         return asdict(self)
-
-    @property
-    def empty_value(self) -> float | None:
-        """Return the value of an IoU whose union is empty; None if it is left out."""
-        return {"one": 1.0, "zero": 0.0, "skip": None}[self.empty]

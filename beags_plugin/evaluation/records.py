@@ -11,8 +11,10 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.evaluation.metrics import MaskMetrics
 
-Kind = Literal["extracted", "rendered"]
-KINDS: tuple[Kind, ...] = ("extracted", "rendered")
+Kind = Literal["extracted", "seen", "rendered"]
+KINDS: tuple[Kind, ...] = ("extracted", "seen", "rendered")
+"""extracted: the object rendered alone. seen: the same over the parts that training photos show, where the data says
+which. rendered: the object's share of the whole scene."""
 
 
 @dataclass(frozen=True)
@@ -22,8 +24,8 @@ class EvalView:
     image: [H, W, 3] float in 0..1, the photograph, or None. visible: [h, w] integer class ids or IGNORE, or None
     without masks; predictions are resized to it. silhouettes: object id to [h, w] bool, what the object covers when
     nothing stands before it. seen: object id to [h, w] bool, the part of the silhouette whose surface some training
-    photo shows; the extracted metrics leave out the rest. visible_objects: object id to [h, w] bool, the visible part
-    where single objects were labelled and nothing is known of the others; scored instead of ``visible``.
+    photo shows; metrics of the kind "seen" leave out the rest. visible_objects: object id to [h, w] bool, the visible
+    part where single objects were labelled and nothing is known of the others; scored instead of ``visible``.
     """
 
     camera: Camera
@@ -37,18 +39,18 @@ class EvalView:
 
 @dataclass(frozen=True)
 class ObjectMetrics:
-    """The metrics of both kinds of masks; None where there was no mask to compare with."""
+    """The metrics of each kind of masks; None where there was no mask to compare with."""
 
     extracted: MaskMetrics | None
     rendered: MaskMetrics | None
+    seen: MaskMetrics | None = None
 
 
 @dataclass(frozen=True)
 class MaskRecord:
     """One scored mask.
 
-    kind: extracted (the object rendered alone) or rendered (the object's share of the whole scene). view: index of the
-    view. truth: "silhouette" or "visible".
+    kind: see ``KINDS``. view: index of the view. truth: "silhouette" or "visible".
     """
 
     kind: Kind
@@ -73,8 +75,8 @@ class SceneMetrics:
 
     mean: over the scene, as the protocol says. objects: object id to the mean over its masks. psnr: dB, mean over the
     views with a photograph, infinite for equal images; None without any. ssim: likewise. extracted_truth: "silhouette"
-    (occlusion-free), "visible" (without the pixels that other objects cover), "both", or None. masks, views: the single
-    figures behind these means.
+    (occlusion-free), "visible" (without the pixels where another object hides this one), "both", or None. masks, views:
+    the single figures behind these means.
     """
 
     mean: ObjectMetrics

@@ -46,13 +46,21 @@ class RunMetrics:
         taken = list(names.values())
         return {c: f"{name} ({c})" if taken.count(name) > 1 else name for c, name in names.items()}
 
+    def worst(self) -> str | None:
+        """Return the name of the object with the lowest extracted BIoU as the run is; None if none was scored."""
+        names = self.names()
+        scores = {c: found.extracted.biou for c, found in self.after.objects.items() if found.extracted is not None}
+        known = {c: score for c, score in scores.items() if score is not None}
+        return names[min(known, key=lambda c: known[c])] if known else None
+
     def to_json(self) -> dict[str, Any]:
         """Return the run as plain values for ``json.dump``; a figure that does not exist or is infinite is None.
 
         {"scene", "config", "protocol": {choice: value}, "extracted_truth", "notes": [sentence], "mean": {"extracted":
-        {"before": {"acc", "iou", "biou"}, "after": {...}}, "rendered": {...}}, "psnr": {"before", "after"}, "ssim":
-        {"before", "after"}, "objects": {name: as mean}, "masks": [{"kind", "object", "view", "truth", "before": {"acc",
-        "iou", "biou"}, "after": {...}}], "views": [{"view", "psnr": {"before", "after"}, "ssim": {...}}]}.
+        {"before": {"acc", "iou", "biou"}, "after": {...}}, "seen": {...}, "rendered": {...}}, "psnr": {"before",
+        "after"}, "ssim": {"before", "after"}, "objects": {name: as mean}, "worst": name, "masks": [{"kind", "object",
+        "view", "truth", "before": {"acc", "iou", "biou"}, "after": {...}}], "views": [{"view", "psnr": {"before",
+        "after"}, "ssim": {...}}]}.
         """
         names, stages = self.names(), self.stages()
         view_names = [view.name for view in self.after.views]
@@ -63,7 +71,7 @@ class RunMetrics:
         def metrics(pick: Callable[[SceneMetrics], MaskMetrics | None]) -> dict[str, Any]:
             return {stage: plain_metrics(pick(stages[stage]) if stage in stages else None) for stage in STAGES}
 
-        def both_kinds(pick: Callable[[SceneMetrics], ObjectMetrics]) -> dict[str, Any]:
+        def all_kinds(pick: Callable[[SceneMetrics], ObjectMetrics]) -> dict[str, Any]:
             return {kind: metrics(lambda scene, kind=kind: getattr(pick(scene), kind)) for kind in KINDS}
 
         return {
@@ -72,10 +80,11 @@ class RunMetrics:
             "protocol": self.protocol.to_json(),
             "extracted_truth": self.after.extracted_truth,
             "notes": list(self.notes),
-            "mean": both_kinds(lambda scene: scene.mean),
+            "mean": all_kinds(lambda scene: scene.mean),
             "psnr": numbers(lambda scene: scene.psnr),
             "ssim": numbers(lambda scene: scene.ssim),
-            "objects": {name: both_kinds(lambda scene, c=c: scene.objects[c]) for c, name in names.items()},
+            "objects": {name: all_kinds(lambda scene, c=c: scene.objects[c]) for c, name in names.items()},
+            "worst": self.worst(),
             "masks": [
                 {
                     "kind": mask.kind,
@@ -164,7 +173,7 @@ def data_set(name: str, runs: Sequence[RunMetrics]) -> DataSetMetrics:
     psnr, ssim = of_images("psnr"), of_images("ssim")
     means: dict[Stage, ObjectMetrics] = {}
     for stage in STAGES:
-        figures = ObjectMetrics(kinds[stage].get("extracted"), kinds[stage].get("rendered"))
+        figures = ObjectMetrics(**{kind: kinds[stage].get(kind) for kind in KINDS})
         if figures != ObjectMetrics(None, None) or psnr[stage] is not None:
             means[stage] = figures
     return DataSetMetrics(name, tuple(runs), means, psnr, ssim)

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import MaskMetrics, mask_metrics, mean, mean_metrics, psnr
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import KINDS, EvalView, Kind, MaskRecord, ObjectMetrics, SceneMetrics, ViewRecord
 from beags_plugin.extraction.select import select_class
-from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.labels.class_ids import IGNORE, resize_nearest
 from beags_plugin.losses.photometric import ssim
-from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
-from beags_plugin.rasterizers.rendering import geometry_inputs, surfel_inputs
+from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
+from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth, surfel_inputs
 
 
 def evaluate_scene(
@@ -50,7 +50,7 @@ def evaluate_scene(
     with torch.no_grad():
         for index, view in enumerate(views):
             renderer = MaskRenderer(surfels, class_ids, view, rasterizer, settings, protocol)
-            for kind in KINDS if complete else KINDS[:1]:
+            for kind in KINDS if complete else ("extracted", "seen"):
                 for class_id, mask in renderer.masks(kind, objects).items():
                     metrics = mask_metrics(mask.prediction, mask.truth, mask.ignore, protocol)
                     masks.append(MaskRecord(kind, class_id, index, mask.source, metrics))
@@ -69,8 +69,8 @@ def evaluate_scene(
         return mean_metrics(r.metrics for r in masks if r.kind == kind and r.class_id == class_id)
 
     return SceneMetrics(
-        mean=ObjectMetrics(*(average(masks, kind, protocol) for kind in KINDS)),
-        objects={c: ObjectMetrics(*(of_object(c, kind) for kind in KINDS)) for c in objects},
+        mean=ObjectMetrics(**{kind: average(masks, kind, protocol) for kind in KINDS}),
+        objects={c: ObjectMetrics(**{kind: of_object(c, kind) for kind in KINDS}) for c in objects},
         psnr=mean(image.psnr for image in images),
         extracted_truth="both" if len(truths) == 2 else next(iter(truths), None),
         ssim=mean(image.ssim for image in images),
@@ -98,10 +98,24 @@ def pooled_average(
 
 
 @dataclass(frozen=True)
-class RenderedMask:
-    """A predicted mask [H, W] bool and its truth.
+class Truth:
+    """The mask of an object in a view, [h, w] bool, and pixels of that size that may not count.
 
-    truth: [h, w] bool. ignore: [h, w] bool, pixels that do not count, or None. source: "silhouette" or "visible".
+    source: "silhouette" or "visible". unknown: pixels that count nowhere, or None. others: pixels of other objects,
+    which count unless their object hides this one, or None.
+    """
+
+    source: str
+    mask: Tensor
+    unknown: Tensor | None = None
+    others: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class RenderedMask:
+    """A predicted mask [H, W] bool and its truth [h, w] bool. ignore: [h, w] bool, pixels that do not count, or None.
+
+    source: as of ``Truth``.
     """
 
     prediction: Tensor
@@ -120,25 +134,52 @@ class MaskRenderer:
     rasterizer: Rasterizer
     settings: RasterSettings
     protocol: Protocol
+    _alone: dict[int, tuple[Tensor, Tensor | None]] = field(default_factory=dict)
 
     def masks(self, kind: Kind, objects: Sequence[int]) -> dict[int, RenderedMask]:
         """Return object id to its mask, for those of ``objects`` that the view has a truth of."""
         if self.class_ids is None or not objects:
             return {}
         if kind == "rendered":
-            known = {
-                class_id: truth for class_id in objects if (truth := rendered_truth(self.view, class_id)) is not None
-            }
+            known = {c: truth for c in objects if (truth := rendered_truth(self.view, c)) is not None}
             rendered = self._rendered(self.class_ids, list(known))
-            return {c: RenderedMask(mask, *known[c], "visible") for c, mask in rendered.items()}
+            return {c: RenderedMask(mask, known[c].mask, known[c].unknown, "visible") for c, mask in rendered.items()}
         found = {}
         for class_id in objects:
-            if (truth := extracted_truth(self.view, class_id, self.protocol)) is not None:
-                part = select_class(self.surfels, self.class_ids, class_id)[0]
-                threshold = self.protocol.threshold
-                mask = extracted_mask(part, self.view.camera, self.rasterizer, self.settings, threshold)
-                found[class_id] = RenderedMask(mask, truth[1], truth[2], truth[0])
+            truth = extracted_truth(self.view, class_id) if kind == "extracted" else seen_truth(self.view, class_id)
+            if truth is not None:
+                mask, hidden = self._extracted(class_id, truth.others)
+                left_out = [pixels for pixels in (truth.unknown, hidden) if pixels is not None]
+                ignore = torch.stack(left_out).any(dim=0) if left_out else None
+                found[class_id] = RenderedMask(mask, truth.mask, ignore, truth.source)
         return found
+
+    def _extracted(self, class_id: int, others: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """Return [H, W] bool, alpha of the object alone above the threshold; and which of ``others`` may hide it.
+
+        A pixel of another object tells nothing about what lies behind it; what is drawn before it is wrong.
+        """
+        if class_id not in self._alone:
+            assert self.class_ids is not None
+            part = select_class(self.surfels, self.class_ids, class_id)[0]
+            camera, hidden = self.view.camera, None
+            if len(part) == 0:
+                return torch.zeros(camera.height, camera.width, dtype=torch.bool), None
+            render = self._render(part, depth=others is not None)
+            if others is not None:
+                nearer = self._scene_depth < surface_depth(render, "median")
+                hidden = others & torch.from_numpy(resize_nearest(nearer.cpu().numpy(), *others.shape))
+            self._alone[class_id] = render.alpha > self.protocol.threshold, hidden
+        return self._alone[class_id]
+
+    @cached_property
+    def _scene_depth(self) -> Tensor:
+        """Return [H, W], the depth of the surface that the whole scene shows, 0 where none."""
+        return surface_depth(self._render(self.surfels, depth=True), "median")
+
+    def _render(self, surfels: Surfels, depth: bool) -> RasterOutputs:
+        inputs, settings = geometry_inputs(surfels), replace(self.settings, geometry=depth)
+        return self.rasterizer.rasterize(inputs, self.view.camera, settings, surfels.means.new_zeros(3))
 
     def _rendered(self, class_ids: Tensor, objects: Sequence[int]) -> dict[int, Tensor]:
         """Return object id to [H, W] bool: value > threshold, with the object 1 and the rest of the scene 0, on black.
@@ -159,43 +200,33 @@ class MaskRenderer:
         return masks
 
 
-def extracted_mask(
-    part: Surfels, camera: Camera, rasterizer: Rasterizer, settings: RasterSettings, threshold: float
-) -> Tensor:
-    """Return [H, W] bool: A > threshold with the object's Gaussians ``part`` alone."""
-    if len(part) == 0:
-        return torch.zeros(camera.height, camera.width, dtype=torch.bool)
-    black = part.means.new_zeros(3)
-    return rasterizer.rasterize(geometry_inputs(part), camera, settings, black).alpha > threshold
-
-
-def rendered_truth(view: EvalView, class_id: int) -> tuple[Tensor, Tensor | None] | None:
-    """Return an object's visible mask, [h, w] bool, and the unlabelled pixels; None if the view has no mask of it."""
+def rendered_truth(view: EvalView, class_id: int) -> Truth | None:
+    """Return an object's visible mask; None if the view has no mask of it."""
     if view.visible_objects is not None:
-        truth = view.visible_objects.get(class_id)
-        return None if truth is None else (truth, None)
-    return None if view.visible is None else (view.visible == class_id, view.visible == IGNORE)
+        mask = view.visible_objects.get(class_id)
+        return None if mask is None else Truth("visible", mask)
+    return None if view.visible is None else Truth("visible", view.visible == class_id, view.visible == IGNORE)
 
 
-def extracted_truth(
-    view: EvalView, class_id: int, protocol: Protocol | None = None
-) -> tuple[str, Tensor, Tensor | None] | None:
-    """Return the truth of an extracted object in a view; None if the view has no mask of it.
-
-    That is (source, mask [h, w] bool, pixels to leave out [h, w] bool or None). source: "silhouette", or "visible",
-    which leaves out pixels of other objects and IGNORE pixels.
-    """
+def extracted_truth(view: EvalView, class_id: int) -> Truth | None:
+    """Return the silhouette of an object in a view, else its visible mask; None if the view has no mask of it."""
     if view.silhouettes is not None and class_id in view.silhouettes:
-        silhouette = view.silhouettes[class_id]
-        scored_whole = (protocol or Protocol()).silhouettes == "whole"
-        known = None if scored_whole or view.seen is None else view.seen.get(class_id)
-        return "silhouette", silhouette, None if known is None else silhouette & ~known
-    if view.visible_objects is not None:
-        truth = view.visible_objects.get(class_id)
-        return None if truth is None else ("visible", truth, _of_others(view.visible_objects, class_id) & ~truth)
-    if view.visible is None:
+        return Truth("silhouette", view.silhouettes[class_id])
+    visible = rendered_truth(view, class_id)
+    if visible is None:
         return None
-    return "visible", view.visible == class_id, (view.visible != class_id) & (view.visible != 0)
+    if view.visible_objects is not None:
+        return replace(visible, others=_of_others(view.visible_objects, class_id) & ~visible.mask)
+    assert view.visible is not None
+    return replace(visible, others=(view.visible != class_id) & (view.visible != 0) & (view.visible != IGNORE))
+
+
+def seen_truth(view: EvalView, class_id: int) -> Truth | None:
+    """Return an object's silhouette, where training photos show it; None unless the data says where."""
+    known = None if view.seen is None else view.seen.get(class_id)
+    if known is None or view.silhouettes is None or class_id not in view.silhouettes:
+        return None
+    return Truth("silhouette", view.silhouettes[class_id], view.silhouettes[class_id] & ~known)
 
 
 def _of_others(masks: Mapping[int, Tensor], class_id: int) -> Tensor:

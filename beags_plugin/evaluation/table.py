@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from beags_plugin.evaluation.metrics import METRICS
-from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import KINDS, ObjectMetrics
 from beags_plugin.evaluation.report import DataSetMetrics, RunMetrics, Stage
 
@@ -14,12 +13,13 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 _STAGE_NAMES = {"before": "assigned", "after": "refined"}  # in summary.json
+_Row = tuple[str, Mapping[str, Any], Mapping[str, Any] | None]
+"""A row's name, its metrics {kind: {stage: {metric: value}}}, and {"psnr", "ssim"} of its images or None."""
 _TRUTHS = {
-    "silhouette": "Extracted masks are compared with occlusion-free silhouettes{seen}.",
-    "visible": "Extracted masks are compared with the visible masks; pixels that other objects cover are left out.",
-    "both": "Extracted masks are compared with occlusion-free silhouettes{seen}, or else with the visible masks.",
+    "silhouette": "whole occlusion-free silhouettes",
+    "visible": "visible masks, less the pixels where another object stands nearer",
+    "both": "whole occlusion-free silhouettes, else visible masks, less the pixels where another object stands nearer",
 }
-_SEEN = " (less the parts that hardly any training photo shows, where the data says which)"
 
 
 def summary_json(run: RunMetrics, seconds: Mapping[str, float], peak_memory_mb: float) -> dict[str, Any]:
@@ -53,7 +53,8 @@ def render_run(
     content, stages = run.to_json(), list(run.stages())
     parts: list[RenderableType] = []
     if run.after.mean != ObjectMetrics(None, None):
-        rows = {**content["objects"], "mean": content["mean"]}
+        rows = [(name, row, None) for name, row in content["objects"].items()]
+        rows += [("mean", content["mean"], None), *_worst(content)]
         parts.append(_mask_table(f"{run.scene}: masks, %{_meaning(stages)}", "object", rows, stages))
     else:
         parts.append(Text(run.scene))
@@ -65,60 +66,70 @@ def render_run(
         lines.append("Seconds: " + ", ".join(f"{stage} {value:.1f}" for stage, value in seconds.items()))
     if peak_memory_mb:
         lines.append(f"Peak memory: {peak_memory_mb:.0f} MB")
-    if run.after.extracted_truth in _TRUTHS:
-        seen = _SEEN if run.protocol.silhouettes == "seen" else ""
-        lines.append(_TRUTHS[run.after.extracted_truth].format(seen=seen))
-    return Group(*parts, *(Text(line) for line in (*lines, *run.notes)))
+    return Group(*parts, *(Text(line) for line in (*lines, *run.notes, protocol_line([run]))))
 
 
 def render_data_set(found: DataSetMetrics) -> RenderableType:
-    """Return a table of several runs: the means of each scene, then those of the data set."""
-    content = found.to_json()
-    stages: list[Stage] = [stage for stage in ("before", "after") if any(stage in run.stages() for run in found.runs)]
-    rows = {run.scene: scene for run, scene in zip(found.runs, content["scenes"], strict=True)}
-    figures = {name: row["mean"] for name, row in rows.items()} | {found.name: content["mean"]}
-    images = {name: row for name, row in rows.items()} | {found.name: content}
-    return _mask_table(f"All scenes: masks, %{_meaning(stages)}", "scene", figures, stages, images)
-
-
-def render_protocol(protocol: Protocol) -> RenderableType:
-    """Return a line that names the choices that are not the defaults."""
+    """Return a table of several runs: the means of each scene, its worst object, then the means of the data set."""
+    from rich.console import Group
     from rich.text import Text
 
-    default = Protocol().to_json()
-    changed = [f"{name} {value}" for name, value in protocol.to_json().items() if value != default[name]]
-    return Text(f"Protocol: {', '.join(changed)}; else the defaults." if changed else "Protocol: the defaults.")
+    content = found.to_json()
+    stages: list[Stage] = [stage for stage in ("before", "after") if any(stage in run.stages() for run in found.runs)]
+    rows = []
+    for run, scene in zip(found.runs, content["scenes"], strict=True):
+        rows += [(run.scene, scene["mean"], scene), *_worst(scene)]
+    rows.append((found.name, content["mean"], content))
+    table = _mask_table(f"All scenes: masks, %{_meaning(stages)}", "scene", rows, stages)
+    return Group(table, Text(protocol_line(found.runs)))
+
+
+def protocol_line(runs: Sequence[RunMetrics]) -> str:
+    """Return a sentence with all choices behind the figures of runs of one protocol."""
+    protocol = runs[0].protocol
+    truths = {truth for run in runs if (truth := run.after.extracted_truth) is not None}
+    truth = _TRUTHS[truths.pop() if len(truths) == 1 else "both"] if truths else "no masks"
+    scenes = "over scenes" if protocol.data_set_average == "scenes" else "of all scenes pooled"
+    return (
+        f"Protocol: extracted masks against {truth}; above {protocol.threshold:g}; boundary band "
+        f"{100 * protocol.band_share:g} % of the diagonal; the {protocol.resize} is resized; masks empty in truth and "
+        f"prediction are left out; means over {protocol.scene_average}, then {scenes}."
+    )
+
+
+def _worst(run: Mapping[str, Any]) -> list[_Row]:
+    """Return the row of the object with the lowest extracted BIoU; none for a single object."""
+    name = run["worst"]
+    return [] if name is None or len(run["objects"]) < 2 else [(f"worst: {name}", run["objects"][name], None)]
 
 
 def _meaning(stages: Sequence[Stage]) -> str:
     return " (before: assignment alone; after: after refinement)" if len(stages) == 2 else ""
 
 
-def _mask_table(
-    title: str,
-    first: str,
-    rows: Mapping[str, Any],
-    stages: Sequence[Stage],
-    images: Mapping[str, Any] | None = None,
-) -> RenderableType:
-    """Return rows of both kinds of metrics per stage; ``images`` adds columns for PSNR and SSIM."""
+def _mask_table(title: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> RenderableType:
+    """Return rows of all kinds of metrics per stage, with PSNR and SSIM if any row has images."""
     from rich.box import SIMPLE
     from rich.table import Table
     from rich.text import Text
 
+    known = any(row["seen"][stage]["iou"] is not None for _, row, _ in rows for stage in stages)
+    columns = [(kind, metric) for kind in KINDS for metric in METRICS]
+    columns = [(kind, metric) for kind, metric in columns if kind != "seen" or (known and metric != "acc")]
     table = Table(title=title, title_justify="left", box=SIMPLE, collapse_padding=True, pad_edge=False)
     table.add_column(first)
     table.add_column("stage")
-    for kind in KINDS:
-        for heading in (f"{kind}\nAcc", "\nIoU", "\nBIoU"):
-            table.add_column(heading, justify="right", min_width=9 if kind in heading else 5)
-    for heading in ("\nPSNR", "\nSSIM") if images else ():
+    for index, (kind, metric) in enumerate(columns):
+        new = index == 0 or columns[index - 1][0] != kind
+        heading = {"acc": "Acc", "iou": "IoU", "biou": "BIoU"}[metric]
+        table.add_column(f"{kind if new else ''}\n{heading}", justify="right", min_width=len(kind) if new else 5)
+    for heading in ("\nPSNR", "\nSSIM") if any(images for *_, images in rows) else ():
         table.add_column(heading, justify="right")
-    for name, row in rows.items():
+    for name, row, images in rows:
         for stage in stages:
-            cells = [_number(row[kind][stage][metric], 1, 100) for kind in KINDS for metric in METRICS]
-            if images:
-                cells += [_number(images[name]["psnr"][stage], 2), _number(images[name]["ssim"][stage], 3)]
+            cells = [_number(row[kind][stage][metric], 1, 100) for kind, metric in columns]
+            if images is not None:
+                cells += [_number(images["psnr"][stage], 2), _number(images["ssim"][stage], 3)]
             table.add_row(Text(name) if stage == stages[0] else "", stage, *cells)
         table.add_section()
     return table

@@ -80,7 +80,7 @@ def draw_rows(
                 render=render,
                 before={c: _alone(*before, c, view.camera, rasterizer, settings) for c in objects},
                 after={c: _alone(*after, c, view.camera, rasterizer, settings) for c in objects},
-                focus={c: resize_nearest(t[1].cpu().numpy(), *size) for c, t in truths.items() if t is not None},
+                focus={c: resize_nearest(t.mask.cpu().numpy(), *size) for c, t in truths.items() if t is not None},
             )
             rows.append(row)
             if progress is not None:

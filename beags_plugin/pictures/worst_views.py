@@ -12,7 +12,7 @@ from torch import Tensor
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import MaskMetrics, compared_masks
 from beags_plugin.evaluation.protocol import Protocol
-from beags_plugin.evaluation.records import KINDS, EvalView, Kind
+from beags_plugin.evaluation.records import EvalView, Kind
 from beags_plugin.evaluation.report import RunMetrics, Stage
 from beags_plugin.evaluation.run_metrics import MaskRenderer
 from beags_plugin.pictures.cells import GAP, Square, below, beside, cell, crop, printable, square_around
@@ -22,6 +22,7 @@ RIGHT, MISSED, WRONG, LEFT_OUT = 1, 2, 3, 4  # of an error map; 0 is right too: 
 COLORS = {RIGHT: (0, 158, 115), MISSED: (0, 114, 178), WRONG: (213, 94, 0), LEFT_OUT: (150, 150, 150)}
 """RGB; distinct for colour-blind eyes too (Okabe and Ito)."""
 _MEANINGS = {RIGHT: "right", MISSED: "missed", WRONG: "wrong", LEFT_OUT: "not scored"}
+_KINDS: tuple[Kind, ...] = ("extracted", "rendered")
 _SIDE = 240  # pixels of a cell
 _LEGEND = 24  # pixels
 _GREY = 128  # where there is no photograph
@@ -98,7 +99,7 @@ def draw_worst(
     """
     names = run.names()
     found = []
-    chosen: list[tuple[Kind, int]] = [(kind, index) for kind in KINDS for index in worst_records(run, kind, count)]
+    chosen: list[tuple[Kind, int]] = [(kind, index) for kind in _KINDS for index in worst_records(run, kind, count)]
     with torch.no_grad():
         for kind, index in chosen:
             record = run.after.masks[index]
@@ -138,7 +139,7 @@ def worst_views_picture(masks: Sequence[WorstMask], count: int = 6) -> np.ndarra
     if not masks:
         raise ValueError("a picture of the worst views needs at least one mask")
     blocks = []
-    for kind in KINDS:
+    for kind in _KINDS:
         worst = sorted((mask for mask in masks if mask.kind == kind), key=lambda mask: mask.score)[:count]
         if worst:
             blocks.append(below([_heading(kind), *(_line(mask) for mask in worst)]))

@@ -24,6 +24,7 @@ from beags_plugin.bench.run import rows_of
 from beags_plugin.bench.runner import Outcome
 from beags_plugin.bench.tables import memory_line, per_million_pixels, tables
 from beags_plugin.bench.trials import VariantTrial, plan
+from beags_plugin.evaluation.records import KINDS
 
 
 @pytest.fixture
@@ -35,7 +36,7 @@ def masks(value: float) -> dict:
     return {
         kind: {moment: {metric: value + 0.1 * (moment == "after") for metric in ("acc", "iou", "biou")}
                for moment in ("before", "after")}
-        for kind in ("extracted", "rendered")
+        for kind in KINDS
     }  # fmt: skip
 
 

@@ -84,6 +84,12 @@ def test_pixels_of_other_objects_are_left_out_of_extracted_masks():
         assert box.extracted.iou == pytest.approx(iou) and box.rendered.iou == 1.0
 
 
+def test_what_is_drawn_before_another_object_counts_as_wrong():
+    """The box is drawn whole before the cup, though the cup hides its left half."""
+    box = evaluated([BOX, CUP, FLOOR], [2, 1, 0], EvalView(camera(), None, truth())).objects[2]
+    assert box.extracted is not None and box.extracted.iou == pytest.approx(0.5)
+
+
 def test_ignored_pixels_do_not_count():
     labels = truth()
     labels[square_mask(*STRAY)] = IGNORE
@@ -137,7 +143,7 @@ def test_the_summary_has_the_documented_keys():
     assert set(summary) == {"mean", "objects", "psnr", "seconds", "peak_memory_mb"}
     assert set(summary["objects"]) == {"cup", "box"}
     for row in (summary["mean"], summary["objects"]["cup"]):
-        assert set(row) == {"extracted", "rendered"}
+        assert set(row) == {"extracted", "seen", "rendered"}
         assert row["extracted"]["assigned"] == pytest.approx({"acc": 0.8, "iou": 0.7, "biou": 0.6})
         assert row["rendered"]["refined"] == pytest.approx({"acc": 0.9, "iou": 0.9, "biou": 0.9})
     assert summary["objects"]["box"]["extracted"]["refined"] == {"acc": None, "iou": None, "biou": None}
@@ -162,7 +168,13 @@ def test_the_table_shows_both_stages():
     assert ["cup", "before", "80.0", "70.0", "60.0", "80.0", "80.0", "80.0"] in cells
     assert ["after", "90.0", "80.0", "70.0", "90.0", "90.0", "90.0"] in cells
     assert ["box", "before", *6 * ["–"]] in cells
-    for part in ("PSNR, dB: 30.00 → –", "base 12.3", "812 MB", "silhouettes"):
+    assert "worst: cup" in out.getvalue()
+    for part in (
+        "PSNR, dB: 30.00 → –",
+        "base 12.3",
+        "812 MB",
+        "Protocol: extracted masks against whole occlusion-free",
+    ):
         assert part in out.getvalue()
 
 

@@ -18,6 +18,7 @@ from beags_plugin.evaluation.report import RunMetrics, data_set
 from beags_plugin.evaluation.run_metrics import average, evaluate_scene
 from beags_plugin.system.errors import UserError
 
+NO_FIGURES = MaskMetrics(None, None, None)
 pytestmark = pytest.mark.filterwarnings("ignore:Mean of empty slice")
 
 
@@ -68,22 +69,18 @@ def test_who_is_resized():
     assert by_truth.acc == (small[:, 10:26] == few[:, 10:]).mean()
 
 
-@pytest.mark.parametrize(("empty", "value"), [("one", 1.0), ("zero", 0.0), ("skip", None)])
-def test_empty_unions(empty, value):
-    nothing = np.zeros((8, 9), bool)
-    found = mask_metrics(nothing, nothing, None, Protocol(empty=empty))
-    assert found == MaskMetrics(1.0, value, value)
-    # one mask with half of its pixels found, and one that is empty in truth and prediction
+def test_a_mask_that_is_empty_in_both_is_left_out_and_one_that_should_be_empty_counts_zero():
+    nothing, something = np.zeros((8, 9), bool), np.ones((8, 9), bool)
+    assert mask_metrics(nothing, nothing) == mask_metrics(something, something, something) == NO_FIGURES
+    assert mask_metrics(something, nothing) == MaskMetrics(0.0, 0.0, 0.0)
+    # of the cup, one mask with half of its pixels found; of the box, one that is empty, in truth and as drawn
     views = [EvalView(camera(), None, None, {1: square_mask(*CUP)}), EvalView(camera(), None, None, {2: truth() > 9})]
     x, y, half = CUP
     surfels, ids = scene([(x - half / 2, y, half), FLOOR]), torch.tensor([1, 0], dtype=torch.int32)
-    metrics = evaluate_scene(surfels, ids, Squares(), SETTINGS, views, CLASSES, protocol=Protocol(empty=empty))
+    metrics = evaluate_scene(surfels, ids, Squares(), SETTINGS, views, CLASSES)
     expected = ratio(square_mask(x - half / 2, y, half).numpy(), square_mask(*CUP).numpy())
-    assert metrics.mean.extracted is not None
-    counted = [expected] if value is None else [expected, value]
-    assert metrics.mean.extracted.iou == pytest.approx(np.mean(counted))
-    box = metrics.objects[2].extracted
-    assert box is not None and box.iou == value and box.acc == 1.0
+    assert metrics.mean.extracted is not None and metrics.mean.extracted.iou == pytest.approx(expected)
+    assert metrics.objects[2].extracted == NO_FIGURES
 
 
 class Ramp(Squares):
@@ -108,20 +105,16 @@ def test_the_threshold_cuts_both_kinds(threshold):
     assert cup.rendered.iou == ratio(predicted, (truth() == 1).numpy())
 
 
-@pytest.mark.parametrize("silhouettes", ["seen", "whole"])
-def test_what_no_photo_shows_is_scored_on_demand(silhouettes):
+def test_what_no_photo_shows_is_scored_and_the_rest_stands_beside_it():
     known = square_mask(*CUP)
     known[:, : int(CUP[0])] = False  # the left half is not known, and not there
     view = EvalView(camera(), None, None, {1: square_mask(*CUP)}, seen={1: known})
     x, y, half = CUP
     surfels, ids = scene([(x + half / 2, y, half / 2), BOX]), torch.tensor([1, 2], dtype=torch.int32)
-    metrics = evaluate_scene(
-        surfels, ids, Squares(), SETTINGS, [view], CLASSES, protocol=Protocol(silhouettes=silhouettes)
-    )
-    cup = metrics.objects[1].extracted
-    predicted = square_mask(x + half / 2, y, half / 2)
-    assert cup is not None
-    assert cup.iou == (predicted.sum() / (known if silhouettes == "seen" else square_mask(*CUP)).sum()).item()
+    cup = evaluate_scene(surfels, ids, Squares(), SETTINGS, [view], CLASSES).objects[1]
+    predicted = square_mask(x + half / 2, y, half / 2).sum().item()
+    assert cup.extracted is not None and cup.extracted.iou == predicted / square_mask(*CUP).sum().item()
+    assert cup.seen is not None and cup.seen.iou == predicted / known.sum().item()
 
 
 def records(seed: int, views: int, objects: int) -> list[MaskRecord]:
@@ -236,7 +229,7 @@ def test_a_former_state_that_some_scenes_lack_is_not_averaged():
         (dict(threshold=math.nan), "threshold is nan"),
         (dict(band_share=0.0), "band_share is 0.0"),
         (dict(band_share=math.inf), "band_share is inf"),
-        (dict(empty="two"), "empty is 'two': choose one of one, zero, skip"),
+        (dict(resize="both"), "resize is 'both': choose one of prediction, truth"),
         (dict(scene_average="median"), "choose one of masks, objects, views"),
     ],
 )

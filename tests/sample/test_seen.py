@@ -8,7 +8,7 @@ import torch
 from beags_plugin.core.cameras import Camera
 from beags_plugin.evaluation.metrics import mask_metrics
 from beags_plugin.evaluation.records import EvalView
-from beags_plugin.evaluation.run_metrics import extracted_truth
+from beags_plugin.evaluation.run_metrics import seen_truth
 from beags_plugin.sample.seen import PATCH, seen_part, well_seen
 from beags_plugin.sample.views import View
 
@@ -47,7 +47,7 @@ def test_unseen_pixels_are_left_out_and_make_no_boundary():
     seen[25:35, 25:35] = False
     camera = Camera(torch.eye(4), torch.eye(3), 60, 60)
     view = EvalView(camera, None, silhouettes={1: silhouette}, seen={1: seen})
-    kind, truth, ignore = extracted_truth(view, 1)
-    assert kind == "silhouette" and torch.equal(ignore, silhouette & ~seen)
-    assert mask_metrics(seen, truth, ignore).biou == 1.0  # a hole where nothing is known
-    assert mask_metrics(seen, truth).biou < 0.9  # the same hole counts where it is known
+    truth = seen_truth(view, 1)
+    assert truth.source == "silhouette" and torch.equal(truth.unknown, silhouette & ~seen)
+    assert mask_metrics(seen, truth.mask, truth.unknown).biou == 1.0  # a hole where nothing is known
+    assert mask_metrics(seen, truth.mask).biou < 0.9  # the same hole counts where it is known

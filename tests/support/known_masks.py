@@ -14,7 +14,7 @@ CLASSES = {0: "background", 1: "cup", 2: "box"}
 
 
 class Squares(Rasterizer):
-    """Surfel i is an opaque square: centre (x, y) pixels, half side z; earlier ones lie in front."""
+    """A surfel is an opaque square: centre (x, y) pixels, half side z, depth 1 + log scale; earlier ones in front."""
 
     @classmethod
     def unavailable(cls) -> str | None:
@@ -23,12 +23,14 @@ class Squares(Rasterizer):
     def rasterize(self, inputs, camera, settings, background, target=None) -> RasterOutputs:
         ys, xs = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
         color, free = torch.zeros(camera.height, camera.width, 3), torch.ones(camera.height, camera.width)
-        for (x, y, half), rgb in zip(inputs.means.tolist(), inputs.colors, strict=True):
+        depth = torch.zeros_like(free)
+        depths = 1.0 + inputs.log_scales[:, 0]
+        for (x, y, half), rgb, far in zip(inputs.means.tolist(), inputs.colors, depths, strict=True):
             inside = ((xs - x).abs() < half) & ((ys - y).abs() < half)
             weight = free * inside
-            color, free = color + weight[..., None] * rgb, free - weight
+            color, depth, free = color + weight[..., None] * rgb, depth + weight * far, free - weight
         color = color + free[..., None] * background
-        return RasterOutputs(color, 1 - free, None, None, None, None, None, torch.ones(len(inputs.means)) > 0, 0)
+        return RasterOutputs(color, 1 - free, depth, depth, None, None, None, torch.ones(len(inputs.means)) > 0, 0)
 
     def class_contributions(self, inputs, camera, settings, labels, num_classes):
         raise NotImplementedError
@@ -51,7 +53,8 @@ def scene(squares: list[tuple[float, float, float]], grey: float = 0.3) -> Surfe
     n = len(squares)
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1)
     sh = torch.full((n, 1, 3), (grey - 0.5) / 0.28209479177387814)
-    return Surfels.of(torch.tensor(squares), quats, torch.zeros(n, 2), torch.zeros(n), sh)
+    order = torch.arange(n, dtype=torch.float32)[:, None].repeat(1, 2)
+    return Surfels.of(torch.tensor(squares), quats, order, torch.zeros(n), sh)
 
 
 def square_mask(x: float, y: float, half: float) -> torch.Tensor:

@@ -18,7 +18,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import mask_metrics
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import EvalView
-from beags_plugin.evaluation.run_metrics import extracted_mask, extracted_truth
+from beags_plugin.evaluation.run_metrics import MaskRenderer
 from beags_plugin.evaluation.violations import boundary_errors, occupancy_violations
 from beags_plugin.extraction.select import select_class
 from beags_plugin.labels.class_ids import BACKGROUND
@@ -115,15 +115,15 @@ class Curves:
         objects = [index for index in sorted(model.classes)[:MOST_CLASSES] if index != BACKGROUND]
         parts = {index: select_class(surfels, class_ids, index)[0] for index in objects}
         settings = model.settings(geometry=False)
+        renderers = [MaskRenderer(surfels, class_ids, view, model.rasterizer, settings, Protocol()) for view in views]
         values: list[float] = []
         done, total = 0, len(objects) * (len(views) + 1)
         for index in objects:
             scores = []
-            for view in views:
+            for renderer in renderers:
                 progress(done := done + 1, total)
-                if (truth := extracted_truth(view, index)) is not None:
-                    mask = extracted_mask(parts[index], view.camera, model.rasterizer, settings, Protocol().threshold)
-                    scores.append(mask_metrics(mask, truth[1], truth[2]).iou)
+                for mask in renderer.masks("extracted", [index]).values():
+                    scores.append(mask_metrics(mask.prediction, mask.truth, mask.ignore).iou)
             scores = [score for score in scores if score is not None]
             if scores:
                 writer.put_scalar(f"Extracted IoU/{model.classes[index]}", float(np.mean(scores)), step)

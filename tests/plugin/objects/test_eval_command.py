@@ -76,7 +76,8 @@ def test_the_json_says_everything(trained, tmp_path):
     assert content["protocol"] == Protocol(threshold=0.4).to_json()
     (scene,) = content["scenes"]
     assert set(scene) == {
-        "scene", "config", "protocol", "extracted_truth", "notes", "mean", "psnr", "ssim", "objects", "masks", "views"
+        "scene", "config", "protocol", "extracted_truth", "notes", "mean", "psnr", "ssim", "objects", "worst", "masks",
+        "views",
     }  # fmt: skip
     assert scene["extracted_truth"] == "both" and set(scene["objects"]) == {"cup", "box"}
     figures = {"before", "after"}
@@ -102,10 +103,12 @@ def test_several_runs_are_a_data_set(trained, tmp_path, capsys):
     other = write_trained(tmp_path / "second", write_scene(tmp_path / "other" / "lab"))
     picture, path = tmp_path / "worst.png", tmp_path / "all.json"
     arguments = ["--load-config", str(trained), str(other), "--data-set-name", "labs", "--worst", "2"]
-    main(["eval", *arguments, "--json", str(path), "--picture", str(picture), "--empty", "skip"])
+    main(["eval", *arguments, "--json", str(path), "--picture", str(picture), "--scene-average", "views"])
     printed = capsys.readouterr().out
     assert "labs" in printed and "lab (run)" in printed and "lab (second)" in printed
-    assert "Protocol: empty skip; else the defaults." in printed
+    printed = " ".join(printed.split())
+    assert "else visible masks, less the pixels where another object stands nearer; above 0.5; boundary" in printed
+    assert "means over views, then over scenes." in printed and "worst: " in printed
     content = json.loads(path.read_text())
     assert [scene["scene"] for scene in content["scenes"]] == ["lab (run)", "lab (second)"]
     assert [scene["extracted_truth"] for scene in content["scenes"]] == ["both", "visible"]
