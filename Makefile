@@ -1,4 +1,4 @@
-# make setup | test [JOBS=n] | demo [DATA=folder] | soak | fuzz [COUNT=scenes] [SEED=first] | lint | format | clean
+# make setup | test [JOBS=n] | wheel | demo [DATA=folder] | soak | fuzz [COUNT=n] [SEED=n] | lint | format | clean
 # BEAGS_VENV names the environment; clones may share one. PYTHON names the interpreter that makes it.
 BEAGS_VENV ?= .venv
 BIN := $(BEAGS_VENV)/bin
@@ -9,7 +9,7 @@ export OMP_WAIT_POLICY = PASSIVE
 
 JOBS ?= 2
 
-.PHONY: help setup test demo soak fuzz lint format clean
+.PHONY: help setup test wheel demo soak fuzz lint format clean
 
 help:
 	@sed -n '1,2p' Makefile
@@ -23,6 +23,10 @@ setup:
 test: setup
 	BEAGS_REQUIRE_NATIVE=1 OMP_NUM_THREADS=1 \
 	  "$(BIN)/python" -m pytest -q -n $(JOBS) --dist loadscope --no-loadscope-reorder
+
+# An sdist and a wheel in dist/, for computers without a compiler.
+wheel: setup
+	@bash scripts/build_wheel.sh "$(BEAGS_VENV)" dist
 
 demo: setup
 	"$(BIN)/beags" demo $(if $(DATA),--data "$(DATA)")

@@ -178,3 +178,22 @@ def without_small_parts(mesh: Mesh, share: float) -> Mesh:
     number = np.cumsum(kept) - 1
     faces = mesh.faces[kept[mesh.faces[:, 0]]]
     return Mesh(mesh.vertices[kept], number[faces], mesh.colors[kept], mesh.voxel)
+
+
+def decimated(mesh: Mesh, most: int) -> Mesh:
+    """Return the mesh with at most ``most`` faces: edges collapse where that moves the surface least."""
+    if len(mesh.faces) <= most:
+        return mesh
+    import open3d
+
+    origin = mesh.vertices.mean(axis=0)  # quadrics lose digits far from the origin
+    full = open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector((mesh.vertices - origin) / mesh.voxel),
+        open3d.utility.Vector3iVector(mesh.faces.astype(np.int32)),
+    )
+    full.vertex_colors = open3d.utility.Vector3dVector(mesh.colors.astype(np.float64))
+    few = full.simplify_quadric_decimation(most)  # of Open3D's two the one that keeps colours
+    few.remove_unreferenced_vertices()
+    vertices = np.asarray(few.vertices) * mesh.voxel + origin
+    colors = np.asarray(few.vertex_colors, np.float32)
+    return sorted_mesh(Mesh(vertices, np.asarray(few.triangles, np.int64), colors, mesh.voxel))

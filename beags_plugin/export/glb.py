@@ -19,8 +19,11 @@ _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 
 
 def glb_bytes(mesh: Mesh, name: str) -> bytes:
-    """Return the file's content: one node, one mesh, one unlit material; float32 places, linear 16-bit colours."""
-    positions = mesh.vertices.astype("<f4")
+    """Return the file's content: one node, one mesh, one unlit material; float32 places, linear 16-bit colours.
+
+    The mesh has z up and the file y, as glTF demands: the places are turned, as some readers ignore nodes' matrices.
+    """
+    positions = (mesh.vertices[:, [0, 2, 1]] * [1.0, 1.0, -1.0]).astype("<f4")
     colors = np.full((len(positions), 4), 65535, dtype="<u2")
     colors[:, :3] = np.round(linear_from_srgb(mesh.colors) * 65535)
     indices = mesh.faces.astype("<u4").reshape(-1)

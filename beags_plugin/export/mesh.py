@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from beags_plugin.export.base import Exporter, ExportItem, NothingToExport
-from beags_plugin.export.fusion import Mesh, fuse, without_small_parts
+from beags_plugin.export.fusion import Mesh, decimated, fuse, without_small_parts
 from beags_plugin.export.glb import glb_bytes
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.extraction.files import whole_file
@@ -47,7 +47,8 @@ class MeshExporter(MeshOptions, Exporter):
             raise ValueError("a mesh needs the views of the training photos")
         options = self.resolution, self.truncation, self.memory_mb, self.min_views
         fused = fuse(item.surfels, item.views, *options, item.on_render)
-        return without_small_parts(fused, self.smallest_part)
+        most = self.faces or max(1000, 20 * len(item.surfels))
+        return decimated(without_small_parts(fused, self.smallest_part), most)
 
     @staticmethod
     def facts(mesh: Mesh) -> dict[str, Any]:

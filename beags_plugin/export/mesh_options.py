@@ -25,6 +25,8 @@ class MeshOptions:
     """Meshes: views that must show a surface (all, if there are fewer)."""
     smallest_part: float = 0.01
     """Meshes: loose parts with fewer faces than this share of the largest part's are left out."""
+    faces: int = 0
+    """Meshes: most faces (triangles); 0 stands for 20 for each Gaussian, and 1,000 at least."""
 
     def __post_init__(self) -> None:
         if not 8 <= self.resolution <= MOST_VOXELS:
@@ -37,3 +39,5 @@ class MeshOptions:
             raise UserError(f"min_views is {self.min_views}: a surface needs at least 1 view.")
         if not 0.0 <= self.smallest_part <= 1.0:
             raise UserError(f"smallest_part is {self.smallest_part}: it must lie in 0..1.")
+        if self.faces != 0 and self.faces < 100:
+            raise UserError(f"faces is {self.faces}: give at least 100, or 0 for 20 for each Gaussian.")

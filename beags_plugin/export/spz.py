@@ -72,8 +72,8 @@ class SpzExporter(Exporter):
         parts = (
             struct.pack("<IIIBBBB", MAGIC, VERSION, len(turned), degree, bits, 0, 0),
             np.ascontiguousarray(fixed).view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),
-            # 255 would be read as an infinite logit; nothing is rendered with an alpha above 0.99 anyway
-            _bytes(255.0 * opacities(turned.opacity_logits.double()), most=254),
+            # 0 and 255 would be read as infinite logits; renderers skip what 1 shows, and cap alphas at 0.99
+            _bytes(255.0 * opacities(turned.opacity_logits.double()), 1, 254),
             _bytes(255.0 * (0.5 + _COLOR_SCALE * turned.sh_dc.double())),
             _bytes(16.0 * (torch.cat([log_scales, thin], dim=1) + 10.0)),
             _rotation_bytes(turned.quats.double()),
@@ -106,5 +106,5 @@ def _rotation_bytes(quats: torch.Tensor) -> bytes:
     return _bytes(127.5 + 127.5 * unit[:, 1:])
 
 
-def _bytes(values: torch.Tensor, most: int = 255) -> bytes:
-    return values.round().clamp(0, most).to(torch.uint8).cpu().numpy().tobytes()
+def _bytes(values: torch.Tensor, least: int = 0, most: int = 255) -> bytes:
+    return values.round().clamp(least, most).to(torch.uint8).cpu().numpy().tobytes()

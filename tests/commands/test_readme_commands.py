@@ -73,7 +73,9 @@ ELSEWHERE = {
     "make format": "changes the files of this clone",
     "make soak": "an hour; tests/soak/test_soak.py runs the scripts, what make calls is looked at below",
     "scripts/sanitize.sh": "compiles everything anew",
-    "pip install -c constraints.txt -e .": "make setup has done it in the environment that runs this test",
+    "pip install .": "make setup has done it, editable, in the environment that runs this test",
+    "pip install dist/beags-*.whl": "test_wheel.py installs it in a fresh environment",
+    "make wheel": "test_wheel.py calls the script that it calls",
 }
 OWN = {  # name in README.md: name here
     r" \[.*\]": "",

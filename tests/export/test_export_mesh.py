@@ -20,7 +20,7 @@ from beags_plugin.core.lifting import project
 from beags_plugin.export.base import ExportItem, NothingToExport, Viewpoints, make_exporter
 from beags_plugin.export.close_up import close_up
 from beags_plugin.export.frames import bounding_box
-from beags_plugin.export.fusion import Mesh, _grid_mb, sorted_mesh, voxel_size, without_small_parts
+from beags_plugin.export.fusion import Mesh, _grid_mb, decimated, sorted_mesh, voxel_size, without_small_parts
 from beags_plugin.export.glb import linear_from_srgb
 from beags_plugin.export.mesh import GlbExporter
 from beags_plugin.export.mesh_options import MeshOptions
@@ -85,10 +85,11 @@ def test_a_glb_is_read_back(item, mesh, tmp_path):
     facts = make_exporter("glb", **OPTIONS).write(tmp_path / "cup.glb", item)
     assert facts == {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "voxel": mesh.voxel}
     (read,) = trimesh.load(tmp_path / "cup.glb", process=False).geometry.values()
-    assert np.allclose(read.vertices, mesh.vertices, atol=1e-6) and np.array_equal(read.faces, mesh.faces)
+    y_up = np.stack([mesh.vertices[:, 0], mesh.vertices[:, 2], -mesh.vertices[:, 1]], axis=1)
+    assert np.allclose(read.vertices, y_up, atol=1e-6) and np.array_equal(read.faces, mesh.faces)
     other = open3d.io.read_triangle_mesh(str(tmp_path / "cup.glb"))
     tree = cKDTree(np.asarray(other.vertices))  # this reader may renumber
-    distance, index = tree.query(mesh.vertices)
+    distance, index = tree.query(y_up)
     assert distance.max() < 1e-6
     # glTF's vertex colours are linear
     colors = np.asarray(other.vertex_colors)[index]
@@ -108,6 +109,25 @@ def test_an_obj_is_read_back(item, mesh, tmp_path):
 def test_both_file_types_share_one_mesh(item):
     glb, obj = (make_exporter(name, **OPTIONS) for name in ("glb", "obj"))
     assert glb.mesh(item) is obj.mesh(item)
+
+
+def test_fewer_faces_keep_bounds_surface_and_colours(thing, item, mesh):
+    few = decimated(mesh, 3000)
+    assert 2900 <= len(few.faces) <= 3000 < len(mesh.faces) / 10 and len(few.vertices) == len(np.unique(few.faces))
+    for end in (np.min, np.max):
+        assert np.abs(end(few.vertices, axis=0) - end(mesh.vertices, axis=0)).max() < mesh.voxel
+    assert np.quantile(np.abs(thing.distance(few.vertices)), 0.9) < mesh.voxel
+    assert np.abs(few.colors - color_at(few.vertices)).mean() < 0.02
+    again = decimated(mesh, 3000)
+    assert np.array_equal(again.vertices, few.vertices) and np.array_equal(again.faces, few.faces)
+
+
+def test_a_small_object_gets_few_faces_and_the_option_another_number(item):
+    """Faces in proportion to the Gaussians, as a cup of 400 is not drawn better by 100,000."""
+    discs = item.surfels[::100]
+    some = replace(item, surfels=replace(discs, log_scales=discs.log_scales + 2.5), shared={})
+    for options, most in (({}, 20 * len(some.surfels)), ({"faces": 1000}, 1000)):
+        assert 0.97 * most <= len(GlbExporter(resolution=64, **options).mesh(some).faces) <= most
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
@@ -224,6 +244,7 @@ def test_without_open3d_a_user_error_explains_it(monkeypatch):
         ({"truncation": 0.5}, "truncation is 0.5: it must lie in 1..64"),
         ({"memory_mb": 1.0}, "memory_mb is 1.0: give the voxel grid at least 50 MB"),
         ({"min_views": 0}, "min_views is 0: a surface needs at least 1 view"),
+        ({"faces": 99}, "faces is 99: give at least 100, or 0 for 20 for each Gaussian"),
         ({"smallest_part": float("nan")}, "smallest_part is nan: it must lie in 0..1"),
     ],
 )

@@ -163,6 +163,13 @@ def test_the_same_bytes_again_and_much_smaller_than_a_ply(tmp_path):
     assert (tmp_path / "a.spz").stat().st_size * 4 < (tmp_path / "a.ply").stat().st_size
 
 
+def test_no_reader_gets_an_infinite_logit(tmp_path):
+    surfels = random_surfels()
+    surfels.opacity_logits[:2] = torch.tensor([-20.0, 20.0])
+    write(tmp_path / "a.spz", surfels)
+    assert (255 * read(tmp_path / "a.spz")["alphas"])[:2].tolist() == [1, 254]
+
+
 def test_what_is_not_finite_is_left_out_and_nothing_is_a_file_too(tmp_path):
     surfels = random_surfels()
     surfels.means[2, 1], surfels.opacity_logits[4] = math.nan, math.inf

@@ -171,7 +171,8 @@ def test_meshes_of_a_run_lie_where_its_discs_are(trained, tmp_path, monkeypatch)
         vertices = trimesh.load_mesh(tmp_path / file["path"], process=False).vertices
         assert len(vertices) == file["vertices"] > 100
         there = place.surfels(surfels[ids == one["class_id"]])
-        distances = torch.cdist(torch.from_numpy(np.array(vertices)).float(), there.means)
+        z_up = vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0]
+        distances = torch.cdist(torch.from_numpy(np.array(z_up)).float(), there.means)
         radius = 3.0 * float(there.log_scales.exp().max())
         assert float((distances.min(dim=1).values < radius).float().mean()) > 0.99
 

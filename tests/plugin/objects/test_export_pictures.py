@@ -77,11 +77,12 @@ def srgb_from_linear(values: np.ndarray) -> np.ndarray:
 
 
 def read(path: Path) -> ReadMesh:
-    """Read a mesh by other projects' readers; trimesh gives no vertex colours where a .glb has a material."""
+    """Read a mesh, z up, by other projects' readers; trimesh gives no vertex colours where a .glb has a material."""
     if path.suffix == ".glb":
         glb = open3d.io.read_triangle_mesh(str(path))
         linear = np.asarray(glb.vertex_colors)
-        return ReadMesh(np.asarray(glb.vertices), np.asarray(glb.triangles), srgb_from_linear(linear))
+        z_up = np.asarray(glb.vertices)[:, [0, 2, 1]] * [1.0, -1.0, 1.0]
+        return ReadMesh(z_up, np.asarray(glb.triangles), srgb_from_linear(linear))
     obj = trimesh.load_mesh(path, process=False, maintain_order=True)
     return ReadMesh(np.array(obj.vertices), np.array(obj.faces), obj.visual.vertex_colors[:, :3] / 255.0)
 
