@@ -6,6 +6,7 @@ set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 env="${1:?usage: scripts/setup_env.sh <environment folder>}"
 python="${PYTHON:-python3}"
+opencv="opencv-contrib-python-headless"
 
 fail() {
   echo "beags setup: $1" >&2
@@ -60,6 +61,8 @@ if [ -z "${BEAGS_CUDA_ARCHITECTURES:-}" ] && nvidia-smi -L >/dev/null 2>&1; then
 build=(-C "cmake.define.BEAGS_CUDA_ARCHITECTURES=$architectures" -C cmake.define.BEAGS_CUDA_EMULATION=ON)
 
 pip() { "$env/bin/python" -m pip --disable-pip-version-check "$@"; }
+# guidedFilter, not ximgproc itself: an emptied package leaves an importable shell behind.
+contrib_works() { "$env/bin/python" -c 'import sys, cv2; sys.exit(not hasattr(getattr(cv2, "ximgproc", None), "guidedFilter"))' 2>/dev/null; }
 
 if [ "$packages_now" != "$packages_before" ]; then
   pins=(-c constraints.txt)
@@ -79,6 +82,11 @@ if [ "$packages_now" != "$packages_before" ]; then
   # sam2 (transformers) is for the tests of its masks; it brings no weights.
   # The build tools are in the environment by now, so the build needs no isolated copy of them.
   pip install -qq --no-build-isolation "${build[@]}" "${pins[@]}" -e '.[dev,sam2]'
+  # nerfstudio brings plain opencv, which shares the folder cv2/ with contrib: the one written last wins.
+  if ! contrib_works; then
+    pip install -qq "${pins[@]}" --force-reinstall --no-deps "$opencv"
+    contrib_works || fail "cv2.ximgproc.guidedFilter is missing after installing $opencv: delete $env and run make setup again."
+  fi
   echo "$packages_now" >"$env/.beags-packages"
   echo "$source_now" >"$env/.beags-source"
 elif [ "$source_now" != "$source_before" ]; then

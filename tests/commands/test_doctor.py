@@ -25,11 +25,11 @@ def checks() -> dict[str, Check]:
 
 
 def test_everything_is_checked(checks):
-    expected = {"python", "torch", "CUDA device", "nvcc", "nerfstudio", "opencv", "open3d", "presets"}
+    expected = {"python", "torch", "CUDA device", "nvcc", "nerfstudio", "opencv contrib", "open3d", "presets"}
     assert expected | {f"rasterizer {name}" for name in RASTERIZERS.names()} <= set(checks)
     assert all(check.sentence and "\n" not in check.sentence for check in checks.values())
     assert not any(check.repair for check in checks.values() if check.ok)
-    for name in ("python", "torch", "nerfstudio", "opencv", "rasterizer torch"):
+    for name in ("python", "torch", "nerfstudio", "opencv contrib", "rasterizer torch"):
         assert checks[name].ok, checks[name].sentence
 
 
@@ -42,7 +42,12 @@ def test_a_missing_package_is_a_finding(monkeypatch, module):
     assert found.repair.startswith("pip install") and name in found.repair
 
 
-def test_presets_that_nerfstudio_does_not_know_are_a_finding(monkeypatch):
+def test_missing_parts_of_packages_are_findings(monkeypatch):
+    cv2 = pytest.importorskip("cv2")
+    monkeypatch.setattr(cv2, "ximgproc", type(sys)("cv2.ximgproc"))  # an empty shell, as plain opencv leaves it
+    found = diagnosis._opencv()
+    assert not found.ok and "guidedFilter" in found.sentence
+    assert found.repair == "pip install --force-reinstall --no-deps opencv-contrib-python-headless==4.10.0.84"
     monkeypatch.setattr(metadata, "entry_points", lambda group: [])
     presets = diagnosis._presets()
     assert not presets.ok and presets.required and presets.repair == "pip install -c constraints.txt -e ."

@@ -11,10 +11,11 @@ from pathlib import Path
 from beags_plugin.commands.doctor.backends import rasterizers
 from beags_plugin.commands.doctor.check import Check, first_line
 
+_OPENCV = "pip install --force-reinstall --no-deps opencv-contrib-python-headless==4.10.0.84"
 _REPAIRS = {  # by the name of a check that raises
     "torch": "pip install torch",
     "nerfstudio": "pip install nerfstudio==1.1.5",
-    "opencv": "pip install opencv-python-headless==4.10.0.84",
+    "opencv": _OPENCV,
     "presets": "pip install -c constraints.txt -e .",
 }
 
@@ -98,7 +99,10 @@ def _presets() -> Check:
 def _opencv() -> Check:
     import cv2
 
-    return Check("opencv", True, cv2.__version__)
+    # Plain opencv installed over contrib leaves an empty ximgproc, so look for the function itself.
+    ok = hasattr(getattr(cv2, "ximgproc", None), "guidedFilter")
+    sentence = f"{cv2.__version__} {'with' if ok else 'without'} cv2.ximgproc.guidedFilter"
+    return Check("opencv contrib", ok, sentence, repair="" if ok else _OPENCV)
 
 
 def _open3d() -> Check:
