@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.system.errors import UserError
 
 EPSILON = 1e-2  # variance of colour (0..1) below which the guide counts as flat
 
@@ -14,10 +15,12 @@ def snap_to_edges(labels: np.ndarray, photo: np.ndarray, radius: int) -> np.ndar
 
     radius: pixels of the filter's window, and the largest distance of a changed label from an outline. Each class's
     indicator is filtered with the photo as guide (He et al., "Guided image filtering"); near outlines the class of the
-    largest value is taken. IGNORE stays.
+    largest value is taken. IGNORE stays. Raises ``UserError`` where OpenCV lacks the filter.
     """
     import cv2
 
+    if not hasattr(getattr(cv2, "ximgproc", None), "guidedFilter"):
+        raise UserError("this OpenCV has no guided filter: run beags doctor, which names the command that repairs it.")
     ids = [int(i) for i in np.unique(labels) if i != IGNORE]
     if radius < 1 or len(ids) < 2:
         return labels

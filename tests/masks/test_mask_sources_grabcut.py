@@ -94,3 +94,12 @@ def test_outlines_snap_to_the_edge_of_the_photo():
     far = ndimage.distance_transform_edt(~(ndimage.binary_dilation(disc, iterations=3) & ~ndimage.binary_erosion(disc)))
     assert not ((snapped != ragged) & (far > 8))[5:].any()
     np.testing.assert_array_equal(snap_to_edges(ragged, photo, 0), ragged)
+
+
+def test_plain_opencv_has_no_guided_filter(monkeypatch):
+    cv2 = pytest.importorskip("cv2")
+    monkeypatch.setattr(cv2, "ximgproc", type("shell", (), {}))  # what plain opencv installed over contrib leaves
+    labels = np.zeros((8, 9), np.uint16)
+    labels[2:5] = 1
+    with pytest.raises(UserError, match="run beags doctor"):
+        snap_to_edges(labels, np.zeros((8, 9, 3), np.uint8), 2)
