@@ -62,16 +62,17 @@ def code_lines(text: str) -> list[str]:
     return lines
 
 
-def commands_of(document: Path) -> list[str]:
+def commands_of(text: str) -> list[str]:
     """Return the commands of a document's code blocks, without synopses (which have brackets)."""
-    return [
-        line
-        for line in code_lines(document.read_text("utf8"))
-        if PROGRAMS.match(line + " ") and not re.search(r"[\[\]<>]", line)
-    ]
+    return [line for line in code_lines(text) if PROGRAMS.match(line + " ") and not re.search(r"[\[\]<>]", line)]
 
 
-COMMANDS = [(document.name, line) for document in DOCUMENTS if document.exists() for line in commands_of(document)]
+COMMANDS = [
+    (document.name, line)
+    for document in DOCUMENTS
+    if document.exists()
+    for line in commands_of(document.read_text("utf8"))
+]
 pytestmark = pytest.mark.skipif(not COMMANDS, reason="no documents beside the tests")
 
 

@@ -28,7 +28,7 @@ from beags_plugin.plugin.training.resumable import TrainingRun
 from beags_plugin.plugin.training.scene_edits import edit_scene
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
-from beags_plugin.preparation.pipeline import Preparation, prepare
+from beags_plugin.preparation.pipeline import Preparation, check_masks, prepare
 from beags_plugin.refiners import REFINERS
 from beags_plugin.system import processes
 from beags_plugin.system.errors import UserError, writing
@@ -59,12 +59,8 @@ class RefinementSwitch:
 
     def check_masks(self) -> None:
         """Raise ``UserError`` if no training view has a mask to refine with."""
-        masks = self.datamanager.train_dataset.metadata["mask_filenames"]
-        if self.wanted and all(path is None for path in masks):
-            raise UserError(
-                "no training view has a mask: put id images into masks/<image name>.png, or train the preset "
-                "beags-base, which needs none."
-            )
+        if self.wanted:
+            check_masks(view.labels for view in self.datamanager.views("train", original=True))
 
     def check_options(self) -> None:
         """Raise ``UserError`` for options that would stop the run when it begins to refine."""
