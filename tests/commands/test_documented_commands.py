@@ -13,7 +13,6 @@ import re
 import shlex
 import typing
 from importlib import import_module
-from pathlib import Path
 
 import pytest
 import tyro
