@@ -87,6 +87,5 @@ def _only(files: MaskFiles, views: list[int]) -> str:
 
 
 def _remedy(views: int) -> str:
-    return (
-        f"if {'it is' if views == 1 else 'they are'} right, mask the object in the others too, or remove their masks."
-    )
+    right = "it is right" if views == 1 else "they are right"
+    return f"if {right}, mask the object in the others too, or remove masks that are empty."
