@@ -38,8 +38,8 @@ class Check:
     """Ids in the masks that mean "not labelled", if not the run's own."""
     min_views: int = 3
     """An object in fewer training views is reported."""
-    output: Path = Path("outputs/masks_check")
-    """Folder for report.json, coverage.png and contradicted.png."""
+    output: Path | None = None
+    """Folder for report.json, coverage.png and contradicted.png; outputs/masks_check/<scene's name> if left out."""
 
     def run(self) -> None:
         if self.data is None and self.load_config is None:
@@ -60,10 +60,12 @@ class Check:
         if self.load_config is not None and readable:
             run = reproject_run(self.load_config, ReprojectionOptions(method="voxel", run_size=True, parser=parser))
             report = check_with_run(report, run)
+        for line in report.objects():
+            CONSOLE.print(line)
         for issue in report.issues:
             CONSOLE.print(f"{issue.level}: {issue.message}\n    costs: {issue.cost}")
         CONSOLE.print(report.summary())
-        for path in write_report(report, self.output, run):
+        for path in write_report(report, self.output or Path("outputs/masks_check") / report.data.name, run):
             CONSOLE.print(f"  {path}")
         if self.load_config is not None and not readable:
             CONSOLE.print("The run was not asked, as the masks cannot all be read.")

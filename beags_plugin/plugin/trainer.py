@@ -160,7 +160,7 @@ class BeagsTrainer(Trainer):
             stop(
                 UserError(
                     f"the checkpoint is of a complete run ({self._start_step} steps): nothing is left to train; "
-                    "to refine again, load <run>/base/nerfstudio_models with beags-refine."
+                    "to refine a base, this one or <run>/base/nerfstudio_models, load it with beags-refine."
                 )
             )
         self._estimate = Estimate(str(self.config.method_name), self.config.max_num_iterations)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from beags_plugin.assignment.assignment import Assignment, assign_classes, check_class_ids
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.labels.class_ids import IGNORE, objects_in
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.masks import REPROJECTIONS
@@ -125,11 +125,7 @@ def prepare(
     Raises ``UserError`` if no mask names an object.
     """
     maps = labels if isinstance(labels, LabelMaps) else LabelMaps(labels)
-    if not any(mask is not None and bool(((mask > 0) & (mask != IGNORE)).any()) for mask in maps):
-        raise UserError(
-            "no mask names an object: put id images into masks/<image name>.png, or train the preset beags-base, "
-            "which needs none."
-        )
+    check_masks(maps)
     surfels = surfels.detach()
     known = known_classes(maps, class_names)
     summary: list[str] = []
@@ -167,6 +163,20 @@ def prepare(
         seconds["voxel grids"] = time.perf_counter() - start
         summary.append(f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {k})")
     return Preparation(masks.labels, masks.confidence, assignment, grid, edited, summary, seconds)
+
+
+def check_masks(labels: Iterable[Tensor | None]) -> None:
+    """Raise ``UserError`` if no mask names an object; masks after the first that does are not asked for."""
+    fault = "no training view has a mask"
+    for mask in labels:
+        if mask is not None:
+            if objects_in(mask):
+                return
+            fault = "no mask of a training view names an object"
+    raise UserError(
+        f"{fault}: put id images into masks/<image name>.png, make them with beags masks make, or train the preset "
+        "beags-base, which needs none."
+    )
 
 
 @contextmanager

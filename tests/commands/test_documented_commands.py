@@ -3,7 +3,7 @@
 Names of the reader's own things (``my_scene``, ``outputs/.../config.yml``) are replaced by tiny ones: ``SUBSTITUTES``.
 Commands of ``beags`` that end in seconds then run as they stand, with small sizes appended: ``RUN``. All others
 (training, experiments, the viewer, other programs' commands) are parsed by the same parser that would run them, so that
-a wrong flag or value fails, but not run; the first ``ns-train`` of README.md does run, a few steps long. ``make``
+a wrong flag or value fails, but not run (test_readme_commands.py and test_documented_roads.py run trainings). ``make``
 targets, and scripts and files that ``python`` and ``pip`` name, must exist. New files in docs/ are found by themselves.
 """
 
@@ -13,7 +13,6 @@ import re
 import shlex
 import typing
 from importlib import import_module
-from pathlib import Path
 
 import pytest
 import tyro
@@ -62,16 +61,17 @@ def code_lines(text: str) -> list[str]:
     return lines
 
 
-def commands_of(document: Path) -> list[str]:
+def commands_of(text: str) -> list[str]:
     """Return the commands of a document's code blocks, without synopses (which have brackets)."""
-    return [
-        line
-        for line in code_lines(document.read_text("utf8"))
-        if PROGRAMS.match(line + " ") and not re.search(r"[\[\]<>]", line)
-    ]
+    return [line for line in code_lines(text) if PROGRAMS.match(line + " ") and not re.search(r"[\[\]<>]", line)]
 
 
-COMMANDS = [(document.name, line) for document in DOCUMENTS if document.exists() for line in commands_of(document)]
+COMMANDS = [
+    (document.name, line)
+    for document in DOCUMENTS
+    if document.exists()
+    for line in commands_of(document.read_text("utf8"))
+]
 pytestmark = pytest.mark.skipif(not COMMANDS, reason="no documents beside the tests")
 
 
@@ -151,20 +151,6 @@ def test_a_documented_command_works(folder, monkeypatch, document, line):
         check_beags(words)
     else:
         check_other(program, words)
-
-
-def test_the_training_of_the_quick_start_runs(folder, monkeypatch):
-    from beags_plugin.plugin.runs.launch import train
-
-    monkeypatch.chdir(folder)
-    (line, *_) = [line for name, line in COMMANDS if name == "README.md" and line.startswith("ns-train")]
-    config = training_config(words_of(line)[1:])
-    model = config.model_config
-    model.base_steps, model.refine_steps, config.vis, config.run_dir = 3, 2, "tensorboard", folder / "trained"
-    model.prepare, model.split = type(model.prepare)(k=5), type(model.split)()
-    config.data_config.data = config.data or config.data_config.data  # as ns-train does
-    train(config)
-    assert (folder / "trained" / "base" / "config.yml").exists()
 
 
 def test_commands_in_the_text_exist():

@@ -86,9 +86,10 @@ def test_masks_of_other_methods_are_trained_on(tmp_path, capsys):
 
 @dataclass(frozen=True)
 class Scripted(MaskSource):
-    """Masks of all views, those of ``aside`` only to look at; fails before the view ``breaks``."""
+    """Masks of all views, empty but of ``shown``, those of ``aside`` only to look at; fails before ``breaks``."""
 
     aside: tuple[int, ...] = ()
+    shown: range = range(9)
     breaks: int = 99
 
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
@@ -96,9 +97,18 @@ class Scripted(MaskSource):
             for index in range(len(scene.photos)):
                 if index == self.breaks:
                     raise UserError("interrupted")
-                yield truth(0).astype(np.uint16)
+                yield truth(0).astype(np.uint16) * np.uint16(index in self.shown)
 
         return MadeMasks({0: "background", 1: "cup", 2: "box"}, maps(), [], frozenset(self.aside))
+
+
+def test_objects_that_most_made_masks_lack_are_named(tmp_path):
+    write_transforms(tmp_path)
+    data = BeagsDataParserConfig(data=tmp_path)
+    assert "warning" not in " ".join(make_masks(data, Scripted()))
+    lines = make_masks(data, Scripted(shown=range(3, 4)), output=tmp_path / "made")
+    warnings = [line for line in lines if line.startswith(f"warning: {tmp_path / 'made/masks/v03.png'} is the only")]
+    assert ["1 (cup)" in warnings[0], "2 (box)" in warnings[1]] == [True, True] and "of 7 should" in warnings[0]
 
 
 def test_masks_to_look_at_are_guarded_and_whole_as_the_others(tmp_path):

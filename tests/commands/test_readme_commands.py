@@ -208,9 +208,9 @@ def test_the_commands_run_in_order(tmp_path, monkeypatch):
     assert first.parents[1].name == "beags-tiny" and second.parents[1].name == "beags-refine"
     run = reader.run
     for name in (
-        "worst.png", "made/masks", "made/classes.json", "exported/manifest.json", "outputs/masks_check/report.json",
-        "outputs/my_scene/summary.json", "outputs/my_scene/contact_sheet.png", run / "extracted/cup/cup.ply",
-        run / "reprojected/before_after.png",
+        "worst.png", "made/masks", "made/classes.json", "exported/manifest.json", "outputs/my_scene/summary.json",
+        "outputs/my_scene/contact_sheet.png", "outputs/masks_check/my_scene/report.json",
+        run / "extracted/cup/cup.ply", run / "reprojected/before_after.png",
     ):  # fmt: skip
         assert (tmp_path / name).exists(), name
     assert any((tmp_path / "exports").glob("*.ply")) and any((run / "renders").iterdir())

@@ -17,6 +17,8 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import write_mask
 from beags_plugin.masks.check.areas import contradicted
 from beags_plugin.masks.check.consistency import UNSEEN, Agreement, labels_at, ranks_of
+from beags_plugin.masks.check.disagreement import views_against_others
+from beags_plugin.masks.check.files import Coverage, MaskFiles
 from beags_plugin.masks.check.issues import named, percent
 from beags_plugin.pictures.masks import coverage_picture
 
@@ -109,6 +111,48 @@ def test_an_id_used_in_a_single_view_is_an_exchange(tmp_path):
     assert str(root / "masks/v04.png") in found["few views"][0].message
 
 
+SQUARE = np.zeros((SIDE, SIDE), np.uint8)
+SQUARE[5:43, 5:43] = 1  # more than half of a view
+
+
+@pytest.mark.parametrize(
+    ("change", "words", "lacking"),
+    [
+        (lambda view, ids: SQUARE * (view == 5), "v05.png is the only view that shows 1 (left), but 9 more views", 9),
+        (
+            lambda view, ids: SQUARE if view == 5 else SQUARE * (ids == view % 3 + 1) * (np.arange(SIDE) % 9 == view),
+            "v05.png is the only view that shows 1 (left), but 9 more views", 9,
+        ),
+        (
+            lambda view, ids: (ids == 1) * np.uint8(view in (2, 5, 9)),
+            "v02.png, v05.png, v09.png are the only views that show 1 (left), but 7 more views of 10 should", 7,
+        ),
+    ],
+)  # fmt: skip
+def test_an_object_that_most_views_lack_is_no_mistake_of_the_others(tmp_path, change, words, lacking):
+    root = write_balls(tmp_path, change)
+    (root / "classes.json").write_text('{"1": "left"}')
+    found = issues(root)
+    (issue,) = found["absent"]
+    assert words in issue.message and len(issue.views) == lacking and "v05" not in issue.views
+    assert set(found) <= {"absent", "few views"}
+
+
+def test_a_view_that_alone_shows_an_object_at_a_place_is_not_to_be_inverted():
+    """The masks of two views show the object where all other views see background, each at its own place."""
+    labels = np.zeros((40, 12), np.int16)
+    labels[:30, 3], labels[:30, 4], labels[10:, 5] = 1, UNSEEN, 1
+    pixels = np.array([[1000, 30 * (view in (3, 5))] for view in range(12)])
+    coverage = Coverage([0, 1], pixels, np.zeros(12, np.int64), pixels.sum(1), np.ones(12, bool))
+    names = [f"v{view:02d}" for view in range(12)]
+    masks = [Path(f"masks/{name}.png") for name in names]
+    files = MaskFiles(names, [(1, 1)] * 12, masks, Path("masks"), "ids", (), [True] * 12, None, Path())
+    for issue in views_against_others(Agreement(labels, 2), files, coverage, {0: "background", 1: "bear"}):
+        assert "invert" not in issue.message
+        assert (issue.kind, issue.level) in (("only view", "warning"), ("absent", "warning"))
+        assert "the only views that show 1 (bear)" in issue.message
+
+
 def test_mistakes_in_files_name_file_and_remedy(tmp_path):
     def change(view, ids):
         if view == 2:
@@ -131,16 +175,25 @@ def test_mistakes_in_files_name_file_and_remedy(tmp_path):
     assert "unknown id" not in issues(root, ignore_ids=(255,))
 
 
-def test_the_command_writes_its_report_and_ends_with_1_on_errors(tmp_path, capsys):
-    root = write_balls(tmp_path / "scene", lambda view, ids: ids[::2] if view == 2 else ids)
+@pytest.mark.parametrize(
+    ("change", "kind", "words"),
+    [
+        (lambda view, ids: ids[::2] if view == 2 else ids, "size", "2 (right): in 9 of 9 training views"),
+        (lambda view, ids: 0 * ids if view % 8 else ids, "no object", "no mask of a training view in"),
+    ],
+)  # fmt: skip
+def test_the_command_writes_its_report_and_ends_with_1_on_errors(tmp_path, capsys, monkeypatch, change, kind, words):
+    root = write_balls(tmp_path / "scene", change)
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:
-        main(["masks", "check", "--data", str(root), "--output", str(tmp_path / "out")])
+        main(["masks", "check", "--data", str(root)])
     assert ended.value.code == 1
-    report = json.loads((tmp_path / "out/report.json").read_text())
-    assert [issue["kind"] for issue in report["issues"]] == ["size"]
+    report = json.loads((tmp_path / "outputs/masks_check/scene/report.json").read_text())
+    assert report["issues"][0]["kind"] == kind and report["issues"][0]["level"] == "error"
     assert report["coverage"][0]["pixels"]["1"] == int((balls_from(poses()[0]) == 1).sum())
-    assert (tmp_path / "out/coverage.png").stat().st_size > 5000
-    assert "11 usable masks, 3 objects; 1 errors" in capsys.readouterr().out
+    assert (tmp_path / "outputs/masks_check/scene/coverage.png").stat().st_size > 5000
+    out = capsys.readouterr().out
+    assert words in out and "3 objects; 1 errors" in out
 
 
 def test_unlabelled_masks_are_named(tmp_path):

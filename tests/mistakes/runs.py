@@ -125,6 +125,13 @@ mistakes(
 )
 
 
+@mistake("runs", "load-dir is of a refinement of other classes")
+def _(at: Place):
+    run = broken_off(at)
+    (at.data / "classes.json").write_text(CLASSES)
+    return at.train(load_dir=run / "nerfstudio_models")
+
+
 @mistake("runs", "load-dir is empty")
 def _(at: Place):
     (at.root / "empty").mkdir()

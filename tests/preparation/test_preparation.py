@@ -117,4 +117,4 @@ def test_more_rounds_than_steps_are_refused():
     config = base_config().model_config
     config.refine_steps, config.refine_rounds = 3, 4
     with pytest.raises(UserError, match="refine_rounds is 4: it must be 1 to refine_steps, which is 3"):
-        RefinementSwitch(SimpleNamespace(config=config), None, None).check_options()
+        RefinementSwitch(SimpleNamespace(config=config), None, None).check()

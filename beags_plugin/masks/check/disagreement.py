@@ -1,12 +1,16 @@
-"""Issues of whole views that disagree with the others: exchanged ids, inverted masks."""
+"""Issues of whole views that disagree with the others: exchanged ids, inverted masks, objects that only some show."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
-from beags_plugin.masks.check.consistency import Agreement
+import numpy as np
+
+from beags_plugin.masks.check.consistency import AGREEMENT, LEAST_POINTS, MOST, UNSEEN, Agreement
 from beags_plugin.masks.check.files import Coverage, MaskFiles
-from beags_plugin.masks.check.issues import Issue, percent
+from beags_plugin.masks.check.issues import Issue, named, percent
+
+HARDLY = 0.1  # of the most pixels that an object has in a view: with fewer, a view does not show it
 
 
 def views_against_others(
@@ -14,24 +18,74 @@ def views_against_others(
 ) -> list[Issue]:
     """Describe the disagreements as issues; ranks of ``agreement`` are indices in ``coverage.ids``."""
     titles = [f"{i} ({names[i]})" for i in coverage.ids]
+    absent = dict(_absent(agreement, files, coverage, titles))
     groups: dict[tuple[tuple[int, int], ...], list[int]] = {}
     for found in agreement.renamed():
         groups.setdefault(tuple(sorted(found.instead.items())), []).append(found.view)
-    issues = []
+    issues = list(absent.values())
     for pairs, views in groups.items():
-        says = ", ".join(f"{titles[new]} instead of {titles[true]}" for true, new in pairs)
-        inverted = any(0 in pair for pair in pairs)
+        (true, new), *more = pairs
+        alone = true == 0 and not more  # no exchange: nothing else in the view is called background
+        if alone and new in absent:
+            continue
         ranks = sorted({new for _, new in pairs} - {0})
         wrong, all_of = (int(coverage.pixels[rows][:, ranks].sum()) for rows in (views, slice(None)))
-        issues.append(
-            Issue(
-                "warning",
-                "inverted" if inverted else "swapped ids",
-                f"{len(views)} masks ({files.paths(views)}) say {says}, against the other views: "
-                + ("invert these masks." if inverted else "give these objects the ids of the other views."),
-                f"{wrong} pixels ({percent(wrong, all_of)} of these ids) vote for the wrong object; reprojection "
-                "outvotes single views, but not many",
-                tuple(files.stems[view] for view in views),
-            )
+        cost = (
+            f"{wrong} pixels ({percent(wrong, all_of)} of these ids) vote for the wrong object; reprojection "
+            "outvotes single views, but not many"
         )
+        if alone:
+            kind, message = "only view", f"{_only(files, views)} {titles[new]} there: {_remedy(len(views))}"
+            cost = f"reprojection outvotes {wrong} pixels ({percent(wrong, all_of)} of this id)"
+        else:
+            inverted = any(0 in pair for pair in pairs)
+            kind = "inverted" if inverted else "swapped ids"
+            says = ", ".join(f"{titles[new]} instead of {titles[true]}" for true, new in pairs)
+            remedy = "invert these masks." if inverted else "give these objects the ids of the other views."
+            message = f"{len(views)} masks ({files.paths(views)}) say {says}, against the other views: {remedy}"
+        issues.append(Issue("warning", kind, message, cost, tuple(files.stems[view] for view in views)))
     return issues
+
+
+def _absent(
+    agreement: Agreement, files: MaskFiles, coverage: Coverage, titles: list[str]
+) -> Iterator[tuple[int, Issue]]:
+    """Find objects that most views should show, as the masks of the other views say, and do not; yield their ranks."""
+    trained = np.asarray(files.trained) & coverage.usable
+    for rank in range(1, len(titles)):
+        labels = agreement.labels[agreement.votes[:, rank] > 0]
+        pixels = np.where(trained, coverage.pixels[:, rank], 0)
+        for shown in (pixels > 0, pixels > HARDLY * pixels.max()):  # the second where slivers outvote whole objects
+            showing = np.flatnonzero(shown).tolist()
+            inside, seen = (found.sum(1) for found in (labels[:, shown] == rank, labels[:, shown] != UNSEEN))
+            agreed = labels[(inside >= min(2, len(showing))) & (inside >= AGREEMENT * seen)]
+            if len(agreed) >= LEAST_POINTS:
+                break
+        else:
+            continue
+        background = (agreed == 0).mean(0)  # neither beside the image nor behind another object
+        lacking = np.flatnonzero(trained & ~shown & (background >= MOST)).tolist()
+        if len(lacking) > len(showing):
+            stems = tuple(files.stems[view] for view in lacking)
+            yield (
+                rank,
+                Issue(
+                    "warning",
+                    "absent",
+                    f"{_only(files, showing)} {titles[rank]}, but {len(lacking)} more views of {int(trained.sum())} "
+                    f"should and have hardly any of it or none ({named(stems)}): {_remedy(len(showing))}",
+                    f"{len(lacking)} views vote for the background where {len(showing)} show the object; a view "
+                    "without a mask does not vote",
+                    stems,
+                ),
+            )
+
+
+def _only(files: MaskFiles, views: list[int]) -> str:
+    one = len(views) == 1
+    return f"{files.paths(views)} {'is the only view that shows' if one else 'are the only views that show'}"
+
+
+def _remedy(views: int) -> str:
+    right = "it is right" if views == 1 else "they are right"
+    return f"if {right}, mask the object in the others too, or remove masks that are empty."

@@ -106,7 +106,7 @@ def check_files(
                 progress(view + 1, views)
     coverage = _coverage(counts)
     coverage.issues += issues
-    coverage.issues += [*_missing(files), *_strays(files), *_names(files, coverage)]
+    coverage.issues += [*_missing(files), *_no_object(files, coverage), *_strays(files), *_names(files, coverage)]
     coverage.issues += [*_few_views(files, coverage, few_views), *_unlabelled(files, coverage)]
     return coverage
 
@@ -150,7 +150,7 @@ def _missing(files: MaskFiles) -> Iterator[Issue]:
             "missing",
             f"no training view has a mask in {files.folder}: put id images there, named as the images, or make "
             "them with: beags masks make",
-            "training stops before refinement (beags-base needs no masks)",
+            "training stops before its first step (beags-base needs no masks)",
             tuple(without),
         )
     elif without:
@@ -162,6 +162,18 @@ def _missing(files: MaskFiles) -> Iterator[Issue]:
             f"{percent(len(without), len(trained))} of the views do not vote; reprojection labels them from the "
             "others, and with --pipeline.model.prepare.reprojection none no loss about masks looks at them",
             tuple(without),
+        )
+
+
+def _no_object(files: MaskFiles, coverage: Coverage) -> Iterator[Issue]:
+    masks = np.asarray(files.trained, bool) & coverage.usable
+    if masks.any() and not coverage.pixels[masks][:, np.asarray(coverage.ids) != BACKGROUND].any():
+        yield Issue(
+            "error",
+            "no object",
+            f"no mask of a training view in {files.folder} names an object, all are background or unlabelled: give "
+            "objects ids above 0, or make masks with: beags masks make",
+            "training stops before its first step (beags-base needs no masks)",
         )
 
 

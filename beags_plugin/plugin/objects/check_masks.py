@@ -11,7 +11,7 @@ import numpy as np
 
 from beags_plugin.data.dataset import Dataset
 from beags_plugin.data.files import image_size, photo_names
-from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.labels.classes import read_classes
 from beags_plugin.masks.check.areas import Area, contradicted
 from beags_plugin.masks.check.consistency import Agreement, labels_at, ranks_of
@@ -39,11 +39,15 @@ MOST_PICTURES = 6  # views in contradicted.png
 
 @dataclass
 class Report:
-    """The findings. names: class id to name. areas: places where views disagree, if a trained run was given."""
+    """The findings.
+
+    names: class id to name. trained: False for held-out views. areas: places where views disagree, with a trained run.
+    """
 
     data: Path
     stems: list[str]
     names: dict[int, str]
+    trained: list[bool]
     coverage: Coverage
     issues: list[Issue]
     areas: list[Area] = field(default_factory=list)
@@ -57,6 +61,20 @@ class Report:
             f"{', '.join(counts)}."
         )
 
+    def objects(self) -> list[str]:
+        """Return a line for each object: in how many training views it is, and its share of their pixels."""
+        coverage, lines = self.coverage, []
+        usable = np.asarray(self.trained) & coverage.usable
+        for column, class_id in enumerate(coverage.ids):
+            if class_id != BACKGROUND:
+                views = usable & (coverage.pixels[:, column] > 0)
+                share = percent(coverage.pixels[views, column].sum(), coverage.size[views].sum())
+                lines.append(
+                    f"{class_id} ({self.names[class_id]}): in {views.sum()} of {usable.sum()} training views with a "
+                    f"mask ({percent(views.sum(), usable.sum())}), {share} of their pixels"
+                )
+        return lines
+
     def to_json(self) -> dict[str, Any]:
         """Return plain values."""
         views = [
@@ -66,6 +84,7 @@ class Report:
         return {
             "data": str(self.data),
             "classes": {str(i): name for i, name in self.names.items()},
+            "objects": self.objects(),
             "issues": [issue.to_json() for issue in self.issues],
             "coverage": views,
             "areas": [area.to_json() for area in self.areas],
@@ -99,7 +118,7 @@ def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Re
     elif coverage.usable.sum() > 3 and len(coverage.ids) > 1:
         points = _points(scene, views, config)
         issues += views_against_others(_agreement(files, coverage, views, points), files, coverage, names)
-    return Report(scene.root, list(files.stems), names, coverage, ordered(issues))
+    return Report(scene.root, list(files.stems), names, list(files.trained), coverage, ordered(issues))
 
 
 def agreement_of(config: BeagsDataParserConfig) -> tuple[np.ndarray, int]:
@@ -189,13 +208,15 @@ def _areas(run: ReprojectedRun, index: int) -> list[Area]:
 
 
 def write_report(report: Report, output: Path, run: ReprojectedRun | None = None) -> list[Path]:
-    """Write report.json, coverage.png and, with a run that contradicts masks, contradicted.png; return their paths."""
+    """Write report.json, with objects coverage.png, with contradicted areas contradicted.png; return their paths."""
     coverage = report.coverage
     share = coverage.pixels / np.maximum(coverage.size, 1)[:, None]
-    written = [output / "report.json", output / "coverage.png"]
+    written = [output / "report.json"]
     with writing(output):
         output.mkdir(parents=True, exist_ok=True)
         written[0].write_text(json.dumps(report.to_json(), indent=1), "utf8")
+    if any(class_id != BACKGROUND for class_id in coverage.ids):
+        written.append(output / "coverage.png")
         coverage_picture(written[1], report.stems, coverage.ids, report.names, share, coverage.usable)
     if run is not None and report.areas:
         boxes: dict[str, list[tuple[int, int, int, int]]] = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,6 +20,7 @@ from beags_plugin.masks.snapping import snap_to_edges
 from beags_plugin.masks.sources import MASK_SOURCES
 from beags_plugin.masks.sources.base import MaskSource, Photo, SourceScene
 from beags_plugin.pictures.masks import overlay
+from beags_plugin.plugin.objects.check_masks import check_scene
 from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
 from beags_plugin.plugin.runs.read import raster_settings, read_run
 from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParserConfig
@@ -166,11 +167,13 @@ def make_masks(
     write_whole(classes, lambda file: file.write(json.dumps(names, indent=1).encode()))
     _picture(folder / "made.png", shown)
     aside = len(shown) - len(shares)
+    report = check_scene(replace(data, masks_path=masks.absolute(), classes_path=classes.absolute()))
     return [
         *made.notes,
         f"{len(shares)} masks of {len(photos)} views, {len(names) - 1} objects, which cover "
         f"{100 * np.mean(shares):.1f} % on average: {masks}",
         *([f"{aside} masks of held-out views, only to look at: {look_at}"] if aside else []),
+        *(f"warning: {issue.message}" for issue in report.issues if issue.kind in ("absent", "only view")),
         f"names: {classes}; look at {folder / 'made.png'}",
     ]
 

@@ -31,8 +31,7 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
     pixels = int((cameras.height * cameras.width).sum())
     densifier = Densifier(model, adam, pixels, cameras.camera_to_worlds[:, :3, 3])
     switch = RefinementSwitch(model, trainer, datamanager)
-    switch.check_options()
-    switch.check_masks()
+    switch.check()
     for name, part in {"views": datamanager, "densification": densifier, "refinement": switch}.items():
         trainer.keep(name, part)
 

@@ -66,7 +66,7 @@ class Checkpoints:
         """Restore pipeline, optimizers and scaler from a checkpoint; returns the next step.
 
         ``keep`` restores the other parts later. Raises ``UserError`` for a file that is no checkpoint, does not fit
-        this run, or has other classes.
+        this run, or refines other classes.
         """
         checkpoint = read_checkpoint(path)
         states = training_state(checkpoint, path)
@@ -79,11 +79,14 @@ class Checkpoints:
             scaler.load_state_dict(checkpoint["scalers"])
         except _MISFITS as error:
             raise _misfit(path, error) from error
-        if self.goes_on and model.classes != named:
-            raise UserError(
-                f"the classes of {self.config.data_path} are not those with which training began "
-                f"({', '.join(model.classes.values())}): restore classes.json and the masks, or train again."
-            )
+        if model.classes != named:
+            if self.goes_on or int(model.refined_steps) > 0:
+                raise UserError(
+                    f"the classes of {self.config.data_path} are not those with which training began "
+                    f"({', '.join(model.classes.values())}): restore classes.json and the masks, or train again."
+                )
+            model.take_classes(named)  # of a base, which refinement assigns anew
+            states.pop("refinement", None)
         CONSOLE.print(f"Loaded {path}", highlight=False, markup=False, soft_wrap=True)
         self.loaded_run = self.base_dir.absolute() if self.goes_on else path.absolute().parent.parent
         if model.schedule.base_steps == 0 and int(model.refined_steps) == 0:

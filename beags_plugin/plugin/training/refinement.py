@@ -28,7 +28,7 @@ from beags_plugin.plugin.training.resumable import TrainingRun
 from beags_plugin.plugin.training.scene_edits import edit_scene
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
-from beags_plugin.preparation.pipeline import Preparation, prepare
+from beags_plugin.preparation.pipeline import Preparation, check_masks, prepare
 from beags_plugin.refiners import REFINERS
 from beags_plugin.system import processes
 from beags_plugin.system.errors import UserError, writing
@@ -57,23 +57,15 @@ class RefinementSwitch:
         """True if this run refines at all."""
         return self.model.config.refine_steps > 0
 
-    def check_masks(self) -> None:
-        """Raise ``UserError`` if no training view has a mask to refine with."""
-        masks = self.datamanager.train_dataset.metadata["mask_filenames"]
-        if self.wanted and all(path is None for path in masks):
-            raise UserError(
-                "no training view has a mask: put id images into masks/<image name>.png, or train the preset "
-                "beags-base, which needs none."
-            )
-
-    def check_options(self) -> None:
-        """Raise ``UserError`` for options that would stop the run when it begins to refine."""
+    def check(self) -> None:
+        """Raise ``UserError`` for options and masks that would stop the run when it begins to refine."""
         if self.wanted:
             rounds, steps = self.model.config.refine_rounds, self.model.config.refine_steps
             if not 1 <= rounds <= steps:
                 raise UserError(f"refine_rounds is {rounds}: it must be 1 to refine_steps, which is {steps}.")
             self.model.config.prepare.check()
             self.model.config.split.check()
+            check_masks(view.labels for view in self.datamanager.views("train", original=True))
 
     def state(self) -> dict[str, Any]:
         """Return the number of prepared rounds, and whether nerfstudio has evaluated the step; see ``Resumable``."""

@@ -152,6 +152,12 @@ class SceneModel(SplatfactoModel):
         self.class_ids = torch.zeros(count, dtype=torch.int32, device=self.device)
         self.class_margin = torch.zeros(count, device=self.device)
 
+    def take_classes(self, classes: Mapping[int, str]) -> None:
+        """Take other classes, of which no Gaussian has one yet."""
+        self.classes = dict(classes)
+        self._reset_classes(self.num_points)
+        self.assigned.fill_(False)
+
     # -- checkpoints -------------------------------------------------------------------------------------------------
 
     def load_state_dict(self, state: Mapping[str, Any], **kwargs) -> Any:

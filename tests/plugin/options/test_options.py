@@ -49,6 +49,6 @@ def test_a_run_is_refused_at_its_start_only_if_it_refines(refine_steps):
     switch = RefinementSwitch(SimpleNamespace(config=config), None, None)
     if refine_steps:
         with pytest.raises(UserError, match="k is 0"):
-            switch.check_options()
+            switch.check()
     else:
-        switch.check_options()
+        switch.check()
