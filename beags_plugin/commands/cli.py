@@ -60,6 +60,9 @@ class Resume:
     device: Literal["cpu", "cuda"] | None = None
     """Continue here instead of where it was begun; the result is then no longer the same in every bit."""
 
+    data: Path | None = None
+    """Folder of the photos, if not where the run was trained on them."""
+
     check_memory: bool = True
     """Do not begin where hardly any memory or disk is free; save and stop when memory runs out."""
 
@@ -67,7 +70,7 @@ class Resume:
         with starting(self):
             from beags_plugin.plugin.runs.launch import resume
         try:
-            resume(self.run_folder, self.device, self.check_memory)
+            resume(self.run_folder, self.device, self.check_memory, self.data)
         except KeyboardInterrupt:
             sys.exit(130)
 
@@ -144,6 +147,8 @@ class Export:
     """Folder for the files; exports/ beside config.yml if left out."""
     json: Path | None = None
     """File that lists what was written."""
+    data: Path | None = None
+    """Folder of the photos, whose cameras meshes need, if not where the run was trained on them."""
     mesh: tyro.conf.OmitArgPrefixes[MeshOptions] = MeshOptions()
 
     def run(self) -> None:
@@ -153,7 +158,7 @@ class Export:
         with progress_bar("exporting") as progress:
             exported = export_run(
                 self.load_config, self.object, self.all, self.format, self.frame, self.output, options, progress,
-                whole=self.whole,
+                whole=self.whole, data=self.data,
             )  # fmt: skip
         write_json(self.json, [asdict(one) for one in exported])
         for one in exported:
@@ -174,13 +179,17 @@ class Render:
     """video (.mp4 or .gif), sheet (.png or .jpg), or before-after (any of these, by the name of the file)."""
     output: Path | None = None
     """The file; in renders/ beside config.yml if left out."""
+    data: Path | None = None
+    """Folder of the photos, whose cameras say what is up, if not where the run was trained on them."""
     options: tyro.conf.OmitArgPrefixes[RenderOptions] = RenderOptions()
 
     def run(self) -> None:
         with starting(self):
             from beags_plugin.plugin.objects.render import render_run
         with progress_bar("rendering") as progress:
-            path = render_run(self.load_config, self.object, self.format, self.output, self.options, progress)
+            path = render_run(
+                self.load_config, self.object, self.format, self.output, self.options, progress, self.data
+            )
         CONSOLE.print(f"{self.format}: {path}", markup=False)
 
 
@@ -203,13 +212,15 @@ class Eval:
     """File for a picture of the worst masks: what is right, missed and wrong, before and after."""
     worst: int = 6
     """How many masks of each kind the picture shows."""
+    data: Path | None = None
+    """Folder of the photos, if not where the run was trained on them."""
     protocol: tyro.conf.OmitArgPrefixes[Protocol] = Protocol()
 
     def run(self) -> None:
         with starting(self):
             from beags_plugin.commands.evaluate import Outputs, run_evaluation
         outputs = Outputs(self.json, self.csv, self.picture, self.worst)
-        run_evaluation(self.load_config, self.data_set_name, self.protocol, outputs)
+        run_evaluation(self.load_config, self.data_set_name, self.protocol, outputs, self.data)
 
 
 @dataclass

@@ -92,6 +92,8 @@ class Reproject:
     """Pixels whose winner has a smaller share of the votes are written as unlabelled (65535)."""
     run_size: bool = False
     """Work at the size that was trained on instead of that of the photographs: quicker, smaller masks."""
+    data: Path | None = None
+    """Folder of the photos, if not where the run was trained on them."""
     output: Path | None = None
     """Folder for masks, confidence, classes.json, report.json, before_after.png; reprojected/ beside config.yml."""
 
@@ -105,7 +107,7 @@ class Reproject:
                 write_reprojection,
             )
         options = ReprojectionOptions(
-            self.masks_path, self.classes_path, self.method, self.tau, self.depth, self.run_size
+            self.masks_path, self.classes_path, self.method, self.tau, self.depth, self.run_size, data=self.data
         )
         found = reproject_run(self.load_config, options)
         output = self.output or self.load_config.parent / "reprojected"

@@ -21,6 +21,7 @@ from beags_plugin.masks.sources import MASK_SOURCES
 from beags_plugin.masks.sources.base import MaskSource, Photo, SourceScene
 from beags_plugin.pictures.masks import overlay
 from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
+from beags_plugin.plugin.runs.place import open_run
 from beags_plugin.plugin.runs.read import raster_settings, read_run
 from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParserConfig
 from beags_plugin.rasterizers import make_rasterizer
@@ -33,8 +34,8 @@ from beags_plugin.system.whole_files import write_whole
 class RunGeometry:
     """The surfaces of a trained run, at the size of the photographs: of its training views, then of the others."""
 
-    def __init__(self, config_path: Path) -> None:
-        self.scene = read_run(config_path)
+    def __init__(self, config_path: Path, data: Path | None = None) -> None:
+        self.scene = read_run(config_path, None if open_run(config_path).data_path.exists() else data)
         self.manager = data_to_reproject(self.scene, config_path, ReprojectionOptions())
         self.images = list(self.manager.train_dataset.image_filenames)
         self.cameras = [view.camera for view in self.manager.views("train")]
@@ -133,7 +134,9 @@ def make_masks(
         Photo(name, path, *size, trained=index in trained)
         for index, (name, path, size) in enumerate(zip(photo_names(views.images), views.images, sizes, strict=True))
     ]
-    made_of = SourceScene(scene.root, photos, RunGeometry(run) if run is not None and source.needs_run else None)
+    made_of = SourceScene(
+        scene.root, photos, RunGeometry(run, data.data) if run is not None and source.needs_run else None
+    )
     shares: list[float] = []
     shown: list[tuple[Photo, Path]] = []
     with writing(folder):

@@ -30,18 +30,19 @@ def render_run(
     output: Path | None = None,
     options: RenderOptions | None = None,
     progress: Progress | None = None,
+    data: Path | None = None,
 ) -> Path:
     """Render objects of a run alone, from cameras around each, into one file; return its path.
 
     config_path: config.yml of a refined (or assigned) run. objects: names; all but the background if empty. form:
     "video" (.mp4, .gif), "sheet" (.png, .jpg), or "before-after": assignment alone beside the refined object from the
     same cameras, either. output: the file; in ``renders/`` of the run if None. progress: receives (done, total)
-    pictures. Raises ``UserError`` for a mistake, before anything is rendered.
+    pictures. data: if not where they were. Raises ``UserError`` for a mistake, before anything is rendered.
     """
     options = options or RenderOptions()
     options.check()
     check_choice(form, get_args(PictureFormat), "format")
-    scene = read_assigned_run(config_path)
+    scene = read_assigned_run(config_path, data)
     present = objects_with_gaussians(scene, objects, config_path.parent)
     names = list(dict.fromkeys(objects)) or [name for name, class_id in present.items() if class_id != 0]
     if not names:
