@@ -10,7 +10,7 @@ import torch
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.pictures.cells import below, beside, cell, checkerboard, wrapped
+from beags_plugin.pictures.cells import GAP, below, beside, cell, checkerboard, wrapped
 from beags_plugin.pictures.options import Background
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import surfel_inputs
@@ -89,15 +89,18 @@ def sheet(
 def comparison(
     subjects: Sequence[Subject], rasterizer: Rasterizer, background: Background, progress: Progress | None = None
 ) -> np.ndarray:
-    """Return [H, W, 3] uint8: the stages beside each other, a line for each subject and camera."""
-    lines: list[np.ndarray] = []
+    """Return [H, W, 3] uint8: subjects beside each other; of each the stages, a line for each camera."""
+    blocks, done = [], 0
     total = sum(len(subject.cameras) for subject in subjects)
     for subject in subjects:
+        lines = []
         for index in range(len(subject.cameras)):
             lines.append(beside(_stages(subject, index, rasterizer, background)))
+            done += 1
             if progress:
-                progress(len(lines), total)
-    return below(lines)
+                progress(done, total)
+        blocks.append([below(lines)[:-GAP, :-GAP]])
+    return below(wrapped(blocks, _WIDTH))
 
 
 def _stages(subject: Subject, index: int, rasterizer: Rasterizer, background: Background) -> list[np.ndarray]:
