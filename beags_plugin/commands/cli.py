@@ -104,7 +104,7 @@ class Extract:
     """Write a run folder and a .ply per object; ns-viewer, ns-render and ns-export work on each run."""
 
     load_config: Path
-    """config.yml of a trained run."""
+    """A trained run: its folder, or config.yml in it."""
     object: tuple[str, ...] = ()
     """Names of the objects; all but the background if left out."""
     remove: bool = False
@@ -132,7 +132,7 @@ class Export:
     """Write objects as files for other programs, in the frame of the input poses or centred on each object."""
 
     load_config: Path
-    """config.yml of a trained run."""
+    """A trained run: its folder, or config.yml in it."""
     object: tuple[str, ...] = ()
     """Names of the objects."""
     all: bool = False
@@ -169,10 +169,10 @@ class Export:
 
 @dataclass
 class Render:
-    """Render objects alone: a turntable video, a contact sheet, or assignment alone beside the refined object."""
+    """Render objects: a turntable, a contact sheet, assignment alone beside the refined object, or a camera path."""
 
     load_config: Path
-    """config.yml of a trained run."""
+    """A trained run: its folder, or config.yml in it."""
     object: tuple[str, ...] = ()
     """Names of the objects; all but the background if left out."""
     format: str = "video"
@@ -201,7 +201,7 @@ class Eval:
     """
 
     load_config: tuple[Path, ...]
-    """config.yml of one trained run or more."""
+    """One trained run or more: folders, or config.yml in them."""
     data_set_name: str = "mean"
     """What the mean of several runs is called."""
     json: Path | None = None

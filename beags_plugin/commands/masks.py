@@ -25,7 +25,7 @@ class Check:
     data: Path | None = None
     """Folder of the scene; that of the run if left out."""
     load_config: Path | None = None
-    """config.yml of a run trained on the scene (beags-base will do): its depth shows where views disagree."""
+    """A run (folder or config.yml) trained on the scene, beags-base will do; its depth shows where views disagree."""
     layout: str | None = None
     """How the data set lays out its files (docs/data.md); as in the run, else auto, which recognises it."""
     images_path: Path | None = None
@@ -76,7 +76,7 @@ class Reproject:
     """Let all views vote on each other's masks with the depth of a trained run; write what they agree on."""
 
     load_config: Path
-    """config.yml of any trained run; beags-base will do."""
+    """Any trained run, its folder or config.yml in it; beags-base will do."""
     masks_path: Path | None = None
     """Folder of the id images, if not those that the run was trained on."""
     classes_path: Path | None = None
@@ -126,7 +126,7 @@ class Make:
     options: tuple[str, ...] = ()
     """Of the source, as key=value, e.g. prompts=prompts.json."""
     load_config: Path | None = None
-    """config.yml of a run trained on the scene (beags-base will do), for sources that need its depth."""
+    """A run (folder or config.yml) trained on the scene, beags-base will do; for sources that need its depth."""
     output: Path | None = None
     """Folder for masks/, classes.json and made.png; the scene's own if left out."""
     overwrite: bool = False

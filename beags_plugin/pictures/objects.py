@@ -57,11 +57,12 @@ def _behind(height: int, width: int, background: Background) -> np.ndarray:
 def film(
     subjects: Sequence[Subject], rasterizer: Rasterizer, background: Background, progress: Progress | None = None
 ) -> Iterator[np.ndarray]:
-    """Yield frames [H, W, 3] uint8 of even size: all subjects and stages beside each other, captioned."""
+    """Yield frames [H, W, 3] uint8 of even size: all subjects and stages beside each other."""
     count = len(subjects[0].cameras)
     for index in range(count):
         groups = [_stages(subject, index, rasterizer, background) for subject in subjects]
-        yield _even(below(wrapped(groups, _WIDTH)))
+        alone = len(groups) == len(groups[0]) == 1
+        yield _even(groups[0][0] if alone else below(wrapped(groups, _WIDTH)))
         if progress:
             progress(index + 1, count)
 
@@ -104,20 +105,18 @@ def comparison(
 
 
 def _stages(subject: Subject, index: int, rasterizer: Rasterizer, background: Background) -> list[np.ndarray]:
-    """Return a captioned cell for each stage of a subject, from one of its cameras."""
+    """Return a picture for each stage of a subject, from one of its cameras, under its caption if it has any."""
     camera = subject.cameras[index]
-    return [
-        cell(
-            render_alone(surfels, camera, subject.settings, rasterizer, background),
-            (camera.width, camera.height),
-            _caption(subject.name, stage),
-        )
-        for stage, surfels in subject.stages.items()
-    ]
+    cells = []
+    for stage, surfels in subject.stages.items():
+        picture = render_alone(surfels, camera, subject.settings, rasterizer, background)
+        caption = _caption(subject.name, stage)
+        cells.append(cell(picture, (camera.width, camera.height), caption) if caption else picture)
+    return cells
 
 
 def _caption(name: str, stage: str) -> str:
-    return f"{name}, {stage}" if stage else name
+    return ", ".join(filter(None, (name, stage)))
 
 
 def _even(picture: np.ndarray) -> np.ndarray:
