@@ -92,7 +92,7 @@ def test_two_layouts_in_one_folder_are_refused(tmp_path):
 def test_an_unknown_folder_or_layout_is_refused(tmp_path):
     with pytest.raises(UserError, match=r"neither transforms\.json nor a COLMAP model .*poses_bounds\.npy \(llff\)"):
         parse(tmp_path)
-    with pytest.raises(UserError, match="there is no layout 'llf': choose one of 3dovs, colmap"):
+    with pytest.raises(UserError, match="there is no layout 'llf' .did you mean llff.*: choose one of 3dovs, colmap"):
         parse(tmp_path, layout="llf")
     with pytest.raises(UserError, match=r"holds no cameras_sphere\.npz, which the layout dtu needs"):
         parse(tmp_path, layout="dtu")

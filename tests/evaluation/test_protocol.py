@@ -236,7 +236,7 @@ def test_a_former_state_that_some_scenes_lack_is_not_averaged():
         (dict(threshold=math.nan), "threshold is nan"),
         (dict(band_share=0.0), "band_share is 0.0"),
         (dict(band_share=math.inf), "band_share is inf"),
-        (dict(empty="two"), "empty is 'two': choose one of one, zero, skip"),
+        (dict(empty="two"), "there is no value 'two' for empty: choose one of one, zero, skip"),
         (dict(scene_average="median"), "choose one of masks, objects, views"),
     ],
 )

@@ -79,7 +79,7 @@ mistakes(
     "options",
     {
         "an unknown loss": loss("beauty"),
-        "an unknown option of a loss": loss("photometric", options={"colour": 1}),
+        "an unknown option of a loss": loss("photometric", options={"ssim_wait": 1}),
         "a negative weight": loss("boundary", weight=-1.0),
         "a weight that is not a number": loss("boundary", weight=float("nan")),
         "an infinite weight": loss("boundary", weight=float("inf")),

@@ -26,7 +26,7 @@ from beags_plugin.plugin.runs.read import raster_settings, read_run
 from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParserConfig
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
-from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.errors import UserError, check_choice, writing
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_whole
 
@@ -78,8 +78,9 @@ def configured_source(name: str, options: Sequence[str]) -> MaskSource:
     arguments = []
     for option in options:
         key, equals, value = option.partition("=")
-        if key not in known or not equals:
-            raise UserError(f"the mask source {name} has no option {option!r}: give {', '.join(known)} as key=value.")
+        check_choice(key, known, "option", f" of the mask source {name}")
+        if not equals:
+            raise UserError(f"the option {option!r} of the mask source {name} has no value: give {option}=value.")
         if isinstance(getattr(kind, key, None), bool):
             if value not in ("true", "false"):
                 raise UserError(f"the option {option!r} must be true or false.")
