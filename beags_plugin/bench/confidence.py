@@ -54,11 +54,11 @@ def shown_runs(runs: Sequence[VariantTrial], outcomes: Mapping[str, Outcome]) ->
 
 
 def _views(run: VariantTrial, outcomes: Mapping[str, Outcome]) -> list[TrainingMasks]:
+    from beags_plugin.plugin.runs.place import open_run
     from beags_plugin.plugin.runs.prepared import training_masks
-    from beags_plugin.plugin.runs.run_config import load_run_config
 
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
-        views = training_masks(load_run_config(outcomes[run.trial.digest].folder / "run/config.yml"))
+        views = training_masks(open_run(outcomes[run.trial.digest].folder / "run/config.yml"))
     masked = [view for view in views if view.given is not None]
     changed = sorted(masked, key=lambda view: -int((view.given != view.used).sum()))
     return [*changed[: VIEWS - 1], *[view for view in views if view.given is None][:1]]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from beags_plugin.system.errors import UserError, check_choice
+from beags_plugin.system.errors import UserError, check_choice, meant
 from beags_plugin.system.shipped import read_toml, shipped_folder, shipped_names
 
 PHASES = ("base", "refine", "both")
@@ -133,7 +133,8 @@ class _Reader:
             raise self.wrong(f"has two variants called {min(repeated)!r}: rename one of them.")
         reference = self.value(content, "reference", str, None)
         if reference is not None and reference not in names:
-            raise self.wrong(f"refers to {reference!r}, which is no variant: name one of {', '.join(names)}.")
+            near = meant(reference, names)
+            raise self.wrong(f"refers to {reference!r}, which is no variant{near}: name one of {', '.join(names)}.")
         sample = dict(self.table(content, "sample", ""))
         return Experiment(
             name=self.path.stem,

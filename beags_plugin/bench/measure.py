@@ -19,12 +19,12 @@ def measure_run(config_path: Path) -> dict[str, Any]:
     this run, which is the result of assignment alone. mask_error_...: see ``mask_error``.
     """
     from beags_plugin.plugin.objects.evaluate import evaluate_run
+    from beags_plugin.plugin.runs.place import open_run
     from beags_plugin.plugin.runs.prepared import training_masks
-    from beags_plugin.plugin.runs.run_config import load_run_config
 
     found = evaluate_run(config_path).to_json()
     evaluation = {name: value for name, value in found.items() if name not in ("masks", "views")}
-    views = training_masks(load_run_config(config_path))
+    views = training_masks(open_run(config_path))
     return {"evaluation": evaluation, **{f"mask_error_{kind}": mask_error(views, kind) for kind in ("given", "used")}}
 
 

@@ -60,6 +60,9 @@ class Resume:
     device: Literal["cpu", "cuda"] | None = None
     """Continue here instead of where it was begun; the result is then no longer the same in every bit."""
 
+    data: Path | None = None
+    """Folder of the photos, if not where the run was trained on them."""
+
     check_memory: bool = True
     """Do not begin where hardly any memory or disk is free; save and stop when memory runs out."""
 
@@ -67,7 +70,7 @@ class Resume:
         with starting(self):
             from beags_plugin.plugin.runs.launch import resume
         try:
-            resume(self.run_folder, self.device, self.check_memory)
+            resume(self.run_folder, self.device, self.check_memory, self.data)
         except KeyboardInterrupt:
             sys.exit(130)
 
@@ -101,7 +104,7 @@ class Extract:
     """Write a run folder and a .ply per object; ns-viewer, ns-render and ns-export work on each run."""
 
     load_config: Path
-    """config.yml of a trained run."""
+    """A trained run: its folder, or config.yml in it."""
     object: tuple[str, ...] = ()
     """Names of the objects; all but the background if left out."""
     remove: bool = False
@@ -129,7 +132,7 @@ class Export:
     """Write objects as files for other programs, in the frame of the input poses or centred on each object."""
 
     load_config: Path
-    """config.yml of a trained run."""
+    """A trained run: its folder, or config.yml in it."""
     object: tuple[str, ...] = ()
     """Names of the objects."""
     all: bool = False
@@ -144,6 +147,8 @@ class Export:
     """Folder for the files; exports/ beside config.yml if left out."""
     json: Path | None = None
     """File that lists what was written."""
+    data: Path | None = None
+    """Folder of the photos, whose cameras meshes need, if not where the run was trained on them."""
     mesh: tyro.conf.OmitArgPrefixes[MeshOptions] = MeshOptions()
 
     def run(self) -> None:
@@ -153,7 +158,7 @@ class Export:
         with progress_bar("exporting") as progress:
             exported = export_run(
                 self.load_config, self.object, self.all, self.format, self.frame, self.output, options, progress,
-                whole=self.whole,
+                whole=self.whole, data=self.data,
             )  # fmt: skip
         write_json(self.json, [asdict(one) for one in exported])
         for one in exported:
@@ -164,23 +169,27 @@ class Export:
 
 @dataclass
 class Render:
-    """Render objects alone: a turntable video, a contact sheet, or assignment alone beside the refined object."""
+    """Render objects: a turntable, a contact sheet, assignment alone beside the refined object, or a camera path."""
 
     load_config: Path
-    """config.yml of a trained run."""
+    """A trained run: its folder, or config.yml in it."""
     object: tuple[str, ...] = ()
     """Names of the objects; all but the background if left out."""
     format: str = "video"
     """video (.mp4 or .gif), sheet (.png or .jpg), or before-after (any of these, by the name of the file)."""
     output: Path | None = None
     """The file; in renders/ beside config.yml if left out."""
+    data: Path | None = None
+    """Folder of the photos, whose cameras say what is up, if not where the run was trained on them."""
     options: tyro.conf.OmitArgPrefixes[RenderOptions] = RenderOptions()
 
     def run(self) -> None:
         with starting(self):
             from beags_plugin.plugin.objects.render import render_run
         with progress_bar("rendering") as progress:
-            path = render_run(self.load_config, self.object, self.format, self.output, self.options, progress)
+            path = render_run(
+                self.load_config, self.object, self.format, self.output, self.options, progress, self.data
+            )
         CONSOLE.print(f"{self.format}: {path}", markup=False)
 
 
@@ -192,7 +201,7 @@ class Eval:
     """
 
     load_config: tuple[Path, ...]
-    """config.yml of one trained run or more."""
+    """One trained run or more: folders, or config.yml in them."""
     data_set_name: str = "mean"
     """What the mean of several runs is called."""
     json: Path | None = None
@@ -203,13 +212,15 @@ class Eval:
     """File for a picture of the worst masks: what is right, missed and wrong, before and after."""
     worst: int = 6
     """How many masks of each kind the picture shows."""
+    data: Path | None = None
+    """Folder of the photos, if not where the run was trained on them."""
     protocol: tyro.conf.OmitArgPrefixes[Protocol] = Protocol()
 
     def run(self) -> None:
         with starting(self):
             from beags_plugin.commands.evaluate import Outputs, run_evaluation
         outputs = Outputs(self.json, self.csv, self.picture, self.worst)
-        run_evaluation(self.load_config, self.data_set_name, self.protocol, outputs)
+        run_evaluation(self.load_config, self.data_set_name, self.protocol, outputs, self.data)
 
 
 @dataclass

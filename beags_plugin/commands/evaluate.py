@@ -43,7 +43,9 @@ class Outputs:
                 raise UserError(f"{path} is a folder: name the file to write.")
 
 
-def run_evaluation(configs: Sequence[Path], data_set_name: str, protocol: Protocol, outputs: Outputs) -> None:
+def run_evaluation(
+    configs: Sequence[Path], data_set_name: str, protocol: Protocol, outputs: Outputs, data: Path | None = None
+) -> None:
     """Evaluate runs, print their tables and write the files; see ``cli.Eval`` for the arguments.
 
     Raises ``UserError`` for a run, data, a choice or a file that cannot be used.
@@ -58,7 +60,7 @@ def run_evaluation(configs: Sequence[Path], data_set_name: str, protocol: Protoc
     outputs.check()
     runs, worst = [], []
     for path, name in zip(configs, scene_names(configs), strict=True):
-        evaluated = EvaluatedRun(path, name)
+        evaluated = EvaluatedRun(path, name, data)
         with progress_bar(f"Evaluating {name}") as progress:
             metrics = evaluated.metrics(protocol, progress)
         if outputs.picture is not None:
@@ -88,11 +90,11 @@ def scene_names(configs: Sequence[Path]) -> list[str]:
     Raises ``UserError`` for a file that is no run's config, and for a run given twice.
     """
     from beags_plugin.plugin.objects.evaluate import scene_name
-    from beags_plugin.plugin.runs.run_config import load_run_config
+    from beags_plugin.plugin.runs.place import open_run
 
     if not configs:
         raise UserError("no run is named: give --load-config the config.yml of at least one.")
-    names = [scene_name(load_run_config(path)) for path in configs]
+    names = [scene_name(open_run(path)) for path in configs]
     if repeated := [path for path, count in Counter(path.resolve() for path in configs).items() if count > 1]:
         raise UserError(f"{repeated[0]} is given twice: name each run once.")
     for longer in (lambda path: path.resolve().parent.name, lambda path: str(path.parent)):

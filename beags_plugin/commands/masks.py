@@ -25,7 +25,7 @@ class Check:
     data: Path | None = None
     """Folder of the scene; that of the run if left out."""
     load_config: Path | None = None
-    """config.yml of a run trained on the scene (beags-base will do): its depth shows where views disagree."""
+    """A run (folder or config.yml) trained on the scene, beags-base will do; its depth shows where views disagree."""
     layout: str | None = None
     """How the data set lays out its files (docs/data.md); as in the run, else auto, which recognises it."""
     images_path: Path | None = None
@@ -78,7 +78,7 @@ class Reproject:
     """Let all views vote on each other's masks with the depth of a trained run; write what they agree on."""
 
     load_config: Path
-    """config.yml of any trained run; beags-base will do."""
+    """Any trained run, its folder or config.yml in it; beags-base will do."""
     masks_path: Path | None = None
     """Folder of the id images, if not those that the run was trained on."""
     classes_path: Path | None = None
@@ -94,6 +94,8 @@ class Reproject:
     """Pixels whose winner has a smaller share of the votes are written as unlabelled (65535)."""
     run_size: bool = False
     """Work at the size that was trained on instead of that of the photographs: quicker, smaller masks."""
+    data: Path | None = None
+    """Folder of the photos, if not where the run was trained on them."""
     output: Path | None = None
     """Folder for masks, confidence, classes.json, report.json, before_after.png; reprojected/ beside config.yml."""
 
@@ -107,7 +109,7 @@ class Reproject:
                 write_reprojection,
             )
         options = ReprojectionOptions(
-            self.masks_path, self.classes_path, self.method, self.tau, self.depth, self.run_size
+            self.masks_path, self.classes_path, self.method, self.tau, self.depth, self.run_size, data=self.data
         )
         found = reproject_run(self.load_config, options)
         output = self.output or self.load_config.parent / "reprojected"
@@ -126,7 +128,7 @@ class Make:
     options: tuple[str, ...] = ()
     """Of the source, as key=value, e.g. prompts=prompts.json."""
     load_config: Path | None = None
-    """config.yml of a run trained on the scene (beags-base will do), for sources that need its depth."""
+    """A run (folder or config.yml) trained on the scene, beags-base will do; for sources that need its depth."""
     output: Path | None = None
     """Folder for masks/, classes.json and made.png; the scene's own if left out."""
     overwrite: bool = False

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from beags_plugin.data.dataset import Split
-from beags_plugin.system.errors import UserError
+from beags_plugin.system.errors import UserError, meant
 
 
 def split_views(
@@ -17,8 +17,10 @@ def split_views(
     from the first view that is not left out; 0 for none. held_out: names from the user, besides the protocol's.
     Raises ``UserError`` if a name of ``held_out`` does not exist or no view is left to train on.
     """
-    if unknown := sorted(set(held_out) - set().union(*names)):
-        raise UserError(f"held_out names {unknown[0]!r}, but no image has that stem: correct the name.")
+    known = set().union(*names)
+    if unknown := sorted(set(held_out) - known):
+        near = meant(unknown[0], known)
+        raise UserError(f"held_out names {unknown[0]!r}, but no image has that stem{near}: correct the name.")
     kept = [index for index, own in enumerate(names) if own.isdisjoint(split.left_out)]
     out = set(kept[::interval]) if split.every and interval > 0 else set()
     out |= {index for index in kept if not names[index].isdisjoint(split.held_out)}

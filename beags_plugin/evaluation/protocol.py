@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args, get_type_hints
 
-from beags_plugin.system.errors import UserError
+from beags_plugin.system.errors import UserError, check_choice
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,8 @@ class Protocol:
             raise UserError(f"band_share is {self.band_share}: give a positive share of the diagonal, such as 0.02.")
         types = get_type_hints(Protocol)
         for field in fields(self):
-            choices, value = get_args(types[field.name]), getattr(self, field.name)
-            if choices and value not in choices:
-                raise UserError(f"{field.name} is {value!r}: choose one of {', '.join(choices)}.")
+            if choices := get_args(types[field.name]):
+                check_choice(getattr(self, field.name), choices, "value", f" for {field.name}")
 
     def to_json(self) -> dict[str, Any]:
         """Return every choice by name."""

@@ -10,7 +10,7 @@ import torch
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.pictures.cells import below, beside, cell, checkerboard, wrapped
+from beags_plugin.pictures.cells import GAP, below, beside, cell, checkerboard, wrapped
 from beags_plugin.pictures.options import Background
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import surfel_inputs
@@ -57,11 +57,12 @@ def _behind(height: int, width: int, background: Background) -> np.ndarray:
 def film(
     subjects: Sequence[Subject], rasterizer: Rasterizer, background: Background, progress: Progress | None = None
 ) -> Iterator[np.ndarray]:
-    """Yield frames [H, W, 3] uint8 of even size: all subjects and stages beside each other, captioned."""
+    """Yield frames [H, W, 3] uint8 of even size: all subjects and stages beside each other."""
     count = len(subjects[0].cameras)
     for index in range(count):
         groups = [_stages(subject, index, rasterizer, background) for subject in subjects]
-        yield _even(below(wrapped(groups, _WIDTH)))
+        alone = len(groups) == len(groups[0]) == 1
+        yield _even(groups[0][0] if alone else below(wrapped(groups, _WIDTH)))
         if progress:
             progress(index + 1, count)
 
@@ -89,32 +90,33 @@ def sheet(
 def comparison(
     subjects: Sequence[Subject], rasterizer: Rasterizer, background: Background, progress: Progress | None = None
 ) -> np.ndarray:
-    """Return [H, W, 3] uint8: the stages beside each other, a line for each subject and camera."""
-    lines: list[np.ndarray] = []
+    """Return [H, W, 3] uint8: subjects beside each other; of each the stages, a line for each camera."""
+    blocks, done = [], 0
     total = sum(len(subject.cameras) for subject in subjects)
     for subject in subjects:
+        lines = []
         for index in range(len(subject.cameras)):
             lines.append(beside(_stages(subject, index, rasterizer, background)))
+            done += 1
             if progress:
-                progress(len(lines), total)
-    return below(lines)
+                progress(done, total)
+        blocks.append([below(lines)[:-GAP, :-GAP]])
+    return below(wrapped(blocks, _WIDTH))
 
 
 def _stages(subject: Subject, index: int, rasterizer: Rasterizer, background: Background) -> list[np.ndarray]:
-    """Return a captioned cell for each stage of a subject, from one of its cameras."""
+    """Return a picture for each stage of a subject, from one of its cameras, under its caption if it has any."""
     camera = subject.cameras[index]
-    return [
-        cell(
-            render_alone(surfels, camera, subject.settings, rasterizer, background),
-            (camera.width, camera.height),
-            _caption(subject.name, stage),
-        )
-        for stage, surfels in subject.stages.items()
-    ]
+    cells = []
+    for stage, surfels in subject.stages.items():
+        picture = render_alone(surfels, camera, subject.settings, rasterizer, background)
+        caption = _caption(subject.name, stage)
+        cells.append(cell(picture, (camera.width, camera.height), caption) if caption else picture)
+    return cells
 
 
 def _caption(name: str, stage: str) -> str:
-    return f"{name}, {stage}" if stage else name
+    return ", ".join(filter(None, (name, stage)))
 
 
 def _even(picture: np.ndarray) -> np.ndarray:

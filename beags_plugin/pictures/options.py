@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, get_args
 
 from beags_plugin.system.errors import UserError, check_choice
@@ -15,6 +16,9 @@ Background = Literal["white", "black", "checker"]
 class RenderOptions:
     """The way that the pictures are taken."""
 
+    camera_path: Path | None = None
+    """A file that the viewer's tab Render has saved: a video along it, of its size and frames per second. Without
+    --object it shows the whole scene."""
     size: int | None = None
     """Pixels along each side of one picture; 480 in a video, 232 in a sheet, 400 before and after."""
     frames: int = 120
@@ -33,6 +37,8 @@ class RenderOptions:
     def check(self) -> None:
         """Raise ``UserError`` for a value that cannot be used."""
         check_choice(self.background, get_args(Background), "background")
+        if self.camera_path is not None and not self.camera_path.is_file():
+            raise UserError(f"there is no camera path {self.camera_path}: save one in the tab Render of ns-viewer.")
         for name, lowest, highest in (("frames", 1, 10_000), ("views", 1, 360), ("fps", 1, 240)):
             if not lowest <= (value := getattr(self, name)) <= highest:
                 raise UserError(f"{name} is {value}: give a number from {lowest} to {highest}.")

@@ -10,7 +10,7 @@ from typing import Any, cast
 from nerfstudio.plugins.types import MethodSpecification
 
 from beags_plugin.plugin.options.config import BeagsTrainerConfig, base_config
-from beags_plugin.system.errors import UserError
+from beags_plugin.system.errors import UserError, meant
 from beags_plugin.system.shipped import read_toml, shipped_folder, shipped_names
 
 FIRST_OPTIONS = {
@@ -99,9 +99,9 @@ def override(config: BeagsTrainerConfig, key: str, value: Any, source: Path) -> 
 
 
 def _child(holder: Any, name: str, key: str, source: Path) -> Any:
-    if isinstance(holder, dict):
-        if name in holder:
-            return holder[name]
-    elif dataclasses.is_dataclass(holder) and name in {field.name for field in dataclasses.fields(holder)}:
-        return getattr(holder, name)
-    raise UserError(f"{source}: there is no config key {key!r} ({name!r} is unknown).")
+    known = holder if isinstance(holder, dict) else {}
+    if dataclasses.is_dataclass(holder):
+        known = {field.name: getattr(holder, field.name) for field in dataclasses.fields(holder)}
+    if name in known:
+        return known[name]
+    raise UserError(f"{source}: there is no config key {key!r} ({name!r} is unknown){meant(name, known)}: correct it.")

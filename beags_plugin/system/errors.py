@@ -34,10 +34,15 @@ def check_choice(name: str, choices: Iterable[str], kind: str, where: str = "", 
     """
     if name in (choices := list(choices)):
         return
+    remedy = f"choose one of {', '.join(choices)}" if choices else "leave it out"
+    raise UserError(f"there is no {kind} {name!r}{where}{meant(name, choices)}: {remedy}{more}.")
+
+
+def meant(name: str, choices: Iterable[str]) -> str:
+    """Return the choice nearest to an unknown name, as a question in brackets; nothing if none is near."""
     folded = {choice.casefold(): choice for choice in choices}
     near = get_close_matches(name.casefold(), folded, n=1, cutoff=0.75)
-    meant = f" (did you mean {folded[near[0]]}?)" if near else ""
-    raise UserError(f"there is no {kind} {name!r}{where}{meant}: choose one of {', '.join(choices)}{more}.")
+    return f" (did you mean {folded[near[0]]}?)" if near else ""
 
 
 def system_error(error: BaseException) -> OSError | None:

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from time import monotonic
 from typing import TypeVar
 
+from rich import get_console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 A_MOMENT = 2.0  # seconds
@@ -47,6 +48,11 @@ def progress_bar(name: str, passing: bool = False) -> Iterator[Callable[[int, in
             progress.live.stop()  # progress.stop() would print a blank line where output is no terminal
         else:
             progress.stop()
+
+
+def say(message: str) -> None:
+    """Print a line as it is, above the bar if one is shown: on the console that bars use."""
+    get_console().print(message, highlight=False, markup=False, soft_wrap=True)
 
 
 def counted(items: Iterable[Item], total: int, progress: Callable[[int, int], None]) -> Iterator[Item]:

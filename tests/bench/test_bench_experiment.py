@@ -51,7 +51,7 @@ def test_a_file_describes_variants_and_sweeps(experiment):
     [
         ('preset = "beags-tiny"', "", "has no preset"),
         ('description = "d"', "description = 3", "description must be str"),
-        ('"pipeline.model.refiner"', '"pipeline.model.refinery"', "no config key 'pipeline.model.refinery'"),
+        ('"pipeline.model.refiner"', '"pipeline.model.refinery"', "'refinery' is unknown) (did you mean refiner?)"),
         ('"pipeline.model.refiner" = "none"', '"pipeline.model.refiner" = 3', "must be str"),
         ("values = [5, 10]", "values = []", "sweep 'k': values must be"),
         ("values = [5, 10]", "values = [5, 2026-01-01]", "sweep 'k': values must be"),

@@ -51,8 +51,8 @@ SENTENCES = {
     "masks make --data {tmp}/lab --source grabcut --snap -1": "snap is -1: give a radius in pixels, or 0.",
     "masks make --data {tmp}/lab --source id-images": "{tmp}/lab has masks or a classes.json already "
     "(classes.json): add --overwrite, or give another --output.",
-    "masks make --data {tmp}/lab --source id-images --options colour=red": "the mask source id-images has no option "
-    "'colour=red': give folder, names, colors, ignore_ids, least_views as key=value.",
+    "masks make --data {tmp}/lab --source id-images --options colour=red": "there is no option 'colour' of the mask "
+    "source id-images (did you mean colors?): choose one of folder, names, colors, ignore_ids, least_views.",
     "masks reproject --load-config {tmp}/absent.yml": NO_FILE,
     f"masks reproject --load-config {RUN} --min-confidence 2": "min_confidence is 2.0: it must be a share of the "
     "votes, 0 to 1.",

@@ -17,7 +17,7 @@ from importlib import import_module
 import pytest
 import tyro
 from places import ROOT
-from run_folders import write_scene, write_trained
+from run_folders import write_camera_path, write_scene, write_trained
 
 pytest.importorskip("nerfstudio")
 
@@ -86,7 +86,7 @@ def words_of(line: str) -> list[str]:
 def folder(tmp_path_factory):
     """Return a folder with two runs of the data my_scene, and a scene to start from."""
     root = tmp_path_factory.mktemp("reader")
-    write_scene(root / "my_scene")
+    write_camera_path(write_scene(root / "my_scene") / "camera_paths/flight.json")
     for name in ("run", "other"):
         config = write_trained(root / name, root / "my_scene")
     from beags_plugin.plugin.objects.extract import extract_objects

@@ -229,7 +229,7 @@ def test_a_former_state_that_some_scenes_lack_is_not_averaged():
         (dict(threshold=math.nan), "threshold is nan"),
         (dict(band_share=0.0), "band_share is 0.0"),
         (dict(band_share=math.inf), "band_share is inf"),
-        (dict(resize="both"), "resize is 'both': choose one of prediction, truth"),
+        (dict(resize="both"), "there is no value 'both' for resize: choose one of prediction, truth"),
         (dict(scene_average="median"), "choose one of masks, objects, views"),
     ],
 )

@@ -79,7 +79,7 @@ mistakes(
     "options",
     {
         "an unknown loss": loss("beauty"),
-        "an unknown option of a loss": loss("photometric", options={"colour": 1}),
+        "an unknown option of a loss": loss("photometric", options={"ssim_wait": 1}),
         "a negative weight": loss("boundary", weight=-1.0),
         "a weight that is not a number": loss("boundary", weight=float("nan")),
         "an infinite weight": loss("boundary", weight=float("inf")),
@@ -123,6 +123,17 @@ mistakes(
         "a folder for a file": lambda at: at.beags(EVAL, "--json", at.root),
     },
 )
+PATH = '{"camera_type": "perspective", "render_width": 32, "render_height": 24, "fps": 24, "camera_path": []}'
+
+
+def along(text: str, *words: str) -> Callable[[Place], Any]:
+    def make(at: Place):
+        (path := at.root / "flight.json").write_text(text)
+        return at.beags(RENDER, "--camera-path", path, *words)
+
+    return make
+
+
 mistakes(
     "pictures",
     {
@@ -131,6 +142,11 @@ mistakes(
         "a comparison called .txt": beags(RENDER, "--format before-after --output a.txt"),
         "an unknown object": beags(RENDER, "--object unicorn"),
         "no frames": beags(RENDER, "--frames 0"),
+        "an absent camera path": beags(RENDER, "--camera-path flight.json"),
+        "a camera path of another kind": along('{"frames": []}'),
+        "a camera path of panoramas": along(PATH.replace("perspective", "equirectangular")),
+        "a camera path without cameras": along(PATH),
+        "a sheet along a camera path": along(PATH, "--format sheet"),
         "a sheet without views": beags(RENDER, "--format sheet --views 0"),
     },
 )

@@ -64,6 +64,17 @@ def move_data(at: Place) -> None:
     at.data.rename(at.root / "elsewhere")
 
 
+def copied(without: str, words: str, change: Callable[[Place], Any] = lambda at: None) -> Callable[[Place], Any]:
+    """Return a mistake with a copy of a run that lacks a folder; the whole run stays where it was."""
+
+    def make(at: Place) -> Any:
+        shutil.copytree(at.run, at.root / "copy", ignore=lambda folder, names: {without})
+        change(at)
+        return at.beags(words.replace("{run}", str(at.root / "copy")))
+
+    return make
+
+
 mistakes(
     "configs",
     {
@@ -79,6 +90,8 @@ mistakes(
         ),
         "aliases that grow without end": config(lambda text: ENDLESS),
         "data that have been moved": beags_after(move_data, EVAL),
+        "a copy without its checkpoint": copied("nerfstudio_models", EXTRACT),
+        "a copy elsewhere without its data": copied("", EVAL, move_data),
     },
 )
 

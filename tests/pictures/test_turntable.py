@@ -129,7 +129,7 @@ def test_sheets_films_and_comparisons_hold_every_picture():
     picture = sheet(subjects(3, ("",)), rasterizer, "white", lambda *done: counts.append(done))
     assert picture.shape == (2 * (33 + 18 + 4), 3 * (33 + 4), 3) and counts == [(i, 6) for i in range(1, 7)]
     pair = comparison(subjects(2, ("before", "after")), rasterizer, "black")
-    assert pair.shape == (4 * (33 + 18 + 4), 2 * (33 + 4), 3)
+    assert pair.shape == (2 * (33 + 18 + 4), 4 * (33 + 4), 3)  # objects beside each other
     before, after = pair[18:51, :33], pair[18:51, 37:70]
     assert abs(int(before[16, 16, 0]) - 51) < 8 and abs(int(after[16, 16, 0]) - 153) < 8
     frames = list(film(subjects(3, ("before", "after")), rasterizer, "white"))

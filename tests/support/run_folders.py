@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from data_folders import HEIGHT, WIDTH, write_image, write_transforms
+from data_folders import HEIGHT, WIDTH, ring, write_image, write_transforms
 
 from beags_plugin.core.surfels import Surfels
 
@@ -52,7 +52,7 @@ def write_scene(root: Path, masks: bool = True, truth_factor: int = 1) -> Path:
 
 def write_drawn_scene(root: Path, factor: int = 4) -> Surfels:
     """Write nine fitting photos and masks of the discs, ``factor`` times as large as other scenes; return the discs."""
-    from data_folders import CX, CY, FX, FY, ring
+    from data_folders import CX, CY, FX, FY
 
     from beags_plugin.core.cameras import Camera, viewmat_from_opengl
     from beags_plugin.rasterizers import make_rasterizer
@@ -96,6 +96,15 @@ def write_trained(
     if assigned and base:
         write_run(config, folder / "base", state_of(*discs(shift=0.15), scale=scale), 99)
     return write_run(config, folder, state_of(*discs(), assigned=assigned, scale=scale), 199)
+
+
+def write_camera_path(path: Path) -> Path:
+    """Write a file such as the viewer's tab Render saves: five cameras of the ring."""
+    cameras = [{"camera_to_world": pose.flatten().tolist(), "fov": 40.0, "aspect": 4 / 3} for pose in ring(5)]
+    content = {"camera_type": "perspective", "render_height": 96, "render_width": 128, "fps": 12, "seconds": 0.4}
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(json.dumps({**content, "keyframes": [], "is_cycle": False, "camera_path": cameras}))
+    return path
 
 
 def state_of(surfels: Surfels, class_ids: torch.Tensor, assigned: bool = True, scale: float = 1.0) -> dict:

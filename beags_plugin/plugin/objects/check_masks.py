@@ -19,7 +19,7 @@ from beags_plugin.masks.check.disagreement import views_against_others
 from beags_plugin.masks.check.files import FEW_VIEWS, MOST_IDS, Coverage, MaskFiles, check_files
 from beags_plugin.masks.check.issues import LEVELS, Issue, ordered, percent
 from beags_plugin.pictures.masks import contradictions, coverage_picture
-from beags_plugin.plugin.runs.run_config import load_run_config
+from beags_plugin.plugin.runs.place import open_run
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParserConfig
 from beags_plugin.plugin.views.lens import project_through_lens
@@ -238,7 +238,7 @@ def options_beside(run: Path | None, data: Path | None, **given: Any) -> BeagsDa
     """
     config = BeagsDataParserConfig()
     if run is not None:
-        trained = load_run_config(run)
+        trained = open_run(run, data)
         config = replace(cast("BeagsDataParserConfig", trained.data_config.dataparser), data=trained.data_path)
     if data is not None:
         config = replace(config, data=data)

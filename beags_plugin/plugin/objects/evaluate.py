@@ -40,14 +40,14 @@ def evaluate_run(
 class EvaluatedRun:
     """A run on disk with its held-out views, which are read when first used.
 
-    name: of the scene in tables. stages: "before" and "after", or "after" alone, to the saved scenes. complete: False
-    for a run of ``beags extract``, which holds a part of a scene. classes: id to name of the classes that can be
-    scored.
+    name: of the scene in tables. data: if not where they were. stages: "before" and "after", or "after" alone, to the
+    saved scenes. complete: False for a run of ``beags extract``, which holds a part of a scene. classes: id to name of
+    the classes that can be scored.
     """
 
-    def __init__(self, config_path: Path, name: str = "") -> None:
+    def __init__(self, config_path: Path, name: str = "", data: Path | None = None) -> None:
         self.config_path = Path(config_path)
-        after = read_run(self.config_path)
+        after = read_run(self.config_path, data)
         self.stages: dict[Stage, SavedScene] = {"after": after}
         snapshot = self.config_path.parent / BASE_SNAPSHOT / "config.yml"
         if after.assigned and snapshot.exists() and (before := read_run(snapshot)).assigned:

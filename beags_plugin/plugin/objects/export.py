@@ -18,6 +18,7 @@ from beags_plugin.export.frames import Frame, bounding_box, check_placement
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.select import select_class
 from beags_plugin.plugin.objects.extract import file_name, folder_names, objects_with_gaussians
+from beags_plugin.plugin.runs.place import open_run
 from beags_plugin.plugin.runs.read import (
     SavedScene,
     raster_settings,
@@ -26,7 +27,6 @@ from beags_plugin.plugin.runs.read import (
     read_transform,
     training_viewpoints,
 )
-from beags_plugin.plugin.runs.run_config import load_run_config
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.system.errors import UserError
 
@@ -91,6 +91,7 @@ def export_run(
     options: Mapping[str, Mapping[str, Any]] | None = None,
     progress: Progress | None = None,
     whole: bool = False,
+    data: Path | None = None,
 ) -> list[Exported]:
     """Write files of objects of a run.
 
@@ -99,14 +100,15 @@ def export_run(
     names of exporters. placement: "world", the frame of the input poses (the run's own if it has not kept how that was
     normalised), or "object", the same centred on each object. output: folder; ``exports/`` in the run by default.
     options: format to its exporter's options. progress: receives (done, total) files, and rendered views of the meshes
-    among them. Raises ``UserError`` for a mistake, before anything is written.
+    among them. data: if not where they were. Raises ``UserError`` for a mistake, before anything is written.
     """
     run, folder = config_path.parent, output or config_path.parent / "exports"
     check_placement(placement)
     exporters = {name: make_exporter(name, **(options or {}).get(name, {})) for name in formats}
     if not exporters:
         raise UserError("no format is named: name one with --format.")
-    scene = read_assigned_run(config_path) if everything or objects or not whole else read_run(config_path)
+    read = read_assigned_run if everything or objects or not whole else read_run
+    scene = read(config_path, data)
     present = objects_with_gaussians(scene, objects, run) if scene.assigned else {}
     if everything and objects:
         raise UserError("--all exports every object: leave --object out.")
@@ -233,7 +235,7 @@ def export_shown(
     frame = Frame.of_run() if transform is None else Frame(*transform)
     views = None
     if exporter.needs_views:
-        views = frame.views(training_viewpoints(load_run_config(config_path), settings, config_path))
+        views = frame.views(training_viewpoints(open_run(config_path), settings, config_path))
     path = _free_path(config_path.parent / "exports", title, exporter.suffix)
     total = 0 if views is None else len(views.cameras)
     exporter.write(

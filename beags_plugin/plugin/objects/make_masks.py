@@ -22,11 +22,12 @@ from beags_plugin.masks.sources.base import MaskSource, Photo, SourceScene
 from beags_plugin.pictures.masks import overlay
 from beags_plugin.plugin.objects.check_masks import check_scene
 from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
+from beags_plugin.plugin.runs.place import open_run
 from beags_plugin.plugin.runs.read import raster_settings, read_run
 from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParserConfig
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
-from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.errors import UserError, check_choice, writing
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_whole
 
@@ -34,8 +35,8 @@ from beags_plugin.system.whole_files import write_whole
 class RunGeometry:
     """The surfaces of a trained run, at the size of the photographs: of its training views, then of the others."""
 
-    def __init__(self, config_path: Path) -> None:
-        self.scene = read_run(config_path)
+    def __init__(self, config_path: Path, data: Path | None = None) -> None:
+        self.scene = read_run(config_path, None if open_run(config_path).data_path.exists() else data)
         self.manager = data_to_reproject(self.scene, config_path, ReprojectionOptions())
         self.images = list(self.manager.train_dataset.image_filenames)
         self.cameras = [view.camera for view in self.manager.views("train")]
@@ -78,8 +79,9 @@ def configured_source(name: str, options: Sequence[str]) -> MaskSource:
     arguments = []
     for option in options:
         key, equals, value = option.partition("=")
-        if key not in known or not equals:
-            raise UserError(f"the mask source {name} has no option {option!r}: give {', '.join(known)} as key=value.")
+        check_choice(key, known, "option", f" of the mask source {name}")
+        if not equals:
+            raise UserError(f"the option {option!r} of the mask source {name} has no value: give {option}=value.")
         if isinstance(getattr(kind, key, None), bool):
             if value not in ("true", "false"):
                 raise UserError(f"the option {option!r} must be true or false.")
@@ -134,7 +136,9 @@ def make_masks(
         Photo(name, path, *size, trained=index in trained)
         for index, (name, path, size) in enumerate(zip(photo_names(views.images), views.images, sizes, strict=True))
     ]
-    made_of = SourceScene(scene.root, photos, RunGeometry(run) if run is not None and source.needs_run else None)
+    made_of = SourceScene(
+        scene.root, photos, RunGeometry(run, data.data) if run is not None and source.needs_run else None
+    )
     shares: list[float] = []
     shown: list[tuple[Photo, Path]] = []
     with writing(folder):

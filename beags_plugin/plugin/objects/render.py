@@ -6,17 +6,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
+import torch
+
 from beags_plugin.export.frames import bounding_box
 from beags_plugin.extraction.select import select_class
 from beags_plugin.pictures.cells import write_picture
 from beags_plugin.pictures.objects import Subject, comparison, film, sheet
-from beags_plugin.pictures.options import PictureFormat, RenderOptions
+from beags_plugin.pictures.options import Background, PictureFormat, RenderOptions
 from beags_plugin.pictures.orbit import orbit, orbit_frame, orbit_settings
 from beags_plugin.pictures.video import FILMS, check_film, encoder, write_film
+from beags_plugin.plugin.objects.camera_path import read_camera_path
 from beags_plugin.plugin.objects.export import Progress
 from beags_plugin.plugin.objects.extract import folder_names, objects_with_gaussians
 from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT
-from beags_plugin.plugin.runs.read import SavedScene, raster_settings, read_assigned_run, training_viewpoints
+from beags_plugin.plugin.runs.read import SavedScene, raster_settings, read_assigned_run, read_run, training_viewpoints
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.system.errors import UserError, check_choice
 
@@ -30,25 +33,28 @@ def render_run(
     output: Path | None = None,
     options: RenderOptions | None = None,
     progress: Progress | None = None,
+    data: Path | None = None,
 ) -> Path:
     """Render objects of a run alone, from cameras around each, into one file; return its path.
 
     config_path: config.yml of a refined (or assigned) run. objects: names; all but the background if empty. form:
     "video" (.mp4, .gif), "sheet" (.png, .jpg), or "before-after": assignment alone beside the refined object from the
     same cameras, either. output: the file; in ``renders/`` of the run if None. progress: receives (done, total)
-    pictures. Raises ``UserError`` for a mistake, before anything is rendered.
+    pictures. data: if not where they were. Raises ``UserError`` for a mistake, before anything is rendered.
     """
     options = options or RenderOptions()
     options.check()
     check_choice(form, get_args(PictureFormat), "format")
-    scene = read_assigned_run(config_path)
+    if options.camera_path is not None:
+        return _along(options.camera_path, config_path, objects, form, output, options.background, progress)
+    scene = read_assigned_run(config_path, data)
     present = objects_with_gaussians(scene, objects, config_path.parent)
     names = list(dict.fromkeys(objects)) or [name for name, class_id in present.items() if class_id != 0]
     if not names:
         raise UserError(f"{config_path} holds no object but the background: name it with --object background.")
     if output is None:
         title = folder_names(scene.classes)[present[names[0]]] if len(names) == 1 else "objects"
-        suffix = ".png" if form != "video" else ".gif" if encoder() is None else ".mp4"
+        suffix = ".png" if form != "video" else _film_suffix()
         output = config_path.parent / "renders" / f"{title}_{form}{suffix}"
     moving = _check_output(output, form)
     stages = {"": scene} if form != "before-after" else {"before": _base_of(config_path), "after": scene}
@@ -59,6 +65,39 @@ def render_run(
     else:
         draw = comparison if form == "before-after" else sheet
         write_picture(output, draw(subjects, rasterizer, options.background, progress))
+    return output
+
+
+def _film_suffix() -> str:
+    return ".gif" if encoder() is None else ".mp4"
+
+
+def _along(
+    path: Path,
+    config_path: Path,
+    objects: Sequence[str],
+    form: str,
+    output: Path | None,
+    background: Background,
+    progress: Progress | None,
+) -> Path:
+    """Film the objects together, or the whole scene, along a camera path; arguments as of ``render_run``."""
+    if form == "sheet":
+        raise UserError("a camera path gives a video: leave --format sheet or --camera-path out.")
+    cameras, fps = read_camera_path(path)
+    output = output or config_path.parent / "renders" / f"{path.stem}_{form}{_film_suffix()}"
+    check_film(output)
+    scene = read_assigned_run(config_path) if objects or form != "video" else read_run(config_path)
+    stages = {"": scene} if form == "video" else {"before": _base_of(config_path), "after": scene}
+    present = objects_with_gaussians(scene, objects, config_path.parent) if objects else {}
+    chosen = torch.tensor([present[name] for name in objects])
+    shown = {}
+    for caption, each in stages.items():
+        surfels, class_ids = each.surfels(), each.state["class_ids"]
+        shown[caption] = surfels[torch.isin(class_ids, chosen)] if objects else surfels
+    subject = Subject("", shown, cameras, raster_settings(scene))
+    rasterizer = make_rasterizer(scene.config.model_config.rasterizer)
+    write_film(output, film([subject], rasterizer, background, progress), fps)
     return output
 
 

@@ -18,7 +18,8 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import write_mask
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.pictures.masks import Changed, before_and_after
-from beags_plugin.plugin.runs.read import check_data, raster_settings, read_run
+from beags_plugin.plugin.runs.place import check_data
+from beags_plugin.plugin.runs.read import raster_settings, read_run
 from beags_plugin.preparation.consistent_masks import chosen_reprojection, render_depths, reprojected_masks
 from beags_plugin.preparation.pipeline import known_classes
 from beags_plugin.rasterizers import make_rasterizer
@@ -38,7 +39,7 @@ class ReprojectionOptions:
 
     masks: folder of other id images. classes: their classes.json. method, tau, depth: see
     ``preparation.pipeline.PreparationConfig``. run_size: reproject at the size of the training, not at that of the
-    photographs. parser: the options of ``beags-data``, if not the run's own.
+    photographs. parser: the options of ``beags-data``, if not the run's own. data: of the run, if not where they were.
     """
 
     masks: Path | None = None
@@ -48,6 +49,7 @@ class ReprojectionOptions:
     depth: str | None = None
     run_size: bool = False
     parser: BeagsDataParserConfig | None = None
+    data: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     config_path: config.yml of any run. Raises ``UserError`` for a run, data or an option that cannot be used, and if no
     view has a mask.
     """
-    scene = read_run(config_path)
+    scene = read_run(config_path, options.data)
     manager = data_to_reproject(scene, config_path, options)
     own = {"reprojection": options.method, "tau": options.tau, "depth": options.depth}
     config = replace(scene.config.model_config.prepare, **{k: v for k, v in own.items() if v is not None})

@@ -67,11 +67,12 @@ class BeagsTrainerConfig(TrainerConfig):
     """Version of the files of a run that is trained with this config."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Refuse a run of another format where nerfstudio's own loader reads its config.yml."""
+        """Refuse a run of another format, and find a moved one, where nerfstudio's own loader reads config.yml."""
         if state.get("run_format") != RUN_FORMAT:
             print_user_errors_plainly()
             raise other_format("this run", state.get("run_format"))
         self.__dict__.update(state)
+        load("beags_plugin.plugin.runs.place:place_for_nerfstudio")(self)
 
     @property
     def model_config(self) -> BeagsModelConfig:

@@ -11,7 +11,7 @@ from tyro.conf import Suppress
 from beags_plugin.losses import LOSSES
 from beags_plugin.losses.base import Loss
 from beags_plugin.plugin.options.schedule import PhaseSchedule
-from beags_plugin.system.errors import UserError
+from beags_plugin.system.errors import UserError, check_choice
 
 Phase = Literal["base", "refine", "both"]
 
@@ -37,14 +37,12 @@ class LossSpec:
         kind = LOSSES.get(name)
         if not 0.0 <= self.weight < math.inf:
             raise UserError(f"the loss {name} has the weight {self.weight}: give 0 (off) or more.")
-        if self.phase not in (phases := get_args(Phase)):
-            raise UserError(f"the loss {name} has the phase {self.phase!r}: choose one of {', '.join(phases)}.")
+        check_choice(self.phase, get_args(Phase), "phase", f" of the loss {name}")
         if self.start < 0:
             raise UserError(f"the loss {name} starts at step {self.start}: give 0 or more.")
         known = [field.name for field in fields(kind) if field.name not in ("weight", "start", "stop")]
-        if unknown := sorted(set(self.options) - set(known)):
-            choice = f"choose of {', '.join(known)}" if known else "it has none"
-            raise UserError(f"the loss {name} has no option {unknown[0]!r}: {choice}.")
+        for option in self.options:
+            check_choice(option, known, "option", f" of the loss {name}")
         first = schedule.base_steps + self.start if self.phase == "refine" else schedule.scaled(self.start)
         if self.phase != "refine" and (schedule.base_steps == 0 or schedule.warm):
             first = 0  # the base was trained elsewhere: its terms have long started

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 from beags_plugin.plugin.options.config import CONFIG_FILE
 from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, REPORT_FILE
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.progress import say
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.options.config import BeagsTrainerConfig
@@ -21,17 +22,20 @@ def train(config: BeagsTrainerConfig) -> None:
     _complete(lambda: main(config), config)
 
 
-def resume(run: Path, device: Literal["cpu", "cuda"] | None = None, check_memory: bool = True) -> None:
+def resume(
+    run: Path, device: Literal["cpu", "cuda"] | None = None, check_memory: bool = True, data: Path | None = None
+) -> None:
     """Train an interrupted run to its end, in its own folder and with its own config.
 
     run: its folder, or config.yml in it. device: in place of the config's. check_memory: as in ``BeagsTrainerConfig``.
-    Without a checkpoint it starts from the beginning. Raises ``UserError`` for another folder, and a complete run.
+    data: if not where they were. Without a checkpoint it starts from the beginning. Raises ``UserError`` for another
+    folder, and a complete run.
     """
     from nerfstudio.scripts.train import launch, train_loop
 
     from beags_plugin.plugin.options.machine import check_machine
 
-    config = resumed_config(run)
+    config = resumed_config(run, data)
     machine = config.machine
     config.check_memory = config.check_memory and check_memory
     if device is not None:
@@ -51,23 +55,19 @@ def resume(run: Path, device: Literal["cpu", "cuda"] | None = None, check_memory
     )
 
 
-def resumed_config(run: Path) -> BeagsTrainerConfig:
+def resumed_config(run: Path, data: Path | None = None) -> BeagsTrainerConfig:
     """Return the config with which ``resume`` trains."""
-    from nerfstudio.utils.rich_utils import CONSOLE
-
     from beags_plugin.plugin.runs.checkpoint_file import read_checkpoint, scene_alone
     from beags_plugin.plugin.runs.layout import newest_checkpoint
-    from beags_plugin.plugin.runs.run_config import load_run_config
+    from beags_plugin.plugin.runs.place import check_data, open_run
 
     path = Path(run)
     path = path / CONFIG_FILE if path.is_dir() else path
-    config = load_run_config(path)
-    folder = path.absolute().parent
-    config.run_dir = folder  # wherever it has been moved to
-    models = config.get_checkpoint_dir()
+    config = open_run(path, data)
+    check_data(config.data_path, path)
+    folder, models = config.get_base_dir(), config.get_checkpoint_dir()
     if not any(models.glob("step-*.ckpt")):
-        message = f"{folder} holds no checkpoint yet: it starts from the beginning."
-        CONSOLE.print(message, highlight=False, markup=False, soft_wrap=True)
+        say(f"{folder} holds no checkpoint yet: it starts from the beginning.")
         return config
     if (folder / EXTRACTION_FILE).exists() or scene_alone(read_checkpoint(newest_checkpoint(models))):
         raise UserError(

@@ -20,7 +20,9 @@ def newest_checkpoint(folder: Path) -> Path:
     """Return the checkpoint of the highest step in a nerfstudio_models folder; raises ``UserError`` if none."""
     checkpoints = sorted(folder.glob("step-*.ckpt")) if folder.is_dir() else []
     if not checkpoints:
-        raise UserError(f"{folder} holds no checkpoint (step-….ckpt): train longer, or name another run.")
+        raise UserError(
+            f"{folder} holds no checkpoint (step-….ckpt): train longer, copy the whole run, or name another."
+        )
     return checkpoints[-1]
 
 
@@ -33,7 +35,10 @@ def preparing_run(run: Path) -> Path:
     """Return the run that prepared ``run``: itself, or the one that it is the base or an extract of."""
     origin = run / EXTRACTION_FILE
     if origin.exists():
-        return preparing_run(Path(_origin(origin, "run", str, "")).parent)
+        recorded = Path(_origin(origin, "run", str, "")).parent
+        if run.parent.name == "extracted" and (run.parent.parent / "config.yml").exists():
+            recorded = run.parent.parent  # in the usual place; both may have been moved
+        return preparing_run(recorded)
     return run.parent if run.name == BASE_SNAPSHOT and (run.parent / PREPARED).is_dir() else run
 
 

@@ -17,7 +17,7 @@ from beags_plugin.export.base import Viewpoints
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.runs.checkpoint_file import model_state, read_checkpoint
 from beags_plugin.plugin.runs.layout import TRANSFORM_FILE, newest_checkpoint
-from beags_plugin.plugin.runs.run_config import load_run_config
+from beags_plugin.plugin.runs.place import check_data, open_run
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.rasterizers import make_rasterizer
@@ -52,18 +52,21 @@ class SavedScene:
         return self.state["class_ids"] if self.assigned else None
 
 
-def read_run(config_path: Path) -> SavedScene:
-    """Read a run's newest checkpoint; raises ``UserError`` if the run is incomplete or the file is damaged."""
-    config = load_run_config(config_path)
+def read_run(config_path: Path, data: Path | None = None) -> SavedScene:
+    """Read a run's newest checkpoint; raises ``UserError`` if the run is incomplete or the file is damaged.
+
+    data: its data, if not where they were.
+    """
+    config = open_run(config_path, data)
     path = newest_checkpoint(config.get_checkpoint_dir())
     checkpoint = read_checkpoint(path)
     state = model_state(checkpoint, path)
     return SavedScene(config, state, checkpoint["step"], state["_extra_state"]["classes"])
 
 
-def read_assigned_run(config_path: Path) -> SavedScene:
-    """Read a run's newest checkpoint; raises ``UserError`` if the run is incomplete or no class was assigned."""
-    scene = read_run(config_path)
+def read_assigned_run(config_path: Path, data: Path | None = None) -> SavedScene:
+    """Do as ``read_run``; raises ``UserError`` too if no class was assigned."""
+    scene = read_run(config_path, data)
     if not scene.assigned:
         raise UserError(
             f"{config_path.parent} is a base without classes: refine it first "
@@ -96,12 +99,6 @@ def read_transform(run: Path) -> tuple[Tensor, float] | None:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} cannot be read ({reason(error)}): restore it.") from error
     return transform, scale
-
-
-def check_data(data: Path, config_path: Path) -> None:
-    """Raise ``UserError`` for data of a run that are gone. config_path: of the run."""
-    if not data.exists():
-        raise UserError(f"{config_path} was trained on {data}, which is gone: put it back.")
 
 
 @contextmanager

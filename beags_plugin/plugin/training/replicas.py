@@ -11,6 +11,7 @@ from pathlib import Path
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich import get_console
 from torch import nn
 
 from beags_plugin.ops import cuda_extension
@@ -36,7 +37,7 @@ class Replica:
             config.steps_per_eval_image = config.steps_per_eval_batch = config.steps_per_eval_all_images = 0
             config.steps_per_held_out = config.steps_per_objects = 0
             config.viewer.quit_on_train_completion = True
-            CONSOLE.quiet = True
+            CONSOLE.quiet = get_console().quiet = True
 
     def start_alike(self, scene: nn.Module) -> None:
         """Copy the scene of the first process to all."""

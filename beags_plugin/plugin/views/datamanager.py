@@ -16,7 +16,6 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
-from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import track
 from torch import Tensor
 from tyro.conf import Suppress
@@ -32,6 +31,7 @@ from beags_plugin.plugin.views.streaming import Lazy, StreamedViews
 from beags_plugin.plugin.views.views import View, unique_names
 from beags_plugin.system import processes
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.progress import say
 
 READ_AHEAD = 8  # streamed images that are read before their use
 OWN_KEYS = ("labels", "alpha")
@@ -85,10 +85,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         dataset = self._dataset(split)
         load = partial(self._load_view, split)
         if self.streams(split):
-            CONSOLE.print(
-                f"{len(dataset)} {split} images would take {self._cache_gb(split):.1f} GB: they are read when needed.",
-                highlight=False,
-            )
+            say(f"{len(dataset)} {split} images would take {self._cache_gb(split):.1f} GB: they are read when needed.")
             workers = self.config.max_thread_workers or min(4, os.cpu_count() or 1)
             return StreamedViews(load, len(dataset), READ_AHEAD, workers)
         with ThreadPoolExecutor(max_workers=self.config.max_thread_workers or 2) as pool:

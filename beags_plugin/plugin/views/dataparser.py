@@ -14,7 +14,6 @@ from typing import Any, Literal
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
-from nerfstudio.utils.rich_utils import CONSOLE
 from tyro.conf import Suppress
 
 from beags_plugin.data.dataset import ColmapModel, Dataset, MaskKind, TransformsFile
@@ -28,6 +27,7 @@ from beags_plugin.plugin.views.cameras import check_cameras, downscaled_size, re
 from beags_plugin.plugin.views.poses import Normalization, PosedViews, read_poses
 from beags_plugin.plugin.views.seed_points import starting_points
 from beags_plugin.system.errors import UserError, print_user_errors_plainly
+from beags_plugin.system.progress import say
 
 LEAST_PIXELS = 2  # of a side that was scaled down; fewer show nothing
 
@@ -155,7 +155,7 @@ class BeagsDataParser(DataParser):
         scene, views = self.posed_views()
         self._metadata = self._read_metadata(scene, views)
         for line in self._recognised(scene, views):
-            CONSOLE.print(line, markup=False, highlight=False, soft_wrap=True)
+            say(line)
         self._views = views
 
     def _read_metadata(self, scene: Dataset, views: PosedViews) -> dict[str, Any]:

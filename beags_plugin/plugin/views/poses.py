@@ -16,7 +16,6 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOu
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from beags_plugin.data.dataset import ColmapModel, Poses, PoseTable, TransformsFile
@@ -26,6 +25,7 @@ from beags_plugin.data.transforms_file import read_transforms
 from beags_plugin.plugin.views.cameras import concatenate_cameras
 from beags_plugin.plugin.views.colmap_files import read_lens
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.progress import say
 from beags_plugin.system.reading.ply import read_ply_points
 
 SPLITS = ("train", "val", "test")
@@ -70,7 +70,7 @@ def read_poses(poses: Poses, root: Path, normalization: Normalization) -> PosedV
             file, (parser, named) = poses.folder, _colmap_parser(poses, root, normalization)
         parts = [_delegate(parser, split, file) for split in named or ("train",)]
     if any(part.mask_filenames for part in parts):
-        CONSOLE.print("[yellow]mask_path of transforms.json is not used: beags-data reads class maps only.")
+        say("mask_path of transforms.json is not used: beags-data reads class maps only.")
 
     # A view may be in several named splits (val and test are often the same): keep it once.
     paths = [path for part in parts for path in part.image_filenames]

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.data.dataset import Dataset, PoseTable
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.colmap_files import read_colmap_points
 from beags_plugin.plugin.views.poses import PosedViews
+from beags_plugin.system.progress import say
 from beags_plugin.system.reading.ply import read_ply_points
 
 SEED = 0  # of the sampled points
@@ -39,7 +39,7 @@ def starting_points(scene: Dataset, views: PosedViews, count: int) -> dict[str, 
         if bounds is None or _within_bounds(moved.numpy(), cameras, scale * bounds) > 0.9:
             found = {"points3D_xyz": moved, "points3D_rgb": torch.from_numpy(colors)}
         else:
-            CONSOLE.print(f"{scene.seed_points} is not used: its points do not lie where the poses look.", markup=False)
+            say(f"{scene.seed_points} is not used: its points do not lie where the poses look.")
     if found["points3D_xyz"] is not None and len(found["points3D_xyz"]) > 0:
         return {**found, "points3D_random": False}
     if bounds is None:

@@ -206,7 +206,7 @@ def test_meshes_need_the_data(tmp_path, capsys):
     (tmp_path / "lab").rename(tmp_path / "away")
     with pytest.raises(SystemExit):
         main(["export", "--load-config", str(config), "--all", "--format", "obj"])
-    assert "lab, which is gone: put it back." in capsys.readouterr().out
+    assert "lab: name their place with --data" in capsys.readouterr().out
     main(["export", "--load-config", str(config), "--all", "--format", "spz"])  # splats do not
     assert len(list((config.parent / "exports").glob("*.spz"))) == 3
 

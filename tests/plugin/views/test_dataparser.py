@@ -2,10 +2,12 @@ from __future__ import annotations
 
 import ast
 import json
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rich
 import torch
 from data_folders import (
     CX,
@@ -22,18 +24,31 @@ from data_folders import (
     write_transforms,
 )
 from PIL import Image
+from rich.console import Console
 
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.plugin.views.dataset import BeagsDataset
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.progress import progress_bar
 
 AS_GIVEN = dict(orientation_method="none", center_method="none", auto_scale_poses=False)
 
 
 def parse(root: Path, split: str = "train", **options):
     return BeagsDataParserConfig(data=root, **options).setup().get_dataparser_outputs(split)
+
+
+def test_what_it_says_stands_above_a_bar_not_on_it(tmp_path, monkeypatch):
+    write_transforms(tmp_path)
+    console = Console(file=StringIO(), force_terminal=True)
+    monkeypatch.setattr(rich, "_console", console)
+    with progress_bar("Evaluating"):
+        parse(tmp_path)
+    printed = console.file.getvalue()  # type: ignore[attr-defined]
+    line = f"{tmp_path}: nerfstudio layout"
+    assert "Evaluating" in printed and printed.partition(line)[0].endswith("\x1b[2K")  # the bar's line is erased
 
 
 def names(outputs) -> list[str]:
