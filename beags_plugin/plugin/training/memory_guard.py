@@ -18,7 +18,7 @@ SMALLER = (
     "(--pipeline.model.densify.pixels-per-surfel 100)"
 )
 
-NO_MEMORY = f"memory ran out before the first step: close other programs, or {SMALLER}."
+NO_MEMORY = f"memory ran out before anything was saved: close other programs, or {SMALLER}."
 
 _ANYWAY = "--check-memory False (beags resume: --no-check-memory) tries it all the same."
 
