@@ -182,7 +182,9 @@ class BeagsTrainer(Trainer):
                 f"the checkpoint is of a complete run ({self._start_step} steps): nothing is left to train; "
                 "to refine again, load <run>/base/nerfstudio_models with beags-refine."
             )
-        self._estimate = Estimate(str(self.config.method_name), self.config.max_num_iterations)
+        self._estimate = Estimate(
+            str(self.config.method_name), self.config.max_num_iterations, chosen=self._start_step == 0
+        )
         remove_unfinished(self.base_dir)
         (self.base_dir / REPORT_FILE).unlink(missing_ok=True)  # it marks the run as complete
         if self.config.steps_per_held_out > 0:

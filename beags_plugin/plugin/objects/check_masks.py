@@ -116,6 +116,7 @@ def _files(config: BeagsDataParserConfig) -> tuple[Dataset, PosedViews, MaskFile
     parser.fit_cameras(views, sizes)
     masks, folder, kind = parser.mask_files(scene, views)
     trained = set(parser.views_of_split(views, "train"))
+    parser.views_of_split(views, "val")  # without which training stops
     names_file = scene.root / config.classes_path
     names = read_classes(names_file) if names_file.is_file() else scene.class_names
     files = MaskFiles(
@@ -189,14 +190,16 @@ def _areas(run: ReprojectedRun, index: int) -> list[Area]:
 
 
 def write_report(report: Report, output: Path, run: ReprojectedRun | None = None) -> list[Path]:
-    """Write report.json, coverage.png and, with a run that contradicts masks, contradicted.png; return their paths."""
+    """Write report.json, coverage.png of the objects and contradicted.png of a run, if any; return their paths."""
     coverage = report.coverage
     share = coverage.pixels / np.maximum(coverage.size, 1)[:, None]
-    written = [output / "report.json", output / "coverage.png"]
+    written = [output / "report.json"]
     with writing(output):
         output.mkdir(parents=True, exist_ok=True)
         written[0].write_text(json.dumps(report.to_json(), indent=1), "utf8")
-        coverage_picture(written[1], report.stems, coverage.ids, report.names, share, coverage.usable)
+        if any(coverage.ids):
+            written.append(output / "coverage.png")
+            coverage_picture(written[1], report.stems, coverage.ids, report.names, share, coverage.usable)
     if run is not None and report.areas:
         boxes: dict[str, list[tuple[int, int, int, int]]] = {}
         for area in report.areas:

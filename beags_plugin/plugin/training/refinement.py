@@ -62,8 +62,8 @@ class RefinementSwitch:
         masks = self.datamanager.train_dataset.metadata["mask_filenames"]
         if self.wanted and all(path is None for path in masks):
             raise UserError(
-                "no training view has a mask: put id images into masks/<image name>.png, or train the preset "
-                "beags-base, which needs none."
+                "no training view has a mask: put id images into masks/<image name>.png, make them with beags masks "
+                "make, or train the preset beags-base, which needs none."
             )
 
     def check_options(self) -> None:
