@@ -18,8 +18,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from beags_plugin.importers.base import find_importer
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.options.machine import check_machine
+from beags_plugin.plugin.options.rollback import Rollback, noted
 from beags_plugin.plugin.runs.layout import REPORT_FILE
-from beags_plugin.plugin.runs.rollback import Rollback, noted
 from beags_plugin.plugin.training.checkpoints import Checkpoints
 from beags_plugin.plugin.training.memory_guard import NO_MEMORY, MemoryWatch, check_room, is_out_of_memory
 from beags_plugin.plugin.training.monitor import HeldOutCurve

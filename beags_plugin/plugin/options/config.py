@@ -14,11 +14,11 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from tyro.conf import Suppress
 
+from beags_plugin.plugin.options import rollback
 from beags_plugin.plugin.options.loss_spec import LossSpec
 from beags_plugin.plugin.options.machine import check_machine, default_device
 from beags_plugin.plugin.options.model_options import BeagsModelConfig
 from beags_plugin.plugin.options.run_format import RUN_FORMAT, other_format
-from beags_plugin.plugin.runs import rollback
 from beags_plugin.plugin.views.datamanager import BeagsDataManagerConfig
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.system.errors import UserError, print_user_errors_plainly, writing

@@ -12,9 +12,9 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
+from beags_plugin.plugin.options.rollback import REPLACED
 from beags_plugin.plugin.runs.checkpoint_file import model_state, read_checkpoint
 from beags_plugin.plugin.runs.layout import REPORT_FILE, newest_checkpoint
-from beags_plugin.plugin.runs.rollback import REPLACED
 from beags_plugin.plugin.runs.write import save_atomically
 from beags_plugin.plugin.training.resumable import STATE, VERSION, Resumable, training_state
 from beags_plugin.plugin.training.scene_model import SceneModel

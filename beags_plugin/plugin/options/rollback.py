@@ -6,14 +6,13 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
-from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED, REPORT_FILE, TRANSFORM_FILE
 from beags_plugin.system.lock import LOCK
 
 REPLACED = "replaced_models"
 """Folder of a run: checkpoints of an earlier one in the same place, until the new one has its own."""
 _MODELS = "nerfstudio_models"
-_REWRITTEN = ("config.yml", REPORT_FILE, TRANSFORM_FILE, "start.json", "held_out.json")
-_ADDED = (LOCK, "events.out.tfevents.*", PREPARED, BASE_SNAPSHOT)
+_REWRITTEN = ("config.yml", "training.json", "dataparser_transforms.json", "start.json", "held_out.json")
+_ADDED = (LOCK, "events.out.tfevents.*", "prepared", "base")
 """What a training writes before its first checkpoint; other programs may write into the folder too."""
 
 _noted: dict[Path, Rollback] = {}
