@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-import warnings
 from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
@@ -20,7 +19,7 @@ from beags_plugin.commands.starting import starting
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.pictures.options import RenderOptions
-from beags_plugin.system.errors import UserError, refused
+from beags_plugin.system.errors import UserError, refused, silence_libraries
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
 
@@ -279,8 +278,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command ``beags``; a user error prints one sentence and ends with exit code 2."""
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
     description = "BEA-GS: clean objects out of Gaussian-splat scenes."
-    # torch's deprecation warnings are meant for nerfstudio's authors.
-    warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|nerfstudio)\.")
+    silence_libraries()
     try:
         command = tyro.cli(Command, args=arguments, description=description, config=config)
         command.run()

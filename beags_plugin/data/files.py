@@ -7,11 +7,16 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.images import read_image
 
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+_ENDS = {"PNG": b"IEND", "JPEG": b"\xff\xd9"}
 LARGEST_WIDTH = 1600  # pixels; with it Mip-NeRF 360 gets images_4 outdoors and images_2 indoors, LLFF images_4
 
 
@@ -47,11 +52,23 @@ def choose_images(root: Path, chosen: Path | None = None) -> Path:
 
 
 def image_size(path: Path, what: str = "the image") -> tuple[int, int]:
-    """Read width and height in pixels from the file's header; raise ``UserError`` for an unreadable image."""
+    """Read width and height in pixels from the file's header; raise ``UserError`` for an image that is cut off."""
+
+    def read(image: Image) -> tuple[int, int]:
+        if (end := _ENDS.get(image.format or "")) is not None and end not in _last_bytes(path):
+            image.load()  # refuses it, unless there is only more behind its end, as behind phones' moving photos
+        return image.size
+
     try:
-        return read_image(path, lambda image: image.size, what)
+        return read_image(path, read, what)
     except FileNotFoundError:
         raise UserError(f"{what} {path} does not exist: restore it, or remove it from the poses.") from None
+
+
+def _last_bytes(path: Path, count: int = 16) -> bytes:
+    with path.open("rb") as file:
+        file.seek(max(0, file.seek(0, os.SEEK_END) - count))
+        return file.read()
 
 
 def photo_names(images: Sequence[Path]) -> list[str]:

@@ -11,13 +11,14 @@ from typing import Any, cast
 
 from filelock import BaseFileLock
 from nerfstudio.engine.trainer import Trainer
-from nerfstudio.utils import writer
+from nerfstudio.utils import profiler, writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.importers.base import find_importer
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.options.machine import check_machine
+from beags_plugin.plugin.options.rollback import Rollback, noted
 from beags_plugin.plugin.runs.layout import REPORT_FILE
 from beags_plugin.plugin.training.checkpoints import Checkpoints
 from beags_plugin.plugin.training.memory_guard import NO_MEMORY, MemoryWatch, check_room, is_out_of_memory
@@ -30,7 +31,7 @@ from beags_plugin.plugin.training.timing import Estimate, StageSeconds
 from beags_plugin.plugin.training.warm_start import start_from_scene
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system import processes
-from beags_plugin.system.errors import UserError, is_of_disk, refused
+from beags_plugin.system.errors import UserError, is_of_disk, refused, silence_libraries
 from beags_plugin.system.interrupts import Interrupts, stop
 from beags_plugin.system.lock import run_lock
 from beags_plugin.system.memory import peak_memory_mb
@@ -44,6 +45,7 @@ class BeagsTrainer(Trainer):
     config: BeagsTrainerConfig
 
     def __init__(self, config: BeagsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
+        silence_libraries()
         self.schedule = config.model_config.schedule()
         self.last_step = config.max_num_iterations or self.schedule.total
         config.max_num_iterations = self.last_step
@@ -51,6 +53,7 @@ class BeagsTrainer(Trainer):
         self.seconds = StageSeconds()
         self._interrupts = Interrupts(self._go_on)
         self._lock: BaseFileLock | None = None
+        self._before: Rollback | None = None  # the run's folder, until this process has locked it
         self._watch = MemoryWatch(config.machine.device_type)
         self._done = 0  # the last step that was trained
         self._complete = False
@@ -67,17 +70,18 @@ class BeagsTrainer(Trainer):
         try:
             self._set_up(test_mode)
         except BaseException as error:
-            self._release()
-            self._stop(error, NO_MEMORY)
+            self._stop(error)
             raise
 
     def _set_up(self, test_mode: Any) -> None:
-        check_machine(self.config.machine)
-        self.config.check()
         if processes.rank() == 0:
+            before = noted(self.base_dir)
             self._lock = run_lock(self.base_dir)
+            self._before = before
             # At once: config.yml is this run's already, and a resume would take both for one run.
             self._checkpoints.set_aside()
+        check_machine(self.config.machine)
+        self.config.check()
         if (start := self._start()) is not None:
             find_importer(start)  # before the data are read
         used = any((self.base_dir / self.config.logging.relative_log_dir).glob("events.out.tfevents.*"))
@@ -88,32 +92,47 @@ class BeagsTrainer(Trainer):
         if used:
             self._forget_events()
 
-    def _stop(self, error: BaseException, no_memory: str) -> None:
-        """End the program with one sentence if memory ran out, the system refused a file, or a user can help it.
+    def _stop(self, error: BaseException) -> None:
+        """Release the run, whose training ``error`` has ended; end the program with one sentence where there is one.
 
-        no_memory: the sentence where memory ran out. Other errors pass.
+        There is one if memory ran out, the system refused a file, or a user can help it. Nothing is left of a training
+        that has saved no checkpoint then.
         """
+        self._close_writers()
+        profiler.PROFILER.clear()  # whose figures would be printed below the sentence
+        if (sentence := self._sentence(error)) is None:
+            return self._release()
+        undone = self._before is not None and self._before.undo()
+        self._release()
+        stop(UserError(NO_MEMORY) if undone and is_out_of_memory(error) else sentence)
+
+    def _sentence(self, error: BaseException) -> UserError | None:
         if isinstance(error, UserError):
-            stop(error)
-        if is_out_of_memory(error):
-            stop(UserError(no_memory))
-        if isinstance(error, OSError):
-            if error.filename is None and is_of_disk(error):  # as of nerfstudio's own writers
-                stop(
-                    UserError(
-                        f"a file of {self.base_dir}, or a temporary one in {gettempdir()}, cannot be written "
-                        f"({error.strerror}): free some space there, or choose other places (--run-dir, TMPDIR)."
-                    )
-                )
-            if (message := refused(error)) is not None:
-                stop(message)
+            return error
+        if isinstance(error, Exception) and is_out_of_memory(error):
+            return UserError(
+                f"memory ran out after step {self._done} ({reason(error)}): the last checkpoint is whole. "
+                f"Close other programs and go on with beags resume {self.base_dir}, or begin anew with smaller "
+                "photos or fewer Gaussians."
+            )
+        if not isinstance(error, OSError):
+            return None
+        if error.filename is None and is_of_disk(error):  # as of nerfstudio's own writers
+            return UserError(
+                f"a file of {self.base_dir}, or a temporary one in {gettempdir()}, cannot be written "
+                f"({error.strerror}): free some space there, or choose other places (--run-dir, TMPDIR)."
+            )
+        return refused(error)
 
     def _release(self) -> None:
         """Unlock the run's folder, and close the writers of curves with their threads."""
+        self._close_writers()
         if self._lock is not None:
             self._lock.release()
             self._lock = None
         self._replica.end()
+
+    def _close_writers(self) -> None:
         for each in writer.EVENT_WRITERS:
             if isinstance(each, writer.TensorboardWriter):
                 with suppress(OSError):  # of a full disk, which has been reported
@@ -145,8 +164,10 @@ class BeagsTrainer(Trainer):
         """Train to the end of the schedule, also after a resume (nerfstudio would train that many steps more)."""
         try:
             self._train()
-        finally:
-            self._release()
+        except BaseException as error:
+            self._stop(error)
+            raise
+        self._release()
 
     def _train(self) -> None:
         self.config.max_num_iterations = max(self.last_step - self._start_step, 0)
@@ -157,13 +178,13 @@ class BeagsTrainer(Trainer):
                 return self._write_report()  # killed after its last checkpoint
             if processes.rank() > 0:
                 return None  # the first process writes the report, or the error
-            stop(
-                UserError(
-                    f"the checkpoint is of a complete run ({self._start_step} steps): nothing is left to train; "
-                    "to refine a base, this one or <run>/base/nerfstudio_models, load it with beags-refine."
-                )
+            raise UserError(
+                f"the checkpoint is of a complete run ({self._start_step} steps): nothing is left to train; "
+                "to refine a base, this one or <run>/base/nerfstudio_models, load it with beags-refine."
             )
-        self._estimate = Estimate(str(self.config.method_name), self.config.max_num_iterations)
+        self._estimate = Estimate(
+            str(self.config.method_name), self.config.max_num_iterations, chosen=self._start_step == 0
+        )
         remove_unfinished(self.base_dir)
         (self.base_dir / REPORT_FILE).unlink(missing_ok=True)  # it marks the run as complete
         if self.config.steps_per_held_out > 0:
@@ -177,14 +198,6 @@ class BeagsTrainer(Trainer):
         try:
             with self._interrupts:
                 super().train()
-        except (UserError, MemoryError, RuntimeError, OSError) as error:
-            self._stop(
-                error,
-                f"memory ran out after step {self._done} ({reason(error)}): the last checkpoint is whole. "
-                f"Close other programs and go on with beags resume {self.base_dir}, or begin anew with smaller "
-                "photos or fewer Gaussians.",
-            )
-            raise
         except KeyboardInterrupt as interrupt:
             if (self.base_dir / REPORT_FILE).exists():  # complete: the signal ended what shows it in the browser
                 return

@@ -6,6 +6,7 @@ import errno
 import os
 import sys
 import threading
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
@@ -85,15 +86,16 @@ def writing(path: str | Path, what: str = "") -> Iterator[None]:
         raise
     except Exception as error:
         cause = system_error(error)
-        if cause is None or not _is_below(Path(path).absolute().parent, cause):
+        if cause is None or not _is_about(Path(path).absolute(), cause):
             raise
         raise unwritable(f"{what}{path}", cause) from error
 
 
-def _is_below(folder: Path, error: OSError) -> bool:
-    """Return whether an error is of a file in ``folder``, or names no file and is of a disk."""
+def _is_about(path: Path, error: OSError) -> bool:
+    """Return whether an error is of a file beside or below ``path``, or of a folder above, or of a disk unnamed."""
     if isinstance(error.filename, (str, os.PathLike)):
-        return Path(error.filename).absolute().is_relative_to(folder)
+        named = Path(error.filename).absolute()
+        return named.is_relative_to(path.parent) or path.is_relative_to(named)
     return is_of_disk(error)
 
 
@@ -104,6 +106,12 @@ def refused(error: OSError) -> UserError | None:
     if error.errno in _FULL:
         return UserError(f"a file cannot be written ({error.strerror}): free some space, also for temporary files.")
     return None
+
+
+def silence_libraries() -> None:
+    """Drop warnings that are meant for the authors of torch and nerfstudio, in programs that run beags alone."""
+    warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|nerfstudio)\.")
+    warnings.filterwarnings("ignore", category=UserWarning, module=r"nerfstudio\.")
 
 
 def print_user_errors_plainly() -> None:

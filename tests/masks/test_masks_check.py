@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -194,6 +195,14 @@ def test_the_command_writes_its_report_and_ends_with_1_on_errors(tmp_path, capsy
     assert (tmp_path / "outputs/masks_check/scene/coverage.png").stat().st_size > 5000
     out = capsys.readouterr().out
     assert words in out and "3 objects; 1 errors" in out
+
+
+@pytest.mark.filterwarnings("error:Attempting to set identical")
+def test_no_picture_is_made_of_masks_without_objects(tmp_path):
+    root = write_balls(tmp_path / "scene", lambda view, ids: np.zeros_like(ids))
+    with suppress(SystemExit):
+        main(["masks", "check", "--data", str(root), "--output", str(tmp_path / "out")])
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["report.json"]
 
 
 def test_unlabelled_masks_are_named(tmp_path):

@@ -123,7 +123,7 @@ def test_the_source_makes_a_map_of_every_view(sam2, photos, tmp_path):
 
 
 def test_missing_weights_are_refused(tmp_path):
-    with pytest.raises(UserError, match="cannot be loaded .* name a folder that holds them"):
+    with pytest.raises(UserError, match="there is no folder .*: name one that holds"):
         load(str(tmp_path / "nothing"), "Sam2VideoModel", local=True)
 
 

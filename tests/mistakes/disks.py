@@ -109,6 +109,12 @@ mistakes(
 mistake("no permission", "ns-train")(training(errno.EACCES))
 
 
+@mistake("read-only disk", "ns-train")
+def _(at: Place):
+    at.fail_to_write(at.root / "out", errno.EROFS)
+    return at.train(run_dir=None, output_dir=at.root / "out", timestamp="now")
+
+
 @mistake("full disk", "ns-train writes its curves")
 def _(at: Place):
     from tensorboard.summary.writer.record_writer import RecordWriter

@@ -173,8 +173,7 @@ mistakes(
 )
 
 
-@mistake("mask sources", "SAM2 without weights")
-def _(at: Place):
+def without_weights(at: Place, model: str):
     import sys
     from types import SimpleNamespace
 
@@ -186,7 +185,16 @@ def _(at: Place):
     library = SimpleNamespace(Sam2VideoModel=SimpleNamespace(from_pretrained=absent))  # which is installed on demand
     at.patch.setitem(sys.modules, "transformers", library)
     at.patch.setattr(sam2.Sam2Source, "unavailable", classmethod(lambda cls: None))
-    return made("sam2", GOOD, "--options prompts=prompts.json model=nowhere")(at)
+    return made("sam2", GOOD, f"--options prompts=prompts.json model={model}")(at)
+
+
+mistakes(
+    "mask sources",
+    {
+        "SAM2 without weights": lambda at: without_weights(at, "nowhere"),
+        "SAM2 with a folder of weights that is not there": lambda at: without_weights(at, "/none/such/weights"),
+    },
+)
 
 
 @mistake("mask sources", "SAM2 without its extra")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from data_folders import noise, write_colmap, write_image
 
-from mistakes.table import Place, mistake, mistakes, train_after
+from mistakes.table import Place, beags_after, mistake, mistakes, train_after
 
 
 def huge_png(path: Path, side: int = 60_000) -> None:
@@ -32,6 +32,7 @@ mistakes(
     "photos",
     {
         "cut off": train_after(lambda at: at.cut(at.photo)),
+        "cut off, met by a check": beags_after(lambda at: at.cut(at.photo), "masks check --data {data}"),
         "not the size that the camera has": train_after(lambda at: write_image(at.photo, noise(0, 20, 20))),
         "16 bits per channel": train_after(lambda at: write_image(at.photo, np.zeros((12, 20), np.uint16))),
         "a bomb of 60,000 x 60,000 pixels": train_after(lambda at: huge_png(at.photo)),

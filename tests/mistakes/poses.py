@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from data_folders import HEIGHT, WIDTH, noise, ring, write_colmap, write_image
 
-from mistakes.table import Place, mistakes, train_after
+from mistakes.table import Place, beags_after, mistakes, train_after
 
 NAN = float("nan")
 
@@ -93,6 +93,10 @@ mistakes(
         "an unknown kind of camera": entries(camera_model="MAGIC"),
         "a panorama": entries(camera_model="EQUIRECTANGULAR"),
         "splits without held-out views": entries(train_filenames=["images/v01.png"]),
+        "splits without held-out views, met by a check": beags_after(
+            lambda at: at.edit_poses(lambda meta: meta.update(train_filenames=["images/v01.png"])),
+            "masks check --data {data}",
+        ),
         "splits that name an absent photo": entries(
             train_filenames=["images/v01.png"], val_filenames=["images/v77.png"]
         ),

@@ -162,6 +162,17 @@ def _(at: Place):
     return at.train()
 
 
+@mistake("runs", "no memory is left before the first checkpoint")
+def _(at: Place):
+    from beags_plugin.plugin.trainer import BeagsTrainer
+
+    def growing(trainer, step):
+        raise MemoryError
+
+    at.patch.setattr(BeagsTrainer, "train_iteration", growing)
+    return at.train()
+
+
 def broken_off(at: Place) -> Path:
     """Return a run of ``data`` that ended in the middle of refinement."""
     import yaml

@@ -148,7 +148,6 @@ class Place:
         config.data = self.data if data is None else data
         config.run_dir = self.root / TRAINED
         config.vis = "tensorboard"
-        self.patch.setattr(type(config), "print_to_terminal", lambda config: None)  # of half a second
         config.logging.local_writer.enable = False
         return config
 
@@ -186,7 +185,8 @@ class Place:
             made = os.mkdir
 
             def refusing_folder(path, *rest, **options):
-                if Path(path).absolute().is_relative_to(folder):
+                inside = Path(path).absolute().is_relative_to(folder)
+                if inside and Path(path).parent.exists():  # else the system says that it is absent
                     raise OSError(code, os.strerror(code), str(path))
                 made(path, *rest, **options)
 

@@ -17,9 +17,11 @@ pytest.importorskip("nerfstudio")
 
 from mistakes import disks, masks, options, photos, poses, runs, starts  # noqa: F401  (they fill the table)
 from mistakes.sentences import read_sentences, write_sentence
-from mistakes.table import TABLE, Place, Templates
+from mistakes.table import TABLE, TRAINED, Place, Templates
 
 SENTENCES = read_sentences()
+RUNS = (TRAINED, "run")
+"""Runs in which a command that is refused leaves nothing, unless it has saved a checkpoint."""
 
 
 @pytest.fixture(scope="module")
@@ -34,13 +36,13 @@ def files_below(root: Path) -> dict[Path, str]:
 
 
 @pytest.mark.parametrize("name", TABLE)
-def test_a_mistake_ends_with_one_sentence_and_code_2(name, templates, tmp_path, monkeypatch, capsys):
+def test_a_mistake_ends_with_one_sentence_and_code_2(name, templates, tmp_path, monkeypatch, capsys, recwarn):
     place = Place(tmp_path, templates, monkeypatch)
     monkeypatch.chdir(tmp_path)
     with monkeypatch.context() as patch:
         place.patch = patch
         command = TABLE[name](place)
-        before = files_below(tmp_path)
+        before, there = files_below(tmp_path), set(tmp_path.rglob("*"))
         capsys.readouterr()
         with pytest.raises(SystemExit) as end:
             command()
@@ -48,12 +50,16 @@ def test_a_mistake_ends_with_one_sentence_and_code_2(name, templates, tmp_path, 
     assert end.value.code == 2
     assert "Traceback" not in printed.out + printed.err
     lines = [line for line in printed.out.splitlines() if line.startswith("beags: ")]
-    assert len(lines) == 1
+    assert len(lines) == 1 and printed.out.splitlines()[-1] == lines[0]
+    assert len(printed.out.splitlines()) < 40  # what else is printed does not bury it
+    assert not [each.message for each in recwarn if each.filename.endswith(("engine/trainer.py", "utils/writer.py"))]
     sentence = lines[0].removeprefix("beags: ").replace(str(tmp_path), "{tmp}")
     sentence = re.sub(r"\.masks_\w+", ".masks_...", sentence)  # a temporary folder
     after = files_below(tmp_path)
     changed = [path for path in before if after.get(path) != before[path]]
     assert not changed  # nothing that was saved is lost
+    new = {path for path in set(tmp_path.rglob("*")) - there if path.relative_to(tmp_path).parts[0] in RUNS}
+    assert not new or any(path.suffix == ".ckpt" for path in new)  # no dead run
     assert not list(tmp_path.rglob("*.part")) and not (tmp_path / "ran").exists()  # a command in a foreign file
     if os.environ.get("BEAGS_SENTENCES") == "write":
         write_sentence(name, sentence, list(TABLE))

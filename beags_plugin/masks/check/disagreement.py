@@ -66,7 +66,7 @@ def _absent(
         background = (agreed == 0).mean(0)  # neither beside the image nor behind another object
         lacking = np.flatnonzero(trained & ~shown & (background >= MOST)).tolist()
         if len(lacking) > len(showing):
-            stems = tuple(files.stems[view] for view in lacking)
+            stems = tuple(str(files.stems[view]) for view in lacking)
             yield (
                 rank,
                 Issue(

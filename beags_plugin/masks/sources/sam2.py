@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -76,6 +77,8 @@ def load(name: str, kind: str, local: bool = False) -> tuple[Any, Any]:
     """Load the model of class ``kind`` and its processor from a folder or the hub; raise ``UserError``."""
     import transformers  # pyright: ignore[reportMissingImports]
 
+    if not (Path(name).is_dir() or re.fullmatch(r"[\w.-]+(/[\w.-]+)?", name)):
+        raise UserError(f"there is no folder {name}: name one that holds the weights, or a model of the hub.")
     try:
         model = getattr(transformers, kind).from_pretrained(name, local_files_only=local)
         processor = transformers.AutoProcessor.from_pretrained(name, local_files_only=local)

@@ -135,6 +135,7 @@ def _files(config: BeagsDataParserConfig) -> tuple[Dataset, PosedViews, MaskFile
     parser.fit_cameras(views, sizes)
     masks, folder, kind = parser.mask_files(scene, views)
     trained = set(parser.views_of_split(views, "train"))
+    parser.views_of_split(views, "val")  # without which training stops
     names_file = scene.root / config.classes_path
     names = read_classes(names_file) if names_file.is_file() else scene.class_names
     files = MaskFiles(
@@ -215,9 +216,9 @@ def write_report(report: Report, output: Path, run: ReprojectedRun | None = None
     with writing(output):
         output.mkdir(parents=True, exist_ok=True)
         written[0].write_text(json.dumps(report.to_json(), indent=1), "utf8")
-    if any(class_id != BACKGROUND for class_id in coverage.ids):
-        written.append(output / "coverage.png")
-        coverage_picture(written[1], report.stems, coverage.ids, report.names, share, coverage.usable)
+        if any(class_id != BACKGROUND for class_id in coverage.ids):
+            written.append(output / "coverage.png")
+            coverage_picture(written[1], report.stems, coverage.ids, report.names, share, coverage.usable)
     if run is not None and report.areas:
         boxes: dict[str, list[tuple[int, int, int, int]]] = {}
         for area in report.areas:

@@ -14,13 +14,14 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from tyro.conf import Suppress
 
+from beags_plugin.plugin.options import rollback
 from beags_plugin.plugin.options.loss_spec import LossSpec
 from beags_plugin.plugin.options.machine import check_machine, default_device
 from beags_plugin.plugin.options.model_options import BeagsModelConfig
 from beags_plugin.plugin.options.run_format import RUN_FORMAT, other_format
 from beags_plugin.plugin.views.datamanager import BeagsDataManagerConfig
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
-from beags_plugin.system.errors import UserError, print_user_errors_plainly
+from beags_plugin.system.errors import UserError, print_user_errors_plainly, writing
 from beags_plugin.system.interrupts import stop
 from beags_plugin.system.lock import lock_ahead, run_lock
 from beags_plugin.system.registry import load
@@ -109,15 +110,24 @@ class BeagsTrainerConfig(TrainerConfig):
             stop(error)
         super().set_timestamp()
 
+    def print_to_terminal(self) -> None:
+        """Print nothing: config.yml says what nerfstudio would print in 250 lines."""
+
     def save_config(self) -> None:
         """Save config.yml, the first file of a run, with absolute paths; end the program if another trains there."""
         try:
-            self._lock_and_save()
+            with writing(run := self.get_base_dir()):
+                rollback.note(run)
+            lock_ahead(run)
+            try:
+                self._save()
+            except UserError:
+                rollback.noted(run).undo()
+                raise
         except UserError as error:
             stop(error)
 
-    def _lock_and_save(self) -> None:
-        lock_ahead(self.get_base_dir())
+    def _save(self) -> None:
         self.output_dir = Path(self.output_dir).absolute()
         for name in ("run_dir", "load_dir", "load_checkpoint"):
             if (path := getattr(self, name)) is not None:

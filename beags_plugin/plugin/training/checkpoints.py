@@ -12,6 +12,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
+from beags_plugin.plugin.options.rollback import REPLACED
 from beags_plugin.plugin.runs.checkpoint_file import model_state, read_checkpoint
 from beags_plugin.plugin.runs.layout import REPORT_FILE, newest_checkpoint
 from beags_plugin.plugin.runs.write import save_atomically
@@ -20,8 +21,6 @@ from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import reason
 
-REPLACED = "replaced_models"
-"""Folder of a run: checkpoints of an earlier one in the same place, until the new one has its own."""
 _MISFITS = (RuntimeError, LookupError, ValueError, TypeError, AttributeError)  # what loading a foreign state may raise
 
 

@@ -18,9 +18,9 @@ SMALLER = (
     "(--pipeline.model.densify.pixels-per-surfel 100)"
 )
 
-NO_MEMORY = f"memory ran out before the first step: close other programs, or {SMALLER}."
+NO_MEMORY = f"memory ran out before anything was saved: close other programs, or {SMALLER}."
 
-_ANYWAY = "--check-memory False (beags resume: --no-check-memory) tries it all the same."
+_ANYWAY = "or try it all the same with --check-memory False (beags resume: --no-check-memory)."
 
 
 def check_room(run: Path, device: str) -> None:
@@ -29,12 +29,12 @@ def check_room(run: Path, device: str) -> None:
     run: folder of the run. device: "cpu", or another one, whose memory is not checked.
     """
     if device == "cpu" and (left := available_mb()) < LEAST_FREE_MB:
-        raise UserError(f"the machine has {left:.0f} MB of memory left: close other programs, or {SMALLER}; {_ANYWAY}")
+        raise UserError(f"the machine has {left:.0f} MB of memory left: close other programs, {SMALLER}, {_ANYWAY}")
     temporary = Path(tempfile.gettempdir())
     for folder, remedy in ((run, "another folder with --run-dir"), (temporary, "one for temporary files with TMPDIR")):
         if (free := free_disk_mb(folder)) < LEAST_FREE_MB:
-            sentence = f"the disk of {folder} has {free:.0f} MB left: free some space, or choose {remedy}"
-            raise UserError(f"{sentence}; {_ANYWAY}")
+            sentence = f"the disk of {folder} has {free:.0f} MB left: free some space, choose {remedy}"
+            raise UserError(f"{sentence}, {_ANYWAY}")
 
 
 def free_disk_mb(folder: Path) -> float:

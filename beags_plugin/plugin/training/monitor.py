@@ -109,6 +109,7 @@ class Curves:
         surfels, class_ids = model.surfels().detach(), model.class_ids
         if model.grid is not None:
             found = occupancy_violations(surfels, class_ids, model.grid, model.seed, step)
+            found.pop(BACKGROUND, None)  # all that no object has, seen there or not
             for name, share in self._named(found).items():
                 writer.put_scalar(f"Occupancy violation/{name}", share, step)
         views = self._looked_at()

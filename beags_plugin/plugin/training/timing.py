@@ -7,19 +7,24 @@ from typing import Any
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
-QUICKER = "Quicker: ns-train beags-tiny, or end the command with: beags-data --downscale-factor 2."
+QUICKEST = "beags-tiny"
+QUICKER = f"Quicker: ns-train {QUICKEST}, or end the command with: beags-data --downscale-factor 2."
 LONG_RUN_SECONDS = 20 * 60  # an expected time above this prints which preset is quicker
 ESTIMATE_STEPS = (20, 120)  # the estimate is the mean step between these, after warm-up
 
 
 class Estimate:
-    """The expected time of ``steps`` steps of a method, printed once."""
+    """The expected time of ``steps`` steps of a method, printed once.
 
-    def __init__(self, method: str, steps: int) -> None:
+    chosen: the method was chosen for this run, as not in a resumed one; a quicker one is named then.
+    """
+
+    def __init__(self, method: str, steps: int, chosen: bool = True) -> None:
         self._steps = steps
+        self._quicker = f" {QUICKER}" if chosen and method != QUICKEST else ""
         self._from = 0.0
         CONSOLE.print(
-            f"{method}: {steps} steps; how long they take is said after {ESTIMATE_STEPS[1]} of them. {QUICKER}",
+            f"{method}: {steps} steps; how long they take is said after {ESTIMATE_STEPS[1]} of them.{self._quicker}",
             highlight=False,
         )
 
@@ -38,7 +43,7 @@ class Estimate:
             f"({1000 * seconds_per_step:.0f} ms a step; it slows down as Gaussians are added)."
         )
         if left > LONG_RUN_SECONDS:
-            message += f" {QUICKER}"
+            message += self._quicker
         CONSOLE.print(message, highlight=False)
 
 

@@ -223,7 +223,8 @@ class BeagsDataParser(DataParser):
             for name in {"train": ("train",), "val": ("val", "test"), "test": ("test", "val")}[split]:
                 if views.members.get(name):
                     return views.members[name]
-            raise UserError(f"the data in {self._scene.root} names splits but no views for {split}: name some.")
+            where = self._scene.root
+            raise UserError(f"the data in {where} names splits but no views for {split}: name some, or delete them.")
         config = self.config
         train, held_out = split_views(views.stems, self._scene.split, config.eval_interval, config.held_out)
         return train if split == "train" else held_out

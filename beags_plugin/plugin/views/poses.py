@@ -5,6 +5,7 @@ Nothing here may import a data manager: nerfstudio loads this module while it is
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -167,6 +168,11 @@ def _delegate(parser: DataParser, split: str, file: Path) -> DataparserOutputs:
         raise UserError(f"the poses in {file} are all of one place: give photos from several places.") from error
     # nerfstudio asserts, and its readers let KeyError, struct.error and the like through
     except Exception as error:
+        if poseless := re.match(r"Some filenames for split (\w+) were not found: .*?Path\('(.*?)'\)", str(error)):
+            raise UserError(
+                f"the split {poseless[1]} names {poseless[2]}, of which {file} has no pose: correct the name, or "
+                "delete the split."
+            ) from error
         reason = " ".join(str(error).split()) or type(error).__name__
         raise UserError(
             f"the poses in {file} cannot be read ({type(error).__name__}: {reason}): correct the file."

@@ -20,7 +20,7 @@ from beags_plugin.evaluation.violations import boundary_errors, occupancy_violat
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.trainer import BeagsTrainer
-from beags_plugin.plugin.training.timing import StepClock
+from beags_plugin.plugin.training.timing import Estimate, StepClock
 from beags_plugin.preparation import pipeline as preparation
 
 LAST = sum(STEPS) - 1
@@ -67,6 +67,17 @@ def run(data, tmp_path_factory):
     return run
 
 
+@pytest.mark.parametrize(
+    ("method", "chosen", "told"), [("beags", True, True), ("beags", False, False), ("beags-tiny", True, False)]
+)
+def test_a_quicker_preset_is_named_to_who_can_choose_one(capsys, method, chosen, told):
+    estimate = Estimate(method, 10**9, chosen)
+    estimate.before_step(20)
+    estimate._from -= 3600.0
+    estimate.before_step(120)
+    assert capsys.readouterr().out.replace("\n", " ").count("Quicker: ns-train beags-tiny") == 2 * told
+
+
 def test_the_objects_have_a_bar(run):
     """Two objects in two held-out views, and a picture of each."""
     whole = [(done, 6) for done in range(1, 7)]
@@ -82,7 +93,9 @@ def test_every_curve_and_picture_is_in_the_event_file(run):
         assert f"Train Loss Dict/{term}" in scalars
     assert {"Train Metrics Dict/gaussian_count", "Train Metrics Dict/psnr", "Eval Images Metrics/psnr"} <= set(scalars)
     refining = {f"Boundary error/{name}" for name in CLASSES.values()}
-    refining |= {f"Occupancy violation/{name}" for name in CLASSES.values()}
+    violations = {f"Occupancy violation/{name}" for name in CLASSES.values() if name != "background"}
+    assert violations == {tag for tag in scalars if tag.startswith("Occupancy violation/")}
+    refining |= violations
     for tag in refining:
         assert all(event.step >= STEPS[0] - 1 and 0.0 <= event.value <= 1.0 for event in scalars[tag]), tag
     iou = {name: [(e.step, e.value) for e in scalars[f"Extracted IoU/{name}"]] for name in ("cup", "box", "mean")}

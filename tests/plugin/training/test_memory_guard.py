@@ -95,7 +95,7 @@ def test_a_training_that_gets_no_memory_reports_it_and_keeps_its_checkpoint(tmp_
     "name, message",
     [
         ("available_mb", "the machine has 20 MB of memory left: .*downscale-factor 2.*--no-check-memory"),
-        ("free_disk_mb", "the disk of .*run has 20 MB left: free some space, or choose another folder with --run-dir"),
+        ("free_disk_mb", "the disk of .*run has 20 MB left: .* choose another folder with --run-dir, or try"),
     ],
 )
 def test_a_run_without_room_is_refused_before_its_first_step(tmp_path, monkeypatch, name, message):
@@ -103,7 +103,7 @@ def test_a_run_without_room_is_refused_before_its_first_step(tmp_path, monkeypat
     monkeypatch.setattr(memory_guard, name, lambda *_: 20.0)
     with pytest.raises(UserError, match=message):
         run_to_end(short_config(data, run))
-    assert not list(run.rglob("*.ckpt"))
+    assert not run.exists()
 
 
 def test_temporary_files_need_room_too(tmp_path, monkeypatch):

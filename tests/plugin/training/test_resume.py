@@ -245,21 +245,15 @@ def test_a_new_run_into_the_folder_of_another_is_not_taken_for_it(data, whole, t
     assert not (run / "replaced_models").exists()
 
 
-def test_a_failed_start_in_the_folder_of_another_run_is_not_mixed_with_it(data, tmp_path, monkeypatch):
-    """Where all checkpoints are kept, too; the former run has come further than the new one."""
-    run = tmp_path / "run"
-    keep_all = {"save_only_latest_checkpoint": False, "steps_per_save": 50, "pipeline.model.refine_steps": 0}
-    run_to_end(short_config(data, run, **{**keep_all, "machine.seed": 7}))
-    assert (run / "training.json").exists()
-    config = short_config(data, run, **keep_all)
+def test_a_refused_start_in_the_folder_of_another_run_changes_nothing_there(data, whole, tmp_path):
+    run = shutil.copytree(whole, tmp_path / "run")
+    before = contents(run)
+    config = short_config(data, run, **{"pipeline.model.refine_steps": 0})
     config.pipeline.model.start_from = tmp_path / "nothing.ply"
-    with pytest.raises(UserError):
+    with pytest.raises(UserError, match="nothing.ply"):
         run_to_end(config)
-    assert not (run / "training.json").exists() and not (run / "nerfstudio_models").exists()
-    assert any((run / "replaced_models").glob("*.ckpt"))
-    interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, 5), **keep_all)
-    resume_to_end(run)
-    assert not (run / "replaced_models").exists()
+    assert contents(run).keys() == before.keys()
+    assert all(after[0] == before[path][0] for path, after in contents(run).items())
 
 
 def contents(folder):
