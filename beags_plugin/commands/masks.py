@@ -12,6 +12,7 @@ from beags_plugin.commands.starting import starting
 from beags_plugin.system.errors import UserError
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
+MOST_OBJECTS = 40  # that are printed
 
 
 @dataclass
@@ -60,7 +61,8 @@ class Check:
         if self.load_config is not None and readable:
             run = reproject_run(self.load_config, ReprojectionOptions(method="voxel", run_size=True, parser=parser))
             report = check_with_run(report, run)
-        for line in report.objects():
+        objects = report.objects()
+        for line in objects if len(objects) <= MOST_OBJECTS else [*objects[:MOST_OBJECTS], "and more, in report.json"]:
             CONSOLE.print(line)
         for issue in report.issues:
             CONSOLE.print(f"{issue.level}: {issue.message}\n    costs: {issue.cost}")
@@ -68,7 +70,7 @@ class Check:
         for path in write_report(report, self.output or Path("outputs/masks_check") / report.data.name, run):
             CONSOLE.print(f"  {path}")
         if self.load_config is not None and not readable:
-            CONSOLE.print("The run was not asked, as the masks cannot all be read.")
+            CONSOLE.print("The run is asked once no error is left.")
         if not readable:
             sys.exit(1)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -18,7 +18,7 @@ def views_against_others(
 ) -> list[Issue]:
     """Describe the disagreements as issues; ranks of ``agreement`` are indices in ``coverage.ids``."""
     titles = [f"{i} ({names[i]})" for i in coverage.ids]
-    absent = dict(_absent(agreement, files, coverage, titles))
+    absent = _absent(agreement, files, coverage, titles)
     groups: dict[tuple[tuple[int, int], ...], list[int]] = {}
     for found in agreement.renamed():
         groups.setdefault(tuple(sorted(found.instead.items())), []).append(found.view)
@@ -47,11 +47,9 @@ def views_against_others(
     return issues
 
 
-def _absent(
-    agreement: Agreement, files: MaskFiles, coverage: Coverage, titles: list[str]
-) -> Iterator[tuple[int, Issue]]:
-    """Find objects that most views should show, as the masks of the other views say, and do not; yield their ranks."""
-    trained = np.asarray(files.trained) & coverage.usable
+def _absent(agreement: Agreement, files: MaskFiles, coverage: Coverage, titles: list[str]) -> dict[int, Issue]:
+    """Find objects, by rank, that most views should show, as the masks of the other views say, and do not."""
+    trained, issues = np.asarray(files.trained) & coverage.usable, {}
     for rank in range(1, len(titles)):
         labels = agreement.labels[agreement.votes[:, rank] > 0]
         pixels = np.where(trained, coverage.pixels[:, rank], 0)
@@ -59,26 +57,24 @@ def _absent(
             showing = np.flatnonzero(shown).tolist()
             inside, seen = (found.sum(1) for found in (labels[:, shown] == rank, labels[:, shown] != UNSEEN))
             agreed = labels[(inside >= min(2, len(showing))) & (inside >= AGREEMENT * seen)]
-            if len(agreed) >= LEAST_POINTS:
+            if showing and len(agreed) >= LEAST_POINTS:
                 break
         else:
             continue
         background = (agreed == 0).mean(0)  # neither beside the image nor behind another object
-        lacking = np.flatnonzero(trained & ~shown & (background >= MOST)).tolist()
+        lacking: list[int] = np.flatnonzero(trained & ~shown & (background >= MOST)).tolist()
         if len(lacking) > len(showing):
-            stems = tuple(str(files.stems[view]) for view in lacking)
-            yield (
-                rank,
-                Issue(
-                    "warning",
-                    "absent",
-                    f"{_only(files, showing)} {titles[rank]}, but {len(lacking)} more views of {int(trained.sum())} "
-                    f"should and have hardly any of it or none ({named(stems)}): {_remedy(len(showing))}",
-                    f"{len(lacking)} views vote for the background where {len(showing)} show the object; a view "
-                    "without a mask does not vote",
-                    stems,
-                ),
+            stems = tuple(files.stems[view] for view in lacking)
+            issues[rank] = Issue(
+                "warning",
+                "absent",
+                f"{_only(files, showing)} {titles[rank]}, but {len(lacking)} more views of {int(trained.sum())} should "
+                f"and have hardly any of it or none ({named(stems)}): {_remedy(len(showing))}",
+                f"{len(lacking)} views vote for the background there, {len(showing)} for the object; a view without a "
+                "mask does not vote",
+                stems,
             )
+    return issues
 
 
 def _only(files: MaskFiles, views: list[int]) -> str:
