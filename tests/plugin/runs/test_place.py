@@ -72,16 +72,14 @@ def test_an_extract_and_the_base_move_along(moved, tmp_path):
         assert len(state["_model.class_ids"]) == count
 
 
-@pytest.mark.parametrize("near", ["run", "run/lab", "lab"])
-def test_data_are_found_beside_the_run_too(tmp_path, near):
-    config = write_trained(tmp_path / "run", write_scene(tmp_path / "far/away/lab"))
-    place = tmp_path / "there" / near
-    shutil.copytree(config.parent, tmp_path / "there/run")
-    if near == "run":  # no data there: the recorded ones serve while they are there
-        assert open_run(tmp_path / "there/run/config.yml").data_path == tmp_path / "far/away/lab"
-        return
-    (tmp_path / "far/away/lab").rename(place)
-    assert open_run(tmp_path / "there/run/config.yml").data_path == place
+def test_data_are_found_beside_the_run_too(tmp_path):
+    data = write_scene(tmp_path / "far/away/lab")
+    run = tmp_path / "there/run"
+    shutil.copytree(write_trained(tmp_path / "run", data).parent, run)
+    assert open_run(run / "config.yml").data_path == data  # where it was, while it is there
+    for place in (run.parent / "lab", run / "lab"):
+        data = data.rename(place)
+        assert open_run(run / "config.yml").data_path == place
 
 
 def test_data_elsewhere_are_named_by_an_option(tmp_path):
