@@ -11,7 +11,7 @@ case "${BEAGS_VENV:=.venv}" in /*) ;; *) BEAGS_VENV="$root/$BEAGS_VENV" ;; esac
 export PATH="$BEAGS_VENV/bin:$PATH" PYTHONDONTWRITEBYTECODE=1
 tests=(tests/rasterizers/test_{compiled,native,native_arguments,native_isa,native_work,rasterizer_reference,rasterizer_robustness,invariances}.py
   tests/ops/test_{image_ops,occupancy_loss,ops_everywhere,reprojection_votes,sh_colors,sparse_sums,voxel_lookup}.py
-  tests/masks/test_spatial_chunks.py tests/occupancy/test_voxel_grid.py tests/labels/test_classes.py tests/soak/test_fuzz.py)
+  tests/masks/test_spatial_chunks.py tests/occupancy tests/labels/test_classes.py tests/soak/test_fuzz.py)
 tsan_options="suppressions=$root/tests/native/tsan.supp exitcode=66"
 emulated=(tests/rasterizers/test_{compiled,cuda_rasterizer}.py tests/ops/test_cuda_{ops,votes}.py)
 kernels=("${emulated[@]}" tests/ops/test_image_ops.py)

@@ -29,7 +29,10 @@ LONG = {  # files that take minutes: begun first, so that no process waits for t
     "tests/commands/test_end_to_end.py", "tests/commands/test_readme_commands.py", "tests/test_wheel.py",
     "tests/plugin/viewer/test_viewer_browser.py", "tests/plugin/viewer/test_viewer_browser_runs.py",
 }  # fmt: skip
-SPREAD = {"tests/mistakes/test_mistakes.py", "tests/plugin/training/test_resume.py"}
+SPREAD = {
+    "tests/mistakes/test_mistakes.py", "tests/plugin/training/test_resume.py",
+    "tests/plugin/training/test_started_runs.py",
+}  # fmt: skip
 """Files whose tests any process may run; each other file runs in one process, which makes its fixtures once."""
 
 

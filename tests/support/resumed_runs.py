@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from unittest import mock
 
+import pytest
 import torch
 
 from beags_plugin.preparation import border_split
@@ -111,3 +112,32 @@ def assert_same_run(one: Path, other: Path, but_for: str = "nothing"):
         files = sorted(path.name for path in (one / folder).iterdir())
         assert files and files == sorted(path.name for path in (other / folder).iterdir())
         assert all((one / folder / name).read_bytes() == (other / folder / name).read_bytes() for name in files)
+
+
+def kill_at(monkeypatch, step, after=False):
+    """Let the training end as by a kill before or in the middle of a step."""
+    from beags_plugin.plugin.trainer import BeagsTrainer
+
+    train = BeagsTrainer.train_iteration
+
+    def iteration(self, now):
+        if now == step and not after:
+            raise Killed
+        found = train(self, now)
+        if now == step:
+            raise Killed
+        return found
+
+    monkeypatch.setattr(BeagsTrainer, "train_iteration", iteration)
+
+
+def killed(*_, **__):
+    raise Killed
+
+
+def interrupted(data, run, monkeypatch, kill, **overrides):
+    """Start a run and let ``kill`` end it."""
+    with monkeypatch.context() as patch:
+        kill(patch)
+        with pytest.raises(Killed):
+            run_to_end(short_config(data, run, **overrides))

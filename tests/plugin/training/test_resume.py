@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 
 import pytest
@@ -23,13 +21,15 @@ from resumed_runs import (
     assert_same_run,
     checkpoint_of,
     differences,
+    interrupted,
+    kill_at,
+    killed,
     resume_to_end,
     run_to_end,
     short_config,
     without_clocks,
 )
 
-from beags_plugin.plugin.runs.read import read_run
 from beags_plugin.plugin.trainer import BeagsTrainer
 from beags_plugin.preparation import pipeline as preparation
 from beags_plugin.system.child_processes import bound
@@ -47,33 +47,6 @@ def data(short_run):
 def whole(short_run):
     """The run without a break; tests that change it copy it."""
     return short_run / "run"
-
-
-def kill_at(monkeypatch, step, after=False):
-    """Let the training end as by a kill before or in the middle of a step."""
-    train = BeagsTrainer.train_iteration
-
-    def iteration(self, now):
-        if now == step and not after:
-            raise Killed
-        found = train(self, now)
-        if now == step:
-            raise Killed
-        return found
-
-    monkeypatch.setattr(BeagsTrainer, "train_iteration", iteration)
-
-
-def killed(*_, **__):
-    raise Killed
-
-
-def interrupted(data, run, monkeypatch, kill, **overrides):
-    """Start a run and let ``kill`` end it."""
-    with monkeypatch.context() as patch:
-        kill(patch)
-        with pytest.raises(Killed):
-            run_to_end(short_config(data, run, **overrides))
 
 
 def test_the_run_grows_splits_and_prepares_twice(whole):
@@ -195,24 +168,6 @@ def test_another_run_into_the_folder_leaves_no_round_of_the_former(data, tmp_pat
     assert (run / "prepared" / "masks").is_dir() and not (run / "prepared" / "round_2").exists()
 
 
-def test_ctrl_c_saves_the_step_and_a_resume_goes_on(data, whole, tmp_path, monkeypatch):
-    run, train = tmp_path / "run", BeagsTrainer.train_iteration
-    with monkeypatch.context() as patch:
-
-        def iteration(self, step):
-            if step == 24:
-                signal.raise_signal(signal.SIGTERM)
-            return train(self, step)
-
-        patch.setattr(BeagsTrainer, "train_iteration", iteration)
-        with pytest.raises(KeyboardInterrupt):
-            run_to_end(short_config(data, run))
-    assert checkpoint_of(run)["step"] == 24
-    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
-    resume_to_end(run)
-    assert_same_run(run, whole)
-
-
 def test_a_run_of_a_gpu_goes_on_without_one_if_asked(data, tmp_path, monkeypatch):
     run = tmp_path / "run"
     interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, 20))
@@ -233,132 +188,6 @@ def test_a_kill_before_the_first_checkpoint_starts_again(data, whole, tmp_path, 
     resume_to_end(run)
     assert "starts from the beginning" in capsys.readouterr().out
     assert_same_run(run, whole)
-
-
-def test_a_new_run_into_the_folder_of_another_is_not_taken_for_it(data, whole, tmp_path, monkeypatch):
-    run = tmp_path / "run"
-    run_to_end(short_config(data, run, **{"machine.seed": 7}))
-    interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, 5))
-    assert [path.name for path in (run / "replaced_models").iterdir()] == [f"step-{LAST:09d}.ckpt"]
-    resume_to_end(run)
-    assert_same_run(run, whole)
-    assert not (run / "replaced_models").exists()
-
-
-def test_a_refused_start_in_the_folder_of_another_run_changes_nothing_there(data, whole, tmp_path):
-    run = shutil.copytree(whole, tmp_path / "run")
-    before = contents(run)
-    config = short_config(data, run, **{"pipeline.model.refine_steps": 0})
-    config.pipeline.model.start_from = tmp_path / "nothing.ply"
-    with pytest.raises(UserError, match="nothing.ply"):
-        run_to_end(config)
-    assert contents(run).keys() == before.keys()
-    assert all(after[0] == before[path][0] for path, after in contents(run).items())
-
-
-def contents(folder):
-    return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.rglob("*") if path.is_file()}
-
-
-@pytest.mark.parametrize("again", ["resume", "ns-train"])
-def test_a_run_that_is_training_is_left_alone(data, whole, tmp_path, again):
-    """Also by ns-train, which writes config.yml first."""
-    import fcntl
-
-    from beags_plugin.system.lock import LOCK, run_lock
-
-    run = shutil.copytree(whole, tmp_path / "run")
-    (run / ".half.part").touch()
-    before = contents(run)
-    with open(run / LOCK, "ab") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)  # as another process would
-        with pytest.raises(UserError, match="being trained by another process"):
-            resume_to_end(run) if again == "resume" else run_to_end(short_config(data, run, steps_per_save=99))
-    assert contents(run) == before
-    run_lock(run).release()
-
-
-@pytest.mark.parametrize("devices", [1, 2])
-def test_the_lock_is_held_from_the_first_file_on(data, tmp_path, devices):
-    """Two that start at once: one is refused; where each device has a process of its own, only while it is written."""
-    from filelock import FileLock, Timeout
-
-    from beags_plugin.system.lock import LOCK, run_lock
-
-    config = short_config(data, tmp_path / "run")
-    config.machine.num_devices = devices
-    config.save_config()
-    config.save_config()  # not refused by itself
-    if devices == 1:
-        with pytest.raises(Timeout):
-            FileLock(tmp_path / "run" / LOCK).acquire(blocking=False)
-        run_lock(tmp_path / "run").release()  # as the trainer takes it over
-    run_lock(tmp_path / "run").release()
-
-
-def test_ctrl_c_after_the_end_is_quiet(data, tmp_path, monkeypatch, capsys):
-    """As in a viewer that stays open."""
-    from nerfstudio.engine.trainer import Trainer
-
-    run = tmp_path / "run"
-    config = short_config(data, run, **{"pipeline.model.base_steps": 3, "pipeline.model.refine_steps": 0})
-    after = Trainer._after_train
-
-    def waiting(self):
-        after(self)
-        signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(Trainer, "_after_train", waiting)
-    run_to_end(config)
-    assert (run / "training.json").exists() and "Stopped" not in capsys.readouterr().out
-
-
-def test_ctrl_c_ends_a_training_that_the_viewer_has_paused(data, tmp_path, monkeypatch):
-    run, train = tmp_path / "run", BeagsTrainer.train_iteration
-
-    def iteration(self, step):
-        if step == 4:
-            self.training_state = "paused"
-            threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
-        return train(self, step)
-
-    monkeypatch.setattr(BeagsTrainer, "train_iteration", iteration)
-    with pytest.raises(KeyboardInterrupt):
-        run_to_end(short_config(data, run))
-    assert checkpoint_of(run)["step"] == 4
-
-
-def edit_checkpoint(run, edit):
-    (path,) = (run / "nerfstudio_models").iterdir()
-    content = torch.load(path, weights_only=True)
-    edit(content)
-    torch.save(content, path)
-    return path
-
-
-def test_what_cannot_be_resumed_is_refused_in_one_sentence(data, whole, tmp_path, monkeypatch, capsys):
-    with pytest.raises(UserError, match="complete run"):
-        resume_to_end(whole)
-    with pytest.raises(UserError, match="without the state of its training"):
-        resume_to_end(whole / "base")
-    with pytest.raises(UserError, match="cannot be read"):
-        resume_to_end(tmp_path / "nowhere")
-    run = tmp_path / "run"
-    interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, 50))
-    path = edit_checkpoint(run, lambda content: content["beags"].update(version=99))
-    with pytest.raises(UserError, match="newer version of beags: update"):
-        resume_to_end(run)
-    content = path.read_bytes()
-    path.write_bytes(content[: len(content) // 2])
-    with pytest.raises(UserError, match="is damaged"):
-        resume_to_end(run)
-    with pytest.raises(UserError, match="is damaged"):
-        read_run(run / "config.yml")  # extract, export, render and eval too
-    path.write_bytes(content)
-    edit_checkpoint(run, lambda content: content.pop("beags"))
-    resume_to_end(run)  # of an older version: it goes on all the same
-    assert "older version of beags" in capsys.readouterr().out
-    assert checkpoint_of(run)["step"] == LAST
 
 
 def test_a_kill_between_the_last_checkpoint_and_the_report(data, whole, tmp_path, monkeypatch):
