@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from statistics import median
 
-SECONDS = 1 / 20  # for rendering one picture; with what nerfstudio does to send it, more than 15 come in a second
+SECONDS = 0.055  # for rendering one picture; with what nerfstudio does to send it, more than 15 come in a second
 _HEIGHT = 256  # of the first pictures; each level has twice the pixels of the one below
 _GUESS = 1.3  # times the work of a level, for the one above, as long as it is not known
-_WORTH = 0.8  # at most this much of a level's work makes the one below worth its coarser pictures
-_LEAST, _KEPT = 3, 8  # pictures of a level: before the next choice, and remembered
+_WORTH = 0.7  # at most this much of a level's work makes the one below worth its coarser pictures
+_LEAST, _KEPT = 5, 8  # pictures of a level: before the next choice, and remembered
 
 
 class Pace:
