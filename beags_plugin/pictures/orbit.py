@@ -32,10 +32,14 @@ class OrbitFrame:
     corners: Tensor
 
     @property
+    def reach(self) -> float:
+        """Return the radius of the ball around the box; 1 for an empty one."""
+        return float((self.corners - self.center).norm(dim=1).max()) or 1.0
+
+    @property
     def distance(self) -> float:
-        """Return the cameras' distance from the centre, at which the ball around the box fills the field of view."""
-        radius = float((self.corners - self.center).norm(dim=1).max()) or 1.0
-        return radius / math.sin(_FIELD_OF_VIEW / 2)
+        """Return the cameras' distance from the centre, at which that ball fills the field of view."""
+        return self.reach / math.sin(_FIELD_OF_VIEW / 2)
 
 
 def orbit_frame(low: Tensor, high: Tensor, cameras: Sequence[Camera] = ()) -> OrbitFrame:

@@ -37,7 +37,7 @@ class Picture:
     object: str = "cup"
     """Name of the object that the panel's buttons are about."""
     width: int = 1280
-    height: int = 800
+    height: int = 900
     """Pixels of the window."""
 
     def write(self) -> None:
@@ -54,12 +54,7 @@ class Picture:
             page.wait_for_text("Output render split")
             page.choose("Output render split", "class_map")
             page.choose("Object", self.object)
-            page.evaluate(_TO_OUR_CONTROLS)
             Image.fromarray(_settled(page)).save(self.output, quality=85, optimize=True)
-
-
-_TO_OUR_CONTROLS = """[...document.querySelectorAll('button')].find(b => b.innerText.trim() == 'Isolate')
-    .scrollIntoView({block: 'center'})"""
 
 
 def _settled(page: Page, seconds: float = 15.0) -> np.ndarray:

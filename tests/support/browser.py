@@ -61,8 +61,7 @@ class Page:
             target = self._wait_for(lambda: self._page_target(port))
             self._socket = connect(target, max_size=None, compression=None)
             self._number = 0
-            size = {"width": width, "height": height, "deviceScaleFactor": 1}
-            self._send("Emulation.setDeviceMetricsOverride", **size, mobile=False)
+            self.resize(width, height)
         except BaseException:
             self._end()
             raise
@@ -130,10 +129,27 @@ class Page:
 
     def click(self, x: float, y: float) -> None:
         """Press and release the left button."""
-        self._send("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
-        for kind in ("mousePressed", "mouseReleased"):
-            self._send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
-            time.sleep(0.05)
+        self.drag((x, y), (x, y))
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float], button: str = "left") -> None:
+        """Press a button of the mouse, move it in a few steps, release it."""
+        path = [[a + (b - a) * step / 8 for a, b in zip(start, end, strict=True)] for step in range(9)]
+        kinds = ["mouseMoved", "mousePressed", *["mouseMoved"] * 7, "mouseReleased"]
+        for kind, (x, y) in zip(kinds, [path[0], *path], strict=True):
+            pressed = {} if (kind, x, y) == ("mouseMoved", *start) else {"button": button, "clickCount": 1}
+            held = {"left": 1, "right": 2}[button] if pressed and kind != "mouseReleased" else 0
+            self._send("Input.dispatchMouseEvent", type=kind, x=x, y=y, buttons=held, **pressed)
+            time.sleep(0.03)
+
+    def bottom(self, label: str) -> float:
+        """Return how far down the button of that name reaches, pixels."""
+        button = f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() == {json.dumps(label)})"
+        return self.evaluate(f"{button}.getBoundingClientRect().bottom")
+
+    def resize(self, width: int, height: int) -> None:
+        """Set the page's size, pixels."""
+        size = {"width": width, "height": height, "deviceScaleFactor": 1}
+        self._send("Emulation.setDeviceMetricsOverride", **size, mobile=False)
 
     def press(self, label: str) -> None:
         """Press the button of that name, once it is there; not with the mouse: the panel may still be moving."""

@@ -63,11 +63,14 @@ def started(command: list[object], log: Path, ready: str) -> Iterator[subprocess
 
 @contextmanager
 def viewed(config: Path, log: Path) -> Iterator[str]:
-    """Return the address of ns-viewer of a run."""
+    """Yield the address of ns-viewer of a run, and end it by Ctrl-C."""
     port = free_port()
     options = ("--load-config", config, "--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", port)
-    with started(["-c", ENTRY, *options], log, "disabled local writer"):  # the last that it prints
+    with started(["-c", ENTRY, *options], log, "disabled local writer") as process:  # the last that it prints
         yield f"http://127.0.0.1:{port}"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0
+    assert log.read_text().rstrip().endswith("The viewer is closed.")
 
 
 def picture(page: Page) -> np.ndarray:

@@ -93,7 +93,8 @@ class Stand:
         )  # fmt: skip
         viewer = SimpleNamespace(
             log_filename=config_path.parent / "viewer.log", pipeline=pipeline, trainer=trainer, train_lock=None,
-            control_panel=self.controls, _trigger_rerender=lambda: None,
+            control_panel=self.controls, _trigger_rerender=lambda: None, viewer_elements=[("elsewhere", None)],
+            viser_server=SimpleNamespace(on_client_connect=lambda joined: None),
         )  # fmt: skip
         self.panel.refresh_objects()
         self.panel.attach(viewer, SimpleNamespace(register_pointer_cb=lambda *_: None))

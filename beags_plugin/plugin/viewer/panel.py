@@ -12,7 +12,6 @@ import torch
 from nerfstudio.viewer.viewer_elements import (
     ViewerButton,
     ViewerButtonGroup,
-    ViewerCheckbox,
     ViewerClick,
     ViewerControl,
     ViewerDropdown,
@@ -22,16 +21,18 @@ from nerfstudio.viewer.viewer_elements import (
 )
 
 from beags_plugin.export import EXPORTERS
+from beags_plugin.plugin.viewer.aim import frame_of, look, side_of_photos
 from beags_plugin.plugin.viewer.export import ShownFiles
 from beags_plugin.plugin.viewer.legend import LegendRow, escaped, legend, unique_labels
 from beags_plugin.plugin.viewer.picking import pick
+from beags_plugin.plugin.viewer.serving import end_when_interrupted, first_folder, offer_whole_pictures, set_pace
 from beags_plugin.plugin.viewer.viewed_run import ViewedRun
 from beags_plugin.plugin.viewer.viewing import NO_CLASSES, Viewing
 
 if TYPE_CHECKING:
     from nerfstudio.data.scene_box import OrientedBox
     from nerfstudio.viewer.viewer import Viewer
-    from viser import ViserServer
+    from viser import ClientHandle, ViserServer
 
 NONE = "none yet"  # the drop-down's entry while no Gaussian has a class: it must have one
 REFRESH_SECONDS = 0.3  # how often the panel follows what the scene and the render threads have changed
@@ -54,7 +55,7 @@ class ObjectPanel(ViewerElement[None]):
     """All controls of ours as one element, so that they stand in this order and not in that of their names.
 
     They change ``plugin.viewer.choice``, never the scene. Slow work happens in threads of the panel's own: no control
-    waits for a training step but the click that picks, and none runs in a render thread.
+    waits for a training step but those that pick and centre, and none runs in a render thread.
     """
 
     def __init__(self, viewing: Viewing) -> None:
@@ -70,7 +71,7 @@ class ObjectPanel(ViewerElement[None]):
         self._status: Any = None
         self._counted: tuple | None = None
         self._texts = ["", ""]
-        self.object = ViewerDropdown("Object", NONE, [NONE], hint="Also chosen by a click on the picture")
+        self.object = ViewerDropdown("Object", NONE, [NONE], hint="Also chosen by picking")
         # two rows: four buttons in one are cut off
         self.look = ViewerButtonGroup("Look at it", "Isolate", ["Isolate", "Show"], cb_hook=self._act)
         self.put_away = ViewerButtonGroup("Put it away", "Hide", ["Hide", "Remove"], cb_hook=self._act)
@@ -83,7 +84,7 @@ class ObjectPanel(ViewerElement[None]):
             "Least opacity", 0.0, 0.0, 1.0, 0.01, cb_hook=lambda slider: self._slide(min_opacity=slider.value),
             hint="Weaker Gaussians are left out",
         )  # fmt: skip
-        self.clicks = ViewerCheckbox("Click picks an object", True, cb_hook=lambda box: self._listen(box.value))
+        self.next_click = ViewerButton("Pick with the next click", lambda _: self.listen(not self._listening))
         self.files = ShownFiles(viewing, self.title, lambda: self.format.value, lambda text: self.note("export", text))
         formats = EXPORTERS.names()
         self.format = ViewerDropdown("Format", "ply" if "ply" in formats else formats[0], formats)
@@ -92,15 +93,19 @@ class ObjectPanel(ViewerElement[None]):
     # -- nerfstudio's side -------------------------------------------------------------------------------------------
 
     def install(self, viser_server: ViserServer) -> None:
-        """Add the controls to the page: see ``ViewerElement.install``."""
+        """Add the controls to the page, as its first folder: see ``ViewerElement.install``."""
         self.refresh_objects()
-        rows = self.object, self.look, self.put_away, self.show_all, self.rest, self.min_opacity, self.clicks
-        for element in rows:
-            element.install(viser_server)
-        self._legend = viser_server.gui.add_markdown("")
-        self.format.install(viser_server)
-        self.export.install(viser_server)
-        self._status = viser_server.gui.add_markdown("")
+        gui = viser_server.gui
+        with first_folder(gui, "Objects") as self._folder:
+            self.object.install(viser_server)
+            self.next_click.install(viser_server)
+            gui.add_button("Centre on this object").on_click(lambda event: self.centre(event.client))
+            for element in (self.look, self.put_away, self.show_all, self.rest, self.min_opacity):
+                element.install(viser_server)
+            self._legend = gui.add_markdown("")
+            self.format.install(viser_server)
+            self.export.install(viser_server)
+            self._status = gui.add_markdown("")
         self._texts = ["", ""]
         self.look.value = self.put_away.value = ""
 
@@ -115,11 +120,19 @@ class ObjectPanel(ViewerElement[None]):
         self.viewing.wanted, self.viewing.crop_box = self._wanted, self._crop_box
         if run.note is not None:
             self.note("run", run.note)
-        _offer_whole_pictures(viewer.control_panel)
-        self._listen(self.clicks.value)
+        offer_whole_pictures(viewer.control_panel)
+        if all(element is self for _, element in viewer.viewer_elements):
+            self._folder.remove()
+        viewer.viser_server.on_client_connect(self._joined)
+        if viewer.trainer is None:
+            end_when_interrupted(viewer.viser_server)
         threading.Thread(target=self._follow, name="beags panel", daemon=True).start()
 
-    def _listen(self, wanted: bool) -> None:
+    def listen(self, wanted: bool) -> None:
+        """Begin or end to wait for the click that picks.
+
+        The page holds its camera still while a click is waited for, so one click only is.
+        """
         if self._link is None or wanted == self._listening:
             return
         self._listening = wanted
@@ -127,6 +140,25 @@ class ObjectPanel(ViewerElement[None]):
             self._link.register_pointer_cb("click", self.clicked)
         else:
             self._link.unregister_pointer_cb()
+        self.note("object", "Click an object in the picture; press again to leave it." if wanted else "")
+
+    def _joined(self, client: ClientHandle) -> None:
+        """Pace a new page's pictures, and let it begin at the objects."""
+        assert self.viewer is not None
+        set_pace(self.viewer, client.client_id, self.viewing.pace)
+        # not here: no message of the page is read while this runs
+        threading.Thread(target=self.centre, args=(client, True), daemon=True).start()
+
+    def centre(self, client: ClientHandle | None, first: bool = False) -> None:
+        """Turn a page's camera to the chosen object; first: to all objects, from the side of the photos."""
+        run, chosen = self.viewing.run, self.labels.get(self.object.value)
+        wanted = [class_id for class_id in self.labels.values() if (class_id if first else class_id == chosen)]
+        if not wanted and not first:
+            self.note("object", f"Nothing to centre on: {NO_CLASSES}")
+        if client is None or run is None or not wanted:
+            return
+        frame = frame_of(*self.viewing.whole(), wanted, run.cameras)
+        look(client, frame, side_of_photos(frame, run.cameras) if first else None)
 
     def _redraw(self) -> None:
         if self.viewer is not None:
@@ -158,7 +190,8 @@ class ObjectPanel(ViewerElement[None]):
         self.choose(replace(self.viewing.choice, **values))
 
     def clicked(self, click: ViewerClick) -> None:
-        """Choose the object under the cursor."""
+        """Choose the object under the cursor, and listen no longer."""
+        self.listen(False)
         self.note("object", self._pick(click))
 
     def _pick(self, click: ViewerClick) -> str:
@@ -180,9 +213,10 @@ class ObjectPanel(ViewerElement[None]):
         label = next((label for label, class_id in self.labels.items() if class_id == picked), None)
         if label is None:
             return f"Gaussian {index} of class {picked}, which has no name."
-        self.object.value = label
-        what = "background, no object" if picked == 0 else label
-        return f"Picked: {what} (Gaussian {index}, {margin:.0%} of its weight)."
+        if picked != 0:
+            self.object.value = label
+        what = "background: nothing chosen" if picked == 0 else f"Picked: {label}"
+        return f"{what} (Gaussian {index}, {margin:.0%} of its weight)."
 
     def title(self) -> str:
         """Return the shown part in a few words, for a file's name."""
@@ -255,19 +289,9 @@ class ObjectPanel(ViewerElement[None]):
         ]
         lines = {**self.viewing.notes, **self.notes}
         texts = [legend(rows) if rows else escaped(f"No objects: {NO_CLASSES}")]
-        texts.append("\n\n".join(escaped(line) for line in lines.values()))
+        texts.append("\n\n".join(escaped(line) for line in lines.values() if line))
         for index, (handle, text) in enumerate(zip((self._legend, self._status), texts, strict=True)):
             if handle is not None and text != self._texts[index]:
                 with suppress(KeyError):  # the viewer is being closed
                     handle.content = text
                 self._texts[index] = text
-
-
-def _offer_whole_pictures(controls: Any) -> None:
-    """Leave nerfstudio's "gl_z_buf_depth" out of the lists of outputs.
-
-    It is smaller than the picture. nerfstudio puts it into the split screen at first, and joining the two ends the
-    render thread.
-    """
-    offer = controls.update_output_options
-    controls.update_output_options = lambda names: offer([name for name in names if name != "gl_z_buf_depth"])

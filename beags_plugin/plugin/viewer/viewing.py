@@ -12,9 +12,11 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.surfels import Surfels
 from beags_plugin.occupancy.violation import violation_shares
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.viewer.choice import Choice, Visible, shown
+from beags_plugin.plugin.viewer.pace import Pace
 from beags_plugin.plugin.viewer.pictures import (
     boundary_picture,
     class_picture,
@@ -115,7 +117,7 @@ class Viewing:
 
     background: [3], the viewer's. listed: names of ``CHANNELS`` that this run offers; the same ones as long as a viewer
     runs. wanted: returns those that it shows now. crop_box: returns the viewer's. run: the run's files. notes: remarks
-    on the pictures of the last rendering.
+    on the pictures of the last rendering. pace: of the rendering.
     """
 
     def __init__(self, model: SceneModel) -> None:
@@ -128,6 +130,7 @@ class Viewing:
         self.run: ViewedRun | None = None
         self.shares: Shares | None = None
         self.notes: dict[str, str] = {}
+        self.pace = Pace()
         self.lock = threading.Lock()
         self._rest_until = 0.0
 
@@ -161,6 +164,7 @@ class Viewing:
     def outputs(self, camera: Camera) -> dict[str, Tensor]:
         """Render every picture that the viewer lists; those that it does not show at present are left black."""
         model, notes = self.model, {}
+        started, worked = time.perf_counter(), time.process_time()
         wanted = self.wanted() & frozenset(self.listed)
         scene = self.shown()
         background = model.background_color if self.background is None else self.background
@@ -179,6 +183,8 @@ class Viewing:
         if names := wanted & OF_TRAINING_VIEWS:
             outputs.update(self._of_training_view(names, scene, camera, notes))
         self.notes = notes
+        spent = time.perf_counter() - started, time.process_time() - worked
+        self.pace.took(camera.width * camera.height, len(scene.surfels), *spent)
         return outputs
 
     def _violation(self, scene: Visible, camera: Camera, notes: dict[str, str]) -> dict[str, Tensor]:
@@ -229,6 +235,11 @@ class Viewing:
         with self.lock:
             scene = self.shown(rest)
             return Visible(scene.surfels.clone(), scene.class_ids.clone(), scene.index)
+
+    def whole(self) -> tuple[Surfels, Tensor]:
+        """Return the scene and its class ids in memory of their own; waits as ``copy`` does."""
+        with self.lock:
+            return self.model.surfels().detach().clone(), self.model.class_ids.clone()
 
     def refresh_shares(self) -> bool:
         """Compute the shares behind ``occupancy_violation``, if the scene has changed; return whether it did.

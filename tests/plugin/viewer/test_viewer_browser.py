@@ -101,16 +101,40 @@ def test_the_sliders_fade_and_thin_out(page):
     awaited(page, lambda now: differing(now, whole) > 0.01 < differing(now, alone))
 
 
-def test_a_click_picks_what_is_under_the_cursor(page):
+def middle_of(seen: np.ndarray, name: str) -> tuple[float, float]:
+    """Return the middle of what has a class's colour, in pixels of the page."""
+    rows, columns = (np.abs(seen - np.array(COLORS[name])).max(axis=2) < 30).nonzero()
+    return float(np.median(columns)), 60 + float(np.median(rows))
+
+
+def test_the_mouse_turns_the_camera_and_picks_when_asked_to(page):
+    """As shipped: either button of the mouse turns or moves; the pick takes one click; then the mouse turns again."""
     page.choose("Output type", "class_map")
     seen = awaited(page, lambda now: painted(now, "cup") > 0.01 < painted(now, "box"))
     for name in ("box", "cup"):
-        rows, columns = (np.abs(seen - np.array(COLORS[name])).max(axis=2) < 30).nonzero()
-        page.click(float(np.median(columns)), 60 + float(np.median(rows)))
+        page.press("Pick with the next click")
+        page.wait_for_text("Click an object in the picture")
+        page.click(*middle_of(seen, name))
         page.wait_for_text(f"Picked: {name}")
         assert page.chosen("Object") == name
-    page.click(20, 70)
-    page.wait_for_text("Nothing is shown there.")
+        for button, to in (("left", (200, 230)), ("right", (140, 230)), ("right", (180, 200)), ("left", (120, 170))):
+            page.drag((160, 200), to, button)
+            seen = awaited(page, lambda now, before=seen: differing(now, before) > 0.01)
+        assert f"Picked: {name}" in page.text()  # a drag is no click
+    page.press("Pick with the next click")
+    page.wait_for_text("Click an object in the picture")
+    page.press("Pick with the next click")  # nothing is picked
+    page.wait(lambda: "Click an object" not in page.text())
+    page.choose("Object", "box")
+    page.press("Centre on this object")
+    x, y = middle_of(awaited(page, lambda now: differing(now, seen) > 0.01 and painted(now, "box") > 0.1), "box")
+    assert abs(x - 160) < 40 and abs(y - 225) < 40
+
+
+def test_the_whole_panel_is_seen_at_a_height_of_900(page):
+    page.resize(1280, 900)
+    page.wait(lambda: 0 < page.bottom("Export what is shown") < 900)
+    page.resize(WIDTH, HEIGHT)
 
 
 def test_what_is_shown_is_exported(page, served):

@@ -16,8 +16,10 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.colors import colorize
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.occupancy.violation import violation_shares
+from beags_plugin.plugin.viewer.aim import frame_of, place, side_of_photos
 from beags_plugin.plugin.viewer.choice import Choice, shown
 from beags_plugin.plugin.viewer.legend import LegendRow, escaped, hex_color, legend, unique_labels
+from beags_plugin.plugin.viewer.pace import SECONDS, Pace
 from beags_plugin.plugin.viewer.picking import camera_along, pick
 from beags_plugin.plugin.viewer.pictures import (
     boundary_picture,
@@ -195,6 +197,42 @@ def test_the_nearest_view_is_near_and_looks_the_same_way():
     assert nearest_view(view(turn=1.9), views, 3.0) == 2
     behind = Camera(torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ views[0].viewmat, views[0].K, 32, 24)
     assert nearest_view(view(turn=0.4), [behind, views[1]], 3.0) == 1
+
+
+@pytest.mark.parametrize("aspect", [0.5, 1.0, 2.0])
+def test_a_camera_at_its_place_sees_all_objects_from_the_side_of_a_photo(aspect):
+    """Turned about y towards the middle: view 1 looks straight at it, the others past it."""
+    surfels, ids = discs()
+    views = [view(turn=1.0), view(turn=2.0)]
+    views[0] = Camera(torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ views[0].viewmat, views[0].K, 32, 24)
+    frame = frame_of(surfels, ids, [1, 2], views)
+    away = side_of_photos(frame, views)
+    torch.testing.assert_close(away, views[1].center.double() - frame.center)
+    eye = place(frame, away, 0.9, aspect)
+    camera = camera_along(eye.tolist(), (frame.center - eye).tolist())
+    local = (surfels.means[ids > 0] - eye.float()) @ camera.rotation.T
+    # camera_along may lie on its side: both directions are held to the smaller one
+    assert bool((local[:, :2].abs().amax(1) < math.tan(0.45) * min(aspect, 1.0) * local[:, 2]).all())
+    assert float((local[:, :2].norm(dim=1) / local[:, 2]).max()) > 0.3 * math.tan(0.45) * min(aspect, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("fixed", "each", "height"),
+    [(0.0, 1e-6, 181), (0.03, 1e-7, 362), (0.3, 5e-7, 256), (0.3, 2e-5, 128), (0.001, 1e-9, 400), (0.0, 1e-3, 32)],
+)
+def test_pictures_are_as_large_as_the_pace_allows(fixed, each, height):
+    """Of ``fixed`` seconds and ``each`` per pixel: as many pixels as fit; no smaller where that would gain little.
+
+    The processor's time is longer for the first picture; the still pictures between are of another size.
+    """
+    pace, seen = Pace(), []
+    for index in range(80):
+        seen.append(pace.size(1.25, 500))
+        spent = fixed + each * seen[-1][0] * seen[-1][1]
+        pace.took(seen[-1][0] * seen[-1][1], 9, spent, 2 * spent + (index == 0))
+        pace.took(500 * 400, 9, 1e-6, 1e-6)
+    assert seen[-20:] == [(height, int(1.25 * height))] * 20
+    assert fixed + each * 1.25 * height**2 < SECONDS or fixed > SECONDS or height == 32
 
 
 # -- where the occupancy loss acts -----------------------------------------------------------------------------------

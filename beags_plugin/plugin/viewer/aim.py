@@ -1,0 +1,56 @@
+"""Cameras of a viewer's page: the first one, and those that look at an object."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.export.frames import bounding_box
+from beags_plugin.pictures.orbit import OrbitFrame, orbit_frame
+
+if TYPE_CHECKING:
+    from viser import ClientHandle
+
+_WORLD = 10.0  # viser's units in one of nerfstudio's: VISER_NERFSTUDIO_SCALE_RATIO, whose module is slow to import
+_MARGIN = 1.1  # discs reach beyond their box
+
+
+def frame_of(surfels: Surfels, class_ids: Tensor, wanted: Sequence[int], cameras: Sequence[Camera]) -> OrbitFrame:
+    """Return the place of the box around the Gaussians of the ``wanted`` classes; each must have some."""
+    boxes = [bounding_box(surfels[class_ids == class_id]) for class_id in wanted]
+    low, high = torch.stack([box[0] for box in boxes]), torch.stack([box[1] for box in boxes])
+    return orbit_frame(low.amin(dim=0), high.amax(dim=0), cameras)
+
+
+def side_of_photos(frame: OrbitFrame, cameras: Sequence[Camera]) -> Tensor:
+    """Return [3] from the frame's centre to the training camera that looks at it most directly."""
+    aways = torch.stack([camera.center.double() for camera in cameras]) - frame.center
+    forwards = torch.stack([camera.rotation[2].double() for camera in cameras])
+    return aways[int((-forwards * torch.nn.functional.normalize(aways, dim=1)).sum(dim=1).argmax())]
+
+
+def place(frame: OrbitFrame, away: Tensor, fov: float, aspect: float) -> Tensor:
+    """Return [3], where a camera that looks at the frame's centre from the side ``away`` has all of its box in view.
+
+    fov: of the height, radians. aspect: width over height.
+    """
+    half = math.atan(math.tan(fov / 2) * min(1.0, aspect))
+    distance = _MARGIN * frame.reach / math.sin(half)
+    return frame.center + distance * torch.nn.functional.normalize(away.double(), dim=0)
+
+
+def look(client: ClientHandle, frame: OrbitFrame, away: Tensor | None = None) -> None:
+    """Turn a page's camera to the frame; away: from which side, its own if None."""
+    camera = client.camera
+    if away is None:
+        away = torch.from_numpy(camera.position / _WORLD).double() - frame.center
+    with client.atomic():
+        camera.up_direction = frame.up.numpy()
+        camera.position = _WORLD * place(frame, away, camera.fov, camera.aspect).numpy()
+        camera.look_at = _WORLD * frame.center.numpy()

@@ -1,0 +1,64 @@
+"""Changes to nerfstudio's viewer while it serves one of our runs; other methods' viewers stay as they are."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from beags_plugin.plugin.viewer.pace import Pace
+
+if TYPE_CHECKING:
+    from nerfstudio.viewer.viewer import Viewer
+    from viser import GuiApi, ViserServer
+
+
+@contextmanager
+def first_folder(gui: GuiApi, label: str) -> Iterator[Any]:
+    """Put controls into a folder above all others of the tab; yield nerfstudio's for us, which stays empty.
+
+    That one, Custom Elements > model, is the last of the tab.
+    """
+    inner = gui._get_container_id()
+    folders: Any = gui._container_handle_from_id
+    outer = folders[folders[inner]._parent_container_id]
+    gui._set_container_id(outer._parent_container_id)
+    with gui.add_folder(label, order=-1.0):
+        yield outer
+    gui._set_container_id(inner)
+
+
+def set_pace(viewer: Viewer, client_id: int, pace: Pace) -> None:
+    """Let ``pace`` choose the size of a page's pictures while its camera moves."""
+    machine, controls = viewer.render_statemachines[client_id], viewer.control_panel
+    still = machine._calculate_image_res
+    machine._calculate_image_res = lambda aspect_ratio: (
+        still(aspect_ratio) if machine.state == "high" else pace.size(aspect_ratio, controls.max_res)
+    )
+
+
+def offer_whole_pictures(controls: Any) -> None:
+    """Leave nerfstudio's "gl_z_buf_depth" out of the lists of outputs.
+
+    It is smaller than the picture. nerfstudio puts it into the split screen at first, and joining the two ends the
+    render thread.
+    """
+    offer = controls.update_output_options
+    controls.update_output_options = lambda names: offer([name for name in names if name != "gl_z_buf_depth"])
+
+
+def end_when_interrupted(server: ViserServer) -> None:
+    """Let Ctrl-C end ns-viewer without a traceback, and with exit code 0: it has no other end."""
+    former = sys.excepthook
+
+    def hook(kind: type[BaseException], error: BaseException, traceback: Any) -> None:
+        if not issubclass(kind, KeyboardInterrupt):
+            return former(kind, error, traceback)
+        print("\nThe viewer is closed.", flush=True)
+        server.stop()
+        sys.stderr.flush()
+        os._exit(0)  # a render thread inside the rasterizer would abort an interpreter that ends
+
+    sys.excepthook = hook
