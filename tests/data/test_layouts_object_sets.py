@@ -36,13 +36,17 @@ def test_lerf_mask(tmp_path, capsys):
 
 
 def test_prompts_of_lerf_mask_are_scored_by_class_name(tmp_path):
-    """A run with the classes cup and box, of which the second test view alone has a mask of the cup."""
+    """A run with the classes cup and box, of which the second test view alone has a mask of the cup.
+
+    The first has its own black object_mask, as in the data set: it is no truth.
+    """
     from run_folders import write_trained
 
     from beags_plugin.plugin.objects.evaluate import EvaluatedRun, evaluate_run
 
     write_lerf_mask(tmp_path / "figurines")
     write_image(tmp_path / "figurines/test_mask/1/cup.png", 255 * ids())
+    write_image(tmp_path / "figurines/object_mask/frame_00041.png", ids(0))
     config = write_trained(tmp_path / "run", tmp_path / "figurines")
     first, second = EvaluatedRun(config).views
     assert first.visible_objects is None and first.visible is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +121,20 @@ def test_the_source_makes_a_map_of_every_view(sam2, photos, tmp_path):
     assert made.names == {0: "background", 1: "red", 7: "other"}
     assert [m.shape for m in maps] == [(HEIGHT, WIDTH)] * FRAMES
     assert set(np.unique(np.stack(maps)).tolist()) <= {0, 1, 7}
+
+
+def test_held_out_photos_are_never_seen(sam2, photos, tmp_path):
+    photos[1] = replace(photos[1], trained=False, path=tmp_path / "absent.png")  # reading it would fail
+    source = Sam2Source(Path("prompts.json"), model=str(sam2), local=True, device="cpu")
+
+    def maps(view: str) -> list:
+        objects = [{"name": "red", "prompts": [{"view": view, "box": [10, 8, 24, 22]}]}]
+        (tmp_path / "prompts.json").write_text(json.dumps({"objects": objects}))
+        return list(source.make(SourceScene(tmp_path, photos), lambda done, total: None).maps)
+
+    assert [index for index, labels in enumerate(maps("v02")) if labels is None] == [1]
+    with pytest.raises(UserError, match="prompts in v01, which is held out"):
+        maps("v01")
 
 
 def test_missing_weights_are_refused(tmp_path):

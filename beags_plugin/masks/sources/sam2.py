@@ -23,7 +23,8 @@ KEPT_FRAMES = 32  # of an object's memory about the tracked frame; the model use
 
 @dataclass(frozen=True)
 class Sam2Source(MaskSource):
-    """SAM2 tracks objects through the views in the order of names, from points, boxes, or texts for Grounding DINO.
+    """SAM2 tracks objects through the training views in the order of names, from points, boxes, or texts for Grounding
+    DINO. Held-out views are never seen: a mask that a program made of them is no truth.
 
     prompts: JSON, see ``prompts.read_prompts``. model, detector: a folder with the library's files, or a name on its
     hub; the detector is loaded only if an object has a text. device: "auto" prefers CUDA.
@@ -49,26 +50,32 @@ class Sam2Source(MaskSource):
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
         path = scene.below(self.prompts)
         objects = read_prompts(path)
-        frame_of = {view: scene.index_of(view, str(path)) for one in objects for view in one.prompts}
+        trained = [index for index, photo in enumerate(scene.photos) if photo.trained]
+        photos = [scene.photos[index] for index in trained]
+        prompted = {view: scene.index_of(view, str(path)) for one in objects for view in one.prompts}
+        if held_out := sorted(view for view, index in prompted.items() if index not in trained):
+            raise UserError(f"{path} has prompts in {held_out[0]}, which is held out: prompt a training view.")
+        frame_of = {view: trained.index(index) for view, index in prompted.items()}
         device = self.device
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
-        predictor = Sam2Predictor(*load(self.model, "Sam2VideoModel", self.local), scene.photos, device)
+        predictor = Sam2Predictor(*load(self.model, "Sam2VideoModel", self.local), photos, device)
         detector = None
         if any(one.text for one in objects):
             kind = "GroundingDinoForObjectDetection"
-            detector = GroundingDino(*load(self.detector, kind, self.local), scene.photos, device)
+            detector = GroundingDino(*load(self.detector, kind, self.local), photos, device)
         names = {0: "background", **{one.class_id: one.name for one in objects}}
         options = Retrieval(self.threshold, self.strict, self.searched, self.retries)
         notes: list[str] = []
 
-        def maps() -> Iterator[np.ndarray]:
+        def maps() -> Iterator[np.ndarray | None]:
             with TemporaryDirectory(prefix="beags-sam2-") as folder:
                 best = BestLabels(Path(folder))
-                names = [photo.name for photo in scene.photos]
+                names = [photo.name for photo in photos]
                 notes.extend(retrieve(objects, frame_of, names, predictor, detector, best, options, progress))
-                for frame, photo in enumerate(scene.photos):
-                    yield best.labels(frame, (photo.height, photo.width))
+                frames = iter(range(len(photos)))
+                for photo in scene.photos:
+                    yield best.labels(next(frames), (photo.height, photo.width)) if photo.trained else None
 
         return MadeMasks(names, maps(), notes)
 

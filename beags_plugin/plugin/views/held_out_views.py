@@ -59,7 +59,9 @@ class HeldOutViews(Sequence[EvalView]):
         view = self._views[index]
         truth = self._metadata["ground_truth"] or _NO_TRUTH
         exact = truth["masks"][index] if truth["masks"] else None
-        file, kind = (exact, "ids") if exact else (self._metadata["mask_filenames"][index], self._kind)
+        # Where objects were labelled one by one, a view without such masks has no truth: its own mask is no substitute.
+        own = None if truth["visible"] else self._metadata["mask_filenames"][index]
+        file, kind = (exact, "ids") if exact else (own, self._kind)
         visible = None
         if file is not None:
             ids = read_mask(file, kind, self._metadata["ignore_ids"])
