@@ -129,7 +129,9 @@ def trial_config(request: dict[str, Any], run_folder: Path) -> BeagsTrainerConfi
     data.train_cameras_sampling_seed = request["seed"]
     parser = cast("BeagsDataParserConfig", data.dataparser)
     parser.data = Path(request["data"])
-    parser.downscale_factor *= request["downscale"]  # a variant may shrink the images further
+    parser.downscale_factor = (parser.downscale_factor or 1.0) * request[
+        "downscale"
+    ]  # a variant may shrink the images further
     if request["masks"] is not None:
         parser.masks_path = Path(request["masks"])
     if request["base"] is not None:

@@ -85,6 +85,7 @@ class Dataset:
     class_names: id to name, or None; class_names_file: their file, for messages.
     visible, silhouettes: object name to exact masks for evaluation: of its visible part, and occlusion-free.
     seed_points: .ply, or COLMAP's points3D.bin or .txt, in the frame of a ``PoseTable``; None: the poses bring them.
+    downscale: factor by which the images' sides are divided by default, for the size that the data set's papers use.
     notes: sentences for the user.
     """
 
@@ -100,4 +101,5 @@ class Dataset:
     visible: Mapping[str, FilesOfObject] = field(default_factory=dict)
     silhouettes: Mapping[str, FilesOfObject] = field(default_factory=dict)
     seed_points: Path | None = None
+    downscale: float = 1.0
     notes: tuple[str, ...] = ()

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 _ENDS = {"PNG": b"IEND", "JPEG": b"\xff\xd9"}
-LARGEST_WIDTH = 1600  # pixels; with it Mip-NeRF 360 gets images_4 outdoors and images_2 indoors, LLFF images_4
+LARGEST_WIDTH = 1600  # pixels
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -49,6 +49,25 @@ def choose_images(root: Path, chosen: Path | None = None) -> Path:
         raise UserError(f"{where} holds no images: restore them, or give --images-path.")
     fitting = (folder for folder in folders if max(image_size(list_images(folder)[0])) <= LARGEST_WIDTH)
     return next(fitting, folders[-1])
+
+
+def largest_images(root: Path, chosen: Path | None = None) -> tuple[Path, float]:
+    """Return ``chosen`` and 1, else the folder of the largest copies and the factor that makes them 1600 pixels wide.
+
+    Raises ``UserError`` if there is no image.
+    """
+    folders = [] if chosen is not None else image_folders(root)
+    if not folders:
+        return choose_images(root, chosen), 1.0
+    width = image_size(list_images(folders[0])[0])[0]
+    return folders[0], max(width / LARGEST_WIDTH, 1.0)
+
+
+def size_note(folder: Path, downscale: float = 1.0) -> str:
+    """Return a sentence about the size of images that a layout has chosen."""
+    size = "as they are" if downscale == 1.0 else f"{LARGEST_WIDTH} pixels wide"
+    others = "others: beags-data --images-path FOLDER or --downscale-factor N"
+    return f"The images of {folder.name} are taken {size}, as in the paper ({others})."
 
 
 def image_size(path: Path, what: str = "the image") -> tuple[int, int]:
@@ -156,5 +175,5 @@ def check_same_size(masks: Sequence[Path | None], sizes: Sequence[tuple[int, int
         if mask is not None and (found := image_size(mask, "the mask")) != (width, height):
             raise UserError(
                 f"the mask {mask} is {found[0]}x{found[1]} pixels but its image is {width}x{height}: "
-                f"make the mask from the image at its full size."
+                f"make the mask from that image, or name images of its size with beags-data --images-path."
             )

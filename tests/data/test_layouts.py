@@ -31,13 +31,20 @@ from beags_plugin.plugin.views.dataset import BeagsDataset
 from beags_plugin.system.errors import UserError
 
 
-@pytest.mark.parametrize(("largest", "factor", "size"), [(1600, 1, (20, 12)), (10, 2, (10, 6)), (5, 4, (5, 3))])
-def test_mipnerf360_takes_the_largest_copies_that_are_small_enough(tmp_path, monkeypatch, largest, factor, size):
-    stems = write_mipnerf360(tmp_path)
-    monkeypatch.setattr(files, "LARGEST_WIDTH", largest)
+@pytest.mark.parametrize(("gone", "factor", "size"), [((), 4, (5, 3)), (("images_4", "images_8"), 2, (10, 6))])
+def test_mipnerf360_takes_a_quarter_or_the_largest_copies_that_are_small_enough(
+    tmp_path, monkeypatch, capsys, gone, factor, size
+):
+    stems = write_mipnerf360(tmp_path / "garden")
+    tmp_path = tmp_path / "garden"
+    for name in gone:
+        shutil.rmtree(tmp_path / name)
+    monkeypatch.setattr(files, "LARGEST_WIDTH", 10)
     assert title(tmp_path) == "Mip-NeRF 360"
     outputs = parse(tmp_path, **AS_GIVEN)
-    assert outputs.image_filenames[0].parent.name == ("images" if factor == 1 else f"images_{factor}")
+    assert outputs.image_filenames[0].parent.name == f"images_{factor}"
+    said = " ".join(capsys.readouterr().out.split())
+    assert ("images_4 are taken as they are, as in the paper" in said) is (not gone)
     camera = camera_from_nerfstudio(outputs.cameras, 0)
     assert (camera.width, camera.height) == size
     expected = [[FX / factor, 0, CX / factor], [0, FY / factor, CY / factor], [0, 0, 1]]
@@ -49,15 +56,17 @@ def test_mipnerf360_takes_the_largest_copies_that_are_small_enough(tmp_path, mon
 def test_mipnerf360_masks_and_ground_truth_of_both_kinds(tmp_path):
     stems = write_mipnerf360(tmp_path)
     write_image(tmp_path / f"masks/{stems[1]}.png", ids(3))
+    with pytest.raises(UserError, match="is 20x12 pixels but its image is 5x3: .* name images of its size with"):
+        parse(tmp_path)
     (tmp_path / "classes.json").write_text('{"3": "table"}')
     write_image(tmp_path / f"ground_truth/visible/table/{stems[8]}.png", ids(255))
     write_image(tmp_path / f"ground_truth/silhouettes/table/{stems[0]}.png", ids(255))
-    outputs = parse(tmp_path, "test")
+    outputs = parse(tmp_path, "test", images_path=Path("images"))
     assert outputs.metadata["classes"] == {0: "background", 3: "table"}
     truth = outputs.metadata["ground_truth"]
     assert truth["visible"] == {"table": [None, tmp_path / f"ground_truth/visible/table/{stems[8]}.png"]}
     assert truth["silhouettes"] == {"table": [tmp_path / f"ground_truth/silhouettes/table/{stems[0]}.png", None]}
-    labels = BeagsDataset(parse(tmp_path)).get_data(0)["labels"].numpy()
+    labels = BeagsDataset(parse(tmp_path, images_path=Path("images"))).get_data(0)["labels"].numpy()
     np.testing.assert_array_equal(labels, ids(3))
 
 

@@ -11,6 +11,8 @@ from data_folders import CX, CY, FX, FY, HEIGHT, WIDTH, noise, write_colmap, wri
 from layout_folders import FOCAL, opencv_matrices, write_copies, write_llff, write_poses_bounds
 from parsed_views import AS_GIVEN, POINT, moved, names, parse, pixel, real, title
 
+import beags_plugin.data.files as files
+from beags_plugin.data.files import image_size
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 
 
@@ -28,6 +30,17 @@ def test_llff_scales_the_intrinsics_to_the_images_and_turns_the_axes(tmp_path):
     normalised = parse(root, images_path=Path("images_4"), eval_interval=0)
     expected = pixel(outputs, 0, POINT)
     np.testing.assert_allclose(pixel(normalised, 0, moved(normalised, POINT)), expected, atol=1e-3)
+
+
+def test_llff_makes_the_largest_images_as_wide_as_papers_do(tmp_path, monkeypatch, capsys):
+    root = tmp_path / "fern"
+    write_llff(root, originals=True)
+    monkeypatch.setattr(files, "LARGEST_WIDTH", WIDTH - 4)
+    largest = max(image_size(path)[0] for path in root.rglob("*.*") if path.suffix.lower() in files.IMAGE_SUFFIXES)
+    camera = camera_from_nerfstudio(parse(root).cameras, 0)
+    assert camera.width == WIDTH - 4 < largest
+    assert f"{WIDTH - 4} pixels wide, as in the paper" in " ".join(capsys.readouterr().out.split())
+    assert camera_from_nerfstudio(parse(root, downscale_factor=1.0).cameras, 0).width == largest
 
 
 @pytest.mark.parametrize("known_by", ["images", "names", "copies"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from beags_plugin.data.dataset import ColmapModel, Dataset, PoseTable, Split
-from beags_plugin.data.files import choose_images, image_folders, list_images
+from beags_plugin.data.files import image_folders, largest_images, list_images, size_note
 from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.colmap import complete_model, points_file
 from beags_plugin.data.poses_bounds import FILE, read_poses_bounds
@@ -26,7 +26,10 @@ ORIGINAL_NAMES = "original_names.txt"
 
 
 class Llff(Layout):
-    """images_4 or another size, and poses in a complete COLMAP model, else in poses_bounds.npy."""
+    """images, and poses in a complete COLMAP model, else in poses_bounds.npy.
+
+    By default the largest images, 1600 pixels wide, as in the paper.
+    """
 
     title = "LLFF"
     marks = FILE
@@ -39,9 +42,10 @@ class Llff(Layout):
         return (root / FILE).is_file() or (root.name.lower() in NVOS_TARGETS and complete_model(root) is not None)
 
     def read(self, root: Path, images: Path | None) -> Dataset:
-        folder = choose_images(root, images)
+        folder, downscale = largest_images(root, images)
         poses, points = model_or_bounds(root, folder)
-        return Dataset(self.title, root, poses, Split(nvos_target(root, folder)), seed_points=points)
+        split, notes = Split(nvos_target(root, folder)), () if images else (size_note(folder, downscale),)
+        return Dataset(self.title, root, poses, split, seed_points=points, downscale=downscale, notes=notes)
 
 
 def lacks_poses(root: Path) -> str | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from beags_plugin.data.dataset import ColmapModel, Dataset
-from beags_plugin.data.files import choose_images, image_folders
+from beags_plugin.data.files import choose_images, image_folders, list_images, size_note
 from beags_plugin.data.layouts.colmap import Colmap, checked_model
 
 SCENES = ("bicycle", "bonsai", "counter", "flowers", "garden", "kitchen", "room", "stump", "treehill")
@@ -15,7 +15,7 @@ FOLDERS = {"images", "images_2", "images_4", "images_8"}
 class MipNerf360(Colmap):
     """images, images_2, images_4, images_8 and sparse/0; every 8th view is for evaluation.
 
-    By default images have at most 1600 pixels on a side: images_4 outdoors and images_2 indoors, as in its papers.
+    By default images are a quarter of the original, images_4, as in the paper.
     """
 
     title = "Mip-NeRF 360"
@@ -29,4 +29,8 @@ class MipNerf360(Colmap):
         return folders >= FOLDERS or (root.name in SCENES and bool(folders))
 
     def read(self, root: Path, images: Path | None) -> Dataset:
-        return Dataset(self.title, root, ColmapModel(checked_model(root), choose_images(root, images)))
+        quarter = root / "images_4"
+        default = images is None and bool(list_images(quarter))
+        folder = quarter if default else choose_images(root, images)
+        notes = (size_note(folder),) if default else ()
+        return Dataset(self.title, root, ColmapModel(checked_model(root), folder), notes=notes)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from beags_plugin.data.dataset import Dataset, Split
-from beags_plugin.data.files import choose_images, list_images
+from beags_plugin.data.files import largest_images, list_images, size_note
 from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.llff import lacks_poses, model_or_bounds
 from beags_plugin.system.errors import UserError
@@ -31,7 +31,7 @@ class ThreeDOvs(Layout):
         return lacks_poses(root)
 
     def read(self, root: Path, images: Path | None) -> Dataset:
-        folder = choose_images(root, images)
+        folder, downscale = largest_images(root, images)
         stems = [path.stem for path in list_images(folder)]
         names = _class_names(root / CLASSES)
         visible: dict[str, dict[str, Path]] = {}
@@ -52,6 +52,8 @@ class ThreeDOvs(Layout):
             class_names_file=root / CLASSES,
             visible=visible,
             seed_points=points,
+            downscale=downscale,
+            notes=() if images else (size_note(folder, downscale),),
         )
 
 

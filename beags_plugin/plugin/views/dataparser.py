@@ -53,8 +53,9 @@ class BeagsDataParserConfig(DataParserConfig):
     silhouettes/<object>/<stem>.png; may be missing."""
     ignore_ids: tuple[int, ...] = ()
     """Ids in the masks that mean "not labelled"."""
-    downscale_factor: float = 1.0
-    """Divide the images' width and height by this when loading; nothing is written to disk."""
+    downscale_factor: float | None = None
+    """Divide the images' width and height by this when loading; nothing is written to disk. None: the layout's own,
+    mostly 1 (docs/data.md)."""
     eval_interval: int = 8
     """Of the name-sorted views, one in this many is held out for evaluation; 0: all views serve both.
     Splits that the data or its protocol names come first."""
@@ -75,7 +76,7 @@ class BeagsDataParserConfig(DataParserConfig):
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that nothing can be made of."""
-        if not 1.0 <= self.downscale_factor < math.inf:
+        if self.downscale_factor is not None and not 1.0 <= self.downscale_factor < math.inf:
             raise UserError(f"downscale_factor is {self.downscale_factor}: give 1 (full size) or more.")
         for name in ("scale_factor", "scene_scale"):
             if not 0.0 < (value := getattr(self, name)) < math.inf:
@@ -206,10 +207,11 @@ class BeagsDataParser(DataParser):
                     f"use the images that the poses were made from."
                 )
         actual = torch.tensor(sizes).to(torch.int64)
-        size = downscaled_size(actual, self.config.downscale_factor)
+        factor = self._scene.downscale if self.config.downscale_factor is None else self.config.downscale_factor
+        size = downscaled_size(actual, factor)
         if int(size.min()) < LEAST_PIXELS <= int(actual.min()):
             raise UserError(
-                f"downscale_factor is {self.config.downscale_factor:g}, which leaves {int(size.min())} pixels of "
+                f"downscale_factor is {factor:g}, which leaves {int(size.min())} pixels of "
                 f"a side of {views.images[0]}: give less, so that {LEAST_PIXELS} or more are left."
             )
         resize_cameras(cameras, size[:, :1], size[:, 1:])
