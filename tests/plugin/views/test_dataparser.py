@@ -22,7 +22,7 @@ from data_folders import (
     write_image,
     write_transforms,
 )
-from parsed_scenes import AS_GIVEN, names, parse, pixel, skip_without
+from parsed_views import AS_GIVEN, names, parse, pixel, real
 from rich.console import Console
 
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
@@ -57,7 +57,7 @@ def test_transforms_cameras_see_points_where_the_file_says(tmp_path, per_frame):
         expected = [cx + FX * x / -z, CY - FY * y / -z]
         camera = camera_from_nerfstudio(outputs.cameras, index)
         assert (camera.width, camera.height) == (WIDTH, HEIGHT)
-        np.testing.assert_allclose(pixel(camera, point), expected, atol=1e-4)
+        np.testing.assert_allclose(pixel(outputs, index, point), expected, atol=1e-4)
 
 
 @pytest.mark.parametrize(("text", "folder"), [(False, "sparse/0"), (True, "sparse/0"), (False, "colmap/sparse/0")])
@@ -71,10 +71,9 @@ def test_colmap_cameras_and_seed_points_agree_after_normalisation(tmp_path, text
     assert not outputs.metadata["points3D_random"]
     K = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
     for index, matrix in enumerate(matrices):
-        camera = camera_from_nerfstudio(outputs.cameras, index)
         for raw, moved in zip(points, outputs.metadata["points3D_xyz"].tolist(), strict=True):
             x, y, w = K @ (matrix[:3, :3] @ raw + matrix[:3, 3])
-            np.testing.assert_allclose(pixel(camera, moved), [x / w, y / w], atol=1e-3)
+            np.testing.assert_allclose(pixel(outputs, index, moved), [x / w, y / w], atol=1e-3)
 
 
 def test_transform_and_scale_lead_back_to_the_original_world(tmp_path):
@@ -151,9 +150,8 @@ def test_ply_seed_points_move_with_the_cameras(tmp_path):
     assert outputs.metadata["points3D_rgb"].tolist() == [[9, 8, 7], [255, 0, 1]]
     for index in (0, 5):
         x, y, z = poses[index][:3, :3].T @ (np.array([-0.5, 0.0, 0.25]) - poses[index][:3, 3])
-        camera = camera_from_nerfstudio(outputs.cameras, index)
         moved = outputs.metadata["points3D_xyz"][1].tolist()
-        np.testing.assert_allclose(pixel(camera, moved), [CX + FX * x / -z, CY - FY * y / -z], atol=1e-3)
+        np.testing.assert_allclose(pixel(outputs, index, moved), [CX + FX * x / -z, CY - FY * y / -z], atol=1e-3)
 
 
 @pytest.mark.parametrize("kind", ["around", "forward", "outward"])
@@ -188,7 +186,7 @@ def test_random_points_lie_in_common_view(tmp_path, kind):
 def test_fruit_reprojects_and_its_masks_fit():
     from nerfstudio.data.utils.colmap_parsing_utils import read_images_binary, read_points3D_binary
 
-    root = skip_without("fruit")
+    root = real("fruit")
     outputs = parse(root)
     assert len(outputs.image_filenames) == 70 and len(names(parse(root, "test"))) == 11
     assert outputs.metadata["classes"] == {0: "background", 1: "apple", 2: "banana"}
@@ -207,7 +205,7 @@ def test_fruit_reprojects_and_its_masks_fit():
 
 
 def test_skull_has_no_seed_points_but_starts_around_the_skull():
-    root = skip_without("dtu_skull")
+    root = real("dtu_skull")
     outputs = parse(root, downscale_factor=2.0, num_random_points=2000)
     assert len(outputs.image_filenames) == 42
     centre = outputs.cameras.cx / outputs.cameras.width

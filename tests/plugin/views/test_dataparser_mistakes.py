@@ -12,7 +12,7 @@ from data_folders import (
     write_colmap,
     write_transforms,
 )
-from parsed_scenes import parse
+from parsed_views import parse
 from PIL import Image
 
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig

@@ -16,7 +16,7 @@ from data_folders import (
     write_image,
     write_transforms,
 )
-from parsed_scenes import parse
+from parsed_views import parse
 from PIL import Image
 
 from beags_plugin.labels.class_ids import IGNORE
