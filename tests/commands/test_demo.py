@@ -132,7 +132,7 @@ def test_brackets_in_a_path_are_no_markup(tmp_path, capsys):
     with pytest.raises(SystemExit) as end:
         main(["demo", "--data", str(tmp_path / "x[/y]")])
     assert end.value.code == 2
-    assert "x[/y] is no folder" in capsys.readouterr().out.replace("\n", "")
+    assert "x[/y] does not exist" in capsys.readouterr().out.replace("\n", "")
 
 
 def test_objects_never_share_a_folder():
