@@ -15,7 +15,7 @@ from rich.markup import escape
 
 from beags_plugin.bench.commands import Measurement
 from beags_plugin.commands.masks import Masks
-from beags_plugin.commands.starting import starting
+from beags_plugin.commands.starting import check_arguments, starting
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.pictures.options import RenderOptions
@@ -249,8 +249,7 @@ class Doctor:
         from beags_plugin.commands.doctor.check import print_check
         from beags_plugin.commands.doctor.diagnosis import checks_of_data, diagnose
 
-        with starting(self):
-            pass
+        check_arguments(self)
         checks = []
         for check in chain(diagnose(), checks_of_data(self.data)):
             print_check(check)

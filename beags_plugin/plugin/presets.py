@@ -58,9 +58,9 @@ def load_preset(name: str, folder: Path | None = None) -> MethodSpecification:
 
 
 def _description(name: str, sentence: str) -> str:
-    """Return the text above the help of ``ns-train <name>``; that of beags lists the first options."""
+    """Return the text above the help of ``ns-train <name>``: for beags the first options, else where they are."""
     if name != "beags":
-        return sentence
+        return f"{sentence} The options that matter: ns-train beags --help."
     rows = (f"  {option:<40}{use}" for option, use in FIRST_OPTIONS.items())
     return "\n".join([sentence, "", "The options that people set first:", *rows, "", "All options follow."])
 

@@ -98,7 +98,7 @@ class BeagsTrainer(Trainer):
         There is one if memory ran out, the system refused a file, or a user can help it. Nothing is left of a training
         that has saved no checkpoint then.
         """
-        self._close_writers()
+        self._close_writers(failed=True)
         profiler.PROFILER.clear()  # whose figures would be printed below the sentence
         if (sentence := self._sentence(error)) is None:
             return self._release()
@@ -132,11 +132,15 @@ class BeagsTrainer(Trainer):
             self._lock = None
         self._replica.end()
 
-    def _close_writers(self) -> None:
+    def _close_writers(self, failed: bool = False) -> None:
         for each in writer.EVENT_WRITERS:
             if isinstance(each, writer.TensorboardWriter):
                 with suppress(OSError):  # of a full disk, which has been reported
                     each.tb_writer.close()
+            if failed and isinstance(each, writer.WandbWriter):
+                import wandb
+
+                wandb.finish(exit_code=1, quiet=True)  # it would print below the sentence
         writer.EVENT_WRITERS.clear()
         writer.EVENT_STORAGE.clear()
 

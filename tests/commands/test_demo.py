@@ -31,13 +31,13 @@ def test_large_images_are_scaled_down_by_a_whole_factor(tmp_path):
 
 
 def test_the_images_that_the_layout_takes_decide(tmp_path):
-    """LLFF's poses_bounds.npy with originals too large to take, and copies."""
-    for name, shape in (("images/a.png", (1500, 2000)), ("images_4/a.png", (375, 500))):
+    """LLFF takes the largest copies, not those whose folder comes first by name."""
+    for name, shape in (("images_8/a.png", (750, 1000)), ("images_16/a.png", (375, 500))):
         write_image(tmp_path / name, np.zeros(shape, np.uint8))
-    assert quick_downscale(tmp_path) == 8.0
+    assert quick_downscale(tmp_path) == 2.0  # 250 x 187 are 46,750 pixels
     pose = np.column_stack([np.eye(3), [0.0, 0.0, 0.0], [1500.0, 2000.0, 1800.0]])
     np.save(tmp_path / "poses_bounds.npy", np.concatenate([pose.ravel(), [1.0, 2.0]])[None])
-    assert quick_downscale(tmp_path) == 2.0  # 250 x 187 are 46,750 pixels
+    assert quick_downscale(tmp_path) == 4.0
 
 
 def test_an_image_that_cannot_be_read_is_a_user_error(tmp_path):

@@ -111,6 +111,14 @@ def test_objects_that_most_made_masks_lack_are_named(tmp_path):
     assert ["1 (cup)" in warnings[0], "2 (box)" in warnings[1]] == [True, True] and "of 7 should" in warnings[0]
 
 
+def test_masks_are_made_of_data_that_training_would_refuse(tmp_path):
+    """Splits without held-out views: training names them, and the masks are kept."""
+    write_transforms(tmp_path, train_filenames=["images/v01.png", "images/v02.png"])
+    data = BeagsDataParserConfig(data=tmp_path)
+    assert "masks of" in " ".join(make_masks(data, Scripted()))
+    assert (tmp_path / "masks/v01.png").exists() and (tmp_path / "classes.json").exists()
+
+
 def test_masks_to_look_at_are_guarded_and_whole_as_the_others(tmp_path):
     write_transforms(tmp_path)
     data = BeagsDataParserConfig(data=tmp_path)

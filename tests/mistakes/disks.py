@@ -80,11 +80,11 @@ def training(code: int) -> Callable[[Place], Any]:
     return make
 
 
-def filling(module: str, function: str, folder: str, after: int = 0) -> Callable[[Place], Any]:
+def filling(module: str, function: str, folder: str, after: int = 0, **settings: Any) -> Callable[[Place], Any]:
     """Return a training whose disk is full below ``folder`` from a function of the program on."""
 
     def make(at: Place):
-        command = at.train(*SHORT, preset="beags-tiny")
+        command = at.train(*SHORT, preset="beags-tiny", **settings)
         owner = import_module(f"beags_plugin.plugin.training.{module}")
         save = getattr(owner, function)
 
@@ -106,6 +106,16 @@ mistakes(
         "ns-train prepares refinement": filling("refinement", "save_prepared", f"{TRAINED}/prepared"),
     },
 )
+
+
+@mistake("full disk", "ns-train writes its first checkpoint, and wandb keeps the curves")
+def _(at: Place):
+    """Its client has begun a folder of the run, and prints when it ends."""
+    at.patch.setenv("WANDB_MODE", "offline")
+    at.patch.setenv("WANDB_SILENT", "true")
+    return filling("checkpoints", "save_atomically", TRAINED, after=1000, vis="wandb")(at)
+
+
 mistake("no permission", "ns-train")(training(errno.EACCES))
 
 

@@ -146,6 +146,7 @@ mistakes(
         "a camera path of another kind": along('{"frames": []}'),
         "a camera path of panoramas": along(PATH.replace("perspective", "equirectangular")),
         "a camera path without cameras": along(PATH),
+        "frames along a camera path": along(PATH, "--frames 5"),
         "a sheet along a camera path": along(PATH, "--format sheet"),
         "a sheet without views": beags(RENDER, "--format sheet --views 0"),
     },

@@ -252,8 +252,9 @@ def _converted(current: Any, name: str, values: list[str]) -> Any:
     if isinstance(current, tuple):
         kind = type(current[0]) if current else {"ignore_ids": int}.get(name, str)
         return tuple(kind(value) for value in values)
-    kind = Path if current is None or isinstance(current, Path) else type(current)
-    return kind(values[0])
+    if current is None or isinstance(current, Path):
+        return {"downscale_factor": float}.get(name, Path)(values[0])
+    return type(current)(values[0])
 
 
 def ns_train(config: Any) -> None:

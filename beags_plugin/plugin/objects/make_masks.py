@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from beags_plugin.data.files import image_size, photo_names
 from beags_plugin.labels.classes import check_names, write_mask
+from beags_plugin.masks.check.issues import Issue
 from beags_plugin.masks.snapping import snap_to_edges
 from beags_plugin.masks.sources import MASK_SOURCES
 from beags_plugin.masks.sources.base import MaskSource, Photo, SourceScene
@@ -171,13 +173,15 @@ def make_masks(
     write_whole(classes, lambda file: file.write(json.dumps(names, indent=1).encode()))
     _picture(folder / "made.png", shown)
     aside = len(shown) - len(shares)
-    report = check_scene(replace(data, masks_path=masks.absolute(), classes_path=classes.absolute()))
+    issues: Sequence[Issue] = ()
+    with suppress(UserError):  # training says it; the masks are made
+        issues = check_scene(replace(data, masks_path=masks.absolute(), classes_path=classes.absolute())).issues
     return [
         *made.notes,
         f"{len(shares)} masks of {len(photos)} views, {len(names) - 1} objects, which cover "
         f"{100 * np.mean(shares):.1f} % on average: {masks}",
         *([f"{aside} masks of held-out views, only to look at: {look_at}"] if aside else []),
-        *(f"warning: {issue.message}" for issue in report.issues if issue.kind in ("absent", "only view")),
+        *(f"warning: {issue.message}" for issue in issues if issue.kind in ("absent", "only view")),
         f"names: {classes}; look at {folder / 'made.png'}",
     ]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import get_args
 
@@ -12,7 +13,7 @@ from beags_plugin.export.frames import bounding_box
 from beags_plugin.extraction.select import select_class
 from beags_plugin.pictures.cells import write_picture
 from beags_plugin.pictures.objects import Subject, comparison, film, sheet
-from beags_plugin.pictures.options import Background, PictureFormat, RenderOptions
+from beags_plugin.pictures.options import PictureFormat, RenderOptions
 from beags_plugin.pictures.orbit import orbit, orbit_frame, orbit_settings
 from beags_plugin.pictures.video import FILMS, check_film, encoder, write_film
 from beags_plugin.plugin.objects.camera_path import read_camera_path
@@ -46,7 +47,7 @@ def render_run(
     options.check()
     check_choice(form, get_args(PictureFormat), "format")
     if options.camera_path is not None:
-        return _along(options.camera_path, config_path, objects, form, output, options.background, progress)
+        return _along(options.camera_path, config_path, objects, form, output, options, progress)
     scene = read_assigned_run(config_path, data)
     present = objects_with_gaussians(scene, objects, config_path.parent)
     names = list(dict.fromkeys(objects)) or [name for name, class_id in present.items() if class_id != 0]
@@ -78,12 +79,15 @@ def _along(
     objects: Sequence[str],
     form: str,
     output: Path | None,
-    background: Background,
+    options: RenderOptions,
     progress: Progress | None,
 ) -> Path:
     """Film the objects together, or the whole scene, along a camera path; arguments as of ``render_run``."""
     if form == "sheet":
         raise UserError("a camera path gives a video: leave --format sheet or --camera-path out.")
+    changed = {each.name for each in fields(options) if getattr(options, each.name) != each.default}
+    if ignored := sorted(changed - {"background", "camera_path"}):
+        raise UserError(f"a camera path has a size, cameras and speed of its own: leave --{ignored[0]} out.")
     cameras, fps = read_camera_path(path)
     output = output or config_path.parent / "renders" / f"{path.stem}_{form}{_film_suffix()}"
     check_film(output)
@@ -97,7 +101,7 @@ def _along(
         shown[caption] = surfels[torch.isin(class_ids, chosen)] if objects else surfels
     subject = Subject("", shown, cameras, raster_settings(scene))
     rasterizer = make_rasterizer(scene.config.model_config.rasterizer)
-    write_film(output, film([subject], rasterizer, background, progress), fps)
+    write_film(output, film([subject], rasterizer, options.background, progress), fps)
     return output
 
 

@@ -12,7 +12,7 @@ REPLACED = "replaced_models"
 """Folder of a run: checkpoints of an earlier one in the same place, until the new one has its own."""
 _MODELS = "nerfstudio_models"
 _REWRITTEN = ("config.yml", "training.json", "dataparser_transforms.json", "start.json", "held_out.json")
-_ADDED = (LOCK, "events.out.tfevents.*", "prepared", "base")
+_ADDED = (LOCK, "events.out.tfevents.*", "prepared", "base", "wandb")
 """What a training writes before its first checkpoint; other programs may write into the folder too."""
 
 _noted: dict[Path, Rollback] = {}

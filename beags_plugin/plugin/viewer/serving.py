@@ -56,9 +56,9 @@ def end_when_interrupted(server: ViserServer) -> None:
     def hook(kind: type[BaseException], error: BaseException, traceback: Any) -> None:
         if not issubclass(kind, KeyboardInterrupt):
             return former(kind, error, traceback)
-        print("\nThe viewer is closed.", flush=True)
-        server.stop()
+        server.stop()  # which prints
         sys.stderr.flush()
+        print("\nThe viewer is closed.", flush=True)
         os._exit(0)  # a render thread inside the rasterizer would abort an interpreter that ends
 
     sys.excepthook = hook

@@ -17,6 +17,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOu
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from beags_plugin.data.dataset import ColmapModel, Poses, PoseTable, TransformsFile
@@ -109,7 +110,8 @@ class _Transforms(Nerfstudio):
     global_k4 = 0.0
 
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
-        outputs = super()._generate_dataparser_outputs(split)
+        with CONSOLE.capture():  # it says of every split that the data name it
+            outputs = super()._generate_dataparser_outputs(split)
         parameters = outputs.cameras.distortion_params
         if self.global_k4 != 0.0 and parameters is not None:
             k4 = torch.full_like(parameters[..., :1], self.global_k4)
