@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,8 @@ from nerfstudio.process_data.colmap_utils import parse_colmap_camera_params
 from torch import Tensor
 
 from beags_plugin.system.errors import UserError
+
+_POINT = struct.Struct("<QdddBBBdQ")  # id, position, colour, error, length of the track
 
 
 def read_lens(file: Path, size: Sequence[int], focal: float) -> Tensor:
@@ -37,10 +41,30 @@ def read_lens(file: Path, size: Sequence[int], focal: float) -> Tensor:
 
 def read_colmap_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read positions [N, 3] float32 and colours [N, 3] uint8 of points3D.bin or points3D.txt."""
-    readers = {".bin": colmap.read_points3D_binary, ".txt": colmap.read_points3D_text}
+    readers = {".bin": _binary_points, ".txt": colmap.read_points3D_text}
     points = _read(readers[file.suffix], file).values()
     xyz = np.array([point.xyz for point in points], np.float32).reshape(-1, 3)
     return xyz, np.array([point.rgb for point in points], np.uint8).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class _Point:
+    xyz: Sequence[float]
+    rgb: Sequence[int]
+
+
+def _binary_points(file: Path) -> dict[int, _Point]:
+    """Read points3D.bin by id; nerfstudio's reader takes all memory where the length of a track is damaged."""
+    content, offset = file.read_bytes(), 8
+    (count,) = struct.unpack_from("<Q", content)
+    points = {}
+    for _ in range(count):
+        if offset + _POINT.size > len(content):
+            raise ValueError("the file is cut off")
+        point_id, *values, length = _POINT.unpack_from(content, offset)
+        points[point_id] = _Point(values[:3], values[3:6])
+        offset += _POINT.size + 8 * length  # its track follows
+    return points
 
 
 def _read(reader: Callable[[Any], dict], file: Path) -> dict:

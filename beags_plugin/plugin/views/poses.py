@@ -22,7 +22,6 @@ from torch import Tensor
 
 from beags_plugin.data.dataset import ColmapModel, Poses, PoseTable, TransformsFile
 from beags_plugin.data.files import existing_images, photo_names
-from beags_plugin.data.layouts.colmap import points_file
 from beags_plugin.data.transforms_file import read_transforms
 from beags_plugin.plugin.views.cameras import concatenate_cameras
 from beags_plugin.plugin.views.colmap_files import read_lens
@@ -153,7 +152,7 @@ def _colmap_parser(poses: ColmapModel, root: Path, normalization: Normalization)
             train_split_fraction=1.0,
             images_path=poses.images,
             colmap_path=poses.folder,
-            load_3D_points=points_file(poses.folder) is not None,
+            load_3D_points=False,  # read with the seed points of other layouts
             **vars(normalization),
         )
     )

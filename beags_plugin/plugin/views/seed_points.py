@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.data.dataset import Dataset, PoseTable
+from beags_plugin.data.dataset import ColmapModel, Dataset, PoseTable
+from beags_plugin.data.layouts.colmap import points_file
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.colmap_files import read_colmap_points
 from beags_plugin.plugin.views.poses import PosedViews
@@ -31,15 +32,17 @@ def starting_points(scene: Dataset, views: PosedViews, count: int) -> dict[str, 
     cameras = [camera_from_nerfstudio(views.cameras, index) for index in range(len(views.images))]
     bounds = scene.poses.bounds if isinstance(scene.poses, PoseTable) else None
     scale = views.outputs.dataparser_scale
-    if scene.seed_points is not None:
-        reader = read_ply_points if scene.seed_points.suffix == ".ply" else read_colmap_points
-        points, colors = reader(scene.seed_points)
+    file = scene.seed_points
+    if isinstance(scene.poses, ColmapModel):
+        file = file or points_file(scene.poses.folder)
+    if file is not None:
+        points, colors = (read_ply_points if file.suffix == ".ply" else read_colmap_points)(file)
         transform = views.outputs.dataparser_transform
         moved = (torch.from_numpy(points) @ transform[:, :3].T + transform[:, 3]) * scale
         if bounds is None or _within_bounds(moved.numpy(), cameras, scale * bounds) > 0.9:
             found = {"points3D_xyz": moved, "points3D_rgb": torch.from_numpy(colors)}
         else:
-            say(f"{scene.seed_points} is not used: its points do not lie where the poses look.")
+            say(f"{file} is not used: its points do not lie where the poses look.")
     if found["points3D_xyz"] is not None and len(found["points3D_xyz"]) > 0:
         return {**found, "points3D_random": False}
     if bounds is None:

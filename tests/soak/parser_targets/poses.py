@@ -25,13 +25,15 @@ def _dtu(path: Path) -> None:
     read_cameras(path, sorted(pictures().iterdir()))
 
 
-def _colmap(path: Path) -> None:
+def _colmap(path: Path) -> object:
     from nerfstudio.data.utils import colmap_parsing_utils as colmap
 
-    from beags_plugin.plugin.views.colmap_files import _read
+    from beags_plugin.plugin.views.colmap_files import _read, read_colmap_points
 
     kind = path.name.split(".")[0]
-    _read(getattr(colmap, f"read_{kind}_binary"), path)
+    if kind == "points3D":
+        return read_colmap_points(path)
+    return _read(getattr(colmap, f"read_{kind}_binary"), path)
 
 
 def _transforms(path: Path) -> None:
