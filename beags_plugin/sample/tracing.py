@@ -46,10 +46,13 @@ def _surround(origin: np.ndarray, directions: np.ndarray) -> Hits:
     return Hits(np.minimum(t, ground), np.where(ground < t, GROUND, DOME).astype(np.int32))
 
 
-def first_hits(still: Still, origin: np.ndarray, directions: np.ndarray) -> tuple[Hits, list[np.ndarray]]:
+def first_hits(
+    still: Still, origin: np.ndarray, directions: np.ndarray, without: int | None = None
+) -> tuple[Hits, list[np.ndarray]]:
     """Find first hits of rays from one point, and for each object the rays that would hit it alone.
 
-    origin: [3], world, inside the dome and outside of all objects; directions: [N, 3], any length.
+    origin: [3], world, inside the dome and outside of all objects; directions: [N, 3], any length. without: class id of
+    an object that lets all rays pass.
     """
     hits = _surround(origin, directions)
     t, surface = hits.t, hits.surface
@@ -57,7 +60,7 @@ def first_hits(still: Still, origin: np.ndarray, directions: np.ndarray) -> tupl
     for class_id, thing in enumerate(still.things, start=1):
         rays, distances = object_hits(thing, origin, directions)
         silhouettes.append(rays)
-        first = distances < t[rays]
+        first = (distances < t[rays]) & (class_id != without)
         t[rays[first]] = distances[first]
         surface[rays[first]] = class_id
     return hits, silhouettes

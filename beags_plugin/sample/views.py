@@ -9,7 +9,7 @@ import numpy as np
 from beags_plugin.sample.arrangement import Still
 from beags_plugin.sample.lighting import Light
 from beags_plugin.sample.solids import turned
-from beags_plugin.sample.tracing import CHUNK, first_hits
+from beags_plugin.sample.tracing import CHUNK, first_hits, object_hits
 
 ELEVATIONS = (0.34, 0.66, 1.02)
 """Radians above the ground of the three rounds of cameras."""
@@ -115,17 +115,40 @@ def _grid(view: View, samples: int) -> tuple[np.ndarray, np.ndarray]:
 
 def render_image(still: Still, light: Light, view: View, samples: int) -> np.ndarray:
     """Render [H, W, 3] uint8 sRGB, the mean in linear light over samples x samples rays per pixel."""
-    x, y = _grid(view, samples)
-    per_pixel = samples * samples
+    pixels = _pixels(still, light, view, view.directions(*_grid(view, samples)), samples * samples)
+    return pixels.reshape(view.height, view.width, 3)
+
+
+def render_removed(
+    still: Still, light: Light, view: View, image: np.ndarray, class_id: int, samples: int
+) -> np.ndarray | None:
+    """Render ``image``, that of ``render_image``, with an object cut out; None if the object does not show in it.
+
+    Light is as with the object: what stays keeps its shadows, as it does for an object cut out of photos. Pixels that
+    do not show the object stay the same.
+    """
+    directions, per_pixel = view.directions(*_grid(view, samples)), samples * samples
+    rays, _ = object_hits(still.things[class_id - 1], view.center, directions)
+    places = np.unique(rays // per_pixel)
+    removed = image.reshape(-1, 3).copy()
+    directions = directions.reshape(-1, per_pixel, 3)[places].reshape(-1, 3)
+    removed[places] = _pixels(still, light, view, directions, per_pixel, without=class_id)
+    removed = removed.reshape(image.shape)
+    return None if np.array_equal(removed, image) else removed
+
+
+def _pixels(
+    still: Still, light: Light, view: View, directions: np.ndarray, per_pixel: int, without: int | None = None
+) -> np.ndarray:
+    """Return [P, 3] uint8 sRGB of pixels with ``per_pixel`` directions each, in order; without: see ``first_hits``."""
     chunk = CHUNK // per_pixel * per_pixel
-    pieces = []
-    for start in range(0, len(x), chunk):
-        directions = view.directions(x[start : start + chunk], y[start : start + chunk])
-        hits, _ = first_hits(still, view.center, directions)
-        colours = light.colours(view.center + hits.t[:, None] * directions, hits.surface)
+    pieces = [np.empty((0, 3))]
+    for start in range(0, len(directions), chunk):
+        part = directions[start : start + chunk]
+        hits, _ = first_hits(still, view.center, part, without)
+        colours = light.colours(view.center + hits.t[:, None] * part, hits.surface)
         pieces.append(np.minimum(colours, 1.0).reshape(-1, per_pixel, 3).mean(axis=1))
-    linear = np.concatenate(pieces).reshape(view.height, view.width, 3)
-    return np.floor(255.0 * linear ** (1.0 / 2.2) + 0.5).astype(np.uint8)
+    return np.floor(255.0 * np.concatenate(pieces) ** (1.0 / 2.2) + 0.5).astype(np.uint8)
 
 
 def render_view(still: Still, light: Light, view: View, samples: int = 2) -> Picture:

@@ -18,12 +18,12 @@ from beags_plugin.sample.degrade import Degradation, degrade_mask, dropped_views
 from beags_plugin.sample.lighting import Light
 from beags_plugin.sample.points import seed_points
 from beags_plugin.sample.seen import seen_part, visible_surface, well_seen
-from beags_plugin.sample.views import Picture, View, make_views, render_view
+from beags_plugin.sample.views import Picture, View, make_views, render_removed, render_view
 from beags_plugin.system.errors import UserError, unwritable, writing
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.reading.ply import write_vertices
 
-VERSION = 8
+VERSION = 9
 """Raise it whenever the same config would give other files: older samples are then rebuilt."""
 LARGEST_SIDE = 8192  # pixels
 POINT_NOISE = 0.03
@@ -89,8 +89,10 @@ def write_sample(
     Layout: transforms.json (OpenGL camera-to-world, world z up), images/<stem>.png, masks/<stem>.png (ids; degraded
     for train views, none for dropped ones, exact for test views), classes.json, seed_points.ply, and under
     ground_truth/ the exact masks/<stem>.png, silhouettes/<object>/<stem>.png (0 or 255), for test views
-    seen/<object>/<stem>.png (the part of the silhouette whose surface training photos show) and depth/<stem>.npy
-    (float32, z along the optical axis); masks and depth are those of the pixel centres. sample.json is the config.
+    seen/<object>/<stem>.png (the part of the silhouette whose surface training photos show) and, where the photo shows
+    the object, removed/<object>/<stem>.png (the photo with the object cut out, in the light as it was), and
+    depth/<stem>.npy (float32, z along the optical axis); masks and depth are those of the pixel centres. sample.json is
+    the config.
 
     All is written into a temporary folder beside it and renamed at the end: an interrupted run leaves no ``folder``.
     A folder that holds another sample is replaced.
@@ -144,6 +146,10 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
         mask = picture.labels
         if view.split == "test":
             silhouettes[view.name] = picture.silhouettes
+            for class_id in range(1, len(names)):
+                removed = render_removed(still, light, view, picture.image, class_id, config.antialias)
+                if removed is not None:
+                    _write_png(folder / "ground_truth" / "removed" / names[class_id] / f"{view.name}.png", removed)
         else:
             for surface, part in zip(surfaces, visible_surface(view, picture), strict=True):
                 surface.append(part)
@@ -195,7 +201,7 @@ def transforms(views: list[View]) -> dict[str, Any]:
 
 
 def _truth_folders(names: dict[int, str]) -> list[str]:
-    kinds = ("silhouettes", "seen")
+    kinds = ("silhouettes", "seen", "removed")
     objects = [f"ground_truth/{kind}/{name}" for kind in kinds for class_id, name in names.items() if class_id]
     return ["ground_truth/masks", "ground_truth/depth", *objects]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,8 @@ from beags_plugin.core.cameras import viewmat_from_opengl
 from beags_plugin.sample.arrangement import DOME_RADIUS, make_still
 from beags_plugin.sample.lighting import Light
 from beags_plugin.sample.solids import Ball, Cone, Solid, Tube, slab
-from beags_plugin.sample.views import make_views, render_view
+from beags_plugin.sample.tracing import first_hits
+from beags_plugin.sample.views import make_views, render_removed, render_view
 
 WIDTH, HEIGHT = 96, 72
 
@@ -145,6 +148,30 @@ def test_silhouettes_hold_the_visible_masks(scene):
         assert np.array_equal(picture.silhouettes.any(axis=0), picture.labels > 0)
     assert occluded > 20
     assert unoccluded > 5
+
+
+@pytest.mark.parametrize("class_id", range(1, 8))
+def test_a_removed_object_lets_through_what_stands_behind_it_in_the_same_light(scene, class_id):
+    """Against the scene described without it: what its rays meet has the colour that it has with the object there."""
+    still, views, pictures = scene
+    light = Light(still, object_samples=2, ground_samples=6)
+    rest = replace(still, things=tuple(t for i, t in enumerate(still.things, start=1) if i != class_id))
+    uncovered = 0
+    for view, picture in list(zip(views, pictures, strict=True))[::4]:
+        removed = render_removed(still, light, view, picture.image, class_id, 1)
+        there = picture.labels == class_id
+        assert removed is not None and np.array_equal(removed[~there], picture.image[~there])
+        rows, columns = np.nonzero(there)
+        rays = view.directions(columns + 0.5, rows + 0.5)
+        hits, _ = first_hits(rest, view.center, rays)
+        surface = hits.surface + (hits.surface >= class_id)  # the objects behind have moved up
+        colours = np.minimum(light.colours(view.center + hits.t[:, None] * rays, surface), 1.0)
+        assert np.array_equal(removed[there], np.floor(255.0 * colours ** (1 / 2.2) + 0.5))
+        uncovered += (removed != picture.image).any(axis=-1).sum() / there.sum()
+        elsewhere = replace(view, cx=view.cx + 10 * view.width)
+        blank = np.zeros_like(picture.image)
+        assert render_removed(still, light, elsewhere, blank, class_id, 1) is None
+    assert uncovered > 0.95 * 3
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.ndimage import grey_dilation
 
 from beags_plugin.sample import writer
 from beags_plugin.sample.arrangement import DOME_RADIUS, make_still
@@ -47,6 +48,13 @@ def test_folder_layout(folder):
                 silhouette = grey(folder / "ground_truth/silhouettes" / name / f"{stem}.png")
                 assert set(np.unique(silhouette)) <= {0, 255}
                 assert (silhouette[truth == int(class_id)] == 255).all()
+                removed = folder / "ground_truth/removed" / name / f"{stem}.png"
+                shown = path in meta["test_filenames"] and (truth == int(class_id)).any()
+                assert removed.exists() or not shown
+                if removed.exists():
+                    changed = (grey(removed) != grey(folder / path)).any(axis=-1)
+                    rim = grey_dilation(silhouette, 3)
+                    assert path in meta["test_filenames"] and changed.any() and (rim[changed] == 255).all()
         if path in meta["test_filenames"]:
             assert np.array_equal(grey(folder / "masks" / f"{stem}.png"), truth)
     assert len(list((folder / "masks").iterdir())) == 6  # a fifth of five views is dropped
