@@ -76,7 +76,7 @@ class Resume:
 
 @dataclass
 class Sample:
-    """Generate a scene with exact ground truth: photos, damaged masks, silhouettes, depth."""
+    """Generate a scene with exact ground truth: photos, damaged masks, silhouettes, depth, objects removed."""
 
     output: Path = Path("outputs/sample")
     """Folder to write."""
