@@ -124,17 +124,19 @@ def render_removed(
 ) -> np.ndarray | None:
     """Render ``image``, that of ``render_image``, with an object cut out; None if the object does not show in it.
 
-    Light is as with the object: what stays keeps its shadows, as it does for an object cut out of photos. Pixels that
-    do not show the object stay the same.
+    Light is as with the object: what stays keeps its shadows, as it does for an object cut out of photos. Pixels none
+    of whose rays meets the object first stay the same.
     """
     directions, per_pixel = view.directions(*_grid(view, samples)), samples * samples
     rays, _ = object_hits(still.things[class_id - 1], view.center, directions)
-    places = np.unique(rays // per_pixel)
+    first = first_hits(still, view.center, directions[rays])[0].surface == class_id
+    places = np.unique(rays[first] // per_pixel)
+    if not len(places):
+        return None
     removed = image.reshape(-1, 3).copy()
     directions = directions.reshape(-1, per_pixel, 3)[places].reshape(-1, 3)
     removed[places] = _pixels(still, light, view, directions, per_pixel, without=class_id)
-    removed = removed.reshape(image.shape)
-    return None if np.array_equal(removed, image) else removed
+    return removed.reshape(image.shape)
 
 
 def _pixels(
@@ -142,7 +144,7 @@ def _pixels(
 ) -> np.ndarray:
     """Return [P, 3] uint8 sRGB of pixels with ``per_pixel`` directions each, in order; without: see ``first_hits``."""
     chunk = CHUNK // per_pixel * per_pixel
-    pieces = [np.empty((0, 3))]
+    pieces = []
     for start in range(0, len(directions), chunk):
         part = directions[start : start + chunk]
         hits, _ = first_hits(still, view.center, part, without)
