@@ -124,9 +124,9 @@ def test_every_ray_ends_in_the_room_and_cameras_stand_free(room):
 
 def test_some_held_out_views_show_what_hardly_any_photo_shows(room):
     seed, made = room
-    views = room_views(seed, 48, 36, 60, 12)
+    views = room_views(seed, 24, 18, 60, 12)
     photos = [view for view in views if view.split == "train"]
-    x, y = np.indices((48, 36)).reshape(2, -1) + 0.5
+    x, y = np.indices((24, 18)).reshape(2, -1) + 0.5
     shares = []
     for view in views:
         if view.split == "test":
