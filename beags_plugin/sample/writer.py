@@ -13,13 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from beags_plugin.sample.arrangement import make_still
 from beags_plugin.sample.degrade import Degradation, degrade_mask, dropped_views, resolve_degradation
-from beags_plugin.sample.lighting import Light
+from beags_plugin.sample.families import FAMILIES
 from beags_plugin.sample.points import seed_points
 from beags_plugin.sample.seen import seen_part, visible_surface, well_seen
-from beags_plugin.sample.views import Picture, View, make_views, render_removed, render_view
-from beags_plugin.system.errors import UserError, unwritable, writing
+from beags_plugin.sample.views import Picture, View, render_removed, render_view
+from beags_plugin.system.errors import UserError, check_choice, unwritable, writing
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.reading.ply import write_vertices
 
@@ -35,6 +34,7 @@ SAMPLE_FILE = "sample.json"
 class SampleConfig:
     """Options that decide every byte of the sample.
 
+    family: of scenes: "tabletop" (solids on the ground, seen from all sides) or "room" (a closed room, see ``room``).
     seed: of arrangement, sizes, colours, textures, light, camera jitter, mask degradation.
     width, height: pixels. num_train, num_test: views.
     degradation: of the train masks: "none", "mild", "strong", a degree as text ("1.5"), or a ``Degradation``.
@@ -49,6 +49,7 @@ class SampleConfig:
     degradation: str | Degradation = "mild"
     num_points: int = 2000
     antialias: int = 2
+    family: str = "tabletop"
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that makes no scene."""
@@ -59,6 +60,7 @@ class SampleConfig:
         for name in ("width", "height"):
             if getattr(self, name) > LARGEST_SIDE:
                 raise UserError(f"the sample's {name} is {getattr(self, name)}: give at most {LARGEST_SIDE}.")
+        check_choice(self.family, FAMILIES, "family of scenes")
         resolve_degradation(self.degradation)
 
     def as_dict(self) -> dict[str, Any]:
@@ -125,9 +127,10 @@ def write_sample(
 
 
 def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], None] | None) -> None:
-    still = make_still(config.seed)
-    light = Light(still)
-    views = make_views(config.seed, config.width, config.height, config.num_train, config.num_test)
+    family = FAMILIES[config.family]
+    still = family.scene(config.seed)
+    light = family.light(still)
+    views = family.views(config.seed, config.width, config.height, config.num_train, config.num_test)
     degradation = resolve_degradation(config.degradation)
     train = [view.name for view in views if view.split == "train"]
     dropped = dropped_views(train, config.seed, degradation.dropped)
@@ -233,8 +236,10 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def make_sample(folder: Path, seed: int, width: int, height: int, degradation: str, views: int = 60) -> None:
+def make_sample(
+    folder: Path, seed: int, width: int, height: int, degradation: str, views: int = 60, family: str = "tabletop"
+) -> None:
     """Generate the sample with ``views`` training views in ``folder`` unless the same one lies there already."""
-    config = SampleConfig(seed=seed, width=width, height=height, degradation=degradation, num_train=views)
+    config = SampleConfig(seed, width, height, views, degradation=degradation, family=family)
     with progress_bar("Tracing the sample") as progress:
         write_sample(folder, config, progress)
