@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from beags_plugin.bench.scenes import SEEDS
 from beags_plugin.system.errors import UserError, check_choice, meant
 from beags_plugin.system.shipped import read_toml, shipped_folder, shipped_names
 
@@ -51,7 +52,8 @@ class PaperFigures:
 class Experiment:
     """The content of ``experiments/<name>.toml``.
 
-    sample_seeds, sample: seeds of the generated scenes, and other options of ``SampleConfig``. seeds: of the training.
+    samples, sample: family and seed of the generated scenes, and other options of ``SampleConfig``. seeds: of the
+    training.
     reference: the variant that the others' errors are compared with. confidence, front: also plot the masks'
     confidence, or the Pareto front. relative_to_pixels: sweeps whose axis is also given per million training pixels.
     """
@@ -59,7 +61,7 @@ class Experiment:
     name: str
     description: str
     preset: str
-    sample_seeds: tuple[int, ...]
+    samples: tuple[tuple[str, int], ...]
     sample: Mapping[str, Any]
     seeds: tuple[int, ...]
     variants: tuple[Variant, ...]
@@ -140,7 +142,7 @@ class _Reader:
             name=self.path.stem,
             description=self.value(content, "description", str),
             preset=self.value(content, "preset", str),
-            sample_seeds=self.whole_numbers(sample.pop("seeds", [0]), "sample.seeds"),
+            samples=self.samples(sample),
             sample=self.checked_sample(sample),
             seeds=self.whole_numbers(content.get("seeds", [42]), "seeds"),
             variants=tuple(variants),
@@ -198,11 +200,24 @@ class _Reader:
             rows[name] = tuple((float(iou), float(biou)) for iou, biou in pairs)
         return PaperFigures(self.value(table, "source", str, where="paper: "), tuple(columns), rows)
 
+    def samples(self, sample: dict[str, Any]) -> tuple[tuple[str, int], ...]:
+        """Take families and seeds out of the table; the families take turns, so that the first scenes are of each."""
+        from beags_plugin.sample.families import FAMILIES
+
+        families, seeds = sample.pop("families", ["tabletop"]), sample.pop("seeds", [0])
+        if not isinstance(families, list) or not families or not set(map(str, families)) <= set(FAMILIES):
+            raise self.wrong(f"sample.families must be a list of {', '.join(FAMILIES)}.")
+        if isinstance(seeds, str):
+            if seeds not in SEEDS:
+                raise self.wrong(f"sample.seeds is {seeds!r}: choose one of {', '.join(SEEDS)}, or list whole numbers.")
+            seeds = list(SEEDS[seeds])
+        return tuple((family, seed) for seed in self.whole_numbers(seeds, "sample.seeds") for family in families)
+
     def checked_sample(self, options: dict[str, Any]) -> dict[str, Any]:
         from beags_plugin.sample.writer import SampleConfig
 
         try:
-            SampleConfig(**options).check()
+            SampleConfig(**options, family="tabletop", seed=0).check()
         except (TypeError, UserError) as error:
             raise self.wrong(f"sample: {error}") from None
         return options

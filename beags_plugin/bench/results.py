@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from beags_plugin.bench.experiment import Experiment, Variant
-from beags_plugin.evaluation.metrics import METRICS
-from beags_plugin.evaluation.records import KINDS
+from beags_plugin.evaluation.records import FIGURES as METRICS
 from beags_plugin.evaluation.report import STAGES as MOMENTS
 
 STAGES = ("base training", "reprojection", "assignment", "voxel grids", "refinement")
@@ -17,7 +16,7 @@ MEAN = "mean"  # in the column "object": over all masks of the scene
 _PLACE = ("scene", "seed", "variant", "sweep", "line", "x", "object", "failed")
 _COSTS = ("cpu_seconds", "peak_memory_mb", "own_memory_mb", "steps", "gaussians")
 _QUALITY = tuple(f"{metric}_{moment}" for metric in ("psnr", "ssim") for moment in MOMENTS) + tuple(
-    f"{kind}_{metric}_{moment}" for kind in KINDS for metric in METRICS for moment in MOMENTS
+    f"{kind}_{metric}_{moment}" for kind, metrics in METRICS.items() for metric in metrics for moment in MOMENTS
 )
 _WORST, _LOST = "worst_biou_after", "lost_biou"
 _OBJECTS = (_WORST, _LOST)  # extracted BIoU of the worst object; the most that an object loses against before
@@ -74,8 +73,8 @@ def _masks(found: Mapping[str, Any]) -> dict[str, float | None]:
     """Return the mask figures of ``RunMetrics.to_json``, {kind: {moment: {metric: value}}}, by names of ``FIGURES``."""
     return {
         f"{kind}_{metric}_{moment}": found[kind][moment][metric]
-        for kind in KINDS
-        for metric in METRICS
+        for kind, metrics in METRICS.items()
+        for metric in metrics
         for moment in MOMENTS
     }
 

@@ -85,7 +85,7 @@ def adapted(experiment: Experiment, options: ExperimentOptions) -> Experiment:
         for variant in _thinned(experiment.variants)
     )
     sample = {**experiment.sample, **QUICK_SAMPLE}
-    return dataclasses.replace(experiment, variants=variants, sample=sample, sample_seeds=experiment.sample_seeds[:1])
+    return dataclasses.replace(experiment, variants=variants, sample=sample, samples=experiment.samples[:1])
 
 
 def _thinned(variants: Sequence[Variant]) -> list[Variant]:
@@ -103,13 +103,11 @@ def scenes_of(experiment: Experiment, options: ExperimentOptions) -> list[TrialS
     Raises ``UserError`` if there are none at all, or fewer samples than asked for.
     """
     given = given_scenes(options.data, options.downscale)
-    count = options.scenes if options.scenes is not None else (0 if given else len(experiment.sample_seeds))
-    if not 0 <= count <= len(experiment.sample_seeds):
-        raise UserError(
-            f"--scenes is {count}, but {experiment.name} names {len(experiment.sample_seeds)} sample scenes."
-        )
+    count = options.scenes if options.scenes is not None else (0 if given else len(experiment.samples))
+    if not 0 <= count <= len(experiment.samples):
+        raise UserError(f"--scenes is {count}, but {experiment.name} names {len(experiment.samples)} sample scenes.")
     folder = options.output / "scenes"
-    samples = [sample_scene(folder, seed, experiment.sample) for seed in experiment.sample_seeds[:count]]
+    samples = [sample_scene(folder, *which, experiment.sample) for which in experiment.samples[:count]]
     if not samples and not given:
         raise UserError("there is no scene to train on: name a folder with --data, or give --scenes 1 or more.")
     return samples + given

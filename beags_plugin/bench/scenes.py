@@ -18,6 +18,9 @@ from beags_plugin.system.digests import folder_digest, value_digest
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.progress import progress_bar
 
+SEEDS = {"choosing": (0, 1, 2), "reporting": (100, 101, 102, 103, 104)}
+"""Seeds of generated scenes. No choice is made by a result on those for reporting."""
+
 
 @dataclass(frozen=True)
 class TrialScene:
@@ -30,17 +33,17 @@ class TrialScene:
     seed: int = 0
 
 
-def sample_scene(folder: Path, seed: int, options: Mapping[str, Any]) -> TrialScene:
-    """Return the generated scene of that seed; write it into ``folder`` unless it is there."""
+def sample_scene(folder: Path, family: str, seed: int, options: Mapping[str, Any]) -> TrialScene:
+    """Return the generated scene of that family and seed; write it into ``folder`` unless it is there."""
     from beags_plugin.sample.writer import SampleConfig, is_sample, write_sample
 
-    config = SampleConfig(**{**options, "seed": seed})
+    config = SampleConfig(**{**options, "family": family, "seed": seed})
     digest = value_digest(config.as_dict())
-    target = folder / f"sample-{seed}-{digest[:8]}"
+    target = folder / f"{family}-{seed}-{digest[:8]}"
     if not is_sample(target, config):
-        with progress_bar(f"Tracing sample {seed}") as progress:
+        with progress_bar(f"Tracing {family} {seed}") as progress:
             write_sample(target, config, progress)
-    return TrialScene(f"sample {seed}", target, 1.0, digest, seed)
+    return TrialScene(f"{family} {seed}", target, 1.0, digest, seed)
 
 
 def given_scenes(folders: Sequence[Path], downscale: float | None) -> list[TrialScene]:

@@ -19,6 +19,8 @@ _COLUMNS = (  # head, figure, digits, factor
     ("\nlost", "lost_biou", 1, 100.0),
     ("rendered\nIoU", "rendered_iou_after", 1, 100.0),
     ("\nBIoU", "rendered_biou_after", 1, 100.0),
+    ("removal\nPSNR", "removal_psnr_after", 2, 1.0),
+    ("\nremains", "removal_remains_after", 1, 100.0),
     ("PSNR, dB\nbefore", "psnr_before", 2, 1.0),
     ("\nafter", "psnr_after", 2, 1.0),
     ("SSIM\nafter", "ssim_after", 3, 1.0),
@@ -41,6 +43,8 @@ def tables(experiment: Experiment, rows: Sequence[ResultRow]) -> list[Table | st
     if experiment.paper is not None:
         printed.append(paper_table(experiment.paper, experiment.reference))
     printed.append("Worst object: the lowest extracted BIoU; lost: the most that an object loses by refinement.")
+    if _any(rows, "removal_psnr_after"):
+        printed.append("Removal: the scene without an object, against the exact picture; remains: pixels that show it.")
     printed.append("Seconds of stages are wall time; CPU: of the whole trial after its base, all threads.")
     printed.append("Memory: the peak of the trial's process, and what of it the loaded program does not take.")
     if experiment.reference is not None:
@@ -54,12 +58,13 @@ def _table(experiment: Experiment, rows: Sequence[ResultRow], title: str) -> Tab
     from rich.text import Text
 
     relative = any(row.variant.sweep in experiment.relative_to_pixels for row in rows)
-    masks = experiment.confidence and any(row.figures["mask_error_given"] is not None for row in rows)
+    masks = experiment.confidence and _any(rows, "mask_error_given")
     compared = experiment.reference is not None
+    columns = [column for column in _COLUMNS if "removal" not in column[1] or _any(rows, column[1])]
     heads = ["per 10^6\npixels"] if relative else []
     heads += ["wrong, %\ngiven", "mask pixels\nused"] if masks else []
     heads += ["BIoU error\nleft, %"] if compared else []
-    table = new_table(title, ["variant", *heads, *(head for head, *_ in _COLUMNS)])
+    table = new_table(title, ["variant", *heads, *(head for head, *_ in columns)])
     reference = find_reference(rows, experiment, rows[0].scene) if rows else None
     former = None
     for row in rows:
@@ -72,8 +77,12 @@ def _table(experiment: Experiment, rows: Sequence[ResultRow], title: str) -> Tab
             cells += [number(row.figures[f"mask_error_{kind}"], 2, 100.0) for kind in ("given", "used")]
         if compared:
             cells.append(number(error_left(row, reference), 1, 100.0))
-        table.add_row(Text(name), *cells, *(["failed"] if row.failed else _cells(row)))
+        table.add_row(Text(name), *cells, *(["failed"] if row.failed else _cells(row, columns)))
     return table
+
+
+def _any(rows: Sequence[ResultRow], figure: str) -> bool:
+    return any(row.figures[figure] is not None for row in rows)
 
 
 def per_million_pixels(row: ResultRow, experiment: Experiment) -> str:
@@ -84,10 +93,10 @@ def per_million_pixels(row: ResultRow, experiment: Experiment) -> str:
     return f"{1e6 * row.variant.x / pixels:.3g}"
 
 
-def _cells(row: ResultRow) -> list[str]:
+def _cells(row: ResultRow, columns: Sequence[tuple[str, str, int, float]]) -> list[str]:
     prepare = sum(value for stage in STAGES[1:-1] if (value := row.figures[f"seconds {stage}"]) is not None)
     figures = {**row.figures, "prepare": prepare}
-    return [number(figures[name], digits, factor) for _, name, digits, factor in _COLUMNS]
+    return [number(figures[name], digits, factor) for _, name, digits, factor in columns]
 
 
 def paper_table(paper: PaperFigures, reference: str | None) -> Table:

@@ -76,7 +76,7 @@ class Resume:
 
 @dataclass
 class Sample:
-    """Generate a scene with exact ground truth: photos, damaged masks, silhouettes, depth."""
+    """Generate a scene with exact ground truth: photos, damaged masks, silhouettes, depth, objects removed."""
 
     output: Path = Path("outputs/sample")
     """Folder to write."""
@@ -90,11 +90,14 @@ class Sample:
     """How masks are damaged: none, mild or strong, or any degree from 0 on (1 is mild, 2 strong)."""
     views: int = 60
     """Views to train on; 12 more are held out."""
+    family: str = "tabletop"
+    """tabletop: plain solids that touch, seen from all sides. room: a closed, furnished room with textured objects that
+    lean on and stand in one another, seen from one side of a table."""
 
     def run(self) -> None:
         with starting(self):
             from beags_plugin.sample.writer import make_sample
-        make_sample(self.output, self.seed, self.width, self.height, self.degradation, self.views)
+        make_sample(self.output, self.seed, self.width, self.height, self.degradation, self.views, self.family)
         CONSOLE.print(f"sample: {self.output}", markup=False)
 
 

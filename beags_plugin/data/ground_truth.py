@@ -1,4 +1,4 @@
-"""Exact masks kept for evaluation only."""
+"""Exact masks and pictures kept for evaluation only."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ FilesPerView = list[Path | None]
 
 
 class GroundTruth(TypedDict):
-    """Files of exact masks, one or None per view.
+    """Files of exact masks and pictures, one or None per view.
 
     masks: id images. visible, silhouettes, seen: object name to binary masks of its visible part, without occlusion,
-    and of the part of the silhouette that training photos show.
+    and of the part of the silhouette that training photos show. removed: to pictures without the object.
     """
 
     masks: FilesPerView
     visible: dict[str, FilesPerView]
     silhouettes: dict[str, FilesPerView]
     seen: dict[str, FilesPerView]
+    removed: dict[str, FilesPerView]
 
 
 def of_views(truth: GroundTruth, chosen: Sequence[int]) -> GroundTruth:
@@ -36,13 +37,14 @@ def of_views(truth: GroundTruth, chosen: Sequence[int]) -> GroundTruth:
         visible=each(truth["visible"]),
         silhouettes=each(truth["silhouettes"]),
         seen=each(truth["seen"]),
+        removed=each(truth["removed"]),
     )
 
 
 def find_ground_truth(folder: Path, dataset: Dataset, images: Sequence[Path], images_root: Path) -> GroundTruth | None:
-    """Find the exact masks in ``folder`` and those of the layout; None without any.
+    """Find the exact masks and pictures in ``folder`` and those of the layout; None without any.
 
-    ``folder`` holds masks/<stem>.png, and <kind>/<object>/<stem>.png for visible, silhouettes and seen.
+    ``folder`` holds masks/<stem>.png, and <kind>/<object>/<stem>.png for visible, silhouettes, seen and removed.
     """
     if not (folder.is_dir() or dataset.visible or dataset.silhouettes):
         return None
@@ -60,4 +62,5 @@ def find_ground_truth(folder: Path, dataset: Dataset, images: Sequence[Path], im
         visible=per_object("visible", dataset.visible),
         silhouettes=per_object("silhouettes", dataset.silhouettes),
         seen=per_object("seen", {}),
+        removed=per_object("removed", {}),
     )

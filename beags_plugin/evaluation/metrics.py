@@ -1,10 +1,10 @@
-"""Mask metrics (Acc, IoU, BIoU), PSNR, and their means over views and objects (method, section 8)."""
+"""Metrics of masks (Acc, IoU, BIoU) and removals, PSNR, and their means over views and objects (method, section 8)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import cv2
@@ -27,6 +27,18 @@ class MaskMetrics:
     acc: float | None
     iou: float | None
     biou: float | None
+
+
+@dataclass(frozen=True)
+class RemovalMetrics:
+    """What is left where an object was taken out of the scene, or a mean of it; see ``removal.removal_metrics``.
+
+    psnr: dB, infinite for equal pixels. ssim: at most 1. remains: 0..1, lower is better. None as in ``MaskMetrics``.
+    """
+
+    psnr: float | None
+    ssim: float | None
+    remains: float | None
 
 
 def _array(image: Any) -> np.ndarray:
@@ -112,7 +124,12 @@ def mean(values: Iterable[float | None]) -> float | None:
     return math.fsum(present) / len(present) if present else None
 
 
-def mean_metrics(metrics: Iterable[MaskMetrics | None]) -> MaskMetrics | None:
-    """Return the mean of each metric over those who have it; None for no metrics at all."""
+def mean_metrics(metrics: Iterable[Any]) -> Any:
+    """Return the mean of each metric over those who have it, as metrics of the same type; None for no metrics at all.
+
+    metrics: ``MaskMetrics``, or ``RemovalMetrics``, or None.
+    """
     rows = [row for row in metrics if row is not None]
-    return MaskMetrics(*(mean(getattr(row, name) for row in rows) for name in METRICS)) if rows else None
+    if not rows:
+        return None
+    return type(rows[0])(*(mean(getattr(row, field.name) for row in rows) for field in fields(rows[0])))

@@ -9,12 +9,17 @@ from typing import Literal
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.evaluation.metrics import MaskMetrics
+from beags_plugin.evaluation.metrics import METRICS, MaskMetrics, RemovalMetrics
 
-Kind = Literal["extracted", "seen", "rendered"]
-KINDS: tuple[Kind, ...] = ("extracted", "seen", "rendered")
+MaskKind = Literal["extracted", "seen", "rendered"]
+MASK_KINDS: tuple[MaskKind, ...] = ("extracted", "seen", "rendered")
 """extracted: the object rendered alone. seen: the same over the parts that training photos show, where the data says
 which. rendered: the object's share of the whole scene."""
+Kind = MaskKind | Literal["removal"]
+FIGURES: dict[Kind, tuple[str, ...]] = {**dict.fromkeys(MASK_KINDS, METRICS), "removal": ("psnr", "ssim", "remains")}
+"""The names of the figures of each kind. removal: the scene rendered without the object, where the data has an exact
+picture of that."""
+KINDS = tuple(FIGURES)
 
 
 @dataclass(frozen=True)
@@ -25,7 +30,8 @@ class EvalView:
     without masks; predictions are resized to it. silhouettes: object id to [h, w] bool, what the object covers when
     nothing stands before it. seen: object id to [h, w] bool, the part of the silhouette whose surface some training
     photo shows; metrics of the kind "seen" leave out the rest. visible_objects: object id to [h, w] bool, the visible
-    part where single objects were labelled and nothing is known of the others; scored instead of ``visible``.
+    part where single objects were labelled and nothing is known of the others; scored instead of ``visible``. removed:
+    object id to [H, W, 3] float in 0..1, the exact picture without it.
     """
 
     camera: Camera
@@ -35,20 +41,22 @@ class EvalView:
     name: str = ""
     seen: Mapping[int, Tensor] | None = None
     visible_objects: Mapping[int, Tensor] | None = None
+    removed: Mapping[int, Tensor] | None = None
 
 
 @dataclass(frozen=True)
 class ObjectMetrics:
-    """The metrics of each kind of masks; None where there was no mask to compare with."""
+    """The metrics of each kind; None where there was nothing to compare with."""
 
     extracted: MaskMetrics | None
     rendered: MaskMetrics | None
     seen: MaskMetrics | None = None
+    removal: RemovalMetrics | None = None
 
 
 @dataclass(frozen=True)
 class MaskRecord:
-    """One scored mask.
+    """One scored mask, or object taken out.
 
     kind: see ``KINDS``. view: index of the view. truth: "silhouette" or "visible".
     """
@@ -57,7 +65,7 @@ class MaskRecord:
     class_id: int
     view: int
     truth: str
-    metrics: MaskMetrics
+    metrics: MaskMetrics | RemovalMetrics
 
 
 @dataclass(frozen=True)

@@ -7,16 +7,18 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from beags_plugin.evaluation.metrics import METRICS, MaskMetrics, mean, mean_metrics
+from beags_plugin.evaluation.metrics import mean, mean_metrics
 from beags_plugin.evaluation.protocol import Protocol
-from beags_plugin.evaluation.records import KINDS, Kind, ObjectMetrics, SceneMetrics
+from beags_plugin.evaluation.records import FIGURES, KINDS, Kind, ObjectMetrics, SceneMetrics
 from beags_plugin.evaluation.run_metrics import pooled_average
 
 Stage = Literal["before", "after"]
 STAGES: tuple[Stage, ...] = ("before", "after")
 CSV_COLUMNS = (
-    "scene", "object", "stage", *(f"{kind}_{metric}" for kind in KINDS for metric in METRICS), "psnr", "ssim",
-)  # fmt: skip
+    *("scene", "object", "stage"),
+    *(f"{kind}_{name}" for kind, names in FIGURES.items() for name in names),
+    *("psnr", "ssim"),
+)
 
 
 @dataclass(frozen=True)
@@ -57,10 +59,10 @@ class RunMetrics:
         """Return the run as plain values for ``json.dump``; a figure that does not exist or is infinite is None.
 
         {"scene", "config", "protocol": {choice: value}, "extracted_truth", "notes": [sentence], "mean": {"extracted":
-        {"before": {"acc", "iou", "biou"}, "after": {...}}, "seen": {...}, "rendered": {...}}, "psnr": {"before",
-        "after"}, "ssim": {"before", "after"}, "objects": {name: as mean}, "worst": name, "masks": [{"kind", "object",
-        "view", "truth", "before": {"acc", "iou", "biou"}, "after": {...}}], "views": [{"view", "psnr": {"before",
-        "after"}, "ssim": {...}}]}.
+        {"before": {"acc", "iou", "biou"}, "after": {...}}, "seen": {...}, "rendered": {...}, "removal": {"before":
+        {"psnr", "ssim", "remains"}, "after": {...}}}, "psnr": {"before", "after"}, "ssim": {"before", "after"},
+        "objects": {name: as mean}, "worst": name, "masks": [{"kind", "object", "view", "truth", "before": as in mean,
+        "after": {...}}], "views": [{"view", "psnr": {"before", "after"}, "ssim": {...}}]}.
         """
         names, stages = self.names(), self.stages()
         view_names = [view.name for view in self.after.views]
@@ -68,11 +70,11 @@ class RunMetrics:
         def numbers(pick: Callable[[SceneMetrics], float | None]) -> dict[str, Any]:
             return {stage: finite(pick(stages[stage])) if stage in stages else None for stage in STAGES}
 
-        def metrics(pick: Callable[[SceneMetrics], MaskMetrics | None]) -> dict[str, Any]:
-            return {stage: plain_metrics(pick(stages[stage]) if stage in stages else None) for stage in STAGES}
+        def metrics(kind: Kind, pick: Callable[[SceneMetrics], Any]) -> dict[str, Any]:
+            return {stage: plain_metrics(kind, pick(stages[stage]) if stage in stages else None) for stage in STAGES}
 
         def all_kinds(pick: Callable[[SceneMetrics], ObjectMetrics]) -> dict[str, Any]:
-            return {kind: metrics(lambda scene, kind=kind: getattr(pick(scene), kind)) for kind in KINDS}
+            return {kind: metrics(kind, lambda scene, kind=kind: getattr(pick(scene), kind)) for kind in KINDS}
 
         return {
             "scene": self.scene,
@@ -91,7 +93,7 @@ class RunMetrics:
                     "object": names[mask.class_id],
                     "view": view_names[mask.view],
                     "truth": mask.truth,
-                    **metrics(lambda scene, i=i: scene.masks[i].metrics),
+                    **metrics(mask.kind, lambda scene, i=i: scene.masks[i].metrics),
                 }
                 for i, mask in enumerate(self.after.masks)
             ],
@@ -110,7 +112,7 @@ class RunMetrics:
 class DataSetMetrics:
     """Runs of one protocol and their mean.
 
-    name: of the data set, in tables. means: stage to the mean of both kinds. psnr, ssim: stage to their means. "before"
+    name: of the data set, in tables. means: stage to the mean of all kinds. psnr, ssim: stage to their means. "before"
     is left out unless all scenes with "after" have it.
     """
 
@@ -127,7 +129,7 @@ class DataSetMetrics:
             "data_set": self.name,
             "protocol": self.runs[0].protocol.to_json(),
             "mean": {
-                kind: {stage: plain_metrics(getattr(self.means.get(stage, empty), kind)) for stage in STAGES}
+                kind: {stage: plain_metrics(kind, getattr(self.means.get(stage, empty), kind)) for stage in STAGES}
                 for kind in KINDS
             },
             "psnr": {stage: finite(self.psnr.get(stage)) for stage in STAGES},
@@ -153,7 +155,7 @@ def data_set(name: str, runs: Sequence[RunMetrics]) -> DataSetMetrics:
     if not runs or len({run.protocol for run in runs}) != 1:
         raise ValueError("a data set needs runs, all scored by one protocol")
     protocol = runs[0].protocol
-    kinds: dict[Stage, dict[Kind, MaskMetrics | None]] = {stage: {} for stage in STAGES}
+    kinds: dict[Stage, dict[Kind, Any]] = {stage: {} for stage in STAGES}
     for kind in KINDS:
         for stage, scenes in _comparable(runs, lambda scene, kind=kind: getattr(scene.mean, kind)).items():
             if protocol.data_set_average == "pooled":
@@ -191,13 +193,13 @@ def _comparable(runs: Sequence[RunMetrics], has: Callable[[SceneMetrics], Any]) 
     return scenes
 
 
-def plain_metrics(metrics: MaskMetrics | None) -> dict[str, float | None]:
-    """Return {"acc", "iou", "biou"}, each a float or None."""
-    return {name: None if metrics is None else finite(getattr(metrics, name)) for name in METRICS}
+def plain_metrics(kind: Kind, metrics: Any) -> dict[str, float | None]:
+    """Return the metrics of a kind by name, such as {"acc", "iou", "biou"}, each a float or None."""
+    return {name: None if metrics is None else finite(getattr(metrics, name)) for name in FIGURES[kind]}
 
 
 def _cells(metrics: ObjectMetrics) -> list[float | None]:
-    return [value for kind in KINDS for value in plain_metrics(getattr(metrics, kind)).values()]
+    return [value for kind in KINDS for value in plain_metrics(kind, getattr(metrics, kind)).values()]
 
 
 def finite(value: float | None) -> float | None:

@@ -1,19 +1,31 @@
-"""Scores of the objects that a labelled scene yields: extracted and rendered masks, PSNR, SSIM (method, section 8)."""
+"""Scores of the objects that a labelled scene yields: masks, removals, PSNR, SSIM (method, section 8)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.evaluation.metrics import MaskMetrics, mask_metrics, mean, mean_metrics, psnr
+from beags_plugin.evaluation.metrics import mask_metrics, mean, mean_metrics, psnr
 from beags_plugin.evaluation.protocol import Protocol
-from beags_plugin.evaluation.records import KINDS, EvalView, Kind, MaskRecord, ObjectMetrics, SceneMetrics, ViewRecord
-from beags_plugin.extraction.select import select_class
+from beags_plugin.evaluation.records import (
+    KINDS,
+    MASK_KINDS,
+    EvalView,
+    Kind,
+    MaskKind,
+    MaskRecord,
+    ObjectMetrics,
+    SceneMetrics,
+    ViewRecord,
+)
+from beags_plugin.evaluation.removal import removal_metrics
+from beags_plugin.extraction.select import remove_class, select_class
 from beags_plugin.labels.class_ids import IGNORE, resize_nearest
 from beags_plugin.losses.photometric import ssim
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
@@ -33,7 +45,7 @@ def evaluate_scene(
     background: Tensor | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> SceneMetrics:
-    """Return Acc, IoU and BIoU of each object's extracted and rendered masks, PSNR and SSIM (method, section 8).
+    """Return the figures of each object's masks and of the scene without it, PSNR and SSIM (method, section 8).
 
     surfels: N Gaussians. class_ids: [N] int32, phi; None scores images alone. classes: id to name; the background, 0,
     is not scored. complete: False where Gaussians were taken out of the scene, so that only extracted masks can be
@@ -50,22 +62,25 @@ def evaluate_scene(
     with torch.no_grad():
         for index, view in enumerate(views):
             renderer = MaskRenderer(surfels, class_ids, view, rasterizer, settings, protocol)
-            for kind in KINDS if complete else ("extracted", "seen"):
+            for kind in MASK_KINDS if complete else ("extracted", "seen"):
                 for class_id, mask in renderer.masks(kind, objects).items():
                     metrics = mask_metrics(mask.prediction, mask.truth, mask.ignore, protocol)
                     masks.append(MaskRecord(kind, class_id, index, mask.source, metrics))
+            figures = None, None
             if complete and view.image is not None:
-                inputs = surfel_inputs(surfels, view.camera)
-                color = rasterizer.rasterize(inputs, view.camera, settings, background).color.clamp(0, 1)
-                figures = psnr(color, view.image), float(ssim(color, view.image.to(color)))
-            else:
-                figures = None, None
+                color, photo = renderer.image(surfels, background), view.image.to(surfels.means)
+                figures = psnr(color, photo), float(ssim(color, photo))
+                for class_id, exact, silhouette in removals(view, objects):
+                    assert class_ids is not None
+                    rest = renderer.image(remove_class(surfels, class_ids, class_id)[0], background)
+                    metrics = removal_metrics(rest, photo, exact.to(rest), silhouette.to(rest.device))
+                    masks.append(MaskRecord("removal", class_id, index, "silhouette", metrics))
             images.append(ViewRecord(view.name, *figures))
             if progress is not None:
                 progress(index + 1, len(views))
     truths = {record.truth for record in masks if record.kind == "extracted"}
 
-    def of_object(class_id: int, kind: Kind) -> MaskMetrics | None:
+    def of_object(class_id: int, kind: Kind) -> Any:
         return mean_metrics(r.metrics for r in masks if r.kind == kind and r.class_id == class_id)
 
     return SceneMetrics(
@@ -79,16 +94,14 @@ def evaluate_scene(
     )
 
 
-def average(masks: Iterable[MaskRecord], kind: Kind, protocol: Protocol, scene: Hashable = 0) -> MaskMetrics | None:
-    """Return the mean of one kind of masks over a scene; None without any."""
+def average(masks: Iterable[MaskRecord], kind: Kind, protocol: Protocol, scene: Hashable = 0) -> Any:
+    """Return the mean of one kind of metrics over a scene; None without any."""
     return pooled_average({scene: masks}, kind, protocol)
 
 
-def pooled_average(
-    scenes: Mapping[Hashable, Iterable[MaskRecord]], kind: Kind, protocol: Protocol
-) -> MaskMetrics | None:
-    """Return the mean of one kind of masks of several scenes, as if they were one scene; None without any."""
-    groups: dict[Hashable, list[MaskMetrics]] = {}
+def pooled_average(scenes: Mapping[Hashable, Iterable[MaskRecord]], kind: Kind, protocol: Protocol) -> Any:
+    """Return the mean of one kind of metrics of several scenes, as if they were one scene; None without any."""
+    groups: dict[Hashable, list[Any]] = {}
     for scene, masks in scenes.items():
         for record in masks:
             if record.kind == kind:
@@ -136,7 +149,13 @@ class MaskRenderer:
     protocol: Protocol
     _alone: dict[int, tuple[Tensor, Tensor | None]] = field(default_factory=dict)
 
-    def masks(self, kind: Kind, objects: Sequence[int]) -> dict[int, RenderedMask]:
+    def image(self, surfels: Surfels, background: Tensor) -> Tensor:
+        """Return [H, W, 3] in 0..1, an image of all or some of the scene's Gaussians."""
+        camera = self.view.camera
+        inputs = surfel_inputs(surfels, camera)
+        return self.rasterizer.rasterize(inputs, camera, self.settings, background).color.clamp(0, 1)
+
+    def masks(self, kind: MaskKind, objects: Sequence[int]) -> dict[int, RenderedMask]:
         """Return object id to its mask, for those of ``objects`` that the view has a truth of."""
         if self.class_ids is None or not objects:
             return {}
@@ -227,6 +246,13 @@ def seen_truth(view: EvalView, class_id: int) -> Truth | None:
     if known is None or view.silhouettes is None or class_id not in view.silhouettes:
         return None
     return Truth("silhouette", view.silhouettes[class_id], view.silhouettes[class_id] & ~known)
+
+
+def removals(view: EvalView, objects: Sequence[int]) -> Iterator[tuple[int, Tensor, Tensor]]:
+    """Yield the objects whose removal can be scored: id, exact picture [H, W, 3] and silhouette [H, W] bool."""
+    for class_id, exact in (view.removed or {}).items():
+        if class_id in objects and (silhouette := (view.silhouettes or {}).get(class_id)) is not None:
+            yield class_id, exact, torch.from_numpy(resize_nearest(silhouette.cpu().numpy(), *exact.shape[:2]))
 
 
 def _of_others(masks: Mapping[int, Tensor], class_id: int) -> Tensor:

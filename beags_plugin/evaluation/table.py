@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from beags_plugin.evaluation.metrics import METRICS
-from beags_plugin.evaluation.records import KINDS, ObjectMetrics
+from beags_plugin.evaluation.records import FIGURES, KINDS, MASK_KINDS, ObjectMetrics
+from beags_plugin.evaluation.removal import TELLING
 from beags_plugin.evaluation.report import DataSetMetrics, RunMetrics, Stage
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
+_HEADINGS = {"acc": "Acc", "iou": "IoU", "biou": "BIoU", "psnr": "PSNR", "ssim": "SSIM", "remains": "remains"}
 _STAGE_NAMES = {"before": "assigned", "after": "refined"}  # in summary.json
 _Row = tuple[str, Mapping[str, Any], Mapping[str, Any] | None]
 """A row's name, its metrics {kind: {stage: {metric: value}}}, and {"psnr", "ssim"} of its images or None."""
@@ -26,7 +28,7 @@ def summary_json(run: RunMetrics, seconds: Mapping[str, float], peak_memory_mb: 
     """Return the summary of one run as plain values for ``json.dump``; a missing or infinite figure is None.
 
     seconds: stage to wall time. peak_memory_mb: of the whole process, MB of 10^6 bytes. {"mean": {"extracted":
-    {"assigned": {"acc", "iou", "biou"}, "refined": {...}}, "rendered": {...}}, "objects": {name: as mean}, "psnr":
+    {"assigned": {"acc", "iou", "biou"}, "refined": {...}}, ...}, "objects": {name: as mean}, "psnr":
     {"before", "after"}, "seconds": {stage: s}, "peak_memory_mb": n}.
     """
     content = run.to_json()
@@ -46,7 +48,7 @@ def summary_json(run: RunMetrics, seconds: Mapping[str, float], peak_memory_mb: 
 def render_run(
     run: RunMetrics, seconds: Mapping[str, float] | None = None, peak_memory_mb: float = 0
 ) -> RenderableType:
-    """Return a table of one run: masks per object and stage in percent, then PSNR, SSIM, seconds, memory and notes."""
+    """Return tables of one run, masks and removals per object and stage, then PSNR, SSIM, seconds, memory and notes."""
     from rich.console import Group
     from rich.text import Text
 
@@ -54,14 +56,15 @@ def render_run(
     parts: list[RenderableType] = []
     if run.after.mean != ObjectMetrics(None, None):
         rows = [(name, row, None) for name, row in content["objects"].items()]
-        rows += [("mean", content["mean"], None), *_worst(content)]
-        parts.append(_mask_table(f"{run.scene}: masks, %{_meaning(stages)}", "object", rows, stages))
+        rows.append(("mean", content["mean"], None))
+        parts.append(_mask_table(run.scene, "object", [*rows, *_worst(content)], stages))
+        parts += _removal_table(run.scene, "object", rows, stages)
     else:
         parts.append(Text(run.scene))
     lines = []
     if run.after.psnr is not None:
-        for title, metric, digits in (("PSNR, dB", "psnr", 2), ("SSIM", "ssim", 3)):
-            lines.append(f"{title}: " + " → ".join(_number(content[metric][stage], digits) for stage in stages))
+        for title, metric in (("PSNR, dB", "psnr"), ("SSIM", "ssim")):
+            lines.append(f"{title}: " + " → ".join(_cell(metric, content[metric][stage]) for stage in stages))
     if seconds:
         lines.append("Seconds: " + ", ".join(f"{stage} {value:.1f}" for stage, value in seconds.items()))
     if peak_memory_mb:
@@ -70,18 +73,19 @@ def render_run(
 
 
 def render_data_set(found: DataSetMetrics) -> RenderableType:
-    """Return a table of several runs: the means of each scene, its worst object, then the means of the data set."""
+    """Return tables of several runs: the means of each scene, its worst object, then the means of the data set."""
     from rich.console import Group
     from rich.text import Text
 
     content = found.to_json()
     stages: list[Stage] = [stage for stage in ("before", "after") if any(stage in run.stages() for run in found.runs)]
-    rows = []
+    scenes: list[list[_Row]] = []
     for run, scene in zip(found.runs, content["scenes"], strict=True):
-        rows += [(run.scene, scene["mean"], scene), *_worst(scene)]
-    rows.append((found.name, content["mean"], content))
-    table = _mask_table(f"All scenes: masks, %{_meaning(stages)}", "scene", rows, stages)
-    return Group(table, Text(protocol_line(found.runs)))
+        scenes.append([(run.scene, scene["mean"], scene), *_worst(scene)])
+    scenes.append([(found.name, content["mean"], content)])
+    table = _mask_table("All scenes", "scene", [row for scene in scenes for row in scene], stages)
+    removal = _removal_table("All scenes", "scene", [scene[0] for scene in scenes], stages)
+    return Group(table, *removal, Text(protocol_line(found.runs)))
 
 
 def protocol_line(runs: Sequence[RunMetrics]) -> str:
@@ -89,11 +93,17 @@ def protocol_line(runs: Sequence[RunMetrics]) -> str:
     protocol = runs[0].protocol
     truths = {truth for run in runs if (truth := run.after.extracted_truth) is not None}
     truth = _TRUTHS[truths.pop() if len(truths) == 1 else "both"] if truths else "no masks"
+    removal = ""
+    if any(run.after.mean.removal is not None for run in runs):
+        removal = (
+            " Removal: the scene without the object's Gaussians against the exact picture without it, over the whole "
+            f"silhouette; remains: pixels nearer to the photo, of those where the two differ by {TELLING:g} or more."
+        )
     scenes = "over scenes" if protocol.data_set_average == "scenes" else "of all scenes pooled"
     return (
         f"Protocol: extracted masks against {truth}; above {protocol.threshold:g}; boundary band "
         f"{100 * protocol.band_share:g} % of the diagonal; the {protocol.resize} is resized; masks empty in truth and "
-        f"prediction are left out; means over {protocol.scene_average}, then {scenes}."
+        f"prediction are left out; means over {protocol.scene_average}, then {scenes}.{removal}"
     )
 
 
@@ -107,33 +117,52 @@ def _meaning(stages: Sequence[Stage]) -> str:
     return " (before: assignment alone; after: after refinement)" if len(stages) == 2 else ""
 
 
-def _mask_table(title: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> RenderableType:
-    """Return rows of all kinds of metrics per stage, with PSNR and SSIM if any row has images."""
+def _mask_table(what: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> RenderableType:
+    """Return rows of all kinds of mask metrics per stage, with PSNR and SSIM if any row has images."""
+    columns = [(kind, metric) for kind in MASK_KINDS for metric in METRICS]
+    columns = [c for c in columns if c[0] != "seen" or (c[1] != "acc" and _known(rows, stages, *c))]
+    return _table(f"{what}: masks, %{_meaning(stages)}", first, rows, stages, columns)
+
+
+def _removal_table(what: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> Iterator[RenderableType]:
+    """Yield a table of what is left after removal, if any row has that."""
+    if _known(rows, stages, "removal", "psnr"):
+        columns = [("removal", metric) for metric in FIGURES["removal"]]
+        plain = [(name, row, None) for name, row, _ in rows]
+        yield _table(f"{what}: objects removed, PSNR in dB, remains in %", first, plain, stages, columns)
+
+
+def _known(rows: Sequence[_Row], stages: Sequence[Stage], kind: str, metric: str) -> bool:
+    return any(row[kind][stage][metric] is not None for _, row, _ in rows for stage in stages)
+
+
+def _table(
+    title: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage], columns: Sequence[tuple[str, str]]
+) -> RenderableType:
     from rich.box import SIMPLE
     from rich.table import Table
     from rich.text import Text
 
-    known = any(row["seen"][stage]["iou"] is not None for _, row, _ in rows for stage in stages)
-    columns = [(kind, metric) for kind in KINDS for metric in METRICS]
-    columns = [(kind, metric) for kind, metric in columns if kind != "seen" or (known and metric != "acc")]
     table = Table(title=title, title_justify="left", box=SIMPLE, collapse_padding=True, pad_edge=False)
     table.add_column(first)
     table.add_column("stage")
     for index, (kind, metric) in enumerate(columns):
         new = index == 0 or columns[index - 1][0] != kind
-        heading = {"acc": "Acc", "iou": "IoU", "biou": "BIoU"}[metric]
+        heading = _HEADINGS[metric]
         table.add_column(f"{kind if new else ''}\n{heading}", justify="right", min_width=len(kind) if new else 5)
     for heading in ("\nPSNR", "\nSSIM") if any(images for *_, images in rows) else ():
         table.add_column(heading, justify="right")
     for name, row, images in rows:
         for stage in stages:
-            cells = [_number(row[kind][stage][metric], 1, 100) for kind, metric in columns]
+            cells = [_cell(metric, row[kind][stage][metric]) for kind, metric in columns]
             if images is not None:
-                cells += [_number(images["psnr"][stage], 2), _number(images["ssim"][stage], 3)]
+                cells += [_cell(metric, images[metric][stage]) for metric in ("psnr", "ssim")]
             table.add_row(Text(name) if stage == stages[0] else "", stage, *cells)
         table.add_section()
     return table
 
 
-def _number(value: float | None, digits: int, factor: float = 1.0) -> str:
-    return "–" if value is None else f"{factor * value:.{digits}f}"
+def _cell(metric: str, value: float | None) -> str:
+    if value is None:
+        return "–"
+    return {"psnr": f"{value:.2f}", "ssim": f"{value:.3f}"}.get(metric, f"{100 * value:.1f}")

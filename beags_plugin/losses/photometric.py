@@ -57,6 +57,22 @@ def ssim(image: Tensor, reference: Tensor) -> Tensor:
     return _Ssim.apply(image, reference)
 
 
+def ssim_map(image: Tensor, reference: Tensor) -> Tensor:
+    """Return the map [H, W] whose mean is ``ssim``, averaged over channels; arguments as there, no gradient."""
+    return _similarity(image.detach().permute(2, 0, 1), reference.permute(2, 0, 1))[0].mean(dim=0)
+
+
+def _similarity(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
+    """Return the SSIM of images [C, H, W], per channel and pixel, and the parts that its gradient needs."""
+    # Only the sum of the two variances is needed, so four blurs do for the usual five.
+    m_x, m_y, squares, product = blur(torch.cat([x, y, x * x + y * y, x * y])).chunk(4)
+    m_xx_yy, m_xy = m_x * m_x + m_y * m_y, m_x * m_y
+    a1, a2 = 2 * m_xy + _C1, 2 * (product - m_xy) + _C2
+    b1, b2 = m_xx_yy + _C1, squares - m_xx_yy + _C2
+    inverse = 1.0 / (b1 * b2)
+    return a1 * a2 * inverse, m_x, m_y, a1, a2, b1, b2, inverse
+
+
 def _compiled_takes(image: Tensor, reference: Tensor) -> bool:
     same = image.ndim == 3 and image.shape == reference.shape and image.shape[2] == 3 and image.numel() > 0
     return same and not reference.requires_grad and cuda_extension.supports(image, reference)
@@ -69,13 +85,7 @@ class _Ssim(torch.autograd.Function):
     def forward(ctx, image: Tensor, reference: Tensor) -> Tensor:
         x = image.permute(2, 0, 1).contiguous()
         y = reference.permute(2, 0, 1).contiguous()
-        # Only the sum of the two variances is needed, so four blurs do for the usual five.
-        m_x, m_y, squares, product = blur(torch.cat([x, y, x * x + y * y, x * y])).chunk(4)
-        m_xx_yy, m_xy = m_x * m_x + m_y * m_y, m_x * m_y
-        a1, a2 = 2 * m_xy + _C1, 2 * (product - m_xy) + _C2
-        b1, b2 = m_xx_yy + _C1, squares - m_xx_yy + _C2
-        inverse = 1.0 / (b1 * b2)
-        index = a1 * a2 * inverse
+        index, m_x, m_y, a1, a2, b1, b2, inverse = _similarity(x, y)
         if ctx.needs_input_grad[0]:
             d_product = 2 * a1 * inverse
             d_squares = -index / b2

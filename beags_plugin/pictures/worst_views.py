@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import MaskMetrics, compared_masks
 from beags_plugin.evaluation.protocol import Protocol
-from beags_plugin.evaluation.records import EvalView, Kind
+from beags_plugin.evaluation.records import EvalView, MaskKind
 from beags_plugin.evaluation.report import RunMetrics, Stage
 from beags_plugin.evaluation.run_metrics import MaskRenderer
 from beags_plugin.pictures.cells import GAP, Square, below, beside, cell, crop, printable, square_around
@@ -22,7 +23,7 @@ RIGHT, MISSED, WRONG, LEFT_OUT = 1, 2, 3, 4  # of an error map; 0 is right too: 
 COLORS = {RIGHT: (0, 158, 115), MISSED: (0, 114, 178), WRONG: (213, 94, 0), LEFT_OUT: (150, 150, 150)}
 """RGB; distinct for colour-blind eyes too (Okabe and Ito)."""
 _MEANINGS = {RIGHT: "right", MISSED: "missed", WRONG: "wrong", LEFT_OUT: "not scored"}
-_KINDS: tuple[Kind, ...] = ("extracted", "rendered")
+_KINDS: tuple[MaskKind, ...] = ("extracted", "rendered")
 _SIDE = 240  # pixels of a cell
 _LEGEND = 24  # pixels
 _GREY = 128  # where there is no photograph
@@ -37,7 +38,7 @@ class WorstMask:
     """
 
     title: str
-    kind: Kind
+    kind: MaskKind
     photo: np.ndarray
     errors: Mapping[Stage, np.ndarray]
     metrics: Mapping[Stage, MaskMetrics]
@@ -73,12 +74,12 @@ def paint(photo: np.ndarray, errors: np.ndarray) -> np.ndarray:
     return painted
 
 
-def worst_records(run: RunMetrics, kind: Kind, count: int) -> list[int]:
+def worst_records(run: RunMetrics, kind: MaskKind, count: int) -> list[int]:
     """Return indices into ``run.after.masks`` of the ``count`` masks of a kind with the lowest IoU, worst first."""
     scored = [
-        (mask.metrics.iou, index)
+        (metrics.iou, index)
         for index, mask in enumerate(run.after.masks)
-        if mask.kind == kind and mask.metrics.iou is not None
+        if mask.kind == kind and isinstance(metrics := mask.metrics, MaskMetrics) and metrics.iou is not None
     ]
     return [index for _, index in sorted(scored)[:count]]
 
@@ -99,7 +100,7 @@ def draw_worst(
     """
     names = run.names()
     found = []
-    chosen: list[tuple[Kind, int]] = [(kind, index) for kind in _KINDS for index in worst_records(run, kind, count)]
+    chosen: list[tuple[MaskKind, int]] = [(kind, index) for kind in _KINDS for index in worst_records(run, kind, count)]
     with torch.no_grad():
         for kind, index in chosen:
             record = run.after.masks[index]
@@ -109,9 +110,7 @@ def draw_worst(
                 renderer = MaskRenderer(surfels.detach(), class_ids, view, rasterizer, settings, run.protocol)
                 mask = renderer.masks(kind, [record.class_id])[record.class_id]
                 errors[stage] = error_map(mask.prediction, mask.truth, mask.ignore, run.protocol)
-            metrics: dict[Stage, MaskMetrics] = {
-                stage: scene.masks[index].metrics for stage, scene in run.stages().items()
-            }
+            metrics: dict[Stage, Any] = {stage: scene.masks[index].metrics for stage, scene in run.stages().items()}
             photo = _photo(view, errors["after"].shape)
             title = f"{run.scene}, {view.name}: {names[record.class_id]}"
             found.append(WorstMask(title, kind, photo, errors, metrics))
@@ -169,7 +168,7 @@ def _percent(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.1f}"
 
 
-def _heading(kind: Kind) -> np.ndarray:
+def _heading(kind: MaskKind) -> np.ndarray:
     meaning = {"extracted": "the object drawn alone", "rendered": "its share of the whole scene"}
     return _text(f"{kind} masks: {meaning[kind]}", 2)
 

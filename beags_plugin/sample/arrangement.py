@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beags_plugin.sample.solids import Ball, Cone, Primitive, Solid, Tube, slab, turned
+from beags_plugin.sample.scene import Contact, Scene, Thing
+from beags_plugin.sample.solids import Ball, Cone, Primitive, Solid, Tube, dot, slab
 from beags_plugin.sample.textures import (
     Noise,
     Texture,
@@ -21,61 +22,34 @@ from beags_plugin.sample.textures import (
 DOME_RADIUS = 5.0
 """World units; the ground is the disc z = 0 of this radius, closed by the half-dome above it."""
 
+GROUND, DOME = 0, -1
 HUE_RANGE = 0.12
 """Share of the colour circle that the objects' hues cover; the ground's lies among them."""
 
 
 @dataclass(frozen=True)
-class Thing:
-    """One object: world = rotation @ local + position.
-
-    rotation: [3, 3]; position: [3], world units, z up.
-    """
-
-    name: str
-    solid: Solid
-    rotation: np.ndarray
-    position: np.ndarray
-    texture: Texture
-
-    def to_local(self, points: np.ndarray) -> np.ndarray:
-        """Return world points [N, 3] in the object's frame."""
-        return turned(points - self.position, self.rotation)
-
-    def distance(self, points: np.ndarray) -> np.ndarray:
-        """Return [N] bound of the signed distance of world points [N, 3] (sign and zeros exact)."""
-        return self.solid.distance(self.to_local(points))
-
-
-@dataclass(frozen=True)
-class Contact:
-    """A world point [3] on the surfaces of both objects; 0 is the ground, i the object of class id i."""
-
-    first: int
-    second: int
-    point: np.ndarray
-
-
-@dataclass(frozen=True)
-class Still:
-    """The whole scene: object i has class id i + 1; the ground and the dome around it are class 0.
+class Still(Scene):
+    """The whole scene, on the ground under a dome.
 
     sun: [3] unit vector towards the light. noise: of the ground and the dome. palette: [4, 3] linear RGB of both.
     """
 
-    things: tuple[Thing, ...]
-    contacts: tuple[Contact, ...]
+    things: tuple[Thing[Solid], ...]
     sun: np.ndarray
     noise: Noise
     palette: np.ndarray
 
-    @property
-    def class_names(self) -> dict[int, str]:
-        """Return class id to name, the background included."""
-        return {0: "background", **{i: thing.name for i, thing in enumerate(self.things, start=1)}}
+    def surround(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return hits of the ground or, beyond its edge, of the dome; the origin must lie inside."""
+        a = dot(directions, directions)
+        half_b = dot(directions, origin[None])
+        t = (-half_b + np.sqrt(half_b * half_b - a * (origin @ origin - DOME_RADIUS**2))) / a
+        with np.errstate(divide="ignore"):
+            ground = np.where(directions[:, 2] < 0.0, -origin[2] / directions[:, 2], np.inf)
+        return np.minimum(t, ground), np.where(ground < t, GROUND, DOME).astype(np.int32)
 
 
-def _turn_z(angle: float) -> np.ndarray:
+def turn_z(angle: float) -> np.ndarray:
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
@@ -121,7 +95,7 @@ def make_still(seed: int) -> Still:
 
     def place(name: str, solid: Solid, position: list[float], rotation: np.ndarray | None = None) -> None:
         solids[name] = solid
-        poses[name] = (_turn_z(0.0) if rotation is None else rotation, np.array(position))
+        poses[name] = (turn_z(0.0) if rotation is None else rotation, np.array(position))
 
     def touch(first: str, second: str, point: list[float]) -> None:
         contacts.append((first, second, np.array(point)))
@@ -131,7 +105,7 @@ def make_still(seed: int) -> Still:
         """Place a solid about its own z axis, 2 half high and within ``reach`` of it, with its foot at ``position``."""
         x, y, z = position
         solid = Solid((*outline, *slab(2, -half, half)), cut, bound=float(np.hypot(reach, half)))
-        place(name, solid, [x, y, z + half], _turn_z(generator.uniform(0.0, 2.0 * np.pi)))
+        place(name, solid, [x, y, z + half], turn_z(generator.uniform(0.0, 2.0 * np.pi)))
         touch(name, on, [x + 0.9 * reach, y, z])  # on the foot of a hollow solid too
 
     hx, hy, top = about(0.24, 0.04), about(0.20, 0.04), about(0.30)
@@ -145,7 +119,7 @@ def make_still(seed: int) -> Still:
     radius, height = about(0.19), about(0.40)
     cone_at = [0.62, 0.16, 0.0]
     cone = Solid((Cone(radius, height), *slab(2, 0.0, height)), bound=max(radius, height))
-    place("cone", cone, cone_at, _turn_z(generator.uniform(0.0, 2.0 * np.pi)))
+    place("cone", cone, cone_at, turn_z(generator.uniform(0.0, 2.0 * np.pi)))
     touch("cone", "ground", cone_at)
 
     radius, half = about(0.18), about(0.13)
@@ -180,7 +154,7 @@ def _finish(
     """Move the scene to the middle, mirror and turn it, and give it colours and light."""
     # All solids are symmetric about their own y = 0, so mirroring a pose (M R M, M t) mirrors the object exactly.
     mirror = np.diag([1.0, generator.choice([-1.0, 1.0]), 1.0])
-    turn = _turn_z(generator.uniform(0.0, 2.0 * np.pi))
+    turn = turn_z(generator.uniform(0.0, 2.0 * np.pi))
     shift = np.array([0.0, 0.1, 0.0])
     names = list(solids)
     noise = Noise(generator)

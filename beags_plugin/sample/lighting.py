@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from beags_plugin.sample.arrangement import DOME_RADIUS, Still
+from beags_plugin.sample.arrangement import DOME, DOME_RADIUS, GROUND, Still
 from beags_plugin.sample.solids import dot, turned
-from beags_plugin.sample.tracing import DOME, GROUND, seen_share
+from beags_plugin.sample.tracing import seen_share
 
 SUN = np.array([1.22, 1.13, 1.0])
 SKY = np.array([0.36, 0.39, 0.44])
@@ -36,7 +36,7 @@ def _sky_directions(count: int) -> np.ndarray:
 
 
 class Light:
-    """The light of a scene, with the ground's share baked into a map once."""
+    """The light of a still life, with the ground's share baked into a map once."""
 
     def __init__(self, still: Still, object_samples: int = 8, ground_samples: int = 24) -> None:
         self.still = still
@@ -45,8 +45,8 @@ class Light:
         x, y = np.meshgrid(axis, axis, indexing="ij")
         points = np.stack([x.ravel(), y.ravel(), np.full(x.size, LIFT)], axis=1)
 
-        self._sun_map = seen_share(still, points, _sun_directions(still.sun, ground_samples)).reshape(x.shape)
-        self._sky_map = seen_share(still, points, _sky_directions(2 * ground_samples)).reshape(x.shape)
+        self._sun_map = seen_share(still.things, points, _sun_directions(still.sun, ground_samples)).reshape(x.shape)
+        self._sky_map = seen_share(still.things, points, _sky_directions(2 * ground_samples)).reshape(x.shape)
 
     def _read(self, table: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Read the baked map bilinearly; outside it, its border."""
@@ -102,13 +102,13 @@ class Light:
         sun = np.zeros(len(points))
         bright = np.flatnonzero(cosine > 0.0)
         lifted = points[bright] + LIFT * normals[bright]
-        sun[bright] = cosine[bright] * seen_share(self.still, lifted, self._suns)
+        sun[bright] = cosine[bright] * seen_share(self.still.things, lifted, self._suns)
         # Sky light by tilt, dimmed close to the ground: a cheap stand-in for ambient occlusion.
         sky = (0.62 + 0.38 * normals[:, 2]) * (0.55 + 0.45 * np.clip(points[:, 2] / 0.25, 0.0, 1.0))
         return self._lit(thing.texture(local), sun, sky)
 
-    def colours(self, points: np.ndarray, surface: np.ndarray) -> np.ndarray:
-        """Return [N, 3] linear RGB (may exceed 1) of world points [N, 3] on surfaces [N], as in ``Hits.surface``."""
+    def colours(self, points: np.ndarray, surface: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """See ``scene.Lighting``."""
         colours = np.empty_like(points)
         for which in np.unique(surface):
             chosen = np.flatnonzero(surface == which)

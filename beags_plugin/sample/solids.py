@@ -45,7 +45,7 @@ def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def turned(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """Return [N, 3] ``points @ matrix``, without BLAS as in ``dot``."""
-    return np.stack([dot(points, matrix[None, :, j]) for j in range(3)], axis=1)
+    return np.stack([dot(points, matrix[None, :, j]) for j in range(matrix.shape[1])], axis=1)
 
 
 def _quadratic(a: np.ndarray, half_b: np.ndarray, c: np.ndarray) -> Interval:

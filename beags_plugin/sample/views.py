@@ -6,13 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beags_plugin.sample.arrangement import Still
-from beags_plugin.sample.lighting import Light
+from beags_plugin.sample.scene import Lighting, Scene
 from beags_plugin.sample.solids import turned
-from beags_plugin.sample.tracing import CHUNK, first_hits
+from beags_plugin.sample.tracing import CHUNK, first_hits, object_hits
 
 ELEVATIONS = (0.34, 0.66, 1.02)
-"""Radians above the ground of the three rounds of cameras."""
+"""Radians above the ground of the three rounds of cameras; their lens is 48 degrees wide."""
 TARGET = np.array([0.0, 0.0, 0.26])
 
 
@@ -64,7 +63,7 @@ def make_views(seed: int, width: int, height: int, num_train: int, num_test: int
     """Make three jittered rounds about the scene at rising height, with test views spread evenly."""
     generator = np.random.default_rng([seed, 2])
     total = num_train + num_test
-    tests = {int((i + 0.5) * total / num_test) for i in range(num_test)}
+    tests = set(held_out(num_train, num_test))
     start = generator.uniform(0.0, 2.0 * np.pi)
     views = []
     for i in range(total):
@@ -74,23 +73,32 @@ def make_views(seed: int, width: int, height: int, num_train: int, num_test: int
         radius = (2.3 + 0.12 * int(progress)) * generator.uniform(0.94, 1.06)
         way = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
         target = TARGET + generator.uniform(-0.06, 0.06, 3)
-        views.append(
-            View(
-                name=f"view_{i:03d}",
-                split="test" if i in tests else "train",
-                camera_to_world=_look_at(target + radius * way, target, generator.uniform(-0.04, 0.04)),
-                # One lens for all views: 48 degrees across, its axis a little off the middle of the image.
-                focal=1.12 * width,
-                cx=0.5 * width + 0.015 * width,
-                cy=0.5 * height - 0.011 * height,
-                width=width,
-                height=height,
-            )
-        )
+        pose = look_at(target + radius * way, target, generator.uniform(-0.04, 0.04))
+        views.append(make_view(i, i in tests, pose, 1.12, width, height))
     return views
 
 
-def _look_at(position: np.ndarray, target: np.ndarray, roll: float) -> np.ndarray:
+def held_out(num_train: int, num_test: int) -> list[int]:
+    """Return which of all views are test views: spread evenly."""
+    return [int((i + 0.5) * (num_train + num_test) / num_test) for i in range(num_test)]
+
+
+def make_view(index: int, test: bool, pose: np.ndarray, lens: float, width: int, height: int) -> View:
+    """Return the view number ``index``; lens: focal length over width, the same for all views of a scene."""
+    return View(
+        name=f"view_{index:03d}",
+        split="test" if test else "train",
+        camera_to_world=pose,
+        focal=lens * width,
+        cx=0.5 * width + 0.015 * width,  # the axis is a little off the middle of the image
+        cy=0.5 * height - 0.011 * height,
+        width=width,
+        height=height,
+    )
+
+
+def look_at(position: np.ndarray, target: np.ndarray, roll: float) -> np.ndarray:
+    """Return the camera-to-world matrix [4, 4] of a camera at ``position`` that looks at ``target``."""
     back = position - target
     back = back / np.linalg.norm(back)
     right = np.cross([0.0, 0.0, 1.0], back)
@@ -113,31 +121,56 @@ def _grid(view: View, samples: int) -> tuple[np.ndarray, np.ndarray]:
     return tuple(a.reshape(shape).transpose(0, 2, 1, 3).reshape(-1) for a in (xx, yy))  # type: ignore[return-value]
 
 
-def render_image(still: Still, light: Light, view: View, samples: int) -> np.ndarray:
+def render_image(scene: Scene, light: Lighting, view: View, samples: int) -> np.ndarray:
     """Render [H, W, 3] uint8 sRGB, the mean in linear light over samples x samples rays per pixel."""
-    x, y = _grid(view, samples)
-    per_pixel = samples * samples
+    pixels = _pixels(scene, light, view, view.directions(*_grid(view, samples)), samples * samples)
+    return pixels.reshape(view.height, view.width, 3)
+
+
+def render_removed(
+    scene: Scene, light: Lighting, view: View, image: np.ndarray, class_id: int, samples: int
+) -> np.ndarray | None:
+    """Render ``image``, that of ``render_image``, with an object cut out; None if the object does not show in it.
+
+    Light is as with the object: what stays keeps its shadows, as it does for an object cut out of photos. Pixels none
+    of whose rays meets the object first stay the same.
+    """
+    directions, per_pixel = view.directions(*_grid(view, samples)), samples * samples
+    rays, _ = object_hits(scene.things[class_id - 1], view.center, directions)
+    first = first_hits(scene, view.center, directions[rays])[0].surface == class_id
+    places = np.unique(rays[first] // per_pixel)
+    if not len(places):
+        return None
+    removed = image.reshape(-1, 3).copy()
+    directions = directions.reshape(-1, per_pixel, 3)[places].reshape(-1, 3)
+    removed[places] = _pixels(scene, light, view, directions, per_pixel, without=class_id)
+    return removed.reshape(image.shape)
+
+
+def _pixels(
+    scene: Scene, light: Lighting, view: View, directions: np.ndarray, per_pixel: int, without: int | None = None
+) -> np.ndarray:
+    """Return [P, 3] uint8 sRGB of pixels with ``per_pixel`` directions each, in order; without: see ``first_hits``."""
     chunk = CHUNK // per_pixel * per_pixel
     pieces = []
-    for start in range(0, len(x), chunk):
-        directions = view.directions(x[start : start + chunk], y[start : start + chunk])
-        hits, _ = first_hits(still, view.center, directions)
-        colours = light.colours(view.center + hits.t[:, None] * directions, hits.surface)
+    for start in range(0, len(directions), chunk):
+        part = directions[start : start + chunk]
+        hits, _ = first_hits(scene, view.center, part, without)
+        colours = light.colours(view.center + hits.t[:, None] * part, hits.surface, part)
         pieces.append(np.minimum(colours, 1.0).reshape(-1, per_pixel, 3).mean(axis=1))
-    linear = np.concatenate(pieces).reshape(view.height, view.width, 3)
-    return np.floor(255.0 * linear ** (1.0 / 2.2) + 0.5).astype(np.uint8)
+    return np.floor(255.0 * np.concatenate(pieces) ** (1.0 / 2.2) + 0.5).astype(np.uint8)
 
 
-def render_view(still: Still, light: Light, view: View, samples: int = 2) -> Picture:
+def render_view(scene: Scene, light: Lighting, view: View, samples: int = 2) -> Picture:
     """Render the picture of a view, with ``samples`` x ``samples`` rays per pixel for the image."""
     x, y = _grid(view, 1)
-    hits, silhouettes = first_hits(still, view.center, view.directions(x, y))
-    masks = np.zeros((len(still.things), len(x)), dtype=bool)
+    hits, silhouettes = first_hits(scene, view.center, view.directions(x, y))
+    masks = np.zeros((len(scene.things), len(x)), dtype=bool)
     for mask, rays in zip(masks, silhouettes, strict=True):
         mask[rays] = True
     shape = (view.height, view.width)
     return Picture(
-        image=render_image(still, light, view, samples),
+        image=render_image(scene, light, view, samples),
         labels=np.maximum(hits.surface, 0).astype(np.uint8).reshape(shape),
         depth=hits.t.astype(np.float32).reshape(shape),  # directions have depth 1, so t is z
         silhouettes=masks.reshape(-1, *shape),

@@ -13,17 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from beags_plugin.sample.arrangement import make_still
 from beags_plugin.sample.degrade import Degradation, degrade_mask, dropped_views, resolve_degradation
-from beags_plugin.sample.lighting import Light
+from beags_plugin.sample.families import FAMILIES
 from beags_plugin.sample.points import seed_points
 from beags_plugin.sample.seen import seen_part, visible_surface, well_seen
-from beags_plugin.sample.views import Picture, View, make_views, render_view
-from beags_plugin.system.errors import UserError, unwritable, writing
+from beags_plugin.sample.views import Picture, View, render_removed, render_view
+from beags_plugin.system.errors import UserError, check_choice, unwritable, writing
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.reading.ply import write_vertices
 
-VERSION = 8
+VERSION = 9
 """Raise it whenever the same config would give other files: older samples are then rebuilt."""
 LARGEST_SIDE = 8192  # pixels
 POINT_NOISE = 0.03
@@ -35,6 +34,7 @@ SAMPLE_FILE = "sample.json"
 class SampleConfig:
     """Options that decide every byte of the sample.
 
+    family: of scenes: "tabletop" (solids on the ground, seen from all sides) or "room" (a closed room, see ``room``).
     seed: of arrangement, sizes, colours, textures, light, camera jitter, mask degradation.
     width, height: pixels. num_train, num_test: views.
     degradation: of the train masks: "none", "mild", "strong", a degree as text ("1.5"), or a ``Degradation``.
@@ -49,6 +49,7 @@ class SampleConfig:
     degradation: str | Degradation = "mild"
     num_points: int = 2000
     antialias: int = 2
+    family: str = "tabletop"
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that makes no scene."""
@@ -59,6 +60,7 @@ class SampleConfig:
         for name in ("width", "height"):
             if getattr(self, name) > LARGEST_SIDE:
                 raise UserError(f"the sample's {name} is {getattr(self, name)}: give at most {LARGEST_SIDE}.")
+        check_choice(self.family, FAMILIES, "family of scenes")
         resolve_degradation(self.degradation)
 
     def as_dict(self) -> dict[str, Any]:
@@ -89,8 +91,10 @@ def write_sample(
     Layout: transforms.json (OpenGL camera-to-world, world z up), images/<stem>.png, masks/<stem>.png (ids; degraded
     for train views, none for dropped ones, exact for test views), classes.json, seed_points.ply, and under
     ground_truth/ the exact masks/<stem>.png, silhouettes/<object>/<stem>.png (0 or 255), for test views
-    seen/<object>/<stem>.png (the part of the silhouette whose surface training photos show) and depth/<stem>.npy
-    (float32, z along the optical axis); masks and depth are those of the pixel centres. sample.json is the config.
+    seen/<object>/<stem>.png (the part of the silhouette whose surface training photos show) and, where the photo shows
+    the object, removed/<object>/<stem>.png (the photo with the object cut out, in the light as it was), and
+    depth/<stem>.npy (float32, z along the optical axis); masks and depth are those of the pixel centres. sample.json is
+    the config.
 
     All is written into a temporary folder beside it and renamed at the end: an interrupted run leaves no ``folder``.
     A folder that holds another sample is replaced.
@@ -123,9 +127,10 @@ def write_sample(
 
 
 def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], None] | None) -> None:
-    still = make_still(config.seed)
-    light = Light(still)
-    views = make_views(config.seed, config.width, config.height, config.num_train, config.num_test)
+    family = FAMILIES[config.family]
+    still = family.scene(config.seed)
+    light = family.light(still)
+    views = family.views(config.seed, config.width, config.height, config.num_train, config.num_test)
     degradation = resolve_degradation(config.degradation)
     train = [view.name for view in views if view.split == "train"]
     dropped = dropped_views(train, config.seed, degradation.dropped)
@@ -144,6 +149,10 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
         mask = picture.labels
         if view.split == "test":
             silhouettes[view.name] = picture.silhouettes
+            for class_id in range(1, len(names)):
+                removed = render_removed(still, light, view, picture.image, class_id, config.antialias)
+                if removed is not None:
+                    _write_png(folder / "ground_truth" / "removed" / names[class_id] / f"{view.name}.png", removed)
         else:
             for surface, part in zip(surfaces, visible_surface(view, picture), strict=True):
                 surface.append(part)
@@ -195,7 +204,7 @@ def transforms(views: list[View]) -> dict[str, Any]:
 
 
 def _truth_folders(names: dict[int, str]) -> list[str]:
-    kinds = ("silhouettes", "seen")
+    kinds = ("silhouettes", "seen", "removed")
     objects = [f"ground_truth/{kind}/{name}" for kind in kinds for class_id, name in names.items() if class_id]
     return ["ground_truth/masks", "ground_truth/depth", *objects]
 
@@ -227,8 +236,10 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def make_sample(folder: Path, seed: int, width: int, height: int, degradation: str, views: int = 60) -> None:
+def make_sample(
+    folder: Path, seed: int, width: int, height: int, degradation: str, views: int = 60, family: str = "tabletop"
+) -> None:
     """Generate the sample with ``views`` training views in ``folder`` unless the same one lies there already."""
-    config = SampleConfig(seed=seed, width=width, height=height, degradation=degradation, num_train=views)
+    config = SampleConfig(seed, width, height, views, degradation=degradation, family=family)
     with progress_bar("Tracing the sample") as progress:
         write_sample(folder, config, progress)

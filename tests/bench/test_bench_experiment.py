@@ -11,8 +11,9 @@ pytest.importorskip("nerfstudio")
 from experiment_files import GOOD, masks_of, scene, written
 
 from beags_plugin.bench.experiment import experiment_names, load_experiment
-from beags_plugin.bench.scenes import TrialScene
+from beags_plugin.bench.scenes import SEEDS, TrialScene
 from beags_plugin.bench.trials import MODEL, Trial, plan, steps_of
+from beags_plugin.sample.families import FAMILIES
 from beags_plugin.system.errors import UserError
 
 
@@ -21,9 +22,16 @@ def experiment(tmp_path):
     return load_experiment(written(tmp_path, GOOD))
 
 
+REPORTING = {"presets"}  # experiments whose figures are reported; by all others something is chosen
+
+
 @pytest.mark.parametrize("name", experiment_names())
-def test_every_experiment_that_ships_loads(name):
-    assert load_experiment(name).variants
+def test_scenes_for_choosing_and_for_reporting_are_kept_apart(name):
+    experiment = load_experiment(name)
+    seeds = {seed for _, seed in experiment.samples}
+    assert seeds == set(SEEDS["reporting"]) if name in REPORTING else seeds <= set(SEEDS["choosing"])
+    assert {family for family, _ in experiment.samples} == set(FAMILIES)
+    assert not set(SEEDS["choosing"]) & set(SEEDS["reporting"]) and experiment.variants
 
 
 def test_a_file_describes_variants_and_sweeps(experiment):
@@ -43,7 +51,9 @@ def test_a_file_describes_variants_and_sweeps(experiment):
     assert point.refine["pipeline.model.prepare.reprojection"] == "none"
     assert "pipeline.model.prepare.k" not in point.base
     assert (variants["damage = 1.5"].damage, variants["damage = 1.5"].x) == (1.5, 1.5)
-    assert experiment.sample_seeds == (0,) and experiment.seeds == (42,) and experiment.sweeps == ("k", "damage")
+    assert (
+        experiment.samples == (("tabletop", 0),) and experiment.seeds == (42,) and experiment.sweeps == ("k", "damage")
+    )
 
 
 @pytest.mark.parametrize(
@@ -66,6 +76,9 @@ def test_a_file_describes_variants_and_sweeps(experiment):
         ("[0.0, 1.5]", "[99.0]", "number from 0 to 1"),
         ('name = "noisy"', 'name = "noisy"\nextra = 1', "variant 'noisy': has an unknown entry 'extra'"),
         ("[both]", "[sample]\nseeds = [-1]\n[both]", "sample.seeds must be"),
+        ("[both]", '[sample]\nseeds = "untouched"\n[both]', "'untouched': choose one of choosing, reporting"),
+        ("[both]", '[sample]\nfamilies = ["attic"]\n[both]', "list of tabletop, room"),
+        ("[both]", "[sample]\nfamilies = 3\n[both]", "list of tabletop, room"),
         ("[both]", "[sample]\nwidth = 2\n[both]", "sample: the sample's width is 2"),
         ("[both]", "[sample]\nwidht = 64\n[both]", "widht"),
         ("[both]", '[paper]\nsource = "p"\ncolumns = ["a", "b"]\n[paper.rows]\nx = [[1, 2]]\n[both]', "row 'x' must"),

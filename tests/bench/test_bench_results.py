@@ -24,7 +24,7 @@ from beags_plugin.bench.run import rows_of
 from beags_plugin.bench.runner import Outcome
 from beags_plugin.bench.tables import memory_line, per_million_pixels, tables
 from beags_plugin.bench.trials import VariantTrial, plan
-from beags_plugin.evaluation.records import KINDS
+from beags_plugin.evaluation.records import FIGURES as METRICS
 
 
 @pytest.fixture
@@ -34,10 +34,9 @@ def experiment(tmp_path):
 
 def masks(value: float) -> dict:
     return {
-        kind: {moment: {metric: value + 0.1 * (moment == "after") for metric in ("acc", "iou", "biou")}
-               for moment in ("before", "after")}
-        for kind in KINDS
-    }  # fmt: skip
+        kind: {moment: dict.fromkeys(names, value + 0.1 * (moment == "after")) for moment in ("before", "after")}
+        for kind, names in METRICS.items()
+    }
 
 
 def result(value: float, psnr: float | None = 30.0) -> dict:
@@ -124,6 +123,12 @@ def test_tables_list_failures_and_mark_the_papers_figures(rows):
         console.print(table)
     text = console.file.getvalue()
     assert "failed: k = 8 on b: k is 0." in text and "k = 8 (1 of 2 scenes)" in text
+    assert "remains: pixels that show it" in text and "removal" in text
+    real = [dataclasses.replace(r, figures={**r.figures, "removal_psnr_after": None, "removal_remains_after": None})
+            for r in rows]  # fmt: skip
+    for table in tables(load_experiment("ablation"), real):
+        console.print(table)
+    assert "emov" not in console.file.getvalue()[len(text) :]
     assert "the paper's figures, not ours" in text and "92.0 / 85.8 (52)" in text  # (100 - 85.8) / (100 - 72.8)
 
 

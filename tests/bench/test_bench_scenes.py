@@ -34,7 +34,7 @@ SMALL = {"width": 48, "height": 36, "num_train": 8, "num_test": 2, "num_points":
 @pytest.fixture(scope="module")
 def sample(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene") / "sample"
-    return TrialScene("sample 5", write_sample(folder, SampleConfig(seed=5, **SMALL)), 1.0, "digest", seed=5)
+    return TrialScene("tabletop 5", write_sample(folder, SampleConfig(seed=5, **SMALL)), 1.0, "digest", seed=5)
 
 
 def read_all(folder: Path) -> dict[str, np.ndarray]:
@@ -65,13 +65,13 @@ def test_more_damage_is_more_wrong_and_spares_held_out_views(sample, tmp_path):
 
 
 def test_scenes_are_the_samples_or_the_users_or_both(sample, tmp_path, experiment, monkeypatch):
-    experiment = dataclasses.replace(experiment, sample=SMALL, sample_seeds=(5, 6))
+    experiment = dataclasses.replace(experiment, sample=SMALL, samples=(("tabletop", 5), ("room", 5)))
     options = ExperimentOptions(output=tmp_path)
-    assert [s.name for s in scenes_of(experiment, options)] == ["sample 5", "sample 6"]
+    assert [s.name for s in scenes_of(experiment, options)] == ["tabletop 5", "room 5"]
     given = ExperimentOptions(data=(sample.data,), output=tmp_path)
     assert [s.name for s in scenes_of(experiment, given)] == ["sample"]
     both = scenes_of(experiment, ExperimentOptions(data=(sample.data,), scenes=1, output=tmp_path, downscale=2.0))
-    assert [(s.name, s.downscale) for s in both] == [("sample 5", 1.0), ("sample", 2.0)]
+    assert [(s.name, s.downscale) for s in both] == [("tabletop 5", 1.0), ("sample", 2.0)]
     for wrong, words in [
         ({"scenes": 3}, "--scenes is 3"),
         ({"scenes": 0}, "no scene to train on"),

@@ -13,6 +13,7 @@ open3d = pytest.importorskip("open3d")
 trimesh = pytest.importorskip("trimesh")
 
 from covered_things import camera_of, color_at, covered, hits, thing_called
+from scene_distances import distance
 from scipy.spatial import cKDTree
 
 from beags_plugin.core.cameras import Camera
@@ -26,7 +27,7 @@ from beags_plugin.export.mesh import GlbExporter
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
-from beags_plugin.sample.arrangement import Thing
+from beags_plugin.sample.scene import Thing
 from beags_plugin.sample.views import make_views
 from beags_plugin.system.errors import UserError
 
@@ -58,10 +59,10 @@ def mesh(item) -> Mesh:
 
 def test_vertices_lie_on_the_exact_surface(thing, mesh):
     assert mesh.voxel == pytest.approx(2 * 0.18 / 96, rel=0.15)
-    distance = np.abs(thing.distance(mesh.vertices))
+    off = np.abs(distance(thing, mesh.vertices))
     # not all: at sharp edges discs stick out
-    assert np.quantile(distance, 0.9) < mesh.voxel and distance.max() < 4 * mesh.voxel
-    assert np.median(distance) < 0.5 * mesh.voxel
+    assert np.quantile(off, 0.9) < mesh.voxel and off.max() < 4 * mesh.voxel
+    assert np.median(off) < 0.5 * mesh.voxel
 
 
 def test_the_mesh_covers_what_the_views_see(thing, item, mesh):
@@ -76,8 +77,8 @@ def test_faces_look_outwards_and_colours_are_those_of_the_place(thing, mesh):
     middle = corners.mean(axis=1)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)  # some faces are needles
-    out = thing.distance(middle + 0.5 * mesh.voxel * normals)
-    assert (out > thing.distance(middle)).mean() > 0.95
+    out = distance(thing, middle + 0.5 * mesh.voxel * normals)
+    assert (out > distance(thing, middle)).mean() > 0.95
     assert np.abs(mesh.colors - color_at(mesh.vertices)).mean() < 0.02
 
 
@@ -116,7 +117,7 @@ def test_fewer_faces_keep_bounds_surface_and_colours(thing, item, mesh):
     assert 2900 <= len(few.faces) <= 3000 < len(mesh.faces) / 10 and len(few.vertices) == len(np.unique(few.faces))
     for end in (np.min, np.max):
         assert np.abs(end(few.vertices, axis=0) - end(mesh.vertices, axis=0)).max() < mesh.voxel
-    assert np.quantile(np.abs(thing.distance(few.vertices)), 0.9) < mesh.voxel
+    assert np.quantile(np.abs(distance(thing, few.vertices)), 0.9) < mesh.voxel
     assert np.abs(few.colors - color_at(few.vertices)).mean() < 0.02
     again = decimated(mesh, 3000)
     assert np.array_equal(again.vertices, few.vertices) and np.array_equal(again.faces, few.faces)

@@ -16,7 +16,7 @@ from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.boundary import BoundaryLoss
 from beags_plugin.losses.distortion import DistortionLoss
 from beags_plugin.losses.normal import NormalConsistencyLoss, depth_normals
-from beags_plugin.losses.photometric import PhotometricLoss, blur, ssim
+from beags_plugin.losses.photometric import PhotometricLoss, blur, ssim, ssim_map
 from beags_plugin.losses.reduction import ordered_mean, ordered_sum
 
 
@@ -45,7 +45,7 @@ def _window() -> np.ndarray:
     return np.outer(weights, weights) / weights.sum() ** 2
 
 
-def _ssim_by_loops(a: np.ndarray, b: np.ndarray) -> float:
+def _ssim_by_loops(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     height, width, channels = a.shape
     a, b = (np.pad(image, ((5, 5), (5, 5), (0, 0))) for image in (a, b))
     window, values = _window(), []
@@ -57,13 +57,15 @@ def _ssim_by_loops(a: np.ndarray, b: np.ndarray) -> float:
                 vp, vq = (window * p * p).sum() - mp**2, (window * q * q).sum() - mq**2
                 cov = (window * p * q).sum() - mp * mq
                 values.append((2 * mp * mq + 1e-4) * (2 * cov + 9e-4) / ((mp**2 + mq**2 + 1e-4) * (vp + vq + 9e-4)))
-    return float(np.mean(values))
+    return np.reshape(values, (height, width, channels))
 
 
 @pytest.mark.parametrize("shape", [(7, 9, 3), (33, 40, 1), (1, 1, 3)])
 def test_ssim_equals_loops(shape):
     a, b = _random(*shape), _random(*shape, seed=1)
-    assert float(ssim(a, b)) == pytest.approx(_ssim_by_loops(a.numpy(), b.numpy()), abs=1e-12)
+    expected = _ssim_by_loops(a.numpy(), b.numpy())
+    assert float(ssim(a, b)) == pytest.approx(expected.mean(), abs=1e-12)
+    np.testing.assert_allclose(ssim_map(a, b).numpy(), expected.mean(axis=2), atol=1e-12)
 
 
 def test_ssim_of_equal_images_is_one_and_of_inverted_ones_is_low():
@@ -94,7 +96,8 @@ def test_blur_is_the_window_at_block_borders():
 def test_photometric_is_the_weighted_sum():
     drawn, photo = _random(12, 14, 3), _random(12, 14, 3, seed=1)
     inputs = _inputs(image=photo, color=drawn)
-    expected = 0.8 * float((drawn - photo).abs().mean()) + 0.2 * (1 - _ssim_by_loops(drawn.numpy(), photo.numpy()))
+    similar = _ssim_by_loops(drawn.numpy(), photo.numpy()).mean()
+    expected = 0.8 * float((drawn - photo).abs().mean()) + 0.2 * (1 - similar)
     assert float(PhotometricLoss().value(inputs)) == pytest.approx(expected)
     assert float(PhotometricLoss(ssim_weight=0.0).value(inputs)) == pytest.approx(float((drawn - photo).abs().mean()))
 

@@ -151,6 +151,7 @@ mistakes(
         "a sheet without views": beags(RENDER, "--format sheet --views 0"),
     },
 )
+mistake("sample", "a family that does not exist")(beags("sample --family attic --output out"))
 mistake("sample", "no views")(beags("sample --views 0 --output out"))
 mistake("sample", "a negative seed")(beags("sample --seed -1 --output out"))
 mistake("sample", "pixels that fill no memory")(beags("sample --width 10000000 --height 10000000 --output out"))

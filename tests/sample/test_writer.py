@@ -2,30 +2,41 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 from PIL import Image
+from scene_distances import distance, from_background
+from scipy.ndimage import grey_dilation
 
 from beags_plugin.sample import writer
-from beags_plugin.sample.arrangement import DOME_RADIUS, make_still
+from beags_plugin.sample.families import FAMILIES
 from beags_plugin.sample.writer import SampleConfig, is_sample, write_sample
 from beags_plugin.system.errors import UserError
 
 TINY = SampleConfig(seed=3, width=24, height=16, num_train=5, num_test=2, num_points=101, degradation="strong")
 
 
+CLASSES = {"tabletop": 8, "room": 10}  # with the background
+
+
+@pytest.fixture(scope="module", params=CLASSES)
+def config(request):
+    return dataclasses.replace(TINY, family=request.param)
+
+
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return write_sample(tmp_path_factory.mktemp("sample") / "tiny", TINY)
+def folder(config, tmp_path_factory):
+    return write_sample(tmp_path_factory.mktemp("sample") / "tiny", config)
 
 
 def grey(path):
     return np.array(Image.open(path))
 
 
-def test_folder_layout(folder):
+def test_folder_layout(folder, config):
     meta = json.loads((folder / "transforms.json").read_text())
     frames = [f["file_path"] for f in meta["frames"]]
     assert frames == sorted(frames) and len(frames) == 7
@@ -34,12 +45,12 @@ def test_folder_layout(folder):
     assert (meta["w"], meta["h"]) == (24, 16) and meta["fl_x"] == meta["fl_y"] > 0
     assert all(np.array(f["transform_matrix"]).shape == (4, 4) for f in meta["frames"])
     classes = json.loads((folder / "classes.json").read_text())
-    assert classes["0"] == "background" and len(classes) == 8
+    assert classes["0"] == "background" and len(classes) == CLASSES[config.family]
     for path in frames:
         stem = path.split("/")[1][:-4]
         truth = grey(folder / "ground_truth/masks" / f"{stem}.png")
         assert Image.open(folder / path).size == (24, 16) and Image.open(folder / path).mode == "RGB"
-        assert truth.shape == (16, 24) and truth.max() < 8
+        assert truth.shape == (16, 24) and truth.max() < len(classes)
         depth = np.load(folder / "ground_truth/depth" / f"{stem}.npy")
         assert depth.dtype == np.float32 and depth.shape == (16, 24)
         for class_id, name in classes.items():
@@ -47,30 +58,37 @@ def test_folder_layout(folder):
                 silhouette = grey(folder / "ground_truth/silhouettes" / name / f"{stem}.png")
                 assert set(np.unique(silhouette)) <= {0, 255}
                 assert (silhouette[truth == int(class_id)] == 255).all()
+                removed = folder / "ground_truth/removed" / name / f"{stem}.png"
+                shown = path in meta["test_filenames"] and (truth == int(class_id)).any()
+                assert removed.exists() or not shown
+                if removed.exists():
+                    changed = (grey(removed) != grey(folder / path)).any(axis=-1)
+                    rim = grey_dilation(silhouette, 3)
+                    assert path in meta["test_filenames"] and changed.any() and (rim[changed] == 255).all()
         if path in meta["test_filenames"]:
             assert np.array_equal(grey(folder / "masks" / f"{stem}.png"), truth)
     assert len(list((folder / "masks").iterdir())) == 6  # a fifth of five views is dropped
 
 
-def test_class_maps_are_readable_by_the_mask_module(folder):
+def test_class_maps_are_readable_by_the_mask_module(folder, config):
     classes = pytest.importorskip("beags_plugin.labels.classes")
     for path in (folder / "masks").iterdir():
         assert np.array_equal(classes.read_id_mask(path), grey(path))
-    assert len(classes.read_classes(folder / "classes.json")) == 8
+    assert len(classes.read_classes(folder / "classes.json")) == CLASSES[config.family]
 
 
-def test_seed_points_lie_on_surfaces(folder):
+def test_seed_points_lie_on_surfaces(folder, config):
     raw = (folder / "seed_points.ply").read_bytes()
     header, _, body = raw.partition(b"end_header\n")
     assert b"element vertex 101\n" in header
     records = np.frombuffer(body, dtype=[("p", "<f4", 3), ("c", "u1", 3)])
     assert len(records) == 101
-    still = make_still(TINY.seed)
+    still = FAMILIES[config.family].scene(TINY.seed)
     points = records["p"].astype(float)
-    near = [np.abs(points[:, 2]), np.abs(np.linalg.norm(points, axis=1) - DOME_RADIUS)]
-    near += [np.abs(thing.distance(points)) for thing in still.things]
+    near = [from_background(still, points)]
+    near += [np.abs(distance(thing, points)) for thing in still.things]
     assert np.min(near, axis=0).max() < 6 * writer.POINT_NOISE
-    assert 0.3 < np.mean(np.min(near[2:], axis=0) < 6 * writer.POINT_NOISE) <= 1.0
+    assert 0.3 < np.mean(np.min(near[1:], axis=0) < 6 * writer.POINT_NOISE) <= 1.0
     assert records["c"].std() > 5
 
 
@@ -84,15 +102,15 @@ def test_nerfstudio_reads_it(folder):
     assert len(parser.get_dataparser_outputs("test").cameras) == 2
 
 
-def test_same_config_gives_the_same_bytes_and_is_not_rebuilt(folder, tmp_path, monkeypatch):
+def test_same_config_gives_the_same_bytes_and_is_not_rebuilt(folder, config, tmp_path, monkeypatch):
     calls = []
-    other = write_sample(tmp_path / "again", TINY, progress=lambda done, total: calls.append((done, total)))
+    other = write_sample(tmp_path / "again", config, progress=lambda done, total: calls.append((done, total)))
     assert calls == [(i, 7) for i in range(1, 8)]
     files = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
     assert files == sorted(p.relative_to(other) for p in other.rglob("*") if p.is_file())
     assert all((folder / f).read_bytes() == (other / f).read_bytes() for f in files)
     monkeypatch.setattr(writer, "_build", lambda *_: pytest.fail("rebuilt"))
-    assert write_sample(other, TINY) == other
+    assert write_sample(other, config) == other
 
 
 def test_another_config_replaces_a_sample(tmp_path):
@@ -121,7 +139,9 @@ def test_a_foreign_folder_is_left_alone(tmp_path):
     assert (tmp_path / "thesis.txt").read_text() == "mine"
 
 
-@pytest.mark.parametrize("wrong", [{"width": 2}, {"num_test": 0}, {"seed": -1}, {"degradation": "wild"}])
+@pytest.mark.parametrize(
+    "wrong", [{"width": 2}, {"num_test": 0}, {"seed": -1}, {"degradation": "wild"}, {"family": "x"}]
+)
 def test_bad_configs_are_refused(tmp_path, wrong):
     with pytest.raises(UserError):
         write_sample(tmp_path / "s", SampleConfig(**wrong))

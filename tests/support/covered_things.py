@@ -11,13 +11,15 @@ from beags_plugin.core.cameras import Camera, viewmat_from_opengl
 from beags_plugin.core.lifting import pixel_rays
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.close_up import close_up
-from beags_plugin.sample.arrangement import Thing, make_still
+from beags_plugin.sample.arrangement import make_still
+from beags_plugin.sample.scene import Thing
+from beags_plugin.sample.solids import Solid
 from beags_plugin.sample.views import View
 
 C0 = 0.28209479177387814  # of the constant spherical harmonic
 
 
-def thing_called(name: str) -> Thing:
+def thing_called(name: str) -> Thing[Solid]:
     return next(thing for thing in make_still(1).things if thing.name == name)
 
 
@@ -26,7 +28,7 @@ def camera_of(view: View) -> Camera:
     return Camera(viewmat_from_opengl(torch.from_numpy(view.camera_to_world)).float(), K, view.width, view.height)
 
 
-def hits(thing: Thing, camera: Camera) -> np.ndarray:
+def hits(thing: Thing[Solid], camera: Camera) -> np.ndarray:
     """Return world points of the thing's surface under the pixels of a view, [P, 3]; computed by ray casting."""
     rays = pixel_rays(camera, torch.zeros(1, dtype=torch.float64)).reshape(-1, 3).numpy()
     directions = rays @ camera.rotation.double().numpy()
@@ -40,7 +42,7 @@ def color_at(points: np.ndarray) -> np.ndarray:
     return 0.5 + 0.35 * np.sin(7.0 * points + np.array([0.0, 1.0, 2.0]))
 
 
-def covered(thing: Thing, cameras: Sequence[Camera], radius: float = 0.003) -> Surfels:
+def covered(thing: Thing[Solid], cameras: Sequence[Camera], radius: float = 0.003) -> Surfels:
     """Cover the thing evenly with small opaque discs where the views see it, in ``color_at``'s colours.
 
     radius: one sigma of a disc; there is one in each cube of this size, and a bit, that the surface passes through.

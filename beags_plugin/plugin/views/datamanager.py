@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -139,6 +140,14 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
     def undistorted(self, labels: np.ndarray, index: int, split: Split = "train") -> np.ndarray:
         """Remove a view's lens distortion from labels [h, w] of any size."""
         return lens.undistort_labels(labels, *self._lens(split, index))
+
+    def picture(self, file: Path, index: int, split: Split = "train") -> Tensor:
+        """Read another picture of a view as its photo [H, W, 3] float in 0..1, undistorted."""
+        image = self._dataset(split).get_numpy_image(index, file)
+        cameras = self._distorted[split]
+        if lens.has_lens(cameras, index):
+            image = lens.undistort_image(image, cameras, index)
+        return torch.from_numpy(image).float() / 255.0
 
     def as_in_file(self, labels: np.ndarray, index: int, border: int = IGNORE, split: Split = "train") -> np.ndarray:
         """Put the lens distortion of a view's file back into labels [h', w'], at the size the file was read at.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import torch
@@ -38,9 +40,9 @@ class BeagsDataset(InputDataset):
         # The data manager crops the cameras when it undistorts; the files keep this size.
         self.file_sizes = torch.cat([self.cameras.width, self.cameras.height], 1).tolist()
 
-    def get_numpy_image(self, image_idx: int) -> np.ndarray:
-        """Read the image [H, W, 3] uint8, sRGB, before undistortion."""
-        path = self._dataparser_outputs.image_filenames[image_idx]
+    def get_numpy_image(self, image_idx: int, path: Path | None = None) -> np.ndarray:
+        """Read the image [H, W, 3] uint8, sRGB, before undistortion; path: of another picture of the same view."""
+        path = path or self._dataparser_outputs.image_filenames[image_idx]
 
         def read(image: Image.Image) -> np.ndarray:
             if image.mode.startswith(("I", "F")):

@@ -18,7 +18,7 @@ from beags_plugin.labels.classes import read_binary_mask, read_mask
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system.errors import UserError
 
-_NO_TRUTH = GroundTruth(masks=[], visible={}, silhouettes={}, seen={})
+_NO_TRUTH = GroundTruth(masks=[], visible={}, silhouettes={}, seen={}, removed={})
 
 
 class HeldOutViews(Sequence[EvalView]):
@@ -26,8 +26,9 @@ class HeldOutViews(Sequence[EvalView]):
 
     Masks of all visible objects come from ``ground_truth/masks``, else from the data's own; those of single objects
     from ``ground_truth/visible``, silhouettes from ``ground_truth/silhouettes``, and what training photos show of them
-    from ``ground_truth/seen``, or from where the layout has them. All are undistorted like the photographs.
-    Indexing raises ``UserError`` for a mask that cannot be read or has other proportions than its photograph.
+    from ``ground_truth/seen``, or from where the layout has them; pictures without an object from
+    ``ground_truth/removed``. All are undistorted like the photographs. Indexing raises ``UserError`` for a file that
+    cannot be read or has other proportions than its photograph.
     """
 
     def __init__(self, manager: BeagsDataManager, classes: Mapping[int, str], background: Tensor) -> None:
@@ -77,29 +78,41 @@ class HeldOutViews(Sequence[EvalView]):
             view.name,
             seen or None,
             self._per_object(truth["visible"], index) or None,
+            {c: self._picture(file, index) for c, file in self._files(truth["removed"], index).items()} or None,
         )
 
     def _per_object(self, files: Mapping[str, Sequence[Path | None]], view: int) -> dict[int, Tensor]:
         """Read the [h, w] bool masks of a view by object id."""
         masks = {}
-        for class_id, name in self.classes.items():
-            file = files[name][view] if name in files else None
-            if file is not None:
-                ids = self._straight(file, read_binary_mask(file).astype(np.uint16), view)
-                masks[class_id] = torch.from_numpy((ids != 0) & (ids != IGNORE))  # outside the lens is IGNORE
+        for class_id, file in self._files(files, view).items():
+            ids = self._straight(file, read_binary_mask(file).astype(np.uint16), view)
+            masks[class_id] = torch.from_numpy((ids != 0) & (ids != IGNORE))  # outside the lens is IGNORE
         return masks
+
+    def _files(self, files: Mapping[str, Sequence[Path | None]], view: int) -> dict[int, Path]:
+        """Return object id to its file of a view, for those that have one."""
+        found = {c: files[name][view] for c, name in self.classes.items() if name in files}
+        return {c: file for c, file in found.items() if file is not None}
+
+    def _picture(self, file: Path, view: int) -> Tensor:
+        """Read a picture [H, W, 3] without an object, as the photograph is read."""
+        self._check_proportions("picture", file, image_size(file), view)
+        return self.manager.picture(file, view, "eval")
 
     def _straight(self, file: Path, ids: np.ndarray, view: int) -> np.ndarray:
         """Undistort ids; raises ``UserError`` if they have other proportions than the photograph."""
-        photo = self.manager.eval_dataset.image_filenames[view]
-        (width, height), (mask_height, mask_width) = image_size(photo), ids.shape
-        expected = mask_width * height / width  # a smaller copy rounds each side by up to a pixel
-        if abs(expected - mask_height) > 1.0 + expected / mask_width:
+        self._check_proportions("mask", file, (ids.shape[1], ids.shape[0]), view)
+        return self.manager.undistorted(ids, view, "eval")
+
+    def _check_proportions(self, what: str, file: Path, size: tuple[int, int], view: int) -> None:
+        """Raise ``UserError`` if a file of width and height ``size`` has other proportions than the photograph."""
+        (width, height), (own_width, own_height) = image_size(self.manager.eval_dataset.image_filenames[view]), size
+        expected = own_width * height / width  # a smaller copy rounds each side by up to a pixel
+        if abs(expected - own_height) > 1.0 + expected / own_width:
             raise UserError(
-                f"the mask {file} is {mask_width}x{mask_height} pixels but its image is {width}x{height}: "
+                f"the {what} {file} is {own_width}x{own_height} pixels but its image is {width}x{height}: "
                 f"make it in the proportions of the image."
             )
-        return self.manager.undistorted(ids, view, "eval")
 
 
 def _of_size(mask: Tensor, other: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from data_folders import HEIGHT, WIDTH, write_image, write_transforms
+from data_folders import HEIGHT, WIDTH, noise, write_image, write_transforms
 from PIL import Image
 from run_folders import discs, write_scene, write_trained
 
@@ -163,11 +163,15 @@ def test_truth_is_undistorted_like_the_photographs(tmp_path):
         write_image(tmp_path / f"lab/images/v{index:02d}.png", np.zeros((LARGE_H, LARGE_W, 3), np.uint8))
     write_image(tmp_path / "lab/ground_truth/masks/v00.png", ids)
     write_image(tmp_path / "lab/ground_truth/silhouettes/cup/v00.png", np.uint8(255) * (ids == 1))
+    for place in ("images/v00.png", "ground_truth/removed/cup/v00.png"):
+        write_image(tmp_path / "lab" / place, noise(0, LARGE_W, LARGE_H))
     view = EvaluatedRun(write_trained(tmp_path / "run", tmp_path / "lab")).views[0]
     assert view.visible is not None and view.silhouettes is not None
     height, width = view.visible.shape
     assert abs(height - 2 * view.camera.height) <= 1 and abs(width - 2 * view.camera.width) <= 1
     assert torch.equal(view.silhouettes[1], view.visible == 1)
+    assert view.image is not None and view.removed is not None and list(view.removed) == [1]
+    assert torch.equal(view.removed[1], view.image) and view.image.std() > 0.1
     offsets = []
     for number, (x, y) in enumerate(rays, 1):
         there = torch.nonzero(view.visible == number).double() + 0.5  # row, column
@@ -219,8 +223,12 @@ def test_the_option_who_is_resized_reaches_the_files(trained):
 def test_data_that_has_gone_and_truth_of_other_proportions_are_refused(tmp_path):
     data = write_scene(tmp_path / "lab", truth_factor=2)
     write_image(data / "ground_truth/masks/v08.png", np.zeros((2 * HEIGHT, WIDTH), np.uint8))
+    write_image(data / "ground_truth/removed/cup/v00.png", noise(0, WIDTH, 2 * HEIGHT))
     config = write_trained(tmp_path / "run", data)
-    with pytest.raises(UserError, match=r"v08.png is 20x24 pixels but its image is 20x12"):
+    with pytest.raises(UserError, match=r"the picture .*v00.png is 20x24 pixels but its image is 20x12"):
+        evaluate_run(config)
+    (data / "ground_truth/removed/cup/v00.png").unlink()
+    with pytest.raises(UserError, match=r"the mask .*v08.png is 20x24 pixels but its image is 20x12"):
         evaluate_run(config)
     data.rename(tmp_path / "moved")
     with pytest.raises(UserError, match=r"the data of .*config.yml are not at .*lab: name their place with --data"):

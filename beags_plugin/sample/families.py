@@ -1,0 +1,30 @@
+"""The families of generated scenes: how each makes a scene, its light and its views from a seed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from beags_plugin.sample.arrangement import make_still
+from beags_plugin.sample.lighting import Light
+from beags_plugin.sample.room import make_room
+from beags_plugin.sample.room_light import RoomLight
+from beags_plugin.sample.room_views import room_views
+from beags_plugin.sample.scene import Lighting, Scene
+from beags_plugin.sample.views import View, make_views
+
+
+@dataclass(frozen=True)
+class Family:
+    """scene: from the seed. light: of such a scene, or of one with objects left out. views: as ``make_views``."""
+
+    scene: Callable[[int], Scene]
+    light: Callable[[Any], Lighting]
+    views: Callable[[int, int, int, int, int], list[View]]
+
+
+FAMILIES = {
+    "tabletop": Family(make_still, Light, make_views),
+    "room": Family(make_room, RoomLight, room_views),
+}

@@ -1,0 +1,90 @@
+"""Light of a room: a bright panel in the ceiling with soft shadows, and what the walls throw back."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beags_plugin.sample.meshes import block, moved, raycaster, rays
+from beags_plugin.sample.room import SHELL, Room
+from beags_plugin.sample.solids import dot, turned
+
+LIFT = 1e-3  # world units off the surface, so that shadow rays do not hit where they start
+PANEL = np.array([1.1, 0.7])  # half its sides
+LAMP, BOUNCE = np.array([9.5, 9.1, 8.4]), np.array([0.40, 0.39, 0.41])
+REACH = 0.8  # world units within which surfaces keep thrown-back light from one another
+SHARES = 4
+"""Each ray of a pixel looks at its own share of the lamp and of the ways around, all together at everything."""
+
+
+def _spiral(count: int) -> np.ndarray:
+    """Return [count, 3] unit vectors, spread evenly."""
+    z = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
+    angle = 2.399963 * np.arange(count)
+    return np.stack([np.sqrt(1.0 - z * z) * np.cos(angle), np.sqrt(1.0 - z * z) * np.sin(angle), z], axis=1)
+
+
+class RoomLight:
+    """The light of a room; see ``scene.Lighting``."""
+
+    def __init__(self, room: Room, lamp_samples: int = 24, bounce_samples: int = 16) -> None:
+        self.room = room
+        parts = [
+            (turned(thing.solid.vertices, thing.rotation.T) + thing.position, thing.solid.triangles)
+            for thing in (*room.things, *room.fixtures)
+        ]
+        shell = room.shell
+        box = moved(block(shell.half[0], shell.half[1], -shell.half[2], shell.half[2]), tuple(shell.middle))
+        self._blockers = raycaster([*parts, (turned(box[0], shell.turn.T), box[1])])
+        steps = (np.arange(lamp_samples) + 0.5) / lamp_samples, np.arange(lamp_samples) * 0.618034 % 1.0
+        panel = (2.0 * np.stack(steps, axis=1) - 1.0) * PANEL
+        height = shell.middle[2] + shell.half[2] - 10.0 * LIFT
+        self._lamp = turned(np.column_stack([panel, np.full(lamp_samples, height)]), shell.turn.T)
+        self._ways = _spiral(bounce_samples)
+
+    def _open(self, points: np.ndarray, ways: np.ndarray, end: float) -> np.ndarray:
+        return ~self._blockers.test_occlusions(rays(points, ways), 0.0, end).numpy()
+
+    def _light(self, points: np.ndarray, normals: np.ndarray, share: np.ndarray) -> np.ndarray:
+        """Return [N, 3] light at surface points [N, 3] with normals [N, 3], by the lamps and ways of each's share."""
+        lifted = points + LIFT * normals
+        direct, bounced = np.zeros(len(points)), np.zeros(len(points))
+        members = [np.flatnonzero(share == i) for i in range(SHARES)]
+        for i, place in enumerate(self._lamp):
+            on = members[i % SHARES]
+            way = place - lifted[on]
+            squared = dot(way, way)
+            facing = np.maximum(dot(way, normals[on]), 0.0) * np.maximum(way[:, 2], 0.0) / squared**2
+            lit = np.flatnonzero(facing > 0.0)
+            direct[on[lit]] += facing[lit] * self._open(lifted[on[lit]], way[lit], 1.0)
+        for i, way in enumerate(self._ways):  # about the normal their density is proportional to the cosine
+            on = members[i % SHARES]
+            bounced[on] += self._open(lifted[on], normals[on] + 0.999 * way, REACH)
+        direct *= SHARES / len(self._lamp)
+        bounced = 0.25 + 0.75 * SHARES / len(self._ways) * bounced
+        return direct[:, None] * LAMP + bounced[:, None] * BOUNCE
+
+    def colours(self, points: np.ndarray, surface: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """See ``scene.Lighting``."""
+        albedo, normals = np.empty_like(points), np.empty_like(points)
+        for which in np.unique(surface):
+            on = np.flatnonzero(surface == which)
+            if which == SHELL:
+                albedo[on], normals[on] = self._shell(points[on])
+            else:
+                thing = self.room.things[which - 1] if which > 0 else self.room.fixtures[-1 - which]
+                local, way = thing.to_local(points[on]), turned(directions[on], thing.rotation)
+                albedo[on] = thing.texture(local)
+                normals[on] = turned(thing.solid.normals(local, way), thing.rotation.T)
+        return albedo * self._light(points, normals, np.arange(len(points)) % SHARES)
+
+    def _shell(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return albedo and normals of walls, floor and ceiling; the panel is so bright that it needs no light."""
+        shell = self.room.shell
+        local = shell.to_local(points)
+        axis = np.argmax(np.abs(local) / shell.half, axis=1)
+        rows = np.arange(len(points))
+        normals = np.zeros_like(points)
+        normals[rows, axis] = -np.sign(local[rows, axis])
+        place = np.abs(local[:, :2] + shell.middle[:2])
+        panel = (axis == 2) & (local[:, 2] > 0.0) & (place < PANEL).all(axis=1)
+        return np.where(panel[:, None], 10.0, self.room.walls(local)), turned(normals, shell.turn.T)
