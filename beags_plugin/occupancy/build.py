@@ -13,6 +13,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.lifting import lift
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.occupancy.unseen import with_unseen
 from beags_plugin.occupancy.voxel_size import reference_indices, voxel_size_of_reference
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs, render_class_map, surface_depth
@@ -32,10 +33,13 @@ class _View:
     depth: Tensor
     class_id: Tensor
 
+    def surface(self) -> Tensor:
+        """Return [H, W], the depth of the solid pixels; 0 elsewhere."""
+        return self.depth.new_zeros(self.solid.shape).masked_scatter_(self.solid, self.depth)
+
     def points(self) -> Tensor:
         """Return the lifted pixels, [P, 3] world."""
-        depth = self.depth.new_zeros(self.solid.shape).masked_scatter_(self.solid, self.depth)
-        return lift(depth, self.camera)[self.solid]
+        return lift(self.surface(), self.camera)[self.solid]
 
 
 class _Views:
@@ -67,6 +71,7 @@ def build_visibility_grid(
     seed: int = 0,
     depth: str = "median",
     progress: Callable[[int, int], None] | None = None,
+    unseen: bool = False,
 ) -> VisibilityGrid:
     """Render depth and class of every view, lift the pixels with A >= 0.5, and voxelise them per class.
 
@@ -88,7 +93,8 @@ def build_visibility_grid(
     size = voxel_size_of_reference(reference, total, k, seed)
     origin = torch.from_numpy(reference.min(0).astype(np.float64)).to(surfels.means.device)
     clouds = ((view.points(), view.class_id) for view in views)
-    return VisibilityGrid.from_points(clouds, size, origin, num_classes)
+    grid = VisibilityGrid.from_points(clouds, size, origin, num_classes)
+    return with_unseen(grid, surfels, class_ids, views) if unseen else grid
 
 
 def _render(surfels, class_ids, camera, rasterizer, settings, num_classes: int, depth: str) -> _View:

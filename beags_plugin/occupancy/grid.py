@@ -87,6 +87,18 @@ class VisibilityGrid:
             self.voxel_size, self.origin, self.num_classes, self.keys[kept], self.classes[kept], self._dense_bytes
         )
 
+    def near(self, points: Tensor) -> Tensor:
+        """Return [P] bool, whether points [P, 3] lie where voxels have keys."""
+        return (_scaled(points, self.origin, self.voxel_size).abs() < _HALF).all(-1)
+
+    def keys_of(self, points: Tensor) -> Tensor:
+        """Return [P] int64, the key of the voxel around each point [P, 3]; raises ``UserError`` far away."""
+        return _pack(_voxels(points, self.origin, self.voxel_size))
+
+    def centres(self, keys: Tensor) -> Tensor:
+        """Return [M, 3] float32, world, the centres of voxels by their keys [M]."""
+        return (self.origin + (_unpack(keys).double() + 0.5) * self.voxel_size).float()
+
     def to(self, device: torch.device | str) -> VisibilityGrid:
         """Return the grid on a device; itself if it lies there already."""
         if self.keys.device == torch.device(device):

@@ -53,6 +53,8 @@ class PreparationConfig:
     """Which depth is lifted: median or expected."""
     k: int = 2000
     """Neighbours that set the voxel size (E8); more make larger voxels."""
+    unseen: bool = False
+    """Whether space that no view has looked at supports what it lies in: the object around it, or the background."""
     k_pixels: int = 0
     """Training pixels for which k is stated; with fewer, k shrinks in proportion, so that voxels keep their size. 0, as
     in the paper, takes k as it is."""
@@ -150,7 +152,16 @@ def prepare(
 
     class_ids = (assignment if edited is None else edited.assignment).class_ids
     scene = AssignedScene(
-        surfels, class_ids, cameras, masks.labels, max(class_names) + 1, rasterizer, settings, seed, config.depth
+        surfels,
+        class_ids,
+        cameras,
+        masks.labels,
+        max(class_names) + 1,
+        rasterizer,
+        settings,
+        seed,
+        config.depth,
+        config.unseen,
     )
     k = config.neighbours(cameras)
 

@@ -37,6 +37,7 @@ class AssignedScene:
     settings: RasterSettings
     seed: int
     depth: str = "median"
+    unseen: bool = False
 
 
 @dataclass(frozen=True)

@@ -26,4 +26,5 @@ class BeaRefiner(Refiner):
             seed=scene.seed,
             depth=scene.depth,
             progress=progress,
+            unseen=scene.unseen,
         )
