@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from experiment_files import GOOD, masks_of, scene, written
 from beags_plugin.bench.experiment import experiment_names, load_experiment
 from beags_plugin.bench.scenes import TrialScene
 from beags_plugin.bench.trials import MODEL, Trial, plan, steps_of
+from beags_plugin.plugin.presets import preset_config, preset_names
 from beags_plugin.system.errors import UserError
 
 
@@ -24,6 +26,22 @@ def experiment(tmp_path):
 @pytest.mark.parametrize("name", experiment_names())
 def test_every_experiment_that_ships_loads(name):
     assert load_experiment(name).variants
+
+
+def test_rows_named_after_presets_refine_as_these_do():
+    """In the experiment of presets, all from one base; k of the paper's is scaled to the pixels."""
+    experiment = load_experiment("presets")
+    rows = [variant for variant in experiment.variants if variant.name in preset_names()]
+    assert len(rows) == 4
+    for row in rows:
+        own, preset = (
+            preset_config(name, overrides, Path()).model_config
+            for name, overrides in ((experiment.preset, row.refine), (row.name, {}))
+        )
+        if row.name == "beags-paper":
+            preset = replace(preset, prepare=replace(preset.prepare, k_pixels=own.prepare.k_pixels))
+        base = {"base_steps", "densify"}
+        assert {key for key, value in vars(own).items() if value != getattr(preset, key)} <= base, row.name
 
 
 def test_a_file_describes_variants_and_sweeps(experiment):
