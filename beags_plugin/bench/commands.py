@@ -45,7 +45,7 @@ SHIPPED = {
     "masks": "How much damage to the masks costs, with and without reprojection.",
     "tradeoff": "What time and memory buy: every choice moved alone, and the Pareto front of cost and quality.",
     "presets": "What the refinements of the presets cost and give, from one base.",
-    "improvements": "What each extension of the paper's refinement gives, beside the paper's own method.",
+    "improvements": "What each extension of ours gives, beside both losses alone.",
 }
 """Commands by experiment, with the sentence of their help."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from experiment_files import GOOD, masks_of, scene, written
 from beags_plugin.bench.experiment import experiment_names, load_experiment
 from beags_plugin.bench.scenes import SEEDS, TrialScene
 from beags_plugin.bench.trials import MODEL, Trial, plan, steps_of
+from beags_plugin.plugin.presets import preset_config, preset_names
 from beags_plugin.sample.families import FAMILIES
 from beags_plugin.system.errors import UserError
 
@@ -32,6 +34,22 @@ def test_scenes_for_choosing_and_for_reporting_are_kept_apart(name):
     assert seeds == set(SEEDS["reporting"]) if name in REPORTING else seeds <= set(SEEDS["choosing"])
     assert {family for family, _ in experiment.samples} == set(FAMILIES)
     assert not set(SEEDS["choosing"]) & set(SEEDS["reporting"]) and experiment.variants
+
+
+def test_rows_named_after_presets_refine_as_these_do():
+    """In the experiment of presets, all from one base; k of the paper's is scaled to the pixels."""
+    experiment = load_experiment("presets")
+    rows = [variant for variant in experiment.variants if variant.name in preset_names()]
+    assert len(rows) == 4
+    for row in rows:
+        own, preset = (
+            preset_config(name, overrides, Path()).model_config
+            for name, overrides in ((experiment.preset, row.refine), (row.name, {}))
+        )
+        if row.name == "beags-paper":
+            preset = replace(preset, prepare=replace(preset.prepare, k_pixels=own.prepare.k_pixels))
+        base = {"base_steps", "densify"}
+        assert {key for key, value in vars(own).items() if value != getattr(preset, key)} <= base, row.name
 
 
 def test_a_file_describes_variants_and_sweeps(experiment):

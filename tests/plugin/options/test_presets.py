@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -12,7 +13,7 @@ pytest.importorskip("nerfstudio")
 from beags_plugin.losses import LOSSES
 from beags_plugin.plugin import methods
 from beags_plugin.plugin.options.config import BeagsTrainerConfig, base_config
-from beags_plugin.plugin.presets import load_preset, override, preset_names
+from beags_plugin.plugin.presets import load_preset, override, preset_folder, preset_names
 from beags_plugin.refiners import REFINERS
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.shipped import read_toml
@@ -45,6 +46,16 @@ def test_the_papers_preset_changes_nothing_but_what_is_chosen_by_size():
     assert replace(model, prepare=replace(model.prepare, reprojection="auto")) == documented
     assert (model.split.rounds, model.losses["silhouette"].weight, model.prepare.min_confidence) == (0, 0.0, 0.0)
     assert model.refine_position_lr_factor == 1.0
+
+
+def test_the_papers_preset_pins_every_choice_that_is_an_option():
+    """Those of section 11 of docs/method.md, but for the choices of other presets."""
+    rows = (ROOT / "docs/method.md").read_text("utf-8").split("## 11. ")[1].split("|---|---|---|")[1].splitlines()
+    switches = [row.split("|")[3] for row in rows if row and not row.startswith("| `beags-")]
+    options = set(re.findall(r"`(near|far|prepare\.\w+)", " ".join(switches)))
+    pinned = read_toml(preset_folder() / "beags-paper.toml", "preset")["overrides"]
+    assert {"near", "prepare.tau"} <= options
+    assert {f"pipeline.model.{option}" for option in options} <= set(pinned)
 
 
 @pytest.mark.parametrize("name", preset_names())
