@@ -28,22 +28,23 @@ class OccupancyLoss(Loss):
     Memory does not depend on ``samples``. The compiled op computes it where it can; the code here is its reference.
 
     samples: Z, points per Gaussian and step, uniform in its UV disc of radius 3.
-    background: hold the background's Gaussians to its voxels too, as in the paper. Its far parts are sampled thinly, so
-        that its grid has holes there; without it the background keeps its look (our choice for short runs).
+    background: share of the weight on the background's Gaussians: 1 as in the paper, 0 leaves them out.
     """
 
     weight: float = 10.0
 
     samples: int = 20
-    background: bool = True
+    background: float = 1.0
 
     def __post_init__(self) -> None:
         if not (self.samples >= 1 and float(self.samples).is_integer()):
             raise UserError(f"the occupancy loss has samples = {self.samples}: it must be a whole number, 1 or more.")
+        if not 0.0 <= self.background <= 1.0:
+            raise UserError(f"the occupancy loss has background = {self.background}: give a share from 0 to 1.")
 
     @property
     def asks_grid_about_background(self) -> bool:
-        return self.background
+        return self.background > 0.0
 
     def value(self, inputs: LossInputs) -> Tensor:
         return self._scaled(inputs, 1.0)
@@ -52,6 +53,12 @@ class OccupancyLoss(Loss):
         return self._scaled(inputs, self.weight)
 
     def _scaled(self, inputs: LossInputs, weight: float) -> Tensor:
+        terms = [(weight * self.background, True), (weight * (1.0 - self.background), False)]
+        parts = [self._part(inputs, share, background) for share, background in terms if share != 0.0]
+        return sum(parts[1:], parts[0]) if parts else self._part(inputs, 0.0, False)
+
+    def _part(self, inputs: LossInputs, weight: float, background: bool) -> Tensor:
+        """Return ``weight`` times the loss of the objects, or of the background too, at the same points."""
         surfels, grid, class_ids = inputs.surfels, inputs.grid, inputs.class_ids
         if grid is None or class_ids is None:
             raise ValueError("the occupancy loss needs class ids and a visibility grid")
@@ -62,9 +69,9 @@ class OccupancyLoss(Loss):
         if lookup is not None and compiled:
             stream = sample_stream(inputs.seed, inputs.step)
             ids = class_ids.int()
-            return occupancy_loss(*parameters, ids, lookup, stream, num_samples, self.background, weight)
+            return occupancy_loss(*parameters, ids, lookup, stream, num_samples, background, weight)
         active = _outside(*parameters, class_ids, grid)
-        if not self.background:
+        if not background:
             active = active[class_ids[active] != 0]
         rotation = rotation_from_quat(surfels.quats[active])
         per_gaussian = _Occupancy.apply(

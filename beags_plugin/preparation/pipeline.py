@@ -54,7 +54,8 @@ class PreparationConfig:
     k: int = 2000
     """Neighbours that set the voxel size (E8); more make larger voxels."""
     unseen: bool = False
-    """Whether space that no view has looked at supports what it lies in: the object around it, or the background."""
+    """Whether space that no view has seen supports what it lies in: the object around it, else the background. In the
+    paper it supports nothing."""
     k_pixels: int = 0
     """Training pixels for which k is stated; with fewer, k shrinks in proportion, so that voxels keep their size. 0, as
     in the paper, takes k as it is."""

@@ -214,13 +214,20 @@ def test_importing_the_packages_stays_light():
 
 
 @both
-def test_the_background_can_be_left_out():
+def test_the_background_has_a_share_of_the_weight():
     surfels, ids = _surfels(), _ids()
     objects = surfels[ids != 0]
-    value = OccupancyLoss(background=False, samples=4000).value(_inputs(surfels))
+    value = OccupancyLoss(background=0.0, samples=4000).value(_inputs(surfels))
     alone = OccupancyLoss(samples=4000).value(_inputs(objects, ids=ids[ids != 0]))
     assert float(value) == pytest.approx(float(alone) * len(objects) / COUNT, rel=0.05)  # other points, same mean
     assert all(not gradient[ids == 0].any() for gradient in _gradients(value, surfels))
+    whole = OccupancyLoss().value(_inputs(surfels))
+    part, without = (OccupancyLoss(background=share).value(_inputs(surfels)) for share in (0.25, 0.0))
+    assert float(whole) > 1.1 * float(without)
+    assert float(part) == pytest.approx(0.25 * float(whole) + 0.75 * float(without))
+    of_ids = torch.where(ids == 0, 0.25, 1.0)
+    for own, all_of_it in zip(_gradients(part, surfels), _gradients(whole, surfels), strict=True):
+        torch.testing.assert_close(own, all_of_it * of_ids.view(-1, *[1] * (own.dim() - 1)))
 
 
 @both

@@ -87,6 +87,7 @@ mistakes(
         "a loss that begins before the first step": loss("normal", start=-5),
         "no samples": loss("occupancy", options={"samples": 0}),
         "samples that are negative": loss("occupancy", options={"samples": -1}),
+        "more than the weight on the background": loss("occupancy", options={"background": 1.5}),
     },
 )
 

@@ -167,7 +167,7 @@ def base_config() -> BeagsTrainerConfig:
                     "normal": LossSpec(weight=0.05, start=7_000),
                     "boundary": LossSpec(weight=0.5, phase="refine"),
                     "silhouette": LossSpec(weight=0.0, phase="refine", options={"objects": 1, "seen": 0}),
-                    "occupancy": LossSpec(weight=10.0, phase="refine", options={"samples": 20, "background": True}),
+                    "occupancy": LossSpec(weight=10.0, phase="refine", options={"samples": 20, "background": 1.0}),
                 },
             ),
         ),

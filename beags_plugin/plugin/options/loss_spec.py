@@ -28,9 +28,10 @@ class LossSpec:
     """First step of the term: of the run, stated for a base of schedule_steps; or, for phase "refine", of the
     refinement, as it is."""
     options: dict[str, bool | int | float] = field(default_factory=dict)
-    """Of the loss itself. occupancy: samples, points per Gaussian and step (Z); background, whether the background is
-    held to its voxels too. silhouette: objects, how many are rendered each step; seen, how many of the 27 voxels around
-    what another object covers must have been seen for that pixel to count, 0 for every pixel."""
+    """Of the loss itself. occupancy: samples, points per Gaussian and step (Z); background, the share of the weight on
+    the background's Gaussians, 1 as in the paper. silhouette: objects, how many are rendered each step; seen, how many
+    of the 27 voxels around what another object covers must have been seen for that pixel to count, 0 for every pixel.
+    """
 
     def build(self, name: str, schedule: PhaseSchedule) -> Loss:
         """Build the loss, with absolute steps; raises ``UserError`` for a wrong value."""
