@@ -2,7 +2,8 @@
 
 In the paper a voxel supports a class only where a view has seen it: space inside things, under them and outside of all
 views counts like space that was seen to be empty. Here a voxel in which no surface was seen, and through which no ray
-has passed, supports the object whose convex hull it lies in, the smallest one; else the background.
+has passed, supports the object whose convex hull it lies in, the smallest one; else the background. Hulls are a voxel
+smaller, so that both sides of a contact keep their surfaces.
 """
 
 from __future__ import annotations
@@ -127,7 +128,8 @@ def _innermost(grid: VisibilityGrid, points: Tensor) -> Tensor:
         near &= hull.volume < smallest
         inside = torch.nonzero(near)[:, 0]
         for *normal, offset in np.unique(hull.equations, axis=0).tolist():
-            inside = inside[where[inside] @ torch.tensor(normal, dtype=torch.float64) + offset <= 0]
+            height = where[inside] @ torch.tensor(normal, dtype=torch.float64) + offset
+            inside = inside[height <= -grid.voxel_size]  # the outermost layer is valid by the next one
         smallest[inside], found[inside] = hull.volume, class_id
     return found.to(points.device)
 

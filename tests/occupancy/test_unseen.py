@@ -94,6 +94,8 @@ def test_unseen_space_inside_an_object_is_the_objects_that_of_the_smallest_aroun
     found = with_unseen(grid, asked, torch.zeros(4, dtype=torch.int32), [])
     outside = [True, False, False]
     assert valid(found, asked) == [[False, False, True], [False, True, False], outside, outside]
+    both = discs((0, 0, 0.27))  # at the border of the small cube
+    assert valid(with_unseen(grid, both, torch.zeros(1, dtype=torch.int32), []), both) == [[False, True, True]]
     assert torch.equal(found.classes[torch.isin(found.keys, grid.keys)], grid.classes)  # what was seen stays
 
 
