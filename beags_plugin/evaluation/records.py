@@ -20,6 +20,8 @@ FIGURES: dict[Kind, tuple[str, ...]] = {**dict.fromkeys(MASK_KINDS, METRICS), "r
 """The names of the figures of each kind. removal: the scene rendered without the object, where the data has an exact
 picture of that."""
 KINDS = tuple(FIGURES)
+IMAGE_FIGURES = ("psnr", "psnr_shown", "shown", "ssim")
+"""Of whole images. psnr_shown: over the pixels whose surface some training photo shows; shown: their share."""
 
 
 @dataclass(frozen=True)
@@ -70,11 +72,16 @@ class MaskRecord:
 
 @dataclass(frozen=True)
 class ViewRecord:
-    """The image of one view: its name, PSNR in dB (infinite for equal images) and SSIM; None without a photograph."""
+    """The image of one view: its name, PSNR in dB (infinite for equal images) and SSIM; None without a photograph.
+
+    psnr_shown, shown: see ``IMAGE_FIGURES``; None where that is not known, the former without such pixels too.
+    """
 
     name: str
     psnr: float | None
     ssim: float | None
+    psnr_shown: float | None = None
+    shown: float | None = None
 
 
 @dataclass(frozen=True)
@@ -82,9 +89,9 @@ class SceneMetrics:
     """The figures of a scene over all its views.
 
     mean: over the scene, as the protocol says. objects: object id to the mean over its masks. psnr: dB, mean over the
-    views with a photograph, infinite for equal images; None without any. ssim: likewise. extracted_truth: "silhouette"
-    (occlusion-free), "visible" (without the pixels where another object hides this one), "both", or None. masks, views:
-    the single figures behind these means.
+    views with a photograph, infinite for equal images; None without any. ssim, psnr_shown, shown: likewise.
+    extracted_truth: "silhouette" (occlusion-free), "visible" (without the pixels where another object hides this one),
+    "both", or None. masks, views: the single figures behind these means.
     """
 
     mean: ObjectMetrics
@@ -94,3 +101,5 @@ class SceneMetrics:
     ssim: float | None = None
     masks: tuple[MaskRecord, ...] = ()
     views: tuple[ViewRecord, ...] = ()
+    psnr_shown: float | None = None
+    shown: float | None = None

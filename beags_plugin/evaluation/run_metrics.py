@@ -14,6 +14,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import mask_metrics, mean, mean_metrics, psnr
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import (
+    IMAGE_FIGURES,
     KINDS,
     MASK_KINDS,
     EvalView,
@@ -43,13 +44,15 @@ def evaluate_scene(
     protocol: Protocol | None = None,
     complete: bool = True,
     background: Tensor | None = None,
+    shown: Sequence[Tensor] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> SceneMetrics:
     """Return the figures of each object's masks and of the scene without it, PSNR and SSIM (method, section 8).
 
     surfels: N Gaussians. class_ids: [N] int32, phi; None scores images alone. classes: id to name; the background, 0,
     is not scored. complete: False where Gaussians were taken out of the scene, so that only extracted masks can be
-    scored. background: [3] behind the images; black if None. progress: receives (done, total) views.
+    scored. background: [3] behind the images; black if None. shown: per view [H, W] bool, see ``shown_pixels``.
+    progress: receives (done, total) views.
     """
     protocol = protocol or Protocol()
     surfels = surfels.detach()
@@ -66,16 +69,20 @@ def evaluate_scene(
                 for class_id, mask in renderer.masks(kind, objects).items():
                     metrics = mask_metrics(mask.prediction, mask.truth, mask.ignore, protocol)
                     masks.append(MaskRecord(kind, class_id, index, mask.source, metrics))
-            figures = None, None
+            image = ViewRecord(view.name, None, None)
             if complete and view.image is not None:
                 color, photo = renderer.image(surfels, background), view.image.to(surfels.means)
-                figures = psnr(color, photo), float(ssim(color, photo))
+                image = ViewRecord(view.name, psnr(color, photo), float(ssim(color, photo)))
+                if shown is not None:
+                    known = shown[index]
+                    over = psnr(color[known], photo[known]) if known.any() else None
+                    image = replace(image, psnr_shown=over, shown=float(known.double().mean()))
                 for class_id, exact, silhouette in removals(view, objects):
                     assert class_ids is not None
                     rest = renderer.image(remove_class(surfels, class_ids, class_id)[0], background)
                     metrics = removal_metrics(rest, photo, exact.to(rest), silhouette.to(rest.device))
                     masks.append(MaskRecord("removal", class_id, index, "silhouette", metrics))
-            images.append(ViewRecord(view.name, *figures))
+            images.append(image)
             if progress is not None:
                 progress(index + 1, len(views))
     truths = {record.truth for record in masks if record.kind == "extracted"}
@@ -86,11 +93,10 @@ def evaluate_scene(
     return SceneMetrics(
         mean=ObjectMetrics(**{kind: average(masks, kind, protocol) for kind in KINDS}),
         objects={c: ObjectMetrics(**{kind: of_object(c, kind) for kind in KINDS}) for c in objects},
-        psnr=mean(image.psnr for image in images),
         extracted_truth="both" if len(truths) == 2 else next(iter(truths), None),
-        ssim=mean(image.ssim for image in images),
         masks=tuple(masks),
         views=tuple(images),
+        **{name: mean(getattr(image, name) for image in images) for name in IMAGE_FIGURES},
     )
 
 

@@ -9,14 +9,16 @@ from beags_plugin.evaluation.metrics import METRICS
 from beags_plugin.evaluation.records import FIGURES, KINDS, MASK_KINDS, ObjectMetrics
 from beags_plugin.evaluation.removal import TELLING
 from beags_plugin.evaluation.report import DataSetMetrics, RunMetrics, Stage
+from beags_plugin.evaluation.shown import TAU
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
 _HEADINGS = {"acc": "Acc", "iou": "IoU", "biou": "BIoU", "psnr": "PSNR", "ssim": "SSIM", "remains": "remains"}
+_IMAGE_HEADINGS = {"psnr": "\nPSNR", "psnr_shown": "\nshown", "ssim": "\nSSIM"}
 _STAGE_NAMES = {"before": "assigned", "after": "refined"}  # in summary.json
 _Row = tuple[str, Mapping[str, Any], Mapping[str, Any] | None]
-"""A row's name, its metrics {kind: {stage: {metric: value}}}, and {"psnr", "ssim"} of its images or None."""
+"""A row's name, its metrics {kind: {stage: {metric: value}}}, and its ``IMAGE_FIGURES`` or None."""
 _TRUTHS = {
     "silhouette": "whole occlusion-free silhouettes",
     "visible": "visible masks, less the pixels where another object stands nearer",
@@ -63,7 +65,9 @@ def render_run(
         parts.append(Text(run.scene))
     lines = []
     if run.after.psnr is not None:
-        for title, metric in (("PSNR, dB", "psnr"), ("SSIM", "ssim")):
+        share = _cell("shown", run.after.shown)
+        of_images = {"psnr": "PSNR, dB", "psnr_shown": f"PSNR of the {share} % shown, dB", "ssim": "SSIM"}
+        for metric, title in of_images.items():
             lines.append(f"{title}: " + " → ".join(_cell(metric, content[metric][stage]) for stage in stages))
     if seconds:
         lines.append("Seconds: " + ", ".join(f"{stage} {value:.1f}" for stage, value in seconds.items()))
@@ -99,11 +103,17 @@ def protocol_line(runs: Sequence[RunMetrics]) -> str:
             " Removal: the scene without the object's Gaussians against the exact picture without it, over the whole "
             f"silhouette; remains: pixels nearer to the photo, of those where the two differ by {TELLING:g} or more."
         )
+    shown = ""
+    if any(run.after.shown is not None for run in runs):
+        shown = (
+            " PSNR shown: over the pixels whose surface (median depth before refinement, else of the run) some "
+            f"training view shows within {100 * TAU:g} % of its depth."
+        )
     scenes = "over scenes" if protocol.data_set_average == "scenes" else "of all scenes pooled"
     return (
         f"Protocol: extracted masks against {truth}; above {protocol.threshold:g}; boundary band "
         f"{100 * protocol.band_share:g} % of the diagonal; the {protocol.resize} is resized; masks empty in truth and "
-        f"prediction are left out; means over {protocol.scene_average}, then {scenes}.{removal}"
+        f"prediction are left out; means over {protocol.scene_average}, then {scenes}.{removal}{shown}"
     )
 
 
@@ -150,13 +160,13 @@ def _table(
         new = index == 0 or columns[index - 1][0] != kind
         heading = _HEADINGS[metric]
         table.add_column(f"{kind if new else ''}\n{heading}", justify="right", min_width=len(kind) if new else 5)
-    for heading in ("\nPSNR", "\nSSIM") if any(images for *_, images in rows) else ():
+    for heading in _IMAGE_HEADINGS.values() if any(images for *_, images in rows) else ():
         table.add_column(heading, justify="right")
     for name, row, images in rows:
         for stage in stages:
             cells = [_cell(metric, row[kind][stage][metric]) for kind, metric in columns]
             if images is not None:
-                cells += [_cell(metric, images[metric][stage]) for metric in ("psnr", "ssim")]
+                cells += [_cell(metric, images[metric][stage]) for metric in _IMAGE_HEADINGS]
             table.add_row(Text(name) if stage == stages[0] else "", stage, *cells)
         table.add_section()
     return table
@@ -165,4 +175,4 @@ def _table(
 def _cell(metric: str, value: float | None) -> str:
     if value is None:
         return "–"
-    return {"psnr": f"{value:.2f}", "ssim": f"{value:.3f}"}.get(metric, f"{100 * value:.1f}")
+    return f"{value:.2f}" if "psnr" in metric else f"{value:.3f}" if metric == "ssim" else f"{100 * value:.1f}"

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import overload
+from typing import Literal, overload
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from beags_plugin.core.cameras import Camera
 from beags_plugin.data.files import image_size
 from beags_plugin.data.ground_truth import GroundTruth
 from beags_plugin.evaluation.records import EvalView
 from beags_plugin.labels.class_ids import IGNORE, resize_nearest
 from beags_plugin.labels.classes import read_binary_mask, read_mask
+from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system.errors import UserError
 
@@ -55,6 +57,11 @@ class HeldOutViews(Sequence[EvalView]):
         """Return the number of these views that are training views too."""
         trained = set(self.manager.train_dataset.image_filenames)
         return sum(path in trained for path in self.manager.eval_dataset.image_filenames)
+
+    def cameras(self, split: Literal["train", "eval"]) -> list[Camera]:
+        """Return the cameras of the training or the held-out views, without lens distortion; no photo is read."""
+        cameras = (self.manager.train_dataset if split == "train" else self.manager.eval_dataset).cameras
+        return [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))]
 
     def _view(self, index: int) -> EvalView:
         view = self._views[index]
