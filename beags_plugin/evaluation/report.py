@@ -60,7 +60,7 @@ class RunMetrics:
 
         {"scene", "config", "protocol": {choice: value}, "extracted_truth", "notes": [sentence], "mean": {"extracted":
         {"before": {"acc", "iou", "biou"}, "after": {...}}, "seen": {...}, "rendered": {...}, "removal": {"before":
-        {"psnr", "ssim", "remains"}, "after": {...}}}, "objects": {name: as mean}, "worst": name, "masks": [{"kind",
+        {``REMOVAL_METRICS``}, "after": {...}}}, "objects": {name: as mean}, "worst": name, "masks": [{"kind",
         "object", "view", "truth", "before": as in mean, "after": {...}}], "views": [{"view"}]}, and {"before", "after"}
         of every one of ``IMAGE_FIGURES`` in itself and in each view.
         """

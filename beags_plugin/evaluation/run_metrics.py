@@ -74,13 +74,14 @@ def evaluate_scene(
                 color, photo = renderer.image(surfels, background), view.image.to(surfels.means)
                 image = ViewRecord(view.name, psnr(color, photo), float(ssim(color, photo)))
                 if shown is not None:
-                    known = shown[index]
-                    over = psnr(color[known], photo[known]) if known.any() else None
-                    image = replace(image, psnr_shown=over, shown=float(known.double().mean()))
-                for class_id, exact, silhouette in removals(view, objects):
+                    of_view = shown[index]
+                    over = psnr(color[of_view], photo[of_view]) if of_view.any() else None
+                    image = replace(image, psnr_shown=over, shown=float(of_view.double().mean()))
+                for class_id, exact, silhouette, known in removals(view, objects):
                     assert class_ids is not None
                     rest = renderer.image(remove_class(surfels, class_ids, class_id)[0], background)
-                    metrics = removal_metrics(rest, photo, exact.to(rest), silhouette.to(rest.device))
+                    known = None if known is None else known.to(rest.device)
+                    metrics = removal_metrics(rest, photo, exact.to(rest), silhouette.to(rest.device), known)
                     masks.append(MaskRecord("removal", class_id, index, "silhouette", metrics))
             images.append(image)
             if progress is not None:
@@ -254,11 +255,16 @@ def seen_truth(view: EvalView, class_id: int) -> Truth | None:
     return Truth("silhouette", view.silhouettes[class_id], view.silhouettes[class_id] & ~known)
 
 
-def removals(view: EvalView, objects: Sequence[int]) -> Iterator[tuple[int, Tensor, Tensor]]:
-    """Yield the objects whose removal can be scored: id, exact picture [H, W, 3] and silhouette [H, W] bool."""
+def removals(view: EvalView, objects: Sequence[int]) -> Iterator[tuple[int, Tensor, Tensor, Tensor | None]]:
+    """Yield the objects whose removal can be scored: id, exact picture [H, W, 3], silhouette and known part [H, W]."""
     for class_id, exact in (view.removed or {}).items():
-        if class_id in objects and (silhouette := (view.silhouettes or {}).get(class_id)) is not None:
-            yield class_id, exact, torch.from_numpy(resize_nearest(silhouette.cpu().numpy(), *exact.shape[:2]))
+        found = (None if masks is None else masks.get(class_id) for masks in (view.silhouettes, view.removed_shown))
+        silhouette, shown = (
+            None if mask is None else torch.from_numpy(resize_nearest(mask.cpu().numpy(), *exact.shape[:2]))
+            for mask in found
+        )
+        if class_id in objects and silhouette is not None:
+            yield class_id, exact, silhouette, shown
 
 
 def _of_others(masks: Mapping[int, Tensor], class_id: int) -> Tensor:

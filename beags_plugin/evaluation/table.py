@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 _HEADINGS = {"acc": "Acc", "iou": "IoU", "biou": "BIoU", "psnr": "PSNR", "ssim": "SSIM", "remains": "remains"}
-_IMAGE_HEADINGS = {"psnr": "\nPSNR", "psnr_shown": "\nshown", "ssim": "\nSSIM"}
+_HEADINGS |= {"psnr_shown": "shown", "shown": "pixels"}
+_IN_IMAGES = ("psnr", "psnr_shown", "ssim")
 _STAGE_NAMES = {"before": "assigned", "after": "refined"}  # in summary.json
 _Row = tuple[str, Mapping[str, Any], Mapping[str, Any] | None]
 """A row's name, its metrics {kind: {stage: {metric: value}}}, and its ``IMAGE_FIGURES`` or None."""
@@ -101,7 +102,8 @@ def protocol_line(runs: Sequence[RunMetrics]) -> str:
     if any(run.after.mean.removal is not None for run in runs):
         removal = (
             " Removal: the scene without the object's Gaussians against the exact picture without it, over the whole "
-            f"silhouette; remains: pixels nearer to the photo, of those where the two differ by {TELLING:g} or more."
+            "silhouette; shown: where the latter shows surface that some training view shows; remains: pixels nearer "
+            f"to the photo, of those where the two differ by {TELLING:g} or more."
         )
     shown = ""
     if any(run.after.shown is not None for run in runs):
@@ -137,9 +139,11 @@ def _mask_table(what: str, first: str, rows: Sequence[_Row], stages: Sequence[St
 def _removal_table(what: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> Iterator[RenderableType]:
     """Yield a table of what is left after removal, if any row has that."""
     if _known(rows, stages, "removal", "psnr"):
-        columns = [("removal", metric) for metric in FIGURES["removal"]]
+        columns = [("removal", m) for m in FIGURES["removal"] if "shown" not in m or _known(rows, stages, "removal", m)]
         plain = [(name, row, None) for name, row, _ in rows]
-        yield _table(f"{what}: objects removed, PSNR in dB, remains in %", first, plain, stages, columns)
+        yield _table(
+            f"{what}: objects removed, PSNR in dB, pixels shown and remains in %", first, plain, stages, columns
+        )
 
 
 def _known(rows: Sequence[_Row], stages: Sequence[Stage], kind: str, metric: str) -> bool:
@@ -160,13 +164,13 @@ def _table(
         new = index == 0 or columns[index - 1][0] != kind
         heading = _HEADINGS[metric]
         table.add_column(f"{kind if new else ''}\n{heading}", justify="right", min_width=len(kind) if new else 5)
-    for heading in _IMAGE_HEADINGS.values() if any(images for *_, images in rows) else ():
-        table.add_column(heading, justify="right")
+    for metric in _IN_IMAGES if any(images for *_, images in rows) else ():
+        table.add_column(f"\n{_HEADINGS[metric]}", justify="right")
     for name, row, images in rows:
         for stage in stages:
             cells = [_cell(metric, row[kind][stage][metric]) for kind, metric in columns]
             if images is not None:
-                cells += [_cell(metric, images[metric][stage]) for metric in _IMAGE_HEADINGS]
+                cells += [_cell(metric, images[metric][stage]) for metric in _IN_IMAGES]
             table.add_row(Text(name) if stage == stages[0] else "", stage, *cells)
         table.add_section()
     return table

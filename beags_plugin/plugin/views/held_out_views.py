@@ -20,7 +20,7 @@ from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system.errors import UserError
 
-_NO_TRUTH = GroundTruth(masks=[], visible={}, silhouettes={}, seen={}, removed={})
+_NO_TRUTH = GroundTruth(masks=[], visible={}, silhouettes={}, seen={}, removed={}, removed_shown={})
 
 
 class HeldOutViews(Sequence[EvalView]):
@@ -29,8 +29,9 @@ class HeldOutViews(Sequence[EvalView]):
     Masks of all visible objects come from ``ground_truth/masks``, else from the data's own; those of single objects
     from ``ground_truth/visible``, silhouettes from ``ground_truth/silhouettes``, and what training photos show of them
     from ``ground_truth/seen``, or from where the layout has them; pictures without an object from
-    ``ground_truth/removed``. All are undistorted like the photographs. Indexing raises ``UserError`` for a file that
-    cannot be read or has other proportions than its photograph.
+    ``ground_truth/removed``, and where these can be known from ``ground_truth/removed_shown``. All are undistorted like
+    the photographs. Indexing raises ``UserError`` for a file that cannot be read or has other proportions than its
+    photograph.
     """
 
     def __init__(self, manager: BeagsDataManager, classes: Mapping[int, str], background: Tensor) -> None:
@@ -86,6 +87,7 @@ class HeldOutViews(Sequence[EvalView]):
             seen or None,
             self._per_object(truth["visible"], index) or None,
             {c: self._picture(file, index) for c, file in self._files(truth["removed"], index).items()} or None,
+            self._per_object(truth["removed_shown"], index) or None,
         )
 
     def _per_object(self, files: Mapping[str, Sequence[Path | None]], view: int) -> dict[int, Tensor]:

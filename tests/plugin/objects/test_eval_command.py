@@ -170,7 +170,8 @@ def test_truth_is_undistorted_like_the_photographs(tmp_path):
     for index in range(9):
         write_image(tmp_path / f"lab/images/v{index:02d}.png", np.zeros((LARGE_H, LARGE_W, 3), np.uint8))
     write_image(tmp_path / "lab/ground_truth/masks/v00.png", ids)
-    write_image(tmp_path / "lab/ground_truth/silhouettes/cup/v00.png", np.uint8(255) * (ids == 1))
+    for kind in ("silhouettes", "removed_shown"):
+        write_image(tmp_path / f"lab/ground_truth/{kind}/cup/v00.png", np.uint8(255) * (ids == 1))
     for place in ("images/v00.png", "ground_truth/removed/cup/v00.png"):
         write_image(tmp_path / "lab" / place, noise(0, LARGE_W, LARGE_H))
     view = EvaluatedRun(write_trained(tmp_path / "run", tmp_path / "lab")).views[0]
@@ -178,6 +179,7 @@ def test_truth_is_undistorted_like_the_photographs(tmp_path):
     height, width = view.visible.shape
     assert abs(height - 2 * view.camera.height) <= 1 and abs(width - 2 * view.camera.width) <= 1
     assert torch.equal(view.silhouettes[1], view.visible == 1)
+    assert view.removed_shown is not None and torch.equal(view.removed_shown[1], view.visible == 1)
     assert view.image is not None and view.removed is not None and list(view.removed) == [1]
     assert torch.equal(view.removed[1], view.image) and view.image.std() > 0.1
     offsets = []
