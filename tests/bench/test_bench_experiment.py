@@ -13,6 +13,7 @@ from experiment_files import GOOD, masks_of, scene, written
 from beags_plugin.bench.experiment import experiment_names, load_experiment
 from beags_plugin.bench.scenes import SEEDS, TrialScene
 from beags_plugin.bench.trials import MODEL, Trial, plan, steps_of
+from beags_plugin.plugin.presets import preset_config
 from beags_plugin.sample.families import FAMILIES
 from beags_plugin.system.errors import UserError
 
@@ -32,6 +33,22 @@ def test_scenes_for_choosing_and_for_reporting_are_kept_apart(name):
     assert seeds == set(SEEDS["reporting"]) if name in REPORTING else seeds <= set(SEEDS["choosing"])
     assert {family for family, _ in experiment.samples} == set(FAMILIES)
     assert not set(SEEDS["choosing"]) & set(SEEDS["reporting"]) and experiment.variants
+
+
+@pytest.mark.parametrize("name", [name for name in experiment_names() if name != "base"])  # that refines nothing
+def test_every_length_of_refinement_has_its_control(name):
+    """A gain in PSNR is one over as many steps with no loss of masks; where figures are reported, at equal rates."""
+    lengths: dict[bool, set[tuple[int, float]]] = {True: set(), False: set()}
+    experiment = load_experiment(name)
+    for variant in experiment.variants:
+        model = preset_config(experiment.preset, variant.refine, Path(name)).model_config
+        control = not any(model.losses[loss].weight for loss in ("boundary", "occupancy", "silhouette"))
+        assert control == ("neither loss" in variant.name)
+        if model.refiner != "none":
+            lengths[control].add((model.refine_steps, model.refine_position_lr_factor))
+    assert {steps for steps, _ in lengths[False]} == {steps for steps, _ in lengths[True]}
+    if name in REPORTING:
+        assert lengths[False] == lengths[True]
 
 
 def test_a_file_describes_variants_and_sweeps(experiment):
