@@ -9,13 +9,14 @@ from typing import Any
 
 from beags_plugin.bench.experiment import Experiment, Variant
 from beags_plugin.evaluation.records import FIGURES as METRICS
+from beags_plugin.evaluation.records import IMAGE_FIGURES
 from beags_plugin.evaluation.report import STAGES as MOMENTS
 
 STAGES = ("base training", "reprojection", "assignment", "voxel grids", "refinement")
 MEAN = "mean"  # in the column "object": over all masks of the scene
 _PLACE = ("scene", "seed", "variant", "sweep", "line", "x", "object", "failed")
 _COSTS = ("cpu_seconds", "peak_memory_mb", "own_memory_mb", "steps", "gaussians")
-_QUALITY = tuple(f"{metric}_{moment}" for metric in ("psnr", "ssim") for moment in MOMENTS) + tuple(
+_QUALITY = tuple(f"{metric}_{moment}" for metric in IMAGE_FIGURES for moment in MOMENTS) + tuple(
     f"{kind}_{metric}_{moment}" for kind, metrics in METRICS.items() for metric in metrics for moment in MOMENTS
 )
 _WORST, _LOST = "worst_biou_after", "lost_biou"
@@ -55,7 +56,7 @@ def make_row(
         return ResultRow(variant, scene, seed, dict.fromkeys(FIGURES), {}, failed or "it has no result")
     evaluation = result["evaluation"]
     figures: dict[str, float | None] = {**dict.fromkeys(FIGURES), **_masks(evaluation["mean"])}
-    figures |= {f"{metric}_{m}": evaluation[metric][m] for metric in ("psnr", "ssim") for m in MOMENTS}
+    figures |= {f"{metric}_{m}": evaluation[metric][m] for metric in IMAGE_FIGURES for m in MOMENTS}
     seconds = {**result["seconds"], "base training": base["seconds"]["base training"]}
     figures |= {f"seconds {stage}": seconds.get(stage) for stage in STAGES}
     figures |= {name: result[name] for name in (*_COSTS, *_MASKS, *_SCALE)}

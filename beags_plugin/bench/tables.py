@@ -20,9 +20,13 @@ _COLUMNS = (  # head, figure, digits, factor
     ("rendered\nIoU", "rendered_iou_after", 1, 100.0),
     ("\nBIoU", "rendered_biou_after", 1, 100.0),
     ("removal\nPSNR", "removal_psnr_after", 2, 1.0),
+    ("\nshown", "removal_psnr_shown_after", 2, 1.0),
     ("\nremains", "removal_remains_after", 1, 100.0),
     ("PSNR, dB\nbefore", "psnr_before", 2, 1.0),
     ("\nafter", "psnr_after", 2, 1.0),
+    ("shown, dB\nbefore", "psnr_shown_before", 2, 1.0),
+    ("\nafter", "psnr_shown_after", 2, 1.0),
+    ("\npixels", "shown_after", 1, 100.0),
     ("SSIM\nafter", "ssim_after", 3, 1.0),
     ("prepare\ns", "prepare", 1, 1.0),
     ("refine\ns", "seconds refinement", 1, 1.0),
@@ -45,6 +49,7 @@ def tables(experiment: Experiment, rows: Sequence[ResultRow]) -> list[Table | st
     printed.append("Worst object: the lowest extracted BIoU; lost: the most that an object loses by refinement.")
     if _any(rows, "removal_psnr_after"):
         printed.append("Removal: the scene without an object, against the exact picture; remains: pixels that show it.")
+    printed.append("Shown: PSNR over the pixels (in %) whose surface some training view shows.")
     printed.append("Seconds of stages are wall time; CPU: of the whole trial after its base, all threads.")
     printed.append("Memory: the peak of the trial's process, and what of it the loaded program does not take.")
     if experiment.reference is not None:

@@ -16,7 +16,8 @@ class GroundTruth(TypedDict):
     """Files of exact masks and pictures, one or None per view.
 
     masks: id images. visible, silhouettes, seen: object name to binary masks of its visible part, without occlusion,
-    and of the part of the silhouette that training photos show. removed: to pictures without the object.
+    and of the part of the silhouette that training photos show. removed: to pictures without the object;
+    removed_shown: to the part of the silhouette where these show surface that training photos show.
     """
 
     masks: FilesPerView
@@ -24,6 +25,7 @@ class GroundTruth(TypedDict):
     silhouettes: dict[str, FilesPerView]
     seen: dict[str, FilesPerView]
     removed: dict[str, FilesPerView]
+    removed_shown: dict[str, FilesPerView]
 
 
 def of_views(truth: GroundTruth, chosen: Sequence[int]) -> GroundTruth:
@@ -38,13 +40,14 @@ def of_views(truth: GroundTruth, chosen: Sequence[int]) -> GroundTruth:
         silhouettes=each(truth["silhouettes"]),
         seen=each(truth["seen"]),
         removed=each(truth["removed"]),
+        removed_shown=each(truth["removed_shown"]),
     )
 
 
 def find_ground_truth(folder: Path, dataset: Dataset, images: Sequence[Path], images_root: Path) -> GroundTruth | None:
     """Find the exact masks and pictures in ``folder`` and those of the layout; None without any.
 
-    ``folder`` holds masks/<stem>.png, and <kind>/<object>/<stem>.png for visible, silhouettes, seen and removed.
+    ``folder`` holds masks/<stem>.png, and <kind>/<object>/<stem>.png for the other kinds.
     """
     if not (folder.is_dir() or dataset.visible or dataset.silhouettes):
         return None
@@ -63,4 +66,5 @@ def find_ground_truth(folder: Path, dataset: Dataset, images: Sequence[Path], im
         silhouettes=per_object("silhouettes", dataset.silhouettes),
         seen=per_object("seen", {}),
         removed=per_object("removed", {}),
+        removed_shown=per_object("removed_shown", {}),
     )

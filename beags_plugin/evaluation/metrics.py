@@ -14,6 +14,7 @@ from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.labels.class_ids import resize_nearest
 
 METRICS = ("acc", "iou", "biou")
+REMOVAL_METRICS = ("psnr", "psnr_shown", "shown", "ssim", "remains")
 
 
 @dataclass(frozen=True)
@@ -33,10 +34,13 @@ class MaskMetrics:
 class RemovalMetrics:
     """What is left where an object was taken out of the scene, or a mean of it; see ``removal.removal_metrics``.
 
-    psnr: dB, infinite for equal pixels. ssim: at most 1. remains: 0..1, lower is better. None as in ``MaskMetrics``.
+    psnr: dB, infinite for equal pixels. psnr_shown: over the pixels that can be known; shown: their share. ssim: at
+    most 1. remains: 0..1, lower is better. None as in ``MaskMetrics``.
     """
 
     psnr: float | None
+    psnr_shown: float | None
+    shown: float | None
     ssim: float | None
     remains: float | None
 

@@ -9,17 +9,19 @@ from typing import Literal
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.evaluation.metrics import METRICS, MaskMetrics, RemovalMetrics
+from beags_plugin.evaluation.metrics import METRICS, REMOVAL_METRICS, MaskMetrics, RemovalMetrics
 
 MaskKind = Literal["extracted", "seen", "rendered"]
 MASK_KINDS: tuple[MaskKind, ...] = ("extracted", "seen", "rendered")
 """extracted: the object rendered alone. seen: the same over the parts that training photos show, where the data says
 which. rendered: the object's share of the whole scene."""
 Kind = MaskKind | Literal["removal"]
-FIGURES: dict[Kind, tuple[str, ...]] = {**dict.fromkeys(MASK_KINDS, METRICS), "removal": ("psnr", "ssim", "remains")}
+FIGURES: dict[Kind, tuple[str, ...]] = {**dict.fromkeys(MASK_KINDS, METRICS), "removal": REMOVAL_METRICS}
 """The names of the figures of each kind. removal: the scene rendered without the object, where the data has an exact
 picture of that."""
 KINDS = tuple(FIGURES)
+IMAGE_FIGURES = ("psnr", "psnr_shown", "shown", "ssim")
+"""Of whole images. psnr_shown: over the pixels whose surface some training photo shows; shown: their share."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,8 @@ class EvalView:
     nothing stands before it. seen: object id to [h, w] bool, the part of the silhouette whose surface some training
     photo shows; metrics of the kind "seen" leave out the rest. visible_objects: object id to [h, w] bool, the visible
     part where single objects were labelled and nothing is known of the others; scored instead of ``visible``. removed:
-    object id to [H, W, 3] float in 0..1, the exact picture without it.
+    object id to [H, W, 3] float in 0..1, the exact picture without it. removed_shown: object id to [h, w] bool, the
+    part of the silhouette where that picture shows surface which some training photo shows.
     """
 
     camera: Camera
@@ -42,6 +45,7 @@ class EvalView:
     seen: Mapping[int, Tensor] | None = None
     visible_objects: Mapping[int, Tensor] | None = None
     removed: Mapping[int, Tensor] | None = None
+    removed_shown: Mapping[int, Tensor] | None = None
 
 
 @dataclass(frozen=True)
@@ -70,11 +74,16 @@ class MaskRecord:
 
 @dataclass(frozen=True)
 class ViewRecord:
-    """The image of one view: its name, PSNR in dB (infinite for equal images) and SSIM; None without a photograph."""
+    """The image of one view: its name, PSNR in dB (infinite for equal images) and SSIM; None without a photograph.
+
+    psnr_shown, shown: see ``IMAGE_FIGURES``; None where that is not known, the former without such pixels too.
+    """
 
     name: str
     psnr: float | None
     ssim: float | None
+    psnr_shown: float | None = None
+    shown: float | None = None
 
 
 @dataclass(frozen=True)
@@ -82,9 +91,9 @@ class SceneMetrics:
     """The figures of a scene over all its views.
 
     mean: over the scene, as the protocol says. objects: object id to the mean over its masks. psnr: dB, mean over the
-    views with a photograph, infinite for equal images; None without any. ssim: likewise. extracted_truth: "silhouette"
-    (occlusion-free), "visible" (without the pixels where another object hides this one), "both", or None. masks, views:
-    the single figures behind these means.
+    views with a photograph, infinite for equal images; None without any. ssim, psnr_shown, shown: likewise.
+    extracted_truth: "silhouette" (occlusion-free), "visible" (without the pixels where another object hides this one),
+    "both", or None. masks, views: the single figures behind these means.
     """
 
     mean: ObjectMetrics
@@ -94,3 +103,5 @@ class SceneMetrics:
     ssim: float | None = None
     masks: tuple[MaskRecord, ...] = ()
     views: tuple[ViewRecord, ...] = ()
+    psnr_shown: float | None = None
+    shown: float | None = None

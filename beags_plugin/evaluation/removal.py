@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from beags_plugin.evaluation.metrics import RemovalMetrics, psnr
@@ -13,18 +14,28 @@ TELLING = 0.1
 Where they are more alike, the ordinary error of a rendering decides which of the two it is nearer to."""
 
 
-def removal_metrics(rendered: Tensor, photo: Tensor, exact: Tensor, silhouette: Tensor) -> RemovalMetrics:
+def removal_metrics(
+    rendered: Tensor, photo: Tensor, exact: Tensor, silhouette: Tensor, known: Tensor | None = None
+) -> RemovalMetrics:
     """Return PSNR and SSIM against the exact picture where the object was, and the share of it that still shows.
 
     rendered: [H, W, 3] float in 0..1, the scene without the object's Gaussians. photo, exact: the same view with and
-    without the object. silhouette: [H, W] bool. The three figures are over the silhouette; SSIM is the mean of its map,
-    whose windows reach outside. Remains show in a pixel if its rendering is nearer to the photo than to the exact
-    picture, of the pixels where these two differ by ``TELLING`` or more. A figure without pixels is None.
+    without the object. silhouette: [H, W] bool. known: [H, W] bool, where the exact picture has surface that some
+    training photo shows, or None. All figures are over the silhouette; SSIM is the mean of its map, whose windows reach
+    outside. Remains show in a pixel if its rendering is nearer to the photo than to the exact picture, of the pixels
+    where these two differ by ``TELLING`` or more. A figure without pixels is None.
     """
     if not silhouette.any():
-        return RemovalMetrics(None, None, None)
+        return RemovalMetrics(None, None, None, None, None)
     similar = ssim_map(rendered, exact)[silhouette].mean()
     drawn, shown, empty = rendered[silhouette], photo[silhouette], exact[silhouette]
     telling = (shown - empty).norm(dim=-1) >= TELLING
     remains = ((drawn - shown).norm(dim=-1) < (drawn - empty).norm(dim=-1))[telling]
-    return RemovalMetrics(psnr(drawn, empty), float(similar), float(remains.double().mean()) if len(remains) else None)
+    there = torch.zeros_like(telling) if known is None else known[silhouette]
+    return RemovalMetrics(
+        psnr(drawn, empty),
+        psnr(drawn[there], empty[there]) if there.any() else None,
+        None if known is None else float(there.double().mean()),
+        float(similar),
+        float(remains.double().mean()) if len(remains) else None,
+    )

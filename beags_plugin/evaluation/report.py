@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from beags_plugin.evaluation.metrics import mean, mean_metrics
 from beags_plugin.evaluation.protocol import Protocol
-from beags_plugin.evaluation.records import FIGURES, KINDS, Kind, ObjectMetrics, SceneMetrics
+from beags_plugin.evaluation.records import FIGURES, IMAGE_FIGURES, KINDS, Kind, ObjectMetrics, SceneMetrics
 from beags_plugin.evaluation.run_metrics import pooled_average
 
 Stage = Literal["before", "after"]
@@ -17,7 +17,7 @@ STAGES: tuple[Stage, ...] = ("before", "after")
 CSV_COLUMNS = (
     *("scene", "object", "stage"),
     *(f"{kind}_{name}" for kind, names in FIGURES.items() for name in names),
-    *("psnr", "ssim"),
+    *IMAGE_FIGURES,
 )
 
 
@@ -60,15 +60,20 @@ class RunMetrics:
 
         {"scene", "config", "protocol": {choice: value}, "extracted_truth", "notes": [sentence], "mean": {"extracted":
         {"before": {"acc", "iou", "biou"}, "after": {...}}, "seen": {...}, "rendered": {...}, "removal": {"before":
-        {"psnr", "ssim", "remains"}, "after": {...}}}, "psnr": {"before", "after"}, "ssim": {"before", "after"},
-        "objects": {name: as mean}, "worst": name, "masks": [{"kind", "object", "view", "truth", "before": as in mean,
-        "after": {...}}], "views": [{"view", "psnr": {"before", "after"}, "ssim": {...}}]}.
+        {``REMOVAL_METRICS``}, "after": {...}}}, "objects": {name: as mean}, "worst": name, "masks": [{"kind",
+        "object", "view", "truth", "before": as in mean, "after": {...}}], "views": [{"view"}]}, and {"before", "after"}
+        of every one of ``IMAGE_FIGURES`` in itself and in each view.
         """
         names, stages = self.names(), self.stages()
         view_names = [view.name for view in self.after.views]
 
-        def numbers(pick: Callable[[SceneMetrics], float | None]) -> dict[str, Any]:
-            return {stage: finite(pick(stages[stage])) if stage in stages else None for stage in STAGES}
+        def images(pick: Callable[[SceneMetrics], Any]) -> dict[str, Any]:
+            return {
+                name: {
+                    stage: finite(getattr(pick(stages[stage]), name)) if stage in stages else None for stage in STAGES
+                }
+                for name in IMAGE_FIGURES
+            }
 
         def metrics(kind: Kind, pick: Callable[[SceneMetrics], Any]) -> dict[str, Any]:
             return {stage: plain_metrics(kind, pick(stages[stage]) if stage in stages else None) for stage in STAGES}
@@ -83,8 +88,7 @@ class RunMetrics:
             "extracted_truth": self.after.extracted_truth,
             "notes": list(self.notes),
             "mean": all_kinds(lambda scene: scene.mean),
-            "psnr": numbers(lambda scene: scene.psnr),
-            "ssim": numbers(lambda scene: scene.ssim),
+            **images(lambda scene: scene),
             "objects": {name: all_kinds(lambda scene, c=c: scene.objects[c]) for c, name in names.items()},
             "worst": self.worst(),
             "masks": [
@@ -97,14 +101,7 @@ class RunMetrics:
                 }
                 for i, mask in enumerate(self.after.masks)
             ],
-            "views": [
-                {
-                    "view": name,
-                    "psnr": numbers(lambda scene, i=i: scene.views[i].psnr),
-                    "ssim": numbers(lambda scene, i=i: scene.views[i].ssim),
-                }
-                for i, name in enumerate(view_names)
-            ],
+            "views": [{"view": name, **images(lambda scene, i=i: scene.views[i])} for i, name in enumerate(view_names)],
         }
 
 
@@ -112,18 +109,17 @@ class RunMetrics:
 class DataSetMetrics:
     """Runs of one protocol and their mean.
 
-    name: of the data set, in tables. means: stage to the mean of all kinds. psnr, ssim: stage to their means. "before"
-    is left out unless all scenes with "after" have it.
+    name: of the data set, in tables. means: stage to the mean of all kinds. images: each of ``IMAGE_FIGURES`` to its
+    mean by stage. "before" is left out unless all scenes with "after" have it.
     """
 
     name: str
     runs: tuple[RunMetrics, ...]
     means: Mapping[Stage, ObjectMetrics] = field(default_factory=dict)
-    psnr: Mapping[Stage, float | None] = field(default_factory=dict)
-    ssim: Mapping[Stage, float | None] = field(default_factory=dict)
+    images: Mapping[str, Mapping[Stage, float | None]] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """Return {"data_set", "protocol", "mean", "psnr", "ssim" (all three as of a run), "scenes": [run, ...]}."""
+        """Return {"data_set", "protocol", "mean", ``IMAGE_FIGURES`` (these as of a run), "scenes": [run, ...]}."""
         empty = ObjectMetrics(None, None)
         return {
             "data_set": self.name,
@@ -132,21 +128,22 @@ class DataSetMetrics:
                 kind: {stage: plain_metrics(kind, getattr(self.means.get(stage, empty), kind)) for stage in STAGES}
                 for kind in KINDS
             },
-            "psnr": {stage: finite(self.psnr.get(stage)) for stage in STAGES},
-            "ssim": {stage: finite(self.ssim.get(stage)) for stage in STAGES},
+            **{name: {stage: finite(found[stage]) for stage in STAGES} for name, found in self.images.items()},
             "scenes": [run.to_json() for run in self.runs],
         }
 
     def csv_rows(self) -> list[list[Any]]:
         """Return a row per scene, object and stage, then the means; columns as ``CSV_COLUMNS``, fractions in 0..1."""
-        rows = []
+        rows, no_images = [], [None] * len(IMAGE_FIGURES)
         for run in self.runs:
             for stage, scene in run.stages().items():
                 for class_id, name in run.names().items():
-                    rows.append([run.scene, name, stage, *_cells(scene.objects[class_id]), None, None])
-                rows.append([run.scene, "", stage, *_cells(scene.mean), finite(scene.psnr), finite(scene.ssim)])
+                    rows.append([run.scene, name, stage, *_cells(scene.objects[class_id]), *no_images])
+                images = [finite(getattr(scene, name)) for name in IMAGE_FIGURES]
+                rows.append([run.scene, "", stage, *_cells(scene.mean), *images])
         for stage, found in self.means.items():
-            rows.append([self.name, "", stage, *_cells(found), finite(self.psnr[stage]), finite(self.ssim[stage])])
+            images = [finite(of_stage[stage]) for of_stage in self.images.values()]
+            rows.append([self.name, "", stage, *_cells(found), *images])
         return rows
 
 
@@ -164,7 +161,7 @@ def data_set(name: str, runs: Sequence[RunMetrics]) -> DataSetMetrics:
             else:
                 kinds[stage][kind] = mean_metrics(getattr(scene.mean, kind) for scene in scenes)
 
-    def of_images(metric: Literal["psnr", "ssim"]) -> dict[Stage, float | None]:
+    def of_images(metric: str) -> dict[Stage, float | None]:
         found: dict[Stage, float | None] = dict.fromkeys(STAGES)
         for stage, scenes in _comparable(runs, lambda scene: getattr(scene, metric)).items():
             pooled = protocol.data_set_average == "pooled"
@@ -172,13 +169,13 @@ def data_set(name: str, runs: Sequence[RunMetrics]) -> DataSetMetrics:
             found[stage] = mean(getattr(unit, metric) for unit in units)
         return found
 
-    psnr, ssim = of_images("psnr"), of_images("ssim")
+    images = {name: of_images(name) for name in IMAGE_FIGURES}
     means: dict[Stage, ObjectMetrics] = {}
     for stage in STAGES:
         figures = ObjectMetrics(**{kind: kinds[stage].get(kind) for kind in KINDS})
-        if figures != ObjectMetrics(None, None) or psnr[stage] is not None:
+        if figures != ObjectMetrics(None, None) or images["psnr"][stage] is not None:
             means[stage] = figures
-    return DataSetMetrics(name, tuple(runs), means, psnr, ssim)
+    return DataSetMetrics(name, tuple(runs), means, images)
 
 
 def _comparable(runs: Sequence[RunMetrics], has: Callable[[SceneMetrics], Any]) -> dict[Stage, list[SceneMetrics]]:

@@ -14,6 +14,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import mask_metrics, mean, mean_metrics, psnr
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import (
+    IMAGE_FIGURES,
     KINDS,
     MASK_KINDS,
     EvalView,
@@ -43,13 +44,15 @@ def evaluate_scene(
     protocol: Protocol | None = None,
     complete: bool = True,
     background: Tensor | None = None,
+    shown: Sequence[Tensor] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> SceneMetrics:
     """Return the figures of each object's masks and of the scene without it, PSNR and SSIM (method, section 8).
 
     surfels: N Gaussians. class_ids: [N] int32, phi; None scores images alone. classes: id to name; the background, 0,
     is not scored. complete: False where Gaussians were taken out of the scene, so that only extracted masks can be
-    scored. background: [3] behind the images; black if None. progress: receives (done, total) views.
+    scored. background: [3] behind the images; black if None. shown: per view [H, W] bool, see ``shown_pixels``.
+    progress: receives (done, total) views.
     """
     protocol = protocol or Protocol()
     surfels = surfels.detach()
@@ -66,16 +69,21 @@ def evaluate_scene(
                 for class_id, mask in renderer.masks(kind, objects).items():
                     metrics = mask_metrics(mask.prediction, mask.truth, mask.ignore, protocol)
                     masks.append(MaskRecord(kind, class_id, index, mask.source, metrics))
-            figures = None, None
+            image = ViewRecord(view.name, None, None)
             if complete and view.image is not None:
                 color, photo = renderer.image(surfels, background), view.image.to(surfels.means)
-                figures = psnr(color, photo), float(ssim(color, photo))
-                for class_id, exact, silhouette in removals(view, objects):
+                image = ViewRecord(view.name, psnr(color, photo), float(ssim(color, photo)))
+                if shown is not None:
+                    of_view = shown[index]
+                    over = psnr(color[of_view], photo[of_view]) if of_view.any() else None
+                    image = replace(image, psnr_shown=over, shown=float(of_view.double().mean()))
+                for class_id, exact, silhouette, known in removals(view, objects):
                     assert class_ids is not None
                     rest = renderer.image(remove_class(surfels, class_ids, class_id)[0], background)
-                    metrics = removal_metrics(rest, photo, exact.to(rest), silhouette.to(rest.device))
+                    known = None if known is None else known.to(rest.device)
+                    metrics = removal_metrics(rest, photo, exact.to(rest), silhouette.to(rest.device), known)
                     masks.append(MaskRecord("removal", class_id, index, "silhouette", metrics))
-            images.append(ViewRecord(view.name, *figures))
+            images.append(image)
             if progress is not None:
                 progress(index + 1, len(views))
     truths = {record.truth for record in masks if record.kind == "extracted"}
@@ -86,11 +94,10 @@ def evaluate_scene(
     return SceneMetrics(
         mean=ObjectMetrics(**{kind: average(masks, kind, protocol) for kind in KINDS}),
         objects={c: ObjectMetrics(**{kind: of_object(c, kind) for kind in KINDS}) for c in objects},
-        psnr=mean(image.psnr for image in images),
         extracted_truth="both" if len(truths) == 2 else next(iter(truths), None),
-        ssim=mean(image.ssim for image in images),
         masks=tuple(masks),
         views=tuple(images),
+        **{name: mean(getattr(image, name) for image in images) for name in IMAGE_FIGURES},
     )
 
 
@@ -248,11 +255,16 @@ def seen_truth(view: EvalView, class_id: int) -> Truth | None:
     return Truth("silhouette", view.silhouettes[class_id], view.silhouettes[class_id] & ~known)
 
 
-def removals(view: EvalView, objects: Sequence[int]) -> Iterator[tuple[int, Tensor, Tensor]]:
-    """Yield the objects whose removal can be scored: id, exact picture [H, W, 3] and silhouette [H, W] bool."""
+def removals(view: EvalView, objects: Sequence[int]) -> Iterator[tuple[int, Tensor, Tensor, Tensor | None]]:
+    """Yield the objects whose removal can be scored: id, exact picture [H, W, 3], silhouette and known part [H, W]."""
     for class_id, exact in (view.removed or {}).items():
-        if class_id in objects and (silhouette := (view.silhouettes or {}).get(class_id)) is not None:
-            yield class_id, exact, torch.from_numpy(resize_nearest(silhouette.cpu().numpy(), *exact.shape[:2]))
+        found = (None if masks is None else masks.get(class_id) for masks in (view.silhouettes, view.removed_shown))
+        silhouette, shown = (
+            None if mask is None else torch.from_numpy(resize_nearest(mask.cpu().numpy(), *exact.shape[:2]))
+            for mask in found
+        )
+        if class_id in objects and silhouette is not None:
+            yield class_id, exact, silhouette, shown
 
 
 def _of_others(masks: Mapping[int, Tensor], class_id: int) -> Tensor:

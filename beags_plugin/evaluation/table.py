@@ -9,14 +9,17 @@ from beags_plugin.evaluation.metrics import METRICS
 from beags_plugin.evaluation.records import FIGURES, KINDS, MASK_KINDS, ObjectMetrics
 from beags_plugin.evaluation.removal import TELLING
 from beags_plugin.evaluation.report import DataSetMetrics, RunMetrics, Stage
+from beags_plugin.evaluation.shown import TAU
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
 _HEADINGS = {"acc": "Acc", "iou": "IoU", "biou": "BIoU", "psnr": "PSNR", "ssim": "SSIM", "remains": "remains"}
+_HEADINGS |= {"psnr_shown": "shown", "shown": "pixels"}
+_IN_IMAGES = ("psnr", "psnr_shown", "ssim")
 _STAGE_NAMES = {"before": "assigned", "after": "refined"}  # in summary.json
 _Row = tuple[str, Mapping[str, Any], Mapping[str, Any] | None]
-"""A row's name, its metrics {kind: {stage: {metric: value}}}, and {"psnr", "ssim"} of its images or None."""
+"""A row's name, its metrics {kind: {stage: {metric: value}}}, and its ``IMAGE_FIGURES`` or None."""
 _TRUTHS = {
     "silhouette": "whole occlusion-free silhouettes",
     "visible": "visible masks, less the pixels where another object stands nearer",
@@ -63,7 +66,9 @@ def render_run(
         parts.append(Text(run.scene))
     lines = []
     if run.after.psnr is not None:
-        for title, metric in (("PSNR, dB", "psnr"), ("SSIM", "ssim")):
+        share = _cell("shown", run.after.shown)
+        of_images = {"psnr": "PSNR, dB", "psnr_shown": f"PSNR of the {share} % shown, dB", "ssim": "SSIM"}
+        for metric, title in of_images.items():
             lines.append(f"{title}: " + " → ".join(_cell(metric, content[metric][stage]) for stage in stages))
     if seconds:
         lines.append("Seconds: " + ", ".join(f"{stage} {value:.1f}" for stage, value in seconds.items()))
@@ -97,13 +102,20 @@ def protocol_line(runs: Sequence[RunMetrics]) -> str:
     if any(run.after.mean.removal is not None for run in runs):
         removal = (
             " Removal: the scene without the object's Gaussians against the exact picture without it, over the whole "
-            f"silhouette; remains: pixels nearer to the photo, of those where the two differ by {TELLING:g} or more."
+            "silhouette; shown: where the latter shows surface that some training view shows; remains: pixels nearer "
+            f"to the photo, of those where the two differ by {TELLING:g} or more."
+        )
+    shown = ""
+    if any(run.after.shown is not None for run in runs):
+        shown = (
+            " PSNR shown: over the pixels whose surface (median depth before refinement, else of the run) some "
+            f"training view shows within {100 * TAU:g} % of its depth."
         )
     scenes = "over scenes" if protocol.data_set_average == "scenes" else "of all scenes pooled"
     return (
         f"Protocol: extracted masks against {truth}; above {protocol.threshold:g}; boundary band "
         f"{100 * protocol.band_share:g} % of the diagonal; the {protocol.resize} is resized; masks empty in truth and "
-        f"prediction are left out; means over {protocol.scene_average}, then {scenes}.{removal}"
+        f"prediction are left out; means over {protocol.scene_average}, then {scenes}.{removal}{shown}"
     )
 
 
@@ -127,9 +139,11 @@ def _mask_table(what: str, first: str, rows: Sequence[_Row], stages: Sequence[St
 def _removal_table(what: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> Iterator[RenderableType]:
     """Yield a table of what is left after removal, if any row has that."""
     if _known(rows, stages, "removal", "psnr"):
-        columns = [("removal", metric) for metric in FIGURES["removal"]]
+        columns = [("removal", m) for m in FIGURES["removal"] if "shown" not in m or _known(rows, stages, "removal", m)]
         plain = [(name, row, None) for name, row, _ in rows]
-        yield _table(f"{what}: objects removed, PSNR in dB, remains in %", first, plain, stages, columns)
+        yield _table(
+            f"{what}: objects removed, PSNR in dB, pixels shown and remains in %", first, plain, stages, columns
+        )
 
 
 def _known(rows: Sequence[_Row], stages: Sequence[Stage], kind: str, metric: str) -> bool:
@@ -150,13 +164,13 @@ def _table(
         new = index == 0 or columns[index - 1][0] != kind
         heading = _HEADINGS[metric]
         table.add_column(f"{kind if new else ''}\n{heading}", justify="right", min_width=len(kind) if new else 5)
-    for heading in ("\nPSNR", "\nSSIM") if any(images for *_, images in rows) else ():
-        table.add_column(heading, justify="right")
+    for metric in _IN_IMAGES if any(images for *_, images in rows) else ():
+        table.add_column(f"\n{_HEADINGS[metric]}", justify="right")
     for name, row, images in rows:
         for stage in stages:
             cells = [_cell(metric, row[kind][stage][metric]) for kind, metric in columns]
             if images is not None:
-                cells += [_cell(metric, images[metric][stage]) for metric in ("psnr", "ssim")]
+                cells += [_cell(metric, images[metric][stage]) for metric in _IN_IMAGES]
             table.add_row(Text(name) if stage == stages[0] else "", stage, *cells)
         table.add_section()
     return table
@@ -165,4 +179,4 @@ def _table(
 def _cell(metric: str, value: float | None) -> str:
     if value is None:
         return "–"
-    return {"psnr": f"{value:.2f}", "ssim": f"{value:.3f}"}.get(metric, f"{100 * value:.1f}")
+    return f"{value:.2f}" if "psnr" in metric else f"{value:.3f}" if metric == "ssim" else f"{100 * value:.1f}"

@@ -1,19 +1,26 @@
 """The part of an object's silhouette that rests on surface which the training photos show.
 
 Where objects touch, photos show their surfaces nowhere or only through a gap. An evaluation may leave such pixels of
-the silhouette out.
+the silhouette out. Likewise what an object hid can only be put back where some photo shows it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy import ndimage
 
+from beags_plugin.sample.scene import Scene
+from beags_plugin.sample.tracing import first_hits
 from beags_plugin.sample.views import Picture, View
 
 MIN_VIEWS = 6  # photos that must show a patch of surface; fewer, through a gap and at a slant, do not place it in space
 PATCH = 0.03  # side of a patch, world units: a few pixels, so that every photo that shows one has points in it
 GAP = 1  # pixels: points of neighbouring pixels of one photo lie at most so far apart in another, seen at like distance
+
+NEAR = 0.05  # share of a point's depth by which that of its pixel in a photo may differ where it is not hidden
+SAME = 1e-6  # share of the distance to a point by which rounding lets a ray end before it
 
 
 def visible_surface(view: View, picture: Picture) -> list[np.ndarray]:
@@ -42,16 +49,35 @@ def seen_part(view: View, surface: np.ndarray, silhouette: np.ndarray) -> np.nda
 
     surface: [P, 3] world points of the object, as ``well_seen`` gives them. silhouette: [H, W] bool.
     """
-    rotation = view.camera_to_world[:3, :3]
-    local = (surface - view.center) @ rotation
-    depth = -local[:, 2]
-    front = depth > 0
-    x = np.floor(view.cx + view.focal * local[front, 0] / depth[front]).astype(np.int64)
-    y = np.floor(view.cy - view.focal * local[front, 1] / depth[front]).astype(np.int64)
-    height, width = silhouette.shape
-    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    _, rows, columns, _ = _landing(view, surface)
     hit = np.zeros(silhouette.shape, dtype=bool)
-    hit[y[inside], x[inside]] = True
+    hit[rows, columns] = True
     # Points of neighbouring pixels of one photo lie up to a pixel apart in another: closing fills the gaps between
     # them and leaves the boundary where it is.
     return ndimage.binary_closing(np.pad(hit, GAP), np.ones((3, 3)), GAP)[GAP:-GAP, GAP:-GAP] & silhouette
+
+
+def shown_points(scene: Scene, points: np.ndarray, photos: Sequence[tuple[View, np.ndarray]]) -> np.ndarray:
+    """Return [P] bool: which world points [P, 3] of the scene's surfaces some photo shows.
+
+    photos: each with its depth [H, W], which tells for most points that they are hidden; rays are cast at the others.
+    """
+    shown = np.zeros(len(points), dtype=bool)
+    for view, surface in photos:
+        rest = np.flatnonzero(~shown)
+        inside, rows, columns, depth = _landing(view, points[rest])
+        near = rest[inside[np.abs(depth - surface[rows, columns]) <= NEAR * depth]]
+        hits, _ = first_hits(scene, view.center, points[near] - view.center)
+        shown[near] = hits.t > 1.0 - SAME
+    return shown
+
+
+def _landing(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return which of ``points`` [P, 3] lie inside the picture, [M], and of these row, column and depth."""
+    local = (points - view.center) @ view.camera_to_world[:3, :3]
+    front = np.flatnonzero(local[:, 2] < 0)
+    depth = -local[front, 2]
+    columns = np.floor(view.cx + view.focal * local[front, 0] / depth).astype(np.int64)
+    rows = np.floor(view.cy - view.focal * local[front, 1] / depth).astype(np.int64)
+    inside = (columns >= 0) & (columns < view.width) & (rows >= 0) & (rows < view.height)
+    return front[inside], rows[inside], columns[inside], depth[inside]

@@ -147,6 +147,14 @@ def render_removed(
     return removed.reshape(image.shape)
 
 
+def surface_without(scene: Scene, view: View, pixels: np.ndarray, class_id: int) -> np.ndarray:
+    """Return the world points [P, 3] that the centres of ``pixels`` [H, W] bool would show without an object."""
+    rows, columns = np.nonzero(pixels)
+    directions = view.directions(columns + 0.5, rows + 0.5)
+    hits, _ = first_hits(scene, view.center, directions, without=class_id)
+    return view.center + hits.t[:, None] * directions
+
+
 def _pixels(
     scene: Scene, light: Lighting, view: View, directions: np.ndarray, per_pixel: int, without: int | None = None
 ) -> np.ndarray:

@@ -16,13 +16,14 @@ import numpy as np
 from beags_plugin.sample.degrade import Degradation, degrade_mask, dropped_views, resolve_degradation
 from beags_plugin.sample.families import FAMILIES
 from beags_plugin.sample.points import seed_points
-from beags_plugin.sample.seen import seen_part, visible_surface, well_seen
-from beags_plugin.sample.views import Picture, View, render_removed, render_view
+from beags_plugin.sample.scene import Scene
+from beags_plugin.sample.seen import seen_part, shown_points, visible_surface, well_seen
+from beags_plugin.sample.views import Picture, View, render_removed, render_view, surface_without
 from beags_plugin.system.errors import UserError, check_choice, unwritable, writing
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.reading.ply import write_vertices
 
-VERSION = 9
+VERSION = 10
 """Raise it whenever the same config would give other files: older samples are then rebuilt."""
 LARGEST_SIDE = 8192  # pixels
 POINT_NOISE = 0.03
@@ -92,7 +93,8 @@ def write_sample(
     for train views, none for dropped ones, exact for test views), classes.json, seed_points.ply, and under
     ground_truth/ the exact masks/<stem>.png, silhouettes/<object>/<stem>.png (0 or 255), for test views
     seen/<object>/<stem>.png (the part of the silhouette whose surface training photos show) and, where the photo shows
-    the object, removed/<object>/<stem>.png (the photo with the object cut out, in the light as it was), and
+    the object, removed/<object>/<stem>.png (the photo with the object cut out, in the light as it was) and
+    removed_shown/<object>/<stem>.png (where in the silhouette this is surface that some training photo shows), and
     depth/<stem>.npy (float32, z along the optical axis); masks and depth are those of the pixel centres. sample.json is
     the config.
 
@@ -141,6 +143,7 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
         (folder / sub).mkdir(parents=True)
     points = []
     surfaces: list[list[np.ndarray]] = [[] for _ in still.things]
+    photos: list[tuple[View, np.ndarray]] = []  # of training, with their depth
     silhouettes: dict[str, np.ndarray] = {}
     for done, view in enumerate(views, start=1):
         picture = render_view(still, light, view, config.antialias)
@@ -154,6 +157,7 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
                 if removed is not None:
                     _write_png(folder / "ground_truth" / "removed" / names[class_id] / f"{view.name}.png", removed)
         else:
+            photos.append((view, picture.depth))
             for surface, part in zip(surfaces, visible_surface(view, picture), strict=True):
                 surface.append(part)
             mask = degrade_mask(mask, len(names), degradation, config.seed, view.name)
@@ -168,6 +172,7 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
     for view in views:
         if view.name in silhouettes:
             _write_seen(folder, view, whole, silhouettes[view.name], names)
+            _write_removed_shown(folder, still, view, photos, silhouettes[view.name])
     with open(folder / "seed_points.ply", "wb") as file:
         write_vertices(file, np.concatenate(points))
     _write_json(folder / "classes.json", {str(i): name for i, name in names.items()})
@@ -204,7 +209,7 @@ def transforms(views: list[View]) -> dict[str, Any]:
 
 
 def _truth_folders(names: dict[int, str]) -> list[str]:
-    kinds = ("silhouettes", "seen", "removed")
+    kinds = ("silhouettes", "seen", "removed", "removed_shown")
     objects = [f"ground_truth/{kind}/{name}" for kind in kinds for class_id, name in names.items() if class_id]
     return ["ground_truth/masks", "ground_truth/depth", *objects]
 
@@ -223,6 +228,17 @@ def _write_seen(
     for class_id, (surface, silhouette) in enumerate(zip(surfaces, silhouettes, strict=True), start=1):
         seen = np.uint8(255) * seen_part(view, surface, silhouette)
         _write_png(folder / "ground_truth" / "seen" / names[class_id] / f"{view.name}.png", seen)
+
+
+def _write_removed_shown(
+    folder: Path, scene: Scene, view: View, photos: list[tuple[View, np.ndarray]], silhouettes: np.ndarray
+) -> None:
+    for class_id, silhouette in enumerate(silhouettes, start=1):
+        place = Path(scene.class_names[class_id]) / f"{view.name}.png"
+        if (folder / "ground_truth/removed" / place).exists():
+            shown = np.zeros(silhouette.shape, np.uint8)
+            shown[silhouette] = 255 * shown_points(scene, surface_without(scene, view, silhouette, class_id), photos)
+            _write_png(folder / "ground_truth/removed_shown" / place, shown)
 
 
 def _write_png(path: Path, pixels: np.ndarray) -> None:

@@ -52,6 +52,22 @@ def test_rows_named_after_presets_refine_as_these_do():
         assert {key for key, value in vars(own).items() if value != getattr(preset, key)} <= base, row.name
 
 
+@pytest.mark.parametrize("name", [name for name in experiment_names() if name != "base"])  # that refines nothing
+def test_every_length_of_refinement_has_its_control(name):
+    """A gain in PSNR is one over as many steps with no loss of masks; where figures are reported, at equal rates."""
+    lengths: dict[bool, set[tuple[int, float]]] = {True: set(), False: set()}
+    experiment = load_experiment(name)
+    for variant in experiment.variants:
+        model = preset_config(experiment.preset, variant.refine, Path(name)).model_config
+        control = not any(model.losses[loss].weight for loss in ("boundary", "occupancy", "silhouette"))
+        assert control == ("neither loss" in variant.name)
+        if model.refiner != "none":
+            lengths[control].add((model.refine_steps, model.refine_position_lr_factor))
+    assert {steps for steps, _ in lengths[False]} == {steps for steps, _ in lengths[True]}
+    if name in REPORTING:
+        assert lengths[False] == lengths[True]
+
+
 def test_a_file_describes_variants_and_sweeps(experiment):
     variants = {variant.name: variant for variant in experiment.variants}
     assert list(variants) == [

@@ -44,6 +44,8 @@ def result(value: float, psnr: float | None = 30.0) -> dict:
         "evaluation": {
             "mean": masks(value),
             "psnr": {"before": 29.0, "after": psnr},
+            "psnr_shown": {"before": 31.0, "after": 31.25},
+            "shown": {"before": 0.75, "after": 0.75},
             "ssim": {"before": 0.8, "after": 0.9},
             "objects": {"cup": masks(value / 2), "box": masks(value)},
         },
@@ -124,8 +126,9 @@ def test_tables_list_failures_and_mark_the_papers_figures(rows):
     text = console.file.getvalue()
     assert "failed: k = 8 on b: k is 0." in text and "k = 8 (1 of 2 scenes)" in text
     assert "remains: pixels that show it" in text and "removal" in text
-    real = [dataclasses.replace(r, figures={**r.figures, "removal_psnr_after": None, "removal_remains_after": None})
-            for r in rows]  # fmt: skip
+    assert "29.00 30.00 31.00 31.25 75.0" in " ".join(text.split())  # PSNR, then shown, share
+    of_removal = [f"removal_{metric}_after" for metric in METRICS["removal"]]
+    real = [dataclasses.replace(r, figures={**r.figures, **dict.fromkeys(of_removal)}) for r in rows]  # fmt: skip
     for table in tables(load_experiment("ablation"), real):
         console.print(table)
     assert "emov" not in console.file.getvalue()[len(text) :]

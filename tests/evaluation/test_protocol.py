@@ -208,7 +208,7 @@ def test_the_mean_of_a_data_set(how, over):
         scenes = [getattr(one, stage) for one in runs]
         ratios = [[view.psnr for view in one.views] for one in scenes]
         expected = np.mean([np.mean(r) for r in ratios]) if over == "scenes" else np.mean(np.concatenate(ratios))
-        assert found.psnr[stage] == pytest.approx(expected)
+        assert found.images["psnr"][stage] == pytest.approx(expected)
     row = found.csv_rows()[-1]
     assert row[:3] == ["three", "", "after"] and row[4] == found.means["after"].extracted.iou
 
@@ -216,7 +216,7 @@ def test_the_mean_of_a_data_set(how, over):
 def test_a_former_state_that_some_scenes_lack_is_not_averaged():
     protocol = Protocol()
     found = data_set("two", [run(0, 3, 2, protocol), run(1, 3, 2, protocol, before=False)])
-    assert set(found.means) == {"after"} and found.psnr["before"] is None
+    assert set(found.means) == {"after"} and found.images["psnr"]["before"] is None
     assert found.to_json()["mean"]["extracted"]["before"] == {"acc": None, "iou": None, "biou": None}
     with pytest.raises(ValueError, match="one protocol"):
         data_set("two", [run(0, 3, 2, protocol), run(1, 3, 2, Protocol(threshold=0.3))])

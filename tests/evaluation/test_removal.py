@@ -31,14 +31,14 @@ def picture(*squares: tuple[float, float, float], objects: float = HIGH) -> torc
     return drawn
 
 
-def evaluated(squares, ids, removed, photo=None, silhouettes=None, objects=HIGH, **options) -> SceneMetrics:
+def evaluated(squares, ids, removed, photo=None, silhouettes=None, objects=HIGH, known=None, **options) -> SceneMetrics:
     """Score the squares of grey ``objects`` and the floor behind them, in the view of the cup before the box."""
     surfels = scene([*squares, FLOOR])
     greys = torch.tensor([objects] * len(squares) + [LOW])
     surfels = replace(surfels, sh_dc=((greys - 0.5) / 0.28209479177387814)[:, None].expand(-1, 3).clone())
     silhouettes = {1: square_mask(*CUP), 2: square_mask(*BOX)} if silhouettes is None else silhouettes
     photo = picture(CUP, BOX, objects=objects) if photo is None else photo
-    view = EvalView(camera(), photo, None, silhouettes, "v", removed=removed)
+    view = EvalView(camera(), photo, None, silhouettes, "v", removed=removed, removed_shown=known)
     ids = torch.tensor([*ids, 0], dtype=torch.int32)
     return evaluate_scene(surfels, ids, Squares(), SETTINGS, [view], CLASSES, **options)
 
@@ -70,6 +70,16 @@ def test_figures_of_one_object(squares, ids, taken, psnr, remains):
     drawn = picture(*(square for square, class_id in zip(squares, ids, strict=True) if class_id != taken))
     similar = ssim_map(drawn, rest)[square_mask(*(CUP if taken == 1 else BOX))].mean()
     assert removal.ssim == pytest.approx(float(similar), abs=1e-5)
+
+
+def test_what_photos_show_is_scored_apart():
+    """The piece that stays lies in the cup's half that photos show behind it, at twice the size of the pictures."""
+    half = (square_mask(*CUP) & square_mask(*PIECE[:2], 4.0)).repeat_interleave(2, 0).repeat_interleave(2, 1)
+    for known, psnr, share in ((half, decibels(16, 36), 36 / 64), (half & False, None, 0.0), (None, None, None)):
+        known = None if known is None else {1: known}
+        removal = evaluated([PIECE, CUP], (0, 1), {1: picture()}, picture(PIECE, CUP), known=known).mean.removal
+        assert removal is not None and removal.shown == share and removal.psnr == pytest.approx(decibels(16, 64))
+        assert removal.psnr_shown == (None if psnr is None else pytest.approx(psnr))
 
 
 def test_pixels_that_do_not_tell_are_no_remains():

@@ -61,7 +61,10 @@ def test_folder_layout(folder, config):
                 removed = folder / "ground_truth/removed" / name / f"{stem}.png"
                 shown = path in meta["test_filenames"] and (truth == int(class_id)).any()
                 assert removed.exists() or not shown
+                known = folder / "ground_truth/removed_shown" / name / f"{stem}.png"
+                assert known.exists() == removed.exists()
                 if removed.exists():
+                    assert (silhouette[grey(known) > 0] == 255).all()
                     changed = (grey(removed) != grey(folder / path)).any(axis=-1)
                     rim = grey_dilation(silhouette, 3)
                     assert path in meta["test_filenames"] and changed.any() and (rim[changed] == 255).all()

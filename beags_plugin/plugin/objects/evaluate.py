@@ -13,6 +13,7 @@ from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import SceneMetrics
 from beags_plugin.evaluation.report import RunMetrics, Stage
 from beags_plugin.evaluation.run_metrics import evaluate_scene
+from beags_plugin.evaluation.shown import shown_pixels
 from beags_plugin.pictures.worst_views import WorstMask, draw_worst
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.options.model_options import fixed_background
@@ -69,10 +70,20 @@ class EvaluatedRun:
         manager = data_of_run(config, self.config_path, split="test")
         return HeldOutViews(manager, self.classes, fixed_background(config.model_config))
 
+    def shown(self) -> list[Tensor]:
+        """Return which pixels of each held-out view training photos show, by the depth of the first stage.
+
+        One mask for all stages, so that their figures are of the same pixels.
+        """
+        first = next(iter(self.stages.values())).surfels()
+        held_out, training = self.views.cameras("eval"), self.views.cameras("train")
+        return shown_pixels(first, self.rasterizer, self.settings, held_out, training)
+
     def metrics(self, protocol: Protocol | None = None, progress: Progress | None = None) -> RunMetrics:
         """Return the figures of all stages; arguments as of ``evaluate_run``."""
         protocol = protocol or Protocol()
         protocol.check()
+        shown = self.shown() if self.complete else None
         found: dict[Stage, SceneMetrics] = {}
         total = len(self.views) * len(self.stages)
         for stage, scene in self.stages.items():
@@ -87,6 +98,7 @@ class EvaluatedRun:
                 protocol=protocol,
                 complete=self.complete,
                 background=self.views.background,
+                shown=shown,
                 progress=None if progress is None else lambda done, _, former=former: progress(former + done, total),
             )
         return RunMetrics(

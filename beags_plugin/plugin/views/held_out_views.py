@@ -4,21 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import overload
+from typing import Literal, overload
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from beags_plugin.core.cameras import Camera
 from beags_plugin.data.files import image_size
 from beags_plugin.data.ground_truth import GroundTruth
 from beags_plugin.evaluation.records import EvalView
 from beags_plugin.labels.class_ids import IGNORE, resize_nearest
 from beags_plugin.labels.classes import read_binary_mask, read_mask
+from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system.errors import UserError
 
-_NO_TRUTH = GroundTruth(masks=[], visible={}, silhouettes={}, seen={}, removed={})
+_NO_TRUTH = GroundTruth(masks=[], visible={}, silhouettes={}, seen={}, removed={}, removed_shown={})
 
 
 class HeldOutViews(Sequence[EvalView]):
@@ -27,8 +29,9 @@ class HeldOutViews(Sequence[EvalView]):
     Masks of all visible objects come from ``ground_truth/masks``, else from the data's own; those of single objects
     from ``ground_truth/visible``, silhouettes from ``ground_truth/silhouettes``, and what training photos show of them
     from ``ground_truth/seen``, or from where the layout has them; pictures without an object from
-    ``ground_truth/removed``. All are undistorted like the photographs. Indexing raises ``UserError`` for a file that
-    cannot be read or has other proportions than its photograph.
+    ``ground_truth/removed``, and where these can be known from ``ground_truth/removed_shown``. All are undistorted like
+    the photographs. Indexing raises ``UserError`` for a file that cannot be read or has other proportions than its
+    photograph.
     """
 
     def __init__(self, manager: BeagsDataManager, classes: Mapping[int, str], background: Tensor) -> None:
@@ -56,6 +59,11 @@ class HeldOutViews(Sequence[EvalView]):
         trained = set(self.manager.train_dataset.image_filenames)
         return sum(path in trained for path in self.manager.eval_dataset.image_filenames)
 
+    def cameras(self, split: Literal["train", "eval"]) -> list[Camera]:
+        """Return the cameras of the training or the held-out views, without lens distortion; no photo is read."""
+        cameras = (self.manager.train_dataset if split == "train" else self.manager.eval_dataset).cameras
+        return [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))]
+
     def _view(self, index: int) -> EvalView:
         view = self._views[index]
         truth = self._metadata["ground_truth"] or _NO_TRUTH
@@ -79,6 +87,7 @@ class HeldOutViews(Sequence[EvalView]):
             seen or None,
             self._per_object(truth["visible"], index) or None,
             {c: self._picture(file, index) for c, file in self._files(truth["removed"], index).items()} or None,
+            self._per_object(truth["removed_shown"], index) or None,
         )
 
     def _per_object(self, files: Mapping[str, Sequence[Path | None]], view: int) -> dict[int, Tensor]:

@@ -19,6 +19,7 @@ from distorted_views import BROWN, LARGE_H, LARGE_W, LENS, distort
 from beags_plugin.commands.cli import main
 from beags_plugin.evaluation.metrics import mask_metrics
 from beags_plugin.evaluation.protocol import Protocol
+from beags_plugin.evaluation.records import IMAGE_FIGURES
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.plugin.model import BeagsModel
 from beags_plugin.plugin.objects.evaluate import EvaluatedRun, evaluate_run
@@ -51,12 +52,19 @@ def test_the_figures_of_a_run_are_those_of_its_files(trained):
     assert run.scene == "lab" and run.config == str(trained) and run.notes == ()
     assert run.before is not None and [view.name for view in run.after.views] == ["v00", "v08"]
     root = trained.parents[1] / "lab"
+    evaluated = EvaluatedRun(trained)
+    shown = evaluated.shown()  # of the scene before refinement, for both
+    del evaluated.stages["before"]
+    assert not all(map(torch.equal, shown, evaluated.shown()))
     for scene, shift in ((run.before, 0.15), (run.after, 0.0)):
         surfels, ids = discs(shift=shift)
         for index, name in enumerate(("v00", "v08")):
             photo = np.asarray(Image.open(root / f"images/{name}.png")) / 255.0
-            error = np.mean((rendered(trained, surfels, index).color.clamp(0, 1).numpy() - photo) ** 2)
-            assert scene.views[index].psnr == pytest.approx(-10 * np.log10(error), abs=1e-3)
+            error = (rendered(trained, surfels, index).color.clamp(0, 1).numpy() - photo) ** 2
+            assert scene.views[index].psnr == pytest.approx(-10 * np.log10(error.mean()), abs=1e-3)
+            error = error[shown[index].numpy()]
+            assert scene.views[index].psnr_shown == pytest.approx(-10 * np.log10(error.mean()), abs=1e-3)
+            assert scene.views[index].shown == pytest.approx(len(error) / (WIDTH * HEIGHT)) and len(error) > 0
             silhouette = np.asarray(Image.open(root / f"ground_truth/silhouettes/cup/{name}.png")) > 0
             assert silhouette.shape == (2 * HEIGHT, 2 * WIDTH)
             alone = rendered(trained, surfels[ids == 1], index).alpha.numpy() > 0.5
@@ -71,12 +79,12 @@ def test_the_json_says_everything(trained, tmp_path):
     path, table = tmp_path / "new" / "a.json", tmp_path / "a.csv"
     main(["eval", "--load-config", str(trained), "--json", str(path), "--csv", str(table), "--threshold", "0.4"])
     content = json.loads(path.read_text(), parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
-    assert set(content) == {"data_set", "protocol", "mean", "psnr", "ssim", "scenes"}
+    assert set(content) == {"data_set", "protocol", "mean", *IMAGE_FIGURES, "scenes"}
     assert content["protocol"] == Protocol(threshold=0.4).to_json()
     (scene,) = content["scenes"]
     assert set(scene) == {
-        "scene", "config", "protocol", "extracted_truth", "notes", "mean", "psnr", "ssim", "objects", "worst", "masks",
-        "views",
+        "scene", "config", "protocol", "extracted_truth", "notes", "mean", *IMAGE_FIGURES, "objects", "worst",
+        "masks", "views",
     }  # fmt: skip
     assert scene["extracted_truth"] == "both" and set(scene["objects"]) == {"cup", "box"}
     figures = {"before", "after"}
@@ -162,7 +170,8 @@ def test_truth_is_undistorted_like_the_photographs(tmp_path):
     for index in range(9):
         write_image(tmp_path / f"lab/images/v{index:02d}.png", np.zeros((LARGE_H, LARGE_W, 3), np.uint8))
     write_image(tmp_path / "lab/ground_truth/masks/v00.png", ids)
-    write_image(tmp_path / "lab/ground_truth/silhouettes/cup/v00.png", np.uint8(255) * (ids == 1))
+    for kind in ("silhouettes", "removed_shown"):
+        write_image(tmp_path / f"lab/ground_truth/{kind}/cup/v00.png", np.uint8(255) * (ids == 1))
     for place in ("images/v00.png", "ground_truth/removed/cup/v00.png"):
         write_image(tmp_path / "lab" / place, noise(0, LARGE_W, LARGE_H))
     view = EvaluatedRun(write_trained(tmp_path / "run", tmp_path / "lab")).views[0]
@@ -170,6 +179,7 @@ def test_truth_is_undistorted_like_the_photographs(tmp_path):
     height, width = view.visible.shape
     assert abs(height - 2 * view.camera.height) <= 1 and abs(width - 2 * view.camera.width) <= 1
     assert torch.equal(view.silhouettes[1], view.visible == 1)
+    assert view.removed_shown is not None and torch.equal(view.removed_shown[1], view.visible == 1)
     assert view.image is not None and view.removed is not None and list(view.removed) == [1]
     assert torch.equal(view.removed[1], view.image) and view.image.std() > 0.1
     offsets = []

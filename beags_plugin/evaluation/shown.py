@@ -1,0 +1,45 @@
+"""Which pixels of held-out views show surface that some training photo shows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.masks.reprojection import PixelMaps, landing
+from beags_plugin.preparation.consistent_masks import render_depths
+from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+
+TAU = 0.02
+"""Greatest difference of a point's depth in a training view and that view's surface, as a share of the former (E5)."""
+
+
+def shown_pixels(
+    surfels: Surfels,
+    rasterizer: Rasterizer,
+    settings: RasterSettings,
+    held_out: Sequence[Camera],
+    training: Sequence[Camera],
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Tensor]:
+    """Return for each held-out view [H, W] bool: the pixels whose surface lies in some training view, unhidden.
+
+    The surface is the median depth of the scene; a pixel without one is not shown. settings: must ask for geometry.
+    progress: receives (done, total) training views. Every view is rendered once; of training views, one is held.
+    """
+    depths = list(render_depths(surfels.detach(), held_out, rasterizer, settings, "median"))
+    shown = [torch.zeros_like(depth, dtype=torch.bool) for depth in depths]
+    maps = PixelMaps([*held_out, *training])
+    surfaces = render_depths(surfels.detach(), training, rasterizer, settings, "median", progress)
+    for index, surface in enumerate(surfaces, start=len(held_out)):
+        height, width = surface.shape
+        for depth, found, A, b in zip(depths, shown, *maps.towards(index), strict=False):
+            rows, columns = torch.nonzero((depth > 0) & ~found, as_tuple=True)
+            far = depth[rows, columns]
+            x, y = columns.to(far) + 0.5, rows.to(far) + 0.5
+            lands, pixel, z = landing(x, y, far, (A, b), (width, height), far > 0)
+            found[rows[lands], columns[lands]] = (z - surface.reshape(-1)[pixel]).abs() <= TAU * z
+    return shown

@@ -1,0 +1,105 @@
+"""README's table of results: ``python -m benchmarks.readme_table [outputs/bench/presets.json ...]``.
+
+Each given result of ``beags bench`` is reduced to its means, command, commit and machine in docs/results. Then the
+lines between README's two markers are written anew from the files there, which are the only source of its figures.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from beags_plugin.bench.report import number, write_json
+from beags_plugin.bench.results import MEAN
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.whole_files import write_text_atomically
+
+ROOT = Path(__file__).resolve().parents[1]
+BEGIN, END = "<!-- made by python -m benchmarks.readme_table -->\n", "<!-- end of the table -->\n"
+GROUPS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
+    ("three generated scenes, base of `beags-fast`", "presets", MEAN, ()),
+    ("fruit, a real capture", "improvements-captures", "fruit", ("assignment alone", "the paper's")),
+    ("a skull, a real capture", "improvements-captures", "dtu_skull", ("assignment alone", "the paper's")),
+)
+"""What a group of rows is called, its file in docs/results, the scene there or ``MEAN``, and its variants (or all)."""
+LABELS = {
+    "the paper's": "both losses, short, without the background",
+    "beags-paper": "`beags-paper`, k by [the rule](docs/method.md#5-the-visibility-voxel-grid)",
+}
+COLUMNS: tuple[tuple[str, tuple[str, ...], int, float], ...] = (
+    ("extracted IoU, BIoU", ("extracted_iou_after", "extracted_biou_after"), 1, 100.0),
+    ("worst object's BIoU", ("worst_biou_after",), 1, 100.0),
+    ("PSNR", ("psnr_after",), 2, 1.0),
+    ("PSNR shown", ("psnr_shown_after",), 2, 1.0),
+    ("removal PSNR, shown", ("removal_psnr_after", "removal_psnr_shown_after"), 2, 1.0),
+)
+"""Head, figures, digits, factor; a column without figures is left out."""
+_SOURCE = ("experiment", "preset", "reference", "command", "commit", "machine", "torch", "busy", "quick")
+_ROW = ("scene", "seed", "variant", "failed", "failures", "error_left", "lost_biou", "shown_after", "ssim_after",
+        "removal_remains_after", "cpu_seconds", "own_memory_mb")  # fmt: skip
+
+
+def reduced(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is kept of a result of ``beags bench``: its source, means, and the means of each scene."""
+    kept = (*_ROW, *(figure for _, figures, *_ in COLUMNS for figure in figures))
+
+    def row(full: Mapping[str, Any]) -> dict[str, Any]:
+        found = {name: full[name] for name in kept if full.get(name) is not None}
+        return {name: round(value, 6) if isinstance(value, float) else value for name, value in found.items()}
+
+    return {
+        **{name: report[name] for name in _SOURCE if name in report},
+        "means": [row(mean) for mean in report["means"]],
+        "rows": [row(line) for line in report["rows"] if line.get("object", MEAN) == MEAN],
+    }
+
+
+def table(folder: Path) -> str:
+    """Return the table of ``GROUPS`` in Markdown, from the files of ``folder``; raises ``UserError`` for what lacks."""
+    groups = [(title, name, _rows(folder / f"{name}.json", scene, chosen)) for title, name, scene, chosen in GROUPS]
+    known = {figure for *_, rows in groups for row in rows for figure, value in row.items() if value is not None}
+    columns = [column for column in COLUMNS if known & set(column[1])]
+    lines = [["scene", "", *(head for head, *_ in columns)], ["---"] * (2 + len(columns))]
+    for title, name, rows in groups:
+        scene = f"{title} ([figures](docs/results/{name}.json))"
+        for row in rows:
+            cells = [", ".join(number(row.get(f), digits, factor) for f in fs) for _, fs, digits, factor in columns]
+            variant = row["variant"]
+            label = f"`{variant}`" if variant.startswith("beags") and " " not in variant else variant
+            lines.append([scene, LABELS.get(variant, label), *cells])
+            scene = ""
+    return "".join(f"| {' | '.join(line)} |\n".replace("|  |", "| |") for line in lines)
+
+
+def _rows(path: Path, scene: str, variants: Sequence[str]) -> list[dict[str, Any]]:
+    report = json.loads(path.read_text())
+    rows = [row for row in report["means" if scene == MEAN else "rows"] if row["scene"] == scene]
+    found = {row["variant"]: row for row in rows if row.get("object", MEAN) == MEAN}
+    if missing := [name for name in variants or [""] if name and name not in found] or ([] if found else [scene]):
+        raise UserError(f"{path} has no figures of {missing[0]!r}: name a whole result of beags bench.")
+    return [found[name] for name in variants or found]
+
+
+def main(arguments: Sequence[str], root: Path = ROOT) -> None:
+    """Reduce the named results into docs/results, and write README's table."""
+    folder, readme = root / "docs" / "results", root / "README.md"
+    for path in map(Path, arguments):
+        report = json.loads(path.read_text())
+        if report.get("quick"):
+            raise UserError(f"{path} is of --quick, whose figures mean nothing: run the experiment whole.")
+        write_json(folder / path.name, reduced(report))
+    before, _, rest = readme.read_text().partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not end:
+        raise UserError(f"{readme} lacks the lines {BEGIN.strip()} and {END.strip()}: put them around the table.")
+    write_text_atomically(f"{before}{BEGIN}\n{table(folder)}\n{END}{after}", readme)
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except UserError as error:
+        sys.exit(str(error))

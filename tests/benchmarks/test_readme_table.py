@@ -1,0 +1,84 @@
+"""README's table of results: every figure is one of the committed files'."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+from places import ROOT
+
+pytest.importorskip("nerfstudio")
+
+from experiment_files import GOOD, written
+
+from beags_plugin.bench.experiment import Variant, load_experiment
+from beags_plugin.bench.results import FIGURES, ResultRow, report_json
+from beags_plugin.system.errors import UserError
+from benchmarks import readme_table
+
+RESULTS = ROOT / "docs" / "results"
+
+
+def cells(text: str) -> list[list[str]]:
+    lines = [line for line in text.splitlines() if line.startswith("| ")]
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+
+
+def test_readme_has_the_figures_of_the_committed_files():
+    """Looked up here by their own names, so that neither README nor the program can go wrong alone."""
+    text = (ROOT / "README.md").read_text()
+    shown = text.partition(readme_table.BEGIN)[2].partition(readme_table.END)[0]
+    assert shown.strip() == readme_table.table(RESULTS).strip()
+    presets = json.loads((RESULTS / "presets.json").read_text())
+    (fast,) = (mean for mean in presets["means"] if mean["variant"] == "beags-fast")
+    (row,) = (row for row in cells(shown) if row[1] == "`beags-fast`")
+    assert row[2] == f"{100 * fast['extracted_iou_after']:.1f}, {100 * fast['extracted_biou_after']:.1f}"
+    assert row[1 + cells(shown)[0][1:].index("PSNR")] == f"{fast['psnr_after']:.2f}"
+    for name in {name for _, name, *_ in readme_table.GROUPS}:
+        source = json.loads((RESULTS / f"{name}.json").read_text())
+        assert source["command"] and source["commit"] and source["machine"]["cpu"] and not source["quick"]
+
+
+@pytest.fixture
+def clone(tmp_path):
+    """A folder with README and results, and a fresh result of the presets, with objects and a failure."""
+    shutil.copytree(RESULTS, tmp_path / "docs/results", ignore=shutil.ignore_patterns("*.png"))
+    shutil.copy(ROOT / "README.md", tmp_path)
+    experiment = load_experiment(written(tmp_path, GOOD))
+    figures = {**dict.fromkeys(FIGURES), "extracted_iou_after": 0.91234567, "extracted_biou_after": 0.8,
+               "worst_biou_after": 0.5, "psnr_after": 30.126, "psnr_shown_after": 31.0}  # fmt: skip
+    rows = [ResultRow(Variant("neither loss"), scene, 1, figures, {"cup": figures}) for scene in ("a", "b")]
+    rows.append(ResultRow(Variant("beags-fast"), "a", 1, dict.fromkeys(FIGURES), {}, "no memory"))
+    source = {"command": "beags bench presets", "commit": "abc", "machine": {"cpu": "x"}, "torch": "2", "quick": False}
+    (tmp_path / "presets.json").write_text(json.dumps(report_json(experiment, rows, source)))
+    return tmp_path
+
+
+def test_one_command_makes_the_table_from_a_result(clone):
+    readme_table.main([str(clone / "presets.json")], clone)
+    kept = json.loads((clone / "docs/results/presets.json").read_text())
+    assert kept["command"] == "beags bench presets" and kept["commit"] == "abc" and kept["machine"] == {"cpu": "x"}
+    assert [row["scene"] for row in kept["rows"]] == ["a", "b", "a"] and kept["rows"][2]["failed"] == "no memory"
+    assert kept["means"][0]["extracted_iou_after"] == 0.912346
+    text = (clone / "README.md").read_text()
+    head, line, control, failed, *_ = cells(text.partition(readme_table.BEGIN)[2])
+    assert head[2:] == ["extracted IoU, BIoU", "worst object's BIoU", "PSNR", "PSNR shown"]
+    assert control[1:] == ["neither loss", "91.2, 80.0", "50.0", "30.13", "31.00"]
+    assert failed[1:] == ["`beags-fast`", "–, –", "–", "–", "–"] and line[0] == "---"
+    readme_table.main([], clone)
+    assert (clone / "README.md").read_text() == text and text.startswith("# beags")
+    assert text.endswith((ROOT / "README.md").read_text().partition(readme_table.END)[2])
+
+
+def test_what_cannot_be_a_table_is_refused(clone):
+    captures = clone / "docs/results/improvements-captures.json"
+    content = json.loads(captures.read_text())
+    left = [row for row in content["rows"] if row["variant"] != "the paper's"]
+    for change, words in (({"quick": True}, "figures mean nothing"), ({"rows": left}, 'no figures of "the paper\'s"')):
+        (clone / captures.name).write_text(json.dumps({"means": [], **content, **change}))
+        with pytest.raises(UserError, match=words):
+            readme_table.main([str(clone / captures.name)], clone)
+    (clone / "README.md").write_text("nothing")
+    with pytest.raises(UserError, match="lacks the lines"):
+        readme_table.main([], clone)
