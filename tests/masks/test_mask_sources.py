@@ -24,7 +24,8 @@ from beags_plugin.system.errors import UserError
 
 def test_every_source_can_be_named_without_its_library():
     assert set(MASK_SOURCES.names()) >= {
-        "coco", "gaussian-grouping", "grabcut", "id-images", "langsplat", "object-images", "sam2",
+        "coco", "gaussian-grouping", "grabcut", "id-images", "langsplat", "object-images", "salient",
+        "sam2",
     }  # fmt: skip
     for name in MASK_SOURCES.names():
         kind = MASK_SOURCES.get(name)

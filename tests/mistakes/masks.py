@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from data_folders import HEIGHT, WIDTH, noise, write_image
 from PIL import Image
+from weights import onnx_model
 
-from mistakes.table import Place, beags_after, mistake, mistakes, train_after
+from mistakes.table import Place, beags_after, mistakes, train_after
 
 
 def mask(change: Callable[[Path], Any]) -> Callable[[Place], Any]:
@@ -197,9 +198,39 @@ mistakes(
 )
 
 
-@mistake("mask sources", "SAM2 without its extra")
-def _(at: Place):
-    from beags_plugin.masks.sources import sam2
+def without_extra(source: str) -> Callable[[Place], Any]:
+    def make(at: Place):
+        at.patch.setattr(f"beags_plugin.masks.sources.{source}.find_spec", lambda name: None)
+        return made(source)(at)
 
-    at.patch.setattr(sam2, "find_spec", lambda name: None)
-    return made("sam2")(at)
+    return make
+
+
+def salient(weights: bytes | None, path: str = "../home/u2netp.onnx", model: str = "u2netp") -> Callable[[Place], Any]:
+    """Return a mistake in the weights of the salient source, whose home is beside the data."""
+
+    def write(data: Path) -> None:
+        if weights is not None:
+            (data / path).parent.mkdir(exist_ok=True)
+            (data / path).write_bytes(weights)
+
+    def make(at: Place):
+        pytest.importorskip("onnxruntime", reason="the extra [salient] (onnxruntime) is not installed")
+        at.patch.setenv("U2NET_HOME", str(at.root / "home"))
+        return made("salient", write, f"--options model={model}")(at)
+
+    return make
+
+
+mistakes(
+    "mask sources",
+    {
+        "SAM2 without its extra": without_extra("sam2"),
+        "salient without its extra": without_extra("salient"),
+        "salient without weights": salient(None),
+        "salient: weights that rembg knows but that are not there": salient(None, model="u2net"),
+        "salient: damaged weights": salient(b"\x08\x06"),
+        "salient: a file that is no network": salient(b"no", "../home/u2net.onnx", "u2net"),
+        "salient: a network of another kind": salient(onnx_model([1, 3, 8, 8], [1, 3, 8, 8]), "a.onnx", "a.onnx"),
+    },
+)

@@ -35,6 +35,7 @@ RANDOM_POINTS = 50_000  # beside the seed points: an object that has none of the
 MOST_SEED_POINTS = 100_000
 MOST_COUNTS = 30_000_000  # points times classes that are counted at a time
 MOST_PICTURES = 6  # views in contradicted.png
+MOST_OBJECTS = 40  # that are printed
 
 
 @dataclass
@@ -74,6 +75,14 @@ class Report:
                     f"mask ({percent(views.sum(), usable.sum())}), {share} of their pixels"
                 )
         return lines
+
+    def lines(self) -> list[str]:
+        """Return what people read: the objects, the issues with what they cost, the summary."""
+        objects = self.objects()
+        if len(objects) > MOST_OBJECTS:
+            objects[MOST_OBJECTS:] = [f"and {len(objects) - MOST_OBJECTS} more objects"]
+        issues = [f"{issue.level}: {issue.message}\n    costs: {issue.cost}" for issue in self.issues]
+        return [*objects, *issues, self.summary()]
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values."""

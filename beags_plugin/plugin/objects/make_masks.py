@@ -17,7 +17,6 @@ from torch import Tensor
 
 from beags_plugin.data.files import image_size, photo_names
 from beags_plugin.labels.classes import check_names, write_mask
-from beags_plugin.masks.check.issues import Issue
 from beags_plugin.masks.snapping import snap_to_edges
 from beags_plugin.masks.sources import MASK_SOURCES
 from beags_plugin.masks.sources.base import MaskSource, Photo, SourceScene
@@ -116,7 +115,8 @@ def make_masks(
     <output>/masks_to_look_at/, which nothing reads. data: names the scene. run: config.yml of a run trained on it, for
     sources that need its depth. output: the scene's own folder if None, where ``beags-data`` looks for them. overwrite:
     replace existing masks. snap: radius in pixels of ``masks.snapping.snap_to_edges``; 0 leaves boundaries as they are.
-    Returns lines that report the written files. Raises ``UserError`` before anything is written, or for bad input.
+    Returns lines that report the written files, and what ``beags masks check`` finds in them. Raises ``UserError``
+    before anything is written, or for bad input.
     """
     parser: BeagsDataParser = data.setup()
     scene, views = parser.posed_views()
@@ -173,16 +173,16 @@ def make_masks(
     write_whole(classes, lambda file: file.write(json.dumps(names, indent=1).encode()))
     _picture(folder / "made.png", shown)
     aside = len(shown) - len(shares)
-    issues: Sequence[Issue] = ()
+    checked: list[str] = []
     with suppress(UserError):  # training says it; the masks are made
-        issues = check_scene(replace(data, masks_path=masks.absolute(), classes_path=classes.absolute())).issues
+        checked = check_scene(replace(data, masks_path=masks.absolute(), classes_path=classes.absolute())).lines()
     return [
         *made.notes,
         f"{len(shares)} masks of {len(photos)} views, {len(names) - 1} objects, which cover "
         f"{100 * np.mean(shares):.1f} % on average: {masks}",
         *([f"{aside} masks of held-out views, only to look at: {look_at}"] if aside else []),
-        *(f"warning: {issue.message}" for issue in issues if issue.kind in ("absent", "only view")),
         f"names: {classes}; look at {folder / 'made.png'}",
+        *checked,
     ]
 
 

