@@ -42,8 +42,8 @@ def _agreeing(one: np.ndarray, other: np.ndarray) -> int:
 def choose_pairs(alike: np.ndarray) -> list[tuple[int, int]]:
     """Return the pairs (smaller, larger) to compare, in order.
 
-    They are all pairs of few photos; else the ``NEIGHBOURS`` most alike to each photo, the ``IN_ORDER`` next ones, and the branches of the tree that
-    connects all photos by the pairs most alike.
+    They are all pairs of few photos; else the ``NEIGHBOURS`` most alike to each photo, the ``IN_ORDER`` next ones, and
+    the branches of the tree that connects all photos by the pairs most alike.
     """
     from scipy.sparse.csgraph import minimum_spanning_tree
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,7 @@ from beags_plugin.posing.pairs import COARSE, choose_pairs, likeness
 from beags_plugin.posing.photos import FEWEST, Look, Photo, blurred, find_photos, repeated, take_photos
 from beags_plugin.posing.video import VIDEO_SUFFIXES, take_frames
 from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.progress import Bar
 from beags_plugin.system.whole_files import write_text_atomically
 
 REPORT = "poses.json"
@@ -24,9 +23,6 @@ VERSION = 1  # of what is kept; another is computed anew
 WORK = Path("colmap")
 SHARE = 0.8  # of the photos; where fewer have a pose, a sentence says what to do
 NAMED = 4  # photos in a sentence
-
-Bar = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
-"""Shows a progress bar of that name; ``progress_bar``."""
 
 
 @dataclass

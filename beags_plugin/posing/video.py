@@ -6,17 +6,15 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from beags_plugin.posing.photos import FEWEST, Look, look_at
 from beags_plugin.system.digests import content_digest
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.progress import Bar
 from beags_plugin.system.whole_files import write_text_atomically, write_whole
-
-if TYPE_CHECKING:
-    from beags_plugin.posing.process import Bar
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 MOST = 150  # frames
