@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,12 +11,13 @@ from typing import Any
 SEED = 0
 AT_ONCE = 40  # pairs, between two looks at the progress
 SMALLEST = 3  # photos of a group that is worth a word
-ENOUGH = 6  # photos of a lens whose middle and tangential distortion can be told from its poses
+ENOUGH = 6  # photos of a lens, for its distortion to be told from its poses
 FEWEST_POINTS = 15
 """Of the scene, which a photo must show to be placed; with COLMAP's 30, sparse photos fall apart into groups."""
 LENS = "OPENCV"
 ROUNDS = 3  # of the last adjustment, each without the points that the one before has shown to be wrong
-LARGEST_ERROR = 4.0  # pixels
+GAIN = 0.02  # share by which the reprojection error must fall for the middle of a lens to leave that of the photo
+LARGEST_ERROR = 2.0  # pixels
 SMALLEST_ANGLE = 1.5  # degrees
 
 
@@ -60,11 +62,21 @@ def place(database: Path, images: Path, folder: Path, total: int, progress: Call
     return sorted(found.values(), key=lambda one: -one.num_reg_images())
 
 
-def refine(model: Any) -> None:
-    """Adjust poses, points and lenses together, now with the lens's middle and tangential distortion.
+def refine(model: Any) -> Any:
+    """Return the model with poses, points and lenses adjusted together, now with all distortion and the lens's middle.
 
-    A lens with fewer than ``ENOUGH`` photos keeps its middle.
+    The middle of the photo is kept unless the photos say clearly that the lens's is elsewhere (``GAIN``): few photos
+    can hardly tell it from a turn of the camera.
     """
+    centred, shifted = model, copy.deepcopy(model)
+    for each, middle in ((centred, False), (shifted, True)):
+        _adjust(each, middle)
+    before, after = (each.compute_mean_reprojection_error() for each in (centred, shifted))
+    return shifted if after < (1 - GAIN) * before else centred
+
+
+def _adjust(model: Any, middle: bool) -> None:
+    """Adjust a model; a lens with fewer than ``ENOUGH`` photos is kept."""
     import pycolmap
 
     photos = [model.images[image_id].camera_id for image_id in model.reg_image_ids()]
@@ -74,10 +86,11 @@ def refine(model: Any) -> None:
             camera_id, LENS, camera.mean_focal_length(), camera.width, camera.height
         )
         params = lens.params
-        params[2:4] = camera.principal_point_x, camera.principal_point_y
-        params[4] = camera.params[-1]
+        params[2:5] = camera.principal_point_x, camera.principal_point_y, camera.params[-1]
         camera.model, camera.params = lens.model, params
-    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True, print_summary=False)
+    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=middle, print_summary=False)
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.loss_function_scale = 1.0  # pixel
     for _ in range(ROUNDS):
         config = pycolmap.BundleAdjustmentConfig()
         for image_id in model.reg_image_ids():

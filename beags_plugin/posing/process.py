@@ -106,7 +106,7 @@ def _model(output: Path, database: Path, photos: list[Photo], known: bool, bar: 
             f"none of the {len(photos)} photos fit together: take more of them, closer to each other, of a scene that "
             "has texture and stands still."
         )
-    refine(models[0])
+    models[0] = refine(models[0])
     with writing(output):
         kept.mkdir(exist_ok=True)
         models[0].write(kept)
