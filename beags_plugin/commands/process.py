@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
 from rich.console import Console
 
 from beags_plugin.commands.starting import starting
-from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import progress_bar
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
@@ -28,8 +26,6 @@ class Process:
     """Folder to write: images/, transforms.json, sparse_pc.ply, colmap/sparse/0, poses.json, poses.png."""
 
     def run(self) -> None:
-        if find_spec("pycolmap") is None:
-            raise UserError("pycolmap, which finds poses, is not installed: pip install 'beags[process]'.")
         with starting(self):
             import numpy as np
 

@@ -69,23 +69,25 @@ def find_photos(data: Path) -> list[Path]:
 
 
 def take_photos(found: Sequence[Path], folder: Path, progress: Callable[[int, int], None]) -> list[Photo]:
-    """Copy photos into ``folder``, upright, unless they lie there already; raises ``UserError`` for unusable ones."""
-    photos = []
-    for path in counted(found, len(found), progress):
-        photos.append(_taken(path, folder / path.name))
-    return photos
+    """Copy photos into ``folder``, upright, unless they lie there already.
+
+    Raises ``UserError`` for photos that cannot be used, before any is copied.
+    """
+    checked = [(path, read_image(path, lambda image, path=path: _checked(image, path), "the photo")) for path in found]
+    return [_taken(path, folder / path.name, *header) for path, header in counted(checked, len(checked), progress)]
 
 
-def _taken(path: Path, target: Path) -> Photo:
+def _checked(image: Image, path: Path) -> tuple[int, int, int]:
+    """Return width, height and EXIF's orientation."""
+    if image.mode.startswith(("I", "F")):
+        raise UserError(f"the photo {path} has more than 8 bits a channel: convert the photos to 8 bits.")
+    return *image.size, image.getexif().get(_TURNED, 1)
+
+
+def _taken(path: Path, target: Path, width: int, height: int, turned: int) -> Photo:
     import pycolmap
     from PIL import ImageOps
 
-    def check(image: Image) -> tuple[int, int, int]:
-        if image.mode.startswith(("I", "F")):
-            raise UserError(f"the photo {path} has more than 8 bits a channel: convert the photos to 8 bits.")
-        return *image.size, image.getexif().get(_TURNED, 1)
-
-    width, height, turned = read_image(path, check, "the photo")
     if turned in (5, 6, 7, 8):
         width, height = height, width
     if turned != 1 and path.resolve() == target.resolve():
