@@ -16,7 +16,7 @@ FEWEST_POINTS = 15
 """Of the scene, which a photo must show to be placed; with COLMAP's 30, sparse photos fall apart into groups."""
 LENS = "OPENCV"
 ROUNDS = 3  # of the last adjustment, each without the points that the one before has shown to be wrong
-GAIN = 0.02  # share by which the reprojection error must fall for the middle of a lens to leave that of the photo
+GAIN = 0.05  # share by which the reprojection error must fall for the middle of a lens to leave that of the photo
 LARGEST_ERROR = 2.0  # pixels
 SMALLEST_ANGLE = 1.5  # degrees
 
