@@ -22,7 +22,7 @@ def add_features(database: Any, photos: Sequence[Photo], progress: Callable[[int
     """Add photos and their features to a database, but those it holds; returns the look of every photo."""
     import cv2
 
-    finder = cv2.SIFT_create(nfeatures=MOST, contrastThreshold=0.02, enable_precise_upscale=True)
+    finder = cv2.SIFT.create(nfeatures=MOST, contrastThreshold=0.02, enable_precise_upscale=True)
     cameras: dict[tuple[int, int, float | None], int] = {}
     looks = []
     for photo in counted(photos, len(photos), progress):

@@ -70,7 +70,7 @@ def process(data: Path, output: Path, bar: Bar) -> tuple[Posed, Any]:
     with writing(output):
         known = _keep_or_clear(output / WORK, photos)
     with bar("features") as progress:
-        opened = pycolmap.Database.open(database)
+        opened: Any = pycolmap.Database.open(database)
         looks = add_features(opened, photos, progress)
         ids = [opened.read_image_with_name(photo.path.name).image_id for photo in photos]
         coarse = [coarse_descriptors(opened, image_id, COARSE) for image_id in ids]

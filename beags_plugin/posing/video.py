@@ -95,13 +95,14 @@ def _motion(before: Look, now: Look) -> float:
 def _frames(video: Path) -> Iterator[tuple[Iterator[Any], int]]:
     """Open a video; yields its frames and how many there may be."""
     import av
+    import av.error
 
     try:
         with av.open(str(video)) as container:
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
             yield container.decode(stream), stream.frames
-    except (av.FFmpegError, IndexError) as error:
+    except (av.error.FFmpegError, IndexError) as error:
         raise UserError(f"the video {video} cannot be read ({error}): convert it to an .mp4 of H.264.") from error
 
 
