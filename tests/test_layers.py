@@ -30,6 +30,7 @@ ROOMS = [
     "rasterizers extraction masks",
     "core",
     "ops",
+    "posing",
     "data",
     "labels sample",
     "system",

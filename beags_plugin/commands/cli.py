@@ -1,4 +1,4 @@
-"""The command line: ``beags demo | resume | sample | masks | extract | export | render | eval | bench | doctor``."""
+"""The command line ``beags``: its commands, and what becomes of errors."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from rich.markup import escape
 
 from beags_plugin.bench.commands import Measurement
 from beags_plugin.commands.masks import Masks
+from beags_plugin.commands.process import Process
 from beags_plugin.commands.starting import check_arguments, starting
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.export.mesh_options import MeshOptions
@@ -266,7 +267,7 @@ def write_json(path: Path | None, content: object) -> None:
         write_text_atomically(json.dumps(content, indent=2, default=str) + "\n", path)
 
 
-Command = Demo | Resume | Sample | Masks | Extract | Export | Render | Eval | Bench | Doctor
+Command = Demo | Process | Resume | Sample | Masks | Extract | Export | Render | Eval | Bench | Doctor
 
 
 def exit_with(error: UserError) -> NoReturn:

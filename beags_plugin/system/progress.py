@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from time import monotonic
 from typing import TypeVar
 
@@ -13,6 +13,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 A_MOMENT = 2.0  # seconds
 
 Item = TypeVar("Item")
+Bar = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
+"""Shows a progress bar of that name, as ``progress_bar`` does."""
 
 
 @contextmanager

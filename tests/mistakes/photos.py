@@ -42,6 +42,48 @@ mistakes(
 )
 
 
+PROCESS = "process --output-dir posed --data"
+
+
+def folder_of(*names: str):
+    """Return what makes a folder of such photos, before ``beags process`` runs."""
+
+    def change(at: Place) -> None:
+        (at.root / "taken").mkdir()
+        for name in names:
+            write_image(at.root / "taken" / name, noise(0, 20, 20))
+
+    return change
+
+
+mistakes(
+    "photos",
+    {
+        "no folder to find poses for": beags_after(lambda at: None, f"{PROCESS} nowhere"),
+        "none to find poses for": beags_after(lambda at: (at.root / "taken").mkdir(), f"{PROCESS} taken"),
+        "two to find poses for": beags_after(folder_of("a.png", "b.png"), f"{PROCESS} taken"),
+        "16 bits, to find poses for": beags_after(
+            lambda at: (
+                folder_of("a.png", "b.png")(at),
+                write_image(at.root / "taken/c.png", np.zeros((9, 9), np.uint16)),
+            ),
+            f"{PROCESS} taken",
+        ),
+        "HEIC": beags_after(
+            lambda at: ((at.root / "taken").mkdir(), (at.root / "taken/a.heic").write_bytes(b"x")), f"{PROCESS} taken"
+        ),
+        "nothing alike in them": beags_after(folder_of("a.png", "b.png", "c.png"), f"{PROCESS} taken"),
+        "a video that is none": beags_after(
+            lambda at: (at.root / "walk.mp4").write_bytes(b"no video"), f"{PROCESS} walk.mp4"
+        ),
+        "a file that is no video": beags_after(
+            lambda at: (at.root / "walk.txt").write_bytes(b""), f"{PROCESS} walk.txt"
+        ),
+        "poses of another program": beags_after(lambda at: at.data, "process --data {data} --output-dir {data}"),
+    },
+)
+
+
 @mistake("photos", "none in the folder of a COLMAP scene")
 def _(at: Place):
     write_colmap(at.root / "colmap")

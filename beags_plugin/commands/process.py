@@ -1,0 +1,47 @@
+"""``beags process``: poses of photos or of a video."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from beags_plugin.commands.starting import starting
+from beags_plugin.system.progress import progress_bar
+
+CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
+
+
+@dataclass
+class Process:
+    """Find the poses of photos or of a video, on the CPU, and write a scene that ns-train reads.
+
+    What was computed is kept in the folder: a second call goes on, also with more photos.
+    """
+
+    data: Path
+    """Folder of photos, or a video."""
+    output_dir: Path
+    """Folder to write: images/, transforms.json, sparse_pc.ply, colmap/sparse/0, poses.json, poses.png."""
+
+    def run(self) -> None:
+        with starting(self):
+            import numpy as np
+
+            from beags_plugin.pictures.poses import draw_poses
+            from beags_plugin.posing.files import APPLIED, camera_to_world
+            from beags_plugin.posing.process import process
+        report, model = process(self.data, self.output_dir, progress_bar)
+        images = [model.images[image_id] for image_id in model.reg_image_ids()]
+        points = list(model.points3D.values())
+        draw_poses(
+            self.output_dir / "poses.png",
+            np.stack([camera_to_world(image) for image in images]),
+            np.array([point.xyz for point in points]).reshape(-1, 3) @ APPLIED[:, :3].T,
+            np.array([point.color for point in points]).reshape(-1, 3),
+            report.summary(),
+        )
+        for line in (report.summary(), *report.notes):
+            CONSOLE.print(line)
+        CONSOLE.print(f"  {self.output_dir / 'poses.png'}\n  ns-train beags-base --data {self.output_dir}")

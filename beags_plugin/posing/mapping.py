@@ -1,0 +1,106 @@
+"""Structure from motion on a database of features: matches of chosen pairs, poses, points, and lenses."""
+
+from __future__ import annotations
+
+import copy
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+SEED = 0
+AT_ONCE = 40  # pairs, between two looks at the progress
+SMALLEST = 3  # photos of a group that is worth a word
+ENOUGH = 6  # photos of a lens, for its distortion to be told from its poses
+FEWEST_POINTS = 15
+"""Of the scene, which a photo must show to be placed; with COLMAP's 30, sparse photos fall apart into groups."""
+LENS = "OPENCV"
+ROUNDS = 3  # of the last adjustment, each without the points that the one before has shown to be wrong
+GAIN = 0.05  # share by which the reprojection error must fall for the middle of a lens to leave that of the photo
+LARGEST_ERROR = 2.0  # pixels
+SMALLEST_ANGLE = 1.5  # degrees
+
+
+def match(
+    database: Path, names: Sequence[str], pairs: Sequence[tuple[int, int]], progress: Callable[[int, int], None]
+) -> None:
+    """Match the features of pairs of photos and keep what a camera's motion explains; skips pairs already matched."""
+    import pycolmap
+
+    matching = pycolmap.FeatureMatchingOptions(use_gpu=False)
+    geometry = pycolmap.TwoViewGeometryOptions()
+    geometry.ransac.random_seed = SEED
+    for first in range(0, len(pairs), AT_ONCE):
+        some = pairs[first : first + AT_ONCE]
+        with tempfile.NamedTemporaryFile("w", suffix=".txt", encoding="utf-8") as file:
+            file.writelines(f"{names[one]} {names[other]}\n" for one, other in some)
+            file.flush()
+            pairing = pycolmap.ImportedPairingOptions(match_list_path=file.name)
+            pycolmap.match_image_pairs(database, matching, pairing, geometry, pycolmap.Device.cpu)
+        progress(min(first + AT_ONCE, len(pairs)), len(pairs))
+
+
+def place(database: Path, images: Path, folder: Path, total: int, progress: Callable[[int, int], None]) -> list[Any]:
+    """Place photos one by one; returns pycolmap's reconstructions of unconnected groups, the largest first."""
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions(
+        random_seed=SEED, min_model_size=SMALLEST, num_threads=1, extract_colors=True
+    )
+    options.mapper.random_seed = options.triangulation.random_seed = SEED
+    options.mapper.abs_pose_min_num_inliers = FEWEST_POINTS
+    done = 0
+
+    def placed() -> None:
+        nonlocal done
+        done = min(done + 1, total)
+        progress(done, total)
+
+    pycolmap.set_random_seed(SEED)
+    found = pycolmap.incremental_mapping(database, images, folder, options, next_image_callback=placed)
+    progress(total, total)
+    return sorted(found.values(), key=lambda one: -one.num_reg_images())
+
+
+def refine(model: Any) -> Any:
+    """Return the model with poses, points and lenses adjusted together, now with all distortion and the lens's middle.
+
+    The middle of the photo is kept unless the photos say clearly that the lens's is elsewhere (``GAIN``): few photos
+    can hardly tell it from a turn of the camera.
+    """
+    centred, shifted = model, copy.deepcopy(model)
+    for each, middle in ((centred, False), (shifted, True)):
+        _adjust(each, middle)
+    before, after = (each.compute_mean_reprojection_error() for each in (centred, shifted))
+    return shifted if after < (1 - GAIN) * before else centred
+
+
+def _adjust(model: Any, middle: bool) -> None:
+    """Adjust a model; a lens with fewer than ``ENOUGH`` photos is kept."""
+    import pycolmap
+
+    photos = [model.images[image_id].camera_id for image_id in model.reg_image_ids()]
+    few = [camera_id for camera_id in model.cameras if photos.count(camera_id) < ENOUGH]
+    for camera_id, camera in model.cameras.items():
+        lens = pycolmap.Camera.create_from_model_name(
+            camera_id, LENS, camera.mean_focal_length(), camera.width, camera.height
+        )
+        params = lens.params
+        params[2:5] = camera.principal_point_x, camera.principal_point_y, camera.params[-1]
+        camera.model, camera.params = lens.model, params
+    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=middle, print_summary=False)
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.loss_function_scale = 1.0  # pixel
+    options.ceres.solver_options.function_tolerance = 1e-6  # without it, hundreds of photos take minutes
+    for _ in range(ROUNDS):
+        config = pycolmap.BundleAdjustmentConfig()
+        for image_id in model.reg_image_ids():
+            config.add_image(image_id)
+        for camera_id in few:
+            config.set_constant_cam_intrinsics(camera_id)
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+        manager = pycolmap.ObservationManager(model)
+        manager.filter_all_points3D(LARGEST_ERROR, SMALLEST_ANGLE)
+        manager.filter_observations_with_negative_depth()
+    model.update_point_3d_errors()

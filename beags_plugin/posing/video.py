@@ -1,0 +1,114 @@
+"""Frames of a video to find poses for: the sharpest ones, at even distances of motion."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beags_plugin.posing.photos import FEWEST, Look, look_at
+from beags_plugin.system.digests import content_digest
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.progress import Bar
+from beags_plugin.system.whole_files import write_text_atomically, write_whole
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+MOST = 150  # frames
+STEP = 0.03
+"""Motion between chosen frames, as a share of the picture's longest side, at least."""
+_POINTS = 200  # of a frame, followed into the next
+
+
+def take_frames(video: Path, folder: Path, bar: Bar) -> list[Path]:
+    """Write the frames worth having as JPEGs into ``folder``, unless they are there; returns their files.
+
+    Raises ``UserError`` for a video that cannot be read, or that hardly moves.
+    """
+    record = folder / "frames.json"
+    try:
+        kept = json.loads(record.read_text(encoding="utf-8"))
+        if kept["video"] == content_digest([video]) and all((folder / name).is_file() for name in kept["frames"]):
+            return [folder / name for name in kept["frames"]]
+    except (OSError, ValueError, KeyError):
+        pass
+    with bar("looking at frames") as progress, _frames(video) as (frames, total):
+        sharpness, motions = [], []
+        before: Look | None = None
+        for index, frame in enumerate(frames):
+            look = look_at(frame.to_ndarray(format="gray"))
+            motions.append(_motion(before, look) if before else 0.0)
+            sharpness.append(look.sharpness)
+            before = look
+            progress(index + 1, max(total, index + 1))
+    chosen = choose_frames(np.array(motions), np.array(sharpness))
+    if len(chosen) < FEWEST:
+        raise UserError(
+            f"the video {video} has {len(motions)} frame{'s' * (len(motions) != 1)}, of which only {len(chosen)} show "
+            f"the scene from different places: film while walking around it."
+        )
+    files = []
+    with bar("frames") as progress, _frames(video) as (frames, _):
+        for index, frame in enumerate(frames):
+            if index in chosen:
+                files.append(folder / f"frame_{index + 1:05d}.jpg")
+                _write(files[-1], frame)
+                progress(len(files), len(chosen))
+    for other in set(folder.glob("frame_*.jpg")) - set(files):
+        other.unlink()
+    written = {"video": content_digest([video]), "frames": [file.name for file in files]}
+    write_text_atomically(json.dumps(written) + "\n", record)
+    return files
+
+
+def choose_frames(motions: np.ndarray, sharpness: np.ndarray) -> list[int]:
+    """Return the sharpest frame of each stretch of equal motion, in order.
+
+    motions: of each frame, since the one before, in longest sides. Stretches are at least ``STEP`` long.
+    """
+    way = np.cumsum(motions)
+    if len(way) == 0:
+        return []
+    step = max(STEP, way[-1] / MOST)
+    stretch = np.minimum(way // step, MOST - 1)
+    return [
+        int(part[np.argmax(sharpness[part])]) for part in (np.flatnonzero(stretch == s) for s in np.unique(stretch))
+    ]
+
+
+def _motion(before: Look, now: Look) -> float:
+    """Return the median distance that the corners of a small picture move, in longest sides."""
+    import cv2
+
+    corners = cv2.goodFeaturesToTrack(before.small, _POINTS, 0.01, 5)
+    if corners is None:
+        return 0.0
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(before.small, now.small, corners, np.empty_like(corners))
+    ways = np.linalg.norm(moved - corners, axis=-1)[found == 1]
+    return float(np.median(ways)) / max(now.small.shape) if len(ways) else 0.0
+
+
+@contextmanager
+def _frames(video: Path) -> Iterator[tuple[Iterator[Any], int]]:
+    """Open a video; yields its frames and how many there may be."""
+    import av
+    import av.error
+
+    try:
+        with av.open(str(video)) as container:
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            yield container.decode(stream), stream.frames
+    except (av.error.FFmpegError, IndexError) as error:
+        raise UserError(f"the video {video} cannot be read ({error}): convert it to an .mp4 of H.264.") from error
+
+
+def _write(path: Path, frame: Any) -> None:
+    from PIL import Image
+
+    turns = round(getattr(frame, "rotation", 0) / 90) % 4
+    image = Image.fromarray(np.rot90(frame.to_ndarray(format="rgb24"), turns).copy())
+    write_whole(path, lambda file: image.save(file, "JPEG", quality=95))
