@@ -34,7 +34,10 @@ _CHUNK_POINTS = 1 << 20  # at a time
 class SeenSurface(Protocol):
     """What a training view shows."""
 
-    camera: Camera
+    @property
+    def camera(self) -> Camera:
+        """Return the camera."""
+        ...
 
     def surface(self) -> Tensor:
         """Return [H, W] float, the depth of the surface; 0 where nothing is solid."""
