@@ -65,6 +65,7 @@ ELSEWHERE = {
     "beags extract --load-config C [--object NAME ...] [--remove]": "a line of it is run",
     "beags render --load-config C [--object NAME ...] [--format before-after]": "a line of it is run",
     "ns-viewer --load-config C": "a line of it is run",
+    "beags process --data PHOTOS_OR_VIDEO --output-dir X": "this scene has no texture; test_process.py runs it",
     "beags bench ablation [--data X ...]": "trains for minutes; test_bench_running.py runs experiments to their tables",
     "make demo": "beags demo is run; what make calls is looked at below",
     "make demo DATA=my_scene": "the same",
