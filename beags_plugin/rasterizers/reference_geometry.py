@@ -152,7 +152,8 @@ def hits(projected: ProjectedSurfels, chosen: Tensor, pixels: Tensor, near: floa
     rho = torch.where(on_disc, rho3d, rho2d)
     center_depth = projected.depth[chosen].expand_as(rho)
     depth = torch.where(on_disc, projected.det[chosen] / q_z, center_depth)
-    alpha = (projected.opacity[chosen] * torch.exp(-0.5 * rho)).clamp_max(MAX_ALPHA)  # (E3)
+    alpha = projected.opacity[chosen] * torch.exp(-0.5 * rho)
+    alpha = alpha * (MAX_ALPHA / alpha.detach()).clamp_max(1.0)  # (E3); the clamp lets the gradient through
     if smooth_cutoff:
         fade = ((alpha - MIN_ALPHA) / MIN_ALPHA).clamp(0.0, 1.0)
         alpha = alpha * fade * fade * (3.0 - 2.0 * fade)

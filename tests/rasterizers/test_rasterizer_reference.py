@@ -173,6 +173,26 @@ def test_boundary_gradient_has_the_stated_closed_form():
     torch.testing.assert_close(logits.grad, torch.stack(expected) * a * (1 - a))
 
 
+def test_the_clamp_at_099_lets_the_gradient_through(rasterizer):
+    """d colour / d logit = 0.99 (c - background) (1 - o): alpha is cut to 0.99, its slope by log o is not 0."""
+    scene = make_scene(count=1, width=1, height=1)
+    logit = torch.tensor([7.0], dtype=torch.float64, requires_grad=True)
+    inputs = replace(
+        scene.inputs,
+        means=torch.tensor([[0.0, 0, 2]], dtype=torch.float64),
+        quats=torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64),
+        log_scales=torch.zeros(1, 2, dtype=torch.float64),
+        opacity_logits=logit,
+        colors=torch.tensor([[0.8, 0.6, 0.4]], dtype=torch.float64),
+    )
+    K = torch.tensor([[1.0, 0, 0.5], [0, 1.0, 0.5], [0, 0, 1]], dtype=torch.float64)
+    camera = Camera(torch.eye(4, dtype=torch.float64), K, 1, 1)
+    drawn = rasterizer.rasterize(inputs, camera, scene.settings, torch.zeros(3, dtype=torch.float64))
+    drawn.color.sum().backward()
+    assert drawn.alpha.item() == pytest.approx(0.99, rel=1e-12)
+    assert logit.grad.item() == pytest.approx(0.99 * 1.8 * float(1 - torch.sigmoid(logit.detach())), rel=1e-9)
+
+
 def test_weight_is_the_derivative_of_the_image_by_the_colour(rasterizer):
     scene = make_scene()
     colors = scene.inputs.colors.clone().requires_grad_()

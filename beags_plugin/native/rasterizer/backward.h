@@ -142,9 +142,8 @@ BEAGS_INLINE void add_gradients(const Job<T>& job, int k, const Splat<T>& s, con
   const Real<T> g_w = weight_gradient<kWanted>(job, k, s, hits, i, everywhere, p, w, sums, g_hit);
   store(p.transmittance, before);
   const Real<T> behind = load(p.behind);
-  Real<T> g_log = log_alpha_slope(w, g_w, behind, alpha, inverse_left);
+  const Real<T> g_log = log_alpha_slope(w, g_w, behind, alpha, inverse_left);
   store(p.behind, fma(w, g_w, behind));
-  if (!kPlain) g_log = keep(alpha < all(T(kMaxAlpha)), g_log);  // E3: no slope at 0.99
   add(sums[kLogOpacity], g_log);
   const Real<T> inverse = hits.get(hits.inverse, i);
   const auto plane = plane_slopes<kDepths>(g_log, g_hit, inverse, hits.get(hits.rho, i),

@@ -59,8 +59,8 @@ BEAGS_HD_INLINE void add_distortion(T mapping, R first, R nearness, R g_alpha_m,
   g_hit = fma(w * slope, all(T(2) / mapping) * (nearness * nearness), g_hit);
 }
 
-// Returns the slope by log alpha: alpha dL/dalpha = w g_w - (what lies behind) alpha / (1 - alpha). inverse_left: 1 /
-// (1 - alpha).
+// Returns the slope by log alpha: alpha dL/dalpha = w g_w - (what lies behind) alpha / (1 - alpha), at the clamp of E3
+// too. inverse_left: 1 / (1 - alpha).
 template <class R>
 BEAGS_HD_INLINE R log_alpha_slope(R w, R g_w, R behind, R alpha, R inverse_left) {
   return w * g_w - behind * (alpha * inverse_left);

@@ -117,9 +117,8 @@ BEAGS_DEVICE void pixel_gradients(T mapping, int k, const Splat<T>& s, const Hit
   if (kWanted & kDistortion) add_distortion(mapping, p.first, hit.nearness, p.g_alpha_m, p.g_moment, w, g_w, g_hit);
   if ((kWanted & kBoundary) && s.class_id != p.label) g_w += p.g_boundary;
   p.transmittance = before;
-  T g_log = log_alpha_slope(w, g_w, p.behind, hit.alpha, inverse_left);
+  const T g_log = log_alpha_slope(w, g_w, p.behind, hit.alpha, inverse_left);
   p.behind = fused(w, g_w, p.behind);
-  if (!s.plain && !(hit.alpha < T(kMaxAlpha))) g_log = 0;  // E3: no slope at 0.99
   sums[kLogOpacity] = g_log;
   const auto plane = plane_slopes<kDepths>(g_log, g_hit, hit.inverse, hit.rho, hit.depth);
   const T s_x = plane.s_0 * dx, s_y = plane.s_0 * dy;
