@@ -10,6 +10,7 @@ from torch import Tensor
 
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
+from beags_plugin.occupancy.support import Sightings
 from beags_plugin.ops import cuda_extension, extension
 from beags_plugin.ops.voxel_lookup import VoxelLookup
 from beags_plugin.ops.voxel_tally import VoxelTally
@@ -50,11 +51,12 @@ class VisibilityGrid:
     @classmethod
     def from_points(
         cls, clouds: Iterable[tuple[Tensor, Tensor]], voxel_size: float, origin: Tensor, num_classes: int,
-        dense_bytes: int = DENSE_BYTES,
+        dense_bytes: int = DENSE_BYTES, votes: bool = False,
     ) -> VisibilityGrid:  # fmt: skip
         """Build the grid of lifted points; a voxel in which classes collide is empty in all (method, section 5).
 
-        clouds: pairs (points [P, 3] float, class_ids [P] int), read one by one, e.g. one per view.
+        clouds: pairs (points [P, 3] float, class_ids [P] int), read one by one, one per view.
+        votes: whether the views vote instead (``Sightings.by_votes``).
         Raises ``UserError`` if the cloud spans more than 2^21 voxels along an axis.
         """
         origin = origin.to(torch.float64)
@@ -62,23 +64,17 @@ class VisibilityGrid:
         first = next(clouds, None)
         if first is not None:
             clouds = itertools.chain([first], clouds)
-            if (module := cuda_extension.module_for(first[0])) is not None:
+            if not votes and (module := cuda_extension.module_for(first[0])) is not None:
                 tally = VoxelTally(module, first[0].device)
                 for points, class_ids in clouds:
                     tally.add_points(points, class_ids.int(), origin, voxel_size)
                 if not tally.all_near():
                     raise _too_far(voxel_size)
                 return cls(voxel_size, origin, num_classes, *tally.pure(), dense_bytes)
-        keys = torch.zeros(0, dtype=torch.int64, device=origin.device)
-        classes = torch.zeros(0, dtype=torch.int32, device=origin.device)
-        for points, class_ids in clouds:
-            fresh = _pack(_voxels(points, origin, voxel_size))
-            keys, classes = _unique_pairs(torch.cat([keys, fresh]), torch.cat([classes, class_ids.int()]), num_classes)
-        keys, inverse, counts = torch.unique(keys, return_inverse=True, return_counts=True)
-        alone = counts == 1
-        of_key = torch.zeros_like(keys, dtype=torch.int32)
-        of_key[inverse] = classes  # meaningful for voxels of one class
-        return cls(voxel_size, origin, num_classes, keys[alone], of_key[alone], dense_bytes)
+        seen = ((_pack(_voxels(points, origin, voxel_size)), class_ids.int()) for points, class_ids in clouds)
+        sightings = Sightings(seen, num_classes, origin.device)
+        kept = sightings.by_votes() if votes else sightings.alone()
+        return cls(voxel_size, origin, num_classes, sightings.keys[kept], sightings.classes[kept], dense_bytes)
 
     def only(self, classes: Tensor) -> VisibilityGrid:
         """Return the grid of some classes alone, which needs less memory. classes: [C] int, ids in any order."""
@@ -273,10 +269,3 @@ def _pack(voxels: Tensor) -> Tensor:
 def _unpack(keys: Tensor) -> Tensor:
     mask = (1 << _BITS) - 1
     return torch.stack([keys >> 2 * _BITS, (keys >> _BITS) & mask, keys & mask], dim=-1) - _HALF
-
-
-def _unique_pairs(keys: Tensor, classes: Tensor, num_classes: int) -> tuple[Tensor, Tensor]:
-    """Return the distinct (key, class) pairs; 64 bits hold a key's rank and a class, but no key and class."""
-    voxels, rank = torch.unique(keys, return_inverse=True)
-    pairs = torch.unique(rank * num_classes + classes)
-    return voxels[pairs // num_classes], (pairs % num_classes).int()

@@ -56,6 +56,9 @@ class PreparationConfig:
     unseen: bool = False
     """Whether space that no view has seen supports what it lies in: the object around it, else the background. In the
     paper it supports nothing."""
+    votes: bool = False
+    """Whether a voxel supports the class that most views saw in it, an object if two did. In the paper it supports no
+    class where several were seen, and one view is enough."""
     k_pixels: int = 0
     """Training pixels for which k is stated; with fewer, k shrinks in proportion, so that voxels keep their size. 0, as
     in the paper, takes k as it is."""
@@ -163,6 +166,7 @@ def prepare(
         seed,
         config.depth,
         config.unseen,
+        config.votes,
     )
     k = config.neighbours(cameras)
 

@@ -26,6 +26,7 @@ class AssignedScene:
     cameras: the training views. labels: per training view M', [H, W] int32.
     num_classes: ids lie below it, perhaps far apart: see ``labels.class_ranks`` for arrays with an entry per class.
     depth: the depth of the surface: see ``rasterizers.rendering.surface_depth``.
+    unseen, votes: see ``PreparationConfig``.
     """
 
     surfels: Surfels
@@ -38,6 +39,7 @@ class AssignedScene:
     seed: int
     depth: str = "median"
     unseen: bool = False
+    votes: bool = False
 
 
 @dataclass(frozen=True)

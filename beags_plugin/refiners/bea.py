@@ -27,4 +27,5 @@ class BeaRefiner(Refiner):
             depth=scene.depth,
             progress=progress,
             unseen=scene.unseen,
+            votes=scene.votes,
         )
