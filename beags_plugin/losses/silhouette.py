@@ -15,6 +15,7 @@ from torch import Tensor
 from beags_plugin.core.lifting import lift
 from beags_plugin.labels.class_ids import IGNORE, objects_in
 from beags_plugin.losses.base import Loss, LossInputs
+from beags_plugin.losses.boundary import beyond_slack
 from beags_plugin.losses.class_members import ClassMembers
 from beags_plugin.losses.reduction import ordered_sum
 from beags_plugin.rasterizers.rendering import surfel_inputs
@@ -23,10 +24,13 @@ from beags_plugin.system.errors import UserError
 TAU = 0.02
 """The object is hidden where its depth z and the scene's D have z > (1 + TAU) D; as in reprojection (E5)."""
 
+SLACK = 0.4
+"""Of a pixel next to another class, which may be covered in part; as in the boundary loss."""
+
 
 @dataclass(frozen=True)
 class SilhouetteLoss(Loss):
-    """Mean over the labelled pixels of |A_c - [M' = c]|, summed over the objects c of the view.
+    """Mean over the labelled pixels of |A_c - [M' = c]|, beyond ``SLACK`` at borders, summed over the view's objects c.
 
     A_c is the alpha of the Gaussians of class c rendered alone. Where M' is of another class and the object lies behind
     what the whole scene shows there, it may be hidden rightly, and the pixel does not count.
@@ -87,7 +91,7 @@ class SilhouetteLoss(Loss):
             of_others = outside & (inputs.labels != 0) & (alone.alpha.detach() > 0) & (depth > shown)
             outside &= ~self._seen_from_elsewhere(of_others, depth, class_id, inputs)
         wrong = torch.where(inside, 1.0 - alone.alpha, torch.where(outside, alone.alpha, 0.0))
-        return ordered_sum(wrong)
+        return ordered_sum(beyond_slack(wrong, inputs.labels, SLACK))
 
     def _seen_from_elsewhere(self, asked: Tensor, depth: Tensor, class_id: int, inputs: LossInputs) -> Tensor:
         """Return the pixels of ``asked`` at whose ``depth`` [H, W] some view saw the object, both [H, W] bool."""

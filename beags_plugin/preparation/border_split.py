@@ -16,6 +16,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import Densified
 from beags_plugin.core.splitting import split_in_two
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.borders import at_border
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.preparation.refiner import EditedScene
@@ -23,7 +24,6 @@ from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.system.errors import UserError
 
-BAND = 1  # pixels from another class, at most, for a pixel at a boundary
 MIN_SHARE = 0.2  # least share of a split Gaussian's contributions that is at boundaries
 MIN_SIGMA = 0.7  # pixels that the longer scale of a split Gaussian exceeds in its nearest view
 
@@ -63,7 +63,7 @@ def split_at_borders(
         if progress:
             progress(done, total)
 
-    bands = LabelMaps(border_band(mask, BAND) for mask in labels)
+    bands = LabelMaps(at_border(mask).int().masked_fill_(mask == IGNORE, IGNORE) for mask in labels)
     edited = Densified.unchanged(surfels)
     for _ in range(config.rounds):
         share = _share_of_class(edited.surfels, cameras, bands, rasterizer, settings, tick)
@@ -71,21 +71,6 @@ def split_at_borders(
         edited = edited.then(split_in_two(edited.surfels, (share >= MIN_SHARE) & (sigma > MIN_SIGMA)))
     assignment = assign_classes(edited.surfels, cameras, labels, rasterizer, settings, num_classes, tick)
     return EditedScene(edited, assignment)
-
-
-def border_band(labels: Tensor, width: int) -> Tensor:
-    """Return [H, W] int32: 1 where another class is at most ``width`` rows and columns away, else 0.
-
-    labels: [H, W] int32 class ids or IGNORE; unlabelled pixels stay IGNORE and make no boundary.
-    """
-    unlabelled = labels == IGNORE
-    size = 2 * width + 1
-    # IGNORE must be neither the smallest nor the largest of its window
-    highest = labels.masked_fill(unlabelled, -1).float()[None, None]
-    lowest = -labels.float()[None, None]
-    largest = torch.nn.functional.max_pool2d(highest, size, stride=1, padding=width)[0, 0]
-    smallest = -torch.nn.functional.max_pool2d(lowest, size, stride=1, padding=width)[0, 0]
-    return (largest != smallest).int().masked_fill_(unlabelled, IGNORE)
 
 
 def _share_of_class(surfels, cameras, bands, rasterizer, settings, tick) -> Tensor:

@@ -8,9 +8,8 @@ import torch
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.splitting import split_in_two
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.preparation import border_split
-from beags_plugin.preparation.border_split import BorderSplitConfig, border_band, largest_sigma, split_at_borders
+from beags_plugin.preparation.border_split import BorderSplitConfig, largest_sigma, split_at_borders
 from beags_plugin.preparation.pipeline import PreparationConfig, prepare
 from beags_plugin.preparation.refiner import AssignedScene
 from beags_plugin.rasterizers import make_rasterizer
@@ -69,20 +68,6 @@ def test_halves_lie_on_the_longer_axis_and_the_others_stay():
 
     edited = split_in_two(surfels, torch.zeros(3, dtype=torch.bool))
     assert torch.equal(edited.surfels.log_scales, surfels.log_scales) and not edited.fresh.any()
-
-
-def test_border_band_against_a_slow_count():
-    generator = torch.Generator().manual_seed(0)
-    labels = torch.randint(0, 3, (9, 11), generator=generator, dtype=torch.int32)
-    labels[torch.rand(9, 11, generator=generator) < 0.2] = IGNORE
-    for width in (1, 2):
-        band = border_band(labels, width)
-        for y in range(9):
-            for x in range(11):
-                near = labels[max(y - width, 0) : y + width + 1, max(x - width, 0) : x + width + 1]
-                classes = set(near.flatten().tolist()) - {IGNORE}
-                expected = IGNORE if labels[y, x] == IGNORE else int(len(classes) > 1)
-                assert band[y, x] == expected
 
 
 def test_largest_sigma_is_that_of_the_nearest_view():

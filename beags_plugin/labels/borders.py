@@ -1,0 +1,25 @@
+"""Pixels at the borders of classes."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from beags_plugin.labels.class_ids import IGNORE
+
+
+def at_border(labels: Tensor) -> Tensor:
+    """Return [H, W] bool: one of the eight pixels around is of another class.
+
+    labels: [H, W] int class ids or IGNORE. Unlabelled pixels lie at no border and make none.
+    """
+    found = torch.zeros_like(labels, dtype=torch.bool)
+    height, width = labels.shape
+    for down, right in ((0, 1), (1, -1), (1, 0), (1, 1)):
+        first = (slice(0, height - down), slice(max(-right, 0), width - max(right, 0)))
+        second = (slice(down, height), slice(max(right, 0), width - max(-right, 0)))
+        a, b = labels[first], labels[second]
+        differ = (a != b) & (a != IGNORE) & (b != IGNORE)
+        found[first] |= differ
+        found[second] |= differ
+    return found
