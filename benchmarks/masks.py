@@ -79,30 +79,32 @@ def parts(data: Path, run: Path | None = None) -> None:
     from beags_plugin.labels.classes import read_id_mask, write_mask
     from beags_plugin.plugin.objects.check_masks import check, options_beside
 
-    def named(masks: Path | None) -> dict[str, list[str]]:
-        found = check(options_beside(run, data, masks_path=masks), run=run).contradictions
+    def checked(masks: Path | None) -> tuple[list[str], dict[str, list[str]]]:
+        """Return the training views, and those that each kind of evidence names, the worst first."""
+        report = check(options_beside(run, data, masks_path=masks), run=run)
         kinds = ("points", "pixels") if run is not None else ("points",)
-        return {kind: list(dict.fromkeys(one.view for one in found if one.of == kind)) for kind in kinds}
+        named = {kind: dict.fromkeys(one.view for one in report.contradictions if one.of == kind) for kind in kinds}
+        trained = [stem for stem, used in zip(report.stems, report.trained, strict=True) if used]
+        return trained, {kind: list(views) for kind, views in named.items()}
 
     exact = {path.stem: read_id_mask(path) for path in sorted((data / "masks").glob("*.png"))}
-    rows = {kind: [len(views), 0, 0, 0] for kind, views in named(None).items()}
+    trained, before = checked(None)
+    rows = {kind: np.array([len(views), 0, 0, 0]) for kind, views in before.items()}
     for seed in range(SEEDS):
         generator = np.random.default_rng(seed)
         with tempfile.TemporaryDirectory() as folder:
-            damaged = set(generator.choice(list(exact), len(exact) // 4, replace=False).tolist())
-            for index, stem in enumerate(sorted(exact, key=lambda stem: (stem not in damaged, stem))):
-                mask = exact[stem]
-                if stem in damaged:
-                    mask = _damaged(mask, index % 2 == 1, generator)
+            damaged = generator.choice(trained, len(trained) // 4, replace=False).tolist()
+            for index, stem in enumerate(damaged + sorted(set(exact) - set(damaged))):
+                mask = damaged_mask(exact[stem], index % 2 == 1, generator) if stem in damaged else exact[stem]
                 write_mask(Path(folder) / f"{stem}.png", mask)
-            for kind, views in named(Path(folder)).items():
-                counts = [0, len(damaged & set(views[: len(damaged)])), len(damaged), len(set(views) - damaged)]
-                rows[kind] = [before + now for before, now in zip(rows[kind], counts, strict=True)]
-    for kind, (before, found, planted, others) in rows.items():
-        print(f"| {data.name}, {len(exact)} masks, {kind} | {before} | {found} of {planted} | {others} |", flush=True)
+            for kind, views in checked(Path(folder))[1].items():
+                first = set(views[: len(damaged)]) & set(damaged)
+                rows[kind] += [0, len(first), len(damaged), len(set(views) - set(damaged))]
+    for kind, (names, found, planted, others) in rows.items():
+        print(f"| {data.name}, {len(trained)} views, {kind} | {names} | {found} of {planted} | {others} |", flush=True)
 
 
-def _damaged(mask: np.ndarray, add: bool, generator: np.random.Generator) -> np.ndarray:
+def damaged_mask(mask: np.ndarray, add: bool, generator: np.random.Generator) -> np.ndarray:
     """Return a mask without an object's part towards the foot of the photo, or with the ground about this foot."""
     import cv2
 

@@ -14,7 +14,7 @@ from beags_plugin.masks.check.issues import Issue, named, percent
 
 LEAST_OTHERS = 2  # other views that see a point of a track; most tracks are short
 LEAST = 4  # contradicted points of an object in a view
-SHARE = 0.02  # of its points or pixels there
+SHARE = {"points": 0.02, "pixels": 0.05}  # of its points, or, at depths that are less exact, of its pixels
 WORST = 0.5  # of the worst score: views that are silenced together
 
 
@@ -54,7 +54,7 @@ def contradictions(
     right = np.einsum("vcc->vc", confusion)
     missing, extra = confusion.sum(2) - right, confusion.sum(1) - right
     wrong, total = missing + extra, missing + extra + right
-    flagged = np.nonzero((wrong >= LEAST) & (wrong >= SHARE * total))
+    flagged = np.nonzero((wrong >= LEAST) & (wrong >= SHARE[of] * total))
     found = [
         Contradiction(views[v], ids[k], int(missing[v, k]), int(extra[v, k]), int(total[v, k]), of)
         for v, k in zip(*(axis.tolist() for axis in flagged), strict=True)

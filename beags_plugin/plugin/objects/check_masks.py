@@ -238,10 +238,12 @@ def write_report(report: Report, output: Path) -> list[Path]:
 
 def write_contradictions(report: Report, output: Path) -> list[Path]:
     """Write contradicted.png, the worst views, if there are any; return its path."""
+    picture = output / "contradicted.png"
     if not report.pointed and not report.framed:
+        picture.unlink(missing_ok=True)  # of other masks
         return []
-    contradicted_picture(output / "contradicted.png", report.pointed, report.framed)
-    return [output / "contradicted.png"]
+    contradicted_picture(picture, report.pointed, report.framed)
+    return [picture]
 
 
 def options_beside(run: Path | None, data: Path | None, **given: Any) -> BeagsDataParserConfig:
