@@ -79,16 +79,14 @@ def contradicted_picture(
     pointed: masks with dots at contradicted points, in the colours of the classes that the others say (background:
     black). framed: masks beside the labels of the other views, with the contradicted boxes.
     """
-    dotted = []
+    dotted, compared = [], []
     for view in pointed:
-        photo = read_image(view.photo, lambda image: np.array(image.convert("RGB")))
-        shown = overlay(photo, view.given)
+        shown = overlay(read_image(view.photo, lambda image: np.array(image.convert("RGB"))), view.given)
         height, width = view.given.shape
         for place, color in zip(view.places, colorize(view.others), strict=True):
             _dot(shown, place * [width, height], color)
         size = (2 * _WIDTH, max(1, round(2 * _WIDTH * height / width)))
-        dotted.append([cell(shown, size, f"{view.name}: {len(view.places)} points, in the colours that others say")])
-    lines = wrapped(dotted, 4 * _WIDTH + 2 * GAP)
+        dotted.append([cell(shown, size, f"{view.name}: {len(view.places)} points in the colours of the other views")])
     for view, boxes in framed:
         height, width = view.voted.shape
         size = (_WIDTH, max(1, round(_WIDTH * height / width)))
@@ -97,8 +95,8 @@ def contradicted_picture(
             for box in boxes:
                 _frame(mask, box)
         captions = (f"{view.name}: as given", "the other views")
-        lines.append(beside([cell(mask, size, text) for mask, text in zip(masks, captions, strict=True)]))
-    write_picture(path, below(lines))
+        compared.append([cell(mask, size, text) for mask, text in zip(masks, captions, strict=True)])
+    write_picture(path, below([line for cells in (dotted, compared) for line in wrapped(cells, 4 * (_WIDTH + GAP))]))
 
 
 def _dot(image: np.ndarray, place: np.ndarray, color: np.ndarray) -> None:

@@ -3,112 +3,22 @@
 from __future__ import annotations
 
 import json
-import re
 from contextlib import suppress
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
-import torch
-from data_folders import look_at, write_image, write_transforms
-from parsed_views import real
-from PIL import Image
+from ball_scenes import SIDE, balls_from, issues, poses, write_balls
+from data_folders import write_image, write_transforms
 
 from beags_plugin.commands.cli import main
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.labels.classes import read_id_mask, write_mask
-from beags_plugin.masks.check.areas import contradicted
+from beags_plugin.labels.classes import write_mask
 from beags_plugin.masks.check.consistency import UNSEEN, Agreement, labels_around, labels_at, ranks_of
-from beags_plugin.masks.check.contradictions import contradictions, settle
 from beags_plugin.masks.check.disagreement import views_against_others
 from beags_plugin.masks.check.files import Coverage, MaskFiles
 from beags_plugin.masks.check.issues import named, percent
-from beags_plugin.pictures.masks import Changed, coverage_picture
-
-VIEWS, SIDE = 12, 48
-BALLS = {1: ((-0.6, 0.0, 0.0), 0.4), 2: ((0.6, 0.1, 0.0), 0.4), 3: ((0.0, 0.7, 0.3), 0.3)}
-FOCAL = 60.0
-
-
-def poses() -> list[np.ndarray]:
-    angles = 2 * np.pi * np.arange(VIEWS) / VIEWS
-    return [look_at((4 * np.cos(a), 4 * np.sin(a), 1.5)) for a in angles]
-
-
-def balls_from(pose: np.ndarray) -> np.ndarray:
-    """[SIDE, SIDE] uint8 ids of the nearest ball along each pixel's ray."""
-    row, column = np.mgrid[:SIDE, :SIDE] + 0.5
-    local = np.stack([(column - SIDE / 2) / FOCAL, -(row - SIDE / 2) / FOCAL, -np.ones((SIDE, SIDE))], axis=2)
-    rays = local @ pose[:3, :3].T
-    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-    nearest, ids = np.full((SIDE, SIDE), np.inf), np.zeros((SIDE, SIDE), np.uint8)
-    for class_id, (center, radius) in BALLS.items():
-        to = np.asarray(center) - pose[:3, 3]
-        along = rays @ to
-        root = along**2 - to @ to + radius**2
-        hit = np.where(root > 0, along - np.sqrt(np.maximum(root, 0)), np.inf)
-        ids[hit < nearest], nearest = class_id, np.minimum(hit, nearest)
-    return ids
-
-
-def write_balls(root: Path, change=lambda view, ids: ids) -> Path:
-    """A scene of three balls; ``change`` gives the mask of each view, None for no mask."""
-    write_transforms(root, poses=poses(), fl_x=FOCAL, fl_y=FOCAL, cx=SIDE / 2, cy=SIDE / 2, w=SIDE, h=SIDE)
-    meta = json.loads((root / "transforms.json").read_text())
-    (root / "transforms.json").write_text(json.dumps({**meta, "w": SIDE, "h": SIDE, "fl_x": FOCAL, "fl_y": FOCAL}))
-    (root / "classes.json").write_text(json.dumps({"1": "left", "2": "right", "3": "top"}))
-    for view, pose in enumerate(poses()):
-        write_image(root / f"images/v{view:02d}.png", np.full((SIDE, SIDE, 3), 90, np.uint8))
-        if (mask := change(view, balls_from(pose))) is not None:
-            write_image(root / f"masks/v{view:02d}.png", mask)
-    return root
-
-
-def write_model(root: Path) -> None:
-    """Write a COLMAP model of photos twice as large, in which views show points of the balls and of what is below."""
-    generator = np.random.default_rng(0)
-    around = generator.normal(size=(3, 400, 3))
-    around /= np.linalg.norm(around, axis=2, keepdims=True)
-    centers, radii = (np.array([ball[part] for ball in BALLS.values()]) for part in (0, 1))
-    on_balls = (centers[:, None] + radii[:, None, None] * around).reshape(-1, 3)
-    ground = np.append(generator.uniform(-1.5, 1.5, (1500, 2)), np.full((1500, 1), -0.6), axis=1)
-    points, ids = np.concatenate([on_balls, ground]), np.repeat([1, 2, 3, 0], [400, 400, 400, 1500])
-    outward = np.concatenate([around.reshape(-1, 3), np.tile([0.0, 0.0, 1.0], (1500, 1))])
-    lines = []
-    for view, pose in enumerate(poses()):
-        local = (points - pose[:3, 3]) @ pose[:3, :3]
-        xy = SIDE / 2 + FOCAL * local[:, :2] / -local[:, 2:] * [1, -1]
-        faces = ((pose[:3, 3] - points) * outward).sum(1) > 1.0
-        inside = faces & (xy >= 0).all(1) & (xy < SIDE).all(1)
-        shown = balls_from(pose)
-        seen = [p for p in np.flatnonzero(inside) if shown[int(xy[p, 1]), int(xy[p, 0])] == ids[p]]
-        lines.append(f"{view + 1} 1 0 0 0 0 0 0 1 photos/v{view:02d}.jpg\n")
-        lines.append(" ".join(f"{2 * xy[p, 0]} {2 * xy[p, 1]} {p}" for p in seen) + " 1.0 1.0 -1\n")
-    (root / "colmap/sparse/0").mkdir(parents=True)
-    (root / "colmap/sparse/0/images.txt").write_text("".join(lines))
-    (root / "colmap/sparse/0/cameras.txt").write_text(f"1 PINHOLE {2 * SIDE} {2 * SIDE} 1 1 1 1\n")
-
-
-def damaged(view: int, ids: np.ndarray) -> np.ndarray:
-    """Cut the lower half of ball 1 off in view 3, and add ground to ball 2 in view 7."""
-    rows, columns = np.nonzero(ids == {3: 1, 7: 2}.get(view, 3))
-    if view == 3:
-        ids[rows[rows >= np.median(rows)], columns[rows >= np.median(rows)]] = 0
-    if view == 7:
-        below = ids[rows.max() - 2 : rows.max() + 8, columns.min() : columns.max() + 8]
-        below[below == 0] = 2
-    return ids
-
-
-def issues(root: Path, **options) -> dict[str, list]:
-    from beags_plugin.plugin.objects.check_masks import check_scene, data_options
-
-    found: dict[str, list] = {}
-    for issue in check_scene(data_options(root, **options)).issues:
-        found.setdefault(issue.kind, []).append(issue)
-    return found
+from beags_plugin.pictures.masks import coverage_picture
 
 
 def exchanged(ids: np.ndarray, *order: int) -> np.ndarray:
@@ -117,69 +27,6 @@ def exchanged(ids: np.ndarray, *order: int) -> np.ndarray:
 
 def test_good_masks_give_no_finding(tmp_path):
     assert issues(write_balls(tmp_path)) == {}
-
-
-def test_views_that_cut_or_add_parts_are_named_by_the_points_that_they_saw(tmp_path, capsys):
-    scene = write_balls(tmp_path / "scene", damaged)
-    check = ["masks", "check", "--data", str(scene), "--output", str(tmp_path / "out")]
-    main(check)
-    out = capsys.readouterr().out
-    assert "No COLMAP model says which views saw which points" in out and "0 warnings" in out
-    write_model(scene)
-    main(check)
-    out = " ".join(capsys.readouterr().out.split())
-    assert "Views were compared at " in out and "2 warnings" in out
-    assert re.search(r"1 of 12 masks of 1 \(left\) contradict .* worst first: v03 leaves out \d\d % of \d+ points", out)
-    assert re.search(r"1 of 12 masks of 2 \(right\) contradict .* worst first: v07 takes in \d\d % of \d+ points", out)
-    found = json.loads((tmp_path / "out/report.json").read_text())["contradictions"]
-    assert {(one["view"], one["class_id"], one["of"]) for one in found} == {("v03", 1, "points"), ("v07", 2, "points")}
-    with Image.open(tmp_path / "out/contradicted.png") as picture:
-        assert picture.size[0] > 1200  # both views
-    good = write_balls(tmp_path / "good")
-    write_model(good)
-    assert issues(good) == {}
-
-
-def test_masks_that_are_made_are_compared_too(tmp_path, capsys):
-    scene = write_balls(tmp_path / "scene", damaged)
-    write_model(scene)
-    (scene / "masks").rename(tmp_path / "ids")
-    (scene / "classes.json").unlink()
-    options = ["--source", "id-images", "--options", f"folder={tmp_path / 'ids'}", "--output", str(tmp_path / "out")]
-    main(["masks", "make", "--data", str(scene), *options])
-    assert "worst first: v03 leaves out" in capsys.readouterr().out and (tmp_path / "out/contradicted.png").is_file()
-
-
-def test_damaged_masks_of_a_capture_are_named_and_no_others(tmp_path):
-    from beags_plugin.plugin.objects.check_masks import check_scene, data_options
-    from benchmarks.masks import damaged_mask
-
-    root, generator = real("fruit"), np.random.default_rng(0)
-    assert check_scene(data_options(root)).contradictions == []
-    bad = set()
-    for index, path in enumerate(sorted((root / "masks").iterdir())):
-        mask = read_id_mask(path)
-        if index % 4 == 1:
-            mask = damaged_mask(mask, index % 8 == 1, generator)
-            bad.add(path.stem)
-        write_mask(tmp_path / path.name, mask)
-    named = {one.view for one in check_scene(data_options(root, masks_path=tmp_path)).contradictions}
-    assert named <= bad and len(named) >= 0.65 * len(bad)
-
-
-def test_a_view_that_is_bad_blames_no_other():
-    """Two views of four lack an object at points that few others saw: without them, nobody contradicts the rest."""
-    labels = np.full((60, 6), UNSEEN, np.int16)
-    labels[:, :3] = 1
-    labels[:, 3] = 0
-    labels[40:, 4] = 0
-    labels[50:, :2] = UNSEEN  # there the bad views have the majority
-    agreement = Agreement(labels, 2, least=2)
-    views = [f"v{view}" for view in range(6)]
-    assert {one.view for one in contradictions(agreement.confusion, views, [0, 7], "points")} == {"v2", "v3", "v4"}
-    found = settle(agreement, views, [0, 7])
-    assert [(one.view, one.class_id) for one in found] == [("v3", 7), ("v4", 7)]
-    assert (found[0].missing, found[0].extra, found[0].total) == (50, 0, 50)
 
 
 def test_exchanged_ids_are_found_with_the_view(tmp_path):
@@ -356,53 +203,6 @@ def test_confusion_leaves_the_view_itself_out():
 def test_ranks_of_ids():
     found = ranks_of(np.array([[0, 7], [9, IGNORE]], np.uint16), [0, 7], IGNORE)
     assert found.tolist() == [[0, 1], [UNSEEN, UNSEEN]]
-
-
-def test_contradicted_areas_are_wider_than_outlines():
-    given = np.zeros((100, 100), np.int32)
-    given[20:60, 20:60] = 1
-    voted = given.copy()
-    voted[20:60, 20] = 0  # an outline
-    voted[70:90, 70:95] = 2
-    sure = np.ones((100, 100), np.float32)
-    (area,) = contradicted(given, voted, sure, "v")
-    assert (area.given, area.voted, area.box) == (0, 2, (70, 70, 95, 90)) and 480 < area.pixels <= 500
-    assert contradicted(given, voted, 0.5 * sure, "v") == []
-    assert contradicted(np.full_like(given, IGNORE), voted, sure, "v") == []
-
-
-def test_areas_that_a_run_contradicts_are_reported_with_their_cost(tmp_path):
-    from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
-    from beags_plugin.plugin.objects.check_masks import check_scene, check_with_run, data_options, write_contradictions
-
-    def change(view, ids):
-        blob = ids.copy()
-        blob[2:12, 2:12] = 2
-        return blob if view == 3 else ids
-
-    root = write_balls(tmp_path, change)
-    report = check_scene(data_options(root))
-    good = [balls_from(pose).astype(np.int32) for pose in poses()]
-    given = LabelMaps(torch.from_numpy(change(view, ids)) for view, ids in enumerate(good))
-    voted = LabelMaps(map(torch.from_numpy, good))
-    sure = CompressedMaps(torch.full((SIDE, SIDE), 255, dtype=torch.uint8) for _ in poses())
-    maps = {"names": report.stems, "given": given, "voted": voted, "confidence": sure, "classes": report.names}
-
-    def changed(view: int) -> Changed:
-        shown = [found[view].numpy() for found in (given, voted, sure)]
-        return Changed(report.stems[view], np.zeros((SIDE, SIDE, 3), np.uint8), *shown)
-
-    found = check_with_run(report, cast(Any, SimpleNamespace(**maps, changed=changed)))
-    (area,), (one,) = found.areas, found.contradictions
-    assert (area.view, area.given, area.voted) == ("v03", 2, 0) and 60 < area.pixels <= 100
-    assert (one.view, one.class_id, one.missing, one.extra) == ("v03", 2, 0, area.pixels)
-    assert one.total == area.pixels + (good[3] == 2).sum()
-    (issue,) = [issue for issue in found.issues if issue.kind == "contradicted"]
-    assert "1 of 12 masks of 2 (right) contradict the other views at the run's depths" in issue.message
-    assert issue.views == ("v03",) and issue.cost.startswith(f"{area.pixels} pixels ({percent(area.pixels, one.total)}")
-    assert write_contradictions(found, tmp_path / "out")[0].is_file()
-    same = check_with_run(report, cast(Any, SimpleNamespace(**{**maps, "given": voted})))
-    assert same.areas == [] and same.contradictions == []
 
 
 def test_words():

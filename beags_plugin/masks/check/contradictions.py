@@ -48,16 +48,22 @@ class Contradiction:
 
 
 def contradictions(
-    confusion: np.ndarray, views: Sequence[str], ids: Sequence[int], of: Literal["points", "pixels"]
+    right: np.ndarray,
+    missing: np.ndarray,
+    extra: np.ndarray,
+    views: Sequence[str],
+    ids: Sequence[int],
+    of: Literal["points", "pixels"],
 ) -> list[Contradiction]:
-    """Find views and objects that the other views contradict; confusion: [V, C, C] as of ``Agreement``."""
-    right = np.einsum("vcc->vc", confusion)
-    missing, extra = confusion.sum(2) - right, confusion.sum(1) - right
+    """Find views and objects that the other views contradict.
+
+    right: [V, C] points or pixels that a view and the others give to a class. missing, extra: [V, C], that the others
+    or the view alone give to it.
+    """
     wrong, total = missing + extra, missing + extra + right
-    flagged = np.nonzero((wrong >= LEAST) & (wrong >= SHARE[of] * total))
     found = [
         Contradiction(views[v], ids[k], int(missing[v, k]), int(extra[v, k]), int(total[v, k]), of)
-        for v, k in zip(*(axis.tolist() for axis in flagged), strict=True)
+        for v, k in [(int(v), int(k)) for v, k in np.argwhere((wrong >= LEAST) & (wrong >= SHARE[of] * total))]
         if ids[k] != BACKGROUND
     ]
     return sorted(found, key=lambda one: -one.score)
@@ -69,13 +75,14 @@ def settle(agreement: Agreement, views: Sequence[str], ids: Sequence[int]) -> li
     Ends once all views that still vote agree.
     """
     while True:
-        found = contradictions(agreement.confusion, views, ids, "points")
-        voting = [one for one in found if agreement.voting[views.index(one.view)]]
-        if not voting:
+        right = np.einsum("vcc->vc", agreement.confusion)
+        missing, extra = (agreement.confusion.sum(axis) - right for axis in (2, 1))
+        found = contradictions(right, missing, extra, views, ids, "points")
+        scores = {views.index(one.view): one.score for one in reversed(found)}  # of each view its worst
+        scores = {view: score for view, score in scores.items() if agreement.voting[view]}
+        if not scores:
             return found
-        agreement.silence(
-            [view for view in {views.index(one.view) for one in voting if one.score >= WORST * voting[0].score}]
-        )
+        agreement.silence([view for view, score in scores.items() if score >= WORST * max(scores.values())])
 
 
 def issues_of(found: Sequence[Contradiction], names: Mapping[int, str], masks: int) -> list[Issue]:

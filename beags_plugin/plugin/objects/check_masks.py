@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
@@ -67,6 +68,13 @@ class Report:
         """Whether training would stop."""
         return any(issue.level == "error" for issue in self.issues)
 
+    def add(self, found: Sequence[Contradiction], masks: int) -> None:
+        """Take up contradictions of one kind, except about objects that most views lack."""
+        absent = {class_id for issue in self.issues if issue.kind == "absent" for class_id in issue.objects}
+        found = [one for one in found if one.class_id not in absent]
+        self.contradictions += found
+        self.issues = ordered([*self.issues, *issues_of(found, self.names, masks)])
+
     def objects(self) -> list[str]:
         """Return a line for each object: in how many training views it is, and its share of their pixels."""
         coverage, lines = self.coverage, []
@@ -109,9 +117,10 @@ class Report:
 def check(parser: BeagsDataParserConfig, few_views: int = FEW_VIEWS, run: Path | None = None) -> Report:
     """Check the masks of a scene, with a trained run (its config.yml) also at its depths, if nothing stops training."""
     report = check_scene(parser, few_views)
-    if run is None or report.stops:
-        return report
-    return check_with_run(report, reproject_run(run, ReprojectionOptions(method="voxel", run_size=True, parser=parser)))
+    if run is not None and not report.stops:
+        options = ReprojectionOptions(method="voxel", run_size=True, parser=parser)
+        add_areas(report, reproject_run(run, options))
+    return report
 
 
 def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Report:
@@ -142,7 +151,7 @@ def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Re
         tracks = tracks_of(scene, views, len(coverage.ids))
         agreement, seen = agreements(files, coverage, views, points_in_space(scene, views, config), tracks)
         report.issues += views_against_others(agreement, files, coverage, names)
-        _add_contradictions(report, files, views, tracks, seen)
+        _add_points(report, files, views, tracks, seen)
     report.issues = ordered(report.issues)
     return report
 
@@ -179,7 +188,7 @@ def _files(config: BeagsDataParserConfig) -> tuple[Dataset, PosedViews, MaskFile
     return scene, views, files
 
 
-def _add_contradictions(report: Report, files: MaskFiles, views: PosedViews, tracks: Tracks, seen: Agreement) -> None:
+def _add_points(report: Report, files: MaskFiles, views: PosedViews, tracks: Tracks, seen: Agreement) -> None:
     """Add what the views that saw the same points contradict each other about."""
     report.compared = (
         f"Views were compared at {len(seen.labels)} points of the COLMAP model, each in the views that saw it."
@@ -187,39 +196,31 @@ def _add_contradictions(report: Report, files: MaskFiles, views: PosedViews, tra
         else "No COLMAP model says which views saw which points: parts that masks lack or take in are looked for with "
         "--load-config only."
     )
-    ids, absent = report.coverage.ids, {class_id for issue in report.issues for class_id in issue.objects}
-    found = [one for one in settle(seen, report.stems, ids) if one.class_id not in absent]
-    report.contradictions += found
-    report.issues += issues_of(found, report.names, int(report.coverage.usable.sum()))
-    worst = list(dict.fromkeys(report.stems.index(one.view) for one in found))[:MOST_PICTURES]
-    report.pointed += [pointed(files, views, view, tracks, seen, ids) for view in worst]
+    ids = report.coverage.ids
+    report.add(settle(seen, report.stems, ids), int(report.coverage.usable.sum()))
+    worst = list(dict.fromkeys(report.stems.index(one.view) for one in report.contradictions))[:MOST_PICTURES]
+    report.pointed = [pointed(files, views, view, tracks, seen, ids) for view in worst]
 
 
-def check_with_run(report: Report, run: ReprojectedRun) -> Report:
-    """Return the report with what the other views contradict at the depths of a trained run."""
-    ids, areas = sorted(run.classes), []
-    confusion = np.zeros((len(run.names), len(ids), len(ids)), np.int64)
+def add_areas(report: Report, run: ReprojectedRun) -> None:
+    """Add what the other views contradict at the depths of a trained run."""
+    ids = sorted(run.classes)
+    right, missing, extra = np.zeros((3, len(run.names), len(ids)), np.int64)
     for index, name in enumerate(run.names):
         if (mask := run.given[index]) is None:
             continue
         given, voted = mask.numpy(), run.voted[index].numpy()
-        right = np.bincount(given[(given == voted) & (given != IGNORE)], minlength=ids[-1] + 1)
-        np.fill_diagonal(confusion[index], right[ids])
+        right[index] = np.bincount(given[(given == voted) & (given != IGNORE)], minlength=ids[-1] + 1)[ids]
         for area in contradicted(given, voted, run.confidence[index].numpy() / np.float32(255.0), name):
-            confusion[index, ids.index(area.voted), ids.index(area.given)] += area.pixels
-            areas.append(area)
-    found = contradictions(confusion, run.names, ids, "pixels")
-    issues = issues_of(found, run.classes, sum(mask is not None for mask in run.given.stored))
-    worst = list(dict.fromkeys(one.view for one in found))[:MOST_PICTURES]
-    return replace(
-        report,
-        issues=ordered([*report.issues, *issues]),
-        contradictions=[*report.contradictions, *found],
-        areas=sorted(areas, key=lambda area: -area.pixels),
-        framed=[
-            (run.changed(run.names.index(view)), [area.box for area in areas if area.view == view]) for view in worst
-        ],
-    )
+            missing[index, ids.index(area.voted)] += area.pixels
+            extra[index, ids.index(area.given)] += area.pixels
+            report.areas.append(area)
+    report.areas.sort(key=lambda area: -area.pixels)
+    found = contradictions(right, missing, extra, run.names, ids, "pixels")
+    report.add(found, sum(mask is not None for mask in run.given.stored))
+    for view in list(dict.fromkeys(one.view for one in report.contradictions if one.of == "pixels"))[:MOST_PICTURES]:
+        boxes = [area.box for area in report.areas if area.view == view]
+        report.framed.append((run.changed(run.names.index(view)), boxes))
 
 
 def write_report(report: Report, output: Path) -> list[Path]:
