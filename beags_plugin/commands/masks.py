@@ -19,7 +19,8 @@ class Check:
     """Look for mistakes in masks before training on them; ends with exit code 1 where training would stop.
 
     Which views lack a mask, wrong sizes and types, ids without a name, objects in few views, ids exchanged between
-    views, how much of each view each object covers; with a trained run also where the views contradict each other.
+    views, how much of each view each object covers; which masks lack parts of an object or take in too much, as the
+    other views say at the points of a COLMAP model, and with a trained run everywhere.
     """
 
     data: Path | None = None
@@ -45,28 +46,17 @@ class Check:
         if self.data is None and self.load_config is None:
             raise UserError("no scene is named: give --data its folder, or --load-config a run trained on it.")
         with starting(self):
-            from beags_plugin.plugin.objects.check_masks import (
-                check_scene,
-                check_with_run,
-                options_beside,
-                write_report,
-            )
-            from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, reproject_run
+            from beags_plugin.plugin.objects.check_masks import check, options_beside, write_report
         names = ("layout", "images_path", "masks_path", "classes_path", "ignore_ids")
         parser = options_beside(self.load_config, self.data, **{name: getattr(self, name) for name in names})
-        report = check_scene(parser, self.min_views)
-        run = None
-        readable = not any(issue.level == "error" for issue in report.issues)
-        if self.load_config is not None and readable:
-            run = reproject_run(self.load_config, ReprojectionOptions(method="voxel", run_size=True, parser=parser))
-            report = check_with_run(report, run)
+        report = check(parser, self.min_views, self.load_config)
         for line in report.lines():
             CONSOLE.print(line)
-        for path in write_report(report, self.output or Path("outputs/masks_check") / report.data.name, run):
+        for path in write_report(report, self.output or Path("outputs/masks_check") / report.data.name):
             CONSOLE.print(f"  {path}")
-        if self.load_config is not None and not readable:
-            CONSOLE.print("The run is asked once no error is left.")
-        if not readable:
+        if report.stops:
+            if self.load_config is not None:
+                CONSOLE.print("The run is asked once no error is left.")
             sys.exit(1)
 
 

@@ -64,8 +64,11 @@ def printable(text: str) -> str:
 
 
 def beside(cells: Iterable[np.ndarray]) -> np.ndarray:
-    """Join cells of one height in a line, with a gap after each."""
-    return np.concatenate([np.pad(c, ((0, 0), (0, GAP), (0, 0)), constant_values=255) for c in cells], axis=1)
+    """Join cells of any height in a line, with a gap after each."""
+    cells = list(cells)
+    tallest = max(len(c) for c in cells)
+    padded = [np.pad(c, ((0, tallest - len(c)), (0, GAP), (0, 0)), constant_values=255) for c in cells]
+    return np.concatenate(padded, axis=1)
 
 
 def below(lines: Sequence[np.ndarray]) -> np.ndarray:

@@ -10,8 +10,9 @@ import numpy as np
 
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.colors import colorize
-from beags_plugin.pictures.cells import below, beside, cell, write_picture
+from beags_plugin.pictures.cells import GAP, below, beside, cell, wrapped, write_picture
 from beags_plugin.system.errors import writing
+from beags_plugin.system.reading.images import read_image
 
 _WIDTH = 300  # pixels of a cell
 CHANGED = (255, 0, 255)
@@ -27,6 +28,17 @@ class Changed:
     given: np.ndarray | None
     voted: np.ndarray
     confidence: np.ndarray
+
+
+@dataclass(frozen=True)
+class Pointed:
+    """One view with N contradicted points: photo; given [H, W] ids; places [N, 2] in 0..1; others: ids [N]."""
+
+    name: str
+    photo: Path
+    given: np.ndarray
+    places: np.ndarray
+    others: np.ndarray
 
 
 def overlay(photo: np.ndarray, labels: np.ndarray) -> np.ndarray:
@@ -59,10 +71,23 @@ def before_and_after(path: Path, views: Sequence[Changed]) -> None:
     write_picture(path, below(lines))
 
 
-def contradictions(path: Path, views: Sequence[tuple[Changed, Sequence[tuple[int, int, int, int]]]]) -> None:
-    """Write a picture with a line per view: its mask and the labels of the other views, with the contradicted boxes."""
-    lines = []
-    for view, boxes in views:
+def contradicted_picture(
+    path: Path, pointed: Sequence[Pointed], framed: Sequence[tuple[Changed, Sequence[tuple[int, int, int, int]]]]
+) -> None:
+    """Write a picture of views that the others contradict.
+
+    pointed: masks with dots at contradicted points, in the colours of the classes that the others say (background:
+    black). framed: masks beside the labels of the other views, with the contradicted boxes.
+    """
+    dotted, compared = [], []
+    for view in pointed:
+        shown = overlay(read_image(view.photo, lambda image: np.array(image.convert("RGB"))), view.given)
+        height, width = view.given.shape
+        for place, color in zip(view.places, colorize(view.others), strict=True):
+            _dot(shown, place * [width, height], color)
+        size = (2 * _WIDTH, max(1, round(2 * _WIDTH * height / width)))
+        dotted.append([cell(shown, size, f"{view.name}: {len(view.places)} points in the colours of the other views")])
+    for view, boxes in framed:
         height, width = view.voted.shape
         size = (_WIDTH, max(1, round(_WIDTH * height / width)))
         masks = [view.photo if view.given is None else overlay(view.photo, view.given), overlay(view.photo, view.voted)]
@@ -70,8 +95,16 @@ def contradictions(path: Path, views: Sequence[tuple[Changed, Sequence[tuple[int
             for box in boxes:
                 _frame(mask, box)
         captions = (f"{view.name}: as given", "the other views")
-        lines.append(beside([cell(mask, size, text) for mask, text in zip(masks, captions, strict=True)]))
-    write_picture(path, below(lines))
+        compared.append([cell(mask, size, text) for mask, text in zip(masks, captions, strict=True)])
+    write_picture(path, below([line for cells in (dotted, compared) for line in wrapped(cells, 4 * (_WIDTH + GAP))]))
+
+
+def _dot(image: np.ndarray, place: np.ndarray, color: np.ndarray) -> None:
+    import cv2
+
+    center, radius = place.astype(int).tolist(), max(2, round(image.shape[1] / _WIDTH * 2))
+    cv2.circle(image, center, radius + max(1, radius // 2), (255, 255, 255), -1)
+    cv2.circle(image, center, radius, color.tolist(), -1)
 
 
 def _frame(image: np.ndarray, box: tuple[int, int, int, int]) -> None:

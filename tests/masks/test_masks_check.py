@@ -5,70 +5,20 @@ from __future__ import annotations
 import json
 from contextlib import suppress
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
-import torch
-from data_folders import look_at, write_image, write_transforms
+from ball_scenes import SIDE, balls_from, issues, poses, write_balls
+from data_folders import write_image, write_transforms
 
 from beags_plugin.commands.cli import main
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import write_mask
-from beags_plugin.masks.check.areas import contradicted
-from beags_plugin.masks.check.consistency import UNSEEN, Agreement, labels_at, ranks_of
+from beags_plugin.masks.check.consistency import UNSEEN, Agreement, labels_around, labels_at, ranks_of
 from beags_plugin.masks.check.disagreement import views_against_others
 from beags_plugin.masks.check.files import Coverage, MaskFiles
 from beags_plugin.masks.check.issues import named, percent
 from beags_plugin.pictures.masks import coverage_picture
-
-VIEWS, SIDE = 12, 48
-BALLS = {1: ((-0.6, 0.0, 0.0), 0.4), 2: ((0.6, 0.1, 0.0), 0.4), 3: ((0.0, 0.7, 0.3), 0.3)}
-FOCAL = 60.0
-
-
-def poses() -> list[np.ndarray]:
-    angles = 2 * np.pi * np.arange(VIEWS) / VIEWS
-    return [look_at((4 * np.cos(a), 4 * np.sin(a), 1.5)) for a in angles]
-
-
-def balls_from(pose: np.ndarray) -> np.ndarray:
-    """[SIDE, SIDE] uint8 ids of the nearest ball along each pixel's ray."""
-    row, column = np.mgrid[:SIDE, :SIDE] + 0.5
-    local = np.stack([(column - SIDE / 2) / FOCAL, -(row - SIDE / 2) / FOCAL, -np.ones((SIDE, SIDE))], axis=2)
-    rays = local @ pose[:3, :3].T
-    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-    nearest, ids = np.full((SIDE, SIDE), np.inf), np.zeros((SIDE, SIDE), np.uint8)
-    for class_id, (center, radius) in BALLS.items():
-        to = np.asarray(center) - pose[:3, 3]
-        along = rays @ to
-        root = along**2 - to @ to + radius**2
-        hit = np.where(root > 0, along - np.sqrt(np.maximum(root, 0)), np.inf)
-        ids[hit < nearest], nearest = class_id, np.minimum(hit, nearest)
-    return ids
-
-
-def write_balls(root: Path, change=lambda view, ids: ids) -> Path:
-    """A scene of three balls; ``change`` gives the mask of each view, None for no mask."""
-    write_transforms(root, poses=poses(), fl_x=FOCAL, fl_y=FOCAL, cx=SIDE / 2, cy=SIDE / 2, w=SIDE, h=SIDE)
-    meta = json.loads((root / "transforms.json").read_text())
-    (root / "transforms.json").write_text(json.dumps({**meta, "w": SIDE, "h": SIDE, "fl_x": FOCAL, "fl_y": FOCAL}))
-    (root / "classes.json").write_text(json.dumps({"1": "left", "2": "right", "3": "top"}))
-    for view, pose in enumerate(poses()):
-        write_image(root / f"images/v{view:02d}.png", np.full((SIDE, SIDE, 3), 90, np.uint8))
-        if (mask := change(view, balls_from(pose))) is not None:
-            write_image(root / f"masks/v{view:02d}.png", mask)
-    return root
-
-
-def issues(root: Path, **options) -> dict[str, list]:
-    from beags_plugin.plugin.objects.check_masks import check_scene, data_options
-
-    found: dict[str, list] = {}
-    for issue in check_scene(data_options(root, **options)).issues:
-        found.setdefault(issue.kind, []).append(issue)
-    return found
 
 
 def exchanged(ids: np.ndarray, *order: int) -> np.ndarray:
@@ -231,13 +181,15 @@ def test_no_mask_at_all_is_an_error(tmp_path):
     assert found["missing"][0].level == "error" and "beags masks make" in found["missing"][0].message
 
 
-def test_labels_of_points_heed_the_image_and_the_depth():
+def test_labels_of_points_heed_the_image_and_its_outlines():
     ranks = np.array([[0, 1], [2, UNSEEN]], np.int16)
     xy = np.array([[0.5, 0.5], [1.5, 0.5], [0.5, 1.5], [1.5, 1.5], [-0.1, 0.5], [0.5, 0.5], [np.nan, 0.5]])
     z = np.array([1.0, 1.0, 1.0, 1.0, 1.0, -1.0, 1.0])
     assert labels_at(xy, z, ranks).tolist() == [0, 1, 2, UNSEEN, UNSEEN, UNSEEN, UNSEEN]
-    depth = np.array([[1.01, 1.05], [1.0, 1.0]])
-    assert labels_at(xy, z, ranks, depth, tau=0.02).tolist() == [0, UNSEEN, 2, UNSEEN, UNSEEN, UNSEEN, UNSEEN]
+    halves = np.repeat(np.int16([0, 1]), 500)[None].repeat(700, axis=0)  # a band of 4 pixels
+    columns = np.array([2, 300, 494, 497, 503, 506, 998])
+    found = labels_around(np.stack([columns + 0.5, np.full(7, 350.5)], axis=1), halves)
+    assert found.tolist() == [UNSEEN, 0, 0, UNSEEN, UNSEEN, 1, UNSEEN]
 
 
 def test_confusion_leaves_the_view_itself_out():
@@ -251,44 +203,6 @@ def test_confusion_leaves_the_view_itself_out():
 def test_ranks_of_ids():
     found = ranks_of(np.array([[0, 7], [9, IGNORE]], np.uint16), [0, 7], IGNORE)
     assert found.tolist() == [[0, 1], [UNSEEN, UNSEEN]]
-
-
-def test_contradicted_areas_are_wider_than_outlines():
-    given = np.zeros((100, 100), np.int32)
-    given[20:60, 20:60] = 1
-    voted = given.copy()
-    voted[20:60, 20] = 0  # an outline
-    voted[70:90, 70:95] = 2
-    sure = np.ones((100, 100), np.float32)
-    (area,) = contradicted(given, voted, sure, "v")
-    assert (area.given, area.voted, area.box) == (0, 2, (70, 70, 95, 90)) and 480 < area.pixels <= 500
-    assert contradicted(given, voted, 0.5 * sure, "v") == []
-    assert contradicted(np.full_like(given, IGNORE), voted, sure, "v") == []
-
-
-def test_areas_that_a_run_contradicts_are_reported_with_their_cost(tmp_path):
-    from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
-    from beags_plugin.plugin.objects.check_masks import check_scene, check_with_run, data_options
-
-    def change(view, ids):
-        blob = ids.copy()
-        blob[2:12, 2:12] = 2
-        return blob if view == 3 else ids
-
-    root = write_balls(tmp_path, change)
-    report = check_scene(data_options(root))
-    good = [balls_from(pose).astype(np.int32) for pose in poses()]
-    given = LabelMaps(torch.from_numpy(change(view, ids)) for view, ids in enumerate(good))
-    voted = LabelMaps(map(torch.from_numpy, good))
-    sure = CompressedMaps(torch.full((SIDE, SIDE), 255, dtype=torch.uint8) for _ in poses())
-    run = SimpleNamespace(names=report.stems, given=given, voted=voted, confidence=sure, classes=report.names)
-    found = check_with_run(report, cast(Any, run))
-    (issue,) = [issue for issue in found.issues if issue.kind == "contradicted"]
-    (area,) = found.areas
-    assert (area.view, area.given, area.voted) == ("v03", 2, 0) and issue.views == ("v03",)
-    assert "1 areas in 1 views" in issue.message and f"correct these masks of {root}" in issue.message
-    assert 60 < area.pixels <= 100 and issue.cost.startswith(f"{area.pixels} pixels (0.")
-    assert check_with_run(report, cast(Any, SimpleNamespace(**{**vars(run), "given": voted}))).areas == []
 
 
 def test_words():

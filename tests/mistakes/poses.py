@@ -111,6 +111,10 @@ mistakes(
         "COLMAP's cameras.bin cut off": colmap(lambda model: cut(model / "cameras.bin")),
         "COLMAP's images.bin promises 2^60": colmap(giant("images.bin")),
         "COLMAP's points3D.bin promises 2^60": colmap(giant("points3D.bin")),
+        "COLMAP's images.bin beside transforms.json cut off, met by a check": beags_after(
+            lambda at: (write_colmap(at.data, folder="colmap/sparse/0"), cut(at.data / "colmap/sparse/0/images.bin")),
+            "masks check --data {data}",
+        ),
         "COLMAP's images.bin missing": colmap(lambda model: (model / "images.bin").unlink()),
     },
 )

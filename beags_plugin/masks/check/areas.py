@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.masks.check.consistency import band
 
 SMALLEST = 0.0005  # least share of the image
-BAND = 0.003  # of the image diagonal: any mask is contradicted so near an outline
 CONFIDENCE = 0.6  # least share of contradicting votes
 
 
@@ -34,12 +32,6 @@ class Area:
         """Return plain values."""
         return {**vars(self), "box": list(self.box)}
 
-    def describe(self, names: Mapping[int, str]) -> str:
-        """Describe the area in words."""
-        left, top, right, bottom = self.box
-        kinds = [f"{i} ({names.get(i, f'class_{i}')})" for i in (self.given, self.voted)]
-        return f"{self.view}, x {left}-{right}, y {top}-{bottom}: {kinds[0]}, the others say {kinds[1]}"
-
 
 def contradicted(given: np.ndarray, voted: np.ndarray, confidence: np.ndarray, view: str) -> list[Area]:
     """Find areas of one view that are wider than the band about outlines, the largest first.
@@ -50,7 +42,7 @@ def contradicted(given: np.ndarray, voted: np.ndarray, confidence: np.ndarray, v
 
     height, width = given.shape
     wrong = (given != voted) & (given != IGNORE) & (voted != IGNORE) & (confidence >= CONFIDENCE)
-    radius = max(1, round(BAND * math.hypot(height, width)))
+    radius = band(height, width)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     core = cv2.morphologyEx(wrong.astype(np.uint8), cv2.MORPH_OPEN, disc)
     count, pieces, stats, _ = cv2.connectedComponentsWithStats(core, connectivity=8)

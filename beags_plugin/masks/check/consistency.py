@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-UNSEEN = -1  # label of a point outside the image, behind the camera or another surface, or unlabelled
+BAND = 0.003  # of the image diagonal: any mask is contradicted so near an outline
+UNSEEN = -1  # label of a point outside the image, behind the camera, not seen by the view, or unlabelled
 AGREEMENT = 0.6  # least share of one class in the other views' labels of a point that counts
 LEAST_OTHERS = 3  # other views that see a point that counts
 LEAST_POINTS = 8  # of an object in a view
@@ -23,51 +25,76 @@ class Renamed:
     points: int
 
 
-def labels_at(
-    xy: np.ndarray, z: np.ndarray, ranks: np.ndarray, depth: np.ndarray | None = None, tau: float = 0.02
-) -> np.ndarray:
+def labels_at(xy: np.ndarray, z: np.ndarray, ranks: np.ndarray) -> np.ndarray:
     """Return the label of each point in a view, [P] int16, or ``UNSEEN``.
 
     xy: [P, 2] pixels; z: [P] depth of the points; ranks: [H, W] int16 classes, ``UNSEEN`` if unlabelled.
-    depth: [H, W] of the surface, or None; a point counts then only if |z - D| <= tau z.
     """
     height, width = ranks.shape
     with np.errstate(invalid="ignore"):
         inside = (z > 0) & (xy[:, 0] >= 0) & (xy[:, 0] < width) & (xy[:, 1] >= 0) & (xy[:, 1] < height)
     found = np.full(len(z), UNSEEN, np.int16)
-    index = np.flatnonzero(inside)
-    column, row = xy[index].astype(np.int64).T
-    if depth is not None:
-        visible = np.abs(z[index] - depth[row, column]) <= tau * z[index]
-        index, column, row = index[visible], column[visible], row[visible]
-    found[index] = ranks[row, column]
+    column, row = xy[inside].astype(np.int64).T
+    found[inside] = ranks[row, column]
     return found
+
+
+def labels_around(xy: np.ndarray, ranks: np.ndarray) -> np.ndarray:
+    """Return the label of each point that a view shows, as ``labels_at``; ``UNSEEN`` in the band about outlines."""
+    ahead = np.ones(len(xy))
+    found = labels_at(xy, ahead, ranks)
+    for angle in np.arange(8) * np.pi / 4:
+        beside = xy + band(*ranks.shape) * np.array([np.cos(angle), np.sin(angle)])
+        found[labels_at(beside, ahead, ranks) != found] = UNSEEN
+    return found
+
+
+def band(height: int, width: int) -> int:
+    """Return the width, in pixels, of the band about outlines in which any mask is contradicted."""
+    return max(1, round(BAND * math.hypot(height, width)))
 
 
 class Agreement:
     """Labels of P points in all views, and the confusion of each view with the others.
 
     labels: [P, V] int16 ranks below ``classes``, or ``UNSEEN``; see ``labels_at``. Rank 0 is the background.
+    least: other views that see a point that counts.
     """
 
-    def __init__(self, labels: np.ndarray, classes: int) -> None:
-        self.labels, self.classes = labels, classes
+    def __init__(self, labels: np.ndarray, classes: int, least: int = LEAST_OTHERS) -> None:
+        self.labels, self.classes, self.least = labels, classes, least
         points, views = labels.shape
         self.votes = np.zeros((points, classes), np.int32)
+        self.voting = np.ones(views, bool)
         for view in range(views):
             seen = np.flatnonzero(labels[:, view] != UNSEEN)
             self.votes[seen, labels[seen, view]] += 1
-        self.confusion = np.stack([self._against_others(view) for view in range(views)])
+        self._compare()
+
+    def silence(self, views: Sequence[int]) -> None:
+        """Take back the votes of some views, which are still compared with the others."""
+        for view in views:
+            seen = np.flatnonzero(self.labels[:, view] != UNSEEN)
+            self.votes[seen, self.labels[seen, view]] -= 1
+        self.voting[views] = False
+        self._compare()
+
+    def against_others(self, view: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the points [N] of a view that count, and their classes [N] in the other views."""
+        seen = np.flatnonzero(self.labels[:, view] != UNSEEN)
+        others = self.votes[seen].copy()
+        others[np.arange(len(seen)), self.labels[seen, view]] -= self.voting[view]
+        total = others.sum(1)
+        clear = (total >= self.least) & (others.max(1, initial=0) >= AGREEMENT * total)
+        return seen[clear], others.argmax(1)[clear]
+
+    def _compare(self) -> None:
+        self.confusion = np.stack([self._confusion(view) for view in range(len(self.voting))])
         """[V, C, C]: points with the row's class in the other views and the column's in the view."""
 
-    def _against_others(self, view: int) -> np.ndarray:
-        own = self.labels[:, view]
-        seen = np.flatnonzero(own != UNSEEN)
-        others = self.votes[seen].copy()
-        others[np.arange(len(seen)), own[seen]] -= 1
-        winner, total = others.argmax(1), others.sum(1)
-        clear = (total >= LEAST_OTHERS) & (others.max(1, initial=0) >= AGREEMENT * total)
-        pairs = winner[clear] * self.classes + own[seen][clear]
+    def _confusion(self, view: int) -> np.ndarray:
+        points, winner = self.against_others(view)
+        pairs = winner * self.classes + self.labels[points, view]
         return np.bincount(pairs, minlength=self.classes**2).reshape(self.classes, self.classes)
 
     def renamed(self) -> list[Renamed]:

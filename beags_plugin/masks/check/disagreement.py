@@ -73,6 +73,7 @@ def _absent(agreement: Agreement, files: MaskFiles, coverage: Coverage, titles: 
                 f"{len(lacking)} views vote for the background there, {len(showing)} for the object; a view without a "
                 "mask does not vote",
                 stems,
+                (coverage.ids[rank],),
             )
     return issues
 

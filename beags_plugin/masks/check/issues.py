@@ -17,7 +17,7 @@ class Issue:
 
     level: "error": training refuses it; "warning": it costs quality; "note": fine if intended.
     kind: a short word for similar issues. message: file or object, mistake, remedy.
-    cost: of leaving it, with figures. views: stems of the images concerned.
+    cost: of leaving it, with figures. views: stems of the images concerned. objects: class ids concerned, if one is.
     """
 
     level: Level
@@ -25,10 +25,11 @@ class Issue:
     message: str
     cost: str
     views: tuple[str, ...] = ()
+    objects: tuple[int, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values."""
-        return {**vars(self), "views": list(self.views)}
+        return {**vars(self), "views": list(self.views), "objects": list(self.objects)}
 
 
 def ordered(issues: Sequence[Issue]) -> list[Issue]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -14,26 +15,20 @@ from beags_plugin.data.files import image_size, photo_names
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.labels.classes import read_classes
 from beags_plugin.masks.check.areas import Area, contradicted
-from beags_plugin.masks.check.consistency import Agreement, labels_at, ranks_of
+from beags_plugin.masks.check.consistency import Agreement
+from beags_plugin.masks.check.contradictions import Contradiction, contradictions, issues_of, settle
 from beags_plugin.masks.check.disagreement import views_against_others
 from beags_plugin.masks.check.files import FEW_VIEWS, MOST_IDS, Coverage, MaskFiles, check_files
 from beags_plugin.masks.check.issues import LEVELS, Issue, ordered, percent
-from beags_plugin.pictures.masks import contradictions, coverage_picture
+from beags_plugin.pictures.masks import Changed, Pointed, contradicted_picture, coverage_picture
+from beags_plugin.plugin.objects.compare_views import Tracks, agreements, pointed, points_in_space, tracks_of
+from beags_plugin.plugin.objects.reproject_masks import ReprojectedRun, ReprojectionOptions, reproject_run
 from beags_plugin.plugin.runs.place import open_run
-from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParserConfig
-from beags_plugin.plugin.views.lens import project_through_lens
 from beags_plugin.plugin.views.poses import PosedViews
-from beags_plugin.plugin.views.seed_points import random_points, starting_points
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.progress import progress_bar
 
-if TYPE_CHECKING:
-    from beags_plugin.plugin.objects.reproject_masks import ReprojectedRun
-
-RANDOM_POINTS = 50_000  # beside the seed points: an object that has none of these has some of them in it
-MOST_SEED_POINTS = 100_000
-MOST_COUNTS = 30_000_000  # points times classes that are counted at a time
 MOST_PICTURES = 6  # views in contradicted.png
 MOST_OBJECTS = 40  # that are printed
 
@@ -42,7 +37,9 @@ MOST_OBJECTS = 40  # that are printed
 class Report:
     """The findings.
 
-    names: class id to name. trained: False for held-out views. areas: places where views disagree, with a trained run.
+    names: class id to name. trained: False for held-out views. contradictions: views whose masks the others contradict,
+    the worst first, at the points that views saw, then with a trained run at its depths, in ``areas``. compared: a
+    sentence about these points. pointed, framed: the worst views of both, for ``contradicted_picture``.
     """
 
     data: Path
@@ -51,7 +48,11 @@ class Report:
     trained: list[bool]
     coverage: Coverage
     issues: list[Issue]
+    contradictions: list[Contradiction] = field(default_factory=list)
     areas: list[Area] = field(default_factory=list)
+    compared: str = ""
+    pointed: list[Pointed] = field(default_factory=list)
+    framed: list[tuple[Changed, list[tuple[int, int, int, int]]]] = field(default_factory=list)
 
     def summary(self) -> str:
         """Return a line with the numbers of views, objects and issues."""
@@ -61,6 +62,18 @@ class Report:
             f"{self.data}: {len(self.stems)} views, {int(self.coverage.usable.sum())} usable masks, {objects} objects; "
             f"{', '.join(counts)}."
         )
+
+    @property
+    def stops(self) -> bool:
+        """Whether training would stop."""
+        return any(issue.level == "error" for issue in self.issues)
+
+    def add(self, found: Sequence[Contradiction], masks: int) -> None:
+        """Take up contradictions of one kind, except about objects that most views lack."""
+        absent = {class_id for issue in self.issues if issue.kind == "absent" for class_id in issue.objects}
+        found = [one for one in found if one.class_id not in absent]
+        self.contradictions += found
+        self.issues = ordered([*self.issues, *issues_of(found, self.names, masks)])
 
     def objects(self) -> list[str]:
         """Return a line for each object: in how many training views it is, and its share of their pixels."""
@@ -82,7 +95,7 @@ class Report:
         if len(objects) > MOST_OBJECTS:
             objects[MOST_OBJECTS:] = [f"and {len(objects) - MOST_OBJECTS} more objects"]
         issues = [f"{issue.level}: {issue.message}\n    costs: {issue.cost}" for issue in self.issues]
-        return [*objects, *issues, self.summary()]
+        return [*objects, *issues, *([self.compared] if self.compared else []), self.summary()]
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values."""
@@ -96,8 +109,18 @@ class Report:
             "objects": self.objects(),
             "issues": [issue.to_json() for issue in self.issues],
             "coverage": views,
+            "contradictions": [one.to_json() for one in self.contradictions],
             "areas": [area.to_json() for area in self.areas],
         }
+
+
+def check(parser: BeagsDataParserConfig, few_views: int = FEW_VIEWS, run: Path | None = None) -> Report:
+    """Check the masks of a scene, with a trained run (its config.yml) also at its depths, if nothing stops training."""
+    report = check_scene(parser, few_views)
+    if run is not None and not report.stops:
+        options = ReprojectionOptions(method="voxel", run_size=True, parser=parser)
+        add_areas(report, reproject_run(run, options))
+    return report
 
 
 def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Report:
@@ -113,9 +136,9 @@ def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Re
         coverage = check_files(files, few_views, progress)
     names = files.names or {}
     names = {i: names.get(i, "background" if i == 0 else f"class_{i}") for i in coverage.ids}
-    issues = list(coverage.issues)
+    report = Report(scene.root, list(files.stems), names, list(files.trained), coverage, list(coverage.issues))
     if len(coverage.ids) > MOST_IDS:
-        issues.append(
+        report.issues.append(
             Issue(
                 "note",
                 "not compared",
@@ -125,16 +148,20 @@ def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Re
             )
         )
     elif coverage.usable.sum() > 3 and len(coverage.ids) > 1:
-        points = _points(scene, views, config)
-        issues += views_against_others(_agreement(files, coverage, views, points), files, coverage, names)
-    return Report(scene.root, list(files.stems), names, list(files.trained), coverage, ordered(issues))
+        tracks = tracks_of(scene, views, len(coverage.ids))
+        agreement, seen = agreements(files, coverage, views, points_in_space(scene, views, config), tracks)
+        report.issues += views_against_others(agreement, files, coverage, names)
+        _add_points(report, files, views, tracks, seen)
+    report.issues = ordered(report.issues)
+    return report
 
 
 def agreement_of(config: BeagsDataParserConfig) -> tuple[np.ndarray, int]:
     """Return labels [P, V] of points in space in every view (``consistency.Agreement``) and the number of classes."""
     scene, views, files = _files(config)
     coverage = check_files(files)
-    return _agreement(files, coverage, views, _points(scene, views, config)).labels, len(coverage.ids)
+    points = points_in_space(scene, views, config)
+    return agreements(files, coverage, views, points, [])[0].labels, len(coverage.ids)
 
 
 def _files(config: BeagsDataParserConfig) -> tuple[Dataset, PosedViews, MaskFiles]:
@@ -161,64 +188,43 @@ def _files(config: BeagsDataParserConfig) -> tuple[Dataset, PosedViews, MaskFile
     return scene, views, files
 
 
-def _points(scene: Dataset, views: PosedViews, config: BeagsDataParserConfig) -> np.ndarray:
-    """Return [P, 3] float64 in the cameras' world: seed points, and random points where the cameras look."""
-    found = starting_points(scene, views, config.num_random_points)
-    seeds = found["points3D_xyz"].double().numpy()
-    step = -(-len(seeds) // MOST_SEED_POINTS)
-    cameras = [camera_from_nerfstudio(views.cameras, index) for index in range(len(views.images))]
-    random, _ = random_points(cameras, RANDOM_POINTS)
-    return np.concatenate([seeds[::step], random.astype(np.float64)])
+def _add_points(report: Report, files: MaskFiles, views: PosedViews, tracks: Tracks, seen: Agreement) -> None:
+    """Add what the views that saw the same points contradict each other about."""
+    report.compared = (
+        f"Views were compared at {len(seen.labels)} points of the COLMAP model, each in the views that saw it."
+        if len(seen.labels)
+        else "No COLMAP model says which views saw which points: parts that masks lack or take in are looked for with "
+        "--load-config only."
+    )
+    ids = report.coverage.ids
+    report.add(settle(seen, report.stems, ids), int(report.coverage.usable.sum()))
+    worst = list(dict.fromkeys(report.stems.index(one.view) for one in report.contradictions))[:MOST_PICTURES]
+    report.pointed = [pointed(files, views, view, tracks, seen, ids) for view in worst]
 
 
-def _agreement(files: MaskFiles, coverage: Coverage, views: PosedViews, points: np.ndarray) -> Agreement:
-    step = -(-len(points) * len(coverage.ids) // MOST_COUNTS)
-    points = points[::step]
-    labels = np.full((len(points), len(files.stems)), -1, np.int16)
-    with progress_bar("Comparing views") as progress:
-        for view in range(len(files.stems)):
-            if coverage.usable[view]:
-                mask = files.read(view)
-                assert mask is not None
-                xy, z = project_through_lens(points, views.cameras, view)
-                labels[:, view] = labels_at(xy, z, ranks_of(mask, coverage.ids, IGNORE))
-            progress(view + 1, len(files.stems))
-    return Agreement(labels, len(coverage.ids))
+def add_areas(report: Report, run: ReprojectedRun) -> None:
+    """Add what the other views contradict at the depths of a trained run."""
+    ids = sorted(run.classes)
+    right, missing, extra = np.zeros((3, len(run.names), len(ids)), np.int64)
+    for index, name in enumerate(run.names):
+        if (mask := run.given[index]) is None:
+            continue
+        given, voted = mask.numpy(), run.voted[index].numpy()
+        right[index] = np.bincount(given[(given == voted) & (given != IGNORE)], minlength=ids[-1] + 1)[ids]
+        for area in contradicted(given, voted, run.confidence[index].numpy() / np.float32(255.0), name):
+            missing[index, ids.index(area.voted)] += area.pixels
+            extra[index, ids.index(area.given)] += area.pixels
+            report.areas.append(area)
+    report.areas.sort(key=lambda area: -area.pixels)
+    found = contradictions(right, missing, extra, run.names, ids, "pixels")
+    report.add(found, sum(mask is not None for mask in run.given.stored))
+    for view in list(dict.fromkeys(one.view for one in report.contradictions if one.of == "pixels"))[:MOST_PICTURES]:
+        boxes = [area.box for area in report.areas if area.view == view]
+        report.framed.append((run.changed(run.names.index(view)), boxes))
 
 
-def check_with_run(report: Report, run: ReprojectedRun) -> Report:
-    """Return the report with the areas of masks that the other views contradict at the depths of a trained run."""
-    areas = [area for index in range(len(run.names)) for area in _areas(run, index)]
-    areas.sort(key=lambda area: -area.pixels)
-    issues = list(report.issues)
-    if areas:
-        pixels, views = sum(area.pixels for area in areas), {area.view for area in areas}
-        total = sum(mask.pixels for mask in run.given.stored if mask is not None)
-        issues.append(
-            Issue(
-                "warning",
-                "contradicted",
-                f"{len(areas)} areas in {len(views)} views are contradicted by the other views, the largest: "
-                f"{'; '.join(area.describe(run.classes) for area in areas[:3])}: correct these masks of {report.data}, "
-                "or leave it to reprojection.",
-                f"{pixels} pixels ({percent(pixels, total)} of the masks) go to another class in reprojection; "
-                "with --pipeline.model.prepare.reprojection none they pull Gaussians to the wrong class",
-                tuple(sorted(views)),
-            )
-        )
-    return replace(report, issues=ordered(issues), areas=areas)
-
-
-def _areas(run: ReprojectedRun, index: int) -> list[Area]:
-    given = run.given[index]
-    if given is None:
-        return []
-    confidence = run.confidence[index].numpy() / np.float32(255.0)
-    return contradicted(given.numpy(), run.voted[index].numpy(), confidence, run.names[index])
-
-
-def write_report(report: Report, output: Path, run: ReprojectedRun | None = None) -> list[Path]:
-    """Write report.json, with objects coverage.png, with contradicted areas contradicted.png; return their paths."""
+def write_report(report: Report, output: Path) -> list[Path]:
+    """Write report.json, with objects coverage.png, with contradictions contradicted.png; return their paths."""
     coverage = report.coverage
     share = coverage.pixels / np.maximum(coverage.size, 1)[:, None]
     written = [output / "report.json"]
@@ -228,16 +234,17 @@ def write_report(report: Report, output: Path, run: ReprojectedRun | None = None
         if any(class_id != BACKGROUND for class_id in coverage.ids):
             written.append(output / "coverage.png")
             coverage_picture(written[1], report.stems, coverage.ids, report.names, share, coverage.usable)
-    if run is not None and report.areas:
-        boxes: dict[str, list[tuple[int, int, int, int]]] = {}
-        for area in report.areas:
-            boxes.setdefault(area.view, []).append(area.box)
-        worst = list(boxes)[:MOST_PICTURES]
-        contradictions(
-            output / "contradicted.png", [(run.changed(run.names.index(view)), boxes[view]) for view in worst]
-        )
-        written.append(output / "contradicted.png")
-    return written
+    return [*written, *write_contradictions(report, output)]
+
+
+def write_contradictions(report: Report, output: Path) -> list[Path]:
+    """Write contradicted.png, the worst views, if there are any; return its path."""
+    picture = output / "contradicted.png"
+    if not report.pointed and not report.framed:
+        picture.unlink(missing_ok=True)  # of other masks
+        return []
+    contradicted_picture(picture, report.pointed, report.framed)
+    return [picture]
 
 
 def options_beside(run: Path | None, data: Path | None, **given: Any) -> BeagsDataParserConfig:

@@ -21,7 +21,7 @@ from beags_plugin.masks.snapping import snap_to_edges
 from beags_plugin.masks.sources import MASK_SOURCES
 from beags_plugin.masks.sources.base import MaskSource, Photo, SourceScene
 from beags_plugin.pictures.masks import overlay
-from beags_plugin.plugin.objects.check_masks import check_scene
+from beags_plugin.plugin.objects.check_masks import check, options_beside, write_contradictions
 from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
 from beags_plugin.plugin.runs.place import open_run
 from beags_plugin.plugin.runs.read import raster_settings, read_run
@@ -175,7 +175,9 @@ def make_masks(
     aside = len(shown) - len(shares)
     checked: list[str] = []
     with suppress(UserError):  # training says it; the masks are made
-        checked = check_scene(replace(data, masks_path=masks.absolute(), classes_path=classes.absolute())).lines()
+        given = data if run is None else options_beside(run, data.data, images_path=data.images_path)
+        report = check(replace(given, masks_path=masks.absolute(), classes_path=classes.absolute()), run=run)
+        checked = [*report.lines(), *(str(path) for path in write_contradictions(report, folder))]
     return [
         *made.notes,
         f"{len(shares)} masks of {len(photos)} views, {len(names) - 1} objects, which cover "

@@ -47,6 +47,31 @@ def read_colmap_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
     return xyz, np.array([point.rgb for point in points], np.uint8).reshape(-1, 3)
 
 
+def read_tracks(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Read where each image of a complete model shows its points, by the image's name without suffix.
+
+    Returns ids of points [N] int64, and places [N, 2] float64 in 0..1, from the left and the top of the image. Raises
+    ``UserError`` if a file cannot be read.
+    """
+    text = (folder / "cameras.txt").is_file()  # the order in which nerfstudio looks
+    end, camera_reader, image_reader = (
+        ("txt", colmap.read_cameras_text, colmap.read_images_text)
+        if text
+        else ("bin", colmap.read_cameras_binary, colmap.read_images_binary)
+    )
+    cameras, images = _read(camera_reader, folder / f"cameras.{end}"), folder / f"images.{end}"
+
+    def tracks(file: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        found = {}
+        for image in image_reader(file).values():
+            camera, tracked = cameras[image.camera_id], np.asarray(image.point3D_ids, np.int64) >= 0
+            places = np.reshape(image.xys, (-1, 2))[tracked] / [camera.width, camera.height]
+            found[Path(image.name).with_suffix("").as_posix()] = image.point3D_ids[tracked], places
+        return found
+
+    return _read(tracks, images)
+
+
 @dataclass(frozen=True)
 class _Point:
     xyz: Sequence[float]

@@ -1,0 +1,92 @@
+"""Labels of points in all views of a scene: of any points in space, and of those that views are known to have seen."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beags_plugin.data.dataset import Dataset
+from beags_plugin.data.layouts.colmap import complete_model
+from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.masks.check.consistency import Agreement, labels_around, labels_at, ranks_of
+from beags_plugin.masks.check.contradictions import LEAST_OTHERS
+from beags_plugin.masks.check.files import Coverage, MaskFiles
+from beags_plugin.pictures.masks import Pointed
+from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
+from beags_plugin.plugin.views.colmap_files import read_tracks
+from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+from beags_plugin.plugin.views.lens import project_through_lens
+from beags_plugin.plugin.views.poses import PosedViews
+from beags_plugin.plugin.views.seed_points import random_points, starting_points
+from beags_plugin.system.progress import progress_bar
+
+RANDOM_POINTS = 50_000  # beside the seed points: an object that has none of these has some of them in it
+MOST_SEED_POINTS = 100_000
+MOST_COUNTS = 30_000_000  # points times classes, or times views, that are held at a time
+
+Tracks = list[tuple[np.ndarray, np.ndarray]]
+"""Of each view the points of a COLMAP model that it saw: rows [N], and places [N, 2] in 0..1; empty without a model."""
+
+
+def points_in_space(scene: Dataset, views: PosedViews, config: BeagsDataParserConfig) -> np.ndarray:
+    """Return [P, 3] float64 in the cameras' world: seed points, and random points where the cameras look."""
+    found = starting_points(scene, views, config.num_random_points)
+    seeds = found["points3D_xyz"].double().numpy()
+    step = -(-len(seeds) // MOST_SEED_POINTS)
+    cameras = [camera_from_nerfstudio(views.cameras, index) for index in range(len(views.images))]
+    random, _ = random_points(cameras, RANDOM_POINTS)
+    return np.concatenate([seeds[::step], random.astype(np.float64)])
+
+
+def tracks_of(scene: Dataset, views: PosedViews, classes: int) -> Tracks:
+    """Return the tracks of the COLMAP model of a scene, which may lie beside poses in another file."""
+    folder = complete_model(scene.root)
+    if folder is None:
+        return []
+    named: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+    for name, track in read_tracks(folder).items():
+        for key in {name, name.rpartition("/")[2]}:
+            named.setdefault(key, []).append(track)
+    none = np.zeros(0, np.int64), np.zeros((0, 2))
+    found = []
+    for stems in views.stems:
+        alone = [named[stem][0] for stem in sorted(stems, key=len) if len(named.get(stem, ())) == 1]
+        found.append(alone[-1] if alone else none)
+    ids = np.unique(np.concatenate([points for points, _ in found]))
+    ids = ids[:: max(1, -(-len(ids) * max(classes, len(found)) // MOST_COUNTS))]
+    kept = [np.isin(points, ids) for points, _ in found]
+    return [(np.searchsorted(ids, track[0][k]), track[1][k]) for track, k in zip(found, kept, strict=True)]
+
+
+def agreements(
+    files: MaskFiles, coverage: Coverage, views: PosedViews, points: np.ndarray, tracks: Tracks
+) -> tuple[Agreement, Agreement]:
+    """Return the agreement at points that any view may show, and at those of ``tracks`` in the views that saw them."""
+    classes = len(coverage.ids)
+    points = points[:: -(-len(points) * classes // MOST_COUNTS)]
+    labels = np.full((len(points), len(files.stems)), -1, np.int16)
+    rows = 1 + max((rows.max(initial=-1) for rows, _ in tracks), default=-1)
+    tracked = np.full((rows, len(files.stems)), -1, np.int16)
+    with progress_bar("Comparing views") as progress:
+        for view in range(len(files.stems)):
+            if coverage.usable[view]:
+                mask = files.read(view)
+                assert mask is not None
+                ranks = ranks_of(mask, coverage.ids, IGNORE)
+                xy, z = project_through_lens(points, views.cameras, view)
+                labels[:, view] = labels_at(xy, z, ranks)
+                if tracks:
+                    rows, places = tracks[view]
+                    tracked[rows, view] = labels_around(places * ranks.shape[::-1], ranks)
+            progress(view + 1, len(files.stems))
+    return Agreement(labels, classes), Agreement(tracked, classes, LEAST_OTHERS)
+
+
+def pointed(files: MaskFiles, views: PosedViews, view: int, tracks: Tracks, seen: Agreement, ids: list[int]) -> Pointed:
+    """Return a view with the points that the other views label otherwise."""
+    points, others = seen.against_others(view)
+    wrong = others != seen.labels[points, view]
+    places = dict(zip(tracks[view][0].tolist(), tracks[view][1], strict=True))
+    xy = np.array([places[point] for point in points[wrong].tolist()])
+    mask = files.read(view)
+    assert mask is not None
+    return Pointed(files.stems[view], views.images[view], mask, xy, np.asarray(ids)[others[wrong]])
