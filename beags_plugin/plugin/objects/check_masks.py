@@ -65,7 +65,7 @@ class Report:
 
     @property
     def stops(self) -> bool:
-        """Whether training would stop."""
+        """Return whether training would stop."""
         return any(issue.level == "error" for issue in self.issues)
 
     def add(self, found: Sequence[Contradiction], masks: int) -> None:
