@@ -25,29 +25,29 @@ def add_features(database: Any, photos: Sequence[Photo], progress: Callable[[int
 
     finder = cv2.SIFT.create(nfeatures=MOST, contrastThreshold=0.02, enable_precise_upscale=True)
     known = {image.name: image.camera_id for image in database.read_all_images()}
-    cameras = {_lens_of(photo): known[photo.path.name] for photo in photos if photo.path.name in known}
+    cameras = {_lens_of(photo): known[photo.key] for photo in photos if photo.key in known}
     looks = []
     for photo in counted(photos, len(photos), progress):
         grey = np.asarray(read_image(photo.path, lambda image: image.convert("L"), "the photo"))
         looks.append(look_at(grey))
-        if photo.path.name in known:
+        if photo.key in known:
             continue
         points, descriptors = _features(finder, grey)
         with pycolmap.DatabaseTransaction(database):  # a photo is there with its features, or not at all
             if _lens_of(photo) not in cameras:
                 cameras[_lens_of(photo)] = _write_camera(database, photo)
-            image_id = _write_image(database, photo.path.name, cameras[_lens_of(photo)])
+            image_id = _write_image(database, photo.key, cameras[_lens_of(photo)])
             database.write_keypoints(image_id, points)
             database.write_descriptors(image_id, descriptors)
     return looks
 
 
-def forget(database: Any, names: Sequence[str]) -> None:
+def forget(database: Any, photos: Sequence[Photo]) -> None:
     """Give photos that have changed another name, under which nobody asks for their features and matches."""
-    for name in names:
-        if database.exists_image(name):
-            image = database.read_image_with_name(name)
-            image.name = f"{name} before {database.num_images()}"
+    for photo in photos:
+        if database.exists_image(photo.key):
+            image = database.read_image_with_name(photo.key)
+            image.name = f"{photo.key} before {database.num_images()}"
             database.update_image(image)
 
 

@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -25,7 +26,7 @@ SMALLEST_ANGLE = 1.5  # degrees
 
 
 def match(
-    database: Path, names: Sequence[str], pairs: Sequence[tuple[int, int]], progress: Callable[[int, int], None]
+    database: Path, keys: Sequence[str], pairs: Sequence[tuple[int, int]], progress: Callable[[int, int], None]
 ) -> None:
     """Match the features of pairs of photos and keep what a camera's motion explains; skips pairs already matched."""
     import pycolmap
@@ -36,28 +37,26 @@ def match(
     for first in range(0, len(pairs), AT_ONCE):
         some = pairs[first : first + AT_ONCE]
         with tempfile.NamedTemporaryFile("w", suffix=".txt", encoding="utf-8") as file:
-            file.writelines(f"{names[one]} {names[other]}\n" for one, other in some)
+            file.writelines(f"{keys[one]} {keys[other]}\n" for one, other in some)
             file.flush()
             pairing = pycolmap.ImportedPairingOptions(match_list_path=file.name)
             pycolmap.match_image_pairs(database, matching, pairing, geometry, pycolmap.Device.cpu)
         progress(min(first + AT_ONCE, len(pairs)), len(pairs))
 
 
-def place(
-    database: Path, images: Path, folder: Path, names: Sequence[str], progress: Callable[[int, int], None]
-) -> list[Any]:
+def place(database: Path, folder: Path, keys: Sequence[str], progress: Callable[[int, int], None]) -> list[Any]:
     """Place photos one by one; returns pycolmap's reconstructions of unconnected groups, the largest first.
 
-    names: of the photos to place; a database may hold others.
+    folder: for pycolmap to write. keys: of the photos to place; a database may hold others.
     """
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions(
-        random_seed=SEED, min_model_size=SMALLEST, num_threads=1, extract_colors=True, image_names=names
+        random_seed=SEED, min_model_size=SMALLEST, num_threads=1, extract_colors=False, image_names=keys
     )
     options.mapper.random_seed = options.triangulation.random_seed = SEED
     options.mapper.abs_pose_min_num_inliers = FEWEST_POINTS
-    done, total = 0, len(names)
+    done, total = 0, len(keys)
 
     def placed() -> None:
         nonlocal done
@@ -65,8 +64,11 @@ def place(
         progress(done, total)
 
     pycolmap.set_random_seed(SEED)
-    found = pycolmap.incremental_mapping(database, images, folder, options, next_image_callback=placed)
+    found = pycolmap.incremental_mapping(database, folder, folder, options, next_image_callback=placed)
     progress(total, total)
+    for model in found.values():
+        for image in model.images.values():
+            image.name = unquote(image.name)
     return sorted(found.values(), key=lambda one: -one.num_reg_images())
 
 

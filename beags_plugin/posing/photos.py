@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
+from urllib.parse import quote
 
 import numpy as np
 
@@ -47,6 +48,11 @@ class Photo:
     turned: bool
     focal: float | None
     digest: str
+
+    @property
+    def key(self) -> str:
+        """Return the name in COLMAP's database: COLMAP ends names at a space where it reads pairs."""
+        return quote(self.path.name, safe="")
 
 
 @dataclass(frozen=True)

@@ -126,11 +126,11 @@ def _process(photos: list[Photo], output: Path, bar: Bar) -> tuple[Posed, Any]:
     if kept.posed == content and (output / TRANSFORMS).exists():
         report = json.loads((output / REPORT).read_text(encoding="utf-8"))
         return Posed(**report), pycolmap.Reconstruction(output / MODEL)
-    changed = [name for name in names if kept.photos.get(name, content[name]) != content[name]]
+    changed = [photo for photo in photos if kept.photos.get(photo.path.name, photo.digest) != photo.digest]
     database: Any = pycolmap.Database.open(work / DATABASE)
     forget(database, changed)
-    for photo in photos:
-        if photo.path.name in changed and photo.source.resolve() != photo.path.resolve():
+    for photo in changed:
+        if photo.source.resolve() != photo.path.resolve():
             photo.path.unlink(missing_ok=True)
     if changed or kept.paired != names:
         kept.paired, kept.pairs = [], []
@@ -141,15 +141,16 @@ def _process(photos: list[Photo], output: Path, bar: Bar) -> tuple[Posed, Any]:
         looks = add_features(database, photos, progress)
     if not kept.paired:
         with bar("pairs") as progress:
-            ids = [database.read_image_with_name(name).image_id for name in names]
+            ids = [database.read_image_with_name(photo.key).image_id for photo in photos]
             coarse = [coarse_descriptors(database, image_id, COARSE) for image_id in ids]
             kept.paired, kept.pairs = names, choose_pairs(likeness(coarse, progress))
         kept.write(work)
     database.close()
+    keys = [photo.key for photo in photos]
     with bar("matches") as progress:
-        match(work / DATABASE, names, kept.pairs, progress)
+        match(work / DATABASE, keys, kept.pairs, progress)
     with bar("poses") as progress, TemporaryDirectory(dir=work, prefix=".mapping.") as folder:
-        models = place(work / DATABASE, output / "images", Path(folder), names, progress)
+        models = place(work / DATABASE, Path(folder), keys, progress)
     if not models:
         raise UserError(
             f"none of the {len(photos)} photos fit together: take more of them, closer to each other, of a scene that "
@@ -157,6 +158,7 @@ def _process(photos: list[Photo], output: Path, bar: Bar) -> tuple[Posed, Any]:
         )
     with bar("lens") as progress:
         model = refine(models[0], progress)
+    model.extract_colors_for_all_images(output / "images")
     groups = [sorted(each.images[image_id].name for image_id in each.reg_image_ids()) for each in models]
     report = _report(photos, looks, model, groups)
     write_scene(output, model)

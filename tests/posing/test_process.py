@@ -26,7 +26,7 @@ from benchmarks.poses import errors
 def posed(tmp_path_factory):
     """Return the folder of a scene made by the command from twelve photos, and the true poses."""
     root = tmp_path_factory.mktemp("posed")
-    given = write_photos(root / "photos")
+    given = write_photos(root / "photos", prefix="walk 1, ")  # as phones name them
     main(["process", "--data", str(root / "photos"), "--output-dir", str(root / "scene")])
     return root / "scene", given
 
@@ -73,11 +73,11 @@ def test_a_second_call_computes_nothing_and_another_only_what_is_new(posed, tmp_
     monkeypatch.setattr(features, "_features", lambda *args: computed.append(1) or find_features(*args))
     process(folder / "images", folder, quiet)
     assert (folder / "transforms.json").read_bytes() == before and not computed
-    given |= {"a": camera(0.75, 2.0), "v03": camera(0.5, 2.2)}
-    for name in ("a", "v03"):
+    given |= {"a": camera(0.75, 2.0), "walk 1, 03": camera(0.5, 2.2)}
+    for name in ("a", "walk 1, 03"):
         Image.fromarray(photograph(given[name])).save(folder / f"images/{name}.png")
-    (folder / "images/v05.png").unlink()
-    del given["v05"]
+    (folder / "images/walk 1, 05.png").unlink()
+    del given["walk 1, 05"]
     report, _ = process(folder / "images", folder, quiet)
     assert len(computed) == 2 and report.cameras == 1
     found = frames(folder)
