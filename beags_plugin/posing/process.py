@@ -91,7 +91,7 @@ def process(data: Path, output: Path, bar: Bar) -> tuple[Posed, Any]:
         raise UserError("the library pycolmap is not installed: pip install pycolmap.")
     import pycolmap
 
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     images, work = output / "images", output / WORK
     if (output / TRANSFORMS).exists() and not (output / REPORT).exists():
         raise UserError(f"{output / TRANSFORMS} holds poses of another program: give another --output-dir.")
