@@ -52,7 +52,7 @@ def errors(found: dict[str, np.ndarray], given: dict[str, np.ndarray]) -> tuple[
 
 
 def main() -> None:
-    """Find poses, compare them, print one line (seconds of the processor for each stage last) and write OUTPUT/errors.json."""
+    """Find poses, compare them, print a line and write OUTPUT/errors.json; last are each stage's processor seconds."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("output", type=Path)
