@@ -92,7 +92,7 @@ def main() -> None:
     }
     write_text_atomically(json.dumps({**figures, "stages": stages}, indent=1) + "\n", options.output / "errors.json")
     rounded = {name: round(value, 3) for name, value in figures.items()}
-    print(re.sub(r'[{}"]', "", json.dumps({**rounded, **stages})))
+    print(re.sub(r'[{}"]', "", json.dumps({**rounded, "stages": stages})))
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from typing import Any
 
 from beags_plugin.data.files import list_images
 from beags_plugin.posing.features import add_features, coarse_descriptors, forget
-from beags_plugin.posing.files import MODEL, TRANSFORMS, write_scene
+from beags_plugin.posing.files import MODEL, POINTS, TRANSFORMS, write_scene
 from beags_plugin.posing.mapping import match, place, refine
 from beags_plugin.posing.pairs import COARSE, choose_pairs, likeness
 from beags_plugin.posing.photos import FEWEST, Look, Photo, blurred, check_photos, copy_photos, find_photos, repeated
@@ -93,7 +93,7 @@ def process(data: Path, output: Path, bar: Bar) -> tuple[Posed, Any]:
 
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     images, work = output / "images", output / WORK
-    if (output / TRANSFORMS).exists() and not (output / REPORT).exists():
+    if (output / TRANSFORMS).exists() and not ((output / REPORT).exists() or (work / KEPT).exists()):
         raise UserError(f"{output / TRANSFORMS} holds poses of another program: give another --output-dir.")
     video = data.is_file() and data.suffix.lower() in VIDEO_SUFFIXES
     if data.is_file() and not video:
@@ -123,7 +123,7 @@ def _process(photos: list[Photo], output: Path, bar: Bar) -> tuple[Posed, Any]:
     work.mkdir(parents=True, exist_ok=True)
     kept, names = Kept.read(work), [photo.path.name for photo in photos]
     content = {photo.path.name: photo.digest for photo in photos}
-    if kept.posed == content and (output / TRANSFORMS).exists():
+    if kept.posed == content and all((output / part).exists() for part in (TRANSFORMS, POINTS, MODEL, REPORT)):
         report = json.loads((output / REPORT).read_text(encoding="utf-8"))
         return Posed(**report), pycolmap.Reconstruction(output / MODEL)
     changed = [photo for photo in photos if kept.photos.get(photo.path.name, photo.digest) != photo.digest]
@@ -149,7 +149,7 @@ def _process(photos: list[Photo], output: Path, bar: Bar) -> tuple[Posed, Any]:
     keys = [photo.key for photo in photos]
     with bar("matches") as progress:
         match(work / DATABASE, keys, kept.pairs, progress)
-    with bar("poses") as progress, TemporaryDirectory(dir=work, prefix=".mapping.") as folder:
+    with bar("poses") as progress, TemporaryDirectory() as folder:
         models = place(work / DATABASE, Path(folder), keys, progress)
     if not models:
         raise UserError(
