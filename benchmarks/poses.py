@@ -10,6 +10,8 @@ import argparse
 import json
 import re
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +52,7 @@ def errors(found: dict[str, np.ndarray], given: dict[str, np.ndarray]) -> tuple[
 
 
 def main() -> None:
-    """Find poses, compare them, print one line and write OUTPUT/errors.json."""
+    """Find poses, compare them, print a line and write OUTPUT/errors.json; last are each stage's processor seconds."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("output", type=Path)
@@ -64,7 +66,16 @@ def main() -> None:
             if not (data / photo.name).exists():
                 (data / photo.name).symlink_to(photo.resolve())
     began, used = time.monotonic(), time.process_time()
-    report, _ = process(data, options.output, progress_bar)
+    stages: dict[str, float] = {}
+
+    @contextmanager
+    def timed(name: str) -> Iterator[Callable[[int, int], None]]:
+        start = time.process_time()
+        with progress_bar(name) as progress:
+            yield progress
+        stages[name] = round(time.process_time() - start, 1)
+
+    report, _ = process(data, options.output, timed)
     frames = json.loads((options.output / "transforms.json").read_text())["frames"]
     found = {Path(frame["file_path"]).stem: np.array(frame["transform_matrix"]) for frame in frames}
     turned, moved = errors(found, given_poses(options.data))
@@ -79,8 +90,9 @@ def main() -> None:
         "seconds": time.monotonic() - began,
         "processor_seconds": time.process_time() - used,
     }
-    write_text_atomically(json.dumps(figures, indent=1) + "\n", options.output / "errors.json")
-    print(re.sub(r'[{}"]', "", json.dumps({name: round(value, 3) for name, value in figures.items()})))
+    write_text_atomically(json.dumps({**figures, "stages": stages}, indent=1) + "\n", options.output / "errors.json")
+    rounded = {name: round(value, 3) for name, value in figures.items()}
+    print(re.sub(r'[{}"]', "", json.dumps({**rounded, "stages": stages})))
 
 
 if __name__ == "__main__":

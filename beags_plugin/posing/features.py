@@ -21,24 +21,38 @@ LENS = "SIMPLE_RADIAL"
 def add_features(database: Any, photos: Sequence[Photo], progress: Callable[[int, int], None]) -> list[Look]:
     """Add photos and their features to a database, but those it holds; returns the look of every photo."""
     import cv2
+    import pycolmap
 
     finder = cv2.SIFT.create(nfeatures=MOST, contrastThreshold=0.02, enable_precise_upscale=True)
-    cameras: dict[tuple[int, int, float | None], int] = {}
+    known = {image.name: image.camera_id for image in database.read_all_images()}
+    cameras = {_lens_of(photo): known[photo.key] for photo in photos if photo.key in known}
     looks = []
     for photo in counted(photos, len(photos), progress):
         grey = np.asarray(read_image(photo.path, lambda image: image.convert("L"), "the photo"))
         looks.append(look_at(grey))
-        key = (photo.width, photo.height, photo.focal)
-        if database.exists_image(photo.path.name):
-            cameras[key] = database.read_image_with_name(photo.path.name).camera_id
+        if photo.key in known:
             continue
         points, descriptors = _features(finder, grey)
-        if key not in cameras:
-            cameras[key] = _write_camera(database, photo)
-        image_id = _write_image(database, photo.path.name, cameras[key])
-        database.write_keypoints(image_id, points)
-        database.write_descriptors(image_id, descriptors)
+        with pycolmap.DatabaseTransaction(database):  # a photo is there with its features, or not at all
+            if _lens_of(photo) not in cameras:
+                cameras[_lens_of(photo)] = _write_camera(database, photo)
+            image_id = _write_image(database, photo.key, cameras[_lens_of(photo)])
+            database.write_keypoints(image_id, points)
+            database.write_descriptors(image_id, descriptors)
     return looks
+
+
+def forget(database: Any, photos: Sequence[Photo]) -> None:
+    """Give photos that have changed another name, under which nobody asks for their features and matches."""
+    for photo in photos:
+        if database.exists_image(photo.key):
+            image = database.read_image_with_name(photo.key)
+            image.name = f"{photo.key} before {database.num_images()}"
+            database.update_image(image)
+
+
+def _lens_of(photo: Photo) -> tuple[int, int, float | None]:
+    return photo.width, photo.height, photo.focal
 
 
 def _features(finder: Any, grey: np.ndarray) -> tuple[np.ndarray, Any]:

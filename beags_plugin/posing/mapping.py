@@ -7,6 +7,9 @@ import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
 
 SEED = 0
 AT_ONCE = 40  # pairs, between two looks at the progress
@@ -16,13 +19,14 @@ FEWEST_POINTS = 15
 """Of the scene, which a photo must show to be placed; with COLMAP's 30, sparse photos fall apart into groups."""
 LENS = "OPENCV"
 ROUNDS = 3  # of the last adjustment, each without the points that the one before has shown to be wrong
-GAIN = 0.05  # share by which the reprojection error must fall for the middle of a lens to leave that of the photo
+MIDDLE_KNOWN = 0.03  # degrees of standard deviation, below which the middle of a lens is found by its photos
+MIDDLE_CLEAR = 30.0  # standard deviations from the middle of the photo, beyond which it is found too
 LARGEST_ERROR = 2.0  # pixels
 SMALLEST_ANGLE = 1.5  # degrees
 
 
 def match(
-    database: Path, names: Sequence[str], pairs: Sequence[tuple[int, int]], progress: Callable[[int, int], None]
+    database: Path, keys: Sequence[str], pairs: Sequence[tuple[int, int]], progress: Callable[[int, int], None]
 ) -> None:
     """Match the features of pairs of photos and keep what a camera's motion explains; skips pairs already matched."""
     import pycolmap
@@ -33,23 +37,26 @@ def match(
     for first in range(0, len(pairs), AT_ONCE):
         some = pairs[first : first + AT_ONCE]
         with tempfile.NamedTemporaryFile("w", suffix=".txt", encoding="utf-8") as file:
-            file.writelines(f"{names[one]} {names[other]}\n" for one, other in some)
+            file.writelines(f"{keys[one]} {keys[other]}\n" for one, other in some)
             file.flush()
             pairing = pycolmap.ImportedPairingOptions(match_list_path=file.name)
             pycolmap.match_image_pairs(database, matching, pairing, geometry, pycolmap.Device.cpu)
         progress(min(first + AT_ONCE, len(pairs)), len(pairs))
 
 
-def place(database: Path, images: Path, folder: Path, total: int, progress: Callable[[int, int], None]) -> list[Any]:
-    """Place photos one by one; returns pycolmap's reconstructions of unconnected groups, the largest first."""
+def place(database: Path, folder: Path, keys: Sequence[str], progress: Callable[[int, int], None]) -> list[Any]:
+    """Place photos one by one; returns pycolmap's reconstructions of unconnected groups, the largest first.
+
+    folder: for pycolmap to write. keys: of the photos to place; a database may hold others.
+    """
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions(
-        random_seed=SEED, min_model_size=SMALLEST, num_threads=1, extract_colors=True
+        random_seed=SEED, min_model_size=SMALLEST, num_threads=1, extract_colors=False, image_names=keys
     )
     options.mapper.random_seed = options.triangulation.random_seed = SEED
     options.mapper.abs_pose_min_num_inliers = FEWEST_POINTS
-    done = 0
+    done, total = 0, len(keys)
 
     def placed() -> None:
         nonlocal done
@@ -57,30 +64,24 @@ def place(database: Path, images: Path, folder: Path, total: int, progress: Call
         progress(done, total)
 
     pycolmap.set_random_seed(SEED)
-    found = pycolmap.incremental_mapping(database, images, folder, options, next_image_callback=placed)
+    found = pycolmap.incremental_mapping(database, folder, folder, options, next_image_callback=placed)
     progress(total, total)
+    for model in found.values():
+        for image in model.images.values():
+            image.name = unquote(image.name)
     return sorted(found.values(), key=lambda one: -one.num_reg_images())
 
 
-def refine(model: Any) -> Any:
-    """Return the model with poses, points and lenses adjusted together, now with all distortion and the lens's middle.
+def refine(model: Any, progress: Callable[[int, int], None]) -> Any:
+    """Return the model with poses, points and lenses adjusted together, now with all distortion.
 
-    The middle of the photo is kept unless the photos say clearly that the lens's is elsewhere (``GAIN``): few photos
-    can hardly tell it from a turn of the camera.
+    Few photos can hardly tell the middle of a lens from a turn of the camera: it leaves that of the photo only where it
+    is known (``MIDDLE_KNOWN``) or clearly elsewhere (``MIDDLE_CLEAR``). A lens with fewer than ``ENOUGH`` photos is
+    kept.
     """
-    centred, shifted = model, copy.deepcopy(model)
-    for each, middle in ((centred, False), (shifted, True)):
-        _adjust(each, middle)
-    before, after = (each.compute_mean_reprojection_error() for each in (centred, shifted))
-    return shifted if after < (1 - GAIN) * before else centred
-
-
-def _adjust(model: Any, middle: bool) -> None:
-    """Adjust a model; a lens with fewer than ``ENOUGH`` photos is kept."""
     import pycolmap
 
     photos = [model.images[image_id].camera_id for image_id in model.reg_image_ids()]
-    few = [camera_id for camera_id in model.cameras if photos.count(camera_id) < ENOUGH]
     for camera_id, camera in model.cameras.items():
         lens = pycolmap.Camera.create_from_model_name(
             camera_id, LENS, camera.mean_focal_length(), camera.width, camera.height
@@ -88,19 +89,63 @@ def _adjust(model: Any, middle: bool) -> None:
         params = lens.params
         params[2:5] = camera.principal_point_x, camera.principal_point_y, camera.params[-1]
         camera.model, camera.params = lens.model, params
-    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=middle, print_summary=False)
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    options.ceres.loss_function_scale = 1.0  # pixel
-    options.ceres.solver_options.function_tolerance = 1e-6  # without it, hundreds of photos take minutes
+    few = [camera_id for camera_id in model.cameras if photos.count(camera_id) < ENOUGH]
+    _adjust(model, few, middle=False)
+    progress(1, 2)
+    shifted = copy.deepcopy(model)
+    _adjust(shifted, few, middle=True)
+    progress(2, 2)
+    if len(vague := [*few, *_vague_middles(shifted, few)]) == len(few):
+        return shifted
+    if len(vague) < len(model.cameras):
+        _adjust(model, vague, middle=True)
+    return model
+
+
+def _adjust(model: Any, constant: list[int], middle: bool) -> None:
+    """Adjust a model, but the lenses that are constant; middle: of the lenses too."""
+    import pycolmap
+
     for _ in range(ROUNDS):
-        config = pycolmap.BundleAdjustmentConfig()
-        for image_id in model.reg_image_ids():
-            config.add_image(image_id)
-        for camera_id in few:
-            config.set_constant_cam_intrinsics(camera_id)
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+        _problem(model, constant, middle).solve()
         manager = pycolmap.ObservationManager(model)
         manager.filter_all_points3D(LARGEST_ERROR, SMALLEST_ANGLE)
         manager.filter_observations_with_negative_depth()
     model.update_point_3d_errors()
+
+
+def _problem(model: Any, constant: list[int], middle: bool) -> Any:
+    import pycolmap
+
+    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=middle, print_summary=False)
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.loss_function_scale = 1.0  # pixel
+    options.ceres.solver_options.function_tolerance = 1e-6  # without it, hundreds of photos take minutes
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    for camera_id in constant:
+        config.set_constant_cam_intrinsics(camera_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    return pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+
+
+def _vague_middles(model: Any, few: list[int]) -> list[int]:
+    """Return the lenses, but those of few photos, whose middle the photos cannot tell."""
+    import pycolmap
+
+    problem = _problem(model, few, middle=True)
+    covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, problem)
+    found = []
+    for camera_id in set(model.cameras) - set(few):
+        camera = model.cameras[camera_id]
+        own = None if covariance is None else covariance.get_other_params_cov(camera.params)
+        if own is None:
+            found.append(camera_id)
+            continue
+        deviation = model.compute_mean_reprojection_error() * np.sqrt(np.diag(own)[2:4])  # of x and y, in pixels
+        shift = np.abs(camera.params[2:4] - [camera.width / 2, camera.height / 2])
+        known = deviation.max() < np.deg2rad(MIDDLE_KNOWN) * camera.mean_focal_length()
+        if not known and (shift / deviation).max() < MIDDLE_CLEAR:
+            found.append(camera_id)
+    return found

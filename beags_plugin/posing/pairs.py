@@ -12,6 +12,7 @@ NEIGHBOURS = 16  # the photos most alike, with which each is compared
 IN_ORDER = 2  # and the next ones by name: people walk while they take photos
 ALL = 30  # photos, of which all pairs are compared: few photos are far apart, and each pair counts
 COARSE = 300  # features of a photo that are looked at first, the largest
+AT_ONCE = 16  # photos compared with one
 RATIO = 0.85  # of the distances to the nearest and the next nearest feature, at most
 
 
@@ -20,23 +21,22 @@ def likeness(descriptors: Sequence[np.ndarray], progress: Callable[[int, int], N
 
     descriptors: of each photo [F, 128], of unit length.
     """
-    count = len(descriptors)
+    count, most = len(descriptors), max(1, *map(len, descriptors))
+    table = np.zeros((count, most, 128), np.float32)  # what is missing is equally far from all
+    for rows, found in zip(table, descriptors, strict=True):
+        rows[: len(found)] = found
     alike = np.zeros((count, count), np.int64)
     for one in counted(range(count), count, progress):
-        for other in range(one + 1, count):
-            alike[one, other] = alike[other, one] = _agreeing(descriptors[one], descriptors[other])
-    return alike
-
-
-def _agreeing(one: np.ndarray, other: np.ndarray) -> int:
-    if min(len(one), len(other)) < 2:
-        return 0
-    cosine = one @ other.T
-    nearest = cosine.argmax(1)
-    mutual = cosine.argmax(0)[nearest] == np.arange(len(one))
-    best = np.partition(cosine, -2, axis=1)[:, -2:]
-    next_best, first = np.sqrt(np.maximum(2 - 2 * best, 0)).T
-    return int((mutual & (first < RATIO * next_best)).sum())
+        for first in range(one + 1, count, AT_ONCE):
+            others = table[first : first + AT_ONCE]
+            cosine = (table[one] @ others.reshape(-1, 128).T).reshape(most, -1, most)
+            nearest = cosine.argmax(2)  # of the other's features, for each of ours
+            mutual = np.take_along_axis(cosine.argmax(0).T, nearest, 0) == np.arange(most)[:, None]
+            best = cosine.max(2)
+            np.put_along_axis(cosine, nearest[..., None], 0, 2)
+            clear = 1 - best < RATIO**2 * (1 - cosine.max(2))  # halves of squared distances
+            alike[one, first : first + AT_ONCE] = (mutual & clear).sum(0)
+    return alike + alike.T
 
 
 def choose_pairs(alike: np.ndarray) -> list[tuple[int, int]]:

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import shutil
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
+from urllib.parse import quote
 
 import numpy as np
 
-from beags_plugin.data.files import IMAGE_SUFFIXES, list_images, photo_names
+from beags_plugin.data.files import IMAGE_SUFFIXES, image_size, list_images, photo_names
 from beags_plugin.system.digests import content_digest
-from beags_plugin.system.errors import UserError, writing
-from beags_plugin.system.progress import counted
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.progress import Bar, counted
 from beags_plugin.system.reading.images import read_image
-from beags_plugin.system.whole_files import unfinished, write_whole
+from beags_plugin.system.whole_files import write_whole
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -30,17 +31,28 @@ BLURRED = 0.2
 """A photo is called blurred if its sharpness is below this share of the median of its ten neighbours."""
 _DIGITS = 16
 _TURNED = 274  # EXIF's tag of the orientation
+_LYING = (5, 6, 7, 8)  # its values that swap width and height
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A photo in the folder of the scene: its file, size in pixels, and focal length in pixels if EXIF tells it."""
+    """A photo of the scene: the file given, the scene's upright copy (or the same), and what the given one's head says.
 
+    width, height: in pixels, upright. turned: the given one is not. focal: in pixels, if EXIF tells it.
+    """
+
+    source: Path
     path: Path
     width: int
     height: int
+    turned: bool
     focal: float | None
     digest: str
+
+    @property
+    def key(self) -> str:
+        """Return the name in COLMAP's database: COLMAP ends names at a space where it reads pairs."""
+        return quote(self.path.name, safe="")
 
 
 @dataclass(frozen=True)
@@ -58,57 +70,59 @@ def find_photos(data: Path) -> list[Path]:
     photo_names(found)
     others = Counter(path.suffix.lower() for path in folder.iterdir() if path.is_file() and path not in set(found))
     if heic := others[".heic"] + others[".heif"]:
-        raise UserError(f"{folder} holds {heic} HEIC photos: convert them to JPEG, which other programs can read too.")
+        raise UserError(f"{folder} holds HEIC photos ({heic}): convert them to JPEG, which other programs read too.")
     if not found:
         raise UserError(
             f"{folder} holds no photos: give --data a folder of {', '.join(IMAGE_SUFFIXES)} files, or a video."
         )
     if len(found) < FEWEST:
-        raise UserError(f"{folder} holds only {len(found)} photos: give at least {FEWEST}, better 40.")
+        raise UserError(f"{folder} holds too few photos ({len(found)}): give at least {FEWEST}, better 40.")
     return found
 
 
-def take_photos(found: Sequence[Path], folder: Path, progress: Callable[[int, int], None]) -> list[Photo]:
-    """Copy photos into ``folder``, upright, unless they lie there already.
-
-    Raises ``UserError`` for photos that cannot be used, before any is copied.
-    """
-    checked = [(path, read_image(path, lambda image, path=path: _checked(image, path), "the photo")) for path in found]
-    return [_taken(path, folder / path.name, *header) for path, header in counted(checked, len(checked), progress)]
+def check_photos(found: Sequence[Path], folder: Path, bar: Bar) -> list[Photo]:
+    """Return what the scene's photos in ``folder`` will be; raises ``UserError`` for photos that cannot be used."""
+    with bar("photos") as progress:
+        return [_checked(path, folder / path.name) for path in counted(found, len(found), progress)]
 
 
-def _checked(image: Image, path: Path) -> tuple[int, int, int]:
-    """Return width, height and EXIF's orientation."""
-    if image.mode.startswith(("I", "F")):
-        raise UserError(f"the photo {path} has more than 8 bits a channel: convert the photos to 8 bits.")
-    return *image.size, image.getexif().get(_TURNED, 1)
-
-
-def _taken(path: Path, target: Path, width: int, height: int, turned: int) -> Photo:
+def _checked(source: Path, path: Path) -> Photo:
     import pycolmap
-    from PIL import ImageOps
 
-    if turned in (5, 6, 7, 8):
+    def header(image: Image) -> tuple[str, int]:
+        return image.mode, image.getexif().get(_TURNED, 1)
+
+    width, height = image_size(source, "the photo")
+    mode, turned = read_image(source, header, "the photo")
+    if mode.startswith(("I", "F")):
+        raise UserError(f"the photo {source} has more than 8 bits a channel: convert the photos to 8 bits.")
+    if turned != 1 and source.resolve() == path.resolve():
+        raise UserError(f"the photo {source} is stored on its side: give another --output-dir, for upright copies.")
+    if turned in _LYING:
         width, height = height, width
-    if turned != 1 and path.resolve() == target.resolve():
-        raise UserError(f"the photo {path} is stored lying on its side: give another --output-dir for upright copies.")
-    if turned != 1 and not target.exists():
-
-        def upright(image: Image) -> Image:
-            return ImageOps.exif_transpose(image)
-
-        image = read_image(path, upright, "the photo")
-        kind = {".jpg": "JPEG", ".jpeg": "JPEG", ".tif": "TIFF"}.get(path.suffix.lower(), path.suffix[1:].upper())
-        write_whole(target, lambda file: image.save(file, kind, quality=95))
-    elif not target.exists():
-        with writing(target):
-            target.parent.mkdir(parents=True, exist_ok=True)
-            part = unfinished(target)
-            shutil.copyfile(path, part)
-            part.replace(target)
-    lens = pycolmap.infer_camera_from_image(path)
+    lens = pycolmap.infer_camera_from_image(source)
     focal = float(lens.mean_focal_length()) if lens.has_prior_focal_length else None
-    return Photo(target, width, height, focal, content_digest([path])[:_DIGITS])
+    return Photo(source, path, width, height, turned != 1, focal, content_digest([source])[:_DIGITS])
+
+
+def copy_photos(photos: Sequence[Photo], bar: Bar) -> None:
+    """Write the scene's photos that are not there, upright."""
+    from PIL import Image, ImageOps
+
+    if not (missing := [photo for photo in photos if not photo.path.exists()]):
+        return
+    kinds = Image.registered_extensions()
+
+    def copy(photo: Photo, file: BinaryIO) -> None:
+        if photo.turned:
+            image = read_image(photo.source, ImageOps.exif_transpose, "the photo")
+            image.save(file, kinds[photo.path.suffix.lower()], quality=95, exif=image.getexif())
+        else:
+            file.write(photo.source.read_bytes())
+
+    with bar("copies") as progress:
+        for photo in counted(missing, len(missing), progress):
+            write_whole(photo.path, partial(copy, photo))
 
 
 def small_grey(photo: np.ndarray) -> np.ndarray:

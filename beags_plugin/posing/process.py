@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import json
-import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-from beags_plugin.posing.features import add_features, coarse_descriptors
-from beags_plugin.posing.files import TRANSFORMS, write_scene
+from beags_plugin.data.files import list_images
+from beags_plugin.posing.features import add_features, coarse_descriptors, forget
+from beags_plugin.posing.files import MODEL, POINTS, TRANSFORMS, write_scene
 from beags_plugin.posing.mapping import match, place, refine
 from beags_plugin.posing.pairs import COARSE, choose_pairs, likeness
-from beags_plugin.posing.photos import FEWEST, Look, Photo, blurred, find_photos, repeated, take_photos
-from beags_plugin.posing.video import VIDEO_SUFFIXES, take_frames
+from beags_plugin.posing.photos import FEWEST, Look, Photo, blurred, check_photos, copy_photos, find_photos, repeated
+from beags_plugin.posing.video import VIDEO_SUFFIXES, find_frames, write_frames
 from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.lock import run_lock
 from beags_plugin.system.progress import Bar
 from beags_plugin.system.whole_files import write_text_atomically
 
 REPORT = "poses.json"
 VERSION = 1  # of what is kept; another is computed anew
 WORK = Path("colmap")
+DATABASE = "database.db"
+KEPT = "kept.json"
 SHARE = 0.8  # of the photos; where fewer have a pose, a sentence says what to do
 NAMED = 4  # photos in a sentence
 
@@ -46,99 +51,121 @@ class Posed:
         )
 
 
+@dataclass
+class Kept:
+    """What a second call goes on with, beside COLMAP's database.
+
+    photos: the digest of each whose features the database holds. paired: the names of those that pairs [of indices] are
+    chosen for. posed: the digests of those that transforms.json was made from.
+    """
+
+    version: int = VERSION
+    photos: dict[str, str] = field(default_factory=dict)
+    paired: list[str] = field(default_factory=list)
+    pairs: list[tuple[int, int]] = field(default_factory=list)
+    posed: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, work: Path) -> Kept:
+        """Return what is kept in a folder; without it, also remove its database."""
+        try:
+            kept = cls(**json.loads((work / KEPT).read_text(encoding="utf-8")))
+            if kept.version == VERSION:
+                return kept
+        except (OSError, ValueError, TypeError):
+            pass
+        (work / DATABASE).unlink(missing_ok=True)
+        return cls()
+
+    def write(self, work: Path) -> None:
+        """Keep it; before what it tells of is computed."""
+        write_text_atomically(json.dumps(asdict(self)) + "\n", work / KEPT)
+
+
 def process(data: Path, output: Path, bar: Bar) -> tuple[Posed, Any]:
     """Find the poses of photos and write them into ``output``; returns the report and pycolmap's reconstruction.
 
     Raises ``UserError`` where the photos cannot be used, or fewer than three of them fit together.
     """
+    if find_spec("pycolmap") is None:
+        raise UserError("the library pycolmap is not installed: pip install pycolmap.")
     import pycolmap
 
-    if (output / TRANSFORMS).exists() and not (output / REPORT).exists():
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    images, work = output / "images", output / WORK
+    if (output / TRANSFORMS).exists() and not ((output / REPORT).exists() or (work / KEPT).exists()):
         raise UserError(f"{output / TRANSFORMS} holds poses of another program: give another --output-dir.")
     video = data.is_file() and data.suffix.lower() in VIDEO_SUFFIXES
     if data.is_file() and not video:
         raise UserError(
             f"{data} is no video that is known by its name ({', '.join(VIDEO_SUFFIXES)}): give a folder of photos."
         )
-    found = [] if video else find_photos(data)
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
-    if video:
-        found = take_frames(data, output / WORK / "frames", bar)
-    with bar("photos") as progress:
-        photos = take_photos(found, output / "images", progress)
-    database = output / WORK / "database.db"
-    with writing(output):
-        known = _keep_or_clear(output / WORK, photos)
-    with bar("features") as progress:
-        opened: Any = pycolmap.Database.open(database)
-        looks = add_features(opened, photos, progress)
-        ids = [opened.read_image_with_name(photo.path.name).image_id for photo in photos]
-        coarse = [coarse_descriptors(opened, image_id, COARSE) for image_id in ids]
-        opened.close()
-    _remember(output / WORK, photos)
-    with bar("pairs") as progress:
-        pairs = choose_pairs(likeness(coarse, progress))
-    names = [photo.path.name for photo in photos]
-    with bar("matches") as progress:
-        match(database, names, pairs, progress)
-    model, groups = _model(output, database, photos, known, bar)
-    report = _report(photos, looks, model, groups)
-    write_scene(output, model)
-    write_text_atomically(json.dumps(asdict(report), indent=1) + "\n", output / REPORT)
-    return report, model
+    found = find_frames(data, work / "frames", bar) if video else find_photos(data)
+    if list_images(images) and not (work / KEPT).exists() and found[0].parent.resolve() != images.resolve():
+        raise UserError(f"{images} holds photos already: give another --output-dir, or these as --data.")
+    photos = [] if video else check_photos(found, images, bar)
+    lock = run_lock(output, "being given poses")
+    try:
+        if video:
+            write_frames(data, found, bar)
+            photos = check_photos(found, images, bar)
+        with writing(output):
+            return _process(photos, output, bar)
+    finally:
+        lock.release()
 
 
-def _model(output: Path, database: Path, photos: list[Photo], known: bool, bar: Bar) -> tuple[Any, list[list[str]]]:
-    """Return the refined reconstruction of the largest group of photos, and the names of every group."""
+def _process(photos: list[Photo], output: Path, bar: Bar) -> tuple[Posed, Any]:
+    """Find poses in a folder that no other process writes."""
     import pycolmap
 
-    kept, groups_file = output / WORK / "refined", output / WORK / "groups.json"
-    if known and groups_file.is_file():
-        return pycolmap.Reconstruction(kept), json.loads(groups_file.read_text(encoding="utf-8"))
-    work = output / WORK / "mapping"
-    shutil.rmtree(work, ignore_errors=True)
-    work.mkdir()
-    with bar("poses") as progress:
-        models = place(database, output / "images", work, len(photos), progress)
-    shutil.rmtree(work)
+    work = output / WORK
+    work.mkdir(parents=True, exist_ok=True)
+    kept, names = Kept.read(work), [photo.path.name for photo in photos]
+    content = {photo.path.name: photo.digest for photo in photos}
+    if kept.posed == content and all((output / part).exists() for part in (TRANSFORMS, POINTS, MODEL, REPORT)):
+        report = json.loads((output / REPORT).read_text(encoding="utf-8"))
+        return Posed(**report), pycolmap.Reconstruction(output / MODEL)
+    changed = [photo for photo in photos if kept.photos.get(photo.path.name, photo.digest) != photo.digest]
+    database: Any = pycolmap.Database.open(work / DATABASE)
+    forget(database, changed)
+    for photo in changed:
+        if photo.source.resolve() != photo.path.resolve():
+            photo.path.unlink(missing_ok=True)
+    if changed or kept.paired != names:
+        kept.paired, kept.pairs = [], []
+    kept.photos, kept.posed = {**kept.photos, **content}, {}
+    kept.write(work)
+    copy_photos(photos, bar)
+    with bar("features") as progress:
+        looks = add_features(database, photos, progress)
+    if not kept.paired:
+        with bar("pairs") as progress:
+            ids = [database.read_image_with_name(photo.key).image_id for photo in photos]
+            coarse = [coarse_descriptors(database, image_id, COARSE) for image_id in ids]
+            kept.paired, kept.pairs = names, choose_pairs(likeness(coarse, progress))
+        kept.write(work)
+    database.close()
+    keys = [photo.key for photo in photos]
+    with bar("matches") as progress:
+        match(work / DATABASE, keys, kept.pairs, progress)
+    with bar("poses") as progress, TemporaryDirectory() as folder:
+        models = place(work / DATABASE, Path(folder), keys, progress)
     if not models:
         raise UserError(
             f"none of the {len(photos)} photos fit together: take more of them, closer to each other, of a scene that "
             "has texture and stands still."
         )
-    models[0] = refine(models[0])
-    with writing(output):
-        kept.mkdir(exist_ok=True)
-        models[0].write(kept)
-    groups = [sorted(model.images[image_id].name for image_id in model.reg_image_ids()) for model in models]
-    write_text_atomically(json.dumps(groups) + "\n", groups_file)
-    return models[0], groups
-
-
-def _keep_or_clear(work: Path, photos: list[Photo]) -> bool:
-    """Return whether just these photos were posed before; remove what belongs to others."""
-    now = _content(photos)
-    try:
-        before = json.loads((work / "photos.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        before = None
-    if before == now:
-        return True
-    work.mkdir(parents=True, exist_ok=True)
-    for path in (work / "groups.json", work / "photos.json"):
-        path.unlink(missing_ok=True)
-    if isinstance(before, dict) and before.items() <= now.items():
-        return False  # photos were added; their features and matches are too
-    (work / "database.db").unlink(missing_ok=True)
-    return False
-
-
-def _remember(work: Path, photos: list[Photo]) -> None:
-    write_text_atomically(json.dumps(_content(photos), indent=1) + "\n", work / "photos.json")
-
-
-def _content(photos: list[Photo]) -> dict[str, Any]:
-    return {"version": VERSION, **{photo.path.name: photo.digest for photo in photos}}
+    with bar("lens") as progress:
+        model = refine(models[0], progress)
+    model.extract_colors_for_all_images(output / "images")
+    groups = [sorted(each.images[image_id].name for image_id in each.reg_image_ids()) for each in models]
+    report = _report(photos, looks, model, groups)
+    write_scene(output, model)
+    write_text_atomically(json.dumps(asdict(report), indent=1) + "\n", output / REPORT)
+    kept.posed = content
+    kept.write(work)
+    return report, model
 
 
 def _report(photos: list[Photo], looks: list[Look], model: Any, groups: list[list[str]]) -> Posed:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,28 +13,24 @@ import numpy as np
 from beags_plugin.posing.photos import FEWEST, Look, look_at
 from beags_plugin.system.digests import content_digest
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.progress import Bar
+from beags_plugin.system.progress import Bar, counted
 from beags_plugin.system.whole_files import write_text_atomically, write_whole
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+RECORD = "frames.json"  # beside the frames: of which video they are
 MOST = 150  # frames
 STEP = 0.03
 """Motion between chosen frames, as a share of the picture's longest side, at least."""
 _POINTS = 200  # of a frame, followed into the next
 
 
-def take_frames(video: Path, folder: Path, bar: Bar) -> list[Path]:
-    """Write the frames worth having as JPEGs into ``folder``, unless they are there; returns their files.
+def find_frames(video: Path, folder: Path, bar: Bar) -> list[Path]:
+    """Return the files in ``folder`` for the frames worth having; ``write_frames`` writes them.
 
     Raises ``UserError`` for a video that cannot be read, or that hardly moves.
     """
-    record = folder / "frames.json"
-    try:
-        kept = json.loads(record.read_text(encoding="utf-8"))
-        if kept["video"] == content_digest([video]) and all((folder / name).is_file() for name in kept["frames"]):
-            return [folder / name for name in kept["frames"]]
-    except (OSError, ValueError, KeyError):
-        pass
+    if (kept := _record(folder)).get("video") == content_digest([video]):
+        return [folder / name for name in kept["frames"]]
     with bar("looking at frames") as progress, _frames(video) as (frames, total):
         sharpness, motions = [], []
         before: Look | None = None
@@ -47,21 +43,32 @@ def take_frames(video: Path, folder: Path, bar: Bar) -> list[Path]:
     chosen = choose_frames(np.array(motions), np.array(sharpness))
     if len(chosen) < FEWEST:
         raise UserError(
-            f"the video {video} has {len(motions)} frame{'s' * (len(motions) != 1)}, of which only {len(chosen)} show "
-            f"the scene from different places: film while walking around it."
+            f"the video {video} has too few frames that show the scene from different places ({len(chosen)} of "
+            f"{len(motions)}): film while walking around it."
         )
-    files = []
+    return [folder / f"frame_{index + 1:05d}.jpg" for index in chosen]
+
+
+def write_frames(video: Path, files: Sequence[Path], bar: Bar) -> None:
+    """Write the frames that ``find_frames`` named as JPEGs, unless they are there."""
+    folder = files[0].parent
+    content = {"video": content_digest([video]), "frames": [file.name for file in files]}
+    if _record(folder) == content and all(file.is_file() for file in files):
+        return
+    (folder / RECORD).unlink(missing_ok=True)
+    numbered = {int(file.stem[-5:]): file for file in files}
     with bar("frames") as progress, _frames(video) as (frames, _):
-        for index, frame in enumerate(frames):
-            if index in chosen:
-                files.append(folder / f"frame_{index + 1:05d}.jpg")
-                _write(files[-1], frame)
-                progress(len(files), len(chosen))
-    for other in set(folder.glob("frame_*.jpg")) - set(files):
-        other.unlink()
-    written = {"video": content_digest([video]), "frames": [file.name for file in files]}
-    write_text_atomically(json.dumps(written) + "\n", record)
-    return files
+        wanted = ((numbered[number], frame) for number, frame in enumerate(frames, start=1) if number in numbered)
+        for file, frame in counted(wanted, len(files), progress):
+            _write(file, frame)
+    write_text_atomically(json.dumps(content) + "\n", folder / RECORD)
+
+
+def _record(folder: Path) -> dict[str, Any]:
+    try:
+        return json.loads((folder / RECORD).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
 
 
 def choose_frames(motions: np.ndarray, sharpness: np.ndarray) -> list[int]:

@@ -1,4 +1,4 @@
-"""One training at a time in a run's folder."""
+"""One process at a time in a folder: a training in its run's, beags process in its scene's."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from filelock import BaseFileLock, FileLock, Timeout
 from beags_plugin.system.errors import UserError, writing
 
 LOCK = ".lock"
-"""File of a run's folder, locked by the process that trains there; the file alone means nothing."""
+"""File of a folder, locked by the process that works there; the file alone means nothing."""
 
 _held: WeakValueDictionary[Path, BaseFileLock] = WeakValueDictionary()  # by this process
 _ahead: dict[Path, BaseFileLock] = {}
@@ -26,10 +26,11 @@ def lock_ahead(run: Path) -> None:
         _ahead[run.absolute()] = run_lock(run)
 
 
-def run_lock(run: Path) -> BaseFileLock:
+def run_lock(run: Path, doing: str = "being trained") -> BaseFileLock:
     """Hold a run's folder until ``release()`` is called or the process ends, however it ends.
 
-    Raises ``UserError`` if another training holds it. Holds nothing where the system or the disk has no such locks.
+    doing: says what another process does with it. Raises ``UserError`` if one holds it. Holds nothing where the system
+    or the disk has no such locks.
     """
     if (lock := _ahead.pop(run.absolute(), None)) is not None:
         return lock
@@ -39,7 +40,7 @@ def run_lock(run: Path) -> BaseFileLock:
         try:
             lock.acquire(blocking=False)
         except Timeout:
-            raise UserError(f"{run} is being trained by another process: wait for it, or end it first.") from None
+            raise UserError(f"{run} is {doing} by another process: wait for it, or end it first.") from None
         except OSError as error:
             if error.filename is not None:  # the file cannot be opened; without a name: some network disks
                 raise

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import shutil
 import struct
+import sys
 import zlib
 from pathlib import Path
 
 import numpy as np
 from data_folders import noise, write_colmap, write_image
+from photographed_corner import film
+from PIL import Image
 
 from mistakes.table import Place, beags_after, mistake, mistakes, train_after
 
@@ -45,6 +49,24 @@ mistakes(
 PROCESS = "process --output-dir posed --data"
 
 
+def photo_on_its_side(at: Place) -> None:
+    for name in "abc":
+        image = Image.fromarray(noise(0, 20, 20))
+        exif = image.getexif()
+        exif[274] = 6
+        (at.root / "posed/images").mkdir(parents=True, exist_ok=True)
+        image.save(at.root / f"posed/images/{name}.jpg", exif=exif)
+
+
+def held(at: Place) -> None:
+    import fcntl
+
+    folder_of("a.png", "b.png", "c.png")(at)
+    (at.root / "posed").mkdir()
+    at.held = open(at.root / "posed/.lock", "ab")  # noqa: SIM115  (as another process holds it)
+    fcntl.flock(at.held, fcntl.LOCK_EX)
+
+
 def folder_of(*names: str):
     """Return what makes a folder of such photos, before ``beags process`` runs."""
 
@@ -67,6 +89,28 @@ mistakes(
                 folder_of("a.png", "b.png")(at),
                 write_image(at.root / "taken/c.png", np.zeros((9, 9), np.uint16)),
             ),
+            f"{PROCESS} taken",
+        ),
+        "cut off, to find poses for": beags_after(
+            lambda at: (folder_of("a.png", "b.png", "c.png")(at), at.cut(at.root / "taken/c.png")), f"{PROCESS} taken"
+        ),
+        "on their side, in place": beags_after(photo_on_its_side, f"{PROCESS} posed"),
+        "others in the folder for poses": beags_after(
+            lambda at: (
+                folder_of("a.png", "b.png", "c.png")(at),
+                shutil.copytree(at.root / "taken", at.root / "posed/images"),
+            ),
+            f"{PROCESS} taken",
+        ),
+        "a folder of other files": beags_after(
+            lambda at: ((at.root / "taken").mkdir(), (at.root / "taken/a.txt").write_text("x")), f"{PROCESS} taken"
+        ),
+        "a video of one frame": beags_after(
+            lambda at: film(at.root / "one.mp4", [noise(0, 32, 32)]), f"{PROCESS} one.mp4"
+        ),
+        "two processes find poses": beags_after(held, f"{PROCESS} taken"),
+        "no pycolmap": beags_after(
+            lambda at: (folder_of("a.png", "b.png", "c.png")(at), at.patch.setitem(sys.modules, "pycolmap", None)),
             f"{PROCESS} taken",
         ),
         "HEIC": beags_after(

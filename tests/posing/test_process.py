@@ -4,39 +4,29 @@ from __future__ import annotations
 
 import json
 import shutil
-from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 pycolmap = pytest.importorskip("pycolmap")
-from photographed_corner import camera, photograph, write_photos
+from data_folders import noise, write_image
+from photographed_corner import camera, frames, photograph, quiet, write_photos
 from PIL import Image
 
 from beags_plugin.commands.cli import main
+from beags_plugin.posing import features
+from beags_plugin.posing.features import _features as find_features
 from beags_plugin.posing.files import MODEL
 from beags_plugin.posing.process import REPORT, process
-from beags_plugin.posing.video import choose_frames, take_frames
 from beags_plugin.system.reading.ply import read_ply_points
 from benchmarks.poses import errors
-
-
-@contextmanager
-def quiet(name):
-    yield lambda done, total: None
-
-
-def frames(folder: Path) -> dict[str, np.ndarray]:
-    meta = json.loads((folder / "transforms.json").read_text())
-    return {Path(frame["file_path"]).stem: np.array(frame["transform_matrix"]) for frame in meta["frames"]}
 
 
 @pytest.fixture(scope="module")
 def posed(tmp_path_factory):
     """Return the folder of a scene made by the command from twelve photos, and the true poses."""
     root = tmp_path_factory.mktemp("posed")
-    given = write_photos(root / "photos")
+    given = write_photos(root / "photos", prefix="walk 1, ")  # as phones name them
     main(["process", "--data", str(root / "photos"), "--output-dir", str(root / "scene")])
     return root / "scene", given
 
@@ -74,23 +64,63 @@ def test_ns_train_reads_the_scene(posed):
     assert len(outputs.metadata["points3D_xyz"]) == len(read_ply_points(posed[0] / "sparse_pc.ply")[0])
 
 
-def test_a_second_call_computes_nothing_and_more_photos_only_what_is_new(posed, tmp_path, monkeypatch):
-    folder, given = tmp_path / "scene", posed[1]
+def test_a_second_call_computes_nothing_and_another_only_what_is_new(posed, tmp_path, monkeypatch):
+    """Photos may be added, also before the known ones in order, changed under their names, and left out."""
+    folder, given = tmp_path / "scene", dict(posed[1])
     shutil.copytree(posed[0], folder)
     before = (folder / "transforms.json").read_bytes()
-    monkeypatch.setattr("beags_plugin.posing.features._features", lambda *_: pytest.fail("computed again"))
-    monkeypatch.setattr("beags_plugin.posing.process.place", lambda *_: pytest.fail("computed again"))
+    computed = []
+    monkeypatch.setattr(features, "_features", lambda *args: computed.append(1) or find_features(*args))
     process(folder / "images", folder, quiet)
-    assert (folder / "transforms.json").read_bytes() == before
-    monkeypatch.undo()
-    Image.fromarray(photograph(camera(0.75, 2.0))).save(tmp_path / "scene/images/w.png")
+    assert (folder / "transforms.json").read_bytes() == before and not computed
+    (folder / REPORT).unlink()  # as a call that was cut off at its very end leaves it
+    given |= {"a": camera(0.75, 2.0), "walk 1, 03": camera(0.5, 2.2)}
+    for name in ("a", "walk 1, 03"):
+        Image.fromarray(photograph(given[name])).save(folder / f"images/{name}.png")
+    (folder / "images/walk 1, 05.png").unlink()
+    del given["walk 1, 05"]
     report, _ = process(folder / "images", folder, quiet)
-    assert report.registered == len(given) + 1
+    assert len(computed) == 2 and report.cameras == 1
+    found = frames(folder)
+    assert found.keys() == given.keys()
+    assert errors(found, given)[0].max() < 0.5
 
 
-def test_the_same_photos_give_the_same_poses(posed, tmp_path):
-    process(posed[0] / "images", tmp_path / "again", quiet)
-    assert (tmp_path / "again/transforms.json").read_bytes() == (posed[0] / "transforms.json").read_bytes()
+def test_a_call_that_was_cut_off_goes_on_to_the_same_poses(posed, tmp_path, monkeypatch):
+    photos, folder, computed = posed[0].parent / "photos", tmp_path / "scene", []
+
+    def counting(*args):
+        computed.append(1)
+        if len(computed) == 6:
+            raise KeyboardInterrupt
+        return find_features(*args)
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(features, "_features", counting)
+    monkeypatch.setattr("beags_plugin.posing.process.match", stop)
+    for _ in range(2):  # at the sixth photo, and before the matches
+        with pytest.raises(KeyboardInterrupt):
+            process(photos, folder, quiet)
+    monkeypatch.undo()
+    monkeypatch.setattr(features, "_features", lambda *_: pytest.fail("computed again"))
+    monkeypatch.setattr("beags_plugin.posing.process.likeness", lambda *_: pytest.fail("chosen again"))
+    process(photos, folder, quiet)
+    assert len(computed) == 13  # the sixth twice
+    assert (folder / "transforms.json").read_bytes() == (posed[0] / "transforms.json").read_bytes()
+
+
+def test_photos_that_fit_nowhere_are_named_and_sizes_counted(tmp_path):
+    photos = tmp_path / "photos"
+    write_photos(photos, 7)
+    for index in range(3):
+        write_image(photos / f"x{index}.png", noise(index, 60, 80 + 10 * index))
+    report, _ = process(photos, tmp_path / "scene", quiet)
+    assert (report.registered, report.without_pose) == (7, ["x0.png", "x1.png", "x2.png"])
+    said = "\n".join(report.notes)
+    assert "have 4 sizes (60x80, 60x90, 60x100, 320x240)" in said
+    assert "x0.png, x1.png, x2.png have no pose" in said
 
 
 def test_groups_blur_repeats_and_kinds_of_photos_get_a_sentence_each(tmp_path):
@@ -115,25 +145,3 @@ def test_the_middle_of_a_lens_is_found_where_it_is_far_from_that_of_the_photo(tm
     process(tmp_path / "photos", tmp_path / "scene", quiet)
     turned, _ = errors(frames(tmp_path / "scene"), given)
     assert np.median(turned) < 0.4  # 14 pixels are 2.7 degrees
-
-
-def test_frames_are_the_sharpest_of_each_stretch_of_motion():
-    motions = np.array([0, 0.0, 0.0, 0.02, 0.02, 0.0, 0.04, 0.04])
-    sharpness = np.array([1, 5, 2, 1, 1, 9, 3, 4])
-    assert choose_frames(motions, sharpness) == [1, 5, 6, 7]
-
-
-def test_a_video_gives_frames_and_a_second_call_takes_them(tmp_path, monkeypatch):
-    import av
-
-    with av.open(str(tmp_path / "walk.mp4"), "w") as container:
-        stream = container.add_stream("mpeg4", rate=25)
-        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 320, 240, "yuv420p", 8_000_000
-        for angle in np.repeat(np.linspace(0.3, 1.2, 12), 3):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(photograph(camera(float(angle))), format="rgb24")))
-        container.mux(stream.encode())
-    files = take_frames(tmp_path / "walk.mp4", tmp_path / "frames", quiet)
-    stands = {(int(file.stem[-5:]) - 1) // 3 for file in files}
-    assert len(files) == len(stands) >= 6  # of twelve; standing still gives none
-    monkeypatch.setattr("beags_plugin.posing.video._frames", lambda *_: pytest.fail("decoded again"))
-    assert take_frames(tmp_path / "walk.mp4", tmp_path / "frames", quiet) == files

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 
@@ -67,3 +69,36 @@ def write_photos(folder: Path, count: int = 12, prefix: str = "v", **settings) -
         poses[name] = camera(float(angle), 1.2 + 0.4 * (index % 3))
         Image.fromarray(photograph(poses[name], **settings)).save(folder / f"{name}.png")
     return poses
+
+
+@contextmanager
+def quiet(name):
+    """Stand for a progress bar."""
+    yield lambda done, total: None
+
+
+def frames(folder: Path) -> dict[str, np.ndarray]:
+    """Return the pose that a scene's transforms.json holds of each photo, by the stem of its file."""
+    meta = json.loads((folder / "transforms.json").read_text())
+    return {Path(frame["file_path"]).stem: np.array(frame["transform_matrix"]) for frame in meta["frames"]}
+
+
+def film(path: Path, pictures: list[np.ndarray]) -> Path:
+    """Write a video of pictures [H, W, 3] uint8; returns ``path``."""
+    import av
+
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=25)
+        stream.height, stream.width = pictures[0].shape[:2]
+        stream.pix_fmt, stream.bit_rate = "yuv420p", 8_000_000
+        for picture in pictures:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
+        container.mux(stream.encode())
+    return path
+
+
+def look_alike(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether pictures [H, W, 3] are of one size and differ by a lossy format alone."""
+    if one.shape != other.shape:
+        return False
+    return bool(np.abs(cv2.blur(one, (9, 9)).astype(int) - cv2.blur(other, (9, 9))).mean() < 4)
