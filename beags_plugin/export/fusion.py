@@ -27,6 +27,7 @@ BLOCK = 16
 PIXELS_PER_VOXEL = 2
 """Of the renders: discs smaller than a pixel are rendered a pixel wide, on slanted surfaces too near."""
 _VOXEL_BYTES = 20  # distance, weight and three colours, float32 each
+_STRIDE = 4  # pixels between those at which Open3D looks for blocks
 _SOLID = 0.5  # the median depth exists where more light than this is stopped
 
 
@@ -144,6 +145,8 @@ def _integrate(grid: Any, depth: Tensor, color: Tensor, pose: tuple[np.ndarray, 
     depth_image = open3d.t.geometry.Image(open3d.core.Tensor(depth.float().contiguous().numpy()))
     color_image = open3d.t.geometry.Image(open3d.core.Tensor(color.float().contiguous().numpy()))
     limit = float(depth.max()) + 1.0
+    if not bool((depth[::_STRIDE, ::_STRIDE] > 0).any()):
+        return  # a few pixels between those at which Open3D looks for blocks: it would end with an error
     blocks = grid.compute_unique_block_coordinates(depth_image, K, viewmat, 1.0, limit, float(truncation))
     grid.integrate(blocks, depth_image, color_image, K, viewmat, 1.0, limit, float(truncation))
 

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.lifting import project
+from beags_plugin.export import fusion
 from beags_plugin.export.base import ExportItem, NothingToExport, Viewpoints, make_exporter
 from beags_plugin.export.close_up import close_up
 from beags_plugin.export.frames import bounding_box
@@ -105,6 +106,24 @@ def test_an_obj_is_read_back(item, mesh, tmp_path):
     read = trimesh.load_mesh(tmp_path / "cup.obj", process=False, maintain_order=True)
     assert np.allclose(read.vertices, mesh.vertices, atol=1e-6) and np.array_equal(read.faces, mesh.faces)
     assert np.abs(read.visual.vertex_colors[:, :3] / 255.0 - mesh.colors).max() < 3e-3
+
+
+def test_a_view_of_a_few_pixels_adds_nothing(item, mesh, monkeypatch):
+    """Open3D looks for blocks at every fourth pixel of lines and columns, and ends with an error if none is solid."""
+    draw, calls = fusion._draw, iter(range(1000))
+
+    def drawn(*args):
+        depth, color = draw(*args)
+        if next(calls) == 0:
+            place = (depth.nonzero()[0] // 4 * 4 + 1).tolist()
+            value = float(depth.max())
+            depth = torch.zeros_like(depth)
+            depth[tuple(place)] = value
+        return depth, color
+
+    monkeypatch.setattr(fusion, "_draw", drawn)
+    found = GlbExporter(**OPTIONS).mesh(replace(item, shared={}))
+    assert next(calls) > 20 and len(found.faces) == pytest.approx(len(mesh.faces), rel=0.1)
 
 
 def test_both_file_types_share_one_mesh(item):
