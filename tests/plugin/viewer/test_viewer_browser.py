@@ -88,8 +88,10 @@ def test_objects_are_isolated_hidden_faded_and_removed(page):
 
 def test_the_sliders_fade_and_thin_out(page):
     """The discs have an opacity of 0.95."""
+    page.choose("Output type", "class_map")
+    classes = awaited(page, lambda now: painted(now, "cup") > 0.01 < painted(now, "box"))
     page.choose("Output type", "accumulation")
-    whole = awaited(page, lambda now: varied(now) > 2)
+    whole = awaited(page, lambda now: differing(now, classes) > 0.01 and varied(now) > 2)  # not what was there before
     page.slide("Least opacity", 0.97)
     awaited(page, lambda now: varied(now) < 1)
     page.slide("Least opacity", 0.9)
