@@ -38,8 +38,8 @@ class BoundaryLoss(Loss):
         if inputs.render.boundary is None:
             raise ValueError("the boundary loss needs a render with a target")
         labelled = (inputs.labels - IGNORE).count_nonzero()  # a third of the time of comparing and summing
-        # As a tensor: of a GPU's, the host would have to wait for the number.
         wrong = beyond_slack(inputs.render.boundary, inputs.labels, self.slack)
+        # As a tensor: of a GPU's, the host would have to wait for the number.
         return ordered_sum(wrong) / labelled.clamp(min=1)  # B is 0 at IGNORE
 
 

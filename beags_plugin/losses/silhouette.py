@@ -25,7 +25,7 @@ TAU = 0.02
 """The object is hidden where its depth z and the scene's D have z > (1 + TAU) D; as in reprojection (E5)."""
 
 SLACK = 0.4
-"""Of a pixel next to another class, which may be covered in part; as in the boundary loss."""
+"""Of a pixel next to another class, which may be covered in part; as in the boundary loss of our presets."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Which class a voxel supports, of those that the views saw in it (method, section 5).
+"""Decide which class a voxel supports, of those that the views saw in it (method, section 5).
 
 In the paper, one view is enough, and a voxel in which classes collide supports none. A thin part then has no voxel of
 its own, and a surface that one view puts at a wrong depth has as many as one that all views agree on. With votes (our
@@ -12,8 +12,10 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-MAJORITY = 0.7  # of a voxel's votes, that the class it supports exceeds
-CONFIRMED = 2  # votes that an object needs
+MAJORITY = 0.7
+"""Of a voxel's votes, exceeded by the class it supports. 0.5 gives contacts away, 0.9 thin parts (docs/results.md)."""
+CONFIRMED = 2
+"""Votes that an object needs. The background has no such need: at the rim of the scene one view may see it alone."""
 
 
 class Sightings:

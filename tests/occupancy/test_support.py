@@ -1,4 +1,4 @@
-"""Which class a voxel supports: the paper's rule and that of votes."""
+"""The class that a voxel supports: the paper's rule and that of votes."""
 
 from __future__ import annotations
 
