@@ -29,14 +29,17 @@ CONSOLE = Console(soft_wrap=True, highlight=False)
 
 @dataclass
 class Demo:
-    """Train, extract and measure: on the sample that ships with the code, or on a folder of your own."""
+    """Train, extract and measure: on the sample that ships with the code, or on a scene, photos or a video of yours.
+
+    Poses are computed where there are none, and masks made of what stands out.
+    """
 
     data: Path | None = None
-    """Folder with images, poses and masks; the generated sample if left out."""
+    """Folder of a scene or of photos, or a video; the generated sample if left out."""
     output: Path | None = None
-    """Where everything goes; outputs/demo, or outputs/<name of the data folder>."""
-    preset: str = "beags-tiny"
-    """What to train with: a preset of method_configs/."""
+    """Where everything goes; outputs/demo, or outputs/<name of the data>."""
+    preset: str | None = None
+    """What to train with: a preset of method_configs/; beags-tiny for the sample, beags-fast for data, if left out."""
     downscale: float | None = None
     """Divide the image size by this; chosen for a quick run if left out (a folder of your own only)."""
     seed: int = 0

@@ -23,40 +23,44 @@ from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
 
 if TYPE_CHECKING:
+    from beags_plugin.commands.made_scene import MadeScene
     from beags_plugin.plugin.options.model_options import BeagsModelConfig
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 STAMP = "trained.json"  # beside the run: the request that it was made from
 STARTED = "started"  # in there, holds the request until the training ends
+PRESET, PRESET_OF_PHOTOS = "beags-tiny", "beags-fast"
 SHEET_VIEWS = 3  # held-out views in the picture
 
 
 def run_demo(
-    data: Path | None, output: Path | None, preset: str, downscale: float | None, seed: int, fresh: bool
+    data: Path | None, output: Path | None, preset: str | None, downscale: float | None, seed: int, fresh: bool
 ) -> None:
     """Run the whole demo in ``output`` and print the table; see ``cli.Demo`` for the arguments."""
+    from beags_plugin.commands.made_scene import MadeScene, made_scene
     from beags_plugin.data.layout import read_dataset
     from beags_plugin.data.quick import quick_downscale
     from beags_plugin.sample.writer import make_sample
 
+    preset = preset or (PRESET if data is None else PRESET_OF_PHOTOS)
     check_preset(preset)
     if downscale is not None and not 1.0 <= downscale < math.inf:
         raise UserError(f"downscale is {downscale}: give 1 (full size) or more.")
     seconds: dict[str, float] = {}
     if data is None:
         output = output or Path("outputs/demo")
-        data = output / "sample"
+        scene = MadeScene(output / "sample")
         with timed(seconds, "sample"):
-            make_sample(data, seed, 256, 192, "mild")
+            make_sample(scene.data, seed, 256, 192, "mild")
         downscale = downscale or 1.0
-    elif not data.is_dir():
-        raise UserError(f"{data} is no folder: name one with images, poses and masks.")
     else:
-        read_dataset(data)  # reports what is missing before a training starts
-        output = output or Path("outputs") / data.resolve().name
-        downscale = downscale or quick_downscale(data)
+        output = output or Path("outputs") / (data.stem if data.is_file() else data.resolve().name)
+        with timed(seconds, "poses and masks"):
+            scene = made_scene(data, output)
+        read_dataset(scene.data)  # reports what is missing before a training starts
+        downscale = downscale or quick_downscale(scene.data)
     run = output / "run"
-    request = {"preset": preset, "downscale": downscale, "inputs": _digest(data, preset)}
+    request = {"preset": preset, "downscale": downscale, "inputs": _digest(scene, preset)}
     if not fresh and _trained(output, request):
         CONSOLE.print(f"Trained before: {run} (add --fresh to train again).")
     else:
@@ -69,7 +73,7 @@ def run_demo(
         else:
             shutil.rmtree(run, ignore_errors=True)
             write_stamp(output, {STARTED: request})
-            train(data, run, preset, downscale)
+            train(scene, run, preset, downscale)
         write_stamp(output, request)
     measure(run, output, seconds)
 
@@ -84,11 +88,12 @@ def check_preset(preset: str) -> None:
         raise UserError(f"the demo compares a base with its refinement, and {preset} trains only one: take beags-tiny.")
 
 
-def _digest(data: Path, preset: str) -> str:
+def _digest(scene: MadeScene, preset: str) -> str:
     """Return what changes with the preset, the package's code and any file of the data (by name, size and time)."""
     from beags_plugin.plugin.presets import preset_folder
 
-    return value_digest([folder_digest(data), code_digest(), (preset_folder() / f"{preset}.toml").read_text("utf8")])
+    data = [folder_digest(folder) for folder in (scene.data, scene.labels) if folder is not None]
+    return value_digest([*data, code_digest(), (preset_folder() / f"{preset}.toml").read_text("utf8")])
 
 
 def write_stamp(output: Path, content: dict[str, Any]) -> None:
@@ -115,11 +120,12 @@ def _interrupted(output: Path, request: dict[str, Any]) -> bool:
     return _read_stamp(output).get(STARTED) == request and (output / "run" / "config.yml").exists()
 
 
-def train(data: Path, run: Path, preset: str, downscale: float) -> None:
+def train(scene: MadeScene, run: Path, preset: str, downscale: float) -> None:
     """Run ns-train in a process of its own, as a user would."""
     command = [
-        str(Path(sys.executable).parent / "ns-train"), preset, "--data", str(data), "--run-dir", str(run.absolute()),
-        "--vis", "tensorboard", "beags-data", "--downscale-factor", str(downscale),
+        str(Path(sys.executable).parent / "ns-train"), preset, "--data", str(scene.data),
+        "--run-dir", str(run.absolute()), "--vis", "tensorboard",
+        "beags-data", "--downscale-factor", str(downscale), *scene.options(),
     ]  # fmt: skip
     CONSOLE.print("$ " + " ".join(command))
     _finish(command)
@@ -163,7 +169,8 @@ def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
         rows = draw_rows(shown, *scenes, objects, *drawing, **scenery)
         write_picture(picture, contact_sheet(rows, classes))
     training = json.loads((run / "training.json").read_text())
-    stages = {"sample": seconds.pop("sample", 0.0), **training["seconds"], **seconds}
+    made = {name: seconds.pop(name) for name in ("sample", "poses and masks") if name in seconds}
+    stages = {**made, **training["seconds"], **seconds}
     memory = training["peak_memory_mb"]
     write_text_atomically(json.dumps(summary_json(metrics, stages, memory), indent=2), output / "summary.json")
     CONSOLE.print(render_run(metrics, stages, memory))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,22 +27,32 @@ class Process:
     """Folder to write: images/, transforms.json, sparse_pc.ply, colmap/sparse/0, poses.json, poses.png."""
 
     def run(self) -> None:
-        with starting(self):
-            import numpy as np
+        for line in find_poses(self.data, self.output_dir, starting(self)):
+            CONSOLE.print(line)
+        CONSOLE.print(f"  ns-train beags-base --data {self.output_dir}")
 
-            from beags_plugin.pictures.poses import draw_poses
-            from beags_plugin.posing.files import APPLIED, camera_to_world
-            from beags_plugin.posing.process import process
-        report, model = process(self.data, self.output_dir, progress_bar)
+
+def find_poses(data: Path, output: Path, start: AbstractContextManager[None]) -> list[str]:
+    """Write the poses of photos or a video, and their picture, into ``output``; return lines that report them.
+
+    start: shown while what is needed is imported. Raises ``UserError`` as ``posing.process.process`` does.
+    """
+    with start:
+        import numpy as np
+
+        from beags_plugin.pictures.poses import draw_poses
+        from beags_plugin.posing.files import APPLIED, camera_to_world
+        from beags_plugin.posing.process import REPORT, process
+    report, model = process(data, output, progress_bar)
+    picture = output / "poses.png"
+    if not picture.exists() or picture.stat().st_mtime < (output / REPORT).stat().st_mtime:
         images = [model.images[image_id] for image_id in model.reg_image_ids()]
         points = list(model.points3D.values())
         draw_poses(
-            self.output_dir / "poses.png",
+            picture,
             np.stack([camera_to_world(image) for image in images]),
             np.array([point.xyz for point in points]).reshape(-1, 3) @ APPLIED[:, :3].T,
             np.array([point.color for point in points]).reshape(-1, 3),
             report.summary(),
         )
-        for line in (report.summary(), *report.notes):
-            CONSOLE.print(line)
-        CONSOLE.print(f"  {self.output_dir / 'poses.png'}\n  ns-train beags-base --data {self.output_dir}")
+    return [report.summary(), *report.notes, f"  {picture}"]

@@ -151,21 +151,20 @@ def contact_sheet(rows: Sequence[SheetRow], classes: Mapping[int, str]) -> np.nd
     """
     if not rows:
         raise ValueError("a contact sheet needs at least one row")
-    return below([line for row in rows for line in wrapped(_groups(row, classes), _WIDTH)])
+    masks = any(row.labels is not None for row in rows)
+    return below([line for row in rows for line in wrapped(_groups(row, classes, masks), _WIDTH)])
 
 
-def _groups(row: SheetRow, classes: Mapping[int, str]) -> Iterator[list[np.ndarray]]:
-    """Yield the cells of a row: photo, mask and render; then the two of each object."""
+def _groups(row: SheetRow, classes: Mapping[int, str], masks: bool) -> Iterator[list[np.ndarray]]:
+    """Yield the cells of a row: photo, mask (if the sheet has ``masks``) and render; then the two of each object."""
     height, width = row.render.shape[:2]
     size = (max(1, round(_SIDE * width / height)), _SIDE)
     blank = np.full((height, width, 3), 255, dtype=np.uint8)
     photo = blank if row.photo is None else row.photo
     overlay = blank if row.labels is None else mask_overlay(photo, row.labels)
-    yield [
-        cell(photo, size, f"{row.name}: photo" if row.photo is not None else row.name),
-        cell(overlay, size, "mask" if row.labels is not None else "no mask"),
-        cell(row.render, size, "render"),
-    ]
+    mask = [cell(overlay, size, "mask" if row.labels is not None else "no mask")] if masks else []
+    photo = cell(photo, size, f"{row.name}: photo" if row.photo is not None else row.name)
+    yield [photo, *mask, cell(row.render, size, "render")]
     for class_id in sorted(row.before):
         name, window = classes.get(class_id, f"object {class_id}"), _window(row, class_id)
         stages = (("before", row.before[class_id]), ("after", row.after[class_id]))

@@ -23,9 +23,9 @@ def code_digest() -> str:
 
 
 def folder_digest(folder: Path) -> str:
-    """Digest path, size and time of every file of ``folder``."""
+    """Digest path, size and time of every file of ``folder`` whose name begins with no dot (as locks do)."""
     digest = hashlib.sha256(str(folder.resolve()).encode())
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+    for path in sorted(path for path in folder.rglob("[!.]*") if path.is_file()):
         stat = path.stat()
         digest.update(f"{path.relative_to(folder)} {stat.st_size} {stat.st_mtime_ns}".encode())
     return digest.hexdigest()

@@ -222,7 +222,7 @@ def test_a_sheet_of_many_objects_is_no_wider_than_a_screen():
     cell = np.zeros((SIZE, SIZE, 4), dtype=np.uint8)
     shown = {index: np.where(np.arange(4) < 3, 30 * index, 255) + cell for index in range(1, 8)}
     shown = {index: image.astype(np.uint8) for index, image in shown.items()}
-    row = SheetRow("v", None, None, np.zeros((SIZE, SIZE, 3), np.uint8), shown, shown)
+    row = SheetRow("v", None, np.zeros((SIZE, SIZE), int), np.zeros((SIZE, SIZE, 3), np.uint8), shown, shown)
     sheet = contact_sheet([row], {index: str(index) for index in shown})
     assert sheet.shape[1] <= 1920 and sheet.shape[0] == 3 * (220 + 18 + 4)  # 2, then 4, then 1 object
     for index in shown:
@@ -234,6 +234,9 @@ def test_a_sheet_survives_absent_parts_but_not_a_place_that_cannot_be_written(tm
     nothing = {1: np.zeros((SIZE, 2 * SIZE, 4), dtype=np.uint8)}
     row = SheetRow("an → name", None, None, blank, nothing, nothing)
     assert contact_sheet([row], {1: "Tasse ☕"}).dtype == np.uint8
+    masked = replace(row, labels=np.zeros((SIZE, 2 * SIZE), int))
+    widths = [contact_sheet(rows, {}).shape[1] for rows in ([row], [row, masked])]
+    assert widths[1] - widths[0] > 440  # a cell of masks in every row, where there is one
     with pytest.raises(ValueError, match="at least one row"):
         contact_sheet([], {})
     (tmp_path / "file").write_text("")

@@ -167,6 +167,8 @@ def make_masks(
             shown.append((photos[index], place / path))
         if not shares:
             raise UserError("the mask source gave no mask for any view: check its options.")
+        if not any(shares):
+            raise UserError("the mask source found no object in any view: name another source, or check its options.")
         for place, new in unfinished.items():
             _take_the_place(new, place, {image.stem for image in views.images})
     names = {str(i): name for i, name in sorted(made.names.items())}
