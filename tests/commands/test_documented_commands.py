@@ -29,6 +29,7 @@ PROGRAMS = re.compile(r"^(?:[A-Z_]+=\S+ )*(beags|ns-[a-z-]+|make|pip|python) ")
 SUBSTITUTES = {  # path in the documents: path in the test's folder
     "outputs/.../extracted/cup/config.yml": "run/extracted/cup/config.yml",
     "outputs/.../config.yml": "run/config.yml",
+    "outputs/walk/run/config.yml": "run/config.yml",
     "outputs/.../nerfstudio_models": "run/nerfstudio_models",
     "outputs/...": "run",
     "RUN_A/config.yml": "run/config.yml",

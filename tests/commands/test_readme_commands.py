@@ -55,7 +55,7 @@ RUN = {  # in this order; the command in README.md: flags that are appended
     f"beags extract {CONFIG} --object cup": "",
     f"beags render {CONFIG} --object cup --format before-after": "--size 48 --views 2",
     "ns-export gaussian-splat --load-config outputs/.../extracted/cup/config.yml --output-dir exports/": "",
-    "beags demo [--data X]": "--data my_scene --downscale 2",
+    "beags demo [--data X]": "--data my_scene --downscale 2 --preset beags-tiny",
 }
 STARTED = ("beags sample", "beags resume RUN")
 ELSEWHERE = {
@@ -68,7 +68,7 @@ ELSEWHERE = {
     "beags process --data PHOTOS_OR_VIDEO --output-dir X": "this scene has no texture; test_process.py runs it",
     "beags bench ablation [--data X ...]": "trains for minutes; test_bench_running.py runs experiments to their tables",
     "make demo": "beags demo is run; what make calls is looked at below",
-    "make demo DATA=my_scene": "the same",
+    "make demo DATA=walk.mp4": "the same",
     "make test": "runs these tests",
     "make lint": "looks at the code, not at what it does",
     "make format": "changes the files of this clone",
@@ -105,7 +105,7 @@ def test_every_command_is_run_or_listed_with_a_reason():
 def test_make_calls_the_commands():
     for line, recipe in (
         ("make demo", '/beags" demo'),
-        ("make demo DATA=my_scene", '/beags" demo --data "my_scene"'),
+        ("make demo DATA=walk.mp4", '/beags" demo --data "walk.mp4"'),
         ("make soak", '/python" tests/soak/fuzz.py --count "1000" --seed "0"'),
     ):
         command = [*shlex.split(line), "--dry-run", "--no-print-directory"]  # "make test" is a make above this one
