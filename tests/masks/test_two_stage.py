@@ -65,7 +65,10 @@ def run(tmp_path: Path, objects, looks: str, scores=None, value=None):
 
     detector = None if scores is None else Finding(scores)
     options = Retrieval(threshold=0.3, strict=0.6)
-    notes = retrieve(objects, frame_of, names, new_memory, detector, best, options, lambda done, total: None)
+    steps = []
+    notes = retrieve(objects, frame_of, names, new_memory, detector, best, options, lambda *step: steps.append(step))
+    total = len(objects) * len(looks)
+    assert steps == [(done, total) for done in range(1, total + 1)]  # each view of each object
     assert len(memories) == len(objects)  # stage 2 goes on in the memory of stage 1
     asked = [] if detector is None else detector.asked
     assert len(set(asked)) == len(asked)  # no frame is asked twice

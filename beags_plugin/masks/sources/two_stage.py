@@ -100,14 +100,15 @@ def retrieve(
     notes: list[str] = []
     for index, one in enumerate(objects):
         tracked = _Tracked(one, len(names), new_memory(), detector if one.text else None, best, options)
-        tracked.first_stage({frame_of[view]: [prompt] for view, prompt in one.prompts.items()})
+        prompts = {frame_of[view]: [prompt] for view, prompt in one.prompts.items()}
+        for done, _ in enumerate(tracked.first_stage(prompts), index * len(names) + 1):
+            progress(done, len(objects) * len(names))
         tracked.second_stage()
         if lost := [f"{names[run[0]]} to {names[run[-1]]}" for run in runs_of(~tracked.seen)]:
             notes.append(
                 f"{one.name} is empty from {'; '.join(lost[:5])}{' and in other runs' if len(lost) > 5 else ''}: if it "
                 "shows there, add a prompt in one of these views."
             )
-        progress(index + 1, len(objects))
     return notes
 
 
@@ -120,12 +121,12 @@ class _Tracked:
         self.found: dict[int, list[tuple[Box, float]]] = {}  # by the detector, which is asked once about a frame
         self.score = 0.0  # of the detection that tracking started at
 
-    def first_stage(self, prompts: Mapping[int, Sequence[Prompt]]) -> None:
-        """Track from the first prompted frame, or from the best detection, to both ends."""
+    def first_stage(self, prompts: Mapping[int, Sequence[Prompt]]) -> Iterator[int]:
+        """Track from the first prompted frame, or from the best detection, to both ends; yield each frame."""
         prompts = prompts or self._searched()
         for frame, places in prompts.items():
             self.memory.prompt(frame, places)
-        self._both_ways(min(prompts), range(len(self.seen)))
+        yield from self._both_ways(min(prompts), range(len(self.seen)))
 
     def second_stage(self) -> None:
         """Ask the detector in every frame that is still empty, and track from what it finds through the empty run."""
@@ -133,14 +134,16 @@ class _Tracked:
         for frame in np.flatnonzero(~self.seen).tolist():
             if not self.seen[frame] and (places := self._detected(frame, least)):
                 self.memory.prompt(frame, places)
-                self._both_ways(frame, next(run for run in runs_of(~self.seen) if frame in run))
+                list(self._both_ways(frame, next(run for run in runs_of(~self.seen) if frame in run)))
 
-    def _both_ways(self, start: int, run: range) -> None:
+    def _both_ways(self, start: int, run: range) -> Iterator[int]:
+        """Track up, then down, from a frame through a run; yield each frame."""
         for frames in (range(start, run.stop), range(start - 1, run.start - 1, -1)):
             for frame, logits in self.memory.track(frames):
                 if (logits > 0).sum() >= max(1.0, EMPTY * logits.size):
                     self.seen[frame] = True
                     self.best.add(frame, self.one.class_id, logits)
+                yield frame
 
     def _searched(self) -> dict[int, list[Prompt]]:
         """Return the frame of the best detection in some spread frames (if none, of the first in the others)."""
