@@ -1,10 +1,11 @@
-"""The SAM2 source on toy models of random weights: the code for real weights, without their masks."""
+"""The source of SAM 2 and SAM 3 on toy models of random weights: the code for real weights, without their masks."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,13 +14,18 @@ from data_folders import write_image
 
 from beags_plugin.masks.sources.base import Photo, SourceScene
 from beags_plugin.masks.sources.prompts import Prompt
-from beags_plugin.masks.sources.sam2 import GroundingDino, Sam2Predictor, Sam2Source, load
+from beags_plugin.masks.sources.sam2 import DETECTORS, TRACKERS, Sam2Source, SamMemory, TextDetector, classes, load
 from beags_plugin.system.errors import UserError
 
 transformers = pytest.importorskip("transformers", reason="the extra [sam2] (transformers) is not installed")
 
 SIDE = 64  # pixels that the toy model sees
 FRAMES, WIDTH, HEIGHT = 5, 40, 30
+
+
+def save(model, tracker, folder: Path) -> None:
+    tracker.mask_decoder.pred_obj_score_head.proj_out.bias.data.fill_(9.0)  # else it sees no object in some frames
+    model.save_pretrained(folder)
 
 
 @pytest.fixture(scope="module")
@@ -47,99 +53,58 @@ def sam2(tmp_path_factory):
         memory_fuser_embed_dim=128, memory_fuser_intermediate_dim=32, memory_fuser_num_layers=1,
     )  # fmt: skip
     folder = tmp_path_factory.mktemp("sam2")
-    transformers.Sam2VideoModel(config).save_pretrained(folder)
+    save(model := transformers.Sam2VideoModel(config), model, folder)
     size = {"height": SIDE, "width": SIDE}
     images = transformers.Sam2ImageProcessor(size=size, mask_size={"height": SIDE // 4, "width": SIDE // 4})
     transformers.Sam2VideoProcessor(images, transformers.Sam2VideoVideoProcessor(size=size)).save_pretrained(folder)
     return folder
 
 
-@pytest.fixture
-def photos(tmp_path):
-    found = []
-    for index in range(FRAMES):
-        image = np.full((HEIGHT, WIDTH, 3), 60, np.uint8)
-        image[10:20, 10 + index : 20 + index] = (200, 40, 40)
-        path = tmp_path / f"images/v{index:02d}.png"
-        write_image(path, image)
-        found.append(Photo(path.stem, path, WIDTH, HEIGHT))
-    return found
+@pytest.fixture(scope="module")
+def sam3(tmp_path_factory):
+    """A folder with a tiny Sam3VideoModel and its processor: a detector and a tracker, as SAM 3 is published."""
+    torch.manual_seed(0)
+    side, small = 56, {"hidden_size": 128, "num_attention_heads": 2}
+    layer = {**small, "num_layers": 1, "intermediate_size": 32}
+    vit = transformers.Sam3ViTConfig(
+        **small, intermediate_size=32, num_hidden_layers=2, image_size=side, window_size=4, global_attn_indexes=[1],
+        pretrain_image_size=side,
+    ).to_dict()  # fmt: skip
+    vision = {"backbone_config": vit, "fpn_hidden_size": 128, "backbone_feature_sizes": [[16, 16], [8, 8], [4, 4]]}
+    letters = ["a", "c", "d", "e", "p", "r", "u", "d</w>", "p</w>", "<|startoftext|>", "<|endoftext|>"]
+    text = {
+        **small, "model_type": "clip_text_model", "vocab_size": len(letters), "intermediate_size": 32,
+        "num_hidden_layers": 1, "max_position_embeddings": 32, "bos_token_id": 9, "eos_token_id": 10,
+    }  # fmt: skip
+    detector = transformers.Sam3Config(
+        vision_config=vision, text_config=text, geometry_encoder_config=layer, detr_encoder_config=layer,
+        detr_decoder_config={**layer, "num_queries": 6}, mask_decoder_config=small,
+    )  # fmt: skip
+    tracker = transformers.Sam3TrackerVideoConfig(
+        vision_config={**vision, "model_type": "sam3_vision_model"}, image_size=side, mask_downsampler_embed_dim=128,
+        prompt_encoder_config={"hidden_size": 128, "image_size": side, "mask_input_channels": 4},
+        mask_decoder_config={**small, "mlp_dim": 32, "iou_head_hidden_dim": 16}, memory_attention_hidden_size=128,
+        memory_attention_num_layers=1, memory_attention_feed_forward_hidden_size=32, memory_encoder_hidden_size=128,
+        memory_encoder_output_channels=64, memory_fuser_embed_dim=128, memory_fuser_intermediate_dim=32,
+        memory_fuser_num_layers=1,
+    )  # fmt: skip
+    config = transformers.Sam3VideoConfig(
+        detector_config=detector.to_dict(), tracker_config=tracker.to_dict(), low_res_mask_size=16
+    )
+    folder = tmp_path_factory.mktemp("sam3")
+    save(model := transformers.Sam3VideoModel(config), model.tracker_model, folder)
+    size = {"height": side, "width": side}
+    transformers.Sam3VideoProcessor(
+        transformers.Sam3ImageProcessor(size=size, mask_size={"height": 16, "width": 16}),
+        transformers.Sam2VideoVideoProcessor(size=size),
+        transformers.CLIPTokenizer(vocab={letter: index for index, letter in enumerate(letters)}, merges=[]),
+    ).save_pretrained(folder)
+    return folder
 
 
-def test_the_predictor_tracks_both_ways(sam2, photos):
-    predictor = Sam2Predictor(*load(str(sam2), "Sam2VideoModel", local=True), photos)
-    prompts = {2: Prompt(box=(10, 8, 24, 22)), 3: Prompt(points=((18.0, 15.0), (2.0, 2.0)), inside=(True, False))}
-    up = list(predictor.track(prompts, [2, 3, 4]))
-    down = list(predictor.track(prompts, [2, 1, 0]))
-    assert [frame for frame, _ in up] == [2, 3, 4] and [frame for frame, _ in down] == [2, 1, 0]
-    for _, logits in up + down:
-        assert logits.shape == (HEIGHT, WIDTH) and logits.dtype == np.float32 and np.isfinite(logits).all()
-    np.testing.assert_array_equal(up[0][1], down[0][1])  # calls know nothing of each other
-    other = next(iter(predictor.track({2: Prompt(box=(0, 0, 5, 5))}, [2, 3])))[1]
-    assert np.abs(other - up[0][1]).max() > 0  # the prompt matters
-
-
-def test_the_predictor_forgets_what_the_model_no_longer_looks_at(sam2, photos, monkeypatch):
-    from beags_plugin.masks.sources import sam2 as module
-
-    held, forget = [], module._forget
-
-    def observed(session, frame, kept):
-        forget(session, frame, kept)
-        outputs = next(iter(session.output_dict_per_obj.values()))
-        held.append((sorted(outputs["cond_frame_outputs"]), sorted(outputs["non_cond_frame_outputs"])))
-        assert len(session.processed_frames.keys()) <= 1
-
-    monkeypatch.setattr(module, "KEPT_FRAMES", 1)
-    monkeypatch.setattr(module, "_forget", observed)
-    predictor = Sam2Predictor(*load(str(sam2), "Sam2VideoModel", local=True), photos)
-    list(predictor.track({0: Prompt(box=(10, 8, 24, 22))}, range(FRAMES)))
-    assert held == [([0], []), ([0], [1]), ([0], [1, 2]), ([0], [2, 3]), ([0], [3, 4])]
-
-
-def test_the_predictor_agrees_with_a_whole_video_in_memory(sam2, photos):
-    model, processor = load(str(sam2), "Sam2VideoModel", local=True)
-    found = dict(Sam2Predictor(model, processor, photos).track({0: Prompt(box=(8, 8, 22, 22))}, range(FRAMES)))
-    session = processor.init_video_session(video=[photo.pixels() for photo in photos])
-    processor.add_inputs_to_inference_session(session, frame_idx=0, obj_ids=1, input_boxes=[[[8, 8, 22, 22]]])
-    with torch.inference_mode():
-        for output in model.propagate_in_video_iterator(session, start_frame_idx=0):
-            low = output.pred_masks.reshape(1, 1, *output.pred_masks.shape[-2:])
-            whole = processor.post_process_masks([low], [[HEIGHT, WIDTH]], binarize=False)[0].reshape(HEIGHT, WIDTH)
-            np.testing.assert_allclose(found[output.frame_idx], whole.numpy(), atol=2e-3)
-
-
-def test_the_source_makes_a_map_of_every_view(sam2, photos, tmp_path):
-    objects = [
-        {"name": "red", "prompts": [{"view": "v02", "box": [10, 8, 24, 22]}]},
-        {"name": "other", "id": 7, "prompts": [{"view": "v00", "points": [[30, 5]]}]},
-    ]
-    (tmp_path / "prompts.json").write_text(json.dumps({"objects": objects}))
-    source = Sam2Source(Path("prompts.json"), model=str(sam2), local=True, device="cpu")
-    made = source.make(SourceScene(tmp_path, photos), lambda done, total: None)
-    maps = list(made.maps)
-    assert made.names == {0: "background", 1: "red", 7: "other"}
-    assert [m.shape for m in maps] == [(HEIGHT, WIDTH)] * FRAMES
-    assert set(np.unique(np.stack(maps)).tolist()) <= {0, 1, 7}
-
-
-def test_held_out_photos_are_never_seen(sam2, photos, tmp_path):
-    photos[1] = replace(photos[1], trained=False, path=tmp_path / "absent.png")  # reading it would fail
-    source = Sam2Source(Path("prompts.json"), model=str(sam2), local=True, device="cpu")
-
-    def maps(view: str) -> list:
-        objects = [{"name": "red", "prompts": [{"view": view, "box": [10, 8, 24, 22]}]}]
-        (tmp_path / "prompts.json").write_text(json.dumps({"objects": objects}))
-        return list(source.make(SourceScene(tmp_path, photos), lambda done, total: None).maps)
-
-    assert [index for index, labels in enumerate(maps("v02")) if labels is None] == [1]
-    with pytest.raises(UserError, match="prompts in v01, which is held out"):
-        maps("v01")
-
-
-def test_missing_weights_are_refused(tmp_path):
-    with pytest.raises(UserError, match="there is no folder .*: name one that holds"):
-        load(str(tmp_path / "nothing"), "Sam2VideoModel", local=True)
+@pytest.fixture(params=["sam2", "sam3"])
+def weights(request):
+    return request.getfixturevalue(request.param)
 
 
 @pytest.fixture(scope="module")
@@ -169,19 +134,161 @@ def dino(tmp_path_factory):
     return folder
 
 
-def test_the_detector_gives_boxes_in_pixels_above_the_threshold(dino, photos):
-    detector = GroundingDino(*load(str(dino), "GroundingDinoForObjectDetection", local=True), photos)
+@pytest.fixture
+def photos(tmp_path):
+    found = []
+    for index in range(FRAMES):
+        image = np.full((HEIGHT, WIDTH, 3), 60, np.uint8)
+        image[10:20, 10 + index : 20 + index] = (200, 40, 40)
+        path = tmp_path / f"images/v{index:02d}.png"
+        write_image(path, image)
+        found.append(Photo(path.stem, path, WIDTH, HEIGHT))
+    return found
+
+
+def loaded(weights: Path, kinds) -> tuple[Any, Any]:
+    return load(str(weights), classes(str(weights), kinds, "model", local=True), local=True)
+
+
+def tracked(memory: SamMemory, frames: range) -> dict[int, np.ndarray]:
+    found = dict(memory.track(frames))
+    assert list(found) == list(frames)
+    for logits in found.values():
+        assert logits.shape == (HEIGHT, WIDTH) and logits.dtype == np.float32 and np.isfinite(logits).all()
+    return found
+
+
+def held(memory: SamMemory, kind: str = "cond") -> list[list[int]]:
+    return [sorted(outputs[f"{kind}_frame_outputs"]) for outputs in memory.session.output_dict_per_obj.values()]
+
+
+def test_a_memory_tracks_both_ways_from_boxes_and_points(weights, photos):
+    sam = loaded(weights, TRACKERS)
+    memory, other = (SamMemory(*sam, photos) for _ in range(2))
+    memory.prompt(2, [Prompt(box=(10, 8, 24, 22))])
+    memory.prompt(3, [Prompt(points=((18.0, 15.0), (2.0, 2.0)), inside=(True, False))])
+    up = tracked(memory, range(2, 5))
+    tracked(memory, range(1, -1, -1))
+    assert held(memory) == [[2, 3]]
+    ways = {frame: way["reverse"] for frame, way in memory.session.frames_tracked_per_obj[0].items()}
+    assert ways == {4: False, 1: True, 0: True}
+    other.prompt(2, [Prompt(box=(0, 0, 5, 5))])
+    assert np.abs(tracked(other, range(2, 3))[2] - up[2]).max() > 0  # the prompt matters
+
+
+def test_a_prompt_in_a_tracked_frame_stays_in_the_same_memory(weights, photos):
+    sam, again = loaded(weights, TRACKERS), Prompt(box=(13, 8, 26, 22))
+    memory, fresh = (SamMemory(*sam, photos) for _ in range(2))
+    memory.prompt(0, [Prompt(box=(10, 8, 24, 22))])
+    before = tracked(memory, range(FRAMES))
+    for one in (memory, fresh):
+        one.prompt(3, [again])
+    assert held(memory, "non_cond") == [[]]  # what was tracked about a lost frame tells that the object is absent
+    after, alone = tracked(memory, range(3, FRAMES)), tracked(fresh, range(3, FRAMES))
+    assert held(memory) == [[0, 3]]
+    assert np.abs(after[3] - before[3]).max() > 0
+    np.testing.assert_array_equal(after[3], alone[3])  # the prompt alone says what is in its frame,
+    assert np.abs(after[4] - alone[4]).max() > 0  # and the first one is known in the others
+
+
+def test_an_object_of_several_parts_is_their_union(weights, photos):
+    sam, boxes = loaded(weights, TRACKERS), [Prompt(box=(10, 8, 24, 22)), Prompt(box=(30, 2, 38, 9))]
+    both, *alone = (SamMemory(*sam, photos) for _ in range(3))
+    both.prompt(1, boxes)
+    for memory, box in zip(alone, boxes, strict=True):
+        memory.prompt(1, [box])
+    both.prompt(3, [*boxes, Prompt(box=(1, 1, 5, 5))])  # a part that the first frame did not show
+    assert held(both) == [[1, 3], [1, 3], [3]]
+    one, two = (tracked(memory, range(1, 2))[1] for memory in alone)
+    found = tracked(both, range(1, FRAMES))[1]
+    assert (found >= np.maximum(one, two) - 1e-4).all()
+
+
+def test_a_memory_forgets_what_the_model_no_longer_looks_at(weights, photos, monkeypatch):
+    monkeypatch.setattr("beags_plugin.masks.sources.sam2.KEPT_FRAMES", 1)
+    memory, kept = SamMemory(*loaded(weights, TRACKERS), photos), []
+    memory.prompt(0, [Prompt(box=(10, 8, 24, 22))])
+    for _ in memory.track(range(FRAMES)):
+        kept += held(memory, "non_cond")
+        assert len(memory.session.processed_frames.keys()) <= 1 and held(memory) == [[0]]
+    assert kept == [[], [1], [1, 2], [1, 2, 3], [2, 3, 4]]  # as the next is tracked
+    outputs = memory.session.output_dict_per_obj[0]
+    assert not any("high_res_masks" in one for group in outputs.values() for one in group.values())
+
+
+def test_a_memory_agrees_with_a_whole_video_that_the_library_tracks(weights, photos):
+    model, processor = loaded(weights, TRACKERS)
+    memory = SamMemory(model, processor, photos)
+    memory.prompt(0, [Prompt(box=(8, 8, 22, 22))])
+    found = tracked(memory, range(FRAMES))
+    frames = [processor.image_processor(images=photo.pixels(), return_tensors="pt") for photo in photos]
+    session = processor.init_video_session()
+    session.processed_frames = {index: frame["pixel_values"][0] for index, frame in enumerate(frames)}
+    processor.add_inputs_to_inference_session(
+        session, frame_idx=0, obj_ids=1, input_boxes=[[[8, 8, 22, 22]]], original_size=(HEIGHT, WIDTH)
+    )
+    with torch.inference_mode():
+        for output in model.propagate_in_video_iterator(session, start_frame_idx=0):
+            low = output.pred_masks.reshape(1, 1, *output.pred_masks.shape[-2:])
+            whole = processor.post_process_masks([low], [[HEIGHT, WIDTH]], binarize=False)[0].reshape(HEIGHT, WIDTH)
+            np.testing.assert_allclose(found[output.frame_idx], whole.numpy(), atol=2e-3)
+
+
+def made(folder: Path, photos, objects: list, **options) -> tuple[dict, list]:
+    (folder / "prompts.json").write_text(json.dumps({"objects": objects}))
+    source = Sam2Source(local=True, device="cpu", **options)
+    found = source.make(SourceScene(folder, photos), lambda done, total: None)
+    return dict(found.names), list(found.maps)
+
+
+def test_the_source_makes_a_map_of_every_view(weights, photos, tmp_path):
+    objects = [
+        {"name": "red", "prompts": [{"view": "v02", "box": [10, 8, 24, 22]}]},
+        {"name": "other", "id": 7, "prompts": [{"view": "v00", "points": [[30, 5]]}]},
+    ]
+    names, maps = made(tmp_path, photos, objects, model=str(weights))
+    assert names == {0: "background", 1: "red", 7: "other"}
+    assert [m.shape for m in maps] == [(HEIGHT, WIDTH)] * FRAMES
+    assert set(np.unique(np.stack(maps)).tolist()) <= {0, 1, 7}
+
+
+def test_held_out_photos_are_never_seen(sam2, photos, tmp_path):
+    photos[1] = replace(photos[1], trained=False, path=tmp_path / "absent.png")  # reading it would fail
+
+    def maps(view: str) -> list:
+        objects = [{"name": "red", "prompts": [{"view": view, "box": [10, 8, 24, 22]}]}]
+        return made(tmp_path, photos, objects, model=str(sam2))[1]
+
+    assert [index for index, labels in enumerate(maps("v02")) if labels is None] == [1]
+    with pytest.raises(UserError, match="prompts in v01, which is held out"):
+        maps("v01")
+
+
+@pytest.mark.parametrize("kind", ["dino", "sam3"])
+def test_a_detector_gives_boxes_in_pixels_above_the_threshold(kind, photos, request):
+    detector = TextDetector(*loaded(request.getfixturevalue(kind), DETECTORS), photos)
     found = detector.detect(0, "A red cup", threshold=0.0)
     assert found and all(len(box) == 4 and 0.0 <= score <= 1.0 for box, score in found)
     assert max(abs(value) for box, _ in found for value in box) > 2  # pixels, not shares of the image
     limit = sorted(score for _, score in found)[len(found) // 2]
     assert 0 < len(detector.detect(0, "a red cup.", threshold=limit)) < len(found)
+    with pytest.raises(UserError, match="is too long for the detector"):
+        detector.detect(0, "a red cup " * 60, threshold=0.0)
 
 
-def test_a_text_prompts_the_first_stage(sam2, dino, photos, tmp_path):
-    (tmp_path / "prompts.json").write_text('{"objects": [{"name": "cup", "text": "red cup"}]}')
-    source = Sam2Source(
-        Path("prompts.json"), str(sam2), str(dino), "cpu", threshold=0.0, strict=0.0, retries=1, local=True
-    )
-    made = source.make(SourceScene(tmp_path, photos), lambda done, total: None)
-    assert len(list(made.maps)) == FRAMES
+def test_a_text_needs_no_other_weights_with_sam3_and_a_detector_with_sam2(sam2, sam3, dino, photos, tmp_path):
+    objects = [{"name": "cup", "text": "red cup"}]
+    for options in ({"model": str(sam3)}, {"model": str(sam2), "detector": str(dino)}):
+        assert len(made(tmp_path, photos, objects, threshold=0.0, strict=0.0, **options)[1]) == FRAMES
+    with pytest.raises(UserError, match="the weights IDEA-Research/grounding-dino-tiny cannot be loaded"):
+        made(tmp_path, photos, objects, model=str(sam2))
+
+
+def test_the_parts_of_sam3_are_loaded_from_its_weights(sam3):
+    whole = transformers.Sam3VideoModel.from_pretrained(sam3).state_dict()
+    model, _ = loaded(sam3, DETECTORS)
+    assert all(torch.equal(value, whole[f"detector_model.{name}"]) for name, value in model.state_dict().items())
+    own = loaded(sam3, TRACKERS)[0].state_dict()
+    assert torch.equal(own["memory_encoder.projection.weight"], whole["tracker_model.memory_encoder.projection.weight"])
+    backbone = [name for name in own if name.startswith("vision_encoder.backbone.")]
+    assert backbone and all(torch.equal(own[name], whole[f"detector_model.{name}"]) for name in backbone)

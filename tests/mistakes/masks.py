@@ -174,26 +174,35 @@ mistakes(
 )
 
 
-def without_weights(at: Place, model: str):
-    import sys
-    from types import SimpleNamespace
+def sam2(model_type: str, options: str = "", old: bool = False) -> Callable[[Place], Any]:
+    """Return a mistake in the weights of the SAM source, one folder of which is of a type; old: the library."""
 
-    from beags_plugin.masks.sources import sam2
+    def write(data: Path) -> None:
+        text = {"objects": [{"name": "cup", "text": "a cup"}]}
+        (data / "prompts.json").write_text(json.dumps(text))
+        for name, kind in (("sam2", "sam2_video"), ("other", model_type)):
+            (data.parent / name).mkdir()
+            (data.parent / name / "config.json").write_text(json.dumps({"model_type": kind}))
 
-    def absent(name, **_):
-        raise OSError(f"{name} is not a local folder and is not a valid model identifier")
+    def make(at: Place):
+        from beags_plugin.masks.sources.sam2 import TRACKERS
 
-    library = SimpleNamespace(Sam2VideoModel=SimpleNamespace(from_pretrained=absent))  # which is installed on demand
-    at.patch.setitem(sys.modules, "transformers", library)
-    at.patch.setattr(sam2.Sam2Source, "unavailable", classmethod(lambda cls: None))
-    return made("sam2", GOOD, f"--options prompts=prompts.json model={model}")(at)
+        library = pytest.importorskip("transformers", reason="the extra [sam2] (transformers) is not installed")
+        if old:
+            at.patch.setitem(TRACKERS, "sam3_video", ("Sam3ModelToCome", "Sam3ProcessorToCome"))
+            at.patch.setattr(library, "__version__", "4.57.1")
+        return made("sam2", write, f"--options prompts=prompts.json local=true {options or 'model=other'}")(at)
+
+    return make
 
 
 mistakes(
     "mask sources",
     {
-        "SAM2 without weights": lambda at: without_weights(at, "nowhere"),
-        "SAM2 with a folder of weights that is not there": lambda at: without_weights(at, "/none/such/weights"),
+        "SAM: a folder of weights that is not there": sam2("", "model=/none/such/weights"),
+        "SAM: weights of another model": sam2("bert"),
+        "SAM: a detector that takes no texts": sam2("sam2_video", "model=sam2 detector=other"),
+        "SAM: a library too old": sam2("sam3_video", old=True),
     },
 )
 
@@ -225,7 +234,7 @@ def salient(weights: bytes | None, path: str = "../home/u2netp.onnx", model: str
 mistakes(
     "mask sources",
     {
-        "SAM2 without its extra": without_extra("sam2"),
+        "SAM without its extra": without_extra("sam2"),
         "salient without its extra": without_extra("salient"),
         "salient without weights": salient(None),
         "salient: weights that rembg knows but that are not there": salient(None, model="u2net"),

@@ -1,10 +1,11 @@
-"""Source by two-stage retrieval with SAM2's video model and Grounding DINO, from the library transformers."""
+"""Source by two-stage retrieval with the video models of SAM 2 and SAM 3, from the library transformers."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,27 +19,36 @@ from beags_plugin.masks.sources.prompts import Prompt, read_prompts
 from beags_plugin.masks.sources.two_stage import BestLabels, Box, Retrieval, retrieve
 from beags_plugin.system.errors import UserError
 
-KEPT_FRAMES = 32  # of an object's memory about the tracked frame; the model uses 16 at most
+KEPT_FRAMES = 16  # of an object's memory about the tracked frame; the models use 15 at most
+# the library's classes, of the model and of its processor, by the model type that the weights' config names
+TRACKERS = {
+    "sam2_video": ("Sam2VideoModel", "Sam2VideoProcessor"),
+    "sam3_video": ("Sam3TrackerVideoModel", "Sam3TrackerVideoProcessor"),
+    "sam3_tracker_video": ("Sam3TrackerVideoModel", "Sam3TrackerVideoProcessor"),
+}
+DETECTORS = {
+    "sam3_video": ("Sam3Model", "Sam3Processor"),
+    "grounding-dino": ("GroundingDinoForObjectDetection", "GroundingDinoProcessor"),
+    "mm-grounding-dino": ("MMGroundingDinoForObjectDetection", "GroundingDinoProcessor"),
+}
 
 
 @dataclass(frozen=True)
 class Sam2Source(MaskSource):
-    """SAM2 tracks objects through the training views in the order of names, from points, boxes, or texts for Grounding
-    DINO. Held-out views are never seen: a mask that a program made of them is no truth.
+    """SAM 2 or SAM 3 tracks objects through the training views in the order of names, from points, boxes, or texts.
+    Held-out views are never seen: a mask that a program made of them is no truth.
 
     prompts: JSON, see ``prompts.read_prompts``. model, detector: a folder with the library's files, or a name on its
-    hub; the detector is loaded only if an object has a text. device: "auto" prefers CUDA.
-    threshold, strict, searched, retries: see ``two_stage.Retrieval``. local: never use the hub.
+    hub; the detector is loaded only if an object has a text: "auto" is SAM 3 itself, or Grounding DINO for SAM 2.
+    device: "auto" prefers CUDA. threshold, strict: see ``two_stage.Retrieval``. local: never use the hub.
     """
 
     prompts: Path = Path("prompts.json")
     model: str = "facebook/sam2.1-hiera-small"
-    detector: str = "IDEA-Research/grounding-dino-tiny"
+    detector: str = "auto"
     device: str = "auto"
     threshold: float = 0.3
-    strict: float = 0.5
-    searched: int = 8
-    retries: int = 2
+    strict: float = 0.6
     local: bool = False
 
     @classmethod
@@ -59,20 +69,25 @@ class Sam2Source(MaskSource):
         device = self.device
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
-        predictor = Sam2Predictor(*load(self.model, "Sam2VideoModel", self.local), photos, device)
-        detector = None
+        trackers = classes(self.model, TRACKERS, "video model of SAM 2 or SAM 3", self.local)
+        finder, detectors = self.detector, []
         if any(one.text for one in objects):
-            kind = "GroundingDinoForObjectDetection"
-            detector = GroundingDino(*load(self.detector, kind, self.local), photos, device)
+            if finder == "auto":
+                finds = model_type(self.model, self.local) in DETECTORS
+                finder = self.model if finds else "IDEA-Research/grounding-dino-tiny"
+            detectors = classes(finder, DETECTORS, "detector of texts", self.local)
+        tracker = load(self.model, trackers, self.local)
+        detector = TextDetector(*load(finder, detectors, self.local), photos, device) if detectors else None
         names = {0: "background", **{one.class_id: one.name for one in objects}}
-        options = Retrieval(self.threshold, self.strict, self.searched, self.retries)
+        options = Retrieval(self.threshold, self.strict)
         notes: list[str] = []
 
         def maps() -> Iterator[np.ndarray | None]:
             with TemporaryDirectory(prefix="beags-sam2-") as folder:
                 best = BestLabels(Path(folder))
                 names = [photo.name for photo in photos]
-                notes.extend(retrieve(objects, frame_of, names, predictor, detector, best, options, progress))
+                new_memory = partial(SamMemory, *tracker, photos, device)
+                notes.extend(retrieve(objects, frame_of, names, new_memory, detector, best, options, progress))
                 frames = iter(range(len(photos)))
                 for photo in scene.photos:
                     yield best.labels(next(frames), (photo.height, photo.width)) if photo.trained else None
@@ -80,65 +95,110 @@ class Sam2Source(MaskSource):
         return MadeMasks(names, maps(), notes)
 
 
-def load(name: str, kind: str, local: bool = False) -> tuple[Any, Any]:
-    """Load the model of class ``kind`` and its processor from a folder or the hub; raise ``UserError``."""
+def model_type(name: str, local: bool = False) -> str:
+    """Return the model type of the weights in a folder or on the hub; raise ``UserError``."""
     import transformers  # pyright: ignore[reportMissingImports]
 
     if not (Path(name).is_dir() or re.fullmatch(r"[\w.-]+(/[\w.-]+)?", name)):
         raise UserError(f"there is no folder {name}: name one that holds the weights, or a model of the hub.")
     try:
-        model = getattr(transformers, kind).from_pretrained(name, local_files_only=local)
-        processor = transformers.AutoProcessor.from_pretrained(name, local_files_only=local)
+        return str(transformers.PretrainedConfig.get_config_dict(name, local_files_only=local)[0].get("model_type"))
     except (OSError, ValueError) as error:
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise _not_loaded(name, error) from error
+
+
+def classes(name: str, kinds: Mapping[str, tuple[str, str]], what: str, local: bool = False) -> list[Any]:
+    """Return the classes that ``kinds`` has for the model type of weights; raise ``UserError`` if it has none."""
+    import transformers  # pyright: ignore[reportMissingImports]
+
+    kind = model_type(name, local)
+    if kind not in kinds:
+        raise UserError(f"the weights {name} (model type {kind}) are no {what}: name some of {', '.join(kinds)}.")
+    try:
+        return [getattr(transformers, one) for one in kinds[kind]]
+    except AttributeError as error:
         raise UserError(
-            f"the weights {name} cannot be loaded ({reason}): name a folder that holds them, or go online once."
+            f"transformers {transformers.__version__} is too old for the weights {name} (model type {kind}): pip "
+            "install -U transformers."
         ) from error
+
+
+def load(name: str, loaders: Sequence[Any], local: bool = False) -> tuple[Any, Any]:
+    """Load a model and its processor by their classes from a folder or the hub; raise ``UserError``."""
+    from safetensors import SafetensorError
+
+    try:
+        model, processor = (loader.from_pretrained(name, local_files_only=local) for loader in loaders)
+    except (ImportError, OSError, RuntimeError, ValueError, SafetensorError) as error:
+        raise _not_loaded(name, error) from error
     return model.eval(), processor
 
 
-class Sam2Predictor:
-    """SAM2's video model as a ``two_stage.VideoPredictor``.
+def _not_loaded(name: str, error: Exception) -> UserError:
+    reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+    return UserError(
+        f"the weights {name} cannot be loaded ({reason}): name a folder that holds them, or go online once."
+    )
 
-    Memory is bounded: frames are read when needed, features and memories lie on the CPU, and memories that the model no
-    longer uses are dropped.
+
+class SamMemory:
+    """A session of SAM 2 or SAM 3 as a ``two_stage.Memory``.
+
+    What it holds is bounded, but for the memories of prompted frames: frames are read when needed, and memories of
+    tracked frames that the model no longer uses are dropped.
     """
 
     def __init__(self, model: Any, processor: Any, photos: Sequence[Photo], device: str = "cpu") -> None:
-        self.model, self.processor, self.photos, self.device = model.to(device), processor, photos, device
+        self.model, self.processor, self.photos = model.to(device), processor, photos
+        self.session = processor.init_video_session(
+            inference_device=device, inference_state_device="cpu", video_storage_device="cpu"
+        )
+        self.session.processed_frames = _Frames(processor, photos)
 
     @torch.inference_mode()
-    def track(self, prompts: Mapping[int, Prompt], frames: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        session = self.processor.init_video_session(
-            inference_device=self.device, inference_state_device="cpu", video_storage_device="cpu"
+    def prompt(self, frame: int, places: Sequence[Prompt]) -> None:
+        inputs: dict[str, Any] = {}
+        if places[0].box is not None:
+            inputs["input_boxes"] = [[list(place.box or ()) for place in places]]
+        if places[0].points:
+            inputs["input_points"] = [[[list(point) for point in place.points] for place in places]]
+            inputs["input_labels"] = [[[int(inside) for inside in place.inside] for place in places]]
+        photo = self.photos[frame]  # photos may differ in size
+        self.processor.add_inputs_to_inference_session(
+            inference_session=self.session,
+            frame_idx=frame,
+            obj_ids=list(range(1, len(places) + 1)),
+            original_size=(photo.height, photo.width),
+            **inputs,
         )
-        session.processed_frames = _Frames(self.processor, self.photos)
-        for frame, prompt in prompts.items():
-            self._prompt(session, frame, prompt)
-            self.model(inference_session=session, frame_idx=frame)  # encodes what is prompted before others are tracked
-        reverse = len(frames) > 1 and frames[1] < frames[0]
+        # The library keeps a prompt in memory only if its frame was not tracked before, and tracked frames about a lost
+        # one would tell that the object is absent.
+        for tracked in self.session.frames_tracked_per_obj.values():
+            tracked.pop(frame, None)
+        for outputs in self.session.output_dict_per_obj.values():
+            outputs["non_cond_frame_outputs"].clear()
+        self.model(inference_session=self.session, frame_idx=frame)  # encodes the prompt before others are tracked
+
+    @torch.inference_mode()
+    def track(self, frames: range) -> Iterator[tuple[int, np.ndarray]]:
         for frame in frames:
-            output = self.model(inference_session=session, frame_idx=frame, reverse=reverse)
+            output = self.model(inference_session=self.session, frame_idx=frame, reverse=frames.step < 0)
             photo = self.photos[frame]
-            low = output.pred_masks.float().reshape(1, 1, *output.pred_masks.shape[-2:])
+            parts = output.pred_masks.float().amax(dim=0, keepdim=True)
             logits = torch.nn.functional.interpolate(
-                low, (photo.height, photo.width), mode="bilinear", align_corners=False
+                parts, (photo.height, photo.width), mode="bilinear", align_corners=False
             )
             yield frame, logits[0, 0].cpu().numpy()
-            _forget(session, frame, KEPT_FRAMES)
+            self._forget(frame)
 
-    def _prompt(self, session: Any, frame: int, prompt: Prompt) -> None:
-        photo = self.photos[frame]
-        session.video_height, session.video_width = photo.height, photo.width  # photos may differ in size
-        inputs: dict[str, Any] = {}
-        if prompt.box is not None:
-            inputs["input_boxes"] = [[list(prompt.box)]]
-        if prompt.points:
-            inputs["input_points"] = [[[list(point) for point in prompt.points]]]
-            inputs["input_labels"] = [[[int(inside) for inside in prompt.inside]]]
-        self.processor.add_inputs_to_inference_session(
-            inference_session=session, frame_idx=frame, obj_ids=1, original_size=(photo.height, photo.width), **inputs
-        )
+    def _forget(self, frame: int) -> None:
+        """Drop memories of tracked frames far from ``frame``, and masks of full size, which have been encoded."""
+        for outputs in self.session.output_dict_per_obj.values():
+            tracked = outputs["non_cond_frame_outputs"]
+            for old in [other for other in tracked if abs(other - frame) > KEPT_FRAMES]:
+                del tracked[old]
+            for held in (*tracked.values(), *outputs["cond_frame_outputs"].values()):
+                held.pop("high_res_masks", None)
 
 
 class _Frames(dict):
@@ -158,28 +218,28 @@ class _Frames(dict):
         return self[frame]
 
 
-def _forget(session: Any, frame: int, kept: int) -> None:
-    """Drop the memories of tracked (not prompted) frames that lie more than ``kept`` frames away."""
-    for outputs in session.output_dict_per_obj.values():
-        tracked = outputs["non_cond_frame_outputs"]
-        for old in [other for other in tracked if abs(other - frame) > kept]:
-            del tracked[old]
-
-
-class GroundingDino:
-    """Grounding DINO as a ``two_stage.Detector``."""
+class TextDetector:
+    """SAM 3's detector or Grounding DINO as a ``two_stage.Detector``."""
 
     def __init__(self, model: Any, processor: Any, photos: Sequence[Photo], device: str = "cpu") -> None:
         self.model, self.processor, self.photos, self.device = model.to(device), processor, photos, device
 
     @torch.inference_mode()
     def detect(self, frame: int, text: str, threshold: float) -> list[tuple[Box, float]]:
-        photo = self.photos[frame]
-        phrase = text.strip().lower().rstrip(".") + "."  # the model is trained on such phrases
-        inputs = self.processor(images=photo.pixels(), text=phrase, return_tensors="pt").to(self.device)
-        output = self.model(**inputs)
-        found = self.processor.post_process_grounded_object_detection(
-            output, inputs["input_ids"], threshold=threshold, target_sizes=[(photo.height, photo.width)]
-        )[0]
+        photo, text = self.photos[frame], text.strip()
+        grounding = hasattr(self.processor, "post_process_grounded_object_detection")
+        if grounding:
+            text = text.lower().rstrip(".") + "."  # the model is trained on such phrases
+        inputs = self.processor(images=photo.pixels(), text=text, return_tensors="pt").to(self.device)
+        config = self.model.config
+        if inputs["input_ids"].shape[1] > getattr(config, "max_text_len", config.text_config.max_position_embeddings):
+            raise UserError(f"the text {text!r} is too long for the detector: name the object in a few words.")
+        output, sizes = self.model(**inputs), [(photo.height, photo.width)]
+        if grounding:
+            found = self.processor.post_process_grounded_object_detection(
+                output, inputs["input_ids"], threshold=threshold, target_sizes=sizes
+            )[0]
+        else:
+            found = self.processor.post_process_object_detection(output, threshold=threshold, target_sizes=sizes)[0]
         boxes = [tuple(float(value) for value in box) for box in found["boxes"]]
         return [(box, float(score)) for box, score in zip(boxes, found["scores"], strict=True)]  # type: ignore[misc]

@@ -14,15 +14,21 @@ from beags_plugin.system.errors import UserError
 
 Box = tuple[float, float, float, float]
 
+NEAR = 0.7  # stage 1 takes the boxes that score at least this share of the best one, as COB-GS does
+SURE = 0.85  # share of stage 1's best score that a box of stage 2 must reach too, as in COB-GS
+SEARCHED = 8  # views, evenly spread, in which a text is searched before the others
+EMPTY = 1e-4  # share of the image below which an object counts as lost
 
-class VideoPredictor(Protocol):
-    """Tracker of one object from prompted frames to others, such as SAM2."""
 
-    def track(self, prompts: Mapping[int, Prompt], frames: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield each frame and its logits [H, W] float32 (above 0: the object), independently of earlier calls.
+class Memory(Protocol):
+    """What a tracker such as SAM2 knows of one object: prompted frames, and frames tracked from them."""
 
-        frames: consecutive, up or down; the first is prompted.
-        """
+    def prompt(self, frame: int, places: Sequence[Prompt]) -> None:
+        """Remember the places of the object's parts in a frame; all earlier prompts stay."""
+        ...
+
+    def track(self, frames: range) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield consecutive frames, up or down, and the object's logits [H, W] float32 (above 0: the object)."""
         ...
 
 
@@ -39,15 +45,11 @@ class Retrieval:
     """Options of the retrieval.
 
     threshold: least score of a detection in stage 1; strict: the same in stage 2, where a wrong one would add an absent
-    object. searched: most frames of a run in which the text is searched. retries: repetitions of stage 2 for runs that
-    stay empty. least: share of the image below which an object counts as empty.
+    object.
     """
 
     threshold: float = 0.3
-    strict: float = 0.5
-    searched: int = 8
-    retries: int = 2
-    least: float = 1e-4
+    strict: float = 0.6
 
 
 class BestLabels:
@@ -81,90 +83,94 @@ def retrieve(
     objects: Sequence[PromptedObject],
     frame_of: Mapping[str, int],
     names: Sequence[str],
-    predictor: VideoPredictor,
+    new_memory: Callable[[], Memory],
     detector: Detector | None,
     best: BestLabels,
     options: Retrieval,
     progress: Callable[[int, int], None],
 ) -> list[str]:
-    """Track every object through all frames, then again through the runs of frames where it was lost.
+    """Track every object through all frames, then again where it was lost, in the same memory.
 
-    frame_of: view of a prompt to its frame. names: of all frames. detector: needed for an object with only a text.
-    Stage 1 starts at the first prompted frame (or the best detection) and goes both ways. In stage 2 the detector
-    searches, more strictly, each run where the object is empty; from a detection, tracking goes both ways in the run.
-    Returns sentences about runs that stayed empty. Raises ``UserError`` if an object is found in no frame.
+    frame_of: view of a prompt to its frame. names: of all frames. detector: needed for objects with a text.
+    Stage 1 starts at the first prompted frame (or at the detections) and goes both ways. In stage 2 the detector
+    searches each frame where the object is still empty; a detection joins the memory, and tracking goes both ways
+    through the empty run about it. Returns sentences about runs that stayed empty. Raises ``UserError`` if an object
+    is found in no frame.
     """
     notes: list[str] = []
     for index, one in enumerate(objects):
-        tracked = _Tracking(one, len(names), predictor, detector, best, options)
-        prompts = {frame_of[view]: prompt for view, prompt in one.prompts.items()}
-        if not prompts:
-            found = tracked.detected(range(len(names)), options.threshold)
-            if found is None:
-                raise UserError(
-                    f"{one.text!r} ({one.name}) is found in no view with a score of {options.threshold} or more: give "
-                    "it a box, another text, or a lower threshold."
-                )
-            prompts = dict([found])
-        tracked.both_ways(prompts, 0, len(names) - 1)
+        tracked = _Tracked(one, len(names), new_memory(), detector if one.text else None, best, options)
+        prompts = {frame_of[view]: [prompt] for view, prompt in one.prompts.items()}
+        for done, _ in enumerate(tracked.first_stage(prompts), index * len(names) + 1):
+            progress(done, len(objects) * len(names))
         tracked.second_stage()
-        lost = [f"{names[run[0]]} to {names[run[-1]]}" for run in runs_of(~tracked.seen)]
-        if lost:
+        if lost := [f"{names[run[0]]} to {names[run[-1]]}" for run in runs_of(~tracked.seen)]:
             notes.append(
                 f"{one.name} is empty from {'; '.join(lost[:5])}{' and in other runs' if len(lost) > 5 else ''}: if it "
                 "shows there, add a prompt in one of these views."
             )
-        progress(index + 1, len(objects))
     return notes
 
 
-class _Tracking:
-    """Tracking of one object, and the frames where it was found."""
+class _Tracked:
+    """An object, its memory, and the frames where it was found."""
 
-    def __init__(self, one, frames: int, predictor, detector, best: BestLabels, options: Retrieval) -> None:
-        self.one, self.predictor, self.detector, self.best, self.options = one, predictor, detector, best, options
+    def __init__(self, one: PromptedObject, frames: int, memory: Memory, detector, best: BestLabels, options) -> None:
+        self.one, self.memory, self.detector, self.best, self.options = one, memory, detector, best, options
         self.seen = np.zeros(frames, bool)
+        self.found: dict[int, list[tuple[Box, float]]] = {}  # by the detector, which is asked once about a frame
+        self.score = 0.0  # of the detection that tracking started at
 
-    def both_ways(self, prompts: Mapping[int, Prompt], first: int, last: int) -> None:
-        """Track from the first prompted frame up to ``last`` and down to ``first``."""
-        start = min(prompts)
-        for frames in [range(start, last + 1), range(start, first - 1, -1)]:
-            down = frames.step < 0
-            if down and len(frames) == 1:
-                continue
-            for frame, logits in self.predictor.track(prompts, frames):
-                if down and frame == start:
-                    continue  # already tracked upwards
-                if (logits > 0).sum() >= max(1.0, self.options.least * logits.size):
-                    self.seen[frame] = True
-                    self.best.add(frame, self.one.class_id, logits)
+    def first_stage(self, prompts: Mapping[int, Sequence[Prompt]]) -> Iterator[int]:
+        """Track from the first prompted frame, or from the best detection, to both ends; yield each frame."""
+        prompts = prompts or self._searched()
+        for frame, places in prompts.items():
+            self.memory.prompt(frame, places)
+        yield from self._both_ways(min(prompts), range(len(self.seen)))
 
     def second_stage(self) -> None:
-        """Prompt again in the runs where the object was lost, and track it in the run alone."""
-        if self.one.text is None or self.detector is None:
-            return
-        for _ in range(self.options.retries):
-            found_any = False
-            for run in runs_of(~self.seen):
-                found = self.detected(run, self.options.strict)
-                if found is not None:
-                    found_any = True
-                    self.both_ways(dict([found]), run[0], run[-1])
-            if not found_any:
-                return
+        """Ask the detector in every frame that is still empty, and track from what it finds through the empty run."""
+        least = max(self.options.strict, SURE * self.score)
+        for frame in np.flatnonzero(~self.seen).tolist():
+            if not self.seen[frame] and (places := self._detected(frame, least)):
+                self.memory.prompt(frame, places)
+                list(self._both_ways(frame, next(run for run in runs_of(~self.seen) if frame in run)))
 
-    def detected(self, frames: Sequence[int], threshold: float) -> tuple[int, Prompt] | None:
-        """Return the best detection in some evenly spread ``frames``: its frame, and its box as a prompt."""
-        if self.one.text is None or self.detector is None:
-            return None
-        count = min(self.options.searched, len(frames))
-        chosen = [frames[(2 * place + 1) * len(frames) // (2 * count)] for place in range(count)]
-        best: tuple[float, int, Box] | None = None
-        for frame in chosen:
-            for box, score in self.detector.detect(frame, self.one.text, threshold):
-                if score >= threshold and (best is None or score > best[0]):
-                    best = (score, frame, box)
-        return None if best is None else (best[1], Prompt(box=best[2]))
+    def _both_ways(self, start: int, run: range) -> Iterator[int]:
+        """Track up, then down, from a frame through a run; yield each frame."""
+        for frames in (range(start, run.stop), range(start - 1, run.start - 1, -1)):
+            for frame, logits in self.memory.track(frames):
+                if (logits > 0).sum() >= max(1.0, EMPTY * logits.size):
+                    self.seen[frame] = True
+                    self.best.add(frame, self.one.class_id, logits)
+                yield frame
+
+    def _searched(self) -> dict[int, list[Prompt]]:
+        """Return the frame of the best detection in some spread frames (if none, of the first in the others)."""
+        frames = len(self.seen)
+        spread = sorted({(2 * place + 1) * frames // (2 * SEARCHED) for place in range(SEARCHED)})
+        at = -1
+        for place, frame in enumerate([*spread, *(frame for frame in range(frames) if frame not in spread)]):
+            if place >= len(spread) and at >= 0:
+                break
+            self._detected(frame, self.options.threshold)
+            if (score := max((score for _, score in self.found[frame]), default=0.0)) > self.score:
+                at, self.score = frame, score
+        if at < 0:
+            raise UserError(
+                f"{self.one.text!r} ({self.one.name}) is found in no view with a score of {self.options.threshold} or "
+                "more: give it a box, another text, or a lower threshold."
+            )
+        return {at: self._detected(at, NEAR * self.score)}
+
+    def _detected(self, frame: int, least: float) -> list[Prompt]:
+        """Return the boxes in a frame that score ``least`` or more, the best first."""
+        if self.detector is None:
+            return []
+        if frame not in self.found:
+            found = self.detector.detect(frame, self.one.text, self.options.threshold)
+            self.found[frame] = sorted(found, key=lambda pair: -pair[1])
+        return [Prompt(box=box) for box, score in self.found[frame] if score >= least]
 
 
 def runs_of(mask: np.ndarray) -> list[range]:
