@@ -69,7 +69,7 @@ def viewed(config: Path, log: Path) -> Iterator[str]:
     with started(["-c", ENTRY, *options], log, "disabled local writer") as process:  # the last that it prints
         yield f"http://127.0.0.1:{port}"
         process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 0
+        assert process.wait(120) == 0
     assert log.read_text().rstrip().endswith("The viewer is closed.")
 
 

@@ -72,17 +72,15 @@ def test_objects_are_isolated_hidden_faded_and_removed(page):
     page.choose("Output type", "class_map")
     whole = awaited(page, lambda now: painted(now, "cup") > 0.01 < painted(now, "box"))
     page.choose("Object", "cup")
-    page.press("Isolate")
-    awaited(page, lambda now: painted(now, "box") < 0.001 and painted(now, "cup") > 0.9 * painted(whole, "cup"))
+    awaited(
+        page, lambda now: painted(now, "box") < 0.001 and painted(now, "cup") > 0.9 * painted(whole, "cup"), "Isolate"
+    )
     page.wait(lambda: struck(page) == "background,box")
-    page.press("Show all objects")
-    awaited(page, lambda now: painted(now, "box") > 0.01)
-    page.press("Hide")
-    awaited(page, lambda now: painted(now, "cup") < 0.001 and painted(now, "box") > 0.01)
+    awaited(page, lambda now: painted(now, "box") > 0.01, "Show all objects")
+    awaited(page, lambda now: painted(now, "cup") < 0.001 and painted(now, "box") > 0.01, "Hide")
     page.slide("Rest", 0.5)
     awaited(page, lambda now: painted(now, "cup") > 0.01)
-    page.press("Remove")
-    awaited(page, lambda now: painted(now, "cup") < 0.001 and painted(now, "box") > 0.01)
+    awaited(page, lambda now: painted(now, "cup") < 0.001 and painted(now, "box") > 0.01, "Remove")
     page.wait(lambda: struck(page) == "cup")
 
 
@@ -97,8 +95,7 @@ def test_the_sliders_fade_and_thin_out(page):
     page.slide("Least opacity", 0.9)
     awaited(page, lambda now: differing(now, whole) < 0.002)
     page.choose("Object", "box")
-    page.press("Isolate")
-    alone = awaited(page, lambda now: differing(now, whole) > 0.01)
+    alone = awaited(page, lambda now: differing(now, whole) > 0.01, "Isolate")
     page.slide("Rest", 0.2)
     awaited(page, lambda now: differing(now, whole) > 0.01 < differing(now, alone))
 
