@@ -22,7 +22,7 @@ picture of that."""
 KINDS = tuple(FIGURES)
 IMAGE_FIGURES = ("psnr", "psnr_shown", "shown", "psnr_objects", "ssim")
 """Of whole images. psnr_shown: over the pixels whose surface some training photo shows; shown: their share.
-psnr_objects: over the pixels of any object."""
+psnr_objects: over the pixels of any object but those next to the background."""
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from beags_plugin.evaluation.records import (
 )
 from beags_plugin.evaluation.removal import removal_metrics
 from beags_plugin.extraction.select import remove_class, select_class
+from beags_plugin.labels.borders import at_border
 from beags_plugin.labels.class_ids import IGNORE, resize_nearest
 from beags_plugin.losses.photometric import ssim
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
@@ -273,14 +274,20 @@ def removals(view: EvalView, objects: Sequence[int]) -> Iterator[tuple[int, Tens
 
 
 def object_pixels(view: EvalView) -> Tensor | None:
-    """Return [H, W] bool, the pixels of the photograph that show any object; None without a mask that says."""
+    """Return [H, W] bool, the pixels of the photograph inside the objects; None without a mask that says.
+
+    Those next to the background, which the photograph shows too, are left out.
+    """
     if view.visible_objects is not None:
         masks = list(view.visible_objects.values())
     else:
         masks = [] if view.visible is None else [(view.visible != 0) & (view.visible != IGNORE)]
     size = view.camera.height, view.camera.width
     found = [torch.from_numpy(resize_nearest(mask.cpu().numpy(), *size)) for mask in masks]
-    return torch.stack(found).any(dim=0) if found else None
+    if not found:
+        return None
+    inside = torch.stack(found).any(dim=0)
+    return inside & ~at_border(inside.int())
 
 
 def _of_others(masks: Mapping[int, Tensor], class_id: int) -> Tensor:
