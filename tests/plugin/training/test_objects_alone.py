@@ -12,7 +12,7 @@ import torch
 
 pytest.importorskip("nerfstudio")
 
-from data_folders import write_image
+from data_folders import noise, write_image
 from PIL import Image
 from raster_scenes import make_scene
 from resumed_runs import (
@@ -25,7 +25,7 @@ from resumed_runs import (
     short_config,
     without_clocks,
 )
-from run_folders import write_drawn_scene
+from run_folders import write_drawn_scene, write_trained
 
 from beags_plugin.evaluation.records import IMAGE_FIGURES
 from beags_plugin.labels.class_ids import IGNORE
@@ -33,6 +33,8 @@ from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.normal import NormalConsistencyLoss
 from beags_plugin.losses.photometric import PhotometricLoss
 from beags_plugin.plugin.objects.evaluate import EvaluatedRun
+from beags_plugin.plugin.presets import preset_config
+from beags_plugin.plugin.runs.prepared import photos_contradict
 from beags_plugin.plugin.runs.read import raster_settings, read_run
 from beags_plugin.plugin.views.objects_alone import objects_alone, of_objects
 from beags_plugin.rasterizers import make_rasterizer
@@ -114,3 +116,23 @@ def test_losses_move_depth_and_colour_in_their_pixels_alone():
     assert (leaves["color"].grad.any(dim=-1) == (labels != IGNORE)).all()
     moved, inside = leaves["depth"].grad != 0, labels == 2
     assert moved[inside].any() and not moved[~inside].any()
+
+
+@pytest.mark.parametrize("contradict", [False, True])
+def test_a_run_says_that_its_background_contradicts_itself(tmp_path, capsys, contradict):
+    """On photos of the very scene that it starts from, as they are and with other noise around the objects in each."""
+    write_drawn_scene(tmp_path / "data")
+    for index in range(9 if contradict else 0):
+        ids = np.asarray(Image.open(tmp_path / f"data/masks/v{index:02d}.png"))
+        photo = np.array(Image.open(tmp_path / f"data/images/v{index:02d}.png"))
+        photo[ids == 0] = noise(index, *ids.shape[::-1])[ids == 0]
+        write_image(tmp_path / f"data/images/v{index:02d}.png", photo)
+    write_trained(tmp_path / "base", tmp_path / "data", base=False)
+    frame = {"orientation_method": "none", "center_method": "none", "auto_scale_poses": False}
+    options = {f"pipeline.datamanager.dataparser.{name}": value for name, value in frame.items()}
+    config = preset_config("beags-refine", {**options, "pipeline.model.refine_steps": 1}, tmp_path)
+    config.data, config.run_dir, config.vis = tmp_path / "data", tmp_path / "run", "tensorboard"
+    config.load_dir = tmp_path / "base/nerfstudio_models"
+    run_to_end(config)
+    assert photos_contradict(tmp_path / "run") == contradict
+    assert ("--pipeline.datamanager.photos objects" in capsys.readouterr().out) == contradict
