@@ -25,6 +25,10 @@ class Process:
     output_dir: Path
     """Folder to write: images/, transforms.json, sparse_pc.ply, colmap/sparse/0, poses.json, poses.png."""
 
+    masks: Path | None = None
+    """Folder of id images <photo>.png: only what objects show is used, for turntables, where they turn and the room
+    stands."""
+
     def run(self) -> None:
         with starting(self):
             import numpy as np
@@ -32,7 +36,7 @@ class Process:
             from beags_plugin.pictures.poses import draw_poses
             from beags_plugin.posing.files import APPLIED, camera_to_world
             from beags_plugin.posing.process import process
-        report, model = process(self.data, self.output_dir, progress_bar)
+        report, model = process(self.data, self.output_dir, progress_bar, self.masks)
         images = [model.images[image_id] for image_id in model.reg_image_ids()]
         points = list(model.points3D.values())
         draw_poses(
@@ -44,4 +48,9 @@ class Process:
         )
         for line in (report.summary(), *report.notes):
             CONSOLE.print(line)
-        CONSOLE.print(f"  {self.output_dir / 'poses.png'}\n  ns-train beags-base --data {self.output_dir}")
+        command = f"ns-train beags-base --data {self.output_dir}"
+        if self.masks is not None:
+            command = f"ns-train beags-fast --data {self.output_dir} --pipeline.datamanager.photos objects"
+            if self.masks.resolve() != (self.output_dir / "masks").resolve():
+                command += f" beags-data --masks-path {self.masks.absolute()}"
+        CONSOLE.print(f"  {self.output_dir / 'poses.png'}\n  {command}")
