@@ -27,6 +27,8 @@ _COLUMNS = (  # head, figure, digits, factor
     ("shown, dB\nbefore", "psnr_shown_before", 2, 1.0),
     ("\nafter", "psnr_shown_after", 2, 1.0),
     ("\npixels", "shown_after", 1, 100.0),
+    ("objects, dB\nbefore", "psnr_objects_before", 2, 1.0),
+    ("\nafter", "psnr_objects_after", 2, 1.0),
     ("SSIM\nafter", "ssim_after", 3, 1.0),
     ("prepare\ns", "prepare", 1, 1.0),
     ("refine\ns", "seconds refinement", 1, 1.0),
@@ -50,6 +52,7 @@ def tables(experiment: Experiment, rows: Sequence[ResultRow]) -> list[Table | st
     if _any(rows, "removal_psnr_after"):
         printed.append("Removal: the scene without an object, against the exact picture; remains: pixels that show it.")
     printed.append("Shown: PSNR over the pixels (in %) whose surface some training view shows.")
+    printed.append("Objects: PSNR over the pixels of objects, but those next to the background.")
     printed.append("Seconds of stages are wall time; CPU: of the whole trial after its base, all threads.")
     printed.append("Memory: the peak of the trial's process, and what of it the loaded program does not take.")
     if experiment.reference is not None:

@@ -95,8 +95,8 @@ class Sample:
     views: int = 60
     """Views to train on; 12 more are held out."""
     family: str = "tabletop"
-    """tabletop: plain solids that touch, seen from all sides. room: a closed, furnished room with textured objects that
-    lean on and stand in one another, seen from one side of a table."""
+    """tabletop: plain solids that touch, seen from all sides. turntable: the same, but they turn and the room stands.
+    room: a furnished room with textured objects that lean on and stand in one another, seen from one side."""
 
     def run(self) -> None:
         with starting(self):

@@ -40,6 +40,7 @@ def run_demo(
     from beags_plugin.commands.made_scene import MadeScene, made_scene
     from beags_plugin.data.layout import read_dataset
     from beags_plugin.data.quick import quick_downscale
+    from beags_plugin.plugin.runs.prepared import photos_contradict
     from beags_plugin.sample.writer import make_sample
 
     preset = preset or (PRESET if data is None else PRESET_OF_PHOTOS)
@@ -61,21 +62,35 @@ def run_demo(
         downscale = downscale or quick_downscale(scene.data)
     run = output / "run"
     request = {"preset": preset, "downscale": downscale, "inputs": _digest(scene, preset)}
+    alone = {**request, "photos": "objects"}
+    if alone in (former := _read_stamp(output), former.get(STARTED)) and not fresh:
+        request = alone
+    _train_once(scene, output, request, fresh)
+    if request != alone and photos_contradict(run):
+        CONSOLE.print(
+            "The photos contradict each other outside the masks, as on a turntable: now with the objects' pixels alone."
+        )
+        _train_once(scene, output, alone, fresh)
+    measure(run, output, seconds)
+
+
+def _train_once(scene: MadeScene, output: Path, request: dict[str, Any], fresh: bool) -> None:
+    """Train what is requested, unless that was done before, or resume it."""
+    run = output / "run"
     if not fresh and _trained(output, request):
         CONSOLE.print(f"Trained before: {run} (add --fresh to train again).")
+        return
+    if run.exists() and not (output / STAMP).exists():
+        raise UserError(f"{run} is not the demo's: choose another --output, or move it away.")
+    if run.is_dir():
+        run_lock(run).release()  # refuses if the same demo is being trained
+    if not fresh and _interrupted(output, request):
+        resume(run)
     else:
-        if run.exists() and not (output / STAMP).exists():
-            raise UserError(f"{run} is not the demo's: choose another --output, or move it away.")
-        if run.is_dir():
-            run_lock(run).release()  # refuses if the same demo is being trained
-        if not fresh and _interrupted(output, request):
-            resume(run)
-        else:
-            shutil.rmtree(run, ignore_errors=True)
-            write_stamp(output, {STARTED: request})
-            train(scene, run, preset, downscale)
-        write_stamp(output, request)
-    measure(run, output, seconds)
+        shutil.rmtree(run, ignore_errors=True)
+        write_stamp(output, {STARTED: request})
+        train(scene, run, request["preset"], request["downscale"], request.get("photos", "all"))
+    write_stamp(output, request)
 
 
 def check_preset(preset: str) -> None:
@@ -120,11 +135,11 @@ def _interrupted(output: Path, request: dict[str, Any]) -> bool:
     return _read_stamp(output).get(STARTED) == request and (output / "run" / "config.yml").exists()
 
 
-def train(scene: MadeScene, run: Path, preset: str, downscale: float) -> None:
+def train(scene: MadeScene, run: Path, preset: str, downscale: float, photos: str) -> None:
     """Run ns-train in a process of its own, as a user would."""
     command = [
         str(Path(sys.executable).parent / "ns-train"), preset, "--data", str(scene.data),
-        "--run-dir", str(run.absolute()), "--vis", "tensorboard",
+        "--run-dir", str(run.absolute()), "--vis", "tensorboard", "--pipeline.datamanager.photos", photos,
         "beags-data", "--downscale-factor", str(downscale), *scene.options(),
     ]  # fmt: skip
     CONSOLE.print("$ " + " ".join(command))

@@ -11,6 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from beags_plugin.commands.process import find_poses
+from beags_plugin.data.layout import fitting_layouts
 from beags_plugin.system.digests import folder_digest, value_digest
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.whole_files import write_text_atomically
@@ -42,7 +43,7 @@ def made_scene(data: Path, output: Path) -> MadeScene:
     same photos is taken as it is; masks also where the user has mended them. Raises ``UserError``; where masks cannot
     be made, before poses are computed.
     """
-    if data.is_dir() and _posed(data):
+    if data.is_dir() and fitting_layouts(data):
         if _has_masks(data):
             return MadeScene(data)
         _check_source()
@@ -55,13 +56,6 @@ def made_scene(data: Path, output: Path) -> MadeScene:
     for line in find_poses(data, scene, nullcontext()):
         CONSOLE.print(line)
     return MadeScene(scene, given or _made_masks(scene, scene))
-
-
-def _posed(data: Path) -> bool:
-    """Return whether any layout recognises the folder."""
-    from beags_plugin.data import LAYOUTS
-
-    return any(LAYOUTS.get(name)().recognises(data) for name in LAYOUTS.names())
 
 
 def _has_masks(data: Path) -> bool:

@@ -26,16 +26,26 @@ class Process:
     output_dir: Path
     """Folder to write: images/, transforms.json, sparse_pc.ply, colmap/sparse/0, poses.json, poses.png."""
 
+    masks: Path | None = None
+    """Folder of id images <photo>.png: only what objects show is used, for turntables, where they turn and the room
+    stands."""
+
     def run(self) -> None:
-        for line in find_poses(self.data, self.output_dir, starting(self)):
+        for line in find_poses(self.data, self.output_dir, starting(self), self.masks):
             CONSOLE.print(line)
-        CONSOLE.print(f"  ns-train beags-base --data {self.output_dir}")
+        command = f"ns-train beags-base --data {self.output_dir}"
+        if self.masks is not None:
+            command = f"ns-train beags-fast --data {self.output_dir} --pipeline.datamanager.photos objects"
+            if self.masks.resolve() != (self.output_dir / "masks").resolve():
+                command += f" beags-data --masks-path {self.masks.absolute()}"
+        CONSOLE.print(f"  {command}")
 
 
-def find_poses(data: Path, output: Path, start: AbstractContextManager[None]) -> list[str]:
+def find_poses(data: Path, output: Path, start: AbstractContextManager[None], masks: Path | None = None) -> list[str]:
     """Write the poses of photos or a video, and their picture, into ``output``; return lines that report them.
 
-    start: shown while what is needed is imported. Raises ``UserError`` as ``posing.process.process`` does.
+    start: shown while what is needed is imported. masks: see ``Process``. Raises ``UserError`` as
+    ``posing.process.process`` does.
     """
     with start:
         import numpy as np
@@ -43,7 +53,7 @@ def find_poses(data: Path, output: Path, start: AbstractContextManager[None]) ->
         from beags_plugin.pictures.poses import draw_poses
         from beags_plugin.posing.files import APPLIED, camera_to_world
         from beags_plugin.posing.process import REPORT, process
-    report, model = process(data, output, progress_bar)
+    report, model = process(data, output, progress_bar, masks)
     picture = output / "poses.png"
     if not picture.exists() or picture.stat().st_mtime < (output / REPORT).stat().st_mtime:
         images = [model.images[image_id] for image_id in model.reg_image_ids()]

@@ -61,9 +61,7 @@ def find_layout(data: Path, wanted: str = "auto") -> Layout:
                 f"{data} holds {lacks}, which the layout {wanted} needs: correct --data, or choose another layout."
             )
         return layout
-    layouts: dict[str, Layout] = {name: LAYOUTS.get(name)() for name in LAYOUTS.names()}
-    fitting = {name for name, layout in layouts.items() if layout.recognises(data)}
-    special = sorted(fitting - {coarser for name in fitting for coarser in layouts[name].refines})
+    layouts, special = _all_layouts(), fitting_layouts(data)
     if not special:
         others = ", ".join(
             f"{layout.marks} ({name})" for name, layout in layouts.items() if name not in ("nerfstudio", "colmap")
@@ -76,3 +74,14 @@ def find_layout(data: Path, wanted: str = "auto") -> Layout:
         found = " and ".join(f"{layouts[name].marks} ({name})" for name in special)
         raise UserError(f"{data} holds {found}: choose one of them with beags-data --layout NAME.")
     return layouts[special[0]]
+
+
+def fitting_layouts(data: Path) -> list[str]:
+    """Return the names of the layouts that ``data`` may have, but coarser ones of which another is a refinement."""
+    layouts = _all_layouts()
+    fitting = {name for name, layout in layouts.items() if layout.recognises(data)}
+    return sorted(fitting - {coarser for name in fitting for coarser in layouts[name].refines})
+
+
+def _all_layouts() -> dict[str, Layout]:
+    return {name: LAYOUTS.get(name)() for name in LAYOUTS.names()}

@@ -20,8 +20,9 @@ FIGURES: dict[Kind, tuple[str, ...]] = {**dict.fromkeys(MASK_KINDS, METRICS), "r
 """The names of the figures of each kind. removal: the scene rendered without the object, where the data has an exact
 picture of that."""
 KINDS = tuple(FIGURES)
-IMAGE_FIGURES = ("psnr", "psnr_shown", "shown", "ssim")
-"""Of whole images. psnr_shown: over the pixels whose surface some training photo shows; shown: their share."""
+IMAGE_FIGURES = ("psnr", "psnr_shown", "shown", "psnr_objects", "ssim")
+"""Of whole images. psnr_shown: over the pixels whose surface some training photo shows; shown: their share.
+psnr_objects: over the pixels of any object but those next to the background."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ class MaskRecord:
 class ViewRecord:
     """The image of one view: its name, PSNR in dB (infinite for equal images) and SSIM; None without a photograph.
 
-    psnr_shown, shown: see ``IMAGE_FIGURES``; None where that is not known, the former without such pixels too.
+    The others: see ``IMAGE_FIGURES``; None where that is not known, or no pixel is such.
     """
 
     name: str
@@ -84,6 +85,7 @@ class ViewRecord:
     ssim: float | None
     psnr_shown: float | None = None
     shown: float | None = None
+    psnr_objects: float | None = None
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ class SceneMetrics:
     """The figures of a scene over all its views.
 
     mean: over the scene, as the protocol says. objects: object id to the mean over its masks. psnr: dB, mean over the
-    views with a photograph, infinite for equal images; None without any. ssim, psnr_shown, shown: likewise.
+    views with a photograph, infinite for equal images; None without any. Other ``IMAGE_FIGURES``: likewise.
     extracted_truth: "silhouette" (occlusion-free), "visible" (without the pixels where another object hides this one),
     "both", or None. masks, views: the single figures behind these means.
     """
@@ -105,3 +107,4 @@ class SceneMetrics:
     views: tuple[ViewRecord, ...] = ()
     psnr_shown: float | None = None
     shown: float | None = None
+    psnr_objects: float | None = None

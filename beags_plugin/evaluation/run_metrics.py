@@ -27,6 +27,7 @@ from beags_plugin.evaluation.records import (
 )
 from beags_plugin.evaluation.removal import removal_metrics
 from beags_plugin.extraction.select import remove_class, select_class
+from beags_plugin.labels.borders import at_border
 from beags_plugin.labels.class_ids import IGNORE, resize_nearest
 from beags_plugin.losses.photometric import ssim
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
@@ -43,6 +44,7 @@ def evaluate_scene(
     *,
     protocol: Protocol | None = None,
     complete: bool = True,
+    objects_alone: bool = False,
     background: Tensor | None = None,
     shown: Sequence[Tensor] | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -51,7 +53,8 @@ def evaluate_scene(
 
     surfels: N Gaussians. class_ids: [N] int32, phi; None scores images alone. classes: id to name; the background, 0,
     is not scored. complete: False where Gaussians were taken out of the scene, so that only extracted masks can be
-    scored. background: [3] behind the images; black if None. shown: per view [H, W] bool, see ``shown_pixels``.
+    scored. objects_alone: the scene was trained on nothing but objects: of images, only their pixels are scored.
+    background: [3] behind the images; black if None. shown: per view [H, W] bool, see ``shown_pixels``.
     progress: receives (done, total) views.
     """
     protocol = protocol or Protocol()
@@ -72,12 +75,15 @@ def evaluate_scene(
             image = ViewRecord(view.name, None, None)
             if complete and view.image is not None:
                 color, photo = renderer.image(surfels, background), view.image.to(surfels.means)
-                image = ViewRecord(view.name, psnr(color, photo), float(ssim(color, photo)))
-                if shown is not None:
+                if not objects_alone:
+                    image = ViewRecord(view.name, psnr(color, photo), float(ssim(color, photo)))
+                if (of_objects := object_pixels(view)) is not None and of_objects.any():
+                    image = replace(image, psnr_objects=psnr(color[of_objects], photo[of_objects]))
+                if shown is not None and not objects_alone:
                     of_view = shown[index]
                     over = psnr(color[of_view], photo[of_view]) if of_view.any() else None
                     image = replace(image, psnr_shown=over, shown=float(of_view.double().mean()))
-                for class_id, exact, silhouette, known in removals(view, objects):
+                for class_id, exact, silhouette, known in removals(view, [] if objects_alone else objects):
                     assert class_ids is not None
                     rest = renderer.image(remove_class(surfels, class_ids, class_id)[0], background)
                     known = None if known is None else known.to(rest.device)
@@ -265,6 +271,23 @@ def removals(view: EvalView, objects: Sequence[int]) -> Iterator[tuple[int, Tens
         )
         if class_id in objects and silhouette is not None:
             yield class_id, exact, silhouette, shown
+
+
+def object_pixels(view: EvalView) -> Tensor | None:
+    """Return [H, W] bool, the pixels of the photograph inside the objects; None without a mask that says.
+
+    Those next to the background, which the photograph shows too, are left out.
+    """
+    if view.visible_objects is not None:
+        masks = list(view.visible_objects.values())
+    else:
+        masks = [] if view.visible is None else [(view.visible != 0) & (view.visible != IGNORE)]
+    size = view.camera.height, view.camera.width
+    found = [torch.from_numpy(resize_nearest(mask.cpu().numpy(), *size)) for mask in masks]
+    if not found:
+        return None
+    inside = torch.stack(found).any(dim=0)
+    return inside & ~at_border(inside.int())
 
 
 def _of_others(masks: Mapping[int, Tensor], class_id: int) -> Tensor:

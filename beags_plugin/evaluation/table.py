@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 _HEADINGS = {"acc": "Acc", "iou": "IoU", "biou": "BIoU", "psnr": "PSNR", "ssim": "SSIM", "remains": "remains"}
-_HEADINGS |= {"psnr_shown": "shown", "shown": "pixels"}
-_IN_IMAGES = ("psnr", "psnr_shown", "ssim")
+_HEADINGS |= {"psnr_shown": "shown", "shown": "pixels", "psnr_objects": "objects"}
+_IN_IMAGES = ("psnr", "psnr_shown", "psnr_objects", "ssim")
 _STAGE_NAMES = {"before": "assigned", "after": "refined"}  # in summary.json
 _Row = tuple[str, Mapping[str, Any], Mapping[str, Any] | None]
 """A row's name, its metrics {kind: {stage: {metric: value}}}, and its ``IMAGE_FIGURES`` or None."""
@@ -65,10 +65,13 @@ def render_run(
     else:
         parts.append(Text(run.scene))
     lines = []
-    if run.after.psnr is not None:
-        share = _cell("shown", run.after.shown)
-        of_images = {"psnr": "PSNR, dB", "psnr_shown": f"PSNR of the {share} % shown, dB", "ssim": "SSIM"}
-        for metric, title in of_images.items():
+    share = _cell("shown", run.after.shown)
+    of_images = {
+        "psnr": "PSNR, dB", "psnr_shown": f"PSNR of the {share} % shown, dB",
+        "psnr_objects": "PSNR inside the objects, dB", "ssim": "SSIM",
+    }  # fmt: skip
+    for metric, title in of_images.items():
+        if getattr(run.after, metric) is not None:
             lines.append(f"{title}: " + " → ".join(_cell(metric, content[metric][stage]) for stage in stages))
     if seconds:
         lines.append("Seconds: " + ", ".join(f"{stage} {value:.1f}" for stage, value in seconds.items()))

@@ -23,6 +23,7 @@ from beags_plugin.plugin.training.scene_model import LastRender, SceneModel
 from beags_plugin.plugin.viewer.panel import ObjectPanel, ViewerLink
 from beags_plugin.plugin.viewer.viewing import Viewing, asked_by_viewer, scene_outputs
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
+from beags_plugin.plugin.views.objects_alone import of_objects, where_known
 from beags_plugin.rasterizers.interface import RasterOutputs, SurfelInputs
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.system.devices import to_device_async
@@ -63,12 +64,14 @@ class BeagsModel(SceneModel):
 
     def _training_outputs(self, cameras: Cameras) -> dict[str, Any]:
         self.clock.mark("data")
-        known = (cameras.metadata or {}).get("camera")  # whose numbers the host has too
+        metadata = cameras.metadata or {}
+        known = metadata.get("camera")  # whose numbers the host has too
         camera = known or camera_from_nerfstudio(cameras, 0).to(self.device)
         needs = frozenset().union(*(loss.needs for loss in self.active_losses().values()))
-        labels = (cameras.metadata or {}).get("labels")
+        labels = metadata.get("labels")
         against = labels if "boundary" in needs else None
-        background = self._training_background()
+        # behind objects alone, a colour that no Gaussian can learn
+        background = self._training_background(random=metadata.get("objects_alone", False))
         class_ids = None if against is None else self.class_ids
         inputs = surfel_inputs(self.surfels(), camera, self.active_sh_degree(), class_ids)
         if self.growing:
@@ -82,8 +85,8 @@ class BeagsModel(SceneModel):
             outputs["depth"] = render.depth[..., None]
         return outputs
 
-    def _training_background(self) -> Tensor:
-        if self.config.background_color == "random":
+    def _training_background(self, random: bool) -> Tensor:
+        if random or self.config.background_color == "random":
             return to_device_async(torch.rand(3, generator=self.generator(self.step)), self.device)
         return fixed_background(self.config, self.device)
 
@@ -109,7 +112,8 @@ class BeagsModel(SceneModel):
         metrics: dict[str, Any] = {"gaussian_count": self.num_points}
         if self.measuring:
             with torch.no_grad():
-                metrics["psnr"] = psnr(outputs["rgb"], self._truth(batch, outputs["background"]))
+                image = self._truth(batch, outputs["background"])
+                metrics["psnr"] = psnr(where_known(outputs["rgb"], image, batch), image)
         return metrics
 
     def get_loss_dict(
@@ -124,7 +128,7 @@ class BeagsModel(SceneModel):
             seed=self.seed,
             surfels=self.surfels(),
             camera=self.last_render.camera,
-            render=self.last_render.render,
+            render=of_objects(self.last_render.render, image, batch),
             image=image,
             labels=self.last_render.labels,
             class_ids=self.class_ids,

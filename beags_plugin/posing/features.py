@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
+from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.posing.photos import Look, Photo, look_at
 from beags_plugin.system.progress import counted
 from beags_plugin.system.reading.images import read_image
@@ -32,7 +34,8 @@ def add_features(database: Any, photos: Sequence[Photo], progress: Callable[[int
         looks.append(look_at(grey))
         if photo.key in known:
             continue
-        points, descriptors = _features(finder, grey)
+        inside = None if photo.mask is None else _inside(read_id_mask(photo.mask))
+        points, descriptors = _features(finder, grey, inside)
         with pycolmap.DatabaseTransaction(database):  # a photo is there with its features, or not at all
             if _lens_of(photo) not in cameras:
                 cameras[_lens_of(photo)] = _write_camera(database, photo)
@@ -55,15 +58,24 @@ def _lens_of(photo: Photo) -> tuple[int, int, float | None]:
     return photo.width, photo.height, photo.focal
 
 
-def _features(finder: Any, grey: np.ndarray) -> tuple[np.ndarray, Any]:
-    """Return points [N, 4] float32 (x, y, scale, direction; 0.5 is a pixel's middle) and COLMAP's RootSIFT [N, 128]."""
+def _inside(ids: np.ndarray) -> np.ndarray:
+    """Return [H, W] uint8, not 0 in the pixels of objects."""
+    return np.uint8(255) * ((ids != BACKGROUND) & (ids != IGNORE))
+
+
+def _features(finder: Any, grey: np.ndarray, inside: np.ndarray | None = None) -> tuple[np.ndarray, Any]:
+    """Return points [N, 4] float32 (x, y, scale, direction; 0.5 is a pixel's middle) and COLMAP's RootSIFT [N, 128].
+
+    inside: [H, W] uint8, 0 where no point may lie.
+    """
     import cv2
     import pycolmap
 
     factor = min(1.0, LARGEST / max(grey.shape))
     if factor < 1:
         grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    found, raw = finder.detectAndCompute(grey, None)
+        inside = None if inside is None else cv2.resize(inside, grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    found, raw = finder.detectAndCompute(grey, inside)
     if raw is None:
         found, raw = (), np.zeros((0, 128), np.float32)
     table = [(one.pt[0] + 0.5, one.pt[1] + 0.5, one.size / 2, np.deg2rad(one.angle)) for one in found]

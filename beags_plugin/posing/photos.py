@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
@@ -38,7 +38,8 @@ _LYING = (5, 6, 7, 8)  # its values that swap width and height
 class Photo:
     """A photo of the scene: the file given, the scene's upright copy (or the same), and what the given one's head says.
 
-    width, height: in pixels, upright. turned: the given one is not. focal: in pixels, if EXIF tells it.
+    width, height: in pixels, upright. turned: the given one is not. focal: in pixels, if EXIF tells it. mask: id image
+    of the objects that features may lie on; None for all of the photo.
     """
 
     source: Path
@@ -48,6 +49,7 @@ class Photo:
     turned: bool
     focal: float | None
     digest: str
+    mask: Path | None = None
 
     @property
     def key(self) -> str:
@@ -103,6 +105,32 @@ def _checked(source: Path, path: Path) -> Photo:
     lens = pycolmap.infer_camera_from_image(source)
     focal = float(lens.mean_focal_length()) if lens.has_prior_focal_length else None
     return Photo(source, path, width, height, turned != 1, focal, content_digest([source])[:_DIGITS])
+
+
+def with_masks(photos: Sequence[Photo], folder: Path) -> list[Photo]:
+    """Return photos with the id images <stem>.png of a folder; raises ``UserError`` where these do not fit."""
+    found = []
+    for photo in photos:
+        mask = folder / f"{photo.path.stem}.png"
+        if not mask.is_file():
+            found.append(photo)
+            continue
+        if photo.turned:
+            raise UserError(
+                f"the photo {photo.source} is stored on its side, which its mask may be or not: make masks of the "
+                "upright copies that beags process writes without --masks, and give their folder as --data."
+            )
+        if (size := image_size(mask, "the mask")) != (photo.width, photo.height):
+            raise UserError(
+                f"the mask {mask} is {size[0]}x{size[1]} pixels but its photo {photo.width}x{photo.height}: make it "
+                "from the photo as it is."
+            )
+        found.append(replace(photo, mask=mask, digest=content_digest([photo.source, mask])[:_DIGITS]))
+    if not any(photo.mask for photo in found):
+        raise UserError(
+            f"no mask in {folder} has the name of a photo ({photos[0].path.stem}.png, ...): correct --masks."
+        )
+    return found
 
 
 def copy_photos(photos: Sequence[Photo], bar: Bar) -> None:

@@ -14,7 +14,17 @@ from beags_plugin.posing.features import add_features, coarse_descriptors, forge
 from beags_plugin.posing.files import MODEL, POINTS, TRANSFORMS, write_scene
 from beags_plugin.posing.mapping import match, place, refine
 from beags_plugin.posing.pairs import COARSE, choose_pairs, likeness
-from beags_plugin.posing.photos import FEWEST, Look, Photo, blurred, check_photos, copy_photos, find_photos, repeated
+from beags_plugin.posing.photos import (
+    FEWEST,
+    Look,
+    Photo,
+    blurred,
+    check_photos,
+    copy_photos,
+    find_photos,
+    repeated,
+    with_masks,
+)
 from beags_plugin.posing.video import VIDEO_SUFFIXES, find_frames, write_frames
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.lock import run_lock
@@ -82,9 +92,10 @@ class Kept:
         write_text_atomically(json.dumps(asdict(self)) + "\n", work / KEPT)
 
 
-def process(data: Path, output: Path, bar: Bar) -> tuple[Posed, Any]:
+def process(data: Path, output: Path, bar: Bar, masks: Path | None = None) -> tuple[Posed, Any]:
     """Find the poses of photos and write them into ``output``; returns the report and pycolmap's reconstruction.
 
+    masks: folder of id images <photo>.png, outside of whose objects no feature is used.
     Raises ``UserError`` where the photos cannot be used, or fewer than three of them fit together.
     """
     if find_spec("pycolmap") is None:
@@ -96,6 +107,8 @@ def process(data: Path, output: Path, bar: Bar) -> tuple[Posed, Any]:
     if (output / TRANSFORMS).exists() and not ((output / REPORT).exists() or (work / KEPT).exists()):
         raise UserError(f"{output / TRANSFORMS} holds poses of another program: give another --output-dir.")
     video = data.is_file() and data.suffix.lower() in VIDEO_SUFFIXES
+    if masks is not None and not masks.is_dir():
+        raise UserError(f"{masks} is no folder: give --masks that of the id images.")
     if data.is_file() and not video:
         raise UserError(
             f"{data} is no video that is known by its name ({', '.join(VIDEO_SUFFIXES)}): give a folder of photos."
@@ -103,16 +116,21 @@ def process(data: Path, output: Path, bar: Bar) -> tuple[Posed, Any]:
     found = find_frames(data, work / "frames", bar) if video else find_photos(data)
     if list_images(images) and not (work / KEPT).exists() and found[0].parent.resolve() != images.resolve():
         raise UserError(f"{images} holds photos already: give another --output-dir, or these as --data.")
-    photos = [] if video else check_photos(found, images, bar)
+    photos = [] if video else _checked(found, images, masks, bar)
     lock = run_lock(output, "being given poses")
     try:
         if video:
             write_frames(data, found, bar)
-            photos = check_photos(found, images, bar)
+            photos = _checked(found, images, masks, bar)
         with writing(output):
             return _process(photos, output, bar)
     finally:
         lock.release()
+
+
+def _checked(found: list[Path], images: Path, masks: Path | None, bar: Bar) -> list[Photo]:
+    photos = check_photos(found, images, bar)
+    return photos if masks is None else with_masks(photos, masks)
 
 
 def _process(photos: list[Photo], output: Path, bar: Bar) -> tuple[Posed, Any]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from beags_plugin.sample.arrangement import make_still
-from beags_plugin.sample.lighting import Light
+from beags_plugin.sample.lighting import Light, TurntableLight
 from beags_plugin.sample.room import make_room
 from beags_plugin.sample.room_light import RoomLight
 from beags_plugin.sample.room_views import room_views
@@ -26,5 +26,6 @@ class Family:
 
 FAMILIES = {
     "tabletop": Family(make_still, Light, make_views),
+    "turntable": Family(make_still, TurntableLight, make_views),
     "room": Family(make_room, RoomLight, room_views),
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from beags_plugin.sample.arrangement import DOME, DOME_RADIUS, GROUND, Still
+from beags_plugin.sample.arrangement import DOME, DOME_RADIUS, GROUND, Still, turn_z
 from beags_plugin.sample.solids import dot, turned
 from beags_plugin.sample.tracing import seen_share
 
@@ -61,9 +61,14 @@ class Light:
     def _lit(self, albedo: np.ndarray, sun: np.ndarray, sky: np.ndarray) -> np.ndarray:
         return albedo * (sun[:, None] * SUN + sky[:, None] * SKY)
 
-    def _ground(self, points: np.ndarray) -> np.ndarray:
+    def _standing(self, points: np.ndarray, center: np.ndarray) -> np.ndarray:
+        """Return background points [N, 3] in the room's frame, as a camera at ``center`` [3] sees them."""
+        return points
+
+    def _ground(self, place: np.ndarray, center: np.ndarray) -> np.ndarray:
         """Colour tiles of mottled stone, whose pattern fades outwards, where small images would alias."""
         palette, noise = self.still.palette, self.still.noise
+        points = self._standing(place, center)
         tile = points[:, :2] * TILES
         cell = np.floor(tile)
         flat = np.zeros_like(points)
@@ -79,13 +84,14 @@ class Light:
         albedo = albedo * (0.34 + 0.33 * fade * shade + 0.48 * stone + 0.33 * patch)[:, None]
         joint = fade * (np.max(np.abs(tile - cell - 0.5), axis=1) > 0.465)
         albedo = albedo * (1.0 - 0.5 * joint)[:, None]
-        sun = self._read(self._sun_map, points) * self.still.sun[2]
-        sky = 0.15 + 0.85 * self._read(self._sky_map, points)  # some light is thrown back everywhere
+        sun = self._read(self._sun_map, place) * self.still.sun[2]
+        sky = 0.15 + 0.85 * self._read(self._sky_map, place)  # some light is thrown back everywhere
         return self._lit(albedo, sun, sky)
 
-    def _dome(self, points: np.ndarray) -> np.ndarray:
+    def _dome(self, points: np.ndarray, center: np.ndarray) -> np.ndarray:
         """Colour a curtain of soft folds with clouds of colour, which shines by itself and has no shading."""
         palette, noise = self.still.palette, self.still.noise
+        points = self._standing(points, center)
         height = points[:, 2] / DOME_RADIUS
         cloud = noise(points * 1.1) * 0.6 + noise(points * 2.7 + 5.0) * 0.4
         weight = 0.5 + 0.5 * np.tanh(7.0 * (cloud - 0.5))
@@ -107,15 +113,27 @@ class Light:
         sky = (0.62 + 0.38 * normals[:, 2]) * (0.55 + 0.45 * np.clip(points[:, 2] / 0.25, 0.0, 1.0))
         return self._lit(thing.texture(local), sun, sky)
 
-    def colours(self, points: np.ndarray, surface: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    def colours(
+        self, points: np.ndarray, surface: np.ndarray, directions: np.ndarray, center: np.ndarray
+    ) -> np.ndarray:
         """See ``scene.Lighting``."""
         colours = np.empty_like(points)
         for which in np.unique(surface):
             chosen = np.flatnonzero(surface == which)
             if which == DOME:
-                colours[chosen] = self._dome(points[chosen])
+                colours[chosen] = self._dome(points[chosen], center)
             elif which == GROUND:
-                colours[chosen] = self._ground(points[chosen])
+                colours[chosen] = self._ground(points[chosen], center)
             else:
                 colours[chosen] = self._object(int(which), points[chosen])
         return colours
+
+
+class TurntableLight(Light):
+    """The light of a still life that turns before a camera: ground and curtain stand as the camera does.
+
+    The lamps turn with the objects, so that they keep their shading and their shadows.
+    """
+
+    def _standing(self, points: np.ndarray, center: np.ndarray) -> np.ndarray:
+        return turned(points, turn_z(float(np.arctan2(center[1], center[0]))))

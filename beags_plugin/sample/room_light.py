@@ -63,7 +63,9 @@ class RoomLight:
         bounced = 0.25 + 0.75 * SHARES / len(self._ways) * bounced
         return direct[:, None] * LAMP + bounced[:, None] * BOUNCE
 
-    def colours(self, points: np.ndarray, surface: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    def colours(
+        self, points: np.ndarray, surface: np.ndarray, directions: np.ndarray, center: np.ndarray
+    ) -> np.ndarray:
         """See ``scene.Lighting``."""
         albedo, normals = np.empty_like(points), np.empty_like(points)
         for which in np.unique(surface):

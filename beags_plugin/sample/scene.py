@@ -69,11 +69,13 @@ class Scene(ABC):
 
 
 class Lighting(Protocol):
-    """The light of a scene; it makes surfaces look the same from every view."""
+    """The light of a scene; it makes surfaces look the same from every view, but for a turntable's background."""
 
-    def colours(self, points: np.ndarray, surface: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    def colours(
+        self, points: np.ndarray, surface: np.ndarray, directions: np.ndarray, center: np.ndarray
+    ) -> np.ndarray:
         """Return [N, 3] linear RGB (may exceed 1) of world points [N, 3] that rays along ``directions`` hit first.
 
-        surface: [N], as in ``Hits.surface``.
+        surface: [N], as in ``Hits.surface``. center: [3], the camera's position.
         """
         ...

@@ -164,7 +164,7 @@ def _pixels(
     for start in range(0, len(directions), chunk):
         part = directions[start : start + chunk]
         hits, _ = first_hits(scene, view.center, part, without)
-        colours = light.colours(view.center + hits.t[:, None] * part, hits.surface, part)
+        colours = light.colours(view.center + hits.t[:, None] * part, hits.surface, part, view.center)
         pieces.append(np.minimum(colours, 1.0).reshape(-1, per_pixel, 3).mean(axis=1))
     return np.floor(255.0 * np.concatenate(pieces) ** (1.0 / 2.2) + 0.5).astype(np.uint8)
 

@@ -35,7 +35,8 @@ SAMPLE_FILE = "sample.json"
 class SampleConfig:
     """Options that decide every byte of the sample.
 
-    family: of scenes: "tabletop" (solids on the ground, seen from all sides) or "room" (a closed room, see ``room``).
+    family: of scenes: "tabletop" (solids on the ground, seen from all sides), "turntable" (the same views of the same
+        solids, which turn while ground and curtain stand) or "room" (a closed room, see ``room``).
     seed: of arrangement, sizes, colours, textures, light, camera jitter, mask degradation.
     width, height: pixels. num_train, num_test: views.
     degradation: of the train masks: "none", "mild", "strong", a degree as text ("1.5"), or a ``Degradation``.

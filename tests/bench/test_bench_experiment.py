@@ -15,7 +15,6 @@ from beags_plugin.bench.experiment import experiment_names, load_experiment
 from beags_plugin.bench.scenes import SEEDS, TrialScene
 from beags_plugin.bench.trials import MODEL, Trial, plan, steps_of
 from beags_plugin.plugin.presets import preset_config, preset_names
-from beags_plugin.sample.families import FAMILIES
 from beags_plugin.system.errors import UserError
 
 
@@ -32,7 +31,7 @@ def test_scenes_for_choosing_and_for_reporting_are_kept_apart(name):
     experiment = load_experiment(name)
     seeds = {seed for _, seed in experiment.samples}
     assert seeds == set(SEEDS["reporting"]) if name in REPORTING else seeds <= set(SEEDS["choosing"])
-    assert {family for family, _ in experiment.samples} == set(FAMILIES)
+    assert {family for family, _ in experiment.samples} == {"tabletop", "room"}
     assert not set(SEEDS["choosing"]) & set(SEEDS["reporting"]) and experiment.variants
 
 
@@ -111,8 +110,8 @@ def test_a_file_describes_variants_and_sweeps(experiment):
         ('name = "noisy"', 'name = "noisy"\nextra = 1', "variant 'noisy': has an unknown entry 'extra'"),
         ("[both]", "[sample]\nseeds = [-1]\n[both]", "sample.seeds must be"),
         ("[both]", '[sample]\nseeds = "untouched"\n[both]', "'untouched': choose one of choosing, reporting"),
-        ("[both]", '[sample]\nfamilies = ["attic"]\n[both]', "list of tabletop, room"),
-        ("[both]", "[sample]\nfamilies = 3\n[both]", "list of tabletop, room"),
+        ("[both]", '[sample]\nfamilies = ["attic"]\n[both]', "list of tabletop, turntable, room"),
+        ("[both]", "[sample]\nfamilies = 3\n[both]", "list of tabletop, turntable, room"),
         ("[both]", "[sample]\nwidth = 2\n[both]", "sample: the sample's width is 2"),
         ("[both]", "[sample]\nwidht = 64\n[both]", "widht"),
         ("[both]", '[paper]\nsource = "p"\ncolumns = ["a", "b"]\n[paper.rows]\nx = [[1, 2]]\n[both]', "row 'x' must"),

@@ -45,6 +45,7 @@ def result(value: float, psnr: float | None = 30.0) -> dict:
             "mean": masks(value),
             "psnr": {"before": 29.0, "after": psnr},
             "psnr_shown": {"before": 31.0, "after": 31.25},
+            "psnr_objects": {"before": 29.0, "after": 30.5},
             "shown": {"before": 0.75, "after": 0.75},
             "ssim": {"before": 0.8, "after": 0.9},
             "objects": {"cup": masks(value / 2), "box": masks(value)},

@@ -115,6 +115,34 @@ def test_a_demo_that_was_killed_goes_on(tmp_path, monkeypatch):
     assert again(fresh=True) == ("ns-train", 5) and again() == ("ns-train", 5)
 
 
+def test_photos_of_a_turntable_are_trained_on_again_by_their_objects(tmp_path, monkeypatch):
+    """Once: a second demo takes what was trained, or resumes it."""
+    data, run, commands = write_scene(tmp_path / "data"), tmp_path / "out/run", []
+
+    def finish(command):
+        commands.append(command)
+        (run / "prepared").mkdir(parents=True, exist_ok=True)
+        if "all" in command:
+            (run / "prepared/report.json").write_text(json.dumps({"residuals": {"contradict": True}}))
+        elif "objects" in command:
+            (run / "config.yml").touch()
+            raise KeyboardInterrupt
+        (run / "training.json").write_text("{}")
+
+    monkeypatch.setattr(demo, "_finish", finish)
+    monkeypatch.setattr(demo, "measure", lambda *_: None)
+
+    def again() -> list[str]:
+        commands.clear()
+        with contextlib.suppress(KeyboardInterrupt):
+            demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, False)
+        return [word for command in commands for word in command if word in ("all", "objects", "resume")]
+
+    assert again() == ["all", "objects"]
+    assert again() == ["resume"]
+    assert again() == []
+
+
 def test_a_demo_that_is_under_way_is_left_alone(tmp_path, monkeypatch):
     from beags_plugin.system.lock import run_lock
 

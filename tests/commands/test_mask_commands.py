@@ -52,6 +52,19 @@ def test_the_command_writes_masks_that_training_finds(tmp_path, capsys):
     assert not list(tmp_path.glob(".masks_*"))
 
 
+def test_photos_without_poses_get_masks_for_the_search_of_poses(tmp_path, capsys):
+    for index in range(3):
+        write_image(tmp_path / f"photos/v{index}.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+        write_image(tmp_path / f"objects/cup/v{index}.png", np.uint8(255) * (truth(0) == 1))
+    main(
+        ["masks", "make", "--data", str(tmp_path / "photos"), "--source", "object-images", "--output", str(tmp_path),
+         "--options", f"folder={tmp_path / 'objects'}"]
+    )  # fmt: skip
+    assert "No photo has a pose yet" in capsys.readouterr().out
+    for index in range(3):
+        np.testing.assert_array_equal(read_id_mask(tmp_path / f"masks/v{index}.png"), truth(0) == 1)
+
+
 def test_masks_of_other_methods_are_trained_on(tmp_path, capsys):
     """Gaussian Grouping's ids and LangSplat's segments, from their files to what the data parser reads of them."""
     write_colmap(tmp_path)

@@ -109,6 +109,21 @@ mistakes(
             lambda at: film(at.root / "one.mp4", [noise(0, 32, 32)]), f"{PROCESS} one.mp4"
         ),
         "two processes find poses": beags_after(held, f"{PROCESS} taken"),
+        "masks of other photos": beags_after(
+            lambda at: (folder_of("a.png", "b.png", "c.png")(at), write_image(at.root / "of/d.png", noise(0, 20, 20))),
+            f"{PROCESS} taken --masks of",
+        ),
+        "masks of another size": beags_after(
+            lambda at: (folder_of("a.png", "b.png", "c.png")(at), write_image(at.root / "of/b.png", noise(0, 20, 9))),
+            f"{PROCESS} taken --masks of",
+        ),
+        "no folder of masks for poses": beags_after(
+            folder_of("a.png", "b.png", "c.png"), f"{PROCESS} taken --masks of"
+        ),
+        "on their side, with masks": beags_after(
+            lambda at: (photo_on_its_side(at), write_image(at.root / "of/a.png", noise(0, 20, 20))),
+            "process --data posed/images --output-dir upright --masks of",
+        ),
         "no pycolmap": beags_after(
             lambda at: (folder_of("a.png", "b.png", "c.png")(at), at.patch.setitem(sys.modules, "pycolmap", None)),
             f"{PROCESS} taken",

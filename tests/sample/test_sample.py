@@ -10,7 +10,7 @@ import torch
 from scene_distances import distance, from_background
 
 from beags_plugin.core.cameras import viewmat_from_opengl
-from beags_plugin.sample.arrangement import make_still
+from beags_plugin.sample.arrangement import make_still, turn_z
 from beags_plugin.sample.families import FAMILIES
 from beags_plugin.sample.lighting import Light
 from beags_plugin.sample.room import Room
@@ -168,13 +168,35 @@ def test_a_removed_object_lets_through_what_stands_behind_it_in_the_same_light(s
         rays = view.directions(columns + 0.5, rows + 0.5)
         hits, _ = first_hits(rest, view.center, rays)
         surface = hits.surface + (hits.surface >= class_id)  # the objects behind have moved up
-        colours = np.minimum(light.colours(view.center + hits.t[:, None] * rays, surface, rays), 1.0)
+        colours = np.minimum(light.colours(view.center + hits.t[:, None] * rays, surface, rays, view.center), 1.0)
         assert np.array_equal(removed[there], np.floor(255.0 * colours ** (1 / 2.2) + 0.5))
         uncovered += (removed != picture.image).any(axis=-1).sum() / there.sum()
         elsewhere = replace(view, cx=view.cx + 10 * view.width)
         blank = np.zeros_like(picture.image)
         assert render_removed(still, light, elsewhere, blank, class_id, 1) is None
     assert uncovered > 0.95 * 3
+
+
+def test_on_a_turntable_objects_look_the_same_and_the_room_stands():
+    """Against the tabletop's pictures; and of two cameras on a circle, which see one picture of the room."""
+    table, still = FAMILIES["turntable"], FAMILIES["tabletop"]
+    made = table.scene(0)
+    views = table.views(0, WIDTH, HEIGHT, 6, 1)
+    turn = np.eye(4)
+    turn[:3, :3] = turn_z(1.0)
+    for view in views[:2]:
+        turned = replace(view, camera_to_world=turn @ view.camera_to_world)
+        found = {}
+        for name, family in (("still", still), ("turning", table)):
+            light = family.light(made)
+            found[name] = [render_view(made, light, each, 1) for each in (view, turned)]
+        one, other = found["turning"]
+        assert np.array_equal(one.labels, found["still"][0].labels)
+        objects = one.labels > 0
+        assert np.array_equal(one.image[objects], found["still"][0].image[objects])
+        room = ~objects & (other.labels == 0)
+        differs = {name: np.abs(np.float64(a.image) - b.image)[room].mean() for name, (a, b) in found.items()}
+        assert differs["turning"] < 8 < 16 < differs["still"], differs  # shadows turn
 
 
 def test_what_photos_show_of_the_surface_behind_objects(scene):

@@ -42,7 +42,8 @@ class EvaluatedRun:
     """A run on disk with its held-out views, which are read when first used.
 
     name: of the scene in tables. data: if not where they were. stages: "before" and "after", or "after" alone, to the
-    saved scenes. complete: False for a run of ``beags extract``, which holds a part of a scene. classes: id to name of
+    saved scenes. complete: False for a run of ``beags extract``, which holds a part of a scene. objects_alone: whether
+    it was trained on the objects' pixels alone. classes: id to name of
     the classes that can be scored.
     """
 
@@ -54,6 +55,7 @@ class EvaluatedRun:
         if after.assigned and snapshot.exists() and (before := read_run(snapshot)).assigned:
             self.stages = {"before": before, "after": after}
         self.complete = not (self.config_path.parent / EXTRACTION_FILE).exists()
+        self.objects_alone = after.config.data_config.photos == "objects"
         self.classes = after.classes
         if not self.complete:
             assert after.class_ids is not None  # an extracted run has classes
@@ -83,7 +85,7 @@ class EvaluatedRun:
         """Return the figures of all stages; arguments as of ``evaluate_run``."""
         protocol = protocol or Protocol()
         protocol.check()
-        shown = self.shown() if self.complete else None
+        shown = self.shown() if self.complete and not self.objects_alone else None
         found: dict[Stage, SceneMetrics] = {}
         total = len(self.views) * len(self.stages)
         for stage, scene in self.stages.items():
@@ -97,6 +99,7 @@ class EvaluatedRun:
                 self.classes,
                 protocol=protocol,
                 complete=self.complete,
+                objects_alone=self.objects_alone,
                 background=self.views.background,
                 shown=shown,
                 progress=None if progress is None else lambda done, _, former=former: progress(former + done, total),
@@ -128,6 +131,8 @@ class EvaluatedRun:
             yield "No held-out view has a mask of what this extracted run holds, so nothing is scored."
         elif not self.complete:
             yield "This run holds a part of a scene, so only objects drawn alone are scored."
+        elif self.objects_alone:
+            yield "This run was trained on the objects' pixels alone, so only these are scored."
         elif "before" not in self.stages:
             yield "This run has kept no state before refinement, so there is nothing to compare with."
         if trained_on := self.views.trained_on():

@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beags_plugin.data.files import image_size, photo_names
+from beags_plugin.data.files import image_size, list_images, photo_names
+from beags_plugin.data.layout import fitting_layouts
 from beags_plugin.labels.classes import check_names, write_mask
 from beags_plugin.masks.snapping import snap_to_edges
 from beags_plugin.masks.sources import MASK_SOURCES
@@ -118,9 +119,8 @@ def make_masks(
     Returns lines that report the written files, and what ``beags masks check`` finds in them. Raises ``UserError``
     before anything is written, or for bad input.
     """
-    parser: BeagsDataParser = data.setup()
-    scene, views = parser.posed_views()
-    folder = output or scene.root
+    root, images, trained, posed = _photos(data, source)
+    folder = output or root
     masks, look_at, classes = folder / "masks", folder / "masks_to_look_at", folder / "classes.json"
     there = [*masks.rglob("*.png"), *look_at.rglob("*.png"), *([classes] if classes.exists() else [])]
     if there and not overwrite:
@@ -132,15 +132,12 @@ def make_masks(
         raise UserError(
             "this mask source needs the scene's depth: train beags-base, then add --load-config <run>/config.yml."
         )
-    trained = set(parser.views_of_split(views, "train"))
-    sizes = [image_size(path) for path in views.images]
+    sizes = [image_size(path) for path in images]
     photos = [
         Photo(name, path, *size, trained=index in trained)
-        for index, (name, path, size) in enumerate(zip(photo_names(views.images), views.images, sizes, strict=True))
+        for index, (name, path, size) in enumerate(zip(photo_names(images), images, sizes, strict=True))
     ]
-    made_of = SourceScene(
-        scene.root, photos, RunGeometry(run, data.data) if run is not None and source.needs_run else None
-    )
+    made_of = SourceScene(root, photos, RunGeometry(run, data.data) if run is not None and source.needs_run else None)
     shares: list[float] = []
     shown: list[tuple[Photo, Path]] = []
     with writing(folder):
@@ -153,7 +150,7 @@ def make_masks(
         unfinished = {place: Path(temporary) / place.name for place in (masks, look_at)}
         made = source.make(made_of, progress)
         check_names(made.names)
-        for index, (path, labels) in enumerate(zip(mask_paths(views.images), made.maps, strict=True)):
+        for index, (path, labels) in enumerate(zip(mask_paths(images), made.maps, strict=True)):
             if labels is None:
                 continue
             if snap:
@@ -170,16 +167,18 @@ def make_masks(
         if not any(shares):
             raise UserError("the mask source found no object in any view: name another source, or check its options.")
         for place, new in unfinished.items():
-            _take_the_place(new, place, {image.stem for image in views.images})
+            _take_the_place(new, place, {image.stem for image in images})
     names = {str(i): name for i, name in sorted(made.names.items())}
     write_whole(classes, lambda file: file.write(json.dumps(names, indent=1).encode()))
     _picture(folder / "made.png", shown)
     aside = len(shown) - len(shares)
     checked: list[str] = []
-    with suppress(UserError):  # training says it; the masks are made
+    with suppress(UserError):  # of photos without poses; else training says it
         given = data if run is None else options_beside(run, data.data, images_path=data.images_path)
         report = check(replace(given, masks_path=masks.absolute(), classes_path=classes.absolute()), run=run)
         checked = [*report.lines(), *(str(path) for path in write_contradictions(report, folder))]
+    if not posed:
+        checked = ["No photo has a pose yet, so all got masks: once they have, make those of training views anew."]
     return [
         *made.notes,
         f"{len(shares)} masks of {len(photos)} views, {len(names) - 1} objects, which cover "
@@ -188,6 +187,18 @@ def make_masks(
         f"names: {classes}; look at {folder / 'made.png'}",
         *checked,
     ]
+
+
+def _photos(data: BeagsDataParserConfig, source: MaskSource) -> tuple[Path, list[Path], set[int], bool]:
+    """Return the scene's folder, its photos, which of them are for training, and whether they have poses."""
+    root = Path(data.data).absolute()
+    if data.layout == "auto" and not source.needs_run and root.is_dir() and not fitting_layouts(root):
+        found = list_images(root) or list_images(root / "images")
+        if found:
+            return root, found, set(range(len(found))), False
+    parser: BeagsDataParser = data.setup()
+    scene, views = parser.posed_views()
+    return scene.root, list(views.images), set(parser.views_of_split(views, "train")), True
 
 
 def _take_the_place(unfinished: Path, masks: Path, stems: set[str]) -> None:

@@ -14,16 +14,18 @@ from torch import Tensor
 from beags_plugin.labels.class_ids import resize_nearest
 from beags_plugin.labels.classes import read_id_mask, read_mask
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.plugin.runs.layout import last_prepared
+from beags_plugin.plugin.runs.layout import PREPARED, last_prepared
 from beags_plugin.plugin.views.views import unique_names
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.tensors import load_tensors
+from beags_plugin.system.reading.text import load_json
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
     from beags_plugin.plugin.options.config import BeagsTrainerConfig
 
+PREPARATION_REPORT = "report.json"
 _REMEDY = "restore it, or refine again from base/nerfstudio_models"
 
 
@@ -57,6 +59,12 @@ def _is_grid(state: dict[str, Any]) -> bool:
         and (count.dtype, keys.dtype, classes.dtype) == (torch.int64, torch.int64, torch.int32)
         and (keys.dim(), classes.shape) == (1, keys.shape)
     )
+
+
+def photos_contradict(run: Path) -> bool:
+    """Return whether a run has found that its photos contradict each other outside the masks, as on a turntable."""
+    path = run / PREPARED / PREPARATION_REPORT
+    return path.exists() and bool(load_json(path).get("residuals", {}).get("contradict", False))
 
 
 @dataclass(frozen=True)

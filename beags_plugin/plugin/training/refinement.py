@@ -22,8 +22,9 @@ from beags_plugin.labels.classes import read_id_mask, write_mask
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED, round_folder
-from beags_plugin.plugin.runs.prepared import read_grid
+from beags_plugin.plugin.runs.prepared import PREPARATION_REPORT, read_grid
 from beags_plugin.plugin.runs.write import write_run
+from beags_plugin.plugin.training.contradiction import Residuals, residuals
 from beags_plugin.plugin.training.resumable import TrainingRun
 from beags_plugin.plugin.training.scene_edits import edit_scene
 from beags_plugin.plugin.training.scene_model import SceneModel
@@ -113,6 +114,7 @@ class RefinementSwitch:
             views = self.datamanager.views("train", original=True)
             with _bar("Reading masks", passing=True) as progress:
                 masks = LabelMaps(view.labels for view in counted(views, len(views), progress))
+            fit = residuals(model, views, masks) if first and self.datamanager.config.photos == "all" else None
             with released(self.trainer.train_lock):  # minutes, which only read the scene: a viewer may render it
                 prepared = prepare(
                     model.surfels(),
@@ -135,7 +137,10 @@ class RefinementSwitch:
                 snapshot = self.trainer.base_dir / BASE_SNAPSHOT
                 write_run(self.trainer.config, snapshot, model.state_dict(), max(step, 0))
                 CONSOLE.print(f"  base kept in {snapshot}", highlight=False, markup=False, soft_wrap=True)
-            save_prepared(prepared, [view.name for view in views], round_folder(self.trainer.base_dir, self.rounds))
+            if fit is not None and fit.contradict:
+                CONSOLE.print(fit.sentence(), style="yellow", highlight=False, markup=False, soft_wrap=True)
+            folder = round_folder(self.trainer.base_dir, self.rounds)
+            save_prepared(prepared, [view.name for view in views], folder, fit)
             if prepared.edited is not None:
                 edit_scene(model, self.trainer.optimizers.adam, prepared.edited.edited)
                 self._take_classes(prepared.edited.assignment)
@@ -209,8 +214,11 @@ def _prepared_labels(path: Path, camera: Camera) -> torch.Tensor:
     return labels
 
 
-def save_prepared(prepared: Preparation, names: list[str], folder: Path) -> None:
-    """Write what a resumed refinement needs; grid.pt comes last, as its presence marks the rest as complete."""
+def save_prepared(prepared: Preparation, names: list[str], folder: Path, fit: Residuals | None = None) -> None:
+    """Write what a resumed refinement needs; grid.pt comes last, as its presence marks the rest as complete.
+
+    fit: of the base to the photos, for the report, where it was measured.
+    """
     with writing(folder):
         (folder / "grid.pt").unlink(missing_ok=True)  # an earlier run's
         if folder.name == PREPARED:
@@ -226,7 +234,9 @@ def save_prepared(prepared: Preparation, names: list[str], folder: Path) -> None
                 with writing(path):  # cv2 would ignore a full disk
                     Image.fromarray(prepared.confidence[index].cpu().numpy()).save(path)
     report = {"summary": prepared.summary, "seconds": prepared.seconds, "peak_memory_mb": peak_memory_mb()}
-    write_text_atomically(json.dumps(report, indent=2), folder / "report.json")
+    if fit is not None:
+        report["residuals"] = {**vars(fit), "contradict": fit.contradict}
+    write_text_atomically(json.dumps(report, indent=2), folder / PREPARATION_REPORT)
     state = {} if prepared.grid is None else prepared.grid.state_dict()
     write_whole(folder / "grid.pt", lambda file: torch.save(state, file))
 

@@ -28,6 +28,7 @@ from beags_plugin.plugin.views import lens
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig, absolute
 from beags_plugin.plugin.views.dataset import BeagsDataset
+from beags_plugin.plugin.views.objects_alone import objects_alone
 from beags_plugin.plugin.views.streaming import Lazy, StreamedViews
 from beags_plugin.plugin.views.views import View, unique_names
 from beags_plugin.system import processes
@@ -46,10 +47,12 @@ class BeagsDataManagerConfig(FullImageDatamanagerConfig):
     _target: type = field(default_factory=lambda: BeagsDataManager)
     dataparser: AnnotatedDataParserUnion = field(default_factory=BeagsDataParserConfig)
     stream: Literal["auto", "always", "never"] = "auto"
-    """Whether images are read from disk when they are needed instead of being kept in memory; auto: if the images of a
-    split would take more than stream_above_gb. Training gives the same, bit for bit."""
+    """Whether images are read from disk when needed instead of being kept in memory, with the same results; auto: if
+    those of a split would take more than stream_above_gb."""
     stream_above_gb: Suppress[float] = 0.5
     """GB (10^9 bytes) that the images of a split may take in memory before they are streamed."""
+    photos: Literal["all", "objects"] = "all"
+    """What training sees of the photos: all, or objects, their pixels alone before a random colour (turntables)."""
 
     def __setattr__(self, name: str, value: object) -> None:
         """Keep ``data`` absolute, so that a saved config.yml works from any folder."""
@@ -60,9 +63,9 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
     """nerfstudio's data manager of full images, for CPUs too, with labels in every batch.
 
     Batches hold ``image`` [H, W, 3], ``labels`` [H, W] int32 and ``alpha`` [H, W] uint8 where the image has it, all
-    on the device, and, once ``replace_labels`` was called, ``present``, the objects of ``labels``. The cache holds
-    labels in the narrowest type. Training views come in a random order without repetition within a round, given by
-    ``train_cameras_sampling_seed`` alone.
+    on the device, and, once ``replace_labels`` was called, ``present``, the objects of ``labels``; with ``photos`` of
+    objects, what ``objects_alone`` adds for training. The cache holds labels in the narrowest type. Training views come
+    in a random order without repetition within a round, given by ``train_cameras_sampling_seed`` alone.
     """
 
     config: BeagsDataManagerConfig
@@ -166,9 +169,11 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         self._pass_over(processes.size() - own - 1)
         if isinstance(self.cached_train, StreamedViews):
             self.cached_train.expect(self.train_unseen_cameras)
-        data = self._on_device(data)
+        whole = self._on_device(data)
+        data = objects_alone(whole) if self.config.photos == "objects" else whole
         metadata = camera.metadata or {}
-        camera.metadata = {**metadata, "labels": data["labels"], "camera": self._camera(metadata["cam_idx"])}
+        own = {"labels": data["labels"], "camera": self._camera(metadata["cam_idx"])}
+        camera.metadata = metadata | own | {"objects_alone": "inside" in data}
         if self._present is not None:
             data["present"] = self._present[metadata["cam_idx"]]
         return camera, data
@@ -272,13 +277,9 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
     def replace_labels(self, labels: Sequence[Tensor]) -> None:
         """Train on the labels M' of reprojected masks instead of those of the mask files (method, section 2).
 
-        M' are called ``labels`` all the way. ``Preparation.labels``, or in a resumed run the masks that were prepared,
-        come here and take their place in the cache. ``next_train`` gives those of its view [H, W] int32 to the model in
-        ``camera.metadata["labels"]``, since the rasterizer, which sees no batch, renders the class boundary against
-        them. The model keeps them as ``LastRender.labels`` and passes them to the losses as ``LossInputs.labels``.
-
-        labels: [H, W] integers of each training view. Raises ``ValueError`` if their number, a size or an id
-        (0..IGNORE) is wrong.
+        ``next_train`` gives those of its view [H, W] int32 to the model in ``camera.metadata["labels"]``, since the
+        rasterizer, which sees no batch, renders the class boundary against them. labels: [H, W] integers of each
+        training view. Raises ``ValueError`` if their number, a size or an id (0..IGNORE) is wrong.
         """
         cache, cameras = self.cached_train, self.train_dataset.cameras
         if len(labels) != len(cache):

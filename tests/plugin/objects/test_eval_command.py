@@ -11,6 +11,7 @@ import torch
 from data_folders import HEIGHT, WIDTH, noise, write_image, write_transforms
 from PIL import Image
 from run_folders import discs, write_scene, write_trained
+from scipy.ndimage import binary_erosion
 
 pytest.importorskip("nerfstudio")
 
@@ -62,6 +63,9 @@ def test_the_figures_of_a_run_are_those_of_its_files(trained):
             photo = np.asarray(Image.open(root / f"images/{name}.png")) / 255.0
             error = (rendered(trained, surfels, index).color.clamp(0, 1).numpy() - photo) ** 2
             assert scene.views[index].psnr == pytest.approx(-10 * np.log10(error.mean()), abs=1e-3)
+            inside = np.asarray(Image.open(root / f"ground_truth/masks/{name}.png"))[1::2, 1::2] > 0
+            inside = binary_erosion(inside, np.ones((3, 3)), border_value=1)
+            assert scene.views[index].psnr_objects == pytest.approx(-10 * np.log10(error[inside].mean()), abs=1e-3)
             error = error[shown[index].numpy()]
             assert scene.views[index].psnr_shown == pytest.approx(-10 * np.log10(error.mean()), abs=1e-3)
             assert scene.views[index].shown == pytest.approx(len(error) / (WIDTH * HEIGHT)) and len(error) > 0

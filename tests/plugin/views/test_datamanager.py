@@ -107,6 +107,27 @@ def test_batches_on_a_cpu(tmp_path, cache, kind):
     assert data.views("train")[0].image.dtype == torch.float32 and data.views("train")[0].image.max() <= 1
 
 
+@pytest.mark.parametrize("kind", ["uint8", "float32"])
+def test_training_sees_objects_alone_where_asked(tmp_path, kind):
+    write_transforms(tmp_path)
+    ids = np.zeros((HEIGHT, WIDTH), np.uint16)
+    ids[2:6], ids[:, 10:] = 7, IGNORE
+    for name in ("v00", "v03"):
+        write_image(tmp_path / f"masks/{name}.png", ids)
+    rgba = np.dstack([noise(3), np.full((HEIGHT, WIDTH), 100, np.uint8)])
+    write_image(tmp_path / "images/v03.png", rgba)
+    data = manager(tmp_path, photos="objects", cache_images_type=kind)
+    whole = data.cached_train
+    for step in range(7):
+        camera, batch = data.next_train(step)
+        inside = torch.from_numpy(ids == 7) if batch["image_idx"] == 2 else torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+        assert torch.equal(batch["alpha"], 100 * inside.byte()) and torch.equal(batch["inside"], inside)
+        assert torch.equal(batch["image"], whole[batch["image_idx"]]["image"] * inside[..., None])
+        assert torch.equal(batch["known"], batch["labels"] != IGNORE) and camera.metadata["objects_alone"]
+    assert "inside" not in data.next_eval_image(0)[1]
+    assert data.views("train")[2].image[ids == 0].any()
+
+
 def test_order_of_views_follows_the_seed_alone(tmp_path):
     write_transforms(tmp_path)
 
