@@ -12,6 +12,8 @@ from rich.console import Console
 
 from beags_plugin.commands.process import find_poses
 from beags_plugin.data.layout import fitting_layouts
+from beags_plugin.posing.photos import find_photos
+from beags_plugin.posing.video import is_video
 from beags_plugin.system.digests import folder_digest, value_digest
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.whole_files import write_text_atomically
@@ -48,7 +50,9 @@ def made_scene(data: Path, output: Path) -> MadeScene:
             return MadeScene(data)
         _check_source()
         return MadeScene(data, _made_masks(data, output / "made"))
-    given = data if data.is_dir() and any((data / "masks").rglob("*.png")) else None
+    if not is_video(data):
+        find_photos(data)  # says what is wrong with them before anything is fetched
+    given = data if any((data / "masks").rglob("*.png")) else None
     if given is None:
         _check_source()
     scene = output / "scene"

@@ -25,7 +25,7 @@ from beags_plugin.posing.photos import (
     repeated,
     with_masks,
 )
-from beags_plugin.posing.video import VIDEO_SUFFIXES, find_frames, write_frames
+from beags_plugin.posing.video import find_frames, is_video, write_frames
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.lock import run_lock
 from beags_plugin.system.progress import Bar
@@ -106,13 +106,9 @@ def process(data: Path, output: Path, bar: Bar, masks: Path | None = None) -> tu
     images, work = output / "images", output / WORK
     if (output / TRANSFORMS).exists() and not ((output / REPORT).exists() or (work / KEPT).exists()):
         raise UserError(f"{output / TRANSFORMS} holds poses of another program: give another --output-dir.")
-    video = data.is_file() and data.suffix.lower() in VIDEO_SUFFIXES
+    video = is_video(data)
     if masks is not None and not masks.is_dir():
         raise UserError(f"{masks} is no folder: give --masks that of the id images.")
-    if data.is_file() and not video:
-        raise UserError(
-            f"{data} is no video that is known by its name ({', '.join(VIDEO_SUFFIXES)}): give a folder of photos."
-        )
     found = find_frames(data, work / "frames", bar) if video else find_photos(data)
     if list_images(images) and not (work / KEPT).exists() and found[0].parent.resolve() != images.resolve():
         raise UserError(f"{images} holds photos already: give another --output-dir, or these as --data.")

@@ -24,6 +24,15 @@ STEP = 0.03
 _POINTS = 200  # of a frame, followed into the next
 
 
+def is_video(data: Path) -> bool:
+    """Return whether ``data`` is a video by its name, or a folder; raises ``UserError`` for another file."""
+    if data.is_file() and data.suffix.lower() not in VIDEO_SUFFIXES:
+        raise UserError(
+            f"{data} is no video that is known by its name ({', '.join(VIDEO_SUFFIXES)}): give a folder of photos."
+        )
+    return data.is_file()
+
+
 def find_frames(video: Path, folder: Path, bar: Bar) -> list[Path]:
     """Return the files in ``folder`` for the frames worth having; ``write_frames`` writes them.
 

@@ -26,7 +26,8 @@ NO_DATA = "the data folder {tmp}/nowhere does not exist: give --data the folder 
 SENTENCES = {
     # demo
     "demo --data {tmp}/nowhere": NO_DATA,
-    "demo --data {tmp}/file": "{tmp}/file is no folder: name one with images, poses and masks.",
+    "demo --data {tmp}/file": "{tmp}/file is no video that is known by its name (.mp4, .mov, .m4v, .avi, .mkv, .webm): "
+    "give a folder of photos.",
     "demo --preset beags-huge": f"there is no preset 'beags-huge': choose one of {PRESETS}.",
     "demo --preset beags-base": "the demo compares a base with its refinement, and beags-base trains only one: take "
     "beags-tiny.",
