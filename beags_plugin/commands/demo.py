@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 from rich.console import Console
 
 from beags_plugin.system.child_processes import bound
-from beags_plugin.system.digests import code_digest, folder_digest, value_digest
+from beags_plugin.system.digests import code_digest, value_digest
 from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.lock import run_lock
 from beags_plugin.system.progress import progress_bar
@@ -37,7 +37,7 @@ def run_demo(
     data: Path | None, output: Path | None, preset: str | None, downscale: float | None, seed: int, fresh: bool
 ) -> None:
     """Run the whole demo in ``output`` and print the table; see ``cli.Demo`` for the arguments."""
-    from beags_plugin.commands.made_scene import MadeScene, made_scene
+    from beags_plugin.commands.made_scene import MadeScene, made_scene, name_of
     from beags_plugin.data.layout import read_dataset
     from beags_plugin.data.quick import quick_downscale
     from beags_plugin.plugin.runs.prepared import photos_contradict
@@ -55,13 +55,15 @@ def run_demo(
             make_sample(scene.data, seed, 256, 192, "mild")
         downscale = downscale or 1.0
     else:
-        output = output or Path("outputs") / (data.stem if data.is_file() else data.resolve().name)
+        output = output or Path("outputs") / name_of(data)
+        if output.resolve() == data.resolve():
+            raise UserError(f"{output} is the data: give another --output.")
         with timed(seconds, "poses and masks"):
             scene = made_scene(data, output)
         read_dataset(scene.data)  # reports what is missing before a training starts
         downscale = downscale or quick_downscale(scene.data)
     run = output / "run"
-    request = {"preset": preset, "downscale": downscale, "inputs": _digest(scene, preset)}
+    request = {"preset": preset, "downscale": downscale, "inputs": _digest(scene, output, preset)}
     alone = {**request, "photos": "objects"}
     if alone in (former := _read_stamp(output), former.get(STARTED)) and not fresh:
         request = alone
@@ -103,12 +105,11 @@ def check_preset(preset: str) -> None:
         raise UserError(f"the demo compares a base with its refinement, and {preset} trains only one: take beags-tiny.")
 
 
-def _digest(scene: MadeScene, preset: str) -> str:
+def _digest(scene: MadeScene, output: Path, preset: str) -> str:
     """Return what changes with the preset, the package's code and any file of the data (by name, size and time)."""
     from beags_plugin.plugin.presets import preset_folder
 
-    data = [folder_digest(folder) for folder in (scene.data, scene.labels) if folder is not None]
-    return value_digest([*data, code_digest(), (preset_folder() / f"{preset}.toml").read_text("utf8")])
+    return value_digest([*scene.digests(output), code_digest(), (preset_folder() / f"{preset}.toml").read_text("utf8")])
 
 
 def write_stamp(output: Path, content: dict[str, Any]) -> None:

@@ -28,6 +28,21 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(files, key=lambda path: path.name)
 
 
+OWN_PICTURES = ("made.png", "contradicted.png", "poses.png", "contact_sheet.png")
+"""What commands of this package draw into a scene's folder: no photos."""
+
+
+def list_photos(data: Path) -> list[Path]:
+    """Return the photos in the folder ``images`` of ``data``, or without one directly in ``data``, sorted by name."""
+    return [path for path in list_images(folder_of_photos(data)) if path.name not in OWN_PICTURES]
+
+
+def folder_of_photos(data: Path) -> Path:
+    """Return the folder ``images`` in ``data``, unless there is none, or it holds no images and ``data`` does."""
+    images = data / "images"
+    return images if images.is_dir() and (list_images(images) or not list_images(data)) else data
+
+
 def image_folders(root: Path) -> list[Path]:
     """Return the folders ``images``, ``images_2``, ... that hold images, the largest images first."""
     numbered = {}

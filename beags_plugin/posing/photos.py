@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from beags_plugin.data.files import IMAGE_SUFFIXES, image_size, list_images, photo_names
+from beags_plugin.data.files import IMAGE_SUFFIXES, folder_of_photos, image_size, list_photos, photo_names
 from beags_plugin.system.digests import content_digest
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import Bar, counted
@@ -67,8 +67,7 @@ class Look:
 
 def find_photos(data: Path) -> list[Path]:
     """Return the photos of a folder, or of ``images`` in it, by name; raises ``UserError`` for too few or none."""
-    folder = data if list_images(data) or not (data / "images").is_dir() else data / "images"
-    found = list_images(folder)
+    folder, found = folder_of_photos(data), list_photos(data)
     photo_names(found)
     others = Counter(path.suffix.lower() for path in folder.iterdir() if path.is_file() and path not in set(found))
     if heic := others[".heic"] + others[".heif"]:

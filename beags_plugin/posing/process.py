@@ -168,7 +168,7 @@ def _process(photos: list[Photo], output: Path, bar: Bar) -> tuple[Posed, Any]:
     if not models:
         raise UserError(
             f"none of the {len(photos)} photos fit together: take more of them, closer to each other, of a scene that "
-            "has texture and stands still."
+            "has texture and stands still; if the thing turned before a room that stands, give --masks of the thing."
         )
     with bar("lens") as progress:
         model = refine(models[0], progress)

@@ -22,12 +22,17 @@ def code_digest() -> str:
     return digest.hexdigest()
 
 
-def folder_digest(folder: Path) -> str:
-    """Digest path, size and time of every file of ``folder`` whose name begins with no dot (as locks do)."""
+def folder_digest(folder: Path, without: Path | None = None) -> str:
+    """Digest path, size and time of every file of ``folder`` whose name begins with no dot (as locks do).
+
+    without: a folder whose content does not count, such as what was made of the files.
+    """
     digest = hashlib.sha256(str(folder.resolve()).encode())
+    left_out = None if without is None else without.resolve()
     for path in sorted(path for path in folder.rglob("[!.]*") if path.is_file()):
-        stat = path.stat()
-        digest.update(f"{path.relative_to(folder)} {stat.st_size} {stat.st_mtime_ns}".encode())
+        if left_out is None or not path.resolve().is_relative_to(left_out):
+            stat = path.stat()
+            digest.update(f"{path.relative_to(folder)} {stat.st_size} {stat.st_mtime_ns}".encode())
     return digest.hexdigest()
 
 

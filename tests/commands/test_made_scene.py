@@ -19,6 +19,7 @@ from beags_plugin.commands import demo, made_scene
 from beags_plugin.commands.made_scene import MadeScene
 from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.masks.sources.salient import SalientSource
+from beags_plugin.posing.photos import find_photos
 from beags_plugin.system.errors import UserError
 
 pytest.importorskip("onnxruntime", reason="the extra [salient] (onnxruntime) is not installed")
@@ -151,6 +152,62 @@ def test_masks_of_photos_without_poses_are_taken(photos, tmp_path, monkeypatch):
     made = made_scene.made_scene(scene, tmp_path / "out")
     assert made == MadeScene(tmp_path / "out/scene", scene)
     assert made.options() == ["--masks-path", str(scene / "masks")]
+
+
+def test_masks_of_photos_that_lie_on_their_side_are_refused_before_poses_are_computed(photos, tmp_path):
+    turned = Image.open(photos / "v03.png")
+    exif = turned.getexif()
+    exif[274] = 3
+    turned.save(photos / "v03.png", exif=exif)
+    for photo in list(photos.iterdir()):
+        write_image(photos / "masks" / photo.name, np.ones((240, 320), np.uint8))
+    with pytest.raises(UserError, match=r"v03\.png is stored on its side"):
+        made_scene.made_scene(photos, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_outputs_inside_the_data_are_no_data(posed, trainings, monkeypatch):
+    monkeypatch.chdir(posed)
+    for _ in range(2):
+        demo.run_demo(Path(), None, "beags-tiny", None, 0, False)
+        (posed / "outputs/data/contact_sheet.png").write_text("drawn by the demo")
+    assert len(trainings) == 1
+    with pytest.raises(UserError, match="is the data: give another --output"):
+        demo.run_demo(posed, posed, "beags-tiny", None, 0, False)
+
+
+def test_what_the_program_drew_is_no_photo(photos):
+    names = sorted(path.name for path in photos.iterdir())
+    for name in ("made.png", "poses.png", "contact_sheet.png"):
+        write_image(photos / name, np.zeros((240, 320, 3), np.uint8))
+    assert [path.name for path in find_photos(photos)] == names
+    within = photos.parent / "within"
+    within.mkdir()
+    photos.rename(within / "images")
+    write_image(within / "stray.png", np.zeros((240, 320, 3), np.uint8))
+    assert [path.name for path in find_photos(within)] == names
+
+
+def test_other_photos_and_incomplete_scenes_are_refused(photos, tmp_path):
+    (tmp_path / "out/scene").mkdir(parents=True)
+    (tmp_path / "out/scene/made_of.json").write_text('"/elsewhere/walk.mp4"')
+    with pytest.raises(UserError, match="was made of /elsewhere/walk.mp4: give another --output"):
+        made_scene.made_scene(photos, tmp_path / "out")
+    (photos / "transforms_train.json").write_text("{}")  # of another program
+    with pytest.raises(UserError, match=r"holds neither transforms\.json"):
+        made_scene.made_scene(photos, tmp_path / "other")
+
+
+def test_masks_that_were_interrupted_are_made_anew(posed, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr("beags_plugin.plugin.objects.make_masks.check", lambda *_, **__: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            made_scene.made_scene(posed, tmp_path / "out")
+    mask = tmp_path / "out/made/masks/v01.png"
+    assert mask.exists()
+    mask.unlink()  # as if it had not been moved yet
+    made_scene.made_scene(posed, tmp_path / "out")
+    assert mask.exists()
 
 
 def test_what_lacks_for_masks_is_said_before_poses_are_computed(photos, tmp_path, monkeypatch):

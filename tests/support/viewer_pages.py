@@ -27,7 +27,8 @@ from beags_plugin.system.child_processes import bound
 WIDTH, HEIGHT = 640, 400
 MAX_RESOLUTION = 512  # pixels of the longer side, the default of the viewer
 COLORS = {name: colorize(np.array([[index]]))[0, 0].astype(int) for index, name in CLASSES.items()}
-ENTRY = "from nerfstudio.scripts.viewer.run_viewer import entrypoint; entrypoint()"  # what ns-viewer runs
+HEARS = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"  # tests in the background ignore it
+ENTRY = f"{HEARS}; from nerfstudio.scripts.viewer.run_viewer import entrypoint; entrypoint()"  # what ns-viewer runs
 
 
 def free_port() -> int:
@@ -69,7 +70,7 @@ def viewed(config: Path, log: Path) -> Iterator[str]:
     with started(["-c", ENTRY, *options], log, "disabled local writer") as process:  # the last that it prints
         yield f"http://127.0.0.1:{port}"
         process.send_signal(signal.SIGINT)
-        assert process.wait(120) == 0
+        assert process.wait(60) == 0
     assert log.read_text().rstrip().endswith("The viewer is closed.")
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beags_plugin.data.files import image_size, list_images, photo_names
+from beags_plugin.data.files import image_size, list_photos, photo_names
 from beags_plugin.data.layout import fitting_layouts
 from beags_plugin.labels.classes import check_names, write_mask
 from beags_plugin.masks.snapping import snap_to_edges
@@ -193,7 +193,7 @@ def _photos(data: BeagsDataParserConfig, source: MaskSource) -> tuple[Path, list
     """Return the scene's folder, its photos, which of them are for training, and whether they have poses."""
     root = Path(data.data).absolute()
     if data.layout == "auto" and not source.needs_run and root.is_dir() and not fitting_layouts(root):
-        found = list_images(root) or list_images(root / "images")
+        found = list_photos(root)
         if found:
             return root, found, set(range(len(found))), False
     parser: BeagsDataParser = data.setup()
