@@ -65,9 +65,7 @@ def made_scene(data: Path, output: Path) -> MadeScene:
     same photos is taken as it is; masks also where the user has mended them. Raises ``UserError``; where masks cannot
     be made, before poses are computed.
     """
-    if data.is_dir() and (
-        fitting_layouts(data) or any(data.glob("transforms*.json")) or any(data.rglob("cameras.bin"))
-    ):
+    if data.is_dir() and (fitting_layouts(data) or any(any(data.glob(pattern)) for pattern in POSES)):
         read_dataset(data)  # says what lacks or is too much
         if _has_masks(data):
             return MadeScene(data)

@@ -212,6 +212,9 @@ def test_masks_that_were_interrupted_are_made_anew(posed, tmp_path, monkeypatch)
 
 def test_what_lacks_for_masks_is_said_before_poses_are_computed(photos, tmp_path, monkeypatch):
     monkeypatch.setattr(SalientSource, "unavailable", classmethod(lambda _: "no onnxruntime."))
+    model = photos / "outputs/walk/scene/colmap/sparse/0/cameras.bin"  # of an earlier demo inside the photos' folder
+    model.parent.mkdir(parents=True)
+    model.touch()
     with pytest.raises(UserError, match=r"none can be made of what stands out: no onnxruntime\."):
         made_scene.made_scene(photos, tmp_path / "out")
     assert not (tmp_path / "out").exists()
