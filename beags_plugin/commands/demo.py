@@ -178,8 +178,7 @@ def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
         shown = views[:: max(1, len(views) // SHEET_VIEWS)][:SHEET_VIEWS]
         objects = [index for index in classes if index != 0]
         base, refined = evaluated.stages["before"], evaluated.stages["after"]
-        assert base.class_ids is not None and refined.class_ids is not None
-        scenes = ((base.surfels(), base.class_ids), (refined.surfels(), refined.class_ids))
+        scenes = ((base.surfels(), base.members), (refined.surfels(), refined.members))
         drawing = (evaluated.rasterizer, evaluated.settings)
         scenery = {"novel": novel_camera(views), "background": views.background, "progress": progress}
         rows = draw_rows(shown, *scenes, objects, *drawing, **scenery)

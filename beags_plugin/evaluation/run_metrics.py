@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import mask_metrics, mean, mean_metrics, psnr
 from beags_plugin.evaluation.protocol import Protocol
@@ -36,7 +37,7 @@ from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth, s
 
 def evaluate_scene(
     surfels: Surfels,
-    class_ids: Tensor | None,
+    members: Membership | None,
     rasterizer: Rasterizer,
     settings: RasterSettings,
     views: Sequence[EvalView],
@@ -51,15 +52,15 @@ def evaluate_scene(
 ) -> SceneMetrics:
     """Return the figures of each object's masks and of the scene without it, PSNR and SSIM (method, section 8).
 
-    surfels: N Gaussians. class_ids: [N] int32, phi; None scores images alone. classes: id to name; the background, 0,
-    is not scored. complete: False where Gaussians were taken out of the scene, so that only extracted masks can be
+    surfels: N Gaussians. members: of them; None scores images alone. classes: id to name; the background, 0, is not
+    scored. complete: False where Gaussians were taken out of the scene, so that only extracted masks can be
     scored. objects_alone: the scene was trained on nothing but objects: of images, only their pixels are scored.
     background: [3] behind the images; black if None. shown: per view [H, W] bool, see ``shown_pixels``.
     progress: receives (done, total) views.
     """
     protocol = protocol or Protocol()
     surfels = surfels.detach()
-    objects = [] if class_ids is None else sorted(class_id for class_id in classes if class_id != 0)
+    objects = [] if members is None else sorted(class_id for class_id in classes if class_id != 0)
     settings = replace(settings, geometry=False, distortion=False)
     if background is None:
         background = surfels.means.new_zeros(3)
@@ -67,7 +68,7 @@ def evaluate_scene(
     images: list[ViewRecord] = []
     with torch.no_grad():
         for index, view in enumerate(views):
-            renderer = MaskRenderer(surfels, class_ids, view, rasterizer, settings, protocol)
+            renderer = MaskRenderer(surfels, members, view, rasterizer, settings, protocol)
             for kind in MASK_KINDS if complete else ("extracted", "seen"):
                 for class_id, mask in renderer.masks(kind, objects).items():
                     metrics = mask_metrics(mask.prediction, mask.truth, mask.ignore, protocol)
@@ -84,8 +85,8 @@ def evaluate_scene(
                     over = psnr(color[of_view], photo[of_view]) if of_view.any() else None
                     image = replace(image, psnr_shown=over, shown=float(of_view.double().mean()))
                 for class_id, exact, silhouette, known in removals(view, [] if objects_alone else objects):
-                    assert class_ids is not None
-                    rest = renderer.image(remove_class(surfels, class_ids, class_id)[0], background)
+                    assert members is not None
+                    rest = renderer.image(remove_class(surfels, members, class_id)[0], background)
                     known = None if known is None else known.to(rest.device)
                     metrics = removal_metrics(rest, photo, exact.to(rest), silhouette.to(rest.device), known)
                     masks.append(MaskRecord("removal", class_id, index, "silhouette", metrics))
@@ -155,7 +156,7 @@ class MaskRenderer:
     """The masks of a labelled scene in one view; fields as the arguments of ``evaluate_scene``."""
 
     surfels: Surfels
-    class_ids: Tensor | None
+    members: Membership | None
     view: EvalView
     rasterizer: Rasterizer
     settings: RasterSettings
@@ -170,11 +171,11 @@ class MaskRenderer:
 
     def masks(self, kind: MaskKind, objects: Sequence[int]) -> dict[int, RenderedMask]:
         """Return object id to its mask, for those of ``objects`` that the view has a truth of."""
-        if self.class_ids is None or not objects:
+        if self.members is None or not objects:
             return {}
         if kind == "rendered":
             known = {c: truth for c in objects if (truth := rendered_truth(self.view, c)) is not None}
-            rendered = self._rendered(self.class_ids, list(known))
+            rendered = self._rendered(self.members, list(known))
             return {c: RenderedMask(mask, known[c].mask, known[c].unknown, "visible") for c, mask in rendered.items()}
         found = {}
         for class_id in objects:
@@ -192,8 +193,8 @@ class MaskRenderer:
         A pixel of another object tells nothing about what lies behind it; what is drawn before it is wrong.
         """
         if class_id not in self._alone:
-            assert self.class_ids is not None
-            part = select_class(self.surfels, self.class_ids, class_id)[0]
+            assert self.members is not None
+            part = select_class(self.surfels, self.members, class_id)[0]
             camera, hidden = self.view.camera, None
             if len(part) == 0:
                 return torch.zeros(camera.height, camera.width, dtype=torch.bool), None
@@ -213,7 +214,7 @@ class MaskRenderer:
         inputs, settings = geometry_inputs(surfels), replace(self.settings, geometry=depth)
         return self.rasterizer.rasterize(inputs, self.view.camera, settings, surfels.means.new_zeros(3))
 
-    def _rendered(self, class_ids: Tensor, objects: Sequence[int]) -> dict[int, Tensor]:
+    def _rendered(self, members: Membership, objects: Sequence[int]) -> dict[int, Tensor]:
         """Return object id to [H, W] bool: value > threshold, with the object 1 and the rest of the scene 0, on black.
 
         Three objects share one rendering, one in each colour channel.
@@ -225,7 +226,7 @@ class MaskRenderer:
             triple = objects[first : first + 3]
             colors = torch.zeros_like(inputs.colors)
             for channel, class_id in enumerate(triple):
-                colors[:, channel] = (class_ids == class_id).to(colors.dtype)
+                colors[:, channel] = members.of(class_id).to(colors)
             colored = replace(inputs, colors=colors)
             value = self.rasterizer.rasterize(colored, self.view.camera, self.settings, black).color
             masks |= {c: value[..., channel] > self.protocol.threshold for channel, c in enumerate(triple)}

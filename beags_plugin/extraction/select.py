@@ -4,25 +4,26 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 
 
-def select_class(surfels: Surfels, class_ids: Tensor, class_id: int) -> tuple[Surfels, Tensor]:
-    """Return the Gaussians of one class: all parameters with phi_i = class_id.
+def select_class(surfels: Surfels, members: Membership, class_id: int) -> tuple[Surfels, Tensor]:
+    """Return the Gaussians of one class: all their parameters.
 
-    surfels: N surfels. class_ids: [N] integer, phi.
+    surfels: N surfels. members: of them.
     Returns (M surfels, [M] int64 their indices among the N, ascending). Raises ``ValueError`` on a wrong length.
     """
-    return _select(surfels, class_ids, class_ids == class_id)
+    return _select(surfels, members, members.of(class_id))
 
 
-def remove_class(surfels: Surfels, class_ids: Tensor, class_id: int) -> tuple[Surfels, Tensor]:
+def remove_class(surfels: Surfels, members: Membership, class_id: int) -> tuple[Surfels, Tensor]:
     """Return the scene without one class: the complement of ``select_class``, with its arguments and returns."""
-    return _select(surfels, class_ids, class_ids != class_id)
+    return _select(surfels, members, ~members.of(class_id))
 
 
-def _select(surfels: Surfels, class_ids: Tensor, keep: Tensor) -> tuple[Surfels, Tensor]:
-    if class_ids.shape != (len(surfels),):
-        raise ValueError(f"class_ids must be [{len(surfels)}], not {list(class_ids.shape)}")
+def _select(surfels: Surfels, members: Membership, keep: Tensor) -> tuple[Surfels, Tensor]:
+    if len(members) != len(surfels):
+        raise ValueError(f"the classes must be of {len(surfels)} Gaussians, not of {len(members)}")
     index = keep.nonzero().squeeze(1)
     return surfels[index], index

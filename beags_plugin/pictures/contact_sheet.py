@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.records import EvalView
 from beags_plugin.evaluation.run_metrics import extracted_truth
@@ -45,8 +46,8 @@ class SheetRow:
 
 def draw_rows(
     views: Sequence[EvalView],
-    before: tuple[Surfels, Tensor],
-    after: tuple[Surfels, Tensor],
+    before: tuple[Surfels, Membership],
+    after: tuple[Surfels, Membership],
     objects: Sequence[int],
     rasterizer: Rasterizer,
     settings: RasterSettings,
@@ -57,7 +58,7 @@ def draw_rows(
 ) -> list[SheetRow]:
     """Render the views and one novel view, without gradients.
 
-    before, after: the Gaussians with assignment alone and after refinement, each with phi, [N] int32. objects: ids to
+    before, after: the Gaussians with assignment alone and after refinement, and their classes. objects: ids to
     show alone. novel: its camera; left out if None. background: [3], black if None. progress: receives (done, total)
     views.
     """
@@ -98,10 +99,15 @@ def novel_camera(views: Sequence[EvalView]) -> Camera | None:
 
 
 def _alone(
-    surfels: Surfels, class_ids: Tensor, class_id: int, camera: Camera, rasterizer: Rasterizer, settings: RasterSettings
+    surfels: Surfels,
+    members: Membership,
+    class_id: int,
+    camera: Camera,
+    rasterizer: Rasterizer,
+    settings: RasterSettings,
 ) -> np.ndarray:
     """Return [H, W, 4] uint8: one object's Gaussians rendered alone, straight alpha."""
-    part = select_class(surfels.detach(), class_ids, class_id)[0]
+    part = select_class(surfels.detach(), members, class_id)[0]
     if len(part) == 0:
         return np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
     render = rasterizer.rasterize(surfel_inputs(part, camera), camera, settings, part.means.new_zeros(3))

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import MaskMetrics, compared_masks
 from beags_plugin.evaluation.protocol import Protocol
@@ -86,7 +87,7 @@ def worst_records(run: RunMetrics, kind: MaskKind, count: int) -> list[int]:
 
 def draw_worst(
     run: RunMetrics,
-    scenes: Mapping[Stage, tuple[Surfels, Tensor]],
+    scenes: Mapping[Stage, tuple[Surfels, Membership]],
     views: Sequence[EvalView],
     rasterizer: Rasterizer,
     settings: RasterSettings,
@@ -95,8 +96,8 @@ def draw_worst(
 ) -> list[WorstMask]:
     """Render the ``count`` worst masks of each kind again, without gradients.
 
-    run: the figures of these scenes and views. scenes: stage to the Gaussians and their classes [N] int32. progress:
-    receives (done, total) masks.
+    run: the figures of these scenes and views. scenes: stage to the Gaussians and their classes. progress: receives
+    (done, total) masks.
     """
     names = run.names()
     found = []
@@ -106,8 +107,8 @@ def draw_worst(
             record = run.after.masks[index]
             view = views[record.view]
             errors: dict[Stage, np.ndarray] = {}
-            for stage, (surfels, class_ids) in scenes.items():
-                renderer = MaskRenderer(surfels.detach(), class_ids, view, rasterizer, settings, run.protocol)
+            for stage, (surfels, members) in scenes.items():
+                renderer = MaskRenderer(surfels.detach(), members, view, rasterizer, settings, run.protocol)
                 mask = renderer.masks(kind, [record.class_id])[record.class_id]
                 errors[stage] = error_map(mask.prediction, mask.truth, mask.ignore, run.protocol)
             metrics: dict[Stage, Any] = {stage: scene.masks[index].metrics for stage, scene in run.stages().items()}

@@ -52,9 +52,9 @@ class Picture:
         photos = training_viewpoints(run.stages["after"].config, run.settings, self.load_config).cameras
         for name, number in zip(self.object, self.camera, strict=True):
             parts = {
-                stage: select_class(scene.surfels(), scene.class_ids, ids[name])[0]
+                stage: select_class(scene.surfels(), scene.members, ids[name])[0]
                 for stage, scene in run.stages.items()
-                if scene.class_ids is not None
+                if scene.assigned
             }
             stand = orbit_frame(*bounding_box(parts["after"]), photos)
             camera = orbit(stand, 12, self.height)[number]

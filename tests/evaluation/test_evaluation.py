@@ -15,6 +15,7 @@ from PIL import Image
 from rich.console import Console
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.membership import Membership
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.evaluation.metrics import MaskMetrics
 from beags_plugin.evaluation.protocol import Protocol
@@ -40,7 +41,7 @@ PERFECT = MaskMetrics(1.0, 1.0, 1.0)
 
 def evaluated(squares, ids, *views: EvalView, **options) -> SceneMetrics:
     ids = torch.as_tensor(ids, dtype=torch.int32)
-    return evaluate_scene(scene(list(squares)), ids, Squares(), SETTINGS, views, CLASSES, **options)
+    return evaluate_scene(scene(list(squares)), Membership(ids), Squares(), SETTINGS, views, CLASSES, **options)
 
 
 def test_a_perfect_scene_scores_one():
@@ -116,14 +117,14 @@ def test_more_objects_than_colour_channels():
     ids = torch.tensor([1, 2, 3, 4], dtype=torch.int32)
     classes = {i: str(i) for i in range(5)}
     view = EvalView(camera(), None, labels)
-    metrics = evaluate_scene(scene(squares), ids, Squares(), SETTINGS, [view], classes)
+    metrics = evaluate_scene(scene(squares), Membership(ids), Squares(), SETTINGS, [view], classes)
     assert [m.rendered.iou for m in metrics.objects.values() if m.rendered] == [1.0] * 4
 
 
 def test_the_image_is_compared_after_clamping():
     surfels, ids = scene([FLOOR], grey=1.5), torch.zeros(1, dtype=torch.int32)
     view = EvalView(camera(), torch.full((SIZE, SIZE, 3), 0.9))
-    metrics = evaluate_scene(surfels, ids, Squares(), SETTINGS, [view], CLASSES)
+    metrics = evaluate_scene(surfels, Membership(ids), Squares(), SETTINGS, [view], CLASSES)
     assert metrics.psnr == pytest.approx(20.0, abs=1e-4)  # an error of 0.1 everywhere
 
 
@@ -200,7 +201,7 @@ def test_the_novel_view_lies_towards_the_nearest_one():
 
 
 def test_the_sheet_shows_objects_before_and_after(tmp_path):
-    scenes = [(scene([CUP, BOX, FLOOR], grey=grey), IDS) for grey in (0.3, 0.6)]
+    scenes = [(scene([CUP, BOX, FLOOR], grey=grey), Membership(IDS)) for grey in (0.3, 0.6)]
     views = [EvalView(camera(s), torch.rand(SIZE, SIZE, 3), truth(), name=f"view {s}") for s in (0.0, 1.0)]
     counts: list[tuple[int, int]] = []
     options = {"novel": novel_camera(views), "progress": lambda *steps: counts.append(steps)}

@@ -11,6 +11,7 @@ import torch
 from known_masks import BOX, CLASSES, CUP, FLOOR, SETTINGS, SIZE, Squares, camera, scene, square_mask, truth
 from scipy.ndimage import binary_erosion
 
+from beags_plugin.core.membership import Membership
 from beags_plugin.evaluation.metrics import METRICS, MaskMetrics, mask_metrics
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import EvalView, MaskRecord, ObjectMetrics, SceneMetrics, ViewRecord
@@ -77,7 +78,7 @@ def test_a_mask_that_is_empty_in_both_is_left_out_and_one_that_should_be_empty_c
     views = [EvalView(camera(), None, None, {1: square_mask(*CUP)}), EvalView(camera(), None, None, {2: truth() > 9})]
     x, y, half = CUP
     surfels, ids = scene([(x - half / 2, y, half), FLOOR]), torch.tensor([1, 0], dtype=torch.int32)
-    metrics = evaluate_scene(surfels, ids, Squares(), SETTINGS, views, CLASSES)
+    metrics = evaluate_scene(surfels, Membership(ids), Squares(), SETTINGS, views, CLASSES)
     expected = ratio(square_mask(x - half / 2, y, half).numpy(), square_mask(*CUP).numpy())
     assert metrics.mean.extracted is not None and metrics.mean.extracted.iou == pytest.approx(expected)
     assert metrics.objects[2].extracted == NO_FIGURES
@@ -97,7 +98,7 @@ def test_the_threshold_cuts_both_kinds(threshold):
     view = EvalView(camera(), None, truth(), {1: square_mask(*CUP)})
     protocol = Protocol(threshold=threshold)
     ids = torch.tensor([1], dtype=torch.int32)
-    metrics = evaluate_scene(scene([CUP]), ids, Ramp(), SETTINGS, [view], {1: "cup"}, protocol=protocol)
+    metrics = evaluate_scene(scene([CUP]), Membership(ids), Ramp(), SETTINGS, [view], {1: "cup"}, protocol=protocol)
     predicted = np.broadcast_to((np.arange(SIZE) + 0.5) / SIZE > threshold, (SIZE, SIZE))
     cup = metrics.objects[1]
     assert cup.extracted is not None and cup.rendered is not None
@@ -111,7 +112,7 @@ def test_what_no_photo_shows_is_scored_and_the_rest_stands_beside_it():
     view = EvalView(camera(), None, None, {1: square_mask(*CUP)}, seen={1: known})
     x, y, half = CUP
     surfels, ids = scene([(x + half / 2, y, half / 2), BOX]), torch.tensor([1, 2], dtype=torch.int32)
-    cup = evaluate_scene(surfels, ids, Squares(), SETTINGS, [view], CLASSES).objects[1]
+    cup = evaluate_scene(surfels, Membership(ids), Squares(), SETTINGS, [view], CLASSES).objects[1]
     predicted = square_mask(x + half / 2, y, half / 2).sum().item()
     assert cup.extracted is not None and cup.extracted.iou == predicted / square_mask(*CUP).sum().item()
     assert cup.seen is not None and cup.seen.iou == predicted / known.sum().item()

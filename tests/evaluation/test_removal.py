@@ -11,6 +11,7 @@ import torch
 from known_masks import BOX, CLASSES, CUP, FLOOR, SETTINGS, SIZE, Squares, camera, scene, square_mask
 from rich.console import Console
 
+from beags_plugin.core.membership import Membership
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import EvalView, SceneMetrics
 from beags_plugin.evaluation.removal import TELLING
@@ -40,7 +41,7 @@ def evaluated(squares, ids, removed, photo=None, silhouettes=None, objects=HIGH,
     photo = picture(CUP, BOX, objects=objects) if photo is None else photo
     view = EvalView(camera(), photo, None, silhouettes, "v", removed=removed, removed_shown=known)
     ids = torch.tensor([*ids, 0], dtype=torch.int32)
-    return evaluate_scene(surfels, ids, Squares(), SETTINGS, [view], CLASSES, **options)
+    return evaluate_scene(surfels, Membership(ids), Squares(), SETTINGS, [view], CLASSES, **options)
 
 
 def decibels(wrong_pixels: int, of: int, by: float = HIGH - LOW) -> float:

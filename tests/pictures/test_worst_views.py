@@ -7,6 +7,7 @@ import pytest
 import torch
 from known_masks import BOX, CLASSES, CUP, FLOOR, SETTINGS, SIZE, Squares, camera, scene, square_mask, truth
 
+from beags_plugin.core.membership import Membership
 from beags_plugin.evaluation.metrics import MaskMetrics
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import EvalView
@@ -35,7 +36,7 @@ GREY = 100
 def evaluated(protocol: Protocol | None = None):
     """Evaluate a cup that assignment puts two pixels off and refinement puts right; in view 1 no box hides it."""
     protocol = protocol or Protocol()
-    ids = torch.tensor([1, 2, 0], dtype=torch.int32)
+    ids = Membership(torch.tensor([1, 2, 0], dtype=torch.int32))
     before, after = scene([SHIFTED, BOX, FLOOR]), scene([CUP, BOX, FLOOR])
     photo = torch.full((SIZE, SIZE, 3), GREY / 255)
     views = [

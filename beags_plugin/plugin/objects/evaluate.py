@@ -8,6 +8,7 @@ from pathlib import Path
 
 from torch import Tensor
 
+from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import SceneMetrics
@@ -58,8 +59,7 @@ class EvaluatedRun:
         self.objects_alone = after.config.data_config.photos == "objects"
         self.classes = after.classes
         if not self.complete:
-            assert after.class_ids is not None  # an extracted run has classes
-            present = set(after.class_ids.unique().tolist())
+            present = after.members.present()
             self.classes = {c: each for c, each in after.classes.items() if c in present}
         self.name = name or scene_name(after.config)
         self.settings = raster_settings(after)
@@ -92,7 +92,7 @@ class EvaluatedRun:
             former = len(found) * len(self.views)
             found[stage] = evaluate_scene(
                 scene.surfels(),
-                scene.class_ids,
+                scene.members if scene.assigned else None,
                 self.rasterizer,
                 self.settings,
                 self.views,
@@ -116,10 +116,9 @@ class EvaluatedRun:
 
     def worst(self, metrics: RunMetrics, count: int, progress: Progress | None = None) -> list[WorstMask]:
         """Render the ``count`` worst masks of each kind; metrics: of this run; progress: receives (done, total)."""
-        scenes: dict[Stage, tuple[Surfels, Tensor]] = {}
-        for stage, scene in self.stages.items():
-            if scene.class_ids is not None:
-                scenes[stage] = (scene.surfels(), scene.class_ids)
+        scenes: dict[Stage, tuple[Surfels, Membership]] = {
+            stage: (scene.surfels(), scene.members) for stage, scene in self.stages.items() if scene.assigned
+        }
         return draw_worst(metrics, scenes, self.views, self.rasterizer, self.settings, count, progress)
 
     def _notes(self, after: SceneMetrics) -> Iterator[str]:

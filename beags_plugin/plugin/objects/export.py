@@ -185,11 +185,10 @@ class _Job:
 
     def export(self, name: str, class_id: int | None, stem: Path, steps: _Steps) -> Exported:
         """Write all files of one class (None: of the whole scene), called ``stem`` and their suffixes."""
-        class_ids = self.scene.state["class_ids"]
-        chosen = self.scene.surfels()
+        class_ids, chosen = self.scene.members.class_ids, self.scene.surfels()
         if class_id is not None:
-            chosen, index = select_class(chosen, class_ids, class_id)
-            class_ids = class_ids[index]
+            chosen, index = select_class(chosen, self.scene.members, class_id)
+            class_ids = torch.full_like(class_ids[index], class_id)
         low, high = bounding_box(self.world.surfels(chosen))
         center = (low + high) / 2 if self.centred else torch.zeros(3, dtype=torch.float64)
         frame = self.world.centred(center)

@@ -10,16 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
+from beags_plugin.core.membership import Membership
 from beags_plugin.extraction.ply import write_ply
 from beags_plugin.extraction.select import remove_class, select_class
+from beags_plugin.plugin.runs.checkpoint_file import extra_state
 from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, prepared_digests
-from beags_plugin.plugin.runs.read import (
-    SavedScene,
-    read_assigned_run,
-    read_transform,
-)
+from beags_plugin.plugin.runs.read import SavedScene, read_assigned_run, read_transform
 from beags_plugin.plugin.runs.write import write_run
 from beags_plugin.system.errors import UserError, check_choice, writing
 from beags_plugin.system.whole_files import write_text_atomically
@@ -50,8 +49,7 @@ def extract_objects(
     written.
     """
     scene = read_assigned_run(config_path)
-    run = config_path.parent
-    class_ids = scene.state["class_ids"]
+    run, members = config_path.parent, scene.members
     ids = objects_with_gaussians(scene, objects, run)
     names = list(objects) or [name for name, index in ids.items() if index != 0]
     transform = read_transform(run)
@@ -62,15 +60,16 @@ def extract_objects(
     prepared = prepared_digests(run)  # shows later if the run was trained again
     written = []
     for name in names:
-        surfels, index = select(scene.surfels(), class_ids, ids[name])
+        surfels, index = select(scene.surfels(), members, ids[name])
+        part = members[index] if remove else Membership(torch.full((len(index),), ids[name], dtype=torch.int32))
         title = folders[ids[name]]
         title = f"without_{title}" if remove else title
         folder = target / title
-        config = write_run(scene.config, folder, _rows(scene.state, index), scene.step)
+        config = write_run(scene.config, folder, _rows(scene.state, index, part), scene.step)
         origin = {"object": name, "removed": remove, "run": str(config_path.absolute()), "prepared": prepared}
         write_text_atomically(json.dumps(origin, indent=2), folder / EXTRACTION_FILE)
         ply = folder / f"{title}.ply"
-        write_ply(ply, surfels, class_ids[index], transform)
+        write_ply(ply, surfels, part.class_ids, transform)
         written.append(Extracted(title, config, ply, len(surfels)))
         if progress is not None:
             progress(len(written), len(names))
@@ -82,19 +81,21 @@ def objects_with_gaussians(scene: SavedScene, objects: Sequence[str], run: Path)
     ids = {name: index for index, name in scene.classes.items()}
     for name in objects:
         check_choice(name, ids, "object", f" in {run}")
-    present = {name: index for name, index in ids.items() if bool((scene.state["class_ids"] == index).any())}
+    there = set(scene.members.present())
+    present = {name: index for name, index in ids.items() if index in there}
     if absent := [name for name in objects if name not in present]:
         raise UserError(f"no Gaussian belongs to {absent[0]!r}: its masks cover too little of the scene.")
     return present
 
 
-def _rows(state: dict[str, Any], index: Tensor) -> dict[str, Any]:
-    """Return a model's state with the Gaussians ``index`` [M] only."""
-    per_surfel = {"class_ids", "class_margin"}
-    return {
-        name: value[index] if name in per_surfel or name.startswith("gauss_params.") else value
+def _rows(state: dict[str, Any], index: Tensor, members: Membership) -> dict[str, Any]:
+    """Return a model's state with the Gaussians ``index`` [M] only, and their classes."""
+    rows = {
+        name: value[index] if name == "class_margin" or name.startswith("gauss_params.") else value
         for name, value in state.items()
     }
+    extra = extra_state(state["_extra_state"]["classes"], members)
+    return {**rows, "class_ids": members.class_ids, "_extra_state": extra}
 
 
 def folder_names(classes: dict[int, str]) -> dict[int, str]:

@@ -94,11 +94,11 @@ def _along(
     scene = read_assigned_run(config_path) if objects or form != "video" else read_run(config_path)
     stages = {"": scene} if form == "video" else {"before": _base_of(config_path), "after": scene}
     present = objects_with_gaussians(scene, objects, config_path.parent) if objects else {}
-    chosen = torch.tensor([present[name] for name in objects])
     shown = {}
     for caption, each in stages.items():
-        surfels, class_ids = each.surfels(), each.state["class_ids"]
-        shown[caption] = surfels[torch.isin(class_ids, chosen)] if objects else surfels
+        surfels, members = each.surfels(), each.members
+        chosen = [members.of(present[name]) for name in objects]
+        shown[caption] = surfels[torch.stack(chosen).any(dim=0)] if chosen else surfels
     subject = Subject("", shown, cameras, raster_settings(scene))
     rasterizer = make_rasterizer(scene.config.model_config.rasterizer)
     write_film(output, film([subject], rasterizer, options.background, progress), fps)
@@ -149,8 +149,7 @@ def _subjects(
     subjects = []
     for name in names:
         shown = {
-            caption: select_class(scene.surfels(), scene.state["class_ids"], present[name])[0]
-            for caption, scene in stages.items()
+            caption: select_class(scene.surfels(), scene.members, present[name])[0] for caption, scene in stages.items()
         }
         stand = orbit_frame(*bounding_box(list(shown.values())[-1]), photos)
         cameras = orbit(stand, count, size, options.elevation, options.turn)

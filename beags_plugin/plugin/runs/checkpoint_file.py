@@ -6,8 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
+from beags_plugin.core.membership import Membership
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.tensors import load_tensors
 
@@ -31,6 +33,14 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     if not whole or not isinstance(checkpoint["pipeline"], dict) or type(checkpoint["step"]) is not int:
         raise UserError(f"{path} is no checkpoint of ns-train: name a step-….ckpt of a run.")
     return checkpoint
+
+
+def extra_state(classes: Mapping[int, str], members: Membership) -> dict[str, Any]:
+    """Return what a model's state holds besides tensors by name: class names, and objects that classes do not tell."""
+    state: dict[str, Any] = {"classes": dict(classes)}
+    if members.objects is not None:
+        state["objects"] = {class_id: index.cpu() for class_id, index in members.objects.items()}
+    return state
 
 
 def scene_alone(checkpoint: dict[str, Any]) -> bool:
@@ -69,5 +79,17 @@ def _wrong(state: Mapping[str, Any]) -> str | None:
     names = extra.get("classes") if isinstance(extra, dict) else None
     if not isinstance(names, dict):
         return "the names of its classes are missing"
-    unnamed = sorted(set(state["class_ids"].unique().tolist()) - set(names)) if bool(state["assigned"]) else []
+    assert isinstance(extra, dict)
+    objects = extra.get("objects", {})
+    if not isinstance(objects, dict) or not all(_is_index(each, count) for each in objects.values()):
+        return "the Gaussians of its objects are not among its own"
+    found = set(objects) | set(state["class_ids"].unique().tolist() if bool(state["assigned"]) else [])
+    unnamed = sorted(found - set(names))
     return f"it gives Gaussians the class {unnamed[0]}, which has no name" if unnamed else None
+
+
+def _is_index(value: Any, count: int) -> bool:
+    """Return whether a value holds indices [M] int64 of ``count`` Gaussians."""
+    if not isinstance(value, Tensor) or value.dim() != 1 or value.dtype != torch.int64:
+        return False
+    return len(value) == 0 or (int(value.min()) >= 0 and int(value.max()) < count)

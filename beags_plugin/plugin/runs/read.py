@@ -12,6 +12,7 @@ from typing import Any, Literal, cast
 import torch
 from torch import Tensor
 
+from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import Viewpoints
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
@@ -47,9 +48,9 @@ class SavedScene:
         return bool(self.state["assigned"])
 
     @property
-    def class_ids(self) -> Tensor | None:
-        """[N] int32, phi; None before the Gaussians have classes."""
-        return self.state["class_ids"] if self.assigned else None
+    def members(self) -> Membership:
+        """Which Gaussians belong to which class; all to the background before they have classes."""
+        return Membership(self.state["class_ids"], self.state["_extra_state"].get("objects"))
 
 
 def read_run(config_path: Path, data: Path | None = None) -> SavedScene:

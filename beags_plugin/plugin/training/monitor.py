@@ -106,17 +106,17 @@ class Curves:
     def _measure(self, step: int, progress: Callable[[int, int], None]) -> None:
         """Measure and write; ``progress`` is called with (done, total) of the masks and pictures."""
         model = self.model
-        surfels, class_ids = model.surfels().detach(), model.class_ids
+        surfels, members = model.surfels().detach(), model.members()
         if model.grid is not None:
-            found = occupancy_violations(surfels, class_ids, model.grid, model.seed, step)
+            found = occupancy_violations(surfels, model.class_ids, model.grid, model.seed, step)
             found.pop(BACKGROUND, None)  # all that no object has, seen there or not
             for name, share in self._named(found).items():
                 writer.put_scalar(f"Occupancy violation/{name}", share, step)
         views = self._looked_at()
         objects = [index for index in sorted(model.classes)[:MOST_CLASSES] if index != BACKGROUND]
-        parts = {index: select_class(surfels, class_ids, index)[0] for index in objects}
+        parts = {index: select_class(surfels, members, index)[0] for index in objects}
         settings = model.settings(geometry=False)
-        renderers = [MaskRenderer(surfels, class_ids, view, model.rasterizer, settings, Protocol()) for view in views]
+        renderers = [MaskRenderer(surfels, members, view, model.rasterizer, settings, Protocol()) for view in views]
         values: list[float] = []
         done, total = 0, len(objects) * (len(views) + 1)
         for index in objects:

@@ -12,10 +12,12 @@ from nerfstudio.models.splatfacto import SplatfactoModel
 from torch import Tensor, nn
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.base import Loss
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.options.model_options import BeagsModelConfig, fixed_background
+from beags_plugin.plugin.runs.checkpoint_file import extra_state
 from beags_plugin.plugin.training.timing import StepClock
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
@@ -68,6 +70,7 @@ class SceneModel(SplatfactoModel):
         self.register_buffer("extent", torch.tensor(1.0))
         self.register_buffer("refined_steps", torch.tensor(0))
         self.classes = dict(classes)
+        self.objects: Mapping[int, Tensor] | None = None
         self.schedule = self.config.schedule()
         self.losses: dict[str, Loss] = {
             name: spec.build(name, self.schedule)
@@ -139,6 +142,16 @@ class SceneModel(SplatfactoModel):
             sh_rest=self.gauss_params["features_rest"],
         )
 
+    def members(self) -> Membership:
+        """Return which Gaussians belong to which class."""
+        return Membership(self.class_ids, self.objects)
+
+    def take_members(self, members: Membership) -> None:
+        """Take the classes of all Gaussians."""
+        self.class_ids = members.class_ids.int().to(self.device)
+        self.objects = members.objects
+        self.assigned.fill_(True)
+
     def replace_surfels(self, surfels: Surfels) -> None:
         """Replace all parameters, in any number and SH degree; classes are reset."""
         self.config.sh_degree = surfels.sh_degree
@@ -151,6 +164,7 @@ class SceneModel(SplatfactoModel):
     def _reset_classes(self, count: int) -> None:
         self.class_ids = torch.zeros(count, dtype=torch.int32, device=self.device)
         self.class_margin = torch.zeros(count, device=self.device)
+        self.objects = None
 
     def take_classes(self, classes: Mapping[int, str]) -> None:
         """Take other classes, of which no Gaussian has one yet."""
@@ -170,12 +184,13 @@ class SceneModel(SplatfactoModel):
         return nn.Module.load_state_dict(self, state, **kwargs)  # type: ignore[arg-type]
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return the class names, which a checkpoint keeps besides tensors."""
-        return {"classes": dict(self.classes)}
+        """Return the class names and objects, which a checkpoint keeps besides tensors by name."""
+        return extra_state(self.classes, self.members())
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Take the class names of a checkpoint."""
+        """Take the class names and objects of a checkpoint."""
         self.classes = {int(index): str(name) for index, name in state["classes"].items()}
+        self.objects = state.get("objects")
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return one optimizer group per kind of parameter."""

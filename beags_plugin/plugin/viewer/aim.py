@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.frames import bounding_box
 from beags_plugin.pictures.orbit import OrbitFrame, orbit_frame
@@ -21,9 +22,9 @@ _WORLD = 10.0  # viser's units in one of nerfstudio's: VISER_NERFSTUDIO_SCALE_RA
 _MARGIN = 1.1  # discs reach beyond their box
 
 
-def frame_of(surfels: Surfels, class_ids: Tensor, wanted: Sequence[int], cameras: Sequence[Camera]) -> OrbitFrame:
+def frame_of(surfels: Surfels, members: Membership, wanted: Sequence[int], cameras: Sequence[Camera]) -> OrbitFrame:
     """Return the place of the box around the Gaussians of the ``wanted`` classes; each must have some."""
-    boxes = [bounding_box(surfels[class_ids == class_id]) for class_id in wanted]
+    boxes = [bounding_box(surfels[members.of(class_id)]) for class_id in wanted]
     low, high = torch.stack([box[0] for box in boxes]), torch.stack([box[1] for box in boxes])
     return orbit_frame(low.amin(dim=0), high.amax(dim=0), cameras)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels, opacities
 
 
@@ -80,24 +81,24 @@ class Visible:
 
 @torch.no_grad()
 def shown(
-    surfels: Surfels, class_ids: Tensor, choice: Choice, rest: bool = True, inside: Tensor | None = None
+    surfels: Surfels, members: Membership, choice: Choice, rest: bool = True, inside: Tensor | None = None
 ) -> Visible:
     """Return the part of a scene that ``choice`` leaves.
 
-    surfels: N Gaussians. class_ids: [N] int, phi. rest: False leaves the rest out. inside: [N] bool, the Gaussians of a
+    surfels: N Gaussians. members: of them. rest: False leaves the rest out. inside: [N] bool, the Gaussians of a
     crop box, or None for all.
     """
     if not choice.of_classes and choice.min_opacity <= 0.0 and inside is None:
-        return Visible(surfels, class_ids, None)
-    keep = torch.ones(len(surfels), dtype=torch.bool, device=class_ids.device)
+        return Visible(surfels, members.class_ids, None)
+    keep = torch.ones(len(surfels), dtype=torch.bool, device=members.class_ids.device)
     if inside is not None:
         keep &= inside
     if choice.min_opacity > 0.0:
         keep &= opacities(surfels.opacity_logits) >= choice.min_opacity
-    fades = _member(class_ids, choice.hidden)
+    fades = _of_any(members, choice.hidden)
     if choice.isolated is not None:
-        fades |= class_ids != choice.isolated
-    keep &= ~_member(class_ids, choice.removed)
+        fades |= ~members.of(choice.isolated)
+    keep &= ~_of_any(members, choice.removed)
     left = choice.faded_opacity if rest else 0.0
     if left <= 0.0:
         keep &= ~fades
@@ -106,8 +107,14 @@ def shown(
     if 0.0 < left < 1.0:
         faded = torch.logit(left * opacities(chosen.opacity_logits), eps=1e-6)  # below 1 / 255 is as good as 0
         chosen = replace(chosen, opacity_logits=torch.where(fades[index], faded, chosen.opacity_logits))
-    return Visible(chosen, class_ids[index], index)
+    return Visible(chosen, members.class_ids[index], index)
 
 
-def _member(class_ids: Tensor, members: frozenset[int]) -> Tensor:
-    return torch.isin(class_ids, class_ids.new_tensor(sorted(members)))
+def _of_any(members: Membership, classes: frozenset[int]) -> Tensor:
+    """Return [N] bool, the Gaussians of any of the classes."""
+    if members.objects is None:
+        return torch.isin(members.class_ids, members.class_ids.new_tensor(sorted(classes)))
+    found = torch.zeros_like(members.class_ids, dtype=torch.bool)
+    for class_id in classes:
+        found |= members.of(class_id)
+    return found

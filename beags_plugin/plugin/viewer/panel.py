@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
 from nerfstudio.viewer.viewer_elements import (
     ViewerButton,
     ViewerButtonGroup,
@@ -263,11 +262,18 @@ class ObjectPanel(ViewerElement[None]):
         """List the classes that have Gaussians, under the names that the model now has."""
         model = self.viewing.model
         ids = model.class_ids
-        key = (bool(model.assigned), ids.data_ptr(), len(ids), ids._version, tuple(model.classes.items()))
+        key = (
+            bool(model.assigned),
+            ids.data_ptr(),
+            len(ids),
+            ids._version,
+            id(model.objects),
+            tuple(model.classes.items()),
+        )
         if key == self._counted:
             return
-        numbers, counts = torch.unique(ids, return_counts=True) if key[0] else (ids[:0], ids[:0])
-        self.counts = dict(zip(numbers.tolist(), counts.tolist(), strict=True))
+        members = model.members()
+        self.counts = {c: int(members.of(c).sum()) for c in members.present()} if key[0] else {}
         self.labels = unique_labels({class_id: model.classes.get(class_id, "") for class_id in self.counts})
         self._counted = key
         options, former = list(self.labels) or [NONE], self.object.value

@@ -12,6 +12,7 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.occupancy.violation import violation_shares
 from beags_plugin.plugin.training.scene_model import SceneModel
@@ -57,7 +58,7 @@ def scene_outputs(model: SceneModel, camera: Camera) -> dict[str, Tensor]:
     Each [H, W, 1 or 3] float32: rgb, depth (world units along z), normal, accumulation, background; with classes also
     class_map (colours) and class_confidence (the winner's share).
     """
-    scene = shown(model.surfels(), model.class_ids, Choice(), inside=within(model, model.crop_box))
+    scene = shown(model.surfels(), model.members(), Choice(), inside=within(model, model.crop_box))
     outputs = plain_outputs(model, scene, camera, model.background_color)
     if bool(model.assigned):
         outputs.update(class_outputs(model, scene, camera))
@@ -159,7 +160,7 @@ class Viewing:
         """Return the Gaussians that the choice leaves; rest: False leaves the faded ones out."""
         model = self.model
         choice = self.choice if bool(model.assigned) else Choice(min_opacity=self.choice.min_opacity)
-        return shown(model.surfels().detach(), model.class_ids, choice, rest, within(model, self.crop_box()))
+        return shown(model.surfels().detach(), model.members(), choice, rest, within(model, self.crop_box()))
 
     def outputs(self, camera: Camera) -> dict[str, Tensor]:
         """Render every picture that the viewer lists; those that it does not show at present are left black."""
@@ -236,10 +237,11 @@ class Viewing:
             scene = self.shown(rest)
             return Visible(scene.surfels.clone(), scene.class_ids.clone(), scene.index)
 
-    def whole(self) -> tuple[Surfels, Tensor]:
-        """Return the scene and its class ids in memory of their own; waits as ``copy`` does."""
+    def whole(self) -> tuple[Surfels, Membership]:
+        """Return the scene and its classes in memory of their own; waits as ``copy`` does."""
         with self.lock:
-            return self.model.surfels().detach().clone(), self.model.class_ids.clone()
+            members = self.model.members()
+            return self.model.surfels().detach().clone(), Membership(members.class_ids.clone(), members.objects)
 
     def refresh_shares(self) -> bool:
         """Compute the shares behind ``occupancy_violation``, if the scene has changed; return whether it did.

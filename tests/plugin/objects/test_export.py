@@ -17,6 +17,7 @@ from run_folders import CLASSES, discs, write_scene, write_trained
 pytest.importorskip("nerfstudio")
 
 from beags_plugin.commands.cli import main
+from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export import EXPORTERS
 from beags_plugin.export.base import Exporter, ExportItem, Viewpoints, make_exporter
@@ -118,7 +119,7 @@ def test_a_splat_file_looks_like_the_object(trained, tmp_path, kind, frame):
           "--output", str(tmp_path)])  # fmt: skip
     (file,) = tmp_path.iterdir()
     surfels, ids = discs()
-    cup, _ = select_class(surfels, ids, 1)
+    cup, _ = select_class(surfels, Membership(ids), 1)
     read, read_ids = read_ply(file)
     assert read_ids is not None and read_ids.tolist() == [1] * len(cup)
     place = world_frame(trained)

@@ -148,7 +148,7 @@ def splats(config, views) -> dict[tuple[str, str], Picture]:
     found = {}
     for view in run.views:
         for class_id, name in OBJECTS.items():
-            part, _ = select_class(scene.surfels(), scene.class_ids, class_id)
+            part, _ = select_class(scene.surfels(), scene.members, class_id)
             inputs = surfel_inputs(part, view.camera)
             drawn = run.rasterizer.rasterize(inputs, view.camera, run.settings, torch.zeros(3))
             alpha = drawn.alpha.numpy()

@@ -11,6 +11,7 @@ import torch
 from run_folders import discs
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels, opacities
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.colors import colorize
@@ -59,7 +60,7 @@ def joined(*parts: Surfels) -> Surfels:
 
 def test_nothing_chosen_shows_everything_without_copying():
     surfels, ids = discs()
-    scene = shown(surfels, ids, Choice(faded_opacity=0.3))
+    scene = shown(surfels, Membership(ids), Choice(faded_opacity=0.3))
     assert scene.surfels is surfels and scene.index is None
 
 
@@ -82,7 +83,7 @@ def test_nothing_chosen_shows_everything_without_copying():
 )
 def test_choices_leave_these_classes(choice, classes):
     surfels, ids = discs()
-    scene = shown(surfels, ids, choice)
+    scene = shown(surfels, Membership(ids), choice)
     index = torch.arange(len(ids)) if scene.index is None else scene.index
     assert set(scene.class_ids.tolist()) == classes
     assert index.tolist() == [i for i, class_id in enumerate(ids.tolist()) if class_id in classes]
@@ -94,22 +95,24 @@ def test_choices_leave_these_classes(choice, classes):
 def test_the_rest_fades_and_what_is_removed_stays_away():
     surfels, ids = discs()
     choice = Choice(faded_opacity=0.25).isolate(1).remove(2)
-    scene = shown(surfels, ids, choice)
+    scene = shown(surfels, Membership(ids), choice)
     before = opacities(surfels.opacity_logits)[scene.index]
     factor = torch.where(scene.class_ids == 1, 1.0, 0.25)
     assert set(scene.class_ids.tolist()) == {0, 1}
     torch.testing.assert_close(opacities(scene.surfels.opacity_logits), before * factor, rtol=1e-5, atol=1e-6)
-    assert set(shown(surfels, ids, choice, rest=False).class_ids.tolist()) == {1}
-    assert shown(surfels, ids, Choice(faded_opacity=1.0).hide(1)).surfels.opacity_logits.equal(surfels.opacity_logits)
+    assert set(shown(surfels, Membership(ids), choice, rest=False).class_ids.tolist()) == {1}
+    assert shown(surfels, Membership(ids), Choice(faded_opacity=1.0).hide(1)).surfels.opacity_logits.equal(
+        surfels.opacity_logits
+    )
 
 
 def test_the_least_opacity_and_a_crop_box_leave_surfels_out():
     surfels = joined(wall(0.0, opacity=0.2), wall(1.0, opacity=0.6), wall(2.0, opacity=0.9))
     ids = torch.tensor([0, 1, 1], dtype=torch.int32)
-    assert shown(surfels, ids, Choice(min_opacity=0.5)).index.tolist() == [1, 2]
+    assert shown(surfels, Membership(ids), Choice(min_opacity=0.5)).index.tolist() == [1, 2]
     inside = torch.tensor([True, True, False])
-    assert shown(surfels, ids, Choice(min_opacity=0.5), inside=inside).index.tolist() == [1]
-    assert shown(surfels, ids, Choice(min_opacity=1.0)).index.tolist() == []
+    assert shown(surfels, Membership(ids), Choice(min_opacity=0.5), inside=inside).index.tolist() == [1]
+    assert shown(surfels, Membership(ids), Choice(min_opacity=1.0)).index.tolist() == []
 
 
 # -- picking -----------------------------------------------------------------------------------------------------------
@@ -205,7 +208,7 @@ def test_a_camera_at_its_place_sees_all_objects_from_the_side_of_a_photo(aspect)
     surfels, ids = discs()
     views = [view(turn=1.0), view(turn=2.0)]
     views[0] = Camera(torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ views[0].viewmat, views[0].K, 32, 24)
-    frame = frame_of(surfels, ids, [1, 2], views)
+    frame = frame_of(surfels, Membership(ids), [1, 2], views)
     away = side_of_photos(frame, views)
     torch.testing.assert_close(away, views[1].center.double() - frame.center)
     eye = place(frame, away, 0.9, aspect)
