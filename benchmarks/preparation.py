@@ -26,7 +26,7 @@ def measure(reprojection: str, views: int) -> None:
     from beags_plugin.preparation.pipeline import Preparation, PreparationConfig, prepare
     from beags_plugin.rasterizers import make_rasterizer
     from beags_plugin.rasterizers.rendering import render_class_map
-    from beags_plugin.refiners import REFINERS
+    from beags_plugin.refiners import make_refiner
     from beags_plugin.system.memory import peak_memory_mb
     from benchmarks.peak_memory import peak_mb_of
     from benchmarks.scaling_scene import SETTINGS, Sizes, make_scene
@@ -44,7 +44,7 @@ def measure(reprojection: str, views: int) -> None:
     names = {index: str(index) for index in range(scene.num_classes)}
     config = PreparationConfig(reprojection=reprojection)
     found: list[Preparation] = []
-    start, refiner = time.perf_counter(), REFINERS.get("bea")()
+    start, refiner = time.perf_counter(), make_refiner("bea", {})
     added = peak_mb_of(
         lambda: found.append(prepare(scene.surfels, cameras, labels, names, rasterizer, SETTINGS, refiner, config))
     )

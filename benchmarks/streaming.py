@@ -47,9 +47,9 @@ def take_batches(root: Path, stream: str) -> None:
     """Print one JSON line: peak memory before and after, waiting, digest of the batches."""
     import hashlib
 
-    from beags_plugin.plugin.training.refinement import peak_memory_mb
     from beags_plugin.plugin.views.datamanager import BeagsDataManagerConfig
     from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+    from beags_plugin.system.memory import peak_memory_mb
 
     parser = BeagsDataParserConfig(data=root, num_random_points=1000)
     config = BeagsDataManagerConfig(dataparser=parser, stream=stream, cache_images_type="uint8")

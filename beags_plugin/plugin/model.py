@@ -137,7 +137,12 @@ class BeagsModel(SceneModel):
             members=self._class_members(),
             present=batch.get("present"),
         )
-        terms = {name: loss.weighted(inputs) for name, loss in self.active_losses().items()}
+
+        def listed() -> dict[str, Tensor]:
+            return {name: loss.weighted(inputs) for name, loss in self.active_losses().items()}
+
+        own, step = self.own_training, self.step - self.schedule.base_steps
+        terms = listed() if own is None else own.terms(inputs, step, listed)
         self.clock.mark("losses")
         # a frozen scene still needs something to call backward on; no parameter hangs on it, so none moves
         return terms or {"none": torch.zeros((), device=self.device, requires_grad=True)}

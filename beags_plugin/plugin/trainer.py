@@ -19,6 +19,7 @@ from beags_plugin.importers.base import find_importer
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.options.machine import check_machine
 from beags_plugin.plugin.options.rollback import Rollback, noted
+from beags_plugin.plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.runs.layout import REPORT_FILE
 from beags_plugin.plugin.training.checkpoints import Checkpoints
 from beags_plugin.plugin.training.memory_guard import NO_MEMORY, MemoryWatch, check_room, is_out_of_memory
@@ -47,7 +48,8 @@ class BeagsTrainer(Trainer):
     def __init__(self, config: BeagsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         silence_libraries()
         self.schedule = config.model_config.schedule()
-        self.last_step = config.max_num_iterations or self.schedule.total
+        self._asked_steps = config.max_num_iterations
+        self.reschedule(self.schedule)
         config.max_num_iterations = self.last_step
         self.curve: HeldOutCurve | None = None
         self.seconds = StageSeconds()
@@ -60,6 +62,11 @@ class BeagsTrainer(Trainer):
         self._replica = Replica(config, local_rank)
         super().__init__(config, local_rank, world_size)
         self._checkpoints = Checkpoints(config, self.base_dir, self.checkpoint_dir)
+
+    def reschedule(self, schedule: PhaseSchedule) -> None:
+        """Take the steps of this run, which some refiners tell from the data."""
+        self.schedule = schedule
+        self.last_step = self._asked_steps or schedule.total
 
     @property
     def _model(self) -> SceneModel:

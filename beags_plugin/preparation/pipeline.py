@@ -10,8 +10,10 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from beags_plugin.assignment.assignment import Assignment, assign_classes, check_class_ids
+from beags_plugin.assignment.assignment import Assignment, by_largest
+from beags_plugin.assignment.contributions import check_class_ids, contributions
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE, objects_in
 from beags_plugin.labels.class_ranks import ClassRanks
@@ -94,6 +96,7 @@ class Preparation:
     assignment: classes of the base.
     grid: the visibility voxel grids, or None if the refiner needs none.
     edited: start of refinement if Gaussians were split; None if it starts from the base.
+    members: the objects, where the refiner says more than the classes do.
     summary: a line of text per stage. seconds: wall time per stage.
     """
 
@@ -102,6 +105,7 @@ class Preparation:
     assignment: Assignment
     grid: VisibilityGrid | None
     edited: EditedScene | None = None
+    members: Membership | None = None
     summary: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -118,6 +122,7 @@ def prepare(
     split: BorderSplitConfig | None = None,
     background_voxels: bool = True,
     seed: int = 0,
+    scale: float = 1.0,
     stage: Stage = lambda name: nullcontext(),
 ) -> Preparation:
     """Make labels consistent, assign classes, split at boundaries if the refiner trains, build the voxel grids.
@@ -126,6 +131,7 @@ def prepare(
     cameras: V training views; labels: per view [H, W] int32 class ids or IGNORE, or None; held as ``LabelMaps``.
     class_names: id to name with background (0), in any range: the stages work on ranks.
     background_voxels: False drops the voxels of the background, for losses that ignore it.
+    scale: units of the scene's frame per unit of the input poses'.
     Data as large as the photos lies in temporary files: memory grows by compressed labels per view and by voxels. Only
     "pairwise" reads depth and labels of all views into memory.
     Raises ``UserError`` if no mask names an object.
@@ -142,8 +148,9 @@ def prepare(
     ranked = masks.ranked
 
     with _timed("assignment", seconds), stage("Assigning classes") as progress:
-        assignment = assign_classes(surfels, cameras, ranked, rasterizer, settings, len(known), progress=progress)
-        assignment = replace(assignment, class_ids=known.class_ids(assignment.class_ids))
+        shares = contributions(surfels, cameras, ranked, rasterizer, settings, len(known), progress=progress)
+        shares = replace(shares, classes=known)
+        assignment = by_largest(shares)
     summary.append(assignment_summary(assignment, class_names))
 
     edited = None
@@ -164,6 +171,8 @@ def prepare(
         rasterizer,
         settings,
         seed,
+        shares,
+        scale,
         config.depth,
         config.unseen,
         config.votes,
@@ -178,7 +187,9 @@ def prepare(
         grid = grid.only(asked if background_voxels else asked[asked != 0])
         seconds["voxel grids"] = time.perf_counter() - start
         summary.append(f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {k})")
-    return Preparation(masks.labels, masks.confidence, assignment, grid, edited, summary, seconds)
+    with _timed("objects", seconds):
+        members = refiner.members(scene)
+    return Preparation(masks.labels, masks.confidence, assignment, grid, edited, members, summary, seconds)
 
 
 def check_masks(labels: Iterable[Tensor | None]) -> None:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
 
 from beags_plugin.assignment.assignment import Assignment
+from beags_plugin.assignment.contributions import Contributions
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import Densified
+from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.preparation.own_training import OwnTraining, TrainedScene
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 
 Progress = Callable[[int, int], None]
@@ -25,6 +27,7 @@ class AssignedScene:
     surfels: the base scene, N Gaussians, without gradients. class_ids: [N] int32, phi.
     cameras: the training views. labels: per training view M', [H, W] int32.
     num_classes: ids lie below it, perhaps far apart: see ``labels.class_ranks`` for arrays with an entry per class.
+    contributions: C of E6, of the base. scale: units of the run's frame per unit of the input poses'.
     depth: the depth of the surface: see ``rasterizers.rendering.surface_depth``.
     unseen, votes: see ``PreparationConfig``.
     """
@@ -37,6 +40,8 @@ class AssignedScene:
     rasterizer: Rasterizer
     settings: RasterSettings
     seed: int
+    contributions: Contributions
+    scale: float = 1.0
     depth: str = "median"
     unseen: bool = False
     votes: bool = False
@@ -53,14 +58,33 @@ class EditedScene:
     assignment: Assignment
 
 
-class Refiner(ABC):
-    """Interface of the refiners."""
+@dataclass(frozen=True)
+class Refiner:
+    """Interface of the refiners: frozen dataclasses, whose fields, all with defaults, are their options.
+
+    As it is, it leaves the base to its classes and trains nothing.
+    """
 
     @property
-    @abstractmethod
     def trains(self) -> bool:
-        """Return whether the scene's parameters are optimised after assignment; False keeps them bit for bit."""
+        """Return whether the scene is trained on with the losses of the config."""
+        return False
 
-    @abstractmethod
+    def steps(self, asked: int, views: int, objects: int) -> int:
+        """Return the number of steps of refinement.
+
+        asked: ``refine_steps``. views: of training. objects: classes but the background.
+        """
+        return asked if self.trains else 1  # which changes nothing
+
     def build_grid(self, scene: AssignedScene, k: int, progress: Progress | None = None) -> VisibilityGrid | None:
         """Build the visibility voxel grid of the refiner's losses (``k`` as in E8), or None if they need none."""
+        return None
+
+    def members(self, scene: AssignedScene) -> Membership | None:
+        """Return which Gaussians belong to which object before any step; None: phi says."""
+        return None
+
+    def own_training(self, scene: TrainedScene) -> OwnTraining | None:
+        """Return what makes the steps of a refiner that owns its training; None for the others."""
+        return None

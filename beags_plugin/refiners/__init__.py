@@ -1,6 +1,16 @@
 """Refiners of a scene with assigned classes, registered by name (entry points: ``beags.refiners``)."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import TYPE_CHECKING
+
+from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.registry import Registry
+
+if TYPE_CHECKING:
+    from beags_plugin.preparation.refiner import Refiner
 
 REFINERS = Registry(
     "refiner",
@@ -10,3 +20,15 @@ REFINERS = Registry(
         "none": "beags_plugin.refiners.none:NoRefiner",
     },
 )
+
+
+def make_refiner(name: str, options: Mapping[str, bool | int | float | str]) -> Refiner:
+    """Return the refiner called ``name``; raises ``UserError`` for an unknown name or option, or a wrong value."""
+    kind = REFINERS.get(name)
+    defaults = {field.name: field.default for field in fields(kind)}
+    for option, value in options.items():
+        check_choice(option, defaults, "option", f" of the refiner {name}")
+        wanted = type(defaults[option])
+        if type(value) is not wanted and not (wanted is float and type(value) is int):
+            raise UserError(f"the option {option} of the refiner {name} is {value!r}: give a {wanted.__name__}.")
+    return kind(**options)

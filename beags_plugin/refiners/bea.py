@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from beags_plugin.occupancy.build import build_visibility_grid
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.preparation.refiner import AssignedScene, Progress, Refiner
 
 
+@dataclass(frozen=True)
 class BeaRefiner(Refiner):
     """Trains on with the losses of the refinement phase; classes and number of Gaussians stay fixed."""
 

@@ -1,16 +1,12 @@
-"""Assignment alone, as in FlashSplat."""
+"""Assignment alone: each Gaussian in the class to which it contributes most (E6)."""
 
 from __future__ import annotations
 
-from beags_plugin.preparation.refiner import AssignedScene, Progress, Refiner
+from dataclasses import dataclass
+
+from beags_plugin.preparation.refiner import Refiner
 
 
+@dataclass(frozen=True)
 class NoRefiner(Refiner):
     """Keeps every parameter of the base bit for bit."""
-
-    @property
-    def trains(self) -> bool:
-        return False
-
-    def build_grid(self, scene: AssignedScene, k: int, progress: Progress | None = None) -> None:
-        return None

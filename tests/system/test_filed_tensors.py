@@ -18,7 +18,7 @@ from beags_plugin.masks.reprojection import check_views
 from beags_plugin.masks.voxel_reprojection import reproject_voxel
 from beags_plugin.preparation import consistent_masks
 from beags_plugin.preparation.pipeline import PreparationConfig, prepare
-from beags_plugin.refiners import REFINERS
+from beags_plugin.refiners import make_refiner
 from beags_plugin.system import filed_tensors
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.filed_tensors import FiledTensors, filed, write_tensors
@@ -154,7 +154,7 @@ def test_what_is_prepared_from_files_is_what_is_prepared_from_memory():
 
     def prepared(name):
         config = PreparationConfig(reprojection=name, k=20)
-        refiner = REFINERS.get("bea")()
+        refiner = make_refiner("bea", {})
         found = prepare(surfels, cameras, masks, names, rasterizer, settings, refiner, config)
         assert isinstance(found.labels, LabelMaps) and isinstance(found.confidence, CompressedMaps)
         return [*found.labels, *found.confidence, found.assignment.margin, found.grid.keys, found.grid.classes]

@@ -18,6 +18,7 @@ from beags_plugin.plugin.options.loss_spec import LossSpec
 from beags_plugin.plugin.options.schedule import PhaseSchedule
 from beags_plugin.preparation.border_split import BorderSplitConfig
 from beags_plugin.preparation.pipeline import PreparationConfig
+from beags_plugin.refiners import make_refiner
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.registry import load
 
@@ -58,7 +59,10 @@ class BeagsModelConfig(ModelConfig):
     """Length of base training for which all other steps and intervals of the base are stated; with another base_steps
     they are scaled in proportion. 0: they are taken as they are."""
     refiner: str = "bea"
-    """What happens after class assignment: bea (this method), none (assignment alone), or a registered one."""
+    """What happens after class assignment: bea (this method), none (assignment alone), one of the other methods in
+    docs/refiners.md, or a registered one."""
+    refiner_options: dict[str, bool | int | float | str] = field(default_factory=dict)
+    """Options of the refiner, as names and values in turn: docs/refiners.md."""
     losses: dict[str, LossSpec] = field(default_factory=dict)
     """The terms of the training loss by name."""
     densify: DensifyConfig = field(default_factory=DensifyConfig)
@@ -92,6 +96,7 @@ class BeagsModelConfig(ModelConfig):
             raise UserError(f"position_lr is {self.position_lr}: give two learning rates above 0.")
         if not 0 <= self.refine_position_lr_factor < math.inf:
             raise UserError(f"refine_position_lr_factor is {self.refine_position_lr_factor}: give 0 or more.")
+        make_refiner(self.refiner, self.refiner_options)
 
     def schedule(self) -> PhaseSchedule:
         """Return the steps of both phases."""

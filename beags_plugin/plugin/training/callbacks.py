@@ -32,6 +32,7 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
     densifier = Densifier(model, adam, pixels, cameras.camera_to_worlds[:, :3, 3])
     switch = RefinementSwitch(model, trainer, datamanager)
     switch.check()
+    switch.ask_steps()
     for name, part in {"views": datamanager, "densification": densifier, "refinement": switch}.items():
         trainer.keep(name, part)
 
@@ -50,6 +51,7 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
             curves.before_step(step)
         model.clock.start()
         set_learning_rates(model, adam, trainer.config.optimizers, step)
+        own_learning_rates(model, adam, step)
 
     def after(step: int) -> None:
         densifier.after_step(step)
@@ -71,6 +73,14 @@ def _curves(model: SceneModel, trainer: TrainingRun, datamanager: BeagsDataManag
         return None
     views = HeldOutViews(datamanager, model.classes, model.background_color)
     return Curves(model, views, config.steps_per_objects, trainer.last_step, config.logging.steps_per_log)
+
+
+def own_learning_rates(model: SceneModel, adam: Adam, step: int) -> None:
+    """Set the rates of this step that a refiner which owns its training asks for."""
+    own = model.own_training
+    if own is not None and (rates := own.rates(step - model.schedule.base_steps)) is not None:
+        for group in adam.param_groups:
+            group["lr"] = rates.get(group["name"], 0.0)
 
 
 def set_learning_rates(model: SceneModel, adam: Adam, configs: dict[str, Any], step: int) -> None:

@@ -2,40 +2,33 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from pathlib import Path
+from contextlib import contextmanager
+from dataclasses import replace
 from threading import Lock
 from typing import Any
 
-import numpy as np
-import torch
 from nerfstudio.utils.rich_utils import CONSOLE
-from PIL import Image
 
 from beags_plugin.assignment.assignment import Assignment
-from beags_plugin.core.cameras import Camera
-from beags_plugin.labels.classes import read_id_mask, write_mask
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED, round_folder
-from beags_plugin.plugin.runs.prepared import PREPARATION_REPORT, read_grid
+from beags_plugin.plugin.runs.prepared import read_grid
 from beags_plugin.plugin.runs.write import write_run
-from beags_plugin.plugin.training.contradiction import Residuals, residuals
+from beags_plugin.plugin.training.contradiction import residuals
+from beags_plugin.plugin.training.prepared_files import bar, clear, prepared_labels, save_prepared
 from beags_plugin.plugin.training.resumable import TrainingRun
-from beags_plugin.plugin.training.scene_edits import edit_scene
+from beags_plugin.plugin.training.scene_edits import apply_edit, edit_scene
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
-from beags_plugin.preparation.pipeline import Preparation, check_masks, prepare
-from beags_plugin.refiners import REFINERS
-from beags_plugin.system import processes
-from beags_plugin.system.errors import UserError, writing
-from beags_plugin.system.memory import peak_memory_mb
-from beags_plugin.system.progress import counted, progress_bar
-from beags_plugin.system.whole_files import write_text_atomically, write_whole
+from beags_plugin.preparation.own_training import Edit, OwnTraining, TrainedScene
+from beags_plugin.preparation.pipeline import check_masks, prepare
+from beags_plugin.refiners import make_refiner
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.progress import counted
 
 
 class RefinementSwitch:
@@ -45,7 +38,8 @@ class RefinementSwitch:
         self.model = model
         self.trainer = trainer
         self.datamanager = datamanager
-        self.refiner = REFINERS.get(model.config.refiner)()
+        self.refiner = make_refiner(model.config.refiner, model.config.refiner_options)
+        self._own_state: dict[str, Any] | None = None  # of a loaded checkpoint
         self.ready = False  # to refine
         self._switching = False  # in the middle of the last base step, before nerfstudio evaluates and saves it
         self._evaluation_due = False
@@ -58,24 +52,38 @@ class RefinementSwitch:
         """True if this run refines at all."""
         return self.model.config.refine_steps > 0
 
+    def ask_steps(self) -> None:
+        """Ask the refiner for the number of its steps, which may follow from the data."""
+        if not self.wanted:
+            return
+        schedule, views = self.model.schedule, len(self.datamanager.train_dataset)
+        steps = self.refiner.steps(schedule.refine_steps, views, len(self.model.classes) - 1)
+        self.model.schedule = replace(schedule, refine_steps=steps)
+        self.trainer.reschedule(self.model.schedule)
+
     def check(self) -> None:
         """Raise ``UserError`` for options and masks that would stop the run when it begins to refine."""
         if self.wanted:
             rounds, steps = self.model.config.refine_rounds, self.model.config.refine_steps
             if not 1 <= rounds <= steps:
                 raise UserError(f"refine_rounds is {rounds}: it must be 1 to refine_steps, which is {steps}.")
+            if rounds > 1 and not self.refiner.trains:
+                raise UserError(f"refine_rounds is {rounds}: the refiner {self.model.config.refiner} has 1 round.")
             self.model.config.prepare.check()
             self.model.config.split.check()
             check_masks(view.labels for view in self.datamanager.views("train", original=True))
 
     def state(self) -> dict[str, Any]:
         """Return the number of prepared rounds, and whether nerfstudio has evaluated the step; see ``Resumable``."""
-        return {"rounds": self.rounds, "evaluated": not self._switching}
+        own = self.model.own_training
+        kept = {} if own is None else {"own": own.state()}
+        return {"rounds": self.rounds, "evaluated": not self._switching, **kept}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on in the round of ``state``."""
         self.rounds = state["rounds"]
         self._evaluation_due = not state["evaluated"]
+        self._own_state = state.get("own")
 
     def before_step(self, step: int) -> None:
         """Restore refinement from a checkpoint, or start it where no base step precedes it."""
@@ -94,13 +102,33 @@ class RefinementSwitch:
             self._evaluation_due = False
         model.refined_steps += 1
         self._done += 1
+        if (own := model.own_training) is not None:
+            self._edit(lambda: own.before_step(step - model.schedule.base_steps))
 
     def after_step(self, step: int) -> None:
         """Switch right after the last base step, so that a run that ends there has its classes too."""
+        own, refined = self.model.own_training, step - self.model.schedule.base_steps
+        if own is not None and refined >= 0:
+            self._edit(lambda: own.after_step(refined))
+            if refined + 1 == self.model.schedule.refine_steps:
+                self._finish(own)
         if self.wanted and not self.ready and step + 1 == self.model.schedule.base_steps:
             self._switching = True
             self._prepare(step)
             self._switching = False
+
+    def _edit(self, asked: Callable[[], Edit | None]) -> None:
+        with released(self.trainer.train_lock):  # it may take minutes
+            edit = asked()
+        apply_edit(self.model, self.trainer.optimizers.adam, edit)
+
+    def _finish(self, own: OwnTraining) -> None:
+        """Change the scene as its refiner does in the end, and take the objects from it."""
+        self._edit(own.last_edit)
+        with released(self.trainer.train_lock):
+            members = own.finish()
+        if members is not None:
+            self.model.take_members(members)
 
     def _round_starts(self) -> list[int]:
         return self.model.schedule.round_starts(self.model.config.refine_rounds)
@@ -112,7 +140,7 @@ class RefinementSwitch:
         start = time.perf_counter()
         with self.trainer.long_stage(step):
             views = self.datamanager.views("train", original=True)
-            with _bar("Reading masks", passing=True) as progress:
+            with bar("Reading masks", passing=True) as progress:
                 masks = LabelMaps(view.labels for view in counted(views, len(views), progress))
             fit = residuals(model, views, masks) if first and self.datamanager.config.photos == "all" else None
             with released(self.trainer.train_lock):  # minutes, which only read the scene: a viewer may render it
@@ -128,7 +156,8 @@ class RefinementSwitch:
                     model.config.split,
                     background_voxels=self._background_voxels(),
                     seed=model.seed,
-                    stage=_bar,
+                    scale=self._scale(),
+                    stage=bar,
                 )
             for line in prepared.summary:
                 CONSOLE.print(f"  {line}", highlight=False, markup=False)
@@ -144,6 +173,8 @@ class RefinementSwitch:
             if prepared.edited is not None:
                 edit_scene(model, self.trainer.optimizers.adam, prepared.edited.edited)
                 self._take_classes(prepared.edited.assignment)
+            if prepared.members is not None:  # beyond the classes, which base/ keeps alone
+                model.take_members(prepared.members)
             self.rounds += 1
             self._start(prepared.grid, prepared.labels)
         self.trainer.seconds.prepared(prepared.seconds, time.perf_counter() - start, first)
@@ -156,19 +187,45 @@ class RefinementSwitch:
         self.model.class_margin.copy_(assignment.margin)
         self.model.assigned.fill_(True)
 
+    def _scale(self) -> float:
+        """Return the units of the run's frame per unit of the input poses'."""
+        return float(self.datamanager.train_dataparser_outputs.dataparser_scale)
+
     def _start(self, grid: VisibilityGrid | None, labels: LabelMaps) -> None:
         self.datamanager.replace_labels(labels)
         self.model.grid = None if grid is None else grid.to(self.model.device)
-        self.model.frozen = not self.refiner.trains
+        own = self.refiner.own_training(self._scene(labels))
+        if own is not None and self._own_state is not None:
+            own.restore(self._own_state)
+        self.model.own_training = own
+        self.model.frozen = own is None and not self.refiner.trains
         self.model.prepared_rounds = self.rounds
         self.ready = True
+
+    def _scene(self, labels: LabelMaps) -> TrainedScene:
+        model = self.model
+        return TrainedScene(
+            surfels=model.surfels,
+            class_ids=lambda: model.class_ids,
+            cameras=[view.camera for view in self.datamanager.views("train")],
+            labels=labels,
+            names=model.classes,
+            rasterizer=model.rasterizer,
+            settings=model.settings(geometry=False),
+            seed=model.seed,
+            steps=model.schedule.refine_steps,
+            base_steps=model.schedule.base_steps,
+            extent=model.extent_on_host(),
+            scale=self._scale(),
+            stage=bar,
+        )
 
     def _restore_files(self) -> None:
         """Read the masks and the grid of the run that the checkpoint came from, and copy them into this one."""
         folder = round_folder(self.trainer.base_dir, self.rounds - 1)
         former = self.trainer.loaded_run
         if former is not None and former != self.trainer.base_dir:
-            _clear(self.trainer.base_dir / PREPARED)
+            clear(self.trainer.base_dir / PREPARED)
             for name in (PREPARED, BASE_SNAPSHOT):
                 if (former / name).is_dir():
                     shutil.copytree(former / name, self.trainer.base_dir / name, dirs_exist_ok=True)
@@ -184,67 +241,14 @@ class RefinementSwitch:
                 f"the occupancy loss to False, or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
             )
         views = self.datamanager.views("train")
-        with _bar("Reading masks", passing=True) as progress:
+        with bar("Reading masks", passing=True) as progress:
             labels = LabelMaps(
-                _prepared_labels(folder / "masks" / f"{view.name}.png", view.camera)
+                prepared_labels(folder / "masks" / f"{view.name}.png", view.camera)
                 for view in counted(views, len(views), progress)
             )
         self._start(grid, labels)
         self.trainer.seconds.refining()
         CONSOLE.print(f"  refinement taken up from {folder}", highlight=False, markup=False, soft_wrap=True)
-
-
-def _bar(name: str, passing: bool = False) -> AbstractContextManager[Callable[[int, int], None]]:
-    """Open a progress bar, in the first of several processes."""
-    return progress_bar(name, passing) if processes.rank() == 0 else nullcontext(lambda done, total: None)
-
-
-def _prepared_labels(path: Path, camera: Camera) -> torch.Tensor:
-    """Read the labels [H, W] int32 of a prepared mask; raises ``UserError`` if it does not fit the camera."""
-    if not path.is_file():
-        raise UserError(
-            f"the prepared mask {path} is missing: restore it, or refine again from base/nerfstudio_models."
-        )
-    labels = torch.from_numpy(read_id_mask(path).astype(np.int32))
-    if labels.shape != (camera.height, camera.width):
-        raise UserError(
-            f"the prepared mask {path} is {labels.shape[1]}x{labels.shape[0]} pixels but its view is "
-            f"{camera.width}x{camera.height}: restore the data, or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
-        )
-    return labels
-
-
-def save_prepared(prepared: Preparation, names: list[str], folder: Path, fit: Residuals | None = None) -> None:
-    """Write what a resumed refinement needs; grid.pt comes last, as its presence marks the rest as complete.
-
-    fit: of the base to the photos, for the report, where it was measured.
-    """
-    with writing(folder):
-        (folder / "grid.pt").unlink(missing_ok=True)  # an earlier run's
-        if folder.name == PREPARED:
-            _clear(folder)
-        (folder / "masks").mkdir(parents=True, exist_ok=True)
-        (folder / "confidence").mkdir(exist_ok=True)
-    with _bar("Keeping masks", passing=True) as progress:
-        for index, name in enumerate(counted(names, len(names), progress)):
-            labels = prepared.labels[index]
-            write_mask(folder / "masks" / f"{name}.png", labels.cpu().numpy().astype(np.uint16))
-            if prepared.confidence is not None:
-                path = folder / "confidence" / f"{name}.png"
-                with writing(path):  # cv2 would ignore a full disk
-                    Image.fromarray(prepared.confidence[index].cpu().numpy()).save(path)
-    report = {"summary": prepared.summary, "seconds": prepared.seconds, "peak_memory_mb": peak_memory_mb()}
-    if fit is not None:
-        report["residuals"] = {**vars(fit), "contradict": fit.contradict}
-    write_text_atomically(json.dumps(report, indent=2), folder / PREPARATION_REPORT)
-    state = {} if prepared.grid is None else prepared.grid.state_dict()
-    write_whole(folder / "grid.pt", lambda file: torch.save(state, file))
-
-
-def _clear(folder: Path) -> None:
-    """Remove the files of another run in the same folder, later rounds too."""
-    for path in folder.glob("*"):
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 @contextmanager

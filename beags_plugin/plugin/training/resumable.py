@@ -13,6 +13,7 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
+from beags_plugin.plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.runs.checkpoint_file import scene_alone
 from beags_plugin.plugin.training.optimizers import SceneOptimizer
 from beags_plugin.plugin.training.timing import StageSeconds
@@ -54,6 +55,10 @@ class TrainingRun(Protocol):
 
     @property
     def loaded_run(self) -> Path | None: ...
+
+    def reschedule(self, schedule: PhaseSchedule) -> None:
+        """Take the steps of this run, which some refiners tell from the data."""
+        ...
 
     def keep(self, name: str, part: Resumable) -> None:
         """Let checkpoints hold the state of ``part``."""

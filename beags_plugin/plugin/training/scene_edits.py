@@ -7,15 +7,30 @@ from torch.optim import Adam
 
 from beags_plugin.core.densification import Densified
 from beags_plugin.plugin.training.scene_model import SceneModel
+from beags_plugin.preparation.own_training import Edit
 
 
 def edit_scene(model: SceneModel, adam: Adam, edited: Densified) -> None:
-    """Put the edited Gaussians into the model and its optimizer; their classes are reset."""
+    """Put the edited Gaussians into the model and its optimizer, with the classes of their sources."""
     former = dict(model.gauss_params.items())
+    class_ids, margin = model.class_ids, model.class_margin
     model.replace_surfels(edited.surfels)
+    source = edited.source.to(class_ids.device)
+    model.class_ids, model.class_margin = class_ids[source], margin[source]
     for group in adam.param_groups:
         name = group["name"]
         move_adam_state(adam, former[name], model.gauss_params[name], edited.source, edited.fresh)
+
+
+def apply_edit(model: SceneModel, adam: Adam, edit: Edit | None) -> None:
+    """Change the scene and its optimizer as a refiner asks."""
+    if edit is None:
+        return
+    if edit.edited is not None:
+        edit_scene(model, adam, edit.edited)
+        model.last_render = None
+    if edit.fresh_adam:
+        adam.state.clear()
 
 
 def move_adam_state(adam: Adam, former: Tensor, parameter: Tensor, source: Tensor, fresh: Tensor) -> None:

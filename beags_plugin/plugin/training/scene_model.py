@@ -19,6 +19,7 @@ from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.options.model_options import BeagsModelConfig, fixed_background
 from beags_plugin.plugin.runs.checkpoint_file import extra_state
 from beags_plugin.plugin.training.timing import StepClock
+from beags_plugin.preparation.own_training import OwnTraining
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
 
@@ -46,10 +47,11 @@ class SceneModel(SplatfactoModel):
     It derives from nerfstudio's ``SplatfactoModel``, whose type ns-export and the viewer ask for; its training is not
     used.
 
-    classes: id to name. step, seed: of the run. grid: voxels of the classes; None before refinement. growing: whether
-    this step gathers gradients for densification. frozen: whether the refiner leaves the scene as it is. last_render:
-    of the last training step. measuring: whether anyone reads this step's metrics. prepared_rounds: rounds of
-    refinement that this run has prepared; None for a scene that is only looked at. crop_box: nerfstudio's.
+    classes: id to name. objects: see ``Membership``. step, seed: of the run. grid: voxels of the classes; None before
+    refinement. growing: whether this step gathers gradients for densification. frozen: whether the refiner leaves the
+    scene as it is. own_training: of a refiner that makes its steps itself. last_render: of the last training step.
+    measuring: whether anyone reads this step's metrics. prepared_rounds: rounds of refinement that this run has
+    prepared; None for a scene that is only looked at. crop_box: nerfstudio's.
     """
 
     config: BeagsModelConfig
@@ -85,6 +87,7 @@ class SceneModel(SplatfactoModel):
         self.grid: VisibilityGrid | None = None
         self.growing = False
         self.frozen = False
+        self.own_training: OwnTraining | None = None
         self.last_render: LastRender | None = None
         self.clock = StepClock()
         self.measuring = True
@@ -116,7 +119,12 @@ class SceneModel(SplatfactoModel):
         """Return the terms that count at the current step."""
         if self.frozen:
             return {}
-        return {name: loss for name, loss in self.losses.items() if loss.active(self.step)}
+        of_base = self.own_training is not None
+        return {
+            name: loss
+            for name, loss in self.losses.items()
+            if loss.active(self.step) and not (of_base and self.config.losses[name].phase == "refine")
+        }
 
     def generator(self, step: int) -> torch.Generator:
         """Return a generator seeded by (seed, step), so that a resumed run samples as the uninterrupted one."""

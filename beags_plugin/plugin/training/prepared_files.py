@@ -1,0 +1,78 @@
+"""The files of a preparation, with which a resumed refinement goes on."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.labels.classes import read_id_mask, write_mask
+from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED
+from beags_plugin.plugin.runs.prepared import PREPARATION_REPORT
+from beags_plugin.plugin.training.contradiction import Residuals
+from beags_plugin.preparation.pipeline import Preparation
+from beags_plugin.system import processes
+from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.memory import peak_memory_mb
+from beags_plugin.system.progress import counted, progress_bar
+from beags_plugin.system.whole_files import write_text_atomically, write_whole
+
+
+def bar(name: str, passing: bool = False) -> AbstractContextManager[Callable[[int, int], None]]:
+    """Open a progress bar, in the first of several processes."""
+    return progress_bar(name, passing) if processes.rank() == 0 else nullcontext(lambda done, total: None)
+
+
+def prepared_labels(path: Path, camera: Camera) -> torch.Tensor:
+    """Read the labels [H, W] int32 of a prepared mask; raises ``UserError`` if it does not fit the camera."""
+    if not path.is_file():
+        raise UserError(
+            f"the prepared mask {path} is missing: restore it, or refine again from base/nerfstudio_models."
+        )
+    labels = torch.from_numpy(read_id_mask(path).astype(np.int32))
+    if labels.shape != (camera.height, camera.width):
+        raise UserError(
+            f"the prepared mask {path} is {labels.shape[1]}x{labels.shape[0]} pixels but its view is "
+            f"{camera.width}x{camera.height}: restore the data, or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
+        )
+    return labels
+
+
+def save_prepared(prepared: Preparation, names: list[str], folder: Path, fit: Residuals | None = None) -> None:
+    """Write what a resumed refinement needs; grid.pt comes last, as its presence marks the rest as complete.
+
+    fit: of the base to the photos, for the report, where it was measured.
+    """
+    with writing(folder):
+        (folder / "grid.pt").unlink(missing_ok=True)  # an earlier run's
+        if folder.name == PREPARED:
+            clear(folder)
+        (folder / "masks").mkdir(parents=True, exist_ok=True)
+        (folder / "confidence").mkdir(exist_ok=True)
+    with bar("Keeping masks", passing=True) as progress:
+        for index, name in enumerate(counted(names, len(names), progress)):
+            labels = prepared.labels[index]
+            write_mask(folder / "masks" / f"{name}.png", labels.cpu().numpy().astype(np.uint16))
+            if prepared.confidence is not None:
+                path = folder / "confidence" / f"{name}.png"
+                with writing(path):  # cv2 would ignore a full disk
+                    Image.fromarray(prepared.confidence[index].cpu().numpy()).save(path)
+    report = {"summary": prepared.summary, "seconds": prepared.seconds, "peak_memory_mb": peak_memory_mb()}
+    if fit is not None:
+        report["residuals"] = {**vars(fit), "contradict": fit.contradict}
+    write_text_atomically(json.dumps(report, indent=2), folder / PREPARATION_REPORT)
+    state = {} if prepared.grid is None else prepared.grid.state_dict()
+    write_whole(folder / "grid.pt", lambda file: torch.save(state, file))
+
+
+def clear(folder: Path) -> None:
+    """Remove the files of another run in the same folder, later rounds too."""
+    for path in folder.glob("*"):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()

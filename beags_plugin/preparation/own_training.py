@@ -1,0 +1,104 @@
+"""The interface of refiners that own their training: losses, rates, edits of the scene, and the objects in the end."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.densification import Densified
+from beags_plugin.core.membership import Membership
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.losses.base import LossInputs
+from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+
+Terms = dict[str, Tensor]
+Stage = Callable[[str], Any]
+
+
+@dataclass(frozen=True)
+class TrainedScene:
+    """What a refiner that owns its training sees of a run.
+
+    surfels, class_ids: return the scene as it now is, N Gaussians with gradients, and [N] int32, phi.
+    cameras, labels: of the V training views; labels per view [H, W] int32. names: class id to name, background (0)
+    included. steps: of the refinement; base_steps: of the base. extent: of the scene, world units. scale: units of the
+    run's frame per unit of the input poses'. stage: opens a progress bar with a title.
+    """
+
+    surfels: Callable[[], Surfels]
+    class_ids: Callable[[], Tensor]
+    cameras: Sequence[Camera]
+    labels: Sequence[Tensor]
+    names: Mapping[int, str]
+    rasterizer: Rasterizer
+    settings: RasterSettings
+    seed: int
+    steps: int
+    base_steps: int
+    extent: float
+    scale: float
+    stage: Stage
+
+    def generator(self, step: int, purpose: int = 0) -> torch.Generator:
+        """Return a generator seeded by run, step of the refinement and purpose, so that a resumed run draws alike."""
+        return torch.Generator().manual_seed((self.seed * 1_000_003 + self.base_steps + step) * 1_009 + purpose + 1)
+
+
+@dataclass(frozen=True)
+class Edit:
+    """A change of the scene between two steps.
+
+    edited: the Gaussians in another number, whose classes and Adam moments follow their sources; None leaves them.
+    fresh_adam: Adam starts anew, moments and step count.
+    """
+
+    edited: Densified | None = None
+    fresh_adam: bool = False
+
+
+class OwnTraining(ABC):
+    """Steps of refinement as a refiner makes them; they count from 0.
+
+    Its state is kept in checkpoints: ``restore(state())`` on a new object with the same scene goes on bit for bit.
+    """
+
+    def rates(self, step: int) -> Mapping[str, float] | None:
+        """Return the learning rate of each group of the scene, 0 for those not named; None: those of refinement."""
+        return None
+
+    def before_step(self, step: int) -> Edit | None:
+        """Return what changes in the scene before a step."""
+        return None
+
+    def terms(self, inputs: LossInputs, step: int, base: Callable[[], Terms]) -> Terms:
+        """Return the terms of the step's loss by name; without any, no parameter changes.
+
+        base: returns those of the base, weighted.
+        """
+        return base()
+
+    def after_step(self, step: int) -> Edit | None:
+        """Return what changes in the scene after the optimizer's step."""
+        return None
+
+    def last_edit(self) -> Edit | None:
+        """Return what changes in the scene after all steps."""
+        return None
+
+    @abstractmethod
+    def finish(self) -> Membership | None:
+        """Return the objects, after ``last_edit``; None: phi, as it is, says which they are."""
+
+    def state(self) -> dict[str, Any]:
+        """Return what decides how it goes on: tensors and plain values."""
+        return {}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on as the one that gave ``state`` would have."""
+        return None
