@@ -1,4 +1,4 @@
-"""Assignment alone, as in FlashSplat."""
+"""Assignment alone: each Gaussian belongs to the class of its largest share (argmax); nothing is trained."""
 
 from __future__ import annotations
 
