@@ -40,7 +40,7 @@ def members(
 
     means, sh_dc: [N, 3]. shares: [N], w. links: from ``n_links``, the same for all objects.
     """
-    if not bool((shares >= foreground_threshold).any()):
+    if not bool((shares.double() >= foreground_threshold).any()):
         return torch.zeros_like(shares, dtype=torch.bool)
     return cut(*links, terminals(means, sh_dc, shares, foreground_threshold)).to(shares.device)
 
@@ -83,8 +83,8 @@ def _likeness(centres: np.ndarray, dc: np.ndarray, chosen: np.ndarray) -> np.nda
     from sklearn.cluster import KMeans
 
     few = min(CLUSTERS, int(chosen.sum()))
-    means = KMeans(few, n_init=1, random_state=0)  # pyright: ignore[reportArgumentType]  (n_init: "auto" or a number)
-    nearest = np.min([_distance(centres, mean) for mean in means.fit(centres[chosen]).cluster_centers_], axis=0)
+    clusters = KMeans(few, n_init=1, random_state=0)  # pyright: ignore[reportArgumentType]  (or "auto")
+    nearest = np.min([_distance(centres, mean) for mean in clusters.fit(centres[chosen]).cluster_centers_], axis=0)
     return 0.5 * np.exp(-TERMINAL_DECAY * nearest) + 0.5 * np.exp(-_distance(dc, dc[chosen].mean(axis=0)))
 
 
