@@ -107,8 +107,7 @@ def cut(pairs: Tensor, capacities: Tensor, terminals: Tensor) -> Tensor:
     there = values > 0
     shape = (count + 2, count + 2)
     graph = csr_array((values[there], (rows[there], columns[there])), shape=shape, dtype=np.int32)
-    residual = graph - maximum_flow(graph, source, sink, method="dinic").flow
-    residual.eliminate_zeros()
+    residual = graph - maximum_flow(graph, source, sink, method="dinic").flow  # without zeros
     reaching = breadth_first_order(residual.T, sink, return_predecessors=False)
     inside = np.ones(count + 2, dtype=bool)
     inside[reaching] = False

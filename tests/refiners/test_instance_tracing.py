@@ -50,6 +50,8 @@ def test_options_of_the_tracing():
     traced = InstanceTracing(3)
     traced.add(keys, torch.tensor([27.0, 2.7, 40.0, 30.0, 30.0]), 3, min_pixels=2, min_share=0.3)
     assert (traced.seen.tolist(), traced.ambiguous().tolist()) == ([1, 1, 1], [False] * 3)
+    traced.seen[:], traced.ambiguous_in[:] = 100, torch.tensor([40, 41, 39])
+    assert traced.ambiguous().tolist() == [False, True, False]
 
 
 def test_members_hold_more_than_two_thirds_of_their_pixels():
