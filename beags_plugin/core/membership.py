@@ -52,7 +52,7 @@ class Membership:
     def of_masks(cls, masks: Mapping[int, Tensor], class_ids: Tensor) -> Membership:
         """Return that of object id to [N] bool; class_ids: [N] int32, phi.
 
-        A Gaussian is shown in the class phi if it belongs to that or to no object, else in the lowest of its objects.
+        A Gaussian of several objects is shown in phi if that is among them, else in the lowest of them.
         """
         shown = class_ids.clone()
         inside = torch.zeros_like(shown, dtype=torch.bool)

@@ -1,0 +1,127 @@
+"""GaussianCut: one minimum cut of a graph of the Gaussians separates each object from the rest; nothing is trained.
+
+Jain, Mirzaei, Gilitschenski, "GaussianCut: Interactive Segmentation via Graph Cut for 3D Gaussian Splatting",
+NeurIPS 2024. Of Gaussian i, mu_i is the centre, d_i the spherical-harmonic coefficient of degree 0 (not the colour),
+w_i the share of its blending weight that falls on the object's pixels, 0 if never seen. The object minimises
+
+    E = sum_{i in object} (1 - w_i + l(i, R)) + sum_{i not in it} (w_i + l(i, F)) + sum_{links between both} b_ij,
+    b_ij = 0.5 exp(-|mu_i - mu_j|) + 0.5 exp(-|d_i - d_j|), twice if both are among each other's nearest,
+    l(i, S) = 0.5 exp(-0.1 min_m |mu_i - m|) + 0.5 exp(-|d_i - mean d of S|),
+
+F being the Gaussians with w >= ``foreground_threshold``, R all others, and m the five k-means centres of S.
+Distances are in the units of the centres; the result depends on them, so that they should be the input's.
+Small, thin or embedded objects lose to the rest, as in the source: their links cost more than their shares are worth.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+NUM_EDGES = 10
+"""Nearest centres to which a Gaussian is linked, itself among them."""
+FOREGROUND_THRESHOLD = 0.9
+"""Share from which a Gaussian shapes the object's clusters; the source names 0.3 for captures all around."""
+
+CLUSTERS = 5
+TERMINAL_DECAY = 0.1  # per unit of distance to a cluster; links and colours decay by 1
+FIXED_POINT = 2**16  # scipy's flows are int32; a link is at most 2, a terminal at most 2
+
+
+def members(
+    means: Tensor,
+    sh_dc: Tensor,
+    shares: Tensor,
+    links: tuple[Tensor, Tensor],
+    foreground_threshold: float = FOREGROUND_THRESHOLD,
+) -> Tensor:
+    """Return which of N Gaussians belong to one object, [N] bool: nobody if no share reaches the threshold.
+
+    means, sh_dc: [N, 3]. shares: [N], w. links: from ``n_links``, the same for all objects.
+    """
+    if not bool((shares.double() >= foreground_threshold).any()):
+        return torch.zeros_like(shares, dtype=torch.bool)
+    return cut(*links, terminals(means, sh_dc, shares, foreground_threshold)).to(shares.device)
+
+
+def n_links(means: Tensor, sh_dc: Tensor, num_edges: int = NUM_EDGES) -> tuple[Tensor, Tensor]:
+    """Return the linked pairs [P, 2] int64, first < second, each once, and their capacities [P] float64, on the CPU.
+
+    means, sh_dc: [N, 3]. P <= (num_edges - 1) N; a little more if centres coincide, as a Gaussian may not find itself.
+    """
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
+
+    centres, dc = _finite(means), _finite(sh_dc)
+    count = len(centres)
+    near = cKDTree(centres).query(centres, k=np.arange(1, min(num_edges, count) + 1))[1]
+    own = np.arange(count)[:, None]
+    first, second = np.minimum(near, own), np.maximum(near, own)
+    keys, found = np.unique((first * count + second)[near != own], return_counts=True)
+    first, second = keys // count, keys % count
+    likeness = np.exp(-_distance(centres[first], centres[second])) + np.exp(-_distance(dc[first], dc[second]))
+    return torch.from_numpy(np.stack([first, second], 1)), torch.from_numpy(0.5 * found * likeness)
+
+
+def terminals(
+    means: Tensor, sh_dc: Tensor, shares: Tensor, foreground_threshold: float = FOREGROUND_THRESHOLD
+) -> Tensor:
+    """Return the capacities [N, 2] float64 from the source (object) and to the sink (rest), on the CPU.
+
+    means, sh_dc: [N, 3]. shares: [N], w. An empty set is like no Gaussian.
+    """
+    centres, dc, w = _finite(means), _finite(sh_dc), _finite(shares)
+    foreground = w >= foreground_threshold
+    to_object, to_rest = (_likeness(centres, dc, chosen) for chosen in (foreground, ~foreground))
+    return torch.from_numpy(np.stack([w + to_object, 1.0 - w + to_rest], 1))
+
+
+def _likeness(centres: np.ndarray, dc: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Return l(i, S) [N] for the set of the ``chosen`` [N] bool."""
+    if not chosen.any():
+        return np.zeros(len(centres))
+    from sklearn.cluster import KMeans
+
+    few = min(CLUSTERS, int(chosen.sum()))
+    clusters = KMeans(few, n_init=1, random_state=0)  # pyright: ignore[reportArgumentType]  (or "auto")
+    nearest = np.min([_distance(centres, mean) for mean in clusters.fit(centres[chosen]).cluster_centers_], axis=0)
+    return 0.5 * np.exp(-TERMINAL_DECAY * nearest) + 0.5 * np.exp(-_distance(dc, dc[chosen].mean(axis=0)))
+
+
+def cut(pairs: Tensor, capacities: Tensor, terminals: Tensor) -> Tensor:
+    """Return the object's side of the minimum cut, [N] bool: all nodes that cannot reach the sink, ties among them.
+
+    pairs: [P, 2] int64. capacities: [P] float64, of a link in both directions. terminals: [N, 2] float64.
+    """
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+    count = len(terminals)
+    source, sink = count, count + 1
+    first, second = pairs.numpy().T
+    nodes, links = np.arange(count), _fixed_point(capacities)
+    gain = _fixed_point(terminals[:, 0]) - _fixed_point(terminals[:, 1])  # what both sides pay anyway changes no cut
+    rows = np.concatenate([first, second, np.full(count, source), nodes])
+    columns = np.concatenate([second, first, nodes, np.full(count, sink)])
+    values = np.concatenate([links, links, gain.clip(0), (-gain).clip(0)])
+    there = values > 0
+    shape = (count + 2, count + 2)
+    graph = csr_array((values[there], (rows[there], columns[there])), shape=shape, dtype=np.int32)
+    residual = graph - maximum_flow(graph, source, sink, method="dinic").flow  # without zeros
+    reaching = breadth_first_order(residual.T, sink, return_predecessors=False)
+    inside = np.ones(count + 2, dtype=bool)
+    inside[reaching] = False
+    return torch.from_numpy(inside[:count])
+
+
+def _fixed_point(capacities: Tensor) -> np.ndarray:
+    return (capacities * FIXED_POINT).round().int().numpy()
+
+
+def _finite(values: Tensor) -> np.ndarray:
+    """Return float64; broken Gaussians, which no view shows, stand at the origin."""
+    return torch.nan_to_num(values.detach().double().cpu(), nan=0.0, posinf=0.0, neginf=0.0).numpy()
+
+
+def _distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(a - b, axis=-1)
