@@ -98,6 +98,11 @@ def test_contributions_class_map_and_heaviest(worked_out, rasterizer):
     expected = np.stack([(weights * (target == c)[..., None]).sum((0, 1)) for c in range(CLASSES)], axis=-1)  # E6
     contributions = rasterizer.class_contributions(*arguments, scene.target, CLASSES)
     np.testing.assert_allclose(contributions.numpy(), expected, rtol=1e-6, atol=1e-8)
+    for least in (0.0, 0.1):
+        expected = np.stack([((weights > least) & (target == c)[..., None]).sum((0, 1)) for c in range(CLASSES)], -1)
+        keys, counts = rasterizer.sparse_class_pixel_counts(*arguments, scene.target, CLASSES, least)
+        assert keys.tolist() == np.flatnonzero(expected).tolist()
+        assert counts.tolist() == expected[expected > 0].tolist()
 
     classes = scene.inputs.class_ids.numpy()
     per_class = np.stack([weights[..., classes == c].sum(-1) for c in range(CLASSES)], axis=-1)
