@@ -4,30 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from raster_scenes import facing
 
-from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.rasterizers.interface import RasterSettings, SurfelInputs
+from beags_plugin.rasterizers.interface import RasterSettings
 
 SETTINGS = RasterSettings(near=0.1, far=100.0, geometry=False)
-FOCAL, DEPTH = 100.0, 2.0
-
-
-def facing(width, height, surfels, dtype=torch.float64):
-    """Inputs and camera of (centre x, centre y, sigma, opacity) in pixels: parallel to the image, the first in front.
-
-    A negative sigma puts a surfel behind the camera.
-    """
-    rows, n = torch.tensor(surfels, dtype=torch.float64), len(surfels)
-    depths = DEPTH + 1e-3 * torch.arange(n, dtype=torch.float64)
-    depths = torch.where(rows[:, 2] < 0, -depths, depths)
-    unit = depths.abs() / FOCAL  # of a pixel, at each surfel's depth
-    means = torch.stack([rows[:, 0] * depths / FOCAL, rows[:, 1] * depths / FOCAL, depths], dim=-1)
-    quats = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).repeat(n, 1)
-    log_scales = (rows[:, 2].abs() * unit).log()[:, None].repeat(1, 2)
-    inputs = SurfelInputs(means, quats, log_scales, torch.logit(rows[:, 3]), torch.zeros_like(means)).to(dtype)
-    K = torch.tensor([[FOCAL, 0, 0], [0, FOCAL, 0], [0, 0, 1]], dtype=dtype)
-    return inputs, Camera(torch.eye(4, dtype=dtype), K, width, height)
 
 
 def counts(rasterizer, inputs, camera, labels, num_classes, min_weight=0.0, settings=SETTINGS):

@@ -12,6 +12,7 @@ from raster_scenes import CLASSES, FLOATS, OUTPUTS, SCENES, make_scene
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.rasterizers.rendering import draw_features
 from beags_plugin.rasterizers.torch_reference import BLOCK, TorchRasterizer
 
 
@@ -114,6 +115,13 @@ def test_contributions_class_map_and_heaviest(worked_out, rasterizer):
 
     dominant_gaussian = np.where(weights.max(-1) > 0, weights.argmax(-1), -1)
     np.testing.assert_array_equal(rasterizer.dominant_gaussian(*arguments).numpy(), dominant_gaussian)
+
+
+def test_features_are_drawn_with_the_weights_of_the_image(worked_out, rasterizer):
+    scene, _, weights = worked_out
+    features = torch.randn(len(scene.inputs.means), 7, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    drawn = draw_features(rasterizer, scene.inputs, features, scene.camera, scene.settings)
+    np.testing.assert_allclose(drawn.numpy(), weights @ features.numpy(), rtol=1e-7, atol=1e-8)
 
 
 @pytest.mark.parametrize("output", OUTPUTS)
