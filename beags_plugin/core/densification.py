@@ -144,11 +144,29 @@ def densify(
     size = surfels.log_scales.exp().amax(dim=-1)
     chosen = _within_budget(mean_gradient >= GRADIENT_THRESHOLD, mean_gradient, config.max_surfels)
     small = size <= CLONE_SCALE * units
-    clones = (chosen & small).nonzero()[:, 0]
-    splits = (chosen & ~small).nonzero()[:, 0]
-    kept = (~(chosen & ~small)).nonzero()[:, 0]
+    edited = _grow(surfels, chosen & small, chosen & ~small, generator)
 
-    # a clone is the copy; a split replaces the surfel by two, so it leaves the kept ones
+    grown, source = edited.surfels, edited.source
+    keep = opacities(grown.opacity_logits) >= PRUNE_OPACITY
+    if step > config.prune_scale_after:
+        keep &= grown.log_scales.exp().amax(dim=-1) <= PRUNE_SCALE * units[source]
+    if not bool(keep.any()):
+        keep[grown.opacity_logits.argmax()] = True
+    return Densified(grown[keep], source[keep], edited.fresh[keep])
+
+
+def split_by_sampling(surfels: Surfels, chosen: Tensor, generator: torch.Generator) -> Densified:
+    """Replace each chosen surfel by two, placed by its own Gaussian and smaller by ``SPLIT_SHRINK``; else its copies.
+
+    surfels: N surfels without gradients. chosen: [N] bool. The others keep their order; the halves follow them. This
+    is the split of densification; ``core.splitting.split_in_two`` changes less of what is seen.
+    """
+    return _grow(surfels, torch.zeros_like(chosen), chosen, generator)
+
+
+def _grow(surfels: Surfels, cloned: Tensor, split: Tensor, generator: torch.Generator) -> Densified:
+    """Add copies of the ``cloned`` [N] bool, then replace each ``split`` [N] bool by two; see ``split_by_sampling``."""
+    kept, clones, splits = (which.nonzero()[:, 0] for which in (~split, cloned, split))
     source = torch.cat([kept, clones, splits, splits])
     fresh = torch.zeros_like(source, dtype=torch.bool)
     fresh[kept.shape[0] :] = True
@@ -156,13 +174,7 @@ def densify(
     halves = slice(kept.shape[0] + clones.shape[0], None)
     grown.means[halves] += _offsets(grown[halves], generator)
     grown.log_scales[halves] -= math.log(SPLIT_SHRINK)
-
-    keep = opacities(grown.opacity_logits) >= PRUNE_OPACITY
-    if step > config.prune_scale_after:
-        keep &= grown.log_scales.exp().amax(dim=-1) <= PRUNE_SCALE * units[source]
-    if not bool(keep.any()):
-        keep[grown.opacity_logits.argmax()] = True
-    return Densified(grown[keep], source[keep], fresh[keep])
+    return Densified(grown, source, fresh)
 
 
 def _within_budget(chosen: Tensor, gradient: Tensor, max_surfels: int) -> Tensor:

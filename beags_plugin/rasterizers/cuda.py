@@ -30,6 +30,7 @@ from beags_plugin.rasterizers.autograd import (
 )
 from beags_plugin.rasterizers.interface import FLOATS, RasterSettings, SurfelInputs, map_ids
 from beags_plugin.rasterizers.pair_counts import PairCounts, capacity_for
+from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 from beags_plugin.system.errors import UserError
 
 _GEOMETRY, _DISTORTION, _BOUNDARY = 1, 2, 4  # Parts of native/rasterizer/types.h
@@ -138,6 +139,19 @@ class CudaRasterizer(KernelRasterizer):
 
         self._frame(inputs, camera, settings, render)
         return (sums.double() * self._native().WEIGHT_UNIT).to(like.dtype)
+
+    def sparse_class_pixel_counts(
+        self,
+        inputs: SurfelInputs,
+        camera: Camera,
+        settings: RasterSettings,
+        labels: Tensor,
+        num_classes: int,
+        min_weight: float = 0.0,
+    ) -> tuple[Tensor, Tensor]:
+        """See ``Rasterizer.sparse_class_pixel_counts``; there is no kernel: the torch reference counts, on the GPU."""
+        labels = check_image("labels", labels, camera)
+        return TorchRasterizer().sparse_class_pixel_counts(inputs, camera, settings, labels, num_classes, min_weight)
 
     @torch.no_grad()
     def class_map(

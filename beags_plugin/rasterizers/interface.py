@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -169,15 +170,25 @@ class Rasterizer(ABC):
         The keys are i * num_classes + c, ascending. A backend should make no table of all classes if it can; this
         method makes one of the classes that ``labels`` hold.
         """
-        present = torch.unique(labels[(labels >= 0) & (labels < num_classes)])
-        if len(present) == 0:
-            return present.long(), inputs.means.new_zeros(0)
-        columns = torch.searchsorted(present, labels)
-        known = present[columns.clamp(max=len(present) - 1)] == labels
-        slots = torch.where(known, columns, IGNORE).int()
-        table = self.class_contributions(inputs, camera, settings, slots, len(present))
-        surfel, column = torch.nonzero(table, as_tuple=True)
-        return surfel * num_classes + present[column].long(), table[surfel, column]
+        return sparse_table(
+            lambda slots, count: self.class_contributions(inputs, camera, settings, slots, count), labels, num_classes
+        )
+
+    @abstractmethod
+    def sparse_class_pixel_counts(
+        self,
+        inputs: SurfelInputs,
+        camera: Camera,
+        settings: RasterSettings,
+        labels: Tensor,  # [H, W] int32 class ids, or IGNORE
+        num_classes: int,
+        min_weight: float = 0.0,
+    ) -> tuple[Tensor, Tensor]:
+        """Return the numbers of pixels u with labels(u) = c and w_i(u) > min_weight that are not zero.
+
+        They are keys [M] int64 as in ``sparse_class_contributions``, and counts [M] int32. A hidden surfel counts too
+        until compositing stops before it. No gradient.
+        """
 
     @abstractmethod
     def class_map(
@@ -192,3 +203,16 @@ class Rasterizer(ABC):
     @abstractmethod
     def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
         """Return [H, W] int32, the index of the surfel with the largest w_i (ties to the nearer); -1 where none is."""
+
+
+def sparse_table(table: Callable[[Tensor, int], Tensor], labels: Tensor, num_classes: int) -> tuple[Tensor, Tensor]:
+    """Return what is not zero of a table by surfel and class, as keys [M] int64 (surfel * num_classes + c) and values.
+
+    table: takes class ids [H, W] int32 or IGNORE and their number, which are those that ``labels`` hold, renumbered.
+    """
+    present = torch.unique(labels[(labels >= 0) & (labels < num_classes)])
+    columns = torch.searchsorted(present, labels)
+    known = torch.isin(labels, present)
+    found = table(torch.where(known, columns, IGNORE).int(), len(present))
+    surfel, column = torch.nonzero(found, as_tuple=True)
+    return surfel * num_classes + present[column].long(), found[surfel, column]

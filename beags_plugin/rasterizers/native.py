@@ -117,11 +117,25 @@ class NativeRasterizer(KernelRasterizer):
         inputs = inputs.checked().detached()
         labels = check_image("labels", labels, camera)
         frame, _ = _frame(inputs, camera, settings)
-        found = frame.sparse_class_contributions(labels, num_classes, extension.threads())
-        keys = torch.empty(found.count, dtype=torch.int64)
-        values = inputs.means.new_empty(found.count)
-        found.write(keys, values)
-        return keys, values
+        return _listed(frame.sparse_class_contributions(labels, num_classes, extension.threads()), inputs.means)
+
+    @torch.no_grad()
+    def sparse_class_pixel_counts(
+        self,
+        inputs: SurfelInputs,
+        camera: Camera,
+        settings: RasterSettings,
+        labels: Tensor,
+        num_classes: int,
+        min_weight: float = 0.0,
+    ) -> tuple[Tensor, Tensor]:
+        """See ``Rasterizer.sparse_class_pixel_counts``; in float32, counts are exact up to 2^24."""
+        inputs = inputs.checked().detached()
+        labels = check_image("labels", labels, camera)
+        frame, _ = _frame(inputs, camera, settings)
+        found = frame.sparse_class_pixel_counts(labels, num_classes, min_weight, extension.threads())
+        keys, counts = _listed(found, inputs.means)
+        return keys, counts.int()
 
     @torch.no_grad()
     def class_map(
@@ -143,6 +157,13 @@ class NativeRasterizer(KernelRasterizer):
         indices = torch.empty(camera.height, camera.width, dtype=torch.int32)
         frame.dominant_gaussian(indices, extension.threads())
         return indices
+
+
+def _listed(found: Any, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the keys and values of the compiled module's ``Contributions``."""
+    keys, values = torch.empty(found.count, dtype=torch.int64), like.new_empty(found.count)
+    found.write(keys, values)
+    return keys, values
 
 
 def _frame(inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> tuple[Any, Tensor]:

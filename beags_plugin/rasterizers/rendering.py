@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -48,6 +50,25 @@ def render_class_map(
     inputs = geometry_inputs(surfels, known.ranks(class_ids))
     classes, share = rasterizer.class_map(inputs, camera, settings, len(known))
     return known.class_ids(classes), share
+
+
+def draw_features(
+    rasterizer: Rasterizer, inputs: SurfelInputs, features: Tensor, camera: Camera, settings: RasterSettings
+) -> Tensor:
+    """Render any number of channels, [H, W, F] sum_i w_i f_i: no background, not divided by A.
+
+    features: [N, F] of the inputs' dtype, F at least 1. Differentiable in them and in the inputs but the colours.
+    Three channels are rendered at a time, which every backend can.
+    """
+    settings = replace(settings, geometry=False, distortion=False)
+    channels = features.shape[1]
+    padded = torch.nn.functional.pad(features, (0, -channels % 3))
+    nothing = features.new_zeros(3)
+    images = [
+        rasterizer.rasterize(replace(inputs, colors=padded[:, first : first + 3]), camera, settings, nothing).color
+        for first in range(0, channels, 3)
+    ]
+    return torch.cat(images, dim=-1)[..., :channels]
 
 
 def check_surface_depth(kind: str) -> None:

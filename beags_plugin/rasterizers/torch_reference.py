@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -19,6 +19,7 @@ from beags_plugin.rasterizers.interface import (
     RasterSettings,
     SurfelInputs,
     map_ids,
+    sparse_table,
 )
 from beags_plugin.rasterizers.reference_geometry import ProjectedSurfels, hits, on_screen, project
 
@@ -88,17 +89,46 @@ class TorchRasterizer(Rasterizer):
             num_nonfinite=projected.num_nonfinite,
         )
 
-    @torch.no_grad()
     def class_contributions(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, labels: Tensor, num_classes: int
     ) -> Tensor:
+        return self._class_sums(inputs, camera, settings, labels, num_classes, lambda weights: weights)
+
+    def sparse_class_pixel_counts(
+        self,
+        inputs: SurfelInputs,
+        camera: Camera,
+        settings: RasterSettings,
+        labels: Tensor,
+        num_classes: int,
+        min_weight: float = 0.0,
+    ) -> tuple[Tensor, Tensor]:
+        def table(slots: Tensor, count: int) -> Tensor:
+            return self._class_sums(
+                inputs, camera, settings, slots, count, lambda weights: (weights > min_weight).to(weights)
+            )
+
+        keys, counts = sparse_table(table, labels, num_classes)
+        return keys, counts.int()
+
+    @torch.no_grad()
+    def _class_sums(
+        self,
+        inputs: SurfelInputs,
+        camera: Camera,
+        settings: RasterSettings,
+        labels: Tensor,
+        num_classes: int,
+        counted: Callable[[Tensor], Tensor],
+    ) -> Tensor:
+        """Sum ``counted`` of the weights [P, S] by surfel and label, [N, num_classes]."""
         inputs, camera = inputs.checked(), camera.to(inputs.means)
         projected = project(inputs, camera, settings)
         total = inputs.means.new_zeros(inputs.means.shape[0], num_classes)
         for block in self._blocks(projected, camera, settings):
             here = labels[block.rows, block.columns].reshape(-1).long()
             one_hot = (here[:, None] == torch.arange(num_classes, device=here.device)).to(block.weights)
-            total[block.index] += block.weights.T @ one_hot  # (E6); IGNORE matches no class
+            total[block.index] += counted(block.weights).T @ one_hot  # (E6); IGNORE matches no class
         return total
 
     @torch.no_grad()

@@ -18,6 +18,7 @@ from beags_plugin.core.densification import (
     initial_surfels,
     length_units,
     reset_opacity,
+    split_by_sampling,
 )
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.sh import sh_colors
@@ -82,6 +83,28 @@ def test_halves_are_spread_like_the_surfel_they_replace():
     local = (edited.surfels.means - surfels.means[0]) @ rotation_from_quat(surfels.quats[0])
     spread = local[:, :2].std(dim=0) / surfels.log_scales[0].exp()
     torch.testing.assert_close(spread, torch.ones(2), rtol=0, atol=0.05)  # 8000 draws: standard error 0.008
+
+
+def test_the_chosen_alone_are_split_as_densification_splits():
+    surfels = scene([MIDDLE, 0.16, MIDDLE, MIDDLE], [0.5, 0.01, 0.5, 0.7])  # one of them too faint for densification
+    surfels.log_scales[1] = torch.tensor([0.16, 0.08]).log()
+    edited = split_by_sampling(surfels, torch.tensor([False, True, False, True]), generator())
+    assert edited.source.tolist() == [0, 2, 1, 3, 1, 3] and edited.fresh.tolist() == [False] * 2 + [True] * 4
+    halves = edited.surfels[edited.source == 1]
+    torch.testing.assert_close(halves.log_scales.exp(), torch.tensor([[0.1, 0.05]] * 2))
+    changed = {"means", "log_scales"}
+    for name, values in vars(edited.surfels).items():
+        same = edited.fresh.logical_not() if name in changed else slice(None)
+        assert torch.equal(values[same], getattr(surfels, name)[edited.source][same]), name
+    offset = halves.means - surfels.means[1]
+    normal = rotation_from_quat(surfels.quats[1])[:, 2]
+    assert (offset.norm(dim=-1) > 0).all() and not torch.equal(*offset)
+    torch.testing.assert_close(offset @ normal, torch.zeros(2), rtol=0, atol=1e-6)
+    again = run(surfels, [LOW, LOW, LOW, HIGH])
+    alone = split_by_sampling(surfels, torch.tensor([False, False, False, True]), generator())
+    assert torch.equal(again.surfels.means[-2:], alone.surfels.means[-2:])
+    nothing = split_by_sampling(surfels, torch.zeros(4, dtype=torch.bool), generator())
+    assert all(torch.equal(getattr(nothing.surfels, f), value) for f, value in vars(surfels).items())
 
 
 def test_faint_surfels_go_at_once_and_huge_ones_after_the_given_step():

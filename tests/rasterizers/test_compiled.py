@@ -93,6 +93,20 @@ def test_float32_stays_within_its_band(compiled, name):
     assert (found.alpha - expected.alpha).abs().max() < 1.1 / 255
 
 
+@pytest.mark.parametrize("name", ALL_SCENES)
+@pytest.mark.parametrize("least", [0.0, 0.1])
+def test_float32_counts_are_the_references_but_for_a_pixel_in_a_thousand(compiled, name, least):
+    """Rounding may carry a weight over ``least``, and a hit over its thresholds."""
+    scene, tables = ALL_SCENES[name](), []
+    for backend, each in ((compiled, scene.to(torch.float32)), (TorchRasterizer(), scene)):
+        what = (each.inputs, each.camera, each.settings, each.target, CLASSES, least)
+        keys, counts = backend.sparse_class_pixel_counts(*what)
+        tables.append(torch.zeros(len(scene.inputs.means) * CLASSES, dtype=torch.int32))
+        tables[-1][keys] = counts
+    found, expected = tables
+    assert (found - expected).abs().sum() <= 1e-3 * expected.sum()
+
+
 @pytest.mark.parametrize(
     "only",
     [
@@ -118,6 +132,11 @@ def test_products_are_the_references(compiled, name):
     expected = TorchRasterizer()
     contributions = compiled.class_contributions(*what, scene.target, CLASSES)
     assert error(contributions, expected.class_contributions(*what, scene.target, CLASSES)) < 1e-9
+    for least in (0.0, 0.1):
+        found, true = (
+            each.sparse_class_pixel_counts(*what, scene.target, CLASSES, least) for each in (compiled, expected)
+        )
+        assert all(torch.equal(*pair) for pair in zip(found, true, strict=True))
     assert torch.equal(compiled.dominant_gaussian(*what), expected.dominant_gaussian(*what))
     (classes, share), (true_classes, true_share) = (each.class_map(*what, CLASSES) for each in (compiled, expected))
     assert torch.equal(classes, true_classes)
@@ -140,6 +159,8 @@ def test_more_classes_than_one_walk_takes(compiled):
     found = torch.zeros(60 * 256, dtype=torch.float64)
     found[keys] = values
     assert error(found.view(60, 256), expected) < 1e-9
+    found, expected = (each.sparse_class_pixel_counts(*what, labels, 256) for each in (compiled, TorchRasterizer()))
+    assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
     with pytest.raises(ValueError, match=r"class_ids must lie in 0\.\.1"):
         compiled.class_map(*what, 2)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from places import ROOT, SUPPORT
-from raster_scenes import FLOATS, OUTPUTS, make_scene
+from raster_scenes import CLASSES, FLOATS, OUTPUTS, make_scene
 
 from beags_plugin.rasterizers import native
 from beags_plugin.rasterizers.native import NativeRasterizer
@@ -44,7 +44,7 @@ def run(isa, program, *args):
 
 
 def draw():
-    """Images and gradients of a scene across tiles, in float32 and float64."""
+    """Images, gradients, contributions and pixel counts of a scene across tiles, in float32 and float64."""
     results = []
     for dtype in (torch.float32, torch.float64):
         scene = make_scene(count=120, width=71, height=51, seed=3, size=-1.8).to(dtype)
@@ -52,12 +52,16 @@ def draw():
         render = scene.draw(NativeRasterizer(), **leaves)
         images = [getattr(render, name) for name in OUTPUTS]
         grads = torch.autograd.grad(sum(image.square().sum() for image in images), list(leaves.values()))
-        results.append([image.detach() for image in images] + list(grads))
+        what = (scene.inputs, scene.camera, scene.settings, scene.target, CLASSES)
+        tables = [*NativeRasterizer().sparse_class_contributions(*what)]
+        for least in (0.0, 0.1):
+            tables += NativeRasterizer().sparse_class_pixel_counts(*what, least)
+        results.append([image.detach() for image in images] + list(grads) + tables)
     return results
 
 
 def error(a, b):
-    return ((a - b).abs().max() / b.abs().max().clamp_min(1.0)).item()
+    return ((a - b).abs().max().double() / b.abs().max().clamp_min(1.0)).item()
 
 
 @needs_native

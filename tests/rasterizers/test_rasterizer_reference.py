@@ -12,6 +12,7 @@ from raster_scenes import CLASSES, FLOATS, OUTPUTS, SCENES, make_scene
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.rasterizers.rendering import draw_features
 from beags_plugin.rasterizers.torch_reference import BLOCK, TorchRasterizer
 
 
@@ -98,6 +99,11 @@ def test_contributions_class_map_and_heaviest(worked_out, rasterizer):
     expected = np.stack([(weights * (target == c)[..., None]).sum((0, 1)) for c in range(CLASSES)], axis=-1)  # E6
     contributions = rasterizer.class_contributions(*arguments, scene.target, CLASSES)
     np.testing.assert_allclose(contributions.numpy(), expected, rtol=1e-6, atol=1e-8)
+    for least in (0.0, 0.1):
+        expected = np.stack([((weights > least) & (target == c)[..., None]).sum((0, 1)) for c in range(CLASSES)], -1)
+        keys, counts = rasterizer.sparse_class_pixel_counts(*arguments, scene.target, CLASSES, least)
+        assert keys.tolist() == np.flatnonzero(expected).tolist()
+        assert counts.tolist() == expected[expected > 0].tolist()
 
     classes = scene.inputs.class_ids.numpy()
     per_class = np.stack([weights[..., classes == c].sum(-1) for c in range(CLASSES)], axis=-1)
@@ -109,6 +115,13 @@ def test_contributions_class_map_and_heaviest(worked_out, rasterizer):
 
     dominant_gaussian = np.where(weights.max(-1) > 0, weights.argmax(-1), -1)
     np.testing.assert_array_equal(rasterizer.dominant_gaussian(*arguments).numpy(), dominant_gaussian)
+
+
+def test_features_are_drawn_with_the_weights_of_the_image(worked_out, rasterizer):
+    scene, _, weights = worked_out
+    features = torch.randn(len(scene.inputs.means), 7, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    drawn = draw_features(rasterizer, scene.inputs, features, scene.camera, scene.settings)
+    np.testing.assert_allclose(drawn.numpy(), weights @ features.numpy(), rtol=1e-7, atol=1e-8)
 
 
 @pytest.mark.parametrize("output", OUTPUTS)

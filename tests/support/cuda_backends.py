@@ -72,6 +72,11 @@ class CudaOnCpuTensors(Rasterizer):
     def class_contributions(self, inputs, camera, settings, labels, num_classes):
         return self.cuda.class_contributions(_to_gpu(inputs), camera, settings, labels.cuda(), num_classes).cpu()
 
+    def sparse_class_pixel_counts(self, inputs, camera, settings, labels, num_classes, min_weight=0.0):
+        what = (_to_gpu(inputs), camera, settings, labels.cuda(), num_classes, min_weight)
+        keys, counts = self.cuda.sparse_class_pixel_counts(*what)
+        return keys.cpu(), counts.cpu()
+
     def class_map(self, inputs, camera, settings, num_classes):
         classes, share = self.cuda.class_map(_to_gpu(inputs), camera, settings, num_classes)
         return classes.cpu(), share.cpu()

@@ -98,6 +98,23 @@ def empty() -> Scene:
     return replace(scene, inputs=replace(scene.inputs, **floats, class_ids=scene.inputs.class_ids[:0]))
 
 
+def facing(
+    width: int, height: int, surfels: list[tuple[float, float, float, float]], dtype: torch.dtype = torch.float64
+) -> tuple[SurfelInputs, Camera]:
+    """Return surfels parallel to the image, the first in front: (centre x, centre y, sigma, opacity), in pixels.
+
+    A negative sigma puts a surfel behind the camera.
+    """
+    rows, focal = torch.tensor(surfels, dtype=torch.float64), 100.0
+    depths = (2.0 + 1e-3 * torch.arange(len(rows), dtype=torch.float64)) * rows[:, 2].sign()
+    means = torch.stack([rows[:, 0] * depths / focal, rows[:, 1] * depths / focal, depths], dim=-1)
+    quats = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).repeat(len(rows), 1)
+    log_scales = (rows[:, 2] * depths / focal).log()[:, None].repeat(1, 2)
+    inputs = SurfelInputs(means, quats, log_scales, torch.logit(rows[:, 3]), torch.zeros_like(means)).to(dtype)
+    K = torch.tensor([[focal, 0, 0], [0, focal, 0], [0, 0, 1]], dtype=dtype)
+    return inputs, Camera(torch.eye(4, dtype=dtype), K, width, height)
+
+
 SCENES = {"small": make_scene, "opaque": opaque_layers, "awkward": awkward, "empty": empty}
 OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion", "boundary")
 

@@ -109,6 +109,13 @@ void bind(nb::module_& m, const char* name) {
           },
           "labels"_a, "num_classes"_a, "threads"_a)
       .def(
+          "sparse_class_pixel_counts",
+          [](const Frame<T>& self, Ids labels, int num_classes, double min_weight, int threads) {
+            nb::gil_scoped_release release;
+            return self.sparse_class_pixel_counts(labels.data(), num_classes, static_cast<T>(min_weight), threads);
+          },
+          "labels"_a, "num_classes"_a, "min_weight"_a, "threads"_a)
+      .def(
           "class_map",
           [](const Frame<T>& self, int num_classes, Array<int32_t> classes, Out share, int threads) {
             nb::gil_scoped_release release;

@@ -28,7 +28,7 @@ struct WorkCounts {
   int64_t box_pairs;   // those that the usual bounds, boxes of 3.33 standard deviations, would give
 };
 
-// The contributions of Gaussians to classes that are not zero: key = Gaussian * num_classes + class, ascending.
+// The sums or pixel counts by Gaussian and class that are not zero: key = Gaussian * num_classes + class, ascending.
 template <class T>
 struct Contributions {
   std::vector<int64_t> keys;
@@ -57,20 +57,24 @@ class Frame {
   void class_contributions(const int32_t* labels, int num_classes, T* out, int threads) const;
   // Returns the same as a list, whose size does not depend on the number of classes.
   Contributions<T> sparse_class_contributions(const int32_t* labels, int num_classes, int threads) const;
+  // Counts pixels of w > min_weight in place of summing w; exact up to 2^24.
+  Contributions<T> sparse_class_pixel_counts(const int32_t* labels, int num_classes, T min_weight, int threads) const;
   // Finds each pixel's class. classes, share: [height, width]. Class ids lie in 0 .. num_classes - 1.
   void class_map(int num_classes, int32_t* classes, T* share, int threads) const;
   void dominant_gaussian(int32_t* indices, int threads) const;
   WorkCounts work_counts(int threads) const;
 
  private:
-  // The contribution of each record to each label that its tile holds.
+  // The sum of each record for each label that its tile holds.
   struct LabelSums {
     std::vector<std::vector<int32_t>> tile_labels;
     std::vector<T> sums;
     std::vector<int64_t> row_of;   // [records], where the sums of a record start, in the order of its tile's labels
     std::vector<int32_t> tile_of;  // [records]
   };
-  LabelSums label_sums(const int32_t* labels, int num_classes, int threads) const;
+  // min_weight: null for sums of w, else what the counted pixels exceed.
+  LabelSums label_sums(const int32_t* labels, int num_classes, const T* min_weight, int threads) const;
+  Contributions<T> sparse(const LabelSums& found, int num_classes, int threads) const;
   Job<T> job() const;
   int tiles() const { return tiles_x_ * tiles_y_; }
   // Calls work(tile) for every tile; idle threads take the next one.

@@ -8,7 +8,8 @@
 namespace beags {
 
 template <class T>
-typename Frame<T>::LabelSums Frame<T>::label_sums(const int32_t* labels, int num_classes, int threads) const {
+typename Frame<T>::LabelSums Frame<T>::label_sums(const int32_t* labels, int num_classes, const T* min_weight,
+                                                  int threads) const {
   LabelSums found;
   // Numbers each tile's labels 0, 1, ..: a tile rarely has more than a few.
   std::vector<int32_t> slots(static_cast<size_t>(view_.width) * view_.height, -1), num_slots(tiles(), 0);
@@ -40,7 +41,8 @@ typename Frame<T>::LabelSums Frame<T>::label_sums(const int32_t* labels, int num
   query.slot_start = slot_start.data();
   query.sums = found.sums.data();
   const Job<T> job = this->job();
-  const auto kernel = kernels<T>().class_contributions;
+  if (min_weight) query.min_weight = *min_weight;
+  const auto kernel = min_weight ? kernels<T>().class_pixel_counts : kernels<T>().class_contributions;
   for_each_tile(threads, [&](int tile) { kernel(job, query, tile); });
 
   found.row_of.resize(num_pairs());
@@ -57,7 +59,7 @@ typename Frame<T>::LabelSums Frame<T>::label_sums(const int32_t* labels, int num
 
 template <class T>
 void Frame<T>::class_contributions(const int32_t* labels, int num_classes, T* out, int threads) const {
-  const LabelSums found = label_sums(labels, num_classes, threads);
+  const LabelSums found = label_sums(labels, num_classes, nullptr, threads);
   const int team = num_surfels_ < kTeamSurfels ? 1 : threads;
   // Determinism: one thread sums each Gaussian's records, in the order of their tiles.
 #pragma omp parallel for num_threads(team) schedule(dynamic, kChunk)
@@ -71,7 +73,17 @@ void Frame<T>::class_contributions(const int32_t* labels, int num_classes, T* ou
 
 template <class T>
 Contributions<T> Frame<T>::sparse_class_contributions(const int32_t* labels, int num_classes, int threads) const {
-  const LabelSums found = label_sums(labels, num_classes, threads);
+  return sparse(label_sums(labels, num_classes, nullptr, threads), num_classes, threads);
+}
+
+template <class T>
+Contributions<T> Frame<T>::sparse_class_pixel_counts(const int32_t* labels, int num_classes, T min_weight,
+                                                     int threads) const {
+  return sparse(label_sums(labels, num_classes, &min_weight, threads), num_classes, threads);
+}
+
+template <class T>
+Contributions<T> Frame<T>::sparse(const LabelSums& found, int num_classes, int threads) const {
   const int64_t chunks = (num_surfels_ + kChunk - 1) / kChunk;
   std::vector<Contributions<T>> parts(chunks);
   const int team = num_surfels_ < kTeamSurfels ? 1 : threads;

@@ -6,7 +6,7 @@
 namespace beags {
 namespace BEAGS_ISA {
 
-// Sums of w by label for one pair after the other, where a tile has few labels.
+// Sums by label for one pair after the other, where a tile has few labels.
 template <class T>
 struct FewLabels {
   static constexpr int kMost = 4;
@@ -29,12 +29,16 @@ struct FewLabels {
   }
 };
 
-// Sums w for each pair over the tile's pixels of each label (E6); the labels are numbered within the tile.
-template <class T>
-void class_contributions(const Job<T>& job, const Query<T>& query, int tile) {
+// Sums w (E6), or [w > min_weight] with kCount, for each pair over the tile's pixels of each label; the labels are
+// numbered within the tile.
+template <bool kCount, class T>
+void class_sums(const Job<T>& job, const Query<T>& query, int tile) {
   const int num_slots = query.num_slots[tile];
   if (num_slots == 0) return;
   T* sums = query.sums + query.slot_start[tile];
+  const auto counted = [&](Real<T> w) __attribute__((always_inline)) {
+    return kCount ? keep(all(query.min_weight) < w, all(T(1))) : w;
+  };
   Walk<T> walk(job, tile);
   if (num_slots <= FewLabels<T>::kMost) {
     FewLabels<T> labels;
@@ -42,7 +46,7 @@ void class_contributions(const Job<T>& job, const Query<T>& query, int tile) {
       if (query.slots[at] >= 0) labels.member[query.slots[at]][pack * kLanes<T> + lane] = T(1);
     });
     composite<0>(job, tile, walk, [&](int k, const Splat<T>&, const Hits<T>& hits, int i, Real<T> w, Real<T>) {
-      labels.add_hit(k, hits.pack[i], w, sums, num_slots);
+      labels.add_hit(k, hits.pack[i], counted(w), sums, num_slots);
     });
     labels.flush(sums, num_slots);
     return;
@@ -53,7 +57,7 @@ void class_contributions(const Job<T>& job, const Query<T>& query, int tile) {
   composite<0>(job, tile, walk, [&](int k, const Splat<T>&, const Hits<T>& hits, int i, Real<T> w, Real<T>) {
     T* row = sums + static_cast<int64_t>(k) * num_slots;
     T lanes[kLanes<T>];
-    store(lanes, w);
+    store(lanes, counted(w));
     for (int lane = 0; lane < kLanes<T>; ++lane) {
       const int slot = slots[hits.pack[i] * kLanes<T> + lane];
       if (slot >= 0) row[slot] += lanes[lane];

@@ -31,7 +31,8 @@ constexpr Kernels<T> make_kernels() {
   return {{make_variant<0, T>(), make_variant<1, T>(), make_variant<2, T>(), make_variant<3, T>(), make_variant<4, T>(),
            make_variant<5, T>(), make_variant<6, T>(), make_variant<7, T>()},
           backward_colors<T>,
-          class_contributions<T>,
+          class_sums<false, T>,
+          class_sums<true, T>,
           class_map<T>,
           dominant_gaussian<T>,
           count<T>};

@@ -123,6 +123,7 @@ struct Query {
   const int32_t* num_slots;   // [tiles]
   const int64_t* slot_start;  // [tiles] into sums
   T* sums;                    // of tile t: [pairs of t, num_slots[t]]
+  T min_weight;               // class_pixel_counts: pixels of larger w count
   int32_t* classes;           // class_map, dominant_gaussian: [height, width]
   T* share;                   // class_map: [height, width]
 };
@@ -144,6 +145,7 @@ struct Kernels {
   Variant<T> variants[kAllParts + 1];                // by Parts
   void (*backward_colors)(const Job<T>&, int tile);  // towards colours and background alone
   void (*class_contributions)(const Job<T>&, const Query<T>&, int tile);
+  void (*class_pixel_counts)(const Job<T>&, const Query<T>&, int tile);
   void (*class_map)(const Job<T>&, const Query<T>&, int tile);
   void (*dominant_gaussian)(const Job<T>&, const Query<T>&, int tile);
   Work (*count)(const Job<T>&, int tile);

@@ -1,0 +1,88 @@
+"""python -m benchmarks.channels: what further channels cost, forward and backward, beside one image of colours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+import tyro
+from rich.console import Console
+
+from beags_plugin.bench.report import plain_table
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.interface import Rasterizer, SurfelInputs
+from beags_plugin.rasterizers.rendering import draw_features
+from benchmarks.clock import Seconds
+from benchmarks.machine import commit, describe_machine
+from benchmarks.scenes import Scene, make_scene, parse_size
+
+
+@dataclass(frozen=True)
+class ChannelOptions:
+    """Time of F channels by passes of three, forward and backward, over that of one image of colours, on one thread.
+
+    sizes: N/WIDTHxHEIGHT. channels: numbers F. rounds: in which everything has its turn; the least CPU time counts.
+    rasterizer: a backend's name.
+    """
+
+    sizes: tuple[str, ...] = ("20k/320x240", "50k/320x240")
+    channels: tuple[int, ...] = (3, 9, 16, 64)
+    rounds: int = 7
+    rasterizer: str = "auto"
+
+
+def run_channels(options: ChannelOptions) -> dict[str, dict[str, float]]:
+    """Measure and print a table; returns CPU seconds by size and what was drawn."""
+    torch.set_num_threads(1)
+    rasterizer, found = make_rasterizer(options.rasterizer), {}
+    for name in options.sizes:
+        ways = _ways(make_scene(parse_size(name)), rasterizer, options.channels)
+        found[name] = dict.fromkeys(ways, float("inf"))
+        for _ in range(options.rounds):
+            for label, way in ways.items():
+                start = Seconds.now()
+                way()
+                found[name][label] = min(found[name][label], (Seconds.now() - start).cpu)
+    rows = [
+        (name, label, f"{1e3 * seconds:.1f}", f"{seconds / least['colours']:.2f}")
+        for name, least in found.items()
+        for label, seconds in least.items()
+    ]
+    console = Console(soft_wrap=True, highlight=False)
+    console.print(f"{describe_machine()['cpu']}; torch {torch.__version__}; commit {commit()}")
+    console.print(plain_table("Channels, forward and backward", ("size", "drawn", "CPU ms", "over colours"), rows))
+    return found
+
+
+def _ways(scene: Scene, rasterizer: Rasterizer, channels: tuple[int, ...]) -> dict[str, Callable[[], None]]:
+    """Return what is timed by name: a drawing and its gradients towards geometry and features, or features alone."""
+    g = torch.Generator().manual_seed(0)
+    s, settings = scene.surfels, replace(scene.settings, geometry=False, distortion=False)
+    geometry = [value.clone().requires_grad_() for value in (s.means, s.quats, s.log_scales, s.opacity_logits)]
+    inputs = SurfelInputs(*geometry, scene.colors.clone().requires_grad_())
+
+    def colors() -> None:
+        image = rasterizer.rasterize(inputs, scene.camera, settings, scene.background).color
+        torch.autograd.grad(image, [*geometry, inputs.colors], scene.gradients["color"])
+
+    ways = {"colours": colors}
+    for count in channels:
+        features = torch.rand(len(s), count, generator=g).requires_grad_()
+        gradient = torch.randn(scene.camera.height, scene.camera.width, count, generator=g)
+        for of, drawn, leaves in (
+            ("", inputs, [*geometry, features]),
+            (", features' gradients alone", inputs.detached(), [features]),
+        ):
+
+            def passes(drawn=drawn, leaves=leaves, features=features, gradient=gradient) -> None:
+                torch.autograd.grad(
+                    draw_features(rasterizer, drawn, features, scene.camera, settings), leaves, gradient
+                )
+
+            ways[f"{count} channels{of}"] = passes
+    return ways
+
+
+if __name__ == "__main__":
+    run_channels(tyro.cli(ChannelOptions))
