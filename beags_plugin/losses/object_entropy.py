@@ -1,0 +1,57 @@
+"""The object loss of ObjectGS: cross-entropy of blended one-hot ids against the mask.
+
+Zhu, Yu, Xu, Jiang, Li, Zhang, Pang, Dai: "ObjectGS: Object-aware Scene Reconstruction and Scene Understanding via
+Gaussian Splatting", ICCV 2025. With p(u) = sum_i w_i onehot(phi_i), on no background:
+
+    L = mean over counted pixels of -p_M(u) + log sum_c exp(p_c)
+
+p itself is the logit: it is no probability (its sum is alpha, at most 1), and L is never 0, so that right pixels are
+pulled towards alpha = 1 for ever. All K channels belong to the sum, also those of classes that the view does not show.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
+from beags_plugin.losses.reduction import ordered_sum
+
+WEIGHT = 0.1  # of L; its releases for single data sets have 0.1, 0.01 and 0.001
+SCALE_WEIGHT = 0.01  # of ``mean_area``
+IGNORE_BACKGROUND = False
+
+
+def counted_labels(
+    labels: Tensor, carried: Tensor | None = None, ignore_background: bool = IGNORE_BACKGROUND
+) -> Tensor:
+    """Return labels [H, W] int of a view, IGNORE at the pixels that do not count.
+
+    carried: [K] bool, the classes that some Gaussian has; pixels of others do not count.
+    ignore_background: leave out 0, which is one more object otherwise; the source leaves out its 0, "unlabelled".
+    """
+    left_out = labels == BACKGROUND if ignore_background else torch.zeros_like(labels, dtype=torch.bool)
+    if carried is not None:
+        left_out = left_out | ((labels != IGNORE) & ~carried[labels.clamp(max=len(carried) - 1).long()])
+    return labels.masked_fill(left_out, IGNORE)
+
+
+def label_entropy(logits: Tensor, labels: Tensor | None) -> Tensor:
+    """Return the mean cross-entropy over labelled pixels; 0, without gradient, where there are none.
+
+    logits: [H, W, K] float. labels: [H, W] int below K, or IGNORE; None for a view without mask.
+    """
+    if labels is None:
+        return logits.new_zeros(())
+    flat = labels.reshape(-1).long()
+    each = torch.nn.functional.cross_entropy(logits.flatten(0, 1), flat, ignore_index=IGNORE, reduction="none")
+    return ordered_sum(each) / (flat != IGNORE).sum().clamp(min=1)
+
+
+def mean_area(log_scales: Tensor, drawn: Tensor) -> Tensor:
+    """Return the mean product of both scales of the drawn Gaussians; 0 if there are none.
+
+    log_scales: [N, 2]; the value is in squared units of the run's frame. drawn: [N] bool.
+    """
+    areas = torch.where(drawn, log_scales.sum(dim=-1), -torch.inf).exp()
+    return ordered_sum(areas) / drawn.sum().clamp(min=1)
