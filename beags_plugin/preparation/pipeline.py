@@ -168,6 +168,7 @@ def prepare(
         cameras,
         masks.labels,
         max(class_names) + 1,
+        sorted(class_id for class_id in class_names if class_id != 0),
         rasterizer,
         settings,
         seed,

@@ -27,6 +27,7 @@ class AssignedScene:
     surfels: the base scene, N Gaussians, without gradients. class_ids: [N] int32, phi.
     cameras: the training views. labels: per training view M', [H, W] int32.
     num_classes: ids lie below it, perhaps far apart: see ``labels.class_ranks`` for arrays with an entry per class.
+    objects: their ids, ascending, without the background.
     contributions: C of E6, of the base. scale: units of the run's frame per unit of the input poses'.
     depth: the depth of the surface: see ``rasterizers.rendering.surface_depth``.
     unseen, votes: see ``PreparationConfig``.
@@ -37,6 +38,7 @@ class AssignedScene:
     cameras: Sequence[Camera]
     labels: Sequence[Tensor]
     num_classes: int
+    objects: Sequence[int]
     rasterizer: Rasterizer
     settings: RasterSettings
     seed: int

@@ -18,6 +18,8 @@ REFINERS = Registry(
     {
         "bea": "beags_plugin.refiners.bea:BeaRefiner",
         "none": "beags_plugin.refiners.none:NoRefiner",
+        "flashsplat": "beags_plugin.refiners.flashsplat:FlashSplatRefiner",
+        "gaussiancut": "beags_plugin.refiners.gaussiancut:GaussianCutRefiner",
     },
 )
 

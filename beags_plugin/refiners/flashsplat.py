@@ -14,9 +14,12 @@ gamma < 0 perhaps several.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 from torch import Tensor
 
+from beags_plugin.core.membership import Membership
+from beags_plugin.preparation.refiner import AssignedScene, Refiner
 from beags_plugin.system.errors import UserError
 
 GAMMA = 0.4
@@ -39,3 +42,21 @@ def members(sums: Tensor, totals: Tensor, gamma: float = GAMMA) -> Tensor:
     """
     inside = sums > threshold(gamma) * totals
     return inside | (totals <= 0) if gamma < 0 else inside
+
+
+@dataclass(frozen=True)
+class FlashSplatRefiner(Refiner):
+    """Cuts every object out of the base against the rest; nothing is trained.
+
+    gamma: see ``GAMMA``.
+    """
+
+    gamma: float = GAMMA
+
+    def __post_init__(self) -> None:
+        threshold(self.gamma)  # raises
+
+    def members(self, scene: AssignedScene) -> Membership:
+        total = scene.contributions.total()
+        masks = {c: members(scene.contributions.of(c), total, self.gamma) for c in scene.objects}
+        return Membership.of_masks(masks, scene.class_ids)

@@ -81,7 +81,7 @@ def test_a_run_that_is_killed_again_and_again(data, whole, tmp_path, monkeypatch
     assert_same_run(run, whole)
 
 
-STAGES = ["render_depths", "reprojected_masks", "assign_classes", "split_at_borders", "build_visibility_grid"]
+STAGES = ["render_depths", "reprojected_masks", "contributions", "split_at_borders", "build_visibility_grid"]
 
 
 def stage_module(name):
@@ -90,7 +90,7 @@ def stage_module(name):
     return bea if name == "build_visibility_grid" else preparation
 
 
-@pytest.mark.parametrize(("name", "round_"), [*((name, 1) for name in STAGES), ("assign_classes", 2)])
+@pytest.mark.parametrize(("name", "round_"), [*((name, 1) for name in STAGES), ("contributions", 2)])
 def test_a_kill_in_the_preparation_ends_as_the_whole_one(data, whole, tmp_path, monkeypatch, name, round_):
     """The preparation that was interrupted is made again, from the scene that was saved before it."""
     run, calls = tmp_path / "run", []
@@ -107,10 +107,10 @@ def test_a_kill_in_the_preparation_ends_as_the_whole_one(data, whole, tmp_path, 
 
 @pytest.mark.parametrize("name", ["write_run", "write_mask"])
 def test_a_kill_while_the_base_or_the_masks_are_written(data, whole, tmp_path, monkeypatch, name):
-    from beags_plugin.plugin.training import refinement
+    from beags_plugin.plugin.training import prepared_files, refinement
 
-    run = tmp_path / "run"
-    interrupted(data, run, monkeypatch, lambda patch: patch.setattr(refinement, name, killed))
+    run, module = tmp_path / "run", refinement if name == "write_run" else prepared_files
+    interrupted(data, run, monkeypatch, lambda patch: patch.setattr(module, name, killed))
     resume_to_end(run)
     assert_same_run(run, whole)
 

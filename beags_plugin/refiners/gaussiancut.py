@@ -1,0 +1,39 @@
+"""GaussianCut as a refiner: a minimum cut of the Gaussians' graph for each object (``graph_cut``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from beags_plugin.core.membership import Membership
+from beags_plugin.preparation.refiner import AssignedScene, Refiner
+from beags_plugin.refiners import graph_cut
+from beags_plugin.system.errors import UserError
+
+
+@dataclass(frozen=True)
+class GaussianCutRefiner(Refiner):
+    """Cuts every object out of the base against the rest; nothing is trained, objects may overlap.
+
+    num_edges, foreground_threshold: see ``graph_cut``.
+    """
+
+    num_edges: int = graph_cut.NUM_EDGES
+    foreground_threshold: float = graph_cut.FOREGROUND_THRESHOLD
+
+    def __post_init__(self) -> None:
+        if self.num_edges < 1:
+            raise UserError(f"num_edges is {self.num_edges}: give a number of neighbours, 1 or more.")
+        if not 0.0 <= self.foreground_threshold <= 1.0:
+            raise UserError(f"foreground_threshold is {self.foreground_threshold}: give a share, 0 to 1.")
+
+    def members(self, scene: AssignedScene) -> Membership:
+        means = scene.surfels.means / scene.scale  # the published decays are per unit of the input poses
+        dc, total = scene.surfels.sh_dc, scene.contributions.total()
+        links = graph_cut.n_links(means, dc, self.num_edges)
+        masks = {}
+        for class_id in scene.objects:
+            share = torch.where(total > 0, scene.contributions.of(class_id) / total.clamp_min(1e-300), 0.0)
+            masks[class_id] = graph_cut.members(means, dc, share, links, self.foreground_threshold)
+        return Membership.of_masks(masks, scene.class_ids)
