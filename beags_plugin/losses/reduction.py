@@ -1,11 +1,14 @@
-"""Sums whose order does not depend on the number of threads."""
+"""Sums and products whose order does not depend on the number of threads."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import torch
 from torch import Tensor
 
 _ROW = 1024  # a whole-tensor sum splits its range by the number of threads; sums of rows never split a row
+_BLOCK, _BLOCKS = 64, 64  # rows of a small product, and the least number of them
 
 
 def ordered_sum(values: Tensor) -> Tensor:
@@ -24,3 +27,41 @@ def ordered_sum(values: Tensor) -> Tensor:
 def ordered_mean(values: Tensor) -> Tensor:
     """Return the mean of all elements (0 of none), as ``ordered_sum``."""
     return ordered_sum(values) / max(values.numel(), 1)
+
+
+def ordered_linear(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """Return rows @ weight.T + bias, value and gradients bit for bit the same for any number of threads.
+
+    rows: [..., C] float. weight: [K, C]. bias: [K]. Returns [..., K].
+    """
+    flat = torch.nn.functional.pad(rows.reshape(-1, rows.shape[-1]), (0, 1), value=1.0)
+    product: Tensor = _RowProduct.apply(flat, torch.cat([weight, bias[:, None]], dim=1))  # pyright: ignore[reportAssignmentType]
+    return product.view(*rows.shape[:-1], len(weight))
+
+
+class _RowProduct(torch.autograd.Function):
+    """rows @ matrix.T by many small products, each of which a thread takes as a whole; a large one would be split."""
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, matrix: Tensor) -> Tensor:
+        ctx.save_for_backward(rows, matrix)
+        return _times(rows, matrix.T)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        rows, matrix = ctx.saved_tensors
+        parts = torch.bmm(_blocks(grad).transpose(1, 2), _blocks(rows))
+        sums = parts.flatten(1).T.contiguous().sum(dim=1)  # a row for each entry, none of which is split
+        return _times(grad, matrix), sums.view_as(matrix)
+
+
+def _times(rows: Tensor, matrix: Tensor) -> Tensor:
+    """Return [P, B] of [P, A] and [A, B]."""
+    blocks = _blocks(rows)
+    return torch.bmm(blocks, matrix.expand(len(blocks), -1, -1)).flatten(0, 1)[: len(rows)]
+
+
+def _blocks(rows: Tensor) -> Tensor:
+    """Return [P, A] as [blocks, 64, A], more of them than there are threads, filled up with zeros."""
+    missing = max(-len(rows) % _BLOCK, _BLOCK * _BLOCKS - len(rows))
+    return torch.nn.functional.pad(rows, (0, 0, 0, missing)).view(-1, _BLOCK, rows.shape[1])

@@ -22,7 +22,7 @@ from torch.nn.functional import embedding
 
 from beags_plugin.core.densification import SH_C0
 from beags_plugin.losses.object_entropy import label_entropy
-from beags_plugin.losses.reduction import ordered_mean
+from beags_plugin.losses.reduction import ordered_linear, ordered_mean
 
 CHANNELS = 16
 CODE_RATE = 2.5e-3  # Adam with eps 1e-15, constant
@@ -40,7 +40,14 @@ THRESHOLD_2D = 0.2  # of an object's picture
 HULL = True
 IQR_FACTOR = 1.0
 
-Classifier = Callable[[Tensor], Tensor]
+Classify = Callable[[Tensor], Tensor]
+
+
+class Classifier(nn.Linear):
+    """Logits [..., K] of codes [..., 16], with the same bits and gradients for any number of threads."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        return ordered_linear(input, self.weight, self.bias)
 
 
 def initial_codes(count: int, generator: torch.Generator) -> Tensor:
@@ -48,9 +55,9 @@ def initial_codes(count: int, generator: torch.Generator) -> Tensor:
     return (torch.rand(count, CHANNELS, generator=generator) - 0.5) / SH_C0
 
 
-def initial_classifier(num_classes: int, generator: torch.Generator) -> nn.Linear:
+def initial_classifier(num_classes: int, generator: torch.Generator) -> Classifier:
     """Return the classifier of codes as torch would start it, uniform within 1/4, but drawn from ``generator``."""
-    layer = nn.utils.skip_init(nn.Linear, CHANNELS, num_classes)
+    layer = Classifier(CHANNELS, num_classes, device="meta").to_empty(device="cpu")  # draws nothing from torch's own
     with torch.no_grad():
         for values in (layer.weight, layer.bias):
             values.uniform_(-(CHANNELS**-0.5), CHANNELS**-0.5, generator=generator)
@@ -62,7 +69,7 @@ def rate_factor(steps: int) -> float:
     return min(FULL_STEPS / steps, FASTEST)
 
 
-def pixel_loss(classifier: Classifier, drawn: Tensor, labels: Tensor | None) -> Tensor:
+def pixel_loss(classifier: Classify, drawn: Tensor, labels: Tensor | None) -> Tensor:
     """Return L_2d; 0 without labelled pixels. drawn: [H, W, C], E. labels: [H, W] int, or IGNORE; None without mask."""
     return label_entropy(classifier(drawn), labels) / math.log(NORMALISER)
 
@@ -93,10 +100,10 @@ def nearest_in_space(
     return sample[torch.cat([chosen[:, None], places], dim=1)].to(means.device)
 
 
-def neighbour_loss(classifier: Classifier, codes: Tensor, groups: Tensor, weight: float = WEIGHT_3D) -> Tensor:
+def neighbour_loss(classifier: Classify, codes: Tensor, groups: Tensor, weight: float = WEIGHT_3D) -> Tensor:
     """Return L_3d. codes: [N, C]. groups: [A, 1 + k] int64 of ``nearest_in_space``."""
-    # an embedding's gradient is summed in one order by any number of threads; that of codes[groups] is not
-    q = classifier(embedding(groups, codes)).softmax(dim=-1)
+    # Determinism: gradients of codes[groups] and of softmax depend on the number of threads, those of these do not.
+    q = classifier(embedding(groups, codes)).log_softmax(dim=-1).exp()
     logs = (q + 1e-10).log()
     divergence = (q[:, :1] * (logs[:, :1] - logs[:, 1:])).sum(dim=-1)
     return weight / NORMALISER * ordered_mean(divergence)
@@ -107,7 +114,7 @@ def right_pixels(logits: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
     return (logits.argmax(dim=-1) == labels).sum(), (labels < logits.shape[-1]).sum()
 
 
-def masks_in_picture(classifier: Classifier, drawn: Tensor, threshold: float = THRESHOLD_2D) -> Tensor:
+def masks_in_picture(classifier: Classify, drawn: Tensor, threshold: float = THRESHOLD_2D) -> Tensor:
     """Return [H, W, K] bool, the authors' masks of all classes: the softmax of a drawn code [H, W, C] above a bound."""
     return classifier(drawn).softmax(dim=-1) > threshold
 

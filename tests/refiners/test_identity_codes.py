@@ -94,18 +94,36 @@ def test_gradients_of_neighbours_reach_codes_and_classifier():
     assert classifier.weight.grad.any() and classifier.bias.grad.any()
 
 
-def test_gradients_do_not_depend_on_the_number_of_threads():
+@pytest.mark.parametrize("num_classes", [5, 37])
+def test_losses_and_gradients_do_not_depend_on_the_number_of_threads(num_classes):
     groups = torch.randint(0, 60, (1_000, 6), generator=generator())  # each Gaussian in many places
-    classifier, threads, found = identity_codes.initial_classifier(8, generator()), torch.get_num_threads(), []
+    drawn = torch.rand(67, 90, 16, generator=generator())
+    labels = torch.randint(0, num_classes, (67, 90), generator=generator())
+    threads, found = torch.get_num_threads(), []
     try:
-        for count in (1, 2, 2, 2, 2):
+        for count in (1, 2, 3, 3, 3, 4):
             torch.set_num_threads(count)
-            codes = identity_codes.initial_codes(60, generator()).requires_grad_()
-            neighbour_loss(classifier, codes, groups).backward()
-            found.append(codes.grad)
+            classifier = identity_codes.initial_classifier(num_classes, generator())
+            leaves = [identity_codes.initial_codes(60, generator()), drawn]
+            codes, picture = (values.clone().requires_grad_() for values in leaves)
+            loss = neighbour_loss(classifier, codes, groups) + pixel_loss(classifier, picture, labels)
+            found.append([loss, *torch.autograd.grad(loss, [codes, picture, *classifier.parameters()])])
     finally:
         torch.set_num_threads(threads)
-    assert all(torch.equal(each, found[0]) for each in found)
+    assert all(torch.equal(value, first) for each in found for value, first in zip(each, found[0], strict=True))
+
+
+def test_the_classifier_is_a_linear_layer():
+    layer, codes = identity_codes.initial_classifier(5, generator()), torch.rand(3, 7, 16, generator=generator())
+    plain = [values.detach().double().requires_grad_() for values in (codes, layer.weight, layer.bias)]
+    slope = torch.randn(3, 7, 5, generator=generator())
+    expected = torch.nn.functional.linear(*plain)
+    codes.requires_grad_()
+    found = layer(codes)
+    assert torch.allclose(found.double(), expected, atol=1e-6)
+    wanted = torch.autograd.grad(expected, plain, slope.double())
+    for value, true in zip(torch.autograd.grad(found, [codes, *layer.parameters()], slope), wanted, strict=True):
+        assert torch.allclose(value.double(), true, atol=1e-5)
 
 
 def test_gradients_of_pixels_reach_the_geometry():

@@ -133,6 +133,16 @@ def test_the_steps_equal_those_of_drawing_with_gradients():
     assert float(m.detach().abs().min()) < 0.3 < float(m.detach().abs().max())  # not all steps had one sign
 
 
+def test_without_edits_the_object_is_what_lies_mostly_inside():
+    """FlashSplat's argmax; 60 views, in each of which a Gaussian lies inside or outside as a whole, and four phases."""
+    inside = (torch.rand(60, 2_000, generator=generator()) < torch.rand(2_000, generator=generator(1))).float()
+    share, logits = inside.mean(dim=0), MaskLogits(torch.zeros(2_000))
+    for phase in range(4):
+        play_phase(logits, lambda view: (inside[view], 1.0 - inside[view]), [100] * 60, generator(phase))
+    differ = logits.members() != (share > 0.5)
+    assert float((share[differ] - 0.5).abs().max()) < 0.05
+
+
 def test_edits_and_checkpoints():
     logits = played(torch.tensor([[9.0, 0.0, 2.0], [0.0, 9.0, 2.1]]), 12)
     before = logits.state()

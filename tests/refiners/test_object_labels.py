@@ -20,7 +20,7 @@ def test_by_weight():
 def test_by_majority_of_projected_centres():
     """Pixels 0..7 in a row; a mask of each view says which class lies there."""
     view, row = camera(8), [4.5]
-    centers = [(x + 0.5, *row) for x in (1, 2, 5, 6, 3)] + [(-3.0, *row), (1.5, *row), (2.5, *row)]
+    centers = [(x + 0.5, *row) for x in (1, 2, 5, 6, 3)] + [(-3.0, *row), (1.5, *row), (1.5, *row)]
     depths = [1.0] * 6 + [5.0, -1.0]  # the last but one is hidden straight behind the first; the last behind the camera
     points = discs(8, centers, 1.0, 0.5, depths).means
 
