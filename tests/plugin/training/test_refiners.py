@@ -125,5 +125,5 @@ def test_a_wrong_option_is_said_before_anything_is_trained(data, tmp_path, optio
 
 def test_more_rounds_are_for_refiners_that_train_with_the_losses_of_the_config(data, tmp_path):
     config = short_config(data, tmp_path / "run", **{**overrides("none"), "pipeline.model.refine_rounds": 2})
-    with pytest.raises(SystemExit):
+    with pytest.raises(UserError, match="refine_rounds is 2: the refiner none has 1 round"):
         run_to_end(config)
