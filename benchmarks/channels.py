@@ -1,4 +1,4 @@
-"""python -m benchmarks.channels: what further channels cost, forward and backward, beside one image of colours."""
+"""python -m benchmarks.channels: what channels cost, by passes of three and by class, beside one image of colours."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 import tyro
 from rich.console import Console
+from torch import Tensor
 
 from beags_plugin.bench.report import plain_table
 from beags_plugin.rasterizers import make_rasterizer
@@ -20,7 +21,7 @@ from benchmarks.scenes import Scene, make_scene, parse_size
 
 @dataclass(frozen=True)
 class ChannelOptions:
-    """Time of F channels by passes of three, forward and backward, over that of one image of colours, on one thread.
+    """Time of F channels, forward and backward, over that of one image of colours, on one thread.
 
     sizes: N/WIDTHxHEIGHT. channels: numbers F. rounds: in which everything has its turn; the least CPU time counts.
     rasterizer: a backend's name.
@@ -55,32 +56,32 @@ def run_channels(options: ChannelOptions) -> dict[str, dict[str, float]]:
     return found
 
 
-def _ways(scene: Scene, rasterizer: Rasterizer, channels: tuple[int, ...]) -> dict[str, Callable[[], None]]:
-    """Return what is timed by name: a drawing and its gradients towards geometry and features, or features alone."""
-    g = torch.Generator().manual_seed(0)
+def _ways(scene: Scene, rasterizer: Rasterizer, channels: tuple[int, ...]) -> dict[str, Callable[[], object]]:
+    """Return what is timed by name: a drawing and its gradients, towards geometry and features or features alone."""
+    g, ways = torch.Generator().manual_seed(0), {}
     s, settings = scene.surfels, replace(scene.settings, geometry=False, distortion=False)
     geometry = [value.clone().requires_grad_() for value in (s.means, s.quats, s.log_scales, s.opacity_logits)]
-    inputs = SurfelInputs(*geometry, scene.colors.clone().requires_grad_())
+    means, quats, log_scales, opacity_logits = geometry
+    inputs = SurfelInputs(means, quats, log_scales, opacity_logits, scene.colors.clone().requires_grad_())
+    what = (scene.camera, settings)
 
-    def colors() -> None:
-        image = rasterizer.rasterize(inputs, scene.camera, settings, scene.background).color
-        torch.autograd.grad(image, [*geometry, inputs.colors], scene.gradients["color"])
+    def add(name: str, leaves: list[Tensor], gradient: Tensor, draw: Callable[..., Tensor], *arguments: object) -> None:
+        ways[name] = lambda: torch.autograd.grad(draw(*arguments), leaves, gradient)
 
-    ways = {"colours": colors}
+    def colors() -> Tensor:
+        return rasterizer.rasterize(inputs, *what, scene.background).color
+
+    add("colours", [*geometry, inputs.colors], scene.gradients["color"], colors)
     for count in channels:
         features = torch.rand(len(s), count, generator=g).requires_grad_()
         gradient = torch.randn(scene.camera.height, scene.camera.width, count, generator=g)
-        for of, drawn, leaves in (
-            ("", inputs, [*geometry, features]),
-            (", features' gradients alone", inputs.detached(), [features]),
-        ):
-
-            def passes(drawn=drawn, leaves=leaves, features=features, gradient=gradient) -> None:
-                torch.autograd.grad(
-                    draw_features(rasterizer, drawn, features, scene.camera, settings), leaves, gradient
-                )
-
-            ways[f"{count} channels{of}"] = passes
+        passes = (gradient, draw_features, rasterizer)
+        add(f"{count} channels", [*geometry, features], *passes, inputs, features, *what)
+        alone = f"{count} channels, features' gradients alone"
+        add(alone, [features], *passes, inputs.detached(), features, *what)
+        ids = torch.randint(0, count, (len(s),), generator=g, dtype=torch.int32)  # every tile has nearly all of them
+        labelled = replace(inputs, class_ids=ids)
+        add(f"{count} class channels", geometry, gradient, rasterizer.class_channels, labelled, *what, count)
     return ways
 
 

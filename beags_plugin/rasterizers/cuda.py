@@ -30,6 +30,7 @@ from beags_plugin.rasterizers.autograd import (
 )
 from beags_plugin.rasterizers.interface import FLOATS, RasterSettings, SurfelInputs, map_ids
 from beags_plugin.rasterizers.pair_counts import PairCounts, capacity_for
+from beags_plugin.rasterizers.rendering import class_channels_by_threes
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 from beags_plugin.system.errors import UserError
 
@@ -169,6 +170,12 @@ class CudaRasterizer(KernelRasterizer):
 
         self._frame(inputs, camera, settings, render)
         return classes, share
+
+    def class_channels(
+        self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
+    ) -> Tensor:
+        """See ``Rasterizer.class_channels``; without a kernel: three classes at a time."""
+        return class_channels_by_threes(self, inputs, camera, settings, num_classes)
 
     @torch.no_grad()
     def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:

@@ -40,5 +40,8 @@ class DeviceDispatchRasterizer(Rasterizer):
     def class_map(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor]:
         return self._backend(inputs).class_map(inputs, *args, **kwargs)
 
+    def class_channels(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> Tensor:
+        return self._backend(inputs).class_channels(inputs, *args, **kwargs)
+
     def dominant_gaussian(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> Tensor:
         return self._backend(inputs).dominant_gaussian(inputs, *args, **kwargs)

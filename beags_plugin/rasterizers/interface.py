@@ -201,6 +201,16 @@ class Rasterizer(ABC):
         """
 
     @abstractmethod
+    def class_channels(
+        self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
+    ) -> Tensor:
+        """Return [H, W, num_classes], p_c = sum_i w_i [phi_i = c], differentiable in the inputs but their colours.
+
+        A backend should take the same time for any number of classes if it can, as dL/dw_i is dL/dp at phi_i; else
+        ``rendering.class_channels_by_threes`` does it.
+        """
+
+    @abstractmethod
     def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
         """Return [H, W] int32, the index of the surfel with the largest w_i (ties to the nearer); -1 where none is."""
 

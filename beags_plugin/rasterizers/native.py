@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.ops import extension
@@ -150,6 +151,18 @@ class NativeRasterizer(KernelRasterizer):
         frame.class_map(num_classes, classes, share, extension.threads())
         return classes, share
 
+    def class_channels(
+        self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
+    ) -> Tensor:
+        """See ``Rasterizer.class_channels``."""
+        inputs = inputs.checked()
+        map_ids(inputs, num_classes)
+        floats = [getattr(inputs, name) for name in FLOATS]
+        found: Any = _ClassChannels.apply(
+            inputs.detached(), camera, settings, num_classes, *floats, inputs.screen_shift
+        )
+        return found
+
     @torch.no_grad()
     def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
         """See ``Rasterizer.dominant_gaussian``."""
@@ -157,6 +170,28 @@ class NativeRasterizer(KernelRasterizer):
         indices = torch.empty(camera.height, camera.width, dtype=torch.int32)
         frame.dominant_gaussian(indices, extension.threads())
         return indices
+
+
+class _ClassChannels(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, inputs, camera, settings, num_classes, *floats):
+        frame, _ = _frame(inputs, camera, settings)
+        channels = inputs.means.new_zeros(camera.height, camera.width, num_classes)
+        frame.class_channels(num_classes, channels, any(ctx.needs_input_grad), extension.threads())
+        ctx.save_for_backward(*floats)
+        ctx.frame = frame
+        return channels
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gradient):
+        *floats, _ = ctx.saved_tensors
+        means, quats, log_scales, opacity_logits, _ = floats
+        *geometry, _, shift = ctx.needs_input_grad[4:]
+        likes = zip((means, quats, log_scales, opacity_logits, means[:, :2]), (*geometry, shift), strict=True)
+        found = [value.new_empty(value.shape) if wanted else None for value, wanted in likes]
+        ctx.frame.class_channels_backward(*floats, gradient.contiguous(), *found, extension.threads())
+        return None, None, None, None, *found[:4], None, found[4]
 
 
 def _listed(found: Any, like: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ranks import ClassRanks
-from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings, SurfelInputs
+from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings, SurfelInputs, map_ids
 from beags_plugin.system.errors import check_choice
 
 SURFACE_DEPTHS = ("median", "expected")
@@ -69,6 +69,14 @@ def draw_features(
         for first in range(0, channels, 3)
     ]
     return torch.cat(images, dim=-1)[..., :channels]
+
+
+def class_channels_by_threes(
+    rasterizer: Rasterizer, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
+) -> Tensor:
+    """Do what ``Rasterizer.class_channels`` says by ``draw_features``, for backends that have nothing faster."""
+    one_hot = torch.nn.functional.one_hot(map_ids(inputs, num_classes).long(), num_classes)
+    return draw_features(rasterizer, inputs, one_hot.to(inputs.means), camera, settings)
 
 
 def check_surface_depth(kind: str) -> None:

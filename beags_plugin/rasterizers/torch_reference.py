@@ -22,6 +22,7 @@ from beags_plugin.rasterizers.interface import (
     sparse_table,
 )
 from beags_plugin.rasterizers.reference_geometry import ProjectedSurfels, hits, on_screen, project
+from beags_plugin.rasterizers.rendering import class_channels_by_threes
 
 KEPT_PER_PAIR = 40  # numbers that autograd keeps per pixel and surfel, as measured
 BLOCK = 16  # pixels are rendered in squares of this side, each with the surfels that reach it
@@ -150,6 +151,11 @@ class TorchRasterizer(Rasterizer):
             rows.put(block.rows, block.columns, {"class": here.class_ids(best)[:, None], "share": share[:, None]})
         images = rows.join()
         return images["class"][..., 0], images["share"][..., 0]
+
+    def class_channels(
+        self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
+    ) -> Tensor:
+        return class_channels_by_threes(self, inputs, camera, settings, num_classes)
 
     @torch.no_grad()
     def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:

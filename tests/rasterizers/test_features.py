@@ -43,19 +43,84 @@ def test_class_ids_as_features_give_the_sums_by_class(rasterizer):
     torch.testing.assert_close(drawn.amax(-1), share * alpha)
 
 
+def leaves_of(scene):
+    leaves = {name: getattr(scene.inputs, name).clone().requires_grad_() for name in GEOMETRY}
+    leaves["screen_shift"] = torch.zeros_like(scene.inputs.means[:, :2]).requires_grad_()
+    return leaves
+
+
 @pytest.mark.parametrize("channels", [1, 3, 7])
 @pytest.mark.parametrize("name", SCENES)
 def test_gradients_are_the_references(name, channels, rasterizer):
     scene, g = SCENES[name](), torch.Generator().manual_seed(5)
-    count, image = len(scene.inputs.means), (scene.camera.height, scene.camera.width)
-    features = torch.randn(count, channels, generator=g, dtype=torch.float64)
-    factors = torch.randn(*image, channels, generator=g, dtype=torch.float64)
+    features = torch.randn(len(scene.inputs.means), channels, generator=g, dtype=torch.float64)
+    factors = torch.randn(scene.camera.height, scene.camera.width, channels, generator=g, dtype=torch.float64)
     found = []
     for backend in (rasterizer, TorchRasterizer()):
-        leaves = {n: getattr(scene.inputs, n).clone().requires_grad_() for n in GEOMETRY}
-        leaves["features"] = features.clone().requires_grad_()
-        inputs = replace(scene.inputs, **{n: leaves[n] for n in GEOMETRY})
-        drawn = draw_features(backend, inputs, leaves["features"], scene.camera, scene.settings)
+        leaves = leaves_of(scene)
+        inputs, those = replace(scene.inputs, **leaves), features.clone().requires_grad_()
+        drawn = draw_features(backend, inputs, those, scene.camera, scene.settings)
         assert drawn.shape == factors.shape
-        found.append([drawn, *torch.autograd.grad((drawn * factors).sum(), list(leaves.values()))])
+        found.append([drawn, *torch.autograd.grad((drawn * factors).sum(), [*leaves.values(), those])])
     assert all(error(a.detach(), b.detach()) < 1e-9 for a, b in zip(*found, strict=True))
+
+
+@pytest.mark.parametrize(("name", "step"), [*((name, 1) for name in SCENES), ("wide", 7)])
+def test_class_channels_are_the_features_of_class_ids(name, step, rasterizer):
+    """With ids 0, 7, 14, 21 most classes have no surfel."""
+    scene = make_scene(count=120, width=71, height=51, seed=3) if name == "wide" else SCENES[name]()
+    num_classes, ids = step * (CLASSES - 1) + 1, scene.inputs.class_ids
+    one_hot = torch.nn.functional.one_hot(ids.long(), CLASSES).double()
+    g, what = torch.Generator().manual_seed(6), (scene.camera, scene.settings)
+    factors = torch.randn(scene.camera.height, scene.camera.width, num_classes, generator=g, dtype=torch.float64)
+    leaves, others = leaves_of(scene), leaves_of(scene)
+    inputs = replace(scene.inputs, class_ids=ids * step, **leaves)
+    drawn = rasterizer.class_channels(inputs, *what, num_classes)
+    assert drawn.shape == factors.shape
+    assert torch.equal(rasterizer.class_channels(inputs.detached(), *what, num_classes), drawn.detach())
+    expected = draw_features(TorchRasterizer(), replace(scene.inputs, **others), one_hot, *what)
+    assert error(drawn[..., ::step].detach(), expected.detach()) < 1e-9
+    assert drawn.sum().item() == pytest.approx(expected.sum().item())
+    found = torch.autograd.grad((drawn * factors).sum(), list(leaves.values()))
+    true = torch.autograd.grad((expected * factors[..., ::step]).sum(), list(others.values()))
+    assert all(error(a, b) < 1e-9 for a, b in zip(found, true, strict=True))
+
+
+def test_float32_stays_within_its_band(rasterizer):
+    found = []
+    for backend, scene in ((rasterizer, make_scene().to(torch.float32)), (TorchRasterizer(), make_scene())):
+        leaves = leaves_of(scene)
+        inputs = replace(scene.inputs, **leaves)
+        drawn = backend.class_channels(inputs, scene.camera, scene.settings, CLASSES)
+        found.append([drawn.detach(), *torch.autograd.grad(drawn.square().sum(), list(leaves.values()))])
+    assert found[0][0].dtype == torch.float32
+    assert all(error(a, b) < 2e-4 for a, b in zip(*found, strict=True))
+
+
+TARGETS = {  # the target class: the loss, and its slopes by the two alphas
+    1: (0.920828, (-0.890048, 0.180148)),
+    0: (1.420828, None),
+}
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_cross_entropy_of_class_channels_over_a_pixel(target, rasterizer):
+    """Front of class 1 and alpha 0.5, back of class 2 and alpha 0.8: p = (0, 0.5, 0.4)."""
+    inputs, camera = facing(1, 1, [(0.5, 0.5, 1e6, 0.5), (0.5, 0.5, 1e6, 0.8)])
+    inputs = replace(inputs, class_ids=torch.tensor([1, 2], dtype=torch.int32))
+    logits = inputs.opacity_logits.requires_grad_()
+    p = rasterizer.class_channels(inputs, camera, RasterSettings(near=0.1, far=100.0), 3)
+    assert p.flatten().tolist() == pytest.approx([0.0, 0.5, 0.4], abs=1e-9)
+    loss = torch.nn.functional.cross_entropy(p.view(1, 3), torch.tensor([target]))
+    loss.backward()
+    expected, slopes = TARGETS[target]
+    assert loss.item() == pytest.approx(expected, abs=1e-6)
+    if slopes is not None:
+        found = logits.grad / (torch.sigmoid(logits) * (1 - torch.sigmoid(logits)))
+        assert found.tolist() == pytest.approx(slopes, abs=1e-6)
+
+
+def test_ids_of_no_class_are_refused(rasterizer):
+    scene = make_scene()
+    with pytest.raises(ValueError, match=r"class_ids must lie in 0\.\.1"):
+        rasterizer.class_channels(scene.inputs, scene.camera, scene.settings, 2)

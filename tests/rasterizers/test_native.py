@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from raster_scenes import (
@@ -41,6 +43,10 @@ def test_any_number_of_threads_gives_the_same_bits(dtype, threads):
         render = scene.draw(backend)
         results = [getattr(render, name) for name in OUTPUTS] + [render.visible]
         results += list(gradients(backend, scene).values())
+        means = scene.inputs.means.clone().requires_grad_()
+        inputs = replace(scene.inputs, means=means)
+        channels = backend.class_channels(inputs, scene.camera, scene.settings, CLASSES)
+        results += [channels.detach(), torch.autograd.grad(channels.square().sum(), means)[0]]
         products = (scene.inputs, scene.camera, scene.settings)
         results += [backend.class_contributions(*products, scene.target, CLASSES), backend.dominant_gaussian(*products)]
         results += list(backend.class_map(*products, CLASSES))

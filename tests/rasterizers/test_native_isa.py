@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,8 @@ def draw():
         leaves = {name: getattr(scene.inputs, name).clone().requires_grad_() for name in FLOATS}
         render = scene.draw(NativeRasterizer(), **leaves)
         images = [getattr(render, name) for name in OUTPUTS]
+        inputs = replace(scene.inputs, **leaves)
+        images.append(NativeRasterizer().class_channels(inputs, scene.camera, scene.settings, CLASSES))
         grads = torch.autograd.grad(sum(image.square().sum() for image in images), list(leaves.values()))
         what = (scene.inputs, scene.camera, scene.settings, scene.target, CLASSES)
         tables = [*NativeRasterizer().sparse_class_contributions(*what)]

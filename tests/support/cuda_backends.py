@@ -81,6 +81,9 @@ class CudaOnCpuTensors(Rasterizer):
         classes, share = self.cuda.class_map(_to_gpu(inputs), camera, settings, num_classes)
         return classes.cpu(), share.cpu()
 
+    def class_channels(self, inputs, camera, settings, num_classes):
+        return self.cuda.class_channels(_to_gpu(inputs), camera, settings, num_classes).cpu()
+
     def dominant_gaussian(self, inputs, camera, settings):
         return self.cuda.dominant_gaussian(_to_gpu(inputs), camera, settings).cpu()
 

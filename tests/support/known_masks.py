@@ -41,6 +41,9 @@ class Squares(Rasterizer):
     def class_map(self, inputs, camera, settings, num_classes):
         raise NotImplementedError
 
+    def class_channels(self, inputs, camera, settings, num_classes):
+        raise NotImplementedError
+
     def dominant_gaussian(self, inputs, camera, settings):
         raise NotImplementedError
 

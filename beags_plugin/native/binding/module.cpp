@@ -123,6 +123,33 @@ void bind(nb::module_& m, const char* name) {
           },
           "num_classes"_a, "classes"_a, "share"_a, "threads"_a)
       .def(
+          "class_channels",
+          [](Frame<T>& self, int num_classes, Out channels, bool keep, int threads) {
+            nb::gil_scoped_release release;
+            self.class_channels(num_classes, channels.data(), keep, threads);
+          },
+          "num_classes"_a, "channels"_a, "keep"_a, "threads"_a)
+      .def(
+          "class_channels_backward",
+          [](const Frame<T>& self, In means, In quats, In log_scales, In opacity_logits, In colors, In gradient,
+             Out g_means, Out g_quats, Out g_log_scales, Out g_opacity_logits, Out g_screen_shift, int threads) {
+            const Inputs<T> inputs{static_cast<int64_t>(means.shape(0)),
+                                   means.data(),
+                                   quats.data(),
+                                   log_scales.data(),
+                                   opacity_logits.data(),
+                                   colors.data(),
+                                   nullptr};
+            nb::gil_scoped_release release;
+            self.class_channels_backward(inputs, static_cast<int>(gradient.shape(2)), gradient.data(),
+                                         {g_means.data(), g_quats.data(), g_log_scales.data(), g_opacity_logits.data(),
+                                          nullptr, g_screen_shift.data(), nullptr},
+                                         threads);
+          },
+          "means"_a, "quats"_a, "log_scales"_a, "opacity_logits"_a, "colors"_a, "gradient"_a, "g_means"_a.none(),
+          "g_quats"_a.none(), "g_log_scales"_a.none(), "g_opacity_logits"_a.none(), "g_screen_shift"_a.none(),
+          "threads"_a)
+      .def(
           "dominant_gaussian",
           [](const Frame<T>& self, Array<int32_t> indices, int threads) {
             nb::gil_scoped_release release;

@@ -105,6 +105,9 @@ template <Parts kWanted, class T>
 BEAGS_INLINE Real<T> weight_gradient(const Job<T>& job, int k, const Splat<T>& s, const Hits<T>& hits, int i,
                                      int32_t everywhere, const PixelGradients<T>& p, Real<T> w, Vector<T>* sums,
                                      Real<T>& g_hit) {
+  if constexpr (kWanted & kClassChannels) {
+    return load(job.class_gradients + job.class_places[s.class_id] * kTilePixels + hits.pack[i] * kLanes<T>);
+  }
   Real<T> g_w = load(p.g_alpha);
   for (int c = 0; c < 3; ++c) {
     const Real<T> g = load(p.g_color[c]);

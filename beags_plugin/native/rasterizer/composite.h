@@ -167,6 +167,15 @@ struct Walk {
     for (int pack = 0; pack < kTilePacks<T>; ++pack) live[pack] = all(T(0.5)) < load(inside + pack * kLanes<T>);
   }
 
+  // Keeps for the backward where each pixel stopped.
+  void save(const Saved<T>& to, int tile) const {
+    for (int pack = 0; pack < kTilePacks<T>; ++pack) {
+      const int64_t at = saved_at<T>(tile, pack);
+      store(to.end_transmittance + at, load(transmittance + pack * kLanes<T>));
+      store(to.end + at, load(end + pack * kLanes<T>));
+    }
+  }
+
   void stop(int pack, Mask<T> stopped, int k) {
     T* at = end + pack * kLanes<T>;
     store(at, select(stopped, all(static_cast<T>(k)), load(at)));

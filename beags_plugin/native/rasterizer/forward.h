@@ -54,11 +54,10 @@ BEAGS_INLINE void add_hit(int k, const Splat<T>& s, const Hits<T>& hits, int i, 
 template <Parts kWanted, class T>
 BEAGS_INLINE void save(const Job<T>& job, int tile, const Walk<T>& walk, const Pixels<T>* pixels) {
   const Saved<T>& to = job.saved;
+  walk.save(to, tile);
   for (int pack = 0; pack < kTilePacks<T>; ++pack) {
     const Pixels<T>& p = pixels[pack];
     const int64_t at = saved_at<T>(tile, pack);
-    store(to.end_transmittance + at, load(walk.transmittance + pack * kLanes<T>));
-    store(to.end + at, load(walk.end + pack * kLanes<T>));
     if ((kWanted & kGeometry) && to.depth_sum) {
       store(to.depth_sum + at, load(p.depth));
       store(to.median_pair + at, load(p.median_pair));

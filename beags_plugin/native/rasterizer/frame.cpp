@@ -53,22 +53,26 @@ Job<T> Frame<T>::job() const {
 }
 
 template <class T>
+void Frame<T>::make_saved(bool keep, bool geometry, bool distortion) {
+  saved_ = {};
+  if (!keep) return;
+  const size_t pixels = static_cast<size_t>(tiles()) * kTilePixels;
+  size_t used = 0;
+  kept_ = Scratch<T>(pixels * Saved<T>::kCount);  // the kernels fill all of it that they read
+  const auto take = [&](bool wanted) { return wanted ? kept_.get() + pixels * used++ : nullptr; };
+  saved_.end_transmittance = take(true);
+  saved_.end = take(true);
+  saved_.depth_sum = take(geometry);
+  saved_.median_pair = take(geometry);
+  saved_.first = take(distortion);
+  saved_.moment1 = take(distortion);
+  saved_.moment2 = take(distortion);
+}
+
+template <class T>
 void Frame<T>::forward(const Images<T>& images, const T* background, const int32_t* target, bool keep, int threads) {
   std::copy_n(background, 3, background_);
-  saved_ = {};
-  if (keep) {
-    const size_t pixels = static_cast<size_t>(tiles()) * kTilePixels;
-    size_t used = 0;
-    kept_ = Scratch<T>(pixels * Saved<T>::kCount);  // the kernels fill all of it that they read
-    const auto take = [&](bool wanted) { return wanted ? kept_.get() + pixels * used++ : nullptr; };
-    saved_.end_transmittance = take(true);
-    saved_.end = take(true);
-    saved_.depth_sum = take(images.depth);
-    saved_.median_pair = take(images.depth);
-    saved_.first = take(images.distortion);
-    saved_.moment1 = take(images.distortion);
-    saved_.moment2 = take(images.distortion);
-  }
+  make_saved(keep, images.depth, images.distortion);
   Job<T> job = this->job();
   job.target = target;
   job.images = images;

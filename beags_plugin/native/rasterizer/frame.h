@@ -61,6 +61,11 @@ class Frame {
   Contributions<T> sparse_class_pixel_counts(const int32_t* labels, int num_classes, T min_weight, int threads) const;
   // Finds each pixel's class. classes, share: [height, width]. Class ids lie in 0 .. num_classes - 1.
   void class_map(int num_classes, int32_t* classes, T* share, int threads) const;
+  // Renders the sums of w by class, [height, width, num_classes], zero on entry. keep: for its backward.
+  void class_channels(int num_classes, T* channels, bool keep, int threads);
+  // Computes their gradients, once after `class_channels`, with the same inputs; colours and background have none.
+  void class_channels_backward(const Inputs<T>& inputs, int num_classes, const T* gradient, const InputGradients<T>& to,
+                               int threads) const;
   void dominant_gaussian(int32_t* indices, int threads) const;
   WorkCounts work_counts(int threads) const;
 
@@ -75,6 +80,11 @@ class Frame {
   // min_weight: null for sums of w, else what the counted pixels exceed.
   LabelSums label_sums(const int32_t* labels, int num_classes, const T* min_weight, int threads) const;
   Contributions<T> sparse(const LabelSums& found, int num_classes, int threads) const;
+  // Calls work(query, tile) for every tile; the query numbers the classes of its Gaussians and has zeros to sum into.
+  template <class Work>
+  void for_each_tile_of_classes(int num_classes, int threads, Work work) const;
+  // Makes memory for what the backward needs.
+  void make_saved(bool keep, bool geometry, bool distortion);
   Job<T> job() const;
   int tiles() const { return tiles_x_ * tiles_y_; }
   // Calls work(tile) for every tile; idle threads take the next one.

@@ -130,9 +130,8 @@ Contributions<T> Frame<T>::sparse(const LabelSums& found, int num_classes, int t
 }
 
 template <class T>
-void Frame<T>::class_map(int num_classes, int32_t* classes, T* share, int threads) const {
-  const Job<T> job = this->job();
-  const auto kernel = kernels<T>().class_map;
+template <class Work>
+void Frame<T>::for_each_tile_of_classes(int num_classes, int threads, Work work) const {
 #pragma omp parallel num_threads(threads)
   {
     std::vector<int32_t> place_of(num_classes, -1), present;
@@ -156,12 +155,50 @@ void Frame<T>::class_map(int num_classes, int32_t* classes, T* share, int thread
       query.slots = place_of.data();
       query.num_slots = &count;
       query.sums = sums.data();
-      query.classes = classes;
-      query.share = share;
-      kernel(job, query, tile);
+      query.num_channels = num_classes;
+      work(query, tile);
       for (const int32_t id : present) place_of[id] = -1;
     }
   }
+}
+
+template <class T>
+void Frame<T>::class_map(int num_classes, int32_t* classes, T* share, int threads) const {
+  const Job<T> job = this->job();
+  const auto kernel = kernels<T>().class_map;
+  for_each_tile_of_classes(num_classes, threads, [&](Query<T>& query, int tile) {
+    query.classes = classes;
+    query.share = share;
+    kernel(job, query, tile);
+  });
+}
+
+template <class T>
+void Frame<T>::class_channels(int num_classes, T* channels, bool keep, int threads) {
+  make_saved(keep, false, false);
+  const Job<T> job = this->job();
+  const auto kernel = kernels<T>().class_channels;
+  for_each_tile_of_classes(num_classes, threads, [&](Query<T>& query, int tile) {
+    query.channels = channels;
+    kernel(job, query, tile);
+  });
+}
+
+template <class T>
+void Frame<T>::class_channels_backward(const Inputs<T>& inputs, int num_classes, const T* gradient,
+                                       const InputGradients<T>& to, int threads) const {
+  Job<T> job = this->job();
+  const int size = record_size(kClassChannels);
+  const Scratch<T> records(static_cast<size_t>(num_pairs()) * size);  // the kernels fill all of it
+  const Scratch<T> backgrounds(static_cast<size_t>(tiles()) * 3);
+  job.records = records.get();
+  job.g_background = backgrounds.get();
+  const auto kernel = kernels<T>().class_channels_backward;
+  for_each_tile_of_classes(num_classes, threads, [&](Query<T>& query, int tile) {
+    query.channel_gradients = gradient;
+    kernel(job, query, tile);
+  });
+  reduce(inputs, records.get(), size, to, threads);
 }
 
 template <class T>

@@ -1,6 +1,7 @@
 // Answers queries of one tile, which have no gradient (sections 3 and 5). Included once for each instruction set.
 #pragma once
 
+#include "rasterizer/backward.h"
 #include "rasterizer/composite.h"
 
 namespace beags {
@@ -65,17 +66,23 @@ void class_sums(const Job<T>& job, const Query<T>& query, int tile) {
   });
 }
 
-// Finds each pixel's class: the largest sum of w; of equal ones the lowest. `query.sums` holds, for each class of the
-// tile in rising order, 256 pixels; `query.slots` maps a class to its place, `query.labels` a place to its class.
+// Sums w by pixel and class. `query.sums` holds, for each class of the tile in rising order, 256 pixels; `query.slots`
+// maps a class to its place, `query.labels` a place to its class.
+template <class T>
+void sum_by_class(const Job<T>& job, const Query<T>& query, int tile, Walk<T>& walk) {
+  composite<0>(job, tile, walk, [&](int, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> w, Real<T>) {
+    T* row = query.sums + static_cast<int64_t>(query.slots[s.class_id]) * kTilePixels + hits.pack[i] * kLanes<T>;
+    store(row, load(row) + w);
+  });
+}
+
+// Finds each pixel's class: the largest sum of w; of equal ones the lowest.
 template <class T>
 void class_map(const Job<T>& job, const Query<T>& query, int tile) {
   const int classes = query.num_slots[0];
-  T* sums = query.sums;
+  const T* sums = query.sums;
   Walk<T> walk(job, tile);
-  composite<0>(job, tile, walk, [&](int, const Splat<T>& s, const Hits<T>& hits, int i, Real<T> w, Real<T>) {
-    T* row = sums + static_cast<int64_t>(query.slots[s.class_id]) * kTilePixels + hits.pack[i] * kLanes<T>;
-    store(row, load(row) + w);
-  });
+  sum_by_class(job, query, tile, walk);
   for_each_pixel(job, tile, [&](int64_t at, int pack, int lane) {
     const int pixel = pack * kLanes<T> + lane;
     T best = 0;
@@ -90,6 +97,36 @@ void class_map(const Job<T>& job, const Query<T>& query, int tile) {
     query.classes[at] = winner;
     query.share[at] = best > T(0) ? best / (T(1) - walk.transmittance[pixel]) : T(0);
   });
+}
+
+// Calls visit(the sum of a class at a pixel, its index in an image of the channels).
+template <class T, class Visit>
+BEAGS_INLINE void for_each_channel(const Job<T>& job, const Query<T>& query, int tile, Visit visit) {
+  for_each_pixel(job, tile, [&](int64_t at, int pack, int lane) __attribute__((always_inline)) {
+    for (int c = 0; c < query.num_slots[0]; ++c) {
+      visit(query.sums[static_cast<int64_t>(c) * kTilePixels + pack * kLanes<T> + lane],
+            at * query.num_channels + query.labels[c]);
+    }
+  });
+}
+
+// Renders the sums of w by class as channels.
+template <class T>
+void class_channels(const Job<T>& job, const Query<T>& query, int tile) {
+  Walk<T> walk(job, tile);
+  sum_by_class(job, query, tile, walk);
+  if (job.saved.end) walk.save(job.saved, tile);
+  for_each_channel(job, query, tile, [&](T sum, int64_t at) { query.channels[at] = sum; });
+}
+
+// Computes their gradients: dL/dw is dL by the channel of the Gaussian's class, whatever the number of classes.
+template <class T>
+void class_channels_backward(const Job<T>& job, const Query<T>& query, int tile) {
+  for_each_channel(job, query, tile, [&](T& gradient, int64_t at) { gradient = query.channel_gradients[at]; });
+  Job<T> by_class = job;
+  by_class.class_gradients = query.sums;
+  by_class.class_places = query.slots;
+  backward<kClassChannels>(by_class, tile);
 }
 
 // Finds each pixel's Gaussian with the largest w; of equal ones the nearer.

@@ -34,6 +34,8 @@ constexpr Kernels<T> make_kernels() {
           class_sums<false, T>,
           class_sums<true, T>,
           class_map<T>,
+          class_channels<T>,
+          class_channels_backward<T>,
           dominant_gaussian<T>,
           count<T>};
 }

@@ -76,6 +76,7 @@ static_assert(kShapeEnd <= kShapeRecord && kRecordEnd <= kRecord, "records hold 
 using Parts = unsigned;
 constexpr Parts kGeometry = 1, kDistortion = 2, kBoundary = 4;
 constexpr Parts kAllParts = kGeometry | kDistortion | kBoundary;
+constexpr Parts kClassChannels = 8;  // of the backward: gradients by the sums of w by class, and by nothing else
 constexpr int record_size(Parts parts) { return parts & (kGeometry | kDistortion) ? kRecord : kShapeRecord; }
 
 // The images, [height, width, channels], or the gradients by them; null: not wanted.
@@ -113,6 +114,9 @@ struct Job {
   Images<const T> gradients;
   T* records;       // [pairs, record_size]
   T* g_background;  // [tiles, 3]
+  // kClassChannels: the gradients by the sums of the tile's classes, 256 pixels each, and the place of a class there.
+  const T* class_gradients;
+  const int32_t* class_places;
 };
 
 // A query, which has no gradient (sections 3 and 5).
@@ -126,6 +130,9 @@ struct Query {
   T min_weight;               // class_pixel_counts: pixels of larger w count
   int32_t* classes;           // class_map, dominant_gaussian: [height, width]
   T* share;                   // class_map: [height, width]
+  T* channels;                // class_channels: [height, width, num_channels]
+  const T* channel_gradients;
+  int num_channels;
 };
 
 // The work of the forward: pixel lanes that it evaluates, and (pixel, Gaussian) pairs that contribute.
@@ -147,6 +154,8 @@ struct Kernels {
   void (*class_contributions)(const Job<T>&, const Query<T>&, int tile);
   void (*class_pixel_counts)(const Job<T>&, const Query<T>&, int tile);
   void (*class_map)(const Job<T>&, const Query<T>&, int tile);
+  void (*class_channels)(const Job<T>&, const Query<T>&, int tile);
+  void (*class_channels_backward)(const Job<T>&, const Query<T>&, int tile);
   void (*dominant_gaussian)(const Job<T>&, const Query<T>&, int tile);
   Work (*count)(const Job<T>&, int tile);
 };
