@@ -46,6 +46,7 @@ SHIPPED = {
     "masks": "How much damage to the masks costs, with and without reprojection.",
     "tradeoff": "What time and memory buy: every choice moved alone, and the Pareto front of cost and quality.",
     "presets": "What the refinements of the presets cost and give, from one base.",
+    "compare": "Six other methods beside this one, from one base, on identical masks.",
     "improvements": "What each extension of ours gives, beside both losses alone.",
 }
 """Commands by experiment, with the sentence of their help."""

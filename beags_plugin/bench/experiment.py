@@ -16,9 +16,9 @@ PHASES = ("base", "refine", "both")
 DAMAGE = "damage"  # the axis that is no config key: the degree of mask damage
 _ENTRIES = {
     "description", "preset", "seeds", "sample", "variant", "sweep", "paper", "reference", "confidence", "front",
-    *PHASES,
+    "objects", *PHASES,
 }  # fmt: skip
-_VARIANT = {"name", DAMAGE, *PHASES}
+_VARIANT = {"name", DAMAGE, "per_object", *PHASES}
 _SWEEP = {"name", "key", "values", "phase", "lines", "relative_to_pixels"}
 
 
@@ -28,6 +28,7 @@ class Variant:
 
     base, refine: dotted config keys and their values. damage: degree of mask damage; None leaves the masks as they are.
     sweep, line, x: name of the sweep, its curve and the place on its axis, if the variant is a point of a sweep.
+    per_object: a training for each object, whose name is the option "object" of the refiner.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Variant:
     sweep: str = ""
     line: str = ""
     x: float | None = None
+    per_object: bool = False
 
 
 @dataclass(frozen=True)
@@ -54,8 +56,9 @@ class Experiment:
 
     samples, sample: family and seed of the generated scenes, and other options of ``SampleConfig``. seeds: of the
     training.
-    reference: the variant that the others' errors are compared with. confidence, front: also plot the masks'
-    confidence, or the Pareto front. relative_to_pixels: sweeps whose axis is also given per million training pixels.
+    reference: the variant that the others' errors are compared with. confidence, front, objects: also plot the masks'
+    confidence, the Pareto front, or every object by each variant. relative_to_pixels: sweeps whose axis is also given
+    per million training pixels.
     """
 
     name: str
@@ -68,6 +71,7 @@ class Experiment:
     reference: str | None = None
     confidence: bool = False
     front: bool = False
+    objects: bool = False
     relative_to_pixels: frozenset[str] = frozenset()
     paper: PaperFigures | None = None
 
@@ -149,6 +153,7 @@ class _Reader:
             reference=reference,
             confidence=self.value(content, "confidence", bool, False),
             front=self.value(content, "front", bool, False),
+            objects=self.value(content, "objects", bool, False),
             relative_to_pixels=frozenset(s["name"] for s in sweeps if s.get("relative_to_pixels")),
             paper=self.paper(),
         )
@@ -158,7 +163,9 @@ class _Reader:
         self.known(entry, _VARIANT, f"variant {name!r}: ")
         own = {phase: self.table(entry, phase, f"variant {name!r}: ") for phase in PHASES}
         damage = entry.get(DAMAGE)
-        return Variant(name, *_by_phase(common, own), damage=None if damage is None else self.degree(damage))
+        each = self.value(entry, "per_object", bool, False, f"variant {name!r}: ")
+        degree = None if damage is None else self.degree(damage)
+        return Variant(name, *_by_phase(common, own), damage=degree, per_object=each)
 
     def points(self, sweep: dict[str, Any], common: dict[str, dict[str, Any]]) -> list[Variant]:
         """Return the variants of a sweep: every value on every line."""

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 def measure_run(config_path: Path) -> dict[str, Any]:
     """Return {"evaluation", "mask_error_given", "mask_error_used"} of a refined run.
 
-    evaluation: ``RunMetrics.to_json`` without its single masks and views. Its "before" is the base with the classes of
+    evaluation: ``RunMetrics.to_json`` without its single views. Its "before" is the base with the classes of
     this run, which is the result of assignment alone. mask_error_...: see ``mask_error``.
     """
     from beags_plugin.plugin.objects.evaluate import evaluate_run
@@ -23,7 +23,7 @@ def measure_run(config_path: Path) -> dict[str, Any]:
     from beags_plugin.plugin.runs.prepared import training_masks
 
     found = evaluate_run(config_path).to_json()
-    evaluation = {name: value for name, value in found.items() if name not in ("masks", "views")}
+    evaluation = {name: value for name, value in found.items() if name != "views"}
     views = training_masks(open_run(config_path))
     return {"evaluation": evaluation, **{f"mask_error_{kind}": mask_error(views, kind) for kind in ("given", "used")}}
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 
 @dataclass
@@ -18,6 +21,8 @@ class ExperimentOptions:
     """What to train with: a preset of method_configs/; the experiment's own if left out."""
     downscale: float | None = None
     """Divide the image size of --data by this; chosen for a quick run if left out."""
+    variants: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--methods"])] = ()
+    """Which of the experiment's variants to run, besides the one that it compares with; all if left out."""
     quick: bool = False
     """Try the experiment out in a minute or two: tiny scenes, few steps, figures that mean nothing."""
     output: Path = Path("outputs/bench")

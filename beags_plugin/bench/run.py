@@ -10,6 +10,7 @@ from rich.console import Console
 
 from beags_plugin.bench.experiment import Experiment, Variant, check_keys, load_experiment
 from beags_plugin.bench.options import ExperimentOptions
+from beags_plugin.bench.per_object import merged
 from beags_plugin.bench.provenance import busy_note
 from beags_plugin.bench.report import provenance, write_csv, write_json
 from beags_plugin.bench.results import ResultRow, make_row, report_json, table_rows
@@ -17,11 +18,11 @@ from beags_plugin.bench.runner import Outcome, run_trials
 from beags_plugin.bench.scenes import TrialScene, damaged_masks, given_scenes, sample_scene
 from beags_plugin.bench.trials import MODEL, VariantTrial, plan, steps_of
 from beags_plugin.system.digests import code_digest
-from beags_plugin.system.errors import UserError
+from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.progress import progress_bar
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
-TABLE_WIDTH = 200  # a narrow terminal breaks the lines, which is better than cells that are cut short
+TABLE_WIDTH = 220  # a narrow terminal breaks the lines, which is better than cells that are cut short
 QUICK_SAMPLE = {"width": 96, "height": 72, "num_train": 16, "num_test": 3}
 QUICK_BASE = {"base_steps": 220, "schedule_steps": 0, "densify.start": 50, "densify.stop": 180}
 QUICK_REFINE = {"refine_steps": 10}
@@ -34,6 +35,7 @@ def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
     """
     from beags_plugin.bench.confidence import plot_confidence
     from beags_plugin.bench.front import plot_front
+    from beags_plugin.bench.objects_picture import plot_objects
     from beags_plugin.bench.pictures import plot_experiment
     from beags_plugin.bench.tables import tables
 
@@ -50,7 +52,9 @@ def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
     }
     runs = plan(experiment, scenes, masks, code_digest())
     with progress_bar("Training, in steps") as progress:
-        outcomes = run_trials([run.trial for run in runs], options.output / "trials", steps_of, progress)
+        outcomes = run_trials(
+            [trial for run in runs for trial in run.trials], options.output / "trials", steps_of, progress
+        )
     rows = rows_of(runs, outcomes)
     wide = Console(width=max(CONSOLE.width, TABLE_WIDTH), highlight=False, markup=False)
     for table in tables(experiment, rows):
@@ -63,6 +67,9 @@ def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
     if experiment.confidence:
         files["confidence"] = picture.with_stem(f"{picture.stem}-confidence")
         plot_confidence(files["confidence"], runs, outcomes)
+    if experiment.objects:
+        files["objects"] = picture.with_stem(f"{picture.stem}-objects")
+        plot_objects(files["objects"], runs, outcomes)
     if experiment.front:
         files["front"] = picture.with_stem(f"{picture.stem}-front")
         plot_front(files["front"], experiment, rows)
@@ -73,6 +80,12 @@ def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
 
 def adapted(experiment: Experiment, options: ExperimentOptions) -> Experiment:
     """Return the experiment with another preset or, for --quick, so small that its figures mean nothing."""
+    if options.variants:
+        known = [variant.name for variant in experiment.variants]
+        for name in options.variants:
+            check_choice(name, known, "variant", f" of {experiment.name}")
+        chosen = tuple(v for v in experiment.variants if v.name in options.variants or v.name == experiment.reference)
+        experiment = dataclasses.replace(experiment, variants=chosen)
     if options.preset is not None:
         experiment = dataclasses.replace(experiment, preset=options.preset)
         check_keys(experiment, Path(f"{experiment.name}.toml"))
@@ -118,6 +131,11 @@ def rows_of(runs: Sequence[VariantTrial], outcomes: dict[str, Outcome]) -> list[
     rows = []
     for run in runs:
         assert run.trial.base is not None
-        base, refined = outcomes[run.trial.base.digest], outcomes[run.trial.digest]
-        rows.append(make_row(run.variant, run.scene.name, run.seed, base.result, refined.result, refined.failed))
+        base, found = outcomes[run.trial.base.digest], [outcomes[trial.digest] for trial in run.trials]
+        failed = next((outcome.failed for outcome in found if outcome.failed), None)
+        result = found[0].result
+        if run.objects and failed is None:
+            results = zip(run.objects, (outcome.result for outcome in found), strict=True)
+            result = merged({name: each for name, each in results if each is not None})
+        rows.append(make_row(run.variant, run.scene.name, run.seed, base.result, result, failed))
     return rows

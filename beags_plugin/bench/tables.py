@@ -30,6 +30,7 @@ _COLUMNS = (  # head, figure, digits, factor
     ("objects, dB\nbefore", "psnr_objects_before", 2, 1.0),
     ("\nafter", "psnr_objects_after", 2, 1.0),
     ("SSIM\nafter", "ssim_after", 3, 1.0),
+    ("\nsteps", "steps", 0, 1.0),
     ("prepare\ns", "prepare", 1, 1.0),
     ("refine\ns", "seconds refinement", 1, 1.0),
     ("CPU\ns", "cpu_seconds", 1, 1.0),

@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from beags_plugin.bench.experiment import Experiment, Variant
+from beags_plugin.bench.per_object import OBJECT, object_names
 from beags_plugin.bench.scenes import TrialScene
 from beags_plugin.system.digests import value_digest
 
 MODEL = "pipeline.model."
+OPTIONS = MODEL + "refiner_options"
 
 
 @dataclass(frozen=True)
@@ -58,12 +60,21 @@ class Trial:
 
 @dataclass(frozen=True)
 class VariantTrial:
-    """A trial in its part in an experiment: that variant on that scene with that seed."""
+    """The trials of a variant on a scene with a seed: one, or one for each object.
+
+    objects: the names of these objects; empty for a trial of all.
+    """
 
     variant: Variant
     scene: TrialScene
     seed: int
-    trial: Trial
+    trials: tuple[Trial, ...]
+    objects: tuple[str, ...] = ()
+
+    @property
+    def trial(self) -> Trial:
+        """Return the first of them."""
+        return self.trials[0]
 
 
 def plan(
@@ -81,8 +92,11 @@ def plan(
                 base = Trial(scene, experiment.preset, {**variant.base, MODEL + "refine_steps": 0}, seed, code)
                 damaged = None if variant.damage is None else masks[scene.name, variant.damage]
                 refine = {**variant.refine, MODEL + "base_steps": 0}
-                refined = Trial(scene, experiment.preset, refine, seed, code, damaged, base)
-                planned.append(VariantTrial(variant, scene, seed, refined))
+                objects = tuple(object_names(scene)) if variant.per_object else ()
+                options = refine.get(OPTIONS, {})
+                changes = [{**refine, OPTIONS: {**options, OBJECT: name}} for name in objects] or [refine]
+                trials = (Trial(scene, experiment.preset, each, seed, code, damaged, base) for each in changes)
+                planned.append(VariantTrial(variant, scene, seed, tuple(trials), objects))
     return planned
 
 

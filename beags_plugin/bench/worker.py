@@ -99,11 +99,12 @@ def run(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
     model = config.model_config
     train(config)
     # CPU time does not grow while other programs have the cores
-    result = {"steps": model.base_steps + model.refine_steps, "cpu_seconds": time.process_time()}
+    result: dict[str, Any] = {"cpu_seconds": time.process_time()}
     result |= json.loads((run_folder / "training.json").read_text())
     result["own_memory_mb"] = result["peak_memory_mb"] - start_memory_mb
     checkpoint = read_checkpoint(newest_checkpoint(config.get_checkpoint_dir()))
     result["gaussians"] = len(checkpoint["pipeline"]["_model.class_ids"])
+    result["steps"] = model.base_steps + int(checkpoint["pipeline"]["_model.refined_steps"])
     if model.refine_steps == 0:
         return result
     del result["seconds"]["base training"]  # that of loading one

@@ -79,8 +79,8 @@ def draw_rows(
                 photo=None if view.image is None else _bytes(view.image),
                 labels=None if view.visible is None else resize_nearest(view.visible.cpu().numpy(), *size),
                 render=render,
-                before={c: _alone(*before, c, view.camera, rasterizer, settings) for c in objects},
-                after={c: _alone(*after, c, view.camera, rasterizer, settings) for c in objects},
+                before={c: alone(*before, c, view.camera, rasterizer, settings) for c in objects},
+                after={c: alone(*after, c, view.camera, rasterizer, settings) for c in objects},
                 focus={c: resize_nearest(t.mask.cpu().numpy(), *size) for c, t in truths.items() if t is not None},
             )
             rows.append(row)
@@ -98,7 +98,7 @@ def novel_camera(views: Sequence[EvalView]) -> Camera | None:
     return interpolate_cameras(first, nearest, 0.5)
 
 
-def _alone(
+def alone(
     surfels: Surfels,
     members: Membership,
     class_id: int,
@@ -174,7 +174,7 @@ def _groups(row: SheetRow, classes: Mapping[int, str], masks: bool) -> Iterator[
     for class_id in sorted(row.before):
         name, window = classes.get(class_id, f"object {class_id}"), _window(row, class_id)
         stages = (("before", row.before[class_id]), ("after", row.after[class_id]))
-        yield [cell(_cut_out(image, window), (_SIDE, _SIDE), f"{name}, {stage}") for stage, image in stages]
+        yield [cell(cut_out(image, window), (_SIDE, _SIDE), f"{name}, {stage}") for stage, image in stages]
 
 
 def mask_overlay(photo: np.ndarray, labels: np.ndarray) -> np.ndarray:
@@ -200,7 +200,7 @@ def _window(row: SheetRow, class_id: int) -> Square:
     return square_around(shown)
 
 
-def _cut_out(image: np.ndarray, window: Square) -> np.ndarray:
+def cut_out(image: np.ndarray, window: Square) -> np.ndarray:
     """Return the window of an [H, W, 4] image, enlarged to a cell, over a checkerboard; uint8."""
     part = crop(image, window)
     large = np.stack([resize_nearest(part[..., i], _SIDE, _SIDE) for i in range(4)], axis=-1).astype(np.float64)

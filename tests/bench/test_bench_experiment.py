@@ -23,7 +23,7 @@ def experiment(tmp_path):
     return load_experiment(written(tmp_path, GOOD))
 
 
-REPORTING = {"presets"}  # experiments whose figures are reported; by all others something is chosen
+REPORTING = {"presets", "compare"}  # experiments whose figures are reported; by all others something is chosen
 
 
 @pytest.mark.parametrize("name", experiment_names())
@@ -60,7 +60,7 @@ def test_every_length_of_refinement_has_its_control(name):
         model = preset_config(experiment.preset, variant.refine, Path(name)).model_config
         control = not any(model.losses[loss].weight for loss in ("boundary", "occupancy", "silhouette"))
         assert control == ("neither loss" in variant.name)
-        if model.refiner != "none":
+        if model.refiner == "bea":
             lengths[control].add((model.refine_steps, model.refine_position_lr_factor))
     assert {steps for steps, _ in lengths[False]} == {steps for steps, _ in lengths[True]}
     if name in REPORTING:

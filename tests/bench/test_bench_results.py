@@ -175,5 +175,5 @@ def test_rows_come_from_outcomes_in_order(experiment):
     variant = experiment.variants[0]
     trial = plan(experiment, [scene()], masks_of(scene()), "code")[0].trial
     outcomes = {trial.base.digest: Outcome(Path("x"), BASE), trial.digest: Outcome(Path("y"), result(0.5))}
-    (row,) = rows_of([VariantTrial(variant, scene(), 42, trial)], outcomes)
+    (row,) = rows_of([VariantTrial(variant, scene(), 42, (trial,))], outcomes)
     assert row.scene == "a" and row.seed == 42 and row.figures["seconds base training"] == 60.0
