@@ -13,7 +13,7 @@ from beags_plugin.system.errors import UserError, check_choice, meant
 from beags_plugin.system.shipped import read_toml, shipped_folder, shipped_names
 
 PHASES = ("base", "refine", "both")
-DAMAGE = "damage"  # the axis that is no config key: the degree of mask damage
+DAMAGE, CLASSES = "damage", "classes"  # axes that are no config keys: the degree of mask damage, a number of objects
 _ENTRIES = {
     "description", "preset", "seeds", "sample", "variant", "sweep", "paper", "reference", "confidence", "front",
     "objects", *PHASES,
@@ -27,6 +27,7 @@ class Variant:
     """One way to train: its changes to the preset.
 
     base, refine: dotted config keys and their values. damage: degree of mask damage; None leaves the masks as they are.
+    classes: number of objects in masks that are made up, with which cost alone is measured.
     sweep, line, x: name of the sweep, its curve and the place on its axis, if the variant is a point of a sweep.
     per_object: a training for each object, whose name is the option "object" of the refiner.
     """
@@ -35,10 +36,16 @@ class Variant:
     base: Mapping[str, Any] = field(default_factory=dict)
     refine: Mapping[str, Any] = field(default_factory=dict)
     damage: float | None = None
+    classes: int | None = None
     sweep: str = ""
     line: str = ""
     x: float | None = None
     per_object: bool = False
+
+    @property
+    def has_other_masks(self) -> bool:
+        """Return whether it is trained with masks other than the scene's own."""
+        return self.damage is not None or self.classes is not None
 
 
 @dataclass(frozen=True)
@@ -165,7 +172,7 @@ class _Reader:
         damage = entry.get(DAMAGE)
         each = self.value(entry, "per_object", bool, False, f"variant {name!r}: ")
         degree = None if damage is None else self.degree(damage)
-        return Variant(name, *_by_phase(common, own), damage=degree, per_object=each)
+        return Variant(name, *_by_phase(common, own), degree, per_object=each)
 
     def points(self, sweep: dict[str, Any], common: dict[str, dict[str, Any]]) -> list[Variant]:
         """Return the variants of a sweep: every value on every line."""
@@ -185,11 +192,12 @@ class _Reader:
         for line, overrides in lines.items():
             for value in values:
                 own = {**{p: {} for p in PHASES}, "refine": dict(overrides)}
-                if key != DAMAGE:
+                if key not in (DAMAGE, CLASSES):
                     own[phase][key] = value
                 title = f"{name} = {value:g}" + (f", {line}" if line else "")
                 damage = self.degree(value) if key == DAMAGE else None
-                variants.append(Variant(title, *_by_phase(common, own), damage, name, line, float(value)))
+                classes = int(value) if key == CLASSES else None
+                variants.append(Variant(title, *_by_phase(common, own), damage, classes, name, line, float(value)))
         return variants
 
     def paper(self) -> PaperFigures | None:

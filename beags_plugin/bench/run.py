@@ -15,7 +15,7 @@ from beags_plugin.bench.provenance import busy_note
 from beags_plugin.bench.report import provenance, write_csv, write_json
 from beags_plugin.bench.results import ResultRow, make_row, report_json, table_rows
 from beags_plugin.bench.runner import Outcome, run_trials
-from beags_plugin.bench.scenes import TrialScene, damaged_masks, given_scenes, sample_scene
+from beags_plugin.bench.scenes import TrialScene, class_masks, damaged_masks, given_scenes, sample_scene
 from beags_plugin.bench.trials import MODEL, VariantTrial, plan, steps_of
 from beags_plugin.system.digests import code_digest
 from beags_plugin.system.errors import UserError, check_choice
@@ -46,9 +46,10 @@ def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
         CONSOLE.print(f"Note: {busy}.")
     scenes = scenes_of(experiment, options)
     masks = {
-        (scene.name, degree): damaged_masks(scene, degree, options.output / "scenes")
+        (scene.name, variant.name): made
         for scene in scenes
-        for degree in sorted({variant.damage for variant in experiment.variants if variant.damage is not None})
+        for variant in experiment.variants
+        if (made := _other_masks(scene, variant, options.output / "scenes")) is not None
     }
     runs = plan(experiment, scenes, masks, code_digest())
     with progress_bar("Training, in steps") as progress:
@@ -76,6 +77,13 @@ def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
     for kind, path in files.items():
         CONSOLE.print(f"{kind}: {path}")
     return rows
+
+
+def _other_masks(scene: TrialScene, variant: Variant, folder: Path) -> Path | None:
+    """Return the folder of the masks that a variant has in place of the scene's; None for those."""
+    if variant.classes is not None:
+        return class_masks(scene, variant.classes, folder)
+    return None if variant.damage is None else damaged_masks(scene, variant.damage, folder)
 
 
 def adapted(experiment: Experiment, options: ExperimentOptions) -> Experiment:

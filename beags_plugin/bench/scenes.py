@@ -106,6 +106,43 @@ def damaged_masks(scene: TrialScene, degree: float, folder: Path) -> Path:
     return target
 
 
+def class_masks(scene: TrialScene, count: int, folder: Path) -> Path:
+    """Return a folder with masks of ``count`` objects for the training views, to measure what classes cost.
+
+    The objects are cells around seed points: each pixel has that of the nearest point in the picture, whatever hides
+    it. Held-out views have none, so that no quality is scored.
+    """
+    import torch
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
+    from sklearn.cluster import KMeans
+
+    from beags_plugin.core.lifting import project
+    from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
+    from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+
+    code = Path(__file__).read_text("utf8")
+    target = folder / f"classes-{value_digest([scene.digest, count, code])[:12]}"
+    if (target / "complete").exists():
+        return target
+    shutil.rmtree(target, ignore_errors=True)
+    with writing(target):
+        target.mkdir(parents=True)
+    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
+        outputs = BeagsDataParserConfig(data=scene.data).setup().get_dataparser_outputs("train")
+    points = outputs.metadata["points3D_xyz"]
+    cells = KMeans(count, n_init=1, random_state=0).fit_predict(points.numpy())  # pyright: ignore[reportArgumentType]
+    for index, image in enumerate(outputs.image_filenames):
+        camera = camera_from_nerfstudio(outputs.cameras, index)
+        xy, z = project(points, camera)
+        before = (z > 0).numpy()
+        pixels = torch.cartesian_prod(torch.arange(camera.height), torch.arange(camera.width)).flip(1) + 0.5
+        nearest = cKDTree(xy[z > 0].numpy()).query(pixels.numpy())[1]
+        labels = 1 + cells[before][nearest].reshape(camera.height, camera.width)
+        write_mask(target / f"{image.stem}.png", labels.astype(np.uint16))
+    (target / "complete").touch()
+    return target
+
+
 def _best_masks(metadata: dict[str, Any], split: str) -> list[tuple[Path | None, str]]:
     """Return each view's mask and its kind: the exact one for a training view that has it, else the given one."""
     given: list[Path | None] = metadata["mask_filenames"]

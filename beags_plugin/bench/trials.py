@@ -78,24 +78,24 @@ class VariantTrial:
 
 
 def plan(
-    experiment: Experiment, scenes: Sequence[TrialScene], masks: Mapping[tuple[str, float], Path], code: str
+    experiment: Experiment, scenes: Sequence[TrialScene], masks: Mapping[tuple[str, str], Path], code: str
 ) -> list[VariantTrial]:
     """Return every variant on every scene with every seed, scene after scene; variants share bases where they can.
 
-    masks: folder of damaged masks by scene name and degree. code: digest of the code.
+    masks: folder of other masks by scene name and variant. code: digest of the code.
     """
     planned = []
     for scene in scenes:
         for seed in experiment.seeds:
             for variant in experiment.variants:
-                # damaged masks do not change the base: it is trained from photos alone
+                # other masks do not change the base: it is trained from photos alone
                 base = Trial(scene, experiment.preset, {**variant.base, MODEL + "refine_steps": 0}, seed, code)
-                damaged = None if variant.damage is None else masks[scene.name, variant.damage]
+                other = masks[scene.name, variant.name] if variant.has_other_masks else None
                 refine = {**variant.refine, MODEL + "base_steps": 0}
                 objects = tuple(object_names(scene)) if variant.per_object else ()
                 options = refine.get(OPTIONS, {})
                 changes = [{**refine, OPTIONS: {**options, OBJECT: name}} for name in objects] or [refine]
-                trials = (Trial(scene, experiment.preset, each, seed, code, damaged, base) for each in changes)
+                trials = (Trial(scene, experiment.preset, each, seed, code, other, base) for each in changes)
                 planned.append(VariantTrial(variant, scene, seed, tuple(trials), objects))
     return planned
 

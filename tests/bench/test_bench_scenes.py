@@ -16,7 +16,7 @@ from experiment_files import GOOD, masks_of, scene, written
 from beags_plugin.bench.experiment import load_experiment
 from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.run import adapted, scenes_of
-from beags_plugin.bench.scenes import TrialScene, damaged_masks, given_scenes
+from beags_plugin.bench.scenes import TrialScene, class_masks, damaged_masks, given_scenes
 from beags_plugin.bench.trials import plan, steps_of
 from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.sample.writer import SampleConfig, write_sample
@@ -51,6 +51,13 @@ def test_mild_damage_is_what_the_sample_has_and_none_is_the_truth(sample, tmp_pa
     assert same(read_all(damaged_masks(sample, 0.0, tmp_path)), read_all(sample.data / "ground_truth/masks"))
     stamp = (mild / "complete").stat().st_mtime_ns
     assert damaged_masks(sample, 1.0, tmp_path) == mild and (mild / "complete").stat().st_mtime_ns == stamp
+
+
+def test_masks_of_any_number_of_classes_cover_the_training_views(sample, tmp_path):
+    found = read_all(class_masks(sample, 5, tmp_path))
+    assert len(found) == SMALL["num_train"]
+    assert set(np.unique(np.concatenate([mask.ravel() for mask in found.values()]))) == {1, 2, 3, 4, 5}
+    assert all(len(np.unique(mask)) >= 2 for mask in found.values())
 
 
 def test_more_damage_is_more_wrong_and_spares_held_out_views(sample, tmp_path):

@@ -48,5 +48,5 @@ def scene(name: str = "a", digest: str = "1") -> TrialScene:
     return TrialScene(name, Path("/nowhere"), 1.0, digest)
 
 
-def masks_of(*scenes: TrialScene) -> dict[tuple[str, float], Path]:
-    return {(s.name, degree): Path(f"masks-{s.name}-{degree}") for s in scenes for degree in (0.0, 1.5)}
+def masks_of(*scenes: TrialScene) -> dict[tuple[str, str], Path]:
+    return {(s.name, f"damage = {degree}"): Path(f"masks-{s.name}-{degree}") for s in scenes for degree in ("0", "1.5")}
