@@ -130,6 +130,14 @@ class _Reader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.content = read_toml(path, "experiment")
+        if (other := self.value(self.content, "like", str, None)) is not None:
+            self.content = self.changed(read_toml(path.with_stem(other), "experiment"))
+
+    def changed(self, other: dict[str, Any]) -> dict[str, Any]:
+        """Return another experiment's content with the entries of this one, which is like it."""
+        both = {phase: {**other.get(phase, {}), **self.table(self.content, phase, "")} for phase in PHASES}
+        own = {key: value for key, value in self.content.items() if key != "like"}
+        return {**other, **own, **{phase: table for phase, table in both.items() if table}}
 
     def experiment(self) -> Experiment:
         content = self.content

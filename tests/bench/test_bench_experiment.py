@@ -24,7 +24,12 @@ def experiment(tmp_path):
 
 
 WITH_QUALITY = [name for name in experiment_names() if name != "classes"]  # which measures cost alone
-REPORTING = {"presets", "compare"}  # experiments whose figures are reported; by all others something is chosen
+# experiments whose figures are reported; by all others something is chosen
+REPORTING = {"presets", "compare", "compare-consistent"}
+    "presets",
+    "compare",
+    "compare-consistent",
+}  # experiments whose figures are reported; by all others something is chosen
 
 
 @pytest.mark.parametrize("name", WITH_QUALITY)
@@ -126,6 +131,15 @@ def test_a_mistake_in_the_file_gets_one_sentence(tmp_path, old, new, words):
         load_experiment(written(tmp_path, GOOD.replace(old, new, 1)))
     assert words in str(error.value)
     assert "mine.toml" in str(error.value)
+
+
+def test_an_experiment_like_another_has_its_variants(tmp_path):
+    other = load_experiment("compare")
+    alike = load_experiment("compare-consistent")
+    key = "pipeline.model.prepare.reprojection"
+    assert [v.name for v in alike.variants] == [v.name for v in other.variants] and alike.samples == other.samples
+    assert {v.refine[key] for v in alike.variants} == {"auto"} and other.variants[0].refine[key] == "none"
+    assert alike.description != other.description and alike.name == "compare-consistent"
 
 
 def test_variants_share_bases_and_nothing_else(experiment):
