@@ -26,10 +26,6 @@ def experiment(tmp_path):
 WITH_QUALITY = [name for name in experiment_names() if name != "classes"]  # which measures cost alone
 # experiments whose figures are reported; by all others something is chosen
 REPORTING = {"presets", "compare", "compare-consistent"}
-    "presets",
-    "compare",
-    "compare-consistent",
-}  # experiments whose figures are reported; by all others something is chosen
 
 
 @pytest.mark.parametrize("name", WITH_QUALITY)
