@@ -19,6 +19,8 @@ REFINERS = Registry(
         "bea": "beags_plugin.refiners.bea:BeaRefiner",
         "none": "beags_plugin.refiners.none:NoRefiner",
         "flashsplat": "beags_plugin.refiners.flashsplat:FlashSplatRefiner",
+        "cob-gs": "beags_plugin.refiners.cob_gs:CobGsRefiner",
+        "trace3d": "beags_plugin.refiners.trace3d:Trace3DRefiner",
         "gaussiancut": "beags_plugin.refiners.gaussiancut:GaussianCutRefiner",
     },
 )
