@@ -163,11 +163,10 @@ class CobGsTraining(OwnTraining):
             table[found[0]] = found[1].to(table)
             return table.view(-1, 2).T.flip(0)
 
-        name = scene.names[class_id]
-        with torch.no_grad(), scene.stage(f"Weights inside {name}") as progress:
-            tables = filed(each_view(count, sums, progress), inputs.means.device)
-        with torch.no_grad(), scene.stage(f"Pixels inside {name}") as progress:
-            agreement = mask_logits.mean_agreement(each_view(count, counts, progress))
+        with torch.no_grad(), scene.stage(f"Learning {scene.names[class_id]}") as progress:
+            tables = filed(each_view(count, sums, lambda done, _: progress(done, 2 * count)), inputs.means.device)
+            views = each_view(count, counts, lambda done, _: progress(count + done, 2 * count))
+            agreement = mask_logits.mean_agreement(views)
         pixels, epochs = [camera.height * camera.width for camera in cameras], mask_logits.phase_epochs(count)
         mask_logits.play_phase(self.logits, tables.__getitem__, pixels, generator, epochs, self.options.outside_weight)
         return agreement
