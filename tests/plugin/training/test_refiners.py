@@ -33,7 +33,7 @@ UNTRAINED = {
     "gaussiancut": {"num_edges": 3, "foreground_threshold": 0.6},
 }
 OWN: dict[str, dict] = {
-    "cob-gs": {"epochs": 6},
+    "cob-gs": {"epochs": 6, "tau": 0.4, "threshold": 0.2},  # both objects claim some Gaussians
     "trace3d": {"min_pixels": 2},
 }
 BASE_STEPS = STEPS[0]
