@@ -8,6 +8,7 @@ from owned_scenes import OwnedScene
 from run_folders import discs, ring_cameras
 
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.refiners import make_refiner
 from beags_plugin.refiners.trace3d import RATES, Trace3DRefiner
 from beags_plugin.system.errors import UserError
@@ -33,6 +34,22 @@ def test_hidden_gaussians_count_whole_pixels_unless_weights_count(weights):
     for class_id, x in ((1, -0.5), (2, 0.5)):
         inside = held.surfels.means[members.of(class_id)]
         assert len(inside) >= 25 and float(inside[:, 0].mean()) == pytest.approx(x, abs=0.1)
+
+
+def test_members_are_by_the_pixels_or_weights_of_all_views():
+    held, found = OwnedScene(views=7), []
+    inputs, rasterizer = geometry_inputs(held.surfels), held.scene.rasterizer
+    products = {"count": rasterizer.sparse_class_pixel_counts, "alpha": rasterizer.sparse_class_contributions}
+    for weights, product in products.items():
+        table = torch.zeros(75 * 3)
+        for camera, labels in zip(held.cameras, held.labels, strict=True):
+            keys, values = product(inputs, camera, held.scene.settings, labels, 3)
+            table[keys] += values
+        largest, class_ids = (table.view(75, 3) / table.view(75, 3).sum(dim=1, keepdim=True)).max(dim=1)
+        members = Trace3DRefiner(weights=weights, member_share=0.8).own_training(held.scene).finish()
+        assert members is not None and torch.equal(members.class_ids, class_ids.where(largest > 0.8, 0).int())
+        found.append(members.class_ids)
+    assert not torch.equal(*found)
 
 
 def test_a_step_before_an_edit_trains_nothing():
