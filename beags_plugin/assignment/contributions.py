@@ -65,8 +65,9 @@ def contributions(
     settings: RasterSettings,
     num_classes: int,
     progress: Callable[[int, int], None] | None = None,
+    counts: bool = False,
 ) -> Contributions:
-    """Return C of the scene (E6).
+    """Return C of the scene (E6), or with ``counts`` the numbers of pixels in place of the weights there.
 
     surfels: N Gaussians. labels: per camera [H, W] int32 class ids below ``num_classes`` or IGNORE, or None.
     Memory is linear in the (Gaussian, class) pairs that occur. Raises ``UserError`` for ids out of range.
@@ -74,6 +75,7 @@ def contributions(
     settings = replace(settings, geometry=False, distortion=False)
     inputs = geometry_inputs(surfels)
     # float64, for thousands of small weights; sparse, as a table of all classes would be mostly zeros
+    product = rasterizer.sparse_class_pixel_counts if counts else rasterizer.sparse_class_contributions
     total = SparseSums() if extension.supports(surfels.means) else TorchSparseSums(surfels.means.device)
 
     def of_view(index: int) -> tuple[Tensor, Tensor]:
@@ -82,7 +84,8 @@ def contributions(
             return inputs.means.new_zeros(0, dtype=torch.int64), inputs.means.new_zeros(0)
         check_class_ids(mask, index, num_classes)
         with torch.no_grad():
-            return rasterizer.sparse_class_contributions(inputs, camera, settings, mask, num_classes)
+            keys, values = product(inputs, camera, settings, mask, num_classes)
+            return keys, values.to(inputs.means.dtype)
 
     if len(cameras) != len(labels):
         raise ValueError(f"{len(cameras)} cameras and {len(labels)} masks do not belong together")

@@ -99,6 +99,12 @@ class Densified:
         """Return this edit followed by ``edited``, whose sources are this one's surfels."""
         return Densified(edited.surfels, self.source[edited.source], self.fresh[edited.source] | edited.fresh)
 
+    def only(self, keep: Tensor) -> Densified:
+        """Return this edit with the surfels of ``keep`` [M] bool alone; at least the most opaque one remains."""
+        if not bool(keep.any()):
+            keep = keep.index_fill(0, self.surfels.opacity_logits.argmax(), True)
+        return Densified(self.surfels[keep], self.source[keep], self.fresh[keep])
+
 
 class GradientStatistics:
     """Mean screen gradient of N surfels over the views that saw them."""
@@ -150,9 +156,7 @@ def densify(
     keep = opacities(grown.opacity_logits) >= PRUNE_OPACITY
     if step > config.prune_scale_after:
         keep &= grown.log_scales.exp().amax(dim=-1) <= PRUNE_SCALE * units[source]
-    if not bool(keep.any()):
-        keep[grown.opacity_logits.argmax()] = True
-    return Densified(grown[keep], source[keep], edited.fresh[keep])
+    return edited.only(keep)
 
 
 def split_by_sampling(surfels: Surfels, chosen: Tensor, generator: torch.Generator) -> Densified:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -71,6 +71,10 @@ class Refiner:
     def trains(self) -> bool:
         """Return whether the scene is trained on with the losses of the config."""
         return False
+
+    def check(self, names: Mapping[int, str]) -> None:
+        """Raise ``UserError`` for options that do not fit the classes; names: by id, background (0) included."""
+        return None
 
     def steps(self, asked: int, views: int, objects: int) -> int:
         """Return the number of steps of refinement.

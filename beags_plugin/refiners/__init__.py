@@ -19,6 +19,8 @@ REFINERS = Registry(
         "bea": "beags_plugin.refiners.bea:BeaRefiner",
         "none": "beags_plugin.refiners.none:NoRefiner",
         "flashsplat": "beags_plugin.refiners.flashsplat:FlashSplatRefiner",
+        "cob-gs": "beags_plugin.refiners.cob_gs:CobGsRefiner",
+        "trace3d": "beags_plugin.refiners.trace3d:Trace3DRefiner",
         "gaussiancut": "beags_plugin.refiners.gaussiancut:GaussianCutRefiner",
     },
 )
@@ -28,9 +30,11 @@ def make_refiner(name: str, options: Mapping[str, bool | int | float | str]) -> 
     """Return the refiner called ``name``; raises ``UserError`` for an unknown name or option, or a wrong value."""
     kind = REFINERS.get(name)
     defaults = {field.name: field.default for field in fields(kind)}
+    given: dict[str, bool | int | float | str] = {}
     for option, value in options.items():
         check_choice(option, defaults, "option", f" of the refiner {name}")
         wanted = type(defaults[option])
+        given[option] = value = str(value) if wanted is str and type(value) is int else value  # a class may be called 7
         if type(value) is not wanted and not (wanted is float and type(value) is int):
             raise UserError(f"the option {option} of the refiner {name} is {value!r}: give a {wanted.__name__}.")
-    return kind(**options)
+    return kind(**given)

@@ -20,11 +20,18 @@ def model(flag: str, value: str) -> Callable[[Place], Any]:
     return trained(f"--pipeline.model.{flag}", value)
 
 
+def refiner(name: str, *options: str) -> Callable[[Place], Any]:
+    return trained("--pipeline.model.refiner", name, "--pipeline.model.refiner-options", *options)
+
+
 mistakes(
     "options",
     {
         "an unknown backend": model("rasterizer", "vulkan"),
         "an unknown refiner": model("refiner", "magic"),
+        "an object that no class is": refiner("cob-gs", "object", "cap"),
+        "epochs that end with a phase of colours": refiner("cob-gs", "epochs", "12"),
+        "objects that could share their Gaussians": refiner("trace3d", "member_share", "0.3"),
         "an unknown reprojection": model("prepare.reprojection", "guess"),
         "an unknown kind of depth": model("prepare.depth", "mean"),
         "negative steps of refinement": model("refine-steps", "-5"),

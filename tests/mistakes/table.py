@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from resumed_runs import Killed, run_to_end
 from run_folders import write_scene, write_trained
 
@@ -252,6 +253,8 @@ def _converted(current: Any, name: str, values: list[str]) -> Any:
     if isinstance(current, tuple):
         kind = type(current[0]) if current else {"ignore_ids": int}.get(name, str)
         return tuple(kind(value) for value in values)
+    if isinstance(current, dict):  # numbers as numbers
+        return dict(zip(values[::2], map(yaml.safe_load, values[1::2]), strict=True))
     if current is None or isinstance(current, Path):
         return {"downscale_factor": float}.get(name, Path)(values[0])
     return type(current)(values[0])

@@ -8,11 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from data_folders import HEIGHT, WIDTH, ring, write_image, write_transforms
+from data_folders import CX, CY, FX, FY, HEIGHT, WIDTH, ring, write_image, write_transforms
 
+from beags_plugin.core.cameras import Camera, viewmat_from_opengl
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.interface import RasterSettings
+from beags_plugin.rasterizers.rendering import render_class_map, surfel_inputs
 
 CLASSES = {0: "background", 1: "cup", 2: "box"}
+SETTINGS = RasterSettings(0.03, 300.0)
 
 
 def discs(seed: int = 0, shift: float = 0.0) -> tuple[Surfels, torch.Tensor]:
@@ -52,29 +57,30 @@ def write_scene(root: Path, masks: bool = True, truth_factor: int = 1) -> Path:
 
 def write_drawn_scene(root: Path, factor: int = 4) -> Surfels:
     """Write nine fitting photos and masks of the discs, ``factor`` times as large as other scenes; return the discs."""
-    from data_folders import CX, CY, FX, FY
-
-    from beags_plugin.core.cameras import Camera, viewmat_from_opengl
-    from beags_plugin.rasterizers import make_rasterizer
-    from beags_plugin.rasterizers.interface import RasterSettings
-    from beags_plugin.rasterizers.rendering import render_class_map, surfel_inputs
-
-    surfels, class_ids = discs()
-    rasterizer, settings = make_rasterizer("auto"), RasterSettings(0.03, 300.0)
+    surfels, _ = discs()
+    rasterizer = make_rasterizer("auto")
     write_scene(root)
     meta = json.loads((root / "transforms.json").read_text())
     meta |= {name: factor * meta[name] for name in ("fl_x", "fl_y", "cx", "cy", "w", "h")}
     (root / "transforms.json").write_text(json.dumps(meta))
-    K = torch.tensor([[FX, 0, CX], [0, FY, CY], [0, 0, 1 / factor]]) * factor
-    for index, pose in enumerate(ring(9)):
-        viewmat = viewmat_from_opengl(torch.from_numpy(pose)).float()
-        camera = Camera(viewmat, K, factor * WIDTH, factor * HEIGHT)
-        image = rasterizer.rasterize(surfel_inputs(surfels, camera), camera, settings, torch.zeros(3)).color
+    for index, camera in enumerate(ring_cameras(9, factor)):
+        image = rasterizer.rasterize(surfel_inputs(surfels, camera), camera, SETTINGS, torch.zeros(3)).color
         write_image(root / f"images/v{index:02d}.png", (255 * image.clamp(0, 1)).round().to(torch.uint8).numpy())
-        labels, _ = render_class_map(rasterizer, surfels, class_ids, camera, settings)
-        labels[labels > max(CLASSES)] = 0  # nothing drawn
-        write_image(root / f"masks/v{index:02d}.png", labels.to(torch.uint8).numpy())
+        write_image(root / f"masks/v{index:02d}.png", drawn_labels(camera).to(torch.uint8).numpy())
     return surfels
+
+
+def ring_cameras(count: int, factor: int) -> list[Camera]:
+    """Return cameras around the discs, ``factor`` times as large as those of ``data_folders``."""
+    K = torch.tensor([[FX, 0, CX], [0, FY, CY], [0, 0, 1 / factor]]) * factor
+    viewmats = (viewmat_from_opengl(torch.from_numpy(pose)).float() for pose in ring(count))
+    return [Camera(viewmat, K, factor * WIDTH, factor * HEIGHT) for viewmat in viewmats]
+
+
+def drawn_labels(camera: Camera) -> torch.Tensor:
+    """Return the class map of the discs, 0 where nothing is drawn."""
+    labels, _ = render_class_map(make_rasterizer("auto"), *discs(), camera, SETTINGS)
+    return labels.masked_fill_(labels > max(CLASSES), 0)
 
 
 def write_trained(

@@ -56,6 +56,7 @@ class RefinementSwitch:
         """Ask the refiner for the number of its steps, which may follow from the data."""
         if not self.wanted:
             return
+        self.refiner.check(self.model.classes)
         schedule, views = self.model.schedule, len(self.datamanager.train_dataset)
         steps = self.refiner.steps(schedule.refine_steps, views, len(self.model.classes) - 1)
         self.model.schedule = replace(schedule, refine_steps=steps)
@@ -243,7 +244,7 @@ class RefinementSwitch:
         views = self.datamanager.views("train")
         with bar("Reading masks", passing=True) as progress:
             labels = LabelMaps(
-                prepared_labels(folder / "masks" / f"{view.name}.png", view.camera)
+                prepared_labels(folder / "masks" / f"{view.name}.png", view.camera).to(self.model.device)
                 for view in counted(views, len(views), progress)
             )
         self._start(grid, labels)

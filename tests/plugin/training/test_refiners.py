@@ -32,7 +32,10 @@ UNTRAINED = {
     "flashsplat": {"gamma": -0.9},
     "gaussiancut": {"num_edges": 3, "foreground_threshold": 0.6},
 }
-OWN: dict[str, dict] = {}
+OWN: dict[str, dict] = {
+    "cob-gs": {"epochs": 6, "tau": 0.4, "threshold": 0.2},  # both objects claim some Gaussians
+    "trace3d": {"min_pixels": 2},
+}
 BASE_STEPS = STEPS[0]
 
 
@@ -98,12 +101,15 @@ def test_objects_that_overlap_go_through_evaluation_extraction_and_export(refine
     assert int(left.sum()) == int((members.of(objects[1]) & ~members.of(objects[0])).sum()) > 0
 
 
-@pytest.mark.parametrize("name", OWN)
-@pytest.mark.parametrize("step", [BASE_STEPS, BASE_STEPS + 2, BASE_STEPS + 7])
+@pytest.mark.parametrize(
+    ("name", "step"),
+    # of cob-gs also where the next object begins, and after a checkpoint that follows this
+    [*((name, step) for name in OWN for step in (0, 2, 7)), ("cob-gs", 14), ("cob-gs", 20)],
+)
 def test_a_killed_run_ends_as_the_whole_one(refined, data, tmp_path, monkeypatch, name, step):
     run = tmp_path / "run"
     changes = overrides(name, **OWN[name])
-    interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, step), **changes)
+    interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, BASE_STEPS + step), **changes)
     resume_to_end(run)
     found = differences(without_clocks(checkpoint_of(run)), without_clocks(checkpoint_of(refined(name))))
     assert not found, found[:9]
