@@ -48,9 +48,9 @@ class BeagsTrainer(Trainer):
     def __init__(self, config: BeagsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         silence_libraries()
         self.schedule = config.model_config.schedule()
+        self.config = config
         self._asked_steps = config.max_num_iterations
         self.reschedule(self.schedule)
-        config.max_num_iterations = self.last_step
         self.curve: HeldOutCurve | None = None
         self.seconds = StageSeconds()
         self._interrupts = Interrupts(self._go_on)
@@ -67,6 +67,7 @@ class BeagsTrainer(Trainer):
         """Take the steps of this run, which some refiners tell from the data."""
         self.schedule = schedule
         self.last_step = self._asked_steps or schedule.total
+        self.config.max_num_iterations = self.last_step  # of which nerfstudio prints a percentage
 
     @property
     def _model(self) -> SceneModel:
