@@ -31,6 +31,7 @@ class LossInputs:
     labels: [H, W] int32 class ids M' of the view, or IGNORE; None if the view has none.
     class_ids: [N] int32, phi; None before assignment.
     grid: the visibility voxel grids; None before refinement.
+    screen_shift: [N, 2] of the render's ``SurfelInputs``, whose gradient says where a base grows; None where none does.
     draw: renders other surfels than the render's, with geometry, on black; for losses that need a render of their own.
     members: the surfels of each class; present: ids of the objects in ``labels``, ascending. None where the host does
         not know them: a loss that needs them reads ``class_ids`` and ``labels``, for which a GPU must wait.
@@ -45,6 +46,7 @@ class LossInputs:
     labels: Tensor | None = None
     class_ids: Tensor | None = None
     grid: VisibilityGrid | None = None
+    screen_shift: Tensor | None = None
     draw: Callable[[SurfelInputs, Camera], RasterOutputs] | None = None
     members: ClassMembers | None = None
     present: Sequence[int] | None = None

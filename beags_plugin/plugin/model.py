@@ -133,6 +133,7 @@ class BeagsModel(SceneModel):
             labels=self.last_render.labels,
             class_ids=self.class_ids,
             grid=self.grid,
+            screen_shift=self.last_render.screen_shift,
             draw=self._draw_apart,
             members=self._class_members(),
             present=batch.get("present"),

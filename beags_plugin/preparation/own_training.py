@@ -63,7 +63,9 @@ class Edit:
 
 
 class OwnTraining(ABC):
-    """Steps of refinement as a refiner makes them; they count from 0.
+    """Steps of refinement as a refiner makes them; they count from 0, in a base that it joins from -base_steps.
+
+    There it says the terms and rates alone: the scene grows as in any base, and no object is asked for in the end.
 
     Its state is kept in checkpoints: ``restore(state())`` on a new object with the same scene goes on bit for bit.
     """

@@ -72,6 +72,11 @@ class Refiner:
         """Return whether the scene is trained on with the losses of the config."""
         return False
 
+    @property
+    def joins_base(self) -> bool:
+        """Return whether its own training makes the steps of the base too, with ``seed_classes``."""
+        return False
+
     def check(self, names: Mapping[int, str]) -> None:
         """Raise ``UserError`` for options that do not fit the classes; names: by id, background (0) included."""
         return None
@@ -90,6 +95,10 @@ class Refiner:
     def members(self, scene: AssignedScene) -> Membership | None:
         """Return which Gaussians belong to which object before any step; None: phi says."""
         return None
+
+    def seed_classes(self, scene: TrainedScene) -> Tensor:
+        """Return the classes [N] int32 with which a base that it joins begins; those of new Gaussians follow them."""
+        raise NotImplementedError
 
     def own_training(self, scene: TrainedScene) -> OwnTraining | None:
         """Return what makes the steps of a refiner that owns its training; None for the others."""

@@ -22,6 +22,8 @@ REFINERS = Registry(
         "cob-gs": "beags_plugin.refiners.cob_gs:CobGsRefiner",
         "trace3d": "beags_plugin.refiners.trace3d:Trace3DRefiner",
         "gaussiancut": "beags_plugin.refiners.gaussiancut:GaussianCutRefiner",
+        "gaussian-grouping": "beags_plugin.refiners.gaussian_grouping:GaussianGroupingRefiner",
+        "objectgs": "beags_plugin.refiners.objectgs:ObjectGsRefiner",
     },
 )
 

@@ -100,10 +100,15 @@ def nearest_in_space(
     return sample[torch.cat([chosen[:, None], places], dim=1)].to(means.device)
 
 
+def probabilities(classifier: Classify, codes: Tensor) -> Tensor:
+    """Return [..., K], the softmax of the logits of codes [..., C]; its gradient is that of any number of threads."""
+    return classifier(codes).log_softmax(dim=-1).exp()  # the gradient of torch's softmax is not
+
+
 def neighbour_loss(classifier: Classify, codes: Tensor, groups: Tensor, weight: float = WEIGHT_3D) -> Tensor:
     """Return L_3d. codes: [N, C]. groups: [A, 1 + k] int64 of ``nearest_in_space``."""
-    # Determinism: gradients of codes[groups] and of softmax depend on the number of threads, those of these do not.
-    q = classifier(embedding(groups, codes)).log_softmax(dim=-1).exp()
+    # Determinism: the gradient of codes[groups] depends on the number of threads.
+    q = probabilities(classifier, embedding(groups, codes))
     logs = (q + 1e-10).log()
     divergence = (q[:, :1] * (logs[:, :1] - logs[:, 1:])).sum(dim=-1)
     return weight / NORMALISER * ordered_mean(divergence)

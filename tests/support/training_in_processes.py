@@ -54,6 +54,8 @@ def worker(local_rank: int, world_size: int, config, global_rank: int = 0) -> No
                 for state in optimizer.state.values()
             )
         ).hexdigest()
+        own = {} if self._model.own_training is None else self._model.own_training.state()
+        ended["own"] = hashlib.sha256(repr(_listed(own)).encode()).hexdigest()
         ended["folder"], ended["run"] = str(self.base_dir), str(self.run)
         after(self)
 
@@ -63,14 +65,21 @@ def worker(local_rank: int, world_size: int, config, global_rank: int = 0) -> No
     (out / f"rank{global_rank}.json").write_text(json.dumps(found))
 
 
-def train_in_two(data: Path, out: Path) -> None:
+def _listed(value):
+    """Return tensors within dicts as plain numbers, each of which repr shows in full."""
+    if isinstance(value, dict):
+        return {key: _listed(item) for key, item in value.items()}
+    return value.tolist() if isinstance(value, torch.Tensor) else value
+
+
+def train_in_two(data: Path, out: Path, **overrides) -> None:
     """Train ``out``/run on ``data``; what process i has at its end is in ``out``/rank<i>.json."""
     from nerfstudio.scripts.train import launch
     from resumed_runs import short_config
 
     from beags_plugin.system.lock import run_lock
 
-    config = short_config(data, out / "run")
+    config = short_config(data, out / "run", **overrides)
     config.pipeline.datamanager.data = data  # as nerfstudio's own main
     config.set_timestamp()
     config.save_config()

@@ -13,6 +13,7 @@ from typing import Any
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.assignment.assignment import Assignment
+from beags_plugin.core.membership import Membership
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED, round_folder
@@ -50,7 +51,7 @@ class RefinementSwitch:
     @property
     def wanted(self) -> bool:
         """True if this run refines at all."""
-        return self.model.config.refine_steps > 0
+        return self.model.schedule.refine_steps > 0
 
     def ask_steps(self) -> None:
         """Ask the refiner for the number of its steps, which may follow from the data."""
@@ -64,14 +65,18 @@ class RefinementSwitch:
 
     def check(self) -> None:
         """Raise ``UserError`` for options and masks that would stop the run when it begins to refine."""
-        if self.wanted:
-            rounds, steps = self.model.config.refine_rounds, self.model.config.refine_steps
+        config = self.model.config
+        if self.refiner.joins_base and config.base_steps == 0:
+            raise UserError("the refiner's option joint trains a base of its own: set base_steps, and load none.")
+        if config.refine_steps > 0:
+            rounds, steps = config.refine_rounds, config.refine_steps
             if not 1 <= rounds <= steps:
                 raise UserError(f"refine_rounds is {rounds}: it must be 1 to refine_steps, which is {steps}.")
             if rounds > 1 and not self.refiner.trains:
-                raise UserError(f"refine_rounds is {rounds}: the refiner {self.model.config.refiner} has 1 round.")
-            self.model.config.prepare.check()
-            self.model.config.split.check()
+                raise UserError(f"refine_rounds is {rounds}: the refiner {config.refiner} has 1 round.")
+            config.prepare.check()
+            config.split.check()
+        if config.refine_steps > 0 or self.refiner.joins_base:
             check_masks(view.labels for view in self.datamanager.views("train", original=True))
 
     def state(self) -> dict[str, Any]:
@@ -87,8 +92,10 @@ class RefinementSwitch:
         self._own_state = state.get("own")
 
     def before_step(self, step: int) -> None:
-        """Restore refinement from a checkpoint, or start it where no base step precedes it."""
+        """Restore refinement from a checkpoint, or start it where no base step precedes it; or join the base."""
         model = self.model
+        if self.refiner.joins_base and model.own_training is None:
+            self._join_base()
         if not self.wanted or not model.schedule.refining(step):
             return
         done = self._done = int(model.refined_steps) if self._done is None else self._done
@@ -195,13 +202,25 @@ class RefinementSwitch:
     def _start(self, grid: VisibilityGrid | None, labels: LabelMaps) -> None:
         self.datamanager.replace_labels(labels)
         self.model.grid = None if grid is None else grid.to(self.model.device)
-        own = self.refiner.own_training(self._scene(labels))
-        if own is not None and self._own_state is not None:
-            own.restore(self._own_state)
-        self.model.own_training = own
+        own = self._own_training(self._scene(labels))
         self.model.frozen = own is None and not self.refiner.trains
         self.model.prepared_rounds = self.rounds
         self.ready = True
+
+    def _join_base(self) -> None:
+        views = self.datamanager.views("train")
+        with bar("Reading masks", passing=True) as progress:
+            scene = self._scene(LabelMaps(view.labels for view in counted(views, len(views), progress)))
+        if not bool(self.model.assigned):  # those of a resumed run have their classes
+            self.model.take_members(Membership(self.refiner.seed_classes(scene)))
+        self._own_training(scene)
+
+    def _own_training(self, scene: TrainedScene) -> OwnTraining | None:
+        own = self.refiner.own_training(scene)
+        if own is not None and self._own_state is not None:
+            own.restore(self._own_state)
+        self.model.own_training = own
+        return own
 
     def _scene(self, labels: LabelMaps) -> TrainedScene:
         model = self.model

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
+from data_folders import write_image
+from PIL import Image
 
 pytest.importorskip("nerfstudio")
 
@@ -19,12 +25,14 @@ from resumed_runs import (
     short_config,
     without_clocks,
 )
-from run_folders import write_scene
+from run_folders import CLASSES, write_scene
 
 from beags_plugin.plugin.objects.evaluate import evaluate_run
 from beags_plugin.plugin.objects.export import export_run
 from beags_plugin.plugin.objects.extract import extract_objects
 from beags_plugin.plugin.runs.read import read_run
+from beags_plugin.plugin.training import densifier
+from beags_plugin.plugin.training.scene_edits import edit_scene
 from beags_plugin.system.errors import UserError
 
 UNTRAINED = {
@@ -35,6 +43,8 @@ UNTRAINED = {
 OWN: dict[str, dict] = {
     "cob-gs": {"epochs": 6, "tau": 0.4, "threshold": 0.2},  # both objects claim some Gaussians
     "trace3d": {"min_pixels": 2},
+    "gaussian-grouping": {"threshold": 0.25},
+    "objectgs": {"labels": "nonzero"},
 }
 BASE_STEPS = STEPS[0]
 
@@ -46,6 +56,10 @@ def overrides(refiner: str, **options) -> dict:
         "pipeline.model.refine_rounds": 1,
         "pipeline.model.prepare.reprojection": "none",
     }
+
+
+def parameters(state: dict) -> dict:
+    return {key: value for key, value in state.items() if key.startswith("gauss_params.")}
 
 
 @pytest.fixture(scope="module")
@@ -72,8 +86,7 @@ def refined(data, tmp_path_factory):
 def test_a_refiner_that_trains_nothing_keeps_the_base_bit_for_bit(refined, name):
     run = refined(name)
     base, after = read_run(run / "base/config.yml"), read_run(run / "config.yml")
-    state = {key: value for key, value in after.state.items() if key.startswith("gauss_params.")}
-    assert not differences(state, {key: base.state[key] for key in state})
+    assert not differences(parameters(base.state), parameters(after.state))
     assert base.members.objects is None, "base/ holds assignment alone"
     found = evaluate_run(run / "config.yml")
     assert found.before is not None and found.before.psnr == found.after.psnr
@@ -99,6 +112,65 @@ def test_objects_that_overlap_go_through_evaluation_extraction_and_export(refine
     assert without.gaussians == len(members) - int(members.of(objects[0]).sum())
     left = read_run(without.config).members.of(objects[1])
     assert int(left.sum()) == int((members.of(objects[1]) & ~members.of(objects[0])).sum()) > 0
+
+
+@pytest.mark.parametrize("name", ["gaussian-grouping", "objectgs"])
+def test_ids_far_apart_and_threads_change_nothing(refined, data, tmp_path, name):
+    """The same masks with the ids 300 and 40000 for 1 and 2, trained with three threads."""
+    far = {0: 0, 1: 300, 2: 40_000}
+    shutil.copytree(data, tmp_path / "data")
+    (tmp_path / "data/classes.json").write_text(json.dumps({str(far[c]): n for c, n in CLASSES.items() if c}))
+    for file in (tmp_path / "data/masks").iterdir():
+        write_image(file, np.vectorize(far.get, otypes=[np.uint16])(np.array(Image.open(file))))
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        run_to_end(short_config(tmp_path / "data", tmp_path / "run", **overrides(name, **OWN[name])))
+    finally:
+        torch.set_num_threads(threads)
+    one, other = read_run(refined(name) / "config.yml"), read_run(tmp_path / "run/config.yml")
+    assert not differences(parameters(one.state), parameters(other.state))
+    assert [far[c] for c in one.members.present()] == other.members.present()
+    assert all(torch.equal(one.members.of(c), other.members.of(far[c])) for c in far)
+
+
+def test_objectgs_trains_the_scene_but_not_its_classes(refined):
+    run = refined("objectgs")
+    base, after = read_run(run / "base/config.yml"), read_run(run / "config.yml")
+    assert len(differences(parameters(base.state), parameters(after.state))) == 6, "all of them moved"
+    e6, phi = base.members.class_ids, after.members.class_ids
+    assert after.members.objects is None and torch.equal(phi[e6 != 0], e6[e6 != 0])
+    assert (phi != 0).sum() > (e6 != 0).sum(), "one pixel of an object makes one of it"
+
+
+def test_a_joint_base_grows_with_the_classes_of_its_seeds(data, tmp_path, monkeypatch):
+    """Clones and splits inherit; a killed run ends as the whole one; there is no refinement."""
+    changes, edits = overrides("objectgs", joint=True), []
+
+    def spied(model, adam, edited):
+        before = model.class_ids
+        edit_scene(model, adam, edited)
+        edits.append((before[edited.source], model.class_ids, edited.fresh))
+
+    run_to_end(short_config(data, tmp_path / "plain", **overrides("none")))
+    monkeypatch.setattr(densifier, "edit_scene", spied)
+    run_to_end(short_config(data, tmp_path / "whole", **changes))
+    assert len(edits) == 3 and all(torch.equal(inherited, found) for inherited, found, _ in edits)
+    assert all(classes[fresh].any() for classes, _, fresh in edits), "new Gaussians are of objects too"
+
+    whole = checkpoint_of(tmp_path / "whole")
+    assert whole["step"] == BASE_STEPS - 1 and whole["pipeline"]["_model.assigned"]
+    plain = checkpoint_of(tmp_path / "plain")["pipeline"]
+    opacities = [state["_model.gauss_params.opacities"] for state in (plain, whole["pipeline"])]
+    assert opacities[0].shape != opacities[1].shape or not torch.equal(*opacities), "the classes take part"
+    scene = read_run(tmp_path / "whole/config.yml")
+    assert scene.members.present() == [0, 1, 2] and scene.members.objects is None
+    assert set(evaluate_run(tmp_path / "whole/config.yml").after.objects) == {1, 2}
+    for step in (3, 24):
+        interrupted(data, tmp_path / str(step), monkeypatch, lambda patch, at=step: kill_at(patch, at), **changes)
+        resume_to_end(tmp_path / str(step))
+        found = differences(without_clocks(checkpoint_of(tmp_path / str(step))), without_clocks(whole))
+        assert not found, found[:9]
 
 
 @pytest.mark.parametrize(
@@ -129,7 +201,23 @@ def test_a_wrong_option_is_said_before_anything_is_trained(data, tmp_path, optio
         config.model_config.check()
 
 
-def test_more_rounds_are_for_refiners_that_train_with_the_losses_of_the_config(data, tmp_path):
-    config = short_config(data, tmp_path / "run", **{**overrides("none"), "pipeline.model.refine_rounds": 2})
-    with pytest.raises(UserError, match="refine_rounds is 2: the refiner none has 1 round"):
+@pytest.mark.parametrize(
+    ("changes", "loaded", "sentence"),
+    [
+        # more rounds are for refiners that train with the losses of the config
+        ({**overrides("none"), "pipeline.model.refine_rounds": 2}, False, "is 2: the refiner none has 1 round"),
+        ({**overrides("objectgs", joint=True), "pipeline.model.base_steps": 0}, True, "joint trains a base of its own"),
+    ],
+)
+def test_a_run_that_cannot_be_is_refused(refined, data, tmp_path, changes, loaded, sentence):
+    config = short_config(data, tmp_path / "run", **changes)
+    config.load_dir = refined("none") / "base/nerfstudio_models" if loaded else None
+    with pytest.raises(UserError, match=sentence):
         run_to_end(config)
+
+
+def test_a_joint_base_needs_masks(tmp_path):
+    data = write_scene(tmp_path / "data", masks=False)
+    changes = {**overrides("objectgs", joint=True), "pipeline.model.refine_steps": 0}
+    with pytest.raises(UserError, match="no training view has a mask"):
+        run_to_end(short_config(data, tmp_path / "run", **changes))
