@@ -58,10 +58,15 @@ def draw_features(
     """Render any number of channels, [H, W, F] sum_i w_i f_i: no background, not divided by A.
 
     features: [N, F] of the inputs' dtype, F at least 1. Differentiable in them and in the inputs but the colours.
-    Three channels are rendered at a time, which every backend can.
+    Three channels are rendered at a time, which every backend can, unless it has a ``feature_channels``.
     """
+    channels, n = features.shape[-1], len(inputs.means)
+    if features.shape != (n, channels) or features.dtype != inputs.means.dtype:
+        expected, got = f"[{n}, F] {inputs.means.dtype}", f"{list(features.shape)} {features.dtype}"
+        raise ValueError(f"features must be {expected}, not {got}")
+    if (drawn := rasterizer.feature_channels(inputs, features, camera, settings)) is not None:
+        return drawn
     settings = replace(settings, geometry=False, distortion=False)
-    channels = features.shape[1]
     padded = torch.nn.functional.pad(features, (0, -channels % 3))
     nothing = features.new_zeros(3)
     images = [

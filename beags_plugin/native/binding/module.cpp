@@ -150,6 +150,35 @@ void bind(nb::module_& m, const char* name) {
           "g_quats"_a.none(), "g_log_scales"_a.none(), "g_opacity_logits"_a.none(), "g_screen_shift"_a.none(),
           "threads"_a)
       .def(
+          "feature_channels",
+          [](Frame<T>& self, In features, Out channels, bool keep, int threads) {
+            nb::gil_scoped_release release;
+            self.feature_channels(features.data(), static_cast<int>(features.shape(1)), channels.data(), keep, threads);
+          },
+          "features"_a, "channels"_a, "keep"_a, "threads"_a)
+      .def(
+          "feature_channels_backward",
+          [](const Frame<T>& self, In means, In quats, In log_scales, In opacity_logits, In colors, In features,
+             In gradient, Out g_means, Out g_quats, Out g_log_scales, Out g_opacity_logits, Out g_screen_shift,
+             Out g_features, int threads) {
+            const Inputs<T> inputs{static_cast<int64_t>(means.shape(0)),
+                                   means.data(),
+                                   quats.data(),
+                                   log_scales.data(),
+                                   opacity_logits.data(),
+                                   colors.data(),
+                                   nullptr};
+            nb::gil_scoped_release release;
+            self.feature_channels_backward(inputs, features.data(), static_cast<int>(features.shape(1)),
+                                           gradient.data(),
+                                           {g_means.data(), g_quats.data(), g_log_scales.data(),
+                                            g_opacity_logits.data(), nullptr, g_screen_shift.data(), nullptr},
+                                           g_features.data(), threads);
+          },
+          "means"_a, "quats"_a, "log_scales"_a, "opacity_logits"_a, "colors"_a, "features"_a, "gradient"_a,
+          "g_means"_a.none(), "g_quats"_a.none(), "g_log_scales"_a.none(), "g_opacity_logits"_a.none(),
+          "g_screen_shift"_a.none(), "g_features"_a.none(), "threads"_a)
+      .def(
           "dominant_gaussian",
           [](const Frame<T>& self, Array<int32_t> indices, int threads) {
             nb::gil_scoped_release release;

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "rasterizer/composite.h"
+#include "rasterizer/features.h"
 #include "rasterizer/labels.h"
 
 namespace beags {
@@ -108,6 +109,7 @@ BEAGS_INLINE Real<T> weight_gradient(const Job<T>& job, int k, const Splat<T>& s
   if constexpr (kWanted & kClassChannels) {
     return load(job.class_gradients + job.class_places[s.class_id] * kTilePixels + hits.pack[i] * kLanes<T>);
   }
+  if constexpr (kWanted & kFeatures) return add_features(job, s, hits.pack[i], w);
   Real<T> g_w = load(p.g_alpha);
   for (int c = 0; c < 3; ++c) {
     const Real<T> g = load(p.g_color[c]);
@@ -197,8 +199,9 @@ struct Waking {
 };
 
 // Calls visit(plain, k, splat, hits, i, dx, dy, pixels of the pack, sums) for each hit that the forward composited,
-// back to front, and writes each pair's record: kSize sums over the tile's pixels.
-template <int kSize, unsigned kNeeds, class T, class Visit>
+// back to front, and writes each pair's record: kSize sums over the tile's pixels, and with kWithFeatures those of the
+// channels.
+template <int kSize, bool kWithFeatures, unsigned kNeeds, class T, class Visit>
 BEAGS_INLINE void walk_back(const Job<T>& job, int tile, PixelGradients<T>* pixels, Visit visit) {
   const Centres<T> centre(job, tile);
   Waking<T> waking(pixels);
@@ -216,7 +219,7 @@ BEAGS_INLINE void walk_back(const Job<T>& job, int tile, PixelGradients<T>* pixe
     collect<kNeeds>(job, splat, pairs[k].mask & waking.active, centre, hits,
                     [&](int pack)
                         __attribute__((always_inline)) { return all(static_cast<T>(k)) < load(pixels[pack].end); });
-    Vector<T> sums[kSize] = {};
+    Vector<T> sums[kSize ? kSize : 1] = {};
     const auto each = [&](auto plain) __attribute__((always_inline)) {
       for (int i = 0; i < hits.count; ++i) {
         const int pack = hits.pack[i];
@@ -231,12 +234,14 @@ BEAGS_INLINE void walk_back(const Job<T>& job, int tile, PixelGradients<T>* pixe
     }
     T* record = job.records + static_cast<int64_t>(pairs[k].record) * kSize;
     for (int i = 0; i < kSize; i += 4) Register<T>::sum4(sums + i, record + i);
+    if (kWithFeatures) write_feature_record(job, pairs[k]);
   }
 }
 
 template <Parts kWanted, class T>
 void backward(const Job<T>& job, int tile) {
   PixelGradients<T> pixels[kTilePacks<T>] = {};
+  if (kWanted & kFeatures) read_feature_gradients(job, tile);
   const int32_t everywhere = load_gradients<kWanted>(job, tile, pixels);
   constexpr unsigned kNeeds =
       kNeedShape | (kWanted & (kGeometry | kDistortion) ? kNeedDepth : 0) | (kWanted & kDistortion ? kNeedNearness : 0);
@@ -245,22 +250,28 @@ void backward(const Job<T>& job, int tile) {
                                       Vector<T>* sums) __attribute__((always_inline)) {
     add_gradients<kWanted, decltype(plain)::value>(job, k, s, hits, i, dx, dy, everywhere, p, sums);
   };
-  walk_back<record_size(kWanted), kNeeds>(job, tile, pixels, add);
+  walk_back<record_size(kWanted), (kWanted & kFeatures) != 0, kNeeds>(job, tile, pixels, add);
 }
 
-// Computes the gradients by the colours and the background alone: dC/dc is w, and nothing behind a hit matters.
-template <class T>
+// Computes the gradients by the colours and the background alone, or by the features alone: dC/dc is w, and nothing
+// behind a hit matters.
+template <bool kOfFeatures, class T>
 void backward_colors(const Job<T>& job, int tile) {
   PixelGradients<T> pixels[kTilePacks<T>] = {};
+  if (kOfFeatures) read_feature_gradients(job, tile);
   load_gradients<0>(job, tile, pixels);
-  const auto add_colors = [](auto, int, const Splat<T>&, const Hits<T>& hits, int i, Real<T>, Real<T>,
+  const auto add_colors = [&job](auto, int, const Splat<T>& s, const Hits<T>& hits, int i, Real<T>, Real<T>,
                              PixelGradients<T>& p, Vector<T>* sums) __attribute__((always_inline)) {
     const Real<T> alpha = hits.get(hits.alpha, i), inverse_left = all(T(1)) / (all(T(1)) - alpha);
     const Real<T> before = load(p.transmittance) * inverse_left, w = alpha * before;
     store(p.transmittance, before);
-    for (int c = 0; c < 3; ++c) add(sums[kColor + c], w, load(p.g_color[c]));
+    if (kOfFeatures) {
+      add_features(job, s, hits.pack[i], w);
+    } else {
+      for (int c = 0; c < 3; ++c) add(sums[kColor + c], w, load(p.g_color[c]));
+    }
   };
-  walk_back<kColorRecord, 0>(job, tile, pixels, add_colors);
+  walk_back<kOfFeatures ? 0 : kColorRecord, kOfFeatures, 0>(job, tile, pixels, add_colors);
 }
 
 }  // namespace BEAGS_ISA

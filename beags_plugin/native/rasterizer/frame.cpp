@@ -91,7 +91,7 @@ void Frame<T>::backward(const Inputs<T>& inputs, const int32_t* target, const Im
   job.gradients = from;
   const Parts parts = (from.depth || from.median_depth || from.normal ? kGeometry : 0) |
                       (from.distortion ? kDistortion : 0) | (from.boundary ? kBoundary : 0);
-  const bool only_colors = !to.means && !to.quats && !to.log_scales && !to.opacity_logits && !to.screen_shift;
+  const bool only_colors = !wants_geometry(to);
   const Variant<T>& variant = kernels<T>().variants[parts];
   const auto kernel = only_colors ? kernels<T>().backward_colors : variant.backward;
   const int size = only_colors ? kColorRecord : variant.record_size;
@@ -146,6 +146,59 @@ void Frame<T>::reduce(const Inputs<T>& inputs, const T* records, int size, const
     write(to.quats, i, g.quat, 4);
     write(to.log_scales, i, g.log_scale, 2);
     write(to.screen_shift, i, g.screen_shift, 2);
+  }
+}
+
+template <class T>
+void Frame<T>::run_features(Job<T> job, const T* features, int count, void (*kernel)(const Job<T>&, int),
+                            int threads) const {
+  job.features = features;
+  job.num_features = count;
+  for_each_tile(threads, [&](int tile) {
+    const Scratch<T> work(static_cast<size_t>(count) * (kTilePixels + kGroupPixels));
+    Job<T> of_tile = job;
+    of_tile.feature_work = work.get();
+    kernel(of_tile, tile);
+  });
+}
+
+template <class T>
+void Frame<T>::feature_channels(const T* features, int count, T* channels, bool keep, int threads) {
+  make_saved(keep, false, false);
+  Job<T> job = this->job();
+  job.channels = channels;
+  run_features(job, features, count, kernels<T>().feature_channels, threads);
+}
+
+template <class T>
+void Frame<T>::feature_channels_backward(const Inputs<T>& inputs, const T* features, int count, const T* gradient,
+                                         const InputGradients<T>& to, T* g_features, int threads) const {
+  Job<T> job = this->job();
+  const bool geometry = wants_geometry(to);
+  const int size = geometry ? record_size(kFeatures) : 0;
+  const Scratch<T> records(static_cast<size_t>(num_pairs()) * size);  // the kernels fill all of both
+  const Scratch<T> feature_records(static_cast<size_t>(num_pairs()) * count);
+  const Scratch<T> backgrounds(static_cast<size_t>(tiles()) * 3);
+  job.records = records.get();
+  job.feature_records = feature_records.get();
+  job.g_background = backgrounds.get();
+  job.channel_gradients = gradient;
+  const auto kernel = geometry ? kernels<T>().feature_channels_backward : kernels<T>().backward_features;
+  run_features(job, features, count, kernel, threads);
+  if (geometry) reduce(inputs, records.get(), size, to, threads);
+  if (!g_features) return;
+  constexpr int kBlock = 4;
+  const int team = num_surfels_ < kTeamSurfels ? 1 : threads;
+  // Determinism: as in `reduce`.
+#pragma omp parallel for num_threads(team) schedule(dynamic, kChunk)
+  for (int64_t i = 0; i < num_surfels_; ++i) {
+    for (int first = 0; first < count; first += kBlock) {
+      double sums[kBlock] = {};
+      for (int64_t record = bins_.record_start[i]; record < bins_.record_start[i + 1]; ++record) {
+        for (int c = 0; c < kBlock; ++c) sums[c] += feature_records[record * count + first + c];
+      }
+      for (int c = 0; c < kBlock; ++c) g_features[i * count + first + c] = static_cast<T>(sums[c]);
+    }
   }
 }
 

@@ -36,6 +36,11 @@ struct Contributions {
 };
 
 template <class T>
+bool wants_geometry(const InputGradients<T>& to) {
+  return to.means || to.quats || to.log_scales || to.opacity_logits || to.screen_shift;
+}
+
+template <class T>
 class Frame {
  public:
   // visible: [N], set to whether a Gaussian is rendered and its box touches the image.
@@ -66,6 +71,13 @@ class Frame {
   // Computes their gradients, once after `class_channels`, with the same inputs; colours and background have none.
   void class_channels_backward(const Inputs<T>& inputs, int num_classes, const T* gradient, const InputGradients<T>& to,
                                int threads) const;
+  // Renders channels of features, sum of w f. features: [N, count], count a multiple of 4; channels: [height, width,
+  // count]. keep: for its backward.
+  void feature_channels(const T* features, int count, T* channels, bool keep, int threads);
+  // Computes their gradients, once after `feature_channels`, with the same inputs and features. g_features: [N, count]
+  // or null; where `to` wants nothing of the geometry, they cost less.
+  void feature_channels_backward(const Inputs<T>& inputs, const T* features, int count, const T* gradient,
+                                 const InputGradients<T>& to, T* g_features, int threads) const;
   void dominant_gaussian(int32_t* indices, int threads) const;
   WorkCounts work_counts(int threads) const;
 
@@ -94,6 +106,8 @@ class Frame {
 #pragma omp parallel for num_threads(team) schedule(dynamic, 1)
     for (int tile = 0; tile < tiles(); ++tile) work(tile);
   }
+  // Calls kernel(job, tile) for every tile, with memory for its channels.
+  void run_features(Job<T> job, const T* features, int count, void (*kernel)(const Job<T>&, int), int threads) const;
   void reduce(const Inputs<T>& inputs, const T* records, int size, const InputGradients<T>& to, int threads) const;
 
   View view_;

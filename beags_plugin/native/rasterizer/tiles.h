@@ -3,6 +3,7 @@
 #pragma once
 
 #include "rasterizer/backward.h"
+#include "rasterizer/features.h"
 #include "rasterizer/forward.h"
 #include "rasterizer/queries.h"
 
@@ -30,7 +31,10 @@ template <class T>
 constexpr Kernels<T> make_kernels() {
   return {{make_variant<0, T>(), make_variant<1, T>(), make_variant<2, T>(), make_variant<3, T>(), make_variant<4, T>(),
            make_variant<5, T>(), make_variant<6, T>(), make_variant<7, T>()},
-          backward_colors<T>,
+          backward_colors<false, T>,
+          feature_channels<T>,
+          backward<kFeatures, T>,
+          backward_colors<true, T>,
           class_sums<false, T>,
           class_sums<true, T>,
           class_map<T>,

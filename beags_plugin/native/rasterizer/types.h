@@ -77,6 +77,7 @@ using Parts = unsigned;
 constexpr Parts kGeometry = 1, kDistortion = 2, kBoundary = 4;
 constexpr Parts kAllParts = kGeometry | kDistortion | kBoundary;
 constexpr Parts kClassChannels = 8;  // of the backward: gradients by the sums of w by class, and by nothing else
+constexpr Parts kFeatures = 16;      // the same by channels of features
 constexpr int record_size(Parts parts) { return parts & (kGeometry | kDistortion) ? kRecord : kShapeRecord; }
 
 // The images, [height, width, channels], or the gradients by them; null: not wanted.
@@ -117,6 +118,13 @@ struct Job {
   // kClassChannels: the gradients by the sums of the tile's classes, 256 pixels each, and the place of a class there.
   const T* class_gradients;
   const int32_t* class_places;
+  // Channels of features, whose number is a multiple of 4.
+  int num_features;
+  const T* features;           // [N, num_features]
+  T* channels;                 // [height, width, num_features]
+  const T* channel_gradients;  // the same
+  T* feature_work;             // of one tile: num_features times 256 pixels, then num_features registers, at most 16 lanes
+  T* feature_records;          // [pairs, num_features]
 };
 
 // A query, which has no gradient (sections 3 and 5).
@@ -151,6 +159,9 @@ template <class T>
 struct Kernels {
   Variant<T> variants[kAllParts + 1];                // by Parts
   void (*backward_colors)(const Job<T>&, int tile);  // towards colours and background alone
+  void (*feature_channels)(const Job<T>&, int tile);
+  void (*feature_channels_backward)(const Job<T>&, int tile);
+  void (*backward_features)(const Job<T>&, int tile);  // towards the features alone
   void (*class_contributions)(const Job<T>&, const Query<T>&, int tile);
   void (*class_pixel_counts)(const Job<T>&, const Query<T>&, int tile);
   void (*class_map)(const Job<T>&, const Query<T>&, int tile);
