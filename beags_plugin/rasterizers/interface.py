@@ -213,7 +213,10 @@ class Rasterizer(ABC):
     def feature_channels(
         self, inputs: SurfelInputs, features: Tensor, camera: Camera, settings: RasterSettings
     ) -> Tensor | None:
-        """Return what ``rendering.draw_features`` says, in one pass; None where three channels at a time cost less."""
+        """Return what ``rendering.draw_features`` says, in one pass; None where three channels at a time cost less.
+
+        Surfels whose features are not finite have such colours too.
+        """
         return None
 
     @abstractmethod

@@ -68,14 +68,14 @@ def test_gradients_are_the_references(name, channels, rasterizer):
     assert error(torch.autograd.grad((drawn * factors).sum(), alone)[0], found[1][-1]) < 1e-9
 
 
-@pytest.mark.parametrize("channels", [2, 5])
-def test_broken_surfels_have_no_part_in_the_channels(channels, rasterizer):
+@pytest.mark.parametrize("spoilt", ["means", "colors", "features"])
+@pytest.mark.parametrize("channels", [4, 5])
+def test_broken_surfels_have_no_part_in_the_channels(channels, spoilt, rasterizer):
     scene, g = make_scene(), torch.Generator().manual_seed(5)
     features = torch.randn(len(scene.inputs.means), channels, generator=g, dtype=torch.float64)
-    features[3], whole = float("nan"), torch.arange(len(features)) != 3
-    leaves = leaves_of(scene)
+    whole, leaves = torch.arange(len(features)) != 3, leaves_of(scene)
     with torch.no_grad():
-        leaves["means"][3, 1] = float("inf")
+        {**leaves, "colors": scene.inputs.colors, "features": features}[spoilt][3, 1] = float("inf")
     others = {name: value.detach()[whole].requires_grad_() for name, value in leaves.items()}
     rest = replace(scene.inputs, colors=scene.inputs.colors[whole], class_ids=scene.inputs.class_ids[whole], **others)
     found = []
