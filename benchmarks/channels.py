@@ -1,4 +1,4 @@
-"""python -m benchmarks.channels: what channels cost, by passes of three and by class, beside one image of colours."""
+"""python -m benchmarks.channels: time of channels in one pass, by threes and by class beside an image of colours."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from rich.console import Console
 from torch import Tensor
 
 from beags_plugin.bench.report import plain_table
-from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import Rasterizer, SurfelInputs
+from beags_plugin.rasterizers.native import NativeRasterizer
 from beags_plugin.rasterizers.rendering import draw_features
 from benchmarks.clock import Seconds
 from benchmarks.machine import commit, describe_machine
@@ -24,21 +24,25 @@ class ChannelOptions:
     """Time of F channels, forward and backward, over that of one image of colours, on one thread.
 
     sizes: N/WIDTHxHEIGHT. channels: numbers F. rounds: in which everything has its turn; the least CPU time counts.
-    rasterizer: a backend's name.
     """
 
     sizes: tuple[str, ...] = ("20k/320x240", "50k/320x240")
     channels: tuple[int, ...] = (3, 9, 16, 64)
     rounds: int = 7
-    rasterizer: str = "auto"
+
+
+class ByThrees(NativeRasterizer):
+    """Three channels at a time."""
+
+    feature_channels = Rasterizer.feature_channels
 
 
 def run_channels(options: ChannelOptions) -> dict[str, dict[str, float]]:
     """Measure and print a table; returns CPU seconds by size and what was drawn."""
     torch.set_num_threads(1)
-    rasterizer, found = make_rasterizer(options.rasterizer), {}
+    found = {}
     for name in options.sizes:
-        ways = _ways(make_scene(parse_size(name)), rasterizer, options.channels)
+        ways = _ways(make_scene(parse_size(name)), options.channels)
         found[name] = dict.fromkeys(ways, float("inf"))
         for _ in range(options.rounds):
             for label, way in ways.items():
@@ -56,9 +60,9 @@ def run_channels(options: ChannelOptions) -> dict[str, dict[str, float]]:
     return found
 
 
-def _ways(scene: Scene, rasterizer: Rasterizer, channels: tuple[int, ...]) -> dict[str, Callable[[], object]]:
+def _ways(scene: Scene, channels: tuple[int, ...]) -> dict[str, Callable[[], object]]:
     """Return what is timed by name: a drawing and its gradients, towards geometry and features or features alone."""
-    g, ways = torch.Generator().manual_seed(0), {}
+    g, rasterizer, ways = torch.Generator().manual_seed(0), NativeRasterizer(), {}
     s, settings = scene.surfels, replace(scene.settings, geometry=False, distortion=False)
     geometry = [value.clone().requires_grad_() for value in (s.means, s.quats, s.log_scales, s.opacity_logits)]
     means, quats, log_scales, opacity_logits = geometry
@@ -75,10 +79,13 @@ def _ways(scene: Scene, rasterizer: Rasterizer, channels: tuple[int, ...]) -> di
     for count in channels:
         features = torch.rand(len(s), count, generator=g).requires_grad_()
         gradient = torch.randn(scene.camera.height, scene.camera.width, count, generator=g)
-        passes = (gradient, draw_features, rasterizer)
-        add(f"{count} channels", [*geometry, features], *passes, inputs, features, *what)
-        alone = f"{count} channels, features' gradients alone"
-        add(alone, [features], *passes, inputs.detached(), features, *what)
+        for way, backend in (("by threes", ByThrees()), ("in one pass", rasterizer)):
+            if backend is rasterizer and count <= 3:
+                continue  # that is a pass of three
+            drawing = (gradient, draw_features, backend)
+            add(f"{count} channels {way}", [*geometry, features], *drawing, inputs, features, *what)
+            alone = f"{count} channels {way}, features' gradients alone"
+            add(alone, [features], *drawing, inputs.detached(), features, *what)
         ids = torch.randint(0, count, (len(s),), generator=g, dtype=torch.int32)  # every tile has nearly all of them
         labelled = replace(inputs, class_ids=ids)
         add(f"{count} class channels", geometry, gradient, rasterizer.class_channels, labelled, *what, count)

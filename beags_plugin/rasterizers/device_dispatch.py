@@ -43,5 +43,8 @@ class DeviceDispatchRasterizer(Rasterizer):
     def class_channels(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> Tensor:
         return self._backend(inputs).class_channels(inputs, *args, **kwargs)
 
+    def feature_channels(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> Tensor | None:
+        return self._backend(inputs).feature_channels(inputs, *args, **kwargs)
+
     def dominant_gaussian(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> Tensor:
         return self._backend(inputs).dominant_gaussian(inputs, *args, **kwargs)

@@ -210,6 +210,15 @@ class Rasterizer(ABC):
         ``rendering.class_channels_by_threes`` does it.
         """
 
+    def feature_channels(
+        self, inputs: SurfelInputs, features: Tensor, camera: Camera, settings: RasterSettings
+    ) -> Tensor | None:
+        """Return what ``rendering.draw_features`` says, in one pass; None where three channels at a time cost less.
+
+        Surfels whose features are not finite have such colours too.
+        """
+        return None
+
     @abstractmethod
     def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
         """Return [H, W] int32, the index of the surfel with the largest w_i (ties to the nearer); -1 where none is."""

@@ -157,11 +157,17 @@ class NativeRasterizer(KernelRasterizer):
         """See ``Rasterizer.class_channels``."""
         inputs = inputs.checked()
         map_ids(inputs, num_classes)
-        floats = [getattr(inputs, name) for name in FLOATS]
-        found: Any = _ClassChannels.apply(
-            inputs.detached(), camera, settings, num_classes, *floats, inputs.screen_shift
-        )
-        return found
+        return _channels(inputs, camera, settings, num_classes, None)
+
+    def feature_channels(
+        self, inputs: SurfelInputs, features: Tensor, camera: Camera, settings: RasterSettings
+    ) -> Tensor | None:
+        """See ``Rasterizer.feature_channels``; up to 3 channels cost least as the colours of an image."""
+        inputs, count = inputs.checked(), features.shape[1]
+        if count <= 3:
+            return None
+        padded = torch.nn.functional.pad(features, (0, -count % 4)).contiguous()
+        return _channels(inputs, camera, settings, 0, padded)[..., :count]
 
     @torch.no_grad()
     def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
@@ -172,26 +178,48 @@ class NativeRasterizer(KernelRasterizer):
         return indices
 
 
-class _ClassChannels(torch.autograd.Function):
+def _channels(
+    inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int, features: Tensor | None
+) -> Tensor:
+    floats = [getattr(inputs, name) for name in FLOATS]
+    found: Any = _Channels.apply(
+        inputs.detached(), camera, settings, num_classes, features, *floats, inputs.screen_shift
+    )
+    return found
+
+
+class _Channels(torch.autograd.Function):
+    """Channels of classes or, if there are any, of features."""
+
     @staticmethod
-    def forward(ctx, inputs, camera, settings, num_classes, *floats):
+    def forward(ctx, inputs, camera, settings, num_classes, features, *floats):
         frame, _ = _frame(inputs, camera, settings)
-        channels = inputs.means.new_zeros(camera.height, camera.width, num_classes)
-        frame.class_channels(num_classes, channels, any(ctx.needs_input_grad), extension.threads())
-        ctx.save_for_backward(*floats)
+        count = num_classes if features is None else features.shape[1]
+        channels = inputs.means.new_zeros(camera.height, camera.width, count)
+        call = (channels, any(ctx.needs_input_grad), extension.threads())
+        if features is None:
+            frame.class_channels(num_classes, *call)
+        else:
+            frame.feature_channels(features, *call)
+        ctx.save_for_backward(features, *floats)
         ctx.frame = frame
         return channels
 
     @staticmethod
     @once_differentiable
     def backward(ctx, gradient):
-        *floats, _ = ctx.saved_tensors
+        features, *floats, _ = ctx.saved_tensors
         means, quats, log_scales, opacity_logits, _ = floats
-        *geometry, _, shift = ctx.needs_input_grad[4:]
-        likes = zip((means, quats, log_scales, opacity_logits, means[:, :2]), (*geometry, shift), strict=True)
-        found = [value.new_empty(value.shape) if wanted else None for value, wanted in likes]
-        ctx.frame.class_channels_backward(*floats, gradient.contiguous(), *found, extension.threads())
-        return None, None, None, None, *found[:4], None, found[4]
+        wants_features, *geometry, _, shift = ctx.needs_input_grad[4:]
+        values = (means, quats, log_scales, opacity_logits, means[:, :2], features)
+        likes = zip(values, (*geometry, shift, wants_features), strict=True)
+        *found, g_features = [value.new_empty(value.shape) if wanted else None for value, wanted in likes]
+        if features is None:
+            ctx.frame.class_channels_backward(*floats, gradient.contiguous(), *found, extension.threads())
+        else:
+            those = (features, gradient.contiguous(), *found, g_features)
+            ctx.frame.feature_channels_backward(*floats, *those, extension.threads())
+        return None, None, None, None, g_features, *found[:4], None, found[4]
 
 
 def _listed(found: Any, like: Tensor) -> tuple[Tensor, Tensor]:

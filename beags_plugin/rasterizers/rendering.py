@@ -58,11 +58,19 @@ def draw_features(
     """Render any number of channels, [H, W, F] sum_i w_i f_i: no background, not divided by A.
 
     features: [N, F] of the inputs' dtype, F at least 1. Differentiable in them and in the inputs but the colours.
-    Three channels are rendered at a time, which every backend can.
+    A surfel with a number that is not finite, be it a colour or a feature, has no part in any channel. Three channels
+    are rendered at a time, which every backend can, unless it has a ``feature_channels``.
     """
+    channels, n = features.shape[-1], len(inputs.means)
+    if features.shape != (n, channels) or features.dtype != inputs.means.dtype:
+        expected, got = f"[{n}, F] {inputs.means.dtype}", f"{list(features.shape)} {features.dtype}"
+        raise ValueError(f"features must be {expected}, not {got}")
+    broken = sum((0 * value.detach()).sum(dim=1, keepdim=True) for value in (features, inputs.colors))  # NaN, else 0
+    inputs = replace(inputs, colors=inputs.colors.detach() + broken)
+    if (drawn := rasterizer.feature_channels(inputs, features, camera, settings)) is not None:
+        return drawn
     settings = replace(settings, geometry=False, distortion=False)
-    channels = features.shape[1]
-    padded = torch.nn.functional.pad(features, (0, -channels % 3))
+    padded = torch.nn.functional.pad(features + broken, (0, -channels % 3))
     nothing = features.new_zeros(3)
     images = [
         rasterizer.rasterize(replace(inputs, colors=padded[:, first : first + 3]), camera, settings, nothing).color

@@ -49,7 +49,7 @@ def leaves_of(scene):
     return leaves
 
 
-@pytest.mark.parametrize("channels", [1, 3, 7])
+@pytest.mark.parametrize("channels", [1, 2, 16, 17])
 @pytest.mark.parametrize("name", SCENES)
 def test_gradients_are_the_references(name, channels, rasterizer):
     scene, g = SCENES[name](), torch.Generator().manual_seed(5)
@@ -63,6 +63,38 @@ def test_gradients_are_the_references(name, channels, rasterizer):
         assert drawn.shape == factors.shape
         found.append([drawn, *torch.autograd.grad((drawn * factors).sum(), [*leaves.values(), those])])
     assert all(error(a.detach(), b.detach()) < 1e-9 for a, b in zip(*found, strict=True))
+    alone = features.clone().requires_grad_()
+    drawn = draw_features(rasterizer, scene.inputs, alone, scene.camera, scene.settings)
+    assert error(torch.autograd.grad((drawn * factors).sum(), alone)[0], found[1][-1]) < 1e-9
+
+
+@pytest.mark.parametrize("spoilt", ["means", "colors", "features"])
+@pytest.mark.parametrize("channels", [4, 5])
+def test_broken_surfels_have_no_part_in_the_channels(channels, spoilt, rasterizer):
+    scene, g = make_scene(), torch.Generator().manual_seed(5)
+    features = torch.randn(len(scene.inputs.means), channels, generator=g, dtype=torch.float64)
+    whole, leaves = torch.arange(len(features)) != 3, leaves_of(scene)
+    with torch.no_grad():
+        {**leaves, "colors": scene.inputs.colors, "features": features}[spoilt][3, 1] = float("inf")
+    others = {name: value.detach()[whole].requires_grad_() for name, value in leaves.items()}
+    rest = replace(scene.inputs, colors=scene.inputs.colors[whole], class_ids=scene.inputs.class_ids[whole], **others)
+    found = []
+    for inputs, those, of in (
+        (replace(scene.inputs, **leaves), features.requires_grad_(), leaves),
+        (rest, features.detach()[whole].requires_grad_(), others),
+    ):
+        drawn = draw_features(rasterizer, inputs, those, scene.camera, scene.settings)
+        found.append([drawn, *torch.autograd.grad(drawn.square().sum(), [*of.values(), those])])
+    (drawn, *gradients), (expected, *true) = found
+    torch.testing.assert_close(drawn, expected)
+    assert all((a[3] == 0).all() and error(a[whole], b) < 1e-9 for a, b in zip(gradients, true, strict=True))
+
+
+def test_features_of_another_dtype_or_number_are_refused(rasterizer):
+    scene = make_scene()
+    for wrong in (torch.zeros(len(scene.inputs.means), 5), torch.zeros(3, 5, dtype=torch.float64)):
+        with pytest.raises(ValueError, match="features must be"):
+            draw_features(rasterizer, scene.inputs, wrong, scene.camera, scene.settings)
 
 
 @pytest.mark.parametrize(("name", "step"), [*((name, 1) for name in SCENES), ("wide", 7)])
@@ -91,9 +123,14 @@ def test_float32_stays_within_its_band(rasterizer):
     for backend, scene in ((rasterizer, make_scene().to(torch.float32)), (TorchRasterizer(), make_scene())):
         leaves = leaves_of(scene)
         inputs = replace(scene.inputs, **leaves)
-        drawn = backend.class_channels(inputs, scene.camera, scene.settings, CLASSES)
-        found.append([drawn.detach(), *torch.autograd.grad(drawn.square().sum(), list(leaves.values()))])
-    assert found[0][0].dtype == torch.float32
+        found.append([])
+        features = torch.randn(len(inputs.means), 17, generator=torch.Generator().manual_seed(5)).to(inputs.means)
+        for drawn in (
+            backend.class_channels(inputs, scene.camera, scene.settings, CLASSES),
+            draw_features(backend, inputs, features, scene.camera, scene.settings),
+        ):
+            found[-1] += [drawn.detach(), *torch.autograd.grad(drawn.square().sum(), list(leaves.values()))]
+    assert all(a.dtype == torch.float32 for a in found[0])
     assert all(error(a, b) < 2e-4 for a, b in zip(*found, strict=True))
 
 

@@ -16,6 +16,7 @@ from raster_scenes import (
 from beags_plugin.ops import cuda_extension, extension
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.native import NativeRasterizer
+from beags_plugin.rasterizers.rendering import draw_features
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 from beags_plugin.system.errors import UserError
 
@@ -45,9 +46,13 @@ def test_any_number_of_threads_gives_the_same_bits(dtype, threads):
         results += list(gradients(backend, scene).values())
         means = scene.inputs.means.clone().requires_grad_()
         inputs = replace(scene.inputs, means=means)
+        products, features = (scene.inputs, scene.camera, scene.settings), inputs.colors.repeat(1, 6).requires_grad_()
         channels = backend.class_channels(inputs, scene.camera, scene.settings, CLASSES)
         results += [channels.detach(), torch.autograd.grad(channels.square().sum(), means)[0]]
-        products = (scene.inputs, scene.camera, scene.settings)
+        for these in (inputs, inputs.detached()):
+            channels = draw_features(backend, these, features, scene.camera, scene.settings)
+            leaves = [features, *([means] if these is inputs else [])]
+            results += [channels.detach(), *torch.autograd.grad(channels.square().sum(), leaves)]
         results += [backend.class_contributions(*products, scene.target, CLASSES), backend.dominant_gaussian(*products)]
         results += list(backend.class_map(*products, CLASSES))
         results += backend.sparse_class_pixel_counts(*products, scene.target, CLASSES, 0.1)

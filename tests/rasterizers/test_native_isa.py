@@ -17,6 +17,7 @@ from raster_scenes import CLASSES, FLOATS, OUTPUTS, make_scene
 
 from beags_plugin.rasterizers import native
 from beags_plugin.rasterizers.native import NativeRasterizer
+from beags_plugin.rasterizers.rendering import draw_features
 
 needs_native = pytest.mark.skipif(
     NativeRasterizer.unavailable() is not None, reason=str(NativeRasterizer.unavailable())
@@ -45,7 +46,7 @@ def run(isa, program, *args):
 
 
 def draw():
-    """Images, gradients, contributions and pixel counts of a scene across tiles, in float32 and float64."""
+    """Images, channels, gradients, contributions and pixel counts of a scene across tiles, in float32 and float64."""
     results = []
     for dtype in (torch.float32, torch.float64):
         scene = make_scene(count=120, width=71, height=51, seed=3, size=-1.8).to(dtype)
@@ -53,10 +54,14 @@ def draw():
         render = scene.draw(NativeRasterizer(), **leaves)
         images = [getattr(render, name) for name in OUTPUTS]
         inputs = replace(scene.inputs, **leaves)
-        images.append(NativeRasterizer().class_channels(inputs, scene.camera, scene.settings, CLASSES))
+        what, features = (scene.camera, scene.settings), inputs.quats.repeat(1, 4)[:, :13]
+        images.append(NativeRasterizer().class_channels(inputs, *what, CLASSES))
+        images.append(draw_features(NativeRasterizer(), inputs, features, *what))
+        alone = draw_features(NativeRasterizer(), inputs.detached(), features, *what)
+        tables = [torch.autograd.grad(alone.square().sum(), leaves["quats"], retain_graph=True)[0]]
         grads = torch.autograd.grad(sum(image.square().sum() for image in images), list(leaves.values()))
         what = (scene.inputs, scene.camera, scene.settings, scene.target, CLASSES)
-        tables = [*NativeRasterizer().sparse_class_contributions(*what)]
+        tables += NativeRasterizer().sparse_class_contributions(*what)
         for least in (0.0, 0.1):
             tables += NativeRasterizer().sparse_class_pixel_counts(*what, least)
         results.append([image.detach() for image in images] + list(grads) + tables)

@@ -38,6 +38,7 @@ from beags_plugin.losses.occupancy import OccupancyLoss
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.rasterizers import make_rasterizer, torch_reference
 from beags_plugin.rasterizers.interface import MIN_TRANSMITTANCE, Rasterizer
+from beags_plugin.rasterizers.rendering import draw_features
 from beags_plugin.system.progress import progress_bar
 from benchmarks.degenerate import FLOATS, Scene, degenerate_scene  # noqa: E402
 
@@ -83,14 +84,19 @@ def examine(number: int) -> Finding:
 
 
 def everything(rasterizer: Rasterizer, scene: Scene) -> dict[str, Tensor]:
-    """Return all outputs, their gradients, contributions and class map, by name."""
+    """Return all outputs, channels, their gradients, contributions, pixel counts and class map, by name."""
     leaves = {name: getattr(scene.inputs, name).clone().requires_grad_() for name in FLOATS}
     leaves["background"] = scene.background.clone().requires_grad_()
+    generator = torch.Generator().manual_seed(1)
+    features = torch.randn(len(scene.inputs.means), 5, generator=generator, dtype=torch.float64)
+    leaves["features"] = features.to(scene.inputs.means).requires_grad_()
     inputs = replace(scene.inputs, **{name: leaves[name] for name in FLOATS})
     drawn = rasterizer.rasterize(inputs, scene.camera, scene.settings, leaves["background"], scene.target)
     images = {name: getattr(drawn, name) for name in OUTPUTS if getattr(drawn, name) is not None}
+    few = replace(inputs, class_ids=scene.inputs.class_ids % 5)
+    images["class channels"] = rasterizer.class_channels(few, scene.camera, scene.settings, 5)
+    images["features"] = draw_features(rasterizer, inputs, leaves["features"], scene.camera, scene.settings)
     results = {name: image.detach() for name, image in images.items()}
-    generator = torch.Generator().manual_seed(1)
     loss = sum(
         (image * torch.randn(image.shape, generator=generator, dtype=torch.float64).to(image)).sum()
         for image in images.values()
@@ -101,10 +107,15 @@ def everything(rasterizer: Rasterizer, scene: Scene) -> dict[str, Tensor]:
         results[f"gradient of {name}"] = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
     results["broken"] = torch.tensor(drawn.num_nonfinite)
     arguments = (scene.inputs, scene.camera, scene.settings)
-    keys, sums = rasterizer.sparse_class_contributions(*arguments, scene.target, scene.num_classes)
-    surfels, classes = keys // scene.num_classes, keys % scene.num_classes
-    for name, values in (("contributions", sums), ("contributions by class", sums * torch.cos(classes.to(sums)))):
-        results[name] = scene.inputs.means.new_zeros(len(scene.inputs.means)).index_add(0, surfels, values)
+    what = (*arguments, scene.target, scene.num_classes)
+    for name, (keys, sums) in (
+        ("contributions", rasterizer.sparse_class_contributions(*what)),
+        ("pixel counts", rasterizer.sparse_class_pixel_counts(*what, 0.1)),
+    ):
+        surfels, classes = keys // scene.num_classes, keys % scene.num_classes
+        for which, values in ((name, sums), (f"{name} by class", sums * torch.cos(classes.to(scene.inputs.means)))):
+            zeros = scene.inputs.means.new_zeros(len(scene.inputs.means))
+            results[which] = zeros.index_add(0, surfels, values.to(zeros))
     results["share"] = rasterizer.class_map(*arguments, scene.num_classes)[1]
     return results
 

@@ -213,6 +213,7 @@ BEAGS_INLINE void walk_back(const Job<T>& job, int tile, PixelGradients<T>* pixe
       const T* record = job.records + static_cast<int64_t>(pairs[k - kPrefetched].record) * kSize;
       __builtin_prefetch(record, 1);
       __builtin_prefetch(record + kSize - 1, 1);
+      if (kWithFeatures) __builtin_prefetch(feature_record(job, pairs[k - kPrefetched]), 1);
     }
     if (k < waking.next) waking.wake(k);
     const Splat<T>& splat = job.splats[pairs[k].splat];
@@ -261,7 +262,7 @@ void backward_colors(const Job<T>& job, int tile) {
   if (kOfFeatures) read_feature_gradients(job, tile);
   load_gradients<0>(job, tile, pixels);
   const auto add_colors = [&job](auto, int, const Splat<T>& s, const Hits<T>& hits, int i, Real<T>, Real<T>,
-                             PixelGradients<T>& p, Vector<T>* sums) __attribute__((always_inline)) {
+                                 PixelGradients<T>& p, Vector<T>* sums) __attribute__((always_inline)) {
     const Real<T> alpha = hits.get(hits.alpha, i), inverse_left = all(T(1)) / (all(T(1)) - alpha);
     const Real<T> before = load(p.transmittance) * inverse_left, w = alpha * before;
     store(p.transmittance, before);

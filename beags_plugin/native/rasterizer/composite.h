@@ -141,6 +141,7 @@ template <class T>
 BEAGS_INLINE void prefetch(const Job<T>& job, const Pair& pair) {
   const char* splat = reinterpret_cast<const char*>(job.splats + pair.splat);
   for (unsigned line = 0; line < sizeof(Splat<T>); line += 64) __builtin_prefetch(splat + line);
+  if (job.num_features) __builtin_prefetch(job.features + static_cast<int64_t>(pair.splat) * job.num_features);
 }
 
 // The state of a tile on its way front to back.

@@ -47,8 +47,9 @@ void feature_channels(const Job<T>& job, int tile) {
                      const T* f = features_of(job, s);
                      T* sum = work_of(job, hits.pack[i]);
                      for (int first = 0; first < job.num_features; first += 4) {
-                       BEAGS_UNROLL for (int c = first; c < first + 4; ++c) {
-                         store(sum + c * kLanes<T>, fma(w, all(f[c]), load(sum + c * kLanes<T>)));
+                       BEAGS_UNROLL for (int c = 0; c < 4; ++c) {
+                         T* to = sum + (first + c) * kLanes<T>;
+                         store(to, fma(w, all(f[first + c]), load(to)));
                        }
                      }
                    });
@@ -71,23 +72,28 @@ BEAGS_INLINE Real<T> add_features(const Job<T>& job, const Splat<T>& s, int pack
   Vector<T>* sums = pair_sums(job);
   Real<T> g_w[2] = {all(T(0)), all(T(0))};  // two chains of dependent sums are shorter than one
   for (int first = 0; first < job.num_features; first += 4) {
-    BEAGS_UNROLL for (int c = first; c < first + 4; ++c) {
-      const Real<T> g = load(gradients + c * kLanes<T>);
-      g_w[c % 2] = fma(g, all(f[c]), g_w[c % 2]);
-      add(sums[c], w, g);
+    BEAGS_UNROLL for (int c = 0; c < 4; ++c) {
+      const Real<T> g = load(gradients + (first + c) * kLanes<T>);
+      g_w[c % 2] = fma(g, all(f[first + c]), g_w[c % 2]);
+      add(sums[first + c], w, g);
     }
   }
   return g_w[0] + g_w[1];
 }
 
+template <class T>
+BEAGS_INLINE T* feature_record(const Job<T>& job, const Pair& pair) {
+  return job.feature_records + static_cast<int64_t>(pair.record) * job.num_features;
+}
+
 // Writes a pair's sums and clears them.
 template <class T>
 BEAGS_INLINE void write_feature_record(const Job<T>& job, const Pair& pair) {
-  T* record = job.feature_records + static_cast<int64_t>(pair.record) * job.num_features;
+  T* record = feature_record(job, pair);
   Vector<T>* sums = pair_sums(job);
   for (int first = 0; first < job.num_features; first += 4) {
     Register<T>::sum4(sums + first, record + first);
-    for (int c = first; c < first + 4; ++c) sums[c] = Vector<T>{};
+    for (int c = 0; c < 4; ++c) sums[first + c] = Vector<T>{};
   }
 }
 

@@ -123,7 +123,7 @@ struct Job {
   const T* features;           // [N, num_features]
   T* channels;                 // [height, width, num_features]
   const T* channel_gradients;  // the same
-  T* feature_work;             // of one tile: num_features times 256 pixels, then num_features registers, at most 16 lanes
+  T* feature_work;             // of one tile: num_features times 256 pixels, then times a register
   T* feature_records;          // [pairs, num_features]
 };
 
