@@ -24,6 +24,18 @@ using namespace nb::literals;
 namespace beags {
 namespace {
 
+template <class T, class In>
+Inputs<T> make_inputs(const In& means, const In& quats, const In& log_scales, const In& opacity_logits,
+                      const In& colors, const int32_t* class_ids) {
+  return {static_cast<int64_t>(means.shape(0)),
+          means.data(),
+          quats.data(),
+          log_scales.data(),
+          opacity_logits.data(),
+          colors.data(),
+          class_ids};
+}
+
 template <class T>
 void bind(nb::module_& m, const char* name) {
   using In = Array<const T>;
@@ -44,13 +56,7 @@ void bind(nb::module_& m, const char* name) {
              const Matrix& viewmat, const Matrix& k, int width, int height, double near_plane, double far_plane,
              Array<bool> visible, int threads) {
             const View view = make_view(viewmat, k, width, height, near_plane, far_plane);
-            const Inputs<T> inputs{static_cast<int64_t>(means.shape(0)),
-                                   means.data(),
-                                   quats.data(),
-                                   log_scales.data(),
-                                   opacity_logits.data(),
-                                   colors.data(),
-                                   class_ids.data()};
+            const Inputs<T> inputs = make_inputs<T>(means, quats, log_scales, opacity_logits, colors, class_ids.data());
             nb::gil_scoped_release release;
             new (self) Frame<T>(view, inputs, visible.data(), threads);
           },
@@ -74,13 +80,7 @@ void bind(nb::module_& m, const char* name) {
              In color, In alpha, In depth, In median_depth, In normal, In distortion, In boundary, Out g_means,
              Out g_quats, Out g_log_scales, Out g_opacity_logits, Out g_colors, Out g_screen_shift, Out g_background,
              int threads) {
-            const Inputs<T> inputs{static_cast<int64_t>(means.shape(0)),
-                                   means.data(),
-                                   quats.data(),
-                                   log_scales.data(),
-                                   opacity_logits.data(),
-                                   colors.data(),
-                                   nullptr};
+            const Inputs<T> inputs = make_inputs<T>(means, quats, log_scales, opacity_logits, colors, nullptr);
             nb::gil_scoped_release release;
             self.backward(inputs, target.data(),
                           {color.data(), alpha.data(), depth.data(), median_depth.data(), normal.data(),
@@ -133,13 +133,7 @@ void bind(nb::module_& m, const char* name) {
           "class_channels_backward",
           [](const Frame<T>& self, In means, In quats, In log_scales, In opacity_logits, In colors, In gradient,
              Out g_means, Out g_quats, Out g_log_scales, Out g_opacity_logits, Out g_screen_shift, int threads) {
-            const Inputs<T> inputs{static_cast<int64_t>(means.shape(0)),
-                                   means.data(),
-                                   quats.data(),
-                                   log_scales.data(),
-                                   opacity_logits.data(),
-                                   colors.data(),
-                                   nullptr};
+            const Inputs<T> inputs = make_inputs<T>(means, quats, log_scales, opacity_logits, colors, nullptr);
             nb::gil_scoped_release release;
             self.class_channels_backward(inputs, static_cast<int>(gradient.shape(2)), gradient.data(),
                                          {g_means.data(), g_quats.data(), g_log_scales.data(), g_opacity_logits.data(),
@@ -161,13 +155,7 @@ void bind(nb::module_& m, const char* name) {
           [](const Frame<T>& self, In means, In quats, In log_scales, In opacity_logits, In colors, In features,
              In gradient, Out g_means, Out g_quats, Out g_log_scales, Out g_opacity_logits, Out g_screen_shift,
              Out g_features, int threads) {
-            const Inputs<T> inputs{static_cast<int64_t>(means.shape(0)),
-                                   means.data(),
-                                   quats.data(),
-                                   log_scales.data(),
-                                   opacity_logits.data(),
-                                   colors.data(),
-                                   nullptr};
+            const Inputs<T> inputs = make_inputs<T>(means, quats, log_scales, opacity_logits, colors, nullptr);
             nb::gil_scoped_release release;
             self.feature_channels_backward(inputs, features.data(), static_cast<int>(features.shape(1)),
                                            gradient.data(),
