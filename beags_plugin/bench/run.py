@@ -90,9 +90,11 @@ def adapted(experiment: Experiment, options: ExperimentOptions) -> Experiment:
     """Return the experiment with another preset or, for --quick, so small that its figures mean nothing."""
     if options.variants:
         known = [variant.name for variant in experiment.variants]
+        known += [name for name in dict.fromkeys(each.split(", ")[0] for each in known) if name not in known]
         for name in options.variants:
             check_choice(name, known, "variant", f" of {experiment.name}")
-        chosen = tuple(v for v in experiment.variants if v.name in options.variants or v.name == experiment.reference)
+        wanted = {*options.variants, experiment.reference}  # "cob-gs" stands for "cob-gs, one scene" too
+        chosen = tuple(v for v in experiment.variants if {v.name, v.name.split(", ")[0]} & wanted)
         experiment = dataclasses.replace(experiment, variants=chosen)
     if options.preset is not None:
         experiment = dataclasses.replace(experiment, preset=options.preset)
@@ -141,8 +143,8 @@ def rows_of(runs: Sequence[VariantTrial], outcomes: dict[str, Outcome]) -> list[
         assert run.trial.base is not None
         base, found = outcomes[run.trial.base.digest], [outcomes[trial.digest] for trial in run.trials]
         failed = next((outcome.failed for outcome in found if outcome.failed), None)
-        result = found[0].result
-        if run.objects and failed is None:
+        result = found[0].result if failed is None else None
+        if run.objects and result is not None:
             results = zip(run.objects, (outcome.result for outcome in found), strict=True)
             result = merged({name: each for name, each in results if each is not None})
         rows.append(make_row(run.variant, run.scene.name, run.seed, base.result, result, failed))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from beags_plugin.labels.classes import read_mask, write_mask
 from beags_plugin.system.digests import folder_digest, value_digest
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.progress import progress_bar
+from beags_plugin.system.whole_files import write_text_atomically
 
 SEEDS = {"choosing": (0, 1, 2), "reporting": (100, 101, 102, 103, 104)}
 """Seeds of generated scenes. No choice is made by a result on those for reporting."""
@@ -139,6 +141,7 @@ def class_masks(scene: TrialScene, count: int, folder: Path) -> Path:
         nearest = cKDTree(xy[z > 0].numpy()).query(pixels.numpy())[1]
         labels = 1 + cells[before][nearest].reshape(camera.height, camera.width)
         write_mask(target / f"{image.stem}.png", labels.astype(np.uint16))
+    write_text_atomically(json.dumps({c: f"cell {c}" for c in range(1, count + 1)}), target / "classes.json")
     (target / "complete").touch()
     return target
 

@@ -56,6 +56,8 @@ def tables(experiment: Experiment, rows: Sequence[ResultRow]) -> list[Table | st
     printed.append("Objects: PSNR over the pixels of objects, but those next to the background.")
     printed.append("Seconds of stages are wall time; CPU: of the whole trial after its base, all threads.")
     printed.append("Memory: the peak of the trial's process, and what of it the loaded program does not take.")
+    if any(row.variant.per_object for row in rows):
+        printed.append("Costs of a scene per object are sums over the objects, each with a preparation of its own.")
     if experiment.reference is not None:
         printed.append(f"BIoU error left: (100 - extracted BIoU) as a share of that of {experiment.reference!r}.")
     printed += [line for sweep in experiment.sweeps if (line := memory_line(averaged, sweep)) is not None]

@@ -92,6 +92,7 @@ def run(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
     from beags_plugin.plugin.runs.launch import train
     from beags_plugin.plugin.runs.layout import newest_checkpoint
     from beags_plugin.plugin.runs.prepared import grid_state
+    from beags_plugin.refiners import make_refiner
     from beags_plugin.system.memory import peak_memory_mb
 
     start_memory_mb = peak_memory_mb()
@@ -104,7 +105,9 @@ def run(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
     result["own_memory_mb"] = result["peak_memory_mb"] - start_memory_mb
     checkpoint = read_checkpoint(newest_checkpoint(config.get_checkpoint_dir()))
     result["gaussians"] = len(checkpoint["pipeline"]["_model.class_ids"])
-    result["steps"] = model.base_steps + int(checkpoint["pipeline"]["_model.refined_steps"])
+    idle = make_refiner(model.refiner, model.refiner_options).leaves_base
+    refined = 0 if idle else int(checkpoint["pipeline"]["_model.refined_steps"])
+    result["steps"] = model.base_steps + refined
     if model.refine_steps == 0:
         return result
     del result["seconds"]["base training"]  # that of loading one
@@ -135,6 +138,8 @@ def trial_config(request: dict[str, Any], run_folder: Path) -> BeagsTrainerConfi
     ]  # a variant may shrink the images further
     if request["masks"] is not None:
         parser.masks_path = Path(request["masks"])
+        if (names := parser.masks_path / "classes.json").exists():  # of other objects, which no truth knows
+            parser.classes_path, parser.ground_truth_path = names, parser.masks_path / "no_truth"
     if request["base"] is not None:
         config.load_dir = Path(request["base"]) / "nerfstudio_models"
     return config

@@ -188,8 +188,9 @@ def prepare(
         grid = grid.only(asked if background_voxels else asked[asked != 0])
         seconds["voxel grids"] = time.perf_counter() - start
         summary.append(f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {k})")
-    with _timed("objects", seconds):
-        members = refiner.members(scene)
+    start = time.perf_counter()
+    if (members := refiner.members(scene)) is not None:
+        seconds["objects"] = time.perf_counter() - start
     return Preparation(masks.labels, masks.confidence, assignment, grid, edited, members, summary, seconds)
 
 

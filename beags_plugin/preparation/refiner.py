@@ -73,6 +73,11 @@ class Refiner:
         return False
 
     @property
+    def leaves_base(self) -> bool:
+        """Return whether every parameter stays as it is in the base."""
+        return not self.trains and type(self).own_training is Refiner.own_training
+
+    @property
     def joins_base(self) -> bool:
         """Return whether its own training makes the steps of the base too, with ``seed_classes``."""
         return False

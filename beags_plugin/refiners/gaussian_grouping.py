@@ -16,6 +16,7 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.preparation.own_training import Edit, OwnTraining, Terms, TrainedScene
@@ -78,7 +79,7 @@ class IdentityTraining(OwnTraining):
 
     def terms(self, inputs: LossInputs, step: int, base: Callable[[], Terms]) -> Terms:
         terms = base()
-        if inputs.labels is not None:
+        if inputs.labels is not None and bool((inputs.labels != IGNORE).any()):  # a view without a mask is all IGNORE
             labels = self.ranks.ranked_labels(inputs.labels)
             drawn = self._drawn(inputs.surfels, inputs.camera)
             terms["identities"] = identity_codes.pixel_loss(self.classifier, drawn, labels)

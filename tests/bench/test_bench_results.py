@@ -177,3 +177,7 @@ def test_rows_come_from_outcomes_in_order(experiment):
     outcomes = {trial.base.digest: Outcome(Path("x"), BASE), trial.digest: Outcome(Path("y"), result(0.5))}
     (row,) = rows_of([VariantTrial(variant, scene(), 42, (trial,))], outcomes)
     assert row.scene == "a" and row.seed == 42 and row.figures["seconds base training"] == 60.0
+    other = dataclasses.replace(trial, seed=43)
+    outcomes[other.digest] = Outcome(Path("z"), None, "no memory")
+    (row,) = rows_of([VariantTrial(variant, scene(), 42, (trial, other), ("cup", "box"))], outcomes)
+    assert row.failed == "no memory" and row.figures["extracted_iou_after"] is None, "one object of two failed"

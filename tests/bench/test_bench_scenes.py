@@ -18,6 +18,7 @@ from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.run import adapted, scenes_of
 from beags_plugin.bench.scenes import TrialScene, class_masks, damaged_masks, given_scenes
 from beags_plugin.bench.trials import plan, steps_of
+from beags_plugin.bench.worker import trial_config
 from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.sample.writer import SampleConfig, write_sample
 from beags_plugin.system.errors import UserError
@@ -56,6 +57,11 @@ def test_mild_damage_is_what_the_sample_has_and_none_is_the_truth(sample, tmp_pa
 def test_masks_of_any_number_of_classes_cover_the_training_views(sample, tmp_path):
     found = read_all(class_masks(sample, 5, tmp_path))
     assert len(found) == SMALL["num_train"]
+    made = class_masks(sample, 5, tmp_path)
+    request = {"preset": "beags-tiny", "overrides": {}, "seed": 0, "data": sample.data, "downscale": 1.0, "base": None}
+    config = trial_config({**request, "masks": str(made)}, tmp_path / "run")
+    outputs = config.data_config.dataparser.setup().get_dataparser_outputs("test")
+    assert len(outputs.metadata["classes"]) == 6 and not outputs.metadata["ground_truth"]
     assert set(np.unique(np.concatenate([mask.ravel() for mask in found.values()]))) == {1, 2, 3, 4, 5}
     assert all(len(np.unique(mask)) >= 2 for mask in found.values())
 

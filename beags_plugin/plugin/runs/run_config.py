@@ -86,7 +86,11 @@ class RunConfigLoader(yaml.UnsafeLoader):
             if issubclass(kind, Enum) and len(args or ()) == 1:
                 return kind(args[0])
             if newobj and dataclasses.is_dataclass(kind) and not args:
-                return kind.__new__(kind)
+                made = kind.__new__(kind)
+                for each in dataclasses.fields(kind):  # those that the run was made without
+                    if each.default_factory is not dataclasses.MISSING:
+                        made.__dict__[each.name] = each.default_factory()
+                return made
         raise Refused(None, None, f"it calls {suffix}, which no run of beags needs", node.start_mark)
 
     def set_python_instance_state(self, instance: Any, state: Any, unsafe: bool = False) -> None:

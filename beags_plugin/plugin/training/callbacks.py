@@ -90,5 +90,5 @@ def set_learning_rates(model: SceneModel, adam: Adam, configs: dict[str, Any], s
         rate = configs[group["name"]]["optimizer"].lr
         if group["name"] == "means":
             rate = log_linear(*model.config.position_lr, progress) * model.extent_on_host()
-            rate *= model.config.refine_position_lr_factor if refining else 1.0
+            rate *= model.config.refine_position_lr_factor if refining and model.own_training is None else 1.0
         group["lr"] = rate

@@ -67,6 +67,7 @@ class Curves:
         """Measure what a run that was interrupted during the preparation would have measured after the last step."""
         model = self.model  # whose `assigned` may lie on a GPU: it is not asked before it may be True
         asked = self.every > 0 and step > 0 and not self._measured and model.schedule.refining(step)
+        asked = asked and model.own_training is None
         if asked and bool(model.assigned):
             self._objects(step - 1)
 
@@ -81,7 +82,8 @@ class Curves:
             self._boundaries(step)
         done = step + 1
         due = self.every > 0 and (not self._measured or done % self.every == 0 or done == self.last)
-        if due and model.schedule.refining(done) and bool(model.assigned):
+        its_own = model.own_training is None or done == self.last  # of other refiners only the end is theirs
+        if due and its_own and model.schedule.refining(done) and bool(model.assigned):
             self._objects(step)
 
     def _named(self, found: dict[int, float]) -> dict[str, float]:

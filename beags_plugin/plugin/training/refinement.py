@@ -82,7 +82,7 @@ class RefinementSwitch:
     def state(self) -> dict[str, Any]:
         """Return the number of prepared rounds, and whether nerfstudio has evaluated the step; see ``Resumable``."""
         own = self.model.own_training
-        kept = {} if own is None else {"own": own.state()}
+        kept = {} if own is None else {"own": own.state(), "refiner": self._refiner_in_words()}
         return {"rounds": self.rounds, "evaluated": not self._switching, **kept}
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -90,6 +90,18 @@ class RefinementSwitch:
         self.rounds = state["rounds"]
         self._evaluation_due = not state["evaluated"]
         self._own_state = state.get("own")
+        now, began = self._refiner_in_words(), state.get("refiner")
+        if self.rounds > 0 and began != (None if self.refiner.leaves_base or self.refiner.trains else now):
+            raise UserError(
+                f"refinement began with the refiner {began or 'bea or none'}, not with {now}: go on with that, or "
+                f"refine again from {BASE_SNAPSHOT}/nerfstudio_models."
+            )
+
+    def _refiner_in_words(self) -> str:
+        config = self.model.config
+        return " ".join(
+            [config.refiner, *(f"{name}={value}" for name, value in sorted(config.refiner_options.items()))]
+        )
 
     def before_step(self, step: int) -> None:
         """Restore refinement from a checkpoint, or start it where no base step precedes it; or join the base."""
@@ -120,6 +132,12 @@ class RefinementSwitch:
             self._edit(lambda: own.after_step(refined))
             if refined + 1 == self.model.schedule.refine_steps:
                 self._finish(own)
+            elif step + 1 == self.trainer.last_step:
+                CONSOLE.print(
+                    f"The refiner {self.model.config.refiner} was stopped before its end: the objects are those of "
+                    "assignment, not yet its own.",
+                    style="yellow", highlight=False, markup=False, soft_wrap=True,
+                )  # fmt: skip
         if self.wanted and not self.ready and step + 1 == self.model.schedule.base_steps:
             self._switching = True
             self._prepare(step)
@@ -192,6 +210,7 @@ class RefinementSwitch:
 
     def _take_classes(self, assignment: Assignment) -> None:
         self.model.class_ids.copy_(assignment.class_ids)
+        self.model.objects = None  # of another refiner, that the base came from
         self.model.class_margin.copy_(assignment.margin)
         self.model.assigned.fill_(True)
 

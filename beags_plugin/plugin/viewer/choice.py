@@ -107,7 +107,10 @@ def shown(
     if 0.0 < left < 1.0:
         faded = torch.logit(left * opacities(chosen.opacity_logits), eps=1e-6)  # below 1 / 255 is as good as 0
         chosen = replace(chosen, opacity_logits=torch.where(fades[index], faded, chosen.opacity_logits))
-    return Visible(chosen, members.class_ids[index], index)
+    class_ids = members.class_ids[index]
+    if choice.isolated is not None and members.objects is not None:  # shared ones may be shown in another class
+        class_ids = torch.where(members.of(choice.isolated)[index], choice.isolated, class_ids)
+    return Visible(chosen, class_ids, index)
 
 
 def _of_any(members: Membership, classes: frozenset[int]) -> Tensor:

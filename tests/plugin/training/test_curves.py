@@ -132,7 +132,7 @@ def kill_and_resume(config, monkeypatch, where):
     train = BeagsTrainer.train_iteration
     with monkeypatch.context() as patch, pytest.raises(Killed):
         if where == "preparation":
-            patch.setattr(preparation, "assign_classes", killed)
+            patch.setattr(preparation, "contributions", killed)
         patch.setattr(
             BeagsTrainer, "train_iteration", lambda self, step: killed() if step == where else train(self, step)
         )

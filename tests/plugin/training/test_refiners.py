@@ -221,3 +221,44 @@ def test_a_joint_base_needs_masks(tmp_path):
     changes = {**overrides("objectgs", joint=True), "pipeline.model.refine_steps": 0}
     with pytest.raises(UserError, match="no training view has a mask"):
         run_to_end(short_config(data, tmp_path / "run", **changes))
+
+
+def test_a_checkpoint_of_another_refiner_is_refused(data, tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    changes = overrides("trace3d", **OWN["trace3d"])
+    interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, BASE_STEPS + 6), **changes)
+    config = short_config(data, tmp_path / "other", **overrides("gaussian-grouping"))
+    (checkpoint,) = (run / "nerfstudio_models").iterdir()
+    config.load_checkpoint = checkpoint
+    with pytest.raises(UserError, match="refinement began with the refiner trace3d .*, not with gaussian-grouping"):
+        run_to_end(config)
+
+
+def test_objects_of_a_former_refiner_do_not_stay(data, refined, tmp_path):
+    config = short_config(data, tmp_path / "run", **overrides("none"), **{"pipeline.model.base_steps": 0})
+    config.load_dir = refined("flashsplat") / "base/nerfstudio_models"
+    run_to_end(config)
+    assert read_run(tmp_path / "run/config.yml").members.objects is None
+    stopped = short_config(data, tmp_path / "stopped", **overrides("flashsplat", **UNTRAINED["flashsplat"]))
+    stopped.max_num_iterations = BASE_STEPS
+    run_to_end(stopped)
+    config = short_config(data, tmp_path / "again", **overrides("none"), **{"pipeline.model.base_steps": 0})
+    config.load_dir = tmp_path / "stopped/nerfstudio_models"
+    run_to_end(config)
+    for again in ("again", "again/base"):
+        assert read_run(tmp_path / again / "config.yml").members.objects is None
+
+
+def test_a_run_says_that_its_refiner_did_not_end(data, tmp_path, capsys):
+    config = short_config(data, tmp_path / "run", **overrides("trace3d", **OWN["trace3d"]))
+    config.max_num_iterations = BASE_STEPS + 4
+    run_to_end(config)
+    assert "The refiner trace3d was stopped before its end" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_run_of_before_the_options_of_refiners_is_read(refined, tmp_path):
+    from beags_plugin.plugin.runs.run_config import load_run_config
+
+    lines = (refined("none") / "config.yml").read_text().splitlines()
+    (tmp_path / "config.yml").write_text("\n".join(line for line in lines if "refiner_options" not in line))
+    assert load_run_config(tmp_path / "config.yml").model_config.refiner_options == {}
