@@ -26,6 +26,7 @@ TABLE_WIDTH = 220  # a narrow terminal breaks the lines, which is better than ce
 QUICK_SAMPLE = {"width": 96, "height": 72, "num_train": 16, "num_test": 3}
 QUICK_BASE = {"base_steps": 220, "schedule_steps": 0, "densify.start": 50, "densify.stop": 180}
 QUICK_REFINE = {"refine_steps": 10}
+QUICK_MOST = 30  # steps of variants that say how many
 
 
 def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
@@ -103,10 +104,13 @@ def adapted(experiment: Experiment, options: ExperimentOptions) -> Experiment:
         return experiment
     base = {MODEL + key: value for key, value in QUICK_BASE.items()}
     refine = {MODEL + key: value for key, value in QUICK_REFINE.items()}
-    variants = tuple(
-        dataclasses.replace(variant, base={**variant.base, **base}, refine={**refine, **variant.refine})
-        for variant in _thinned(experiment.variants)
-    )
+
+    def short(variant: Variant) -> Variant:
+        changed = {**refine, **variant.refine}
+        changed[MODEL + "refine_steps"] = min(changed[MODEL + "refine_steps"], QUICK_MOST)
+        return dataclasses.replace(variant, base={**variant.base, **base}, refine=changed)
+
+    variants = tuple(map(short, _thinned(experiment.variants)))
     sample = {**experiment.sample, **QUICK_SAMPLE}
     return dataclasses.replace(experiment, variants=variants, sample=sample, samples=experiment.samples[:1])
 

@@ -17,7 +17,7 @@ from beags_plugin.bench.experiment import load_experiment
 from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.run import adapted, scenes_of
 from beags_plugin.bench.scenes import TrialScene, class_masks, damaged_masks, given_scenes
-from beags_plugin.bench.trials import plan, steps_of
+from beags_plugin.bench.trials import MODEL, plan, steps_of
 from beags_plugin.bench.worker import trial_config
 from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.sample.writer import SampleConfig, write_sample
@@ -100,6 +100,8 @@ def test_quick_keeps_the_ends_of_sweeps_and_trains_a_few_steps(experiment):
     assert [v.name for v in quick.variants] == [v.name for v in experiment.variants]  # two points a line are its ends
     longer = adapted(load_experiment("sensitivity"), ExperimentOptions(quick=True))
     assert [v.x for v in longer.variants if v.sweep] == [5.0, 5000.0, 1.0, 1000.0]
+    compared = adapted(load_experiment("compare"), ExperimentOptions(quick=True))
+    assert {v.refine[MODEL + "refine_steps"] for v in compared.variants} == {10, 30}
     trial = plan(quick, [scene()], masks_of(scene()), "code")[1].trial
     assert steps_of(trial) == 7 and steps_of(trial.base) < 300
     with pytest.raises(UserError, match="no preset 'beags-huge'"):
