@@ -79,11 +79,8 @@ def damaged_masks(scene: TrialScene, degree: float, folder: Path) -> Path:
     degradation = degrade.degradation_of_degree(degree)
     code = [Path(str(file)).read_text("utf8") for file in (degrade.__file__, __file__)]
     target = folder / f"masks-{value_digest([scene.digest, scene.seed, degree, code])[:12]}"
-    if (target / "complete").exists():
+    if _is_whole(target):
         return target
-    shutil.rmtree(target, ignore_errors=True)
-    with writing(target):
-        target.mkdir(parents=True)
     parser = BeagsDataParserConfig(data=scene.data).setup()
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
         splits = {split: parser.get_dataparser_outputs(split) for split in ("test", "train")}
@@ -124,11 +121,8 @@ def class_masks(scene: TrialScene, count: int, folder: Path) -> Path:
 
     code = Path(__file__).read_text("utf8")
     target = folder / f"classes-{value_digest([scene.digest, count, code])[:12]}"
-    if (target / "complete").exists():
+    if _is_whole(target):
         return target
-    shutil.rmtree(target, ignore_errors=True)
-    with writing(target):
-        target.mkdir(parents=True)
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
         outputs = BeagsDataParserConfig(data=scene.data).setup().get_dataparser_outputs("train")
     points = outputs.metadata["points3D_xyz"]
@@ -144,6 +138,16 @@ def class_masks(scene: TrialScene, count: int, folder: Path) -> Path:
     write_text_atomically(json.dumps({c: f"cell {c}" for c in range(1, count + 1)}), target / "classes.json")
     (target / "complete").touch()
     return target
+
+
+def _is_whole(target: Path) -> bool:
+    """Return whether a folder of made masks is there; if not, make it empty."""
+    if (target / "complete").exists():
+        return True
+    shutil.rmtree(target, ignore_errors=True)
+    with writing(target):
+        target.mkdir(parents=True)
+    return False
 
 
 def _best_masks(metadata: dict[str, Any], split: str) -> list[tuple[Path | None, str]]:
