@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
+
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
 from beags_plugin.plugin.viewer.pace import Pace
 
@@ -47,6 +50,22 @@ def offer_whole_pictures(controls: Any) -> None:
     """
     offer = controls.update_output_options
     controls.update_output_options = lambda names: offer([name for name in names if name != "gl_z_buf_depth"])
+
+
+def end_rendering(viewer: Viewer, seconds: float = 30.0) -> None:
+    """End the render threads of every page, waiting at most ``seconds`` for each to finish its picture.
+
+    A render thread inside the rasterizer would abort an interpreter that ends.
+    """
+    threads = [
+        thread
+        for thread in threading.enumerate()  # with those whose page is closed already
+        if isinstance(thread, RenderStateMachine) and thread.viewer is viewer
+    ]
+    for thread in threads:
+        thread.running = False
+    for thread in threads:
+        thread.join(seconds)
 
 
 def end_when_interrupted(server: ViserServer) -> None:

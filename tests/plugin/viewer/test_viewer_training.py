@@ -41,16 +41,18 @@ def test_a_training_that_is_watched_ends_as_it_does_unwatched(short_run, tmp_pat
 
     def watched_to_the_end(self):
         last["picture"] = client.wait_for_a_picture()
-        last["alive"] = [machine.is_alive() for machine in self.viewer_state.render_statemachines.values()]
+        last["threads"] = list(self.viewer_state.render_statemachines.values())
+        last["alive"] = [thread.is_alive() for thread in last["threads"]]
         after(self)
 
     monkeypatch.setattr(BeagsTrainer, "train_iteration", first_watched)
     monkeypatch.setattr(BeagsTrainer, "_after_train", watched_to_the_end)
     client.start()
     run_to_end(config)
+    left = [thread.is_alive() for thread in last.pop("threads")]  # one at work would abort the end of the program
     client.close()
     assert not client.is_alive() and not client.errors
-    assert last == {"picture": True, "alive": [True]}
+    assert last == {"picture": True, "alive": [True]} and left == [False]
     assert sum(client.pictures.values()) >= 3 and client.seen["rgb"].std() > 0
     # websockets draw from Python's own generator, the training from none but its own
     assert_same_run(tmp_path / "watched", short_run / "run", but_for="/beags/parts/random/python")
