@@ -65,7 +65,7 @@ def run_demo(
     run = output / "run"
     request = {"preset": preset, "downscale": downscale, "inputs": _digest(scene, output, preset)}
     alone = {**request, "photos": "objects"}
-    if alone in (former := _read_stamp(output), former.get(STARTED)) and not fresh:
+    if scene.turned or (alone in (former := _read_stamp(output), former.get(STARTED)) and not fresh):
         request = alone
     _train_once(scene, output, request, fresh)
     if request != alone and photos_contradict(run):

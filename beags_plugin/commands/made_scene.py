@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -11,29 +10,34 @@ from pathlib import Path
 
 from rich.console import Console
 
+from beags_plugin.commands.made_masks import MADE, check_source, made_masks
 from beags_plugin.commands.process import find_poses
 from beags_plugin.data.layout import fitting_layouts, read_dataset
+from beags_plugin.posing.files import MODEL
 from beags_plugin.posing.photos import check_photos, find_photos, with_masks
+from beags_plugin.posing.process import NothingFits
+from beags_plugin.posing.turned import move_otherwise, objects_seem_turned
 from beags_plugin.posing.video import is_video
-from beags_plugin.system.digests import content_digest, folder_digest, value_digest
+from beags_plugin.system.digests import content_digest, folder_digest
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
-SOURCE = "salient"  # of masks
 MADE_OF = "made_of.json"  # in the scene: the path of its photos
-MADE = "made.json"  # beside the masks: what they were made of, and what they were then
 POSES = ("transforms*.json", "cameras.*", "*/cameras.*")  # of a scene that lacks something, not of photos alone
-UNFINISHED = "unfinished"  # in MADE, while they are being made
 
 
 @dataclass(frozen=True)
 class MadeScene:
-    """A scene to train on: its folder, and the folder that holds masks/ and classes.json if it is another."""
+    """A scene to train on: its folder, and the folder that holds masks/ and classes.json if it is another.
+
+    turned: the objects turned while the room stood, and the poses are theirs.
+    """
 
     data: Path
     labels: Path | None = None
+    turned: bool = False
 
     def options(self) -> list[str]:
         """Return the options of ``beags-data`` that name its masks."""
@@ -69,24 +73,67 @@ def made_scene(data: Path, output: Path) -> MadeScene:
         read_dataset(data)  # says what lacks or is too much
         if _has_masks(data):
             return MadeScene(data)
-        _check_source()
-        return MadeScene(data, _made_masks(data, output / "made"))
+        check_source()
+        return MadeScene(data, made_masks(data, output / "made"))
     found = [] if is_video(data) else find_photos(data)  # says what is wrong with them before anything is fetched
     given = data if any((data / "masks").rglob("*.png")) else None
     scene = output / "scene"
     _check_other(data, scene)
     if given is None:
-        _check_source()
+        check_source()
     elif find_spec("pycolmap") is not None:  # else the next step says so
         with_masks(check_photos(found, scene / "images", progress_bar), given / "masks")
     CONSOLE.print(f"{data} has no poses, so they are computed from the photos.")
-    for line in find_poses(data, scene, nullcontext()):
-        CONSOLE.print(line)
+    own = None
+    try:
+        _print_poses(data, scene)
+    except NothingFits as error:
+        CONSOLE.print("The photos as a whole fit no poses, so poses of the objects alone are tried.")
+        if (own := _scene_of_objects(scene, output / "turned", given)) is None:
+            raise error
     if not (scene / MADE_OF).exists():
         write_text_atomically(json.dumps(str(data.resolve())), scene / MADE_OF)
+    if own is not None:
+        return own
     if given is not None and (scene / MADE).exists():
         (scene / "classes.json").unlink(missing_ok=True)  # of masks that were made when none were given
-    return MadeScene(scene, given or _made_masks(scene, scene))
+    labels = given or made_masks(scene, scene)
+    if objects_seem_turned(scene / MODEL, (labels or scene) / "masks"):
+        CONSOLE.print(
+            "The poses explain few of the objects' features, as if the objects had turned before a room that stands: "
+            "poses of the objects alone are tried."
+        )
+        own = _scene_of_objects(scene, output / "turned", given)
+    return own or MadeScene(scene, labels)
+
+
+def _print_poses(data: Path, scene: Path, masks: Path | None = None) -> None:
+    for line in find_poses(data, scene, nullcontext(), masks):
+        CONSOLE.print(line)
+
+
+def _scene_of_objects(scene: Path, folder: Path, given: Path | None) -> MadeScene | None:
+    """Make a scene in ``folder`` with poses from the objects' features alone.
+
+    scene: with the photos, and with poses of the room if any fit. given: the folder that holds the user's masks/.
+    Returns None, and says why, where the objects show too little for poses, or moved as the room did.
+    """
+    labels = given
+    if labels is None:
+        made_masks(scene / "images", labels := folder / "for_poses")  # of held-out photos too
+    try:
+        _print_poses(scene / "images", folder, labels / "masks")
+    except UserError as error:
+        CONSOLE.print(f"There are none of the objects alone: {error}")
+        return None
+    if (scene / MODEL).exists() and not move_otherwise(folder / MODEL, scene / MODEL):
+        CONSOLE.print(
+            f"Those of the objects alone are alike, or are too few, so the poses in {scene} stay. If the objects did "
+            "turn, take more photos of them or give masks of all that turned (in masks/ beside the photos)."
+        )
+        return None
+    CONSOLE.print("The objects turned before a room that stands: poses and training are of the objects alone.")
+    return MadeScene(folder, given or made_masks(folder, folder), turned=True)
 
 
 def _check_other(data: Path, scene: Path) -> None:
@@ -105,51 +152,3 @@ def _has_masks(data: Path) -> bool:
     parser: BeagsDataParser = BeagsDataParserConfig(data=data).setup()
     masks, folder, _ = parser.mask_files(*parser.posed_views())
     return any(masks) or any(folder.glob("**/*.png"))  # training says what is wrong with their names
-
-
-def _check_source() -> None:
-    """Fetch the weights of the network; raises ``UserError`` where it cannot run."""
-    from beags_plugin.masks.sources.salient import SalientSource, fetch_weights
-
-    if reason := SalientSource.unavailable():
-        raise UserError(f"there are no masks, and none can be made of what stands out: {reason}")
-    fetch_weights()
-
-
-def _made_masks(scene: Path, folder: Path) -> Path | None:
-    """Make the masks of a scene in ``folder``; return it, or None if it is the scene's."""
-    from beags_plugin.masks.sources.salient import SalientSource
-    from beags_plugin.plugin.objects.make_masks import make_masks
-    from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
-
-    config = BeagsDataParserConfig(data=scene)
-    photos, masks = _digest(config.setup().posed_views()[1].images), folder / "masks"
-    made = _read(folder / MADE)
-    there = any(masks.rglob("*.png")) and made.get("masks") != UNFINISHED
-    if there and made.get("photos") != photos and made.get("masks") != folder_digest(masks):
-        CONSOLE.print(f"The masks in {masks} are not as they were made, so they stay: delete them for new ones.")
-    elif not there or made.get("photos") != photos:
-        CONSOLE.print(
-            f"{scene} has no masks, so a network marks what stands out in each photo, as one object "
-            f"(beags masks make --source {SOURCE})."
-        )
-        folder.mkdir(parents=True, exist_ok=True)
-        write_text_atomically(json.dumps({"masks": UNFINISHED}), folder / MADE)
-        for line in make_masks(config, SalientSource(), output=folder, overwrite=True):
-            CONSOLE.print(line)
-        write_text_atomically(json.dumps({"photos": photos, "masks": folder_digest(masks)}), folder / MADE)
-    CONSOLE.print(f"Look at {folder / 'made.png'}. Masks in {masks} that you mend are taken by the next demo.")
-    return None if folder == scene else folder
-
-
-def _digest(photos: Sequence[Path]) -> str:
-    """Digest name, size and time of photos."""
-    return value_digest([[path.name, path.stat().st_size, path.stat().st_mtime_ns] for path in photos])
-
-
-def _read(made: Path) -> dict[str, str]:
-    try:
-        content = json.loads(made.read_text())
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}

@@ -30,21 +30,34 @@ class Process:
     """Folder of id images <photo>.png: only what objects show is used, for turntables, where they turn and the room
     stands."""
 
+    ignore_ids: tuple[int, ...] = ()
+    """Ids in these images that mean "unlabelled", e.g. 255."""
+
     def run(self) -> None:
-        for line in find_poses(self.data, self.output_dir, starting(self), self.masks):
+        for line in find_poses(self.data, self.output_dir, starting(self), self.masks, self.ignore_ids):
             CONSOLE.print(line)
         command = f"ns-train beags-base --data {self.output_dir}"
         if self.masks is not None:
             command = f"ns-train beags-fast --data {self.output_dir} --pipeline.datamanager.photos objects"
+            options = []
             if self.masks.resolve() != (self.output_dir / "masks").resolve():
-                command += f" beags-data --masks-path {self.masks.absolute()}"
+                options += ["--masks-path", str(self.masks.absolute())]
+            if self.ignore_ids:
+                options += ["--ignore-ids", *map(str, self.ignore_ids)]
+            command = " ".join([command, *(["beags-data", *options] if options else [])])
         CONSOLE.print(f"  {command}")
 
 
-def find_poses(data: Path, output: Path, start: AbstractContextManager[None], masks: Path | None = None) -> list[str]:
+def find_poses(
+    data: Path,
+    output: Path,
+    start: AbstractContextManager[None],
+    masks: Path | None = None,
+    ignore_ids: tuple[int, ...] = (),
+) -> list[str]:
     """Write the poses of photos or a video, and their picture, into ``output``; return lines that report them.
 
-    start: shown while what is needed is imported. masks: see ``Process``. Raises ``UserError`` as
+    start: shown while what is needed is imported. masks, ignore_ids: see ``Process``. Raises ``UserError`` as
     ``posing.process.process`` does.
     """
     with start:
@@ -53,7 +66,7 @@ def find_poses(data: Path, output: Path, start: AbstractContextManager[None], ma
         from beags_plugin.pictures.poses import draw_poses
         from beags_plugin.posing.files import APPLIED, camera_to_world
         from beags_plugin.posing.process import REPORT, process
-    report, model = process(data, output, progress_bar, masks)
+    report, model = process(data, output, progress_bar, masks, ignore_ids)
     picture = output / "poses.png"
     if not picture.exists() or picture.stat().st_mtime < (output / REPORT).stat().st_mtime:
         images = [model.images[image_id] for image_id in model.reg_image_ids()]

@@ -34,7 +34,7 @@ def add_features(database: Any, photos: Sequence[Photo], progress: Callable[[int
         looks.append(look_at(grey))
         if photo.key in known:
             continue
-        inside = None if photo.mask is None else _inside(read_id_mask(photo.mask))
+        inside = None if photo.mask is None else _inside(read_id_mask(photo.mask, photo.ignore_ids))
         points, descriptors = _features(finder, grey, inside)
         with pycolmap.DatabaseTransaction(database):  # a photo is there with its features, or not at all
             if _lens_of(photo) not in cameras:

@@ -13,7 +13,7 @@ from urllib.parse import quote
 import numpy as np
 
 from beags_plugin.data.files import IMAGE_SUFFIXES, folder_of_photos, image_size, list_photos, photo_names
-from beags_plugin.system.digests import content_digest
+from beags_plugin.system.digests import content_digest, value_digest
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import Bar, counted
 from beags_plugin.system.reading.images import read_image
@@ -39,7 +39,7 @@ class Photo:
     """A photo of the scene: the file given, the scene's upright copy (or the same), and what the given one's head says.
 
     width, height: in pixels, upright. turned: the given one is not. focal: in pixels, if EXIF tells it. mask: id image
-    of the objects that features may lie on; None for all of the photo.
+    of the objects that features may lie on; None for all of the photo. ignore_ids: those in it that mean "unlabelled".
     """
 
     source: Path
@@ -50,6 +50,7 @@ class Photo:
     focal: float | None
     digest: str
     mask: Path | None = None
+    ignore_ids: tuple[int, ...] = ()
 
     @property
     def key(self) -> str:
@@ -106,8 +107,11 @@ def _checked(source: Path, path: Path) -> Photo:
     return Photo(source, path, width, height, turned != 1, focal, content_digest([source])[:_DIGITS])
 
 
-def with_masks(photos: Sequence[Photo], folder: Path) -> list[Photo]:
-    """Return photos with the id images <stem>.png of a folder; raises ``UserError`` where these do not fit."""
+def with_masks(photos: Sequence[Photo], folder: Path, ignore_ids: tuple[int, ...] = ()) -> list[Photo]:
+    """Return photos with the id images <stem>.png of a folder; raises ``UserError`` where these do not fit.
+
+    ignore_ids: see ``Photo``.
+    """
     found = []
     for photo in photos:
         mask = folder / f"{photo.path.stem}.png"
@@ -124,7 +128,9 @@ def with_masks(photos: Sequence[Photo], folder: Path) -> list[Photo]:
                 f"the mask {mask} is {size[0]}x{size[1]} pixels but its photo {photo.width}x{photo.height}: make it "
                 "from the photo as it is."
             )
-        found.append(replace(photo, mask=mask, digest=content_digest([photo.source, mask])[:_DIGITS]))
+        content = content_digest([photo.source, mask])
+        digest = (value_digest([content, *ignore_ids]) if ignore_ids else content)[:_DIGITS]
+        found.append(replace(photo, mask=mask, ignore_ids=ignore_ids, digest=digest))
     if not any(photo.mask for photo in found):
         raise UserError(
             f"no mask in {folder} has the name of a photo ({photos[0].path.stem}.png, ...): correct --masks."

@@ -40,6 +40,10 @@ SHARE = 0.8  # of the photos; where fewer have a pose, a sentence says what to d
 NAMED = 4  # photos in a sentence
 
 
+class NothingFits(UserError):
+    """No three of the photos fit together."""
+
+
 @dataclass
 class Posed:
     """What was found: photos with poses of all photos, their cameras and points, and sentences for the user."""
@@ -92,11 +96,13 @@ class Kept:
         write_text_atomically(json.dumps(asdict(self)) + "\n", work / KEPT)
 
 
-def process(data: Path, output: Path, bar: Bar, masks: Path | None = None) -> tuple[Posed, Any]:
+def process(
+    data: Path, output: Path, bar: Bar, masks: Path | None = None, ignore_ids: tuple[int, ...] = ()
+) -> tuple[Posed, Any]:
     """Find the poses of photos and write them into ``output``; returns the report and pycolmap's reconstruction.
 
-    masks: folder of id images <photo>.png, outside of whose objects no feature is used.
-    Raises ``UserError`` where the photos cannot be used, or fewer than three of them fit together.
+    masks: folder of id images <photo>.png, outside of whose objects no feature is used. ignore_ids: see ``Photo``.
+    Raises ``UserError`` where the photos cannot be used, ``NothingFits`` where fewer than three fit together.
     """
     if find_spec("pycolmap") is None:
         raise UserError("the library pycolmap is not installed: pip install pycolmap.")
@@ -107,26 +113,25 @@ def process(data: Path, output: Path, bar: Bar, masks: Path | None = None) -> tu
     if (output / TRANSFORMS).exists() and not ((output / REPORT).exists() or (work / KEPT).exists()):
         raise UserError(f"{output / TRANSFORMS} holds poses of another program: give another --output-dir.")
     video = is_video(data)
+
+    def given(photos: list[Photo]) -> list[Photo]:
+        return photos if masks is None else with_masks(photos, masks, ignore_ids)
+
     if masks is not None and not masks.is_dir():
         raise UserError(f"{masks} is no folder: give --masks that of the id images.")
     found = find_frames(data, work / "frames", bar) if video else find_photos(data)
     if list_images(images) and not (work / KEPT).exists() and found[0].parent.resolve() != images.resolve():
         raise UserError(f"{images} holds photos already: give another --output-dir, or these as --data.")
-    photos = [] if video else _checked(found, images, masks, bar)
+    photos = [] if video else given(check_photos(found, images, bar))
     lock = run_lock(output, "being given poses")
     try:
         if video:
             write_frames(data, found, bar)
-            photos = _checked(found, images, masks, bar)
+            photos = given(check_photos(found, images, bar))
         with writing(output):
             return _process(photos, output, bar)
     finally:
         lock.release()
-
-
-def _checked(found: list[Path], images: Path, masks: Path | None, bar: Bar) -> list[Photo]:
-    photos = check_photos(found, images, bar)
-    return photos if masks is None else with_masks(photos, masks)
 
 
 def _process(photos: list[Photo], output: Path, bar: Bar) -> tuple[Posed, Any]:
@@ -166,7 +171,7 @@ def _process(photos: list[Photo], output: Path, bar: Bar) -> tuple[Posed, Any]:
     with bar("poses") as progress, TemporaryDirectory() as folder:
         models = place(work / DATABASE, Path(folder), keys, progress)
     if not models:
-        raise UserError(
+        raise NothingFits(
             f"none of the {len(photos)} photos fit together: take more of them, closer to each other, of a scene that "
             "has texture and stands still; if the thing turned before a room that stands, give --masks of the thing."
         )

@@ -157,11 +157,13 @@ def test_on_a_turntable_masks_find_the_poses_of_what_turns(tmp_path, capsys):
     for name in given:
         photo = np.where(inside[..., None] == 1, np.asarray(Image.open(photos / f"{name}.png")), room)
         write_image(photos / f"{name}.png", photo)
-        write_image(scene / f"masks/{name}.png", inside)
+        write_image(scene / f"masks/{name}.png", np.where(inside == 1, 1, 255).astype(np.uint8))
     arguments = ["process", "--data", str(photos), "--output-dir", str(scene)]
     with pytest.raises(SystemExit):  # what most features say is that no camera moved
         main(arguments)
-    main([*arguments, "--masks", str(scene / "masks")])
-    assert "--pipeline.datamanager.photos objects" in " ".join(capsys.readouterr().out.split())
+    main([*arguments, "--masks", str(scene / "masks"), "--ignore-ids", "255"])
+    assert "--pipeline.datamanager.photos objects beags-data --ignore-ids 255" in " ".join(
+        capsys.readouterr().out.split()
+    )
     found = frames(scene)
     assert found.keys() == given.keys() and np.median(errors(found, given)[0]) < 0.5

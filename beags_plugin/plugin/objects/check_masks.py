@@ -21,7 +21,15 @@ from beags_plugin.masks.check.disagreement import views_against_others
 from beags_plugin.masks.check.files import FEW_VIEWS, MOST_IDS, Coverage, MaskFiles, check_files
 from beags_plugin.masks.check.issues import LEVELS, Issue, ordered, percent
 from beags_plugin.pictures.masks import Changed, Pointed, contradicted_picture, coverage_picture
-from beags_plugin.plugin.objects.compare_views import Tracks, agreements, pointed, points_in_space, tracks_of
+from beags_plugin.plugin.objects.compare_views import (
+    Tracks,
+    agreements,
+    features_of,
+    pointed,
+    points_in_space,
+    tracks_of,
+    turned,
+)
 from beags_plugin.plugin.objects.reproject_masks import ReprojectedRun, ReprojectionOptions, reproject_run
 from beags_plugin.plugin.runs.place import open_run
 from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParserConfig
@@ -148,7 +156,10 @@ def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Re
             )
         )
     elif coverage.usable.sum() > 3 and len(coverage.ids) > 1:
-        tracks = tracks_of(scene, views, len(coverage.ids))
+        features = features_of(scene, views)
+        tracks = tracks_of(features, len(coverage.ids))
+        if (issue := turned(features, files, coverage)) is not None:
+            report.issues.append(issue)
         agreement, seen = agreements(files, coverage, views, points_in_space(scene, views, config), tracks)
         report.issues += views_against_others(agreement, files, coverage, names)
         _add_points(report, files, views, tracks, seen)

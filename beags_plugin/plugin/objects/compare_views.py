@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from beags_plugin.data.dataset import Dataset
@@ -10,13 +12,15 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.masks.check.consistency import Agreement, labels_around, labels_at, ranks_of
 from beags_plugin.masks.check.contradictions import LEAST_OTHERS
 from beags_plugin.masks.check.files import Coverage, MaskFiles
+from beags_plugin.masks.check.issues import Issue, percent
 from beags_plugin.pictures.masks import Pointed
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
-from beags_plugin.plugin.views.colmap_files import read_tracks
+from beags_plugin.plugin.views.colmap_files import read_features
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.plugin.views.lens import project_through_lens
 from beags_plugin.plugin.views.poses import PosedViews
 from beags_plugin.plugin.views.seed_points import random_points, starting_points
+from beags_plugin.posing.turned import seem_turned, shares_explained
 from beags_plugin.system.progress import progress_bar
 
 RANDOM_POINTS = 50_000  # beside the seed points: an object that has none of these has some of them in it
@@ -37,24 +41,55 @@ def points_in_space(scene: Dataset, views: PosedViews, config: BeagsDataParserCo
     return np.concatenate([seeds[::step], random.astype(np.float64)])
 
 
-def tracks_of(scene: Dataset, views: PosedViews, classes: int) -> Tracks:
-    """Return the tracks of the COLMAP model of a scene, which may lie beside poses in another file."""
+def features_of(scene: Dataset, views: PosedViews) -> Tracks:
+    """Return the features of each view in the COLMAP model of a scene, which may lie beside poses in another file.
+
+    Each with the id of its point, -1 where it has none, and its place.
+    """
     folder = complete_model(scene.root)
     if folder is None:
         return []
     named: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
-    for name, track in read_tracks(folder).items():
+    for name, features in read_features(folder).items():
         for key in {name, name.rpartition("/")[2]}:
-            named.setdefault(key, []).append(track)
+            named.setdefault(key, []).append(features)
     none = np.zeros(0, np.int64), np.zeros((0, 2))
     found = []
     for stems in views.stems:
         alone = [named[stem][0] for stem in sorted(stems, key=len) if len(named.get(stem, ())) == 1]
         found.append(alone[-1] if alone else none)
-    ids = np.unique(np.concatenate([points for points, _ in found]))
-    ids = ids[:: max(1, -(-len(ids) * max(classes, len(found)) // MOST_COUNTS))]
-    kept = [np.isin(points, ids) for points, _ in found]
-    return [(np.searchsorted(ids, track[0][k]), track[1][k]) for track, k in zip(found, kept, strict=True)]
+    return found
+
+
+def tracks_of(features: Tracks, classes: int) -> Tracks:
+    """Return the points of a COLMAP model that each view saw, as rows of a table."""
+    ids = np.unique(np.concatenate([points[points >= 0] for points, _ in features] or [np.zeros(0, np.int64)]))
+    ids = ids[:: max(1, -(-len(ids) * max(classes, len(features)) // MOST_COUNTS))]
+    kept = [np.isin(points, ids) for points, _ in features]
+    return [(np.searchsorted(ids, points[k]), places[k]) for (points, places), k in zip(features, kept, strict=True)]
+
+
+def turned(features: Tracks, files: MaskFiles, coverage: Coverage) -> Issue | None:
+    """Return the issue that the objects seem to have turned before a room that stands, whose poses the scene has."""
+
+    def photos() -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        for view in np.flatnonzero(coverage.usable).tolist():
+            ids, places = features[view]
+            if len(ids) and (mask := files.read(view)) is not None:
+                yield places, ids >= 0, mask
+
+    if not any((ids < 0).any() for ids, _ in features):  # a model that keeps no others
+        return None
+    inside, around, count = shares_explained(photos())
+    if not seem_turned(inside, around, count):
+        return None
+    return Issue(
+        "warning",
+        "turned",
+        f"the poses explain {percent(inside, 1)} of the features on objects, and {percent(around, 1)} of those around "
+        "them: if the objects turned while the room stood, find their own poses with beags process --masks.",
+        "objects that turned come out as a blur; what is plain or shiny has few good features anyway",
+    )
 
 
 def agreements(

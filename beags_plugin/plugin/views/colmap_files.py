@@ -47,11 +47,11 @@ def read_colmap_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
     return xyz, np.array([point.rgb for point in points], np.uint8).reshape(-1, 3)
 
 
-def read_tracks(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Read where each image of a complete model shows its points, by the image's name without suffix.
+def read_features(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Read the features of each image of a complete model, by the image's name without suffix.
 
-    Returns ids of points [N] int64, and places [N, 2] float64 in 0..1, from the left and the top of the image. Raises
-    ``UserError`` if a file cannot be read.
+    Returns ids of their points [N] int64, -1 where the model has none, and places [N, 2] float64 in 0..1, from the left
+    and the top of the image. Raises ``UserError`` if a file cannot be read.
     """
     text = (folder / "cameras.txt").is_file()  # the order in which nerfstudio looks
     end, camera_reader, image_reader = (
@@ -61,15 +61,15 @@ def read_tracks(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     )
     cameras, images = _read(camera_reader, folder / f"cameras.{end}"), folder / f"images.{end}"
 
-    def tracks(file: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    def features(file: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         found = {}
         for image in image_reader(file).values():
-            camera, tracked = cameras[image.camera_id], np.asarray(image.point3D_ids, np.int64) >= 0
-            places = np.reshape(image.xys, (-1, 2))[tracked] / [camera.width, camera.height]
-            found[Path(image.name).with_suffix("").as_posix()] = image.point3D_ids[tracked], places
+            camera, ids = cameras[image.camera_id], np.asarray(image.point3D_ids, np.int64)
+            places = np.reshape(image.xys, (-1, 2)) / [camera.width, camera.height]
+            found[Path(image.name).with_suffix("").as_posix()] = np.maximum(ids, -1), places
         return found
 
-    return _read(tracks, images)
+    return _read(features, images)
 
 
 @dataclass(frozen=True)

@@ -186,14 +186,15 @@ def test_random_points_lie_in_common_view(tmp_path, kind):
 def test_fruit_reprojects_and_its_masks_fit():
     from nerfstudio.data.utils.colmap_parsing_utils import read_points3D_binary
 
-    from beags_plugin.plugin.views.colmap_files import read_tracks
+    from beags_plugin.plugin.views.colmap_files import read_features
 
     root = real("fruit")
     outputs = parse(root)
     assert len(outputs.image_filenames) == 70 and len(names(parse(root, "test"))) == 11
     assert outputs.metadata["classes"] == {0: "background", 1: "apple", 2: "banana"}
     position = {key: i for i, key in enumerate(read_points3D_binary(root / "sparse/0/points3D.bin"))}
-    seen, places = read_tracks(root / "sparse/0")[outputs.image_filenames[5].stem]
+    seen, places = read_features(root / "sparse/0")[outputs.image_filenames[5].stem]
+    seen, places = seen[seen >= 0], places[seen >= 0]
     points = outputs.metadata["points3D_xyz"][[position[i] for i in seen]]
     camera = camera_from_nerfstudio(outputs.cameras, 5)
     moved = (points @ camera.rotation.T + camera.translation) @ camera.K.T

@@ -1,0 +1,77 @@
+"""Objects that turned before a room that stood still: poses found from the room say nothing about them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
+from beags_plugin.labels.classes import read_id_mask
+
+FEW = 0.25  # of the share around objects; 0.1 on a generated turntable, 0.56 and 3.9 on two captures of still things
+LEAST = 200  # features inside, for their share to tell anything
+TURN = 5.0  # degrees by which two models tell another motion between two photos, in the median of all pairs
+ENOUGH = 0.75  # of the photos that the room places, which the objects alone must place too
+
+
+def shares_explained(photos: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[float, float, int]:
+    """Return the share of features with a point in space inside objects, that around them, and the number inside.
+
+    photos: of each, places of features [N, 2] in 0..1 (from the left, from the top), whether each has a point [N] bool,
+    and class ids [H, W].
+    """
+    table = np.zeros((2, 2), np.int64)  # inside or around; with a point, all
+    for places, known, ids in photos:
+        height, width = ids.shape
+        columns, rows = np.clip((places * [width, height]).astype(np.int64), 0, [width - 1, height - 1]).T
+        label = ids[rows, columns]
+        for row, chosen in enumerate(((label != BACKGROUND) & (label != IGNORE), label == BACKGROUND)):
+            table[row] += known[chosen].sum(), chosen.sum()
+    inside, around = table[:, 0] / np.maximum(table[:, 1], 1)
+    return float(inside), float(around), int(table[0, 1])
+
+
+def seem_turned(inside: float, around: float, count: int) -> bool:
+    """Return whether the poses explain so few features inside objects (see ``shares_explained``) that these moved."""
+    return count >= LEAST and inside < FEW * around
+
+
+def objects_seem_turned(model: Path, masks: Path) -> bool:
+    """Return whether the poses of a COLMAP model are hardly those of the objects in masks <photo>.png."""
+    import pycolmap
+
+    posed: Any = pycolmap.Reconstruction(model)
+
+    def photos() -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        for image_id in posed.reg_image_ids():
+            image = posed.images[image_id]
+            camera, mask = posed.cameras[image.camera_id], masks / f"{Path(image.name).stem}.png"
+            if mask.is_file():
+                places = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
+                known = np.array([point.has_point3D() for point in image.points2D], bool)
+                yield places / [camera.width, camera.height], known, read_id_mask(mask)
+
+    return seem_turned(*shares_explained(photos()))
+
+
+def move_otherwise(objects: Path, room: Path) -> bool:
+    """Return whether a COLMAP model of the objects tells other rotations from photo to photo than that of the room.
+
+    It does not where it has poses of too few photos.
+    """
+    import pycolmap
+
+    turns: list[dict[str, np.ndarray]] = []
+    for folder in (objects, room):
+        model: Any = pycolmap.Reconstruction(folder)
+        images = (model.images[image_id] for image_id in model.reg_image_ids())
+        turns.append({image.name: image.cam_from_world().rotation.matrix() for image in images})
+    names = sorted(turns[0].keys() & turns[1].keys())
+    if len(names) < max(2, ENOUGH * len(turns[1])):
+        return False
+    between = np.array([turns[0][name].T @ turns[1][name] for name in names]).reshape(-1, 9)  # one rotation, if alike
+    cosine = (between @ between.T - 1) / 2
+    return float(np.median(cosine[np.triu_indices(len(names), 1)])) < np.cos(np.deg2rad(TURN))
