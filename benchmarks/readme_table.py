@@ -7,6 +7,7 @@ lines between README's two markers are written anew from the files there, which 
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,14 +25,16 @@ GROUPS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
     ("fruit, a real capture", "improvements-captures", "fruit", ("assignment alone", "the paper's")),
     ("a skull, a real capture", "improvements-captures", "dtu_skull", ("assignment alone", "the paper's")),
 )
-"""What a group of rows is called, its file in docs/results, the scene there or ``MEAN``, and its variants (or all)."""
+"""What a group of rows is called, its file in docs/results, the scene there, ``MEAN`` of all or a family of generated
+scenes, and its variants (or all)."""
 LABELS = {
     "the paper's": "both losses, short, without the background",
     "beags-paper": "`beags-paper`, k by [the rule](docs/method.md#5-the-visibility-voxel-grid)",
 }
+WORST = "worst_biou_after"
 COLUMNS: tuple[tuple[str, tuple[str, ...], int, float], ...] = (
     ("extracted IoU, BIoU", ("extracted_iou_after", "extracted_biou_after"), 1, 100.0),
-    ("worst object's BIoU", ("worst_biou_after",), 1, 100.0),
+    ("worst object's BIoU", (WORST,), 1, 100.0),
     ("PSNR", ("psnr_after",), 2, 1.0),
     ("PSNR shown", ("psnr_shown_after",), 2, 1.0),
     ("removal PSNR, shown", ("removal_psnr_after", "removal_psnr_shown_after"), 2, 1.0),
@@ -76,11 +79,24 @@ def table(folder: Path) -> str:
 
 def _rows(path: Path, scene: str, variants: Sequence[str]) -> list[dict[str, Any]]:
     report = json.loads(path.read_text())
-    rows = [row for row in report["means" if scene == MEAN else "rows"] if row["scene"] == scene]
-    found = {row["variant"]: row for row in rows if row.get("object", MEAN) == MEAN}
+    seeded = re.compile(re.escape(scene) + r"( \d+)?")  # of a family, "room 100"
+    of_variant: dict[str, list[Mapping[str, Any]]] = {}
+    for row in report["means" if scene == MEAN else "rows"]:
+        if row.get("object", MEAN) == MEAN and seeded.fullmatch(row["scene"]):
+            of_variant.setdefault(row["variant"], []).append(row)
+    found = {name: _mean(group) for name, group in of_variant.items()}
     if missing := [name for name in variants or [""] if name and name not in found] or ([] if found else [scene]):
         raise UserError(f"{path} has no figures of {missing[0]!r}: name a whole result of beags bench.")
     return [found[name] for name in variants or found]
+
+
+def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the means of one variant's rows, and its worst object of all."""
+    mean: dict[str, Any] = {"variant": rows[0]["variant"]}
+    for figure in {name for row in rows for name, value in row.items() if isinstance(value, float)}:
+        known = [row[figure] for row in rows if row.get(figure) is not None]
+        mean[figure] = min(known) if figure == WORST else sum(known) / len(known)
+    return mean
 
 
 def main(arguments: Sequence[str], root: Path = ROOT) -> None:

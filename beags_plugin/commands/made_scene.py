@@ -120,7 +120,7 @@ def _scene_of_objects(scene: Path, folder: Path, given: Path | None) -> MadeScen
     """
     labels = given
     if labels is None:
-        made_masks(scene / "images", labels := folder / "for_poses")  # of held-out photos too
+        made_masks(scene / "images", labels := folder / "labels")  # of held-out photos too, for their poses
     try:
         _print_poses(scene / "images", folder, labels / "masks")
     except UserError as error:
@@ -133,7 +133,7 @@ def _scene_of_objects(scene: Path, folder: Path, given: Path | None) -> MadeScen
         )
         return None
     CONSOLE.print("The objects turned before a room that stands: poses and training are of the objects alone.")
-    return MadeScene(folder, given or made_masks(folder, folder), turned=True)
+    return MadeScene(folder, labels, turned=True)
 
 
 def _check_other(data: Path, scene: Path) -> None:

@@ -54,14 +54,15 @@ def test_poses_of_a_thing_that_turned_are_its_own(tmp_path, network, monkeypatch
     printed = capsys.readouterr().out
     assert "as if the objects had turned before a room that stands" in printed
     assert "poses and training are of the objects alone" in printed
-    assert made == MadeScene(tmp_path / "out/turned", None, turned=True)
+    assert made == MadeScene(tmp_path / "out/turned", tmp_path / "out/turned/labels", turned=True)
+    assert (tmp_path / "out/turned/labels/masks/no_truth.json").exists()
     own, room = frames(tmp_path / "out/turned"), frames(tmp_path / "out/scene")
     assert len(own) == PHOTOS and np.abs(motions(own) - true).max() < 3
     assert np.abs(motions(room) - true).max() > 20
-    held_out = {"v00.png", "v08.png"}
-    assert not held_out & {path.name for path in (tmp_path / "out/turned/masks").iterdir()}  # else they were truth
-    assert [any(issue.kind == "turned" for issue in check_scene(BeagsDataParserConfig(data=data)).issues)
-            for data in (tmp_path / "out/scene", tmp_path / "out/turned")] == [True, False]  # fmt: skip
+    for scene, warned in ((MadeScene(tmp_path / "out/scene"), True), (made, False)):
+        labels = (scene.labels or scene.data).absolute()
+        report = check_scene(BeagsDataParserConfig(data=scene.data, masks_path=labels / "masks"))
+        assert any(issue.kind == "turned" for issue in report.issues) == warned
     monkeypatch.setattr("beags_plugin.posing.process._report", lambda *_: pytest.fail("computed again"))
     monkeypatch.setattr(SalientSource, "make", lambda *_: pytest.fail("made again"))
     assert made_scene(tmp_path / "photos", tmp_path / "out") == made

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from beags_plugin.data.files import image_size, list_photos, photo_names
 from beags_plugin.data.layout import fitting_layouts
-from beags_plugin.labels.classes import check_names, write_mask
+from beags_plugin.labels.classes import NO_TRUTH, check_names, write_mask
 from beags_plugin.masks.snapping import snap_to_edges
 from beags_plugin.masks.sources import MASK_SOURCES
 from beags_plugin.masks.sources.base import MaskSource, Photo, SourceScene
@@ -168,6 +168,9 @@ def make_masks(
             raise UserError("the mask source found no object in any view: name another source, or check its options.")
         for place, new in unfinished.items():
             _take_the_place(new, place, {image.stem for image in images})
+        (masks / NO_TRUTH).unlink(missing_ok=True)
+        if not posed:
+            (masks / NO_TRUTH).write_text(json.dumps({"made by": type(source).__name__}))
     names = {str(i): name for i, name in sorted(made.names.items())}
     write_whole(classes, lambda file: file.write(json.dumps(names, indent=1).encode()))
     _picture(folder / "made.png", shown)
@@ -178,7 +181,7 @@ def make_masks(
         report = check(replace(given, masks_path=masks.absolute(), classes_path=classes.absolute()), run=run)
         checked = [*report.lines(), *(str(path) for path in write_contradictions(report, folder))]
     if not posed:
-        checked = ["No photo has a pose yet, so all got masks: once they have, make those of training views anew."]
+        checked = [f"No photo has a pose yet, so all got masks; {masks / NO_TRUTH} says that none of them is truth."]
     return [
         *made.notes,
         f"{len(shares)} masks of {len(photos)} views, {len(names) - 1} objects, which cover "

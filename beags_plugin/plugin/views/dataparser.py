@@ -23,6 +23,7 @@ from beags_plugin.data.labels import read_class_names
 from beags_plugin.data.layout import read_dataset
 from beags_plugin.data.split import split_views
 from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.labels.classes import NO_TRUTH
 from beags_plugin.plugin.views.cameras import check_cameras, downscaled_size, resize_cameras
 from beags_plugin.plugin.views.poses import Normalization, PosedViews, read_poses
 from beags_plugin.plugin.views.seed_points import starting_points
@@ -103,8 +104,8 @@ class BeagsDataParser(DataParser):
 
     Metadata of its outputs, per view of the split where it is a list: ``points3D_xyz`` [P, 3] float32 in the world
     of the cameras, ``points3D_rgb`` [P, 3] uint8, ``points3D_random`` bool, ``classes`` dict id -> name,
-    ``mask_filenames`` list of Path or None, ``mask_kind`` (see ``data.dataset.MaskKind``), ``ignore_ids``,
-    ``ground_truth`` (see ``data.ground_truth.GroundTruth``) or None.
+    ``mask_filenames`` list of Path or None, ``mask_kind`` (see ``data.dataset.MaskKind``), ``masks_are_truth``
+    bool, ``ignore_ids``, ``ground_truth`` (see ``data.ground_truth.GroundTruth``) or None.
     """
 
     config: BeagsDataParserConfig
@@ -180,6 +181,7 @@ class BeagsDataParser(DataParser):
             "classes": read_class_names(classes_file, present, config.ignore_ids, *known),
             "mask_filenames": masks,
             "mask_kind": kind,
+            "masks_are_truth": not (folder / NO_TRUTH).exists(),
             "ignore_ids": tuple(config.ignore_ids),
             "ground_truth": find_ground_truth(
                 scene.root / config.ground_truth_path, scene, views.images, _images_root(scene)

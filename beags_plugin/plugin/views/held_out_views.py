@@ -26,7 +26,8 @@ _NO_TRUTH = GroundTruth(masks=[], visible={}, silhouettes={}, seen={}, removed={
 class HeldOutViews(Sequence[EvalView]):
     """The test views of the data; masks are read when a view is asked for, at the size of their files.
 
-    Masks of all visible objects come from ``ground_truth/masks``, else from the data's own; those of single objects
+    Masks of all visible objects come from ``ground_truth/masks``, else from the data's own, unless a program made these
+    of all views (``labels.classes.NO_TRUTH``); those of single objects
     from ``ground_truth/visible``, silhouettes from ``ground_truth/silhouettes``, and what training photos show of them
     from ``ground_truth/seen``, or from where the layout has them; pictures without an object from
     ``ground_truth/removed``, and where these can be known from ``ground_truth/removed_shown``. All are undistorted like
@@ -69,7 +70,8 @@ class HeldOutViews(Sequence[EvalView]):
         truth = self._metadata["ground_truth"] or _NO_TRUTH
         exact = truth["masks"][index] if truth["masks"] else None
         # Where objects were labelled one by one, a view without such masks has no truth: its own mask is no substitute.
-        own = None if truth["visible"] else self._metadata["mask_filenames"][index]
+        given = self._metadata["masks_are_truth"] and not truth["visible"]
+        own = self._metadata["mask_filenames"][index] if given else None
         file, kind = (exact, "ids") if exact else (own, self._kind)
         visible = None
         if file is not None:
