@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -13,10 +14,11 @@ from rich.console import Console
 from beags_plugin.commands.made_masks import MADE, check_source, made_masks
 from beags_plugin.commands.process import find_poses
 from beags_plugin.data.layout import fitting_layouts, read_dataset
+from beags_plugin.masks.sources.base import NothingFound
 from beags_plugin.posing.files import MODEL
 from beags_plugin.posing.photos import check_photos, find_photos, with_masks
-from beags_plugin.posing.process import NothingFits
-from beags_plugin.posing.turned import move_otherwise, objects_seem_turned
+from beags_plugin.posing.process import REPORT, NothingFits
+from beags_plugin.posing.turned import ENOUGH, objects_seem_turned, poses_are_their_own
 from beags_plugin.posing.video import is_video
 from beags_plugin.system.digests import content_digest, folder_digest
 from beags_plugin.system.errors import UserError
@@ -88,8 +90,8 @@ def made_scene(data: Path, output: Path) -> MadeScene:
     try:
         _print_poses(data, scene)
     except NothingFits as error:
-        CONSOLE.print("The photos as a whole fit no poses, so poses of the objects alone are tried.")
-        if (own := _scene_of_objects(scene, output / "turned", given)) is None:
+        CONSOLE.print("The photos as a whole give no poses, so poses of the objects alone are tried.")
+        if (own := _scene_of_objects(scene, output / "turned", given, room=False)) is None:
             raise error
     if not (scene / MADE_OF).exists():
         write_text_atomically(json.dumps(str(data.resolve())), scene / MADE_OF)
@@ -103,7 +105,7 @@ def made_scene(data: Path, output: Path) -> MadeScene:
             "The poses explain few of the objects' features, as if the objects had turned before a room that stands: "
             "poses of the objects alone are tried."
         )
-        own = _scene_of_objects(scene, output / "turned", given)
+        own = _scene_of_objects(scene, output / "turned", given, room=True)
     return own or MadeScene(scene, labels)
 
 
@@ -112,28 +114,40 @@ def _print_poses(data: Path, scene: Path, masks: Path | None = None) -> None:
         CONSOLE.print(line)
 
 
-def _scene_of_objects(scene: Path, folder: Path, given: Path | None) -> MadeScene | None:
+def _scene_of_objects(scene: Path, folder: Path, given: Path | None, room: bool) -> MadeScene | None:
     """Make a scene in ``folder`` with poses from the objects' features alone.
 
-    scene: with the photos, and with poses of the room if any fit. given: the folder that holds the user's masks/.
-    Returns None, and says why, where the objects show too little for poses, or moved as the room did.
+    scene: with the photos. given: the folder that holds the user's masks/. room: whether ``scene`` has poses of the
+    whole photos. Returns None, and says why, where the objects show too little for poses, or moved as the room did.
     """
-    labels = given
-    if labels is None:
-        made_masks(scene / "images", labels := folder / "labels")  # of held-out photos too, for their poses
+    labels, photos = given or folder / "labels", scene / "images"
     try:
-        _print_poses(scene / "images", folder, labels / "masks")
-    except UserError as error:
-        CONSOLE.print(f"There are none of the objects alone: {error}")
+        if given is None:
+            _all_masks(photos, labels, scene / "masks" if room else None)
+        _print_poses(photos, folder, labels / "masks")
+    except (NothingFits, NothingFound) as error:
+        CONSOLE.print(f"There are no poses of the objects alone: {error}")
         return None
-    if (scene / MODEL).exists() and not move_otherwise(folder / MODEL, scene / MODEL):
+    posed = json.loads((folder / REPORT).read_text(encoding="utf-8"))
+    enough = posed["registered"] >= ENOUGH * posed["photos"]
+    if not (poses_are_their_own(folder / MODEL, scene / MODEL, labels / "masks") if room else enough):
+        kept = f"the poses in {scene} stay" if room else "they are not taken"
         CONSOLE.print(
-            f"Those of the objects alone are alike, or are too few, so the poses in {scene} stay. If the objects did "
-            "turn, take more photos of them or give masks of all that turned (in masks/ beside the photos)."
+            f"Those of the objects alone are too few, or no better, so {kept}. If the objects did turn, take more "
+            "photos of them, or put masks of all that turned into masks/ beside the photos."
         )
         return None
-    CONSOLE.print("The objects turned before a room that stands: poses and training are of the objects alone.")
+    CONSOLE.print("Poses and training are of the objects alone, as they turned before a room that stands.")
     return MadeScene(folder, labels, turned=True)
+
+
+def _all_masks(photos: Path, labels: Path, mended: Path | None) -> None:
+    """Make masks of all photos, of held-out ones too, as their poses need them; those in ``mended`` go before."""
+    made_masks(photos, labels)
+    for mask in sorted(mended.glob("*.png")) if mended is not None else ():
+        same = labels / "masks" / mask.name
+        if not same.exists() or same.read_bytes() != mask.read_bytes():
+            shutil.copyfile(mask, same)
 
 
 def _check_other(data: Path, scene: Path) -> None:

@@ -14,7 +14,7 @@ from beags_plugin.system.reading.images import read_image
 from beags_plugin.system.reading.text import load_json, reason
 
 NO_TRUTH = "no_truth.json"
-"""In a folder of masks: a program made those of all views, so that held-out ones are no truth to evaluate with."""
+"""In a folder of masks: a program drew those of all views, so that held-out ones are no truth to evaluate with."""
 _ID_MODES = {"1", "L", "P", "I", "I;16", "I;16L", "I;16B"}  # Pillow's names of images with one integer per pixel
 _COLOR_MODES = {"RGB", "RGBA", "LA"}
 

@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from beags_plugin.data.files import list_images
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.posing.features import add_features, coarse_descriptors, forget
 from beags_plugin.posing.files import MODEL, POINTS, TRANSFORMS, write_scene
 from beags_plugin.posing.mapping import match, place, refine
@@ -113,6 +114,10 @@ def process(
     if (output / TRANSFORMS).exists() and not ((output / REPORT).exists() or (work / KEPT).exists()):
         raise UserError(f"{output / TRANSFORMS} holds poses of another program: give another --output-dir.")
     video = is_video(data)
+    if ignore_ids and masks is None:
+        raise UserError("ignore_ids says what ids in masks mean, but there are no masks: add --masks, or leave it out.")
+    if wrong := [index for index in ignore_ids if not 0 <= index <= IGNORE]:
+        raise UserError(f"ignore_ids holds {wrong[0]}: ids are whole numbers in 0..{IGNORE}.")
 
     def given(photos: list[Photo]) -> list[Photo]:
         return photos if masks is None else with_masks(photos, masks, ignore_ids)
@@ -138,7 +143,7 @@ def _process(photos: list[Photo], output: Path, bar: Bar) -> tuple[Posed, Any]:
     """Find poses in a folder that no other process writes."""
     import pycolmap
 
-    work = output / WORK
+    work, masked = output / WORK, any(photo.mask for photo in photos)
     work.mkdir(parents=True, exist_ok=True)
     kept, names = Kept.read(work), [photo.path.name for photo in photos]
     content = {photo.path.name: photo.digest for photo in photos}
@@ -151,6 +156,9 @@ def _process(photos: list[Photo], output: Path, bar: Bar) -> tuple[Posed, Any]:
     for photo in changed:
         if photo.source.resolve() != photo.path.resolve():
             photo.path.unlink(missing_ok=True)
+    if photos[0].source.resolve() != photos[0].path.resolve():
+        for name in kept.photos.keys() - content.keys():  # left out since
+            (output / "images" / name).unlink(missing_ok=True)
     if changed or kept.paired != names:
         kept.paired, kept.pairs = [], []
     kept.photos, kept.posed = {**kept.photos, **content}, {}
@@ -173,7 +181,8 @@ def _process(photos: list[Photo], output: Path, bar: Bar) -> tuple[Posed, Any]:
     if not models:
         raise NothingFits(
             f"none of the {len(photos)} photos fit together: take more of them, closer to each other, of a scene that "
-            "has texture and stands still; if the thing turned before a room that stands, give --masks of the thing."
+            "has texture and stands still"
+            + ("." if masked else "; if the thing turned before a room that stands, give --masks of the thing.")
         )
     with bar("lens") as progress:
         model = refine(models[0], progress)

@@ -14,7 +14,8 @@ from beags_plugin.labels.classes import read_id_mask
 FEW = 0.25  # of the share around objects; 0.1 on a generated turntable, 0.56 and 3.9 on two captures of still things
 LEAST = 200  # features inside, for their share to tell anything
 TURN = 5.0  # degrees by which two models tell another motion between two photos, in the median of all pairs
-ENOUGH = 0.75  # of the photos that the room places, which the objects alone must place too
+ENOUGH = 0.75  # of the photos that the room places, or of all, which the objects alone must place too
+MORE = 2.0  # times the share of features inside that the room's poses explain; 6 on the generated turntable
 
 
 def shares_explained(photos: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[float, float, int]:
@@ -41,32 +42,18 @@ def seem_turned(inside: float, around: float, count: int) -> bool:
 
 def objects_seem_turned(model: Path, masks: Path) -> bool:
     """Return whether the poses of a COLMAP model are hardly those of the objects in masks <photo>.png."""
-    import pycolmap
-
-    posed: Any = pycolmap.Reconstruction(model)
-
-    def photos() -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        for image_id in posed.reg_image_ids():
-            image = posed.images[image_id]
-            camera, mask = posed.cameras[image.camera_id], masks / f"{Path(image.name).stem}.png"
-            if mask.is_file():
-                places = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
-                known = np.array([point.has_point3D() for point in image.points2D], bool)
-                yield places / [camera.width, camera.height], known, read_id_mask(mask)
-
-    return seem_turned(*shares_explained(photos()))
+    return seem_turned(*shares_explained(_features(_read(model), masks)))
 
 
-def move_otherwise(objects: Path, room: Path) -> bool:
-    """Return whether a COLMAP model of the objects tells other rotations from photo to photo than that of the room.
+def poses_are_their_own(objects: Path, room: Path, masks: Path) -> bool:
+    """Return whether poses from the objects' features alone are to be taken instead of those from whole photos.
 
-    It does not where it has poses of too few photos.
+    They are if ``ENOUGH`` of the photos have them, if they turn otherwise from photo to photo (``TURN``), and if they
+    explain ``MORE`` times the share of features inside masks <photo>.png. objects, room: folders of COLMAP models.
     """
-    import pycolmap
-
+    models = [_read(folder) for folder in (objects, room)]
     turns: list[dict[str, np.ndarray]] = []
-    for folder in (objects, room):
-        model: Any = pycolmap.Reconstruction(folder)
+    for model in models:
         images = (model.images[image_id] for image_id in model.reg_image_ids())
         turns.append({image.name: image.cam_from_world().rotation.matrix() for image in images})
     names = sorted(turns[0].keys() & turns[1].keys())
@@ -74,4 +61,25 @@ def move_otherwise(objects: Path, room: Path) -> bool:
         return False
     between = np.array([turns[0][name].T @ turns[1][name] for name in names]).reshape(-1, 9)  # one rotation, if alike
     cosine = (between @ between.T - 1) / 2
-    return float(np.median(cosine[np.triu_indices(len(names), 1)])) < np.cos(np.deg2rad(TURN))
+    if np.median(cosine[np.triu_indices(len(names), 1)]) > np.cos(np.deg2rad(TURN)):
+        return False
+    # The room's model also has the features that one of the objects alone lacks, near their outlines: compare shares.
+    own, given = (shares_explained(_features(model, masks))[0] for model in models)
+    return own > MORE * given
+
+
+def _read(model: Path) -> Any:
+    import pycolmap
+
+    return pycolmap.Reconstruction(model)
+
+
+def _features(model: Any, masks: Path) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield what ``shares_explained`` takes of each photo of pycolmap's reconstruction that has a mask."""
+    for image_id in model.reg_image_ids():
+        image = model.images[image_id]
+        camera, mask = model.cameras[image.camera_id], masks / f"{Path(image.name).stem}.png"
+        if mask.is_file():
+            places = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
+            known = np.array([point.has_point3D() for point in image.points2D], bool)
+            yield places / [camera.width, camera.height], known, read_id_mask(mask)

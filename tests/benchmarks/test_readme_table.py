@@ -71,6 +71,16 @@ def test_one_command_makes_the_table_from_a_result(clone):
     assert text.endswith((ROOT / "README.md").read_text().partition(readme_table.END)[2])
 
 
+def test_a_family_of_scenes_is_averaged_and_keeps_its_worst_object(tmp_path):
+    shown = (("room 100", 30.0, 0.5), ("room 101", 32.0, 0.7), ("rooms", 9.0, 0.1))
+    rows = [{"scene": scene, "variant": "beags", "psnr_after": psnr, readme_table.WORST: worst}
+            for scene, psnr, worst in shown]  # fmt: skip
+    rows.append({**rows[0], "scene": "room 102", "psnr_after": None, "failed": "no memory", readme_table.WORST: None})
+    (tmp_path / "presets.json").write_text(json.dumps({"rows": rows}))
+    (mean,) = readme_table._rows(tmp_path / "presets.json", "room", ())
+    assert mean == {"variant": "beags", "psnr_after": 31.0, readme_table.WORST: 0.5}
+
+
 def test_what_cannot_be_a_table_is_refused(clone):
     captures = clone / "docs/results/improvements-captures.json"
     content = json.loads(captures.read_text())

@@ -61,7 +61,7 @@ def test_photos_without_poses_get_masks_for_the_search_of_poses(tmp_path, capsys
          "--options", f"folder={tmp_path / 'objects'}"]
     )  # fmt: skip
     assert "No photo has a pose yet" in capsys.readouterr().out
-    assert (tmp_path / "masks/no_truth.json").exists()
+    assert not (tmp_path / "masks/no_truth.json").exists()  # masks that were read may be anybody's
     for index in range(3):
         np.testing.assert_array_equal(read_id_mask(tmp_path / f"masks/v{index}.png"), truth(0) == 1)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from data_folders import write_image
+from data_folders import noise, write_image
 from photographed_corner import HEIGHT, WIDTH, camera, frames, photograph
 
 pytest.importorskip("nerfstudio")
@@ -12,9 +12,13 @@ pytest.importorskip("pycolmap")
 
 from beags_plugin.commands import demo
 from beags_plugin.commands.made_scene import MadeScene, made_scene
+from beags_plugin.commands.process import find_poses
+from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.masks.sources.salient import SalientSource
 from beags_plugin.plugin.objects.check_masks import check_scene
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+from beags_plugin.posing.process import NothingFits
+from beags_plugin.system.errors import UserError
 
 PHOTOS = 12
 _y, _x = np.mgrid[:HEIGHT, :WIDTH]
@@ -27,13 +31,17 @@ def motions(poses: dict[str, np.ndarray]) -> np.ndarray:
     return np.rad2deg(np.arccos(np.clip((np.einsum("aij,bij->ab", turns, turns) - 1) / 2, -1, 1)))
 
 
-def write_turntable(folder, room=(0.7, 0.9), thing=(0.25, 1.3)) -> np.ndarray:
-    """Write photos in which the thing turns by more than the camera goes round the room; returns its ``motions``."""
+def write_turntable(folder, room=(0.7, 0.9), plain=PHOTOS) -> np.ndarray:
+    """Write photos in which the thing turns by more than the camera goes round the room; returns its ``motions``.
+
+    plain: the first photo in which it shows no texture.
+    """
     poses = {}
     for index, share in enumerate(np.linspace(0, 1, PHOTOS)):
         height = 1.2 + 0.4 * (index % 3)
-        of_room, of_thing = (camera(one + (other - one) * share, height) for one, other in (room, thing))
-        picture = np.where(THING[..., None], photograph(of_thing, seed=1), photograph(of_room))
+        of_room, of_thing = (camera(one + (other - one) * share, height) for one, other in (room, (0.25, 1.3)))
+        shown = photograph(of_thing, seed=1) if index < plain else np.full(3, 90, np.uint8)
+        picture = np.where(THING[..., None], shown, photograph(of_room))
         name = f"v{index:02d}"
         write_image(folder / f"{name}.png", picture)
         poses[name] = of_thing
@@ -53,7 +61,7 @@ def test_poses_of_a_thing_that_turned_are_its_own(tmp_path, network, monkeypatch
     made = made_scene(tmp_path / "photos", tmp_path / "out")
     printed = capsys.readouterr().out
     assert "as if the objects had turned before a room that stands" in printed
-    assert "poses and training are of the objects alone" in printed
+    assert "Poses and training are of the objects alone" in printed
     assert made == MadeScene(tmp_path / "out/turned", tmp_path / "out/turned/labels", turned=True)
     assert (tmp_path / "out/turned/labels/masks/no_truth.json").exists()
     own, room = frames(tmp_path / "out/turned"), frames(tmp_path / "out/scene")
@@ -66,6 +74,19 @@ def test_poses_of_a_thing_that_turned_are_its_own(tmp_path, network, monkeypatch
     monkeypatch.setattr("beags_plugin.posing.process._report", lambda *_: pytest.fail("computed again"))
     monkeypatch.setattr(SalientSource, "make", lambda *_: pytest.fail("made again"))
     assert made_scene(tmp_path / "photos", tmp_path / "out") == made
+
+
+def test_a_second_call_takes_mended_masks_and_forgets_photos_that_are_left_out(tmp_path, network):
+    write_turntable(tmp_path / "photos")
+    made_scene(tmp_path / "photos", tmp_path / "out")
+    wider = np.zeros((HEIGHT, WIDTH), np.uint8)
+    wider[30:210, 70:250] = 1
+    write_image(tmp_path / "out/scene/masks/v03.png", wider)
+    (tmp_path / "photos/v05.png").unlink()
+    made = made_scene(tmp_path / "photos", tmp_path / "out")
+    assert made.turned and made.labels is not None
+    assert (read_id_mask(made.labels / "masks/v03.png") == wider).all()
+    assert "v05" not in frames(made.data) and "v05" not in frames(tmp_path / "out/scene")
 
 
 def test_masks_that_were_given_are_taken_and_the_thing_is_trained_on_alone(tmp_path, monkeypatch):
@@ -86,6 +107,37 @@ def test_a_thing_that_stands_in_its_room_keeps_the_poses_of_both(tmp_path, capsy
         write_image(tmp_path / f"photos/masks/v{index:02d}.png", THING.astype(np.uint8))
     assert made_scene(tmp_path / "photos", tmp_path / "out") == MadeScene(tmp_path / "out/scene", tmp_path / "photos")
     assert "turned" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("room", [True, False])
+def test_poses_of_too_few_photos_are_not_taken(tmp_path, room, monkeypatch, capsys):
+    """The thing shows texture in the first photos alone; with poses of whole photos, or without."""
+
+    def found(data, output, start, masks=None):
+        lines = find_poses(data, output, start, masks)
+        if masks is None and not room:
+            raise NothingFits("none of the photos fit")
+        return lines
+
+    monkeypatch.setattr("beags_plugin.commands.made_scene.find_poses", found)
+    write_turntable(tmp_path / "photos/images", plain=5)
+    for index in range(PHOTOS):
+        write_image(tmp_path / f"photos/masks/v{index:02d}.png", THING.astype(np.uint8))
+    if room:
+        made = made_scene(tmp_path / "photos", tmp_path / "out")
+        assert made == MadeScene(tmp_path / "out/scene", tmp_path / "photos")
+    else:
+        with pytest.raises(NothingFits):
+            made_scene(tmp_path / "photos", tmp_path / "out")
+    assert "Those of the objects alone are too few" in capsys.readouterr().out
+
+
+def test_what_fits_nowhere_is_said_with_what_to_do(tmp_path, network, capsys):
+    for index in range(4):
+        write_image(tmp_path / f"photos/x{index}.png", noise(index, WIDTH, HEIGHT))
+    with pytest.raises(UserError, match="none of the 4 photos fit together"):
+        made_scene(tmp_path / "photos", tmp_path / "out")
+    assert "no poses of the objects alone" in capsys.readouterr().out
 
 
 def test_poses_that_the_room_does_not_give_are_looked_for_on_the_objects(tmp_path, network):

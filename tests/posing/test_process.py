@@ -167,3 +167,13 @@ def test_on_a_turntable_masks_find_the_poses_of_what_turns(tmp_path, capsys):
     )
     found = frames(scene)
     assert found.keys() == given.keys() and np.median(errors(found, given)[0]) < 0.5
+
+
+@pytest.mark.parametrize("options", [["--ignore-ids", "255"], ["--masks", "masks", "--ignore-ids", "70000"]])
+def test_ids_that_mean_nothing_are_refused(tmp_path, monkeypatch, options, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_photos(tmp_path / "photos", 3)
+    (tmp_path / "masks").mkdir()
+    with pytest.raises(SystemExit):
+        main(["process", "--data", "photos", "--output-dir", "scene", *options])
+    assert "ignore_ids" in capsys.readouterr().out and not (tmp_path / "scene").exists()

@@ -182,12 +182,12 @@ def _strays(files: MaskFiles) -> Iterator[Issue]:
     images = (path for path in files.folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
     if others := sorted(set(images) - set(files.masks)):
         other_type = any(path.suffix.lower() != ".png" for path in others)
-        why = "masks are .png files" if other_type else "no image has such a name"
+        why = "masks are .png files" if other_type else "no image with a pose has such a name"
         yield Issue(
             "warning",
             "unused",
             f"{len(others)} files in {files.folder} are not used ({named([path.name for path in others], 3)}), as "
-            f"{why}: rename them after their images, save them as .png, or remove them.",
+            f"{why}: rename them after their images or save them as .png; those of photos without a pose may stay.",
             "what they show does not count",
         )
 

@@ -20,6 +20,10 @@ from beags_plugin.system.reading.images import read_image
 Progress = Callable[[int, int], None]
 
 
+class NothingFound(UserError):
+    """A source found no object in any photo."""
+
+
 @dataclass(frozen=True)
 class Photo:
     """A view: its name (``data.files.photo_names``), its file, its size in pixels; trained: not held out."""
@@ -121,10 +125,12 @@ class MadeMasks:
 class MaskSource(ABC):
     """Interface of the sources: frozen dataclasses whose fields are their options.
 
-    needs_run: True if ``SourceScene.geometry`` is needed.
+    needs_run: True if ``SourceScene.geometry`` is needed. guesses: True if a program draws the masks, so that they are
+    no truth to evaluate with; views known as held out get none. False if it reads masks made elsewhere.
     """
 
     needs_run: ClassVar[bool] = False
+    guesses: ClassVar[bool] = False
 
     @classmethod
     def unavailable(cls) -> str | None:

@@ -35,6 +35,7 @@ class GrabCutSource(MaskSource):
     """
 
     needs_run: ClassVar[bool] = True
+    guesses: ClassVar[bool] = True
 
     prompts: Path = Path("prompts.json")
     rounds: int = 2

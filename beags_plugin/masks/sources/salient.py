@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import ClassVar
 from zipfile import BadZipFile, ZipFile
 
 import numpy as np
@@ -31,6 +32,8 @@ class SalientSource(MaskSource):
 
     model: a path that ends in .onnx, or the name of a file of rembg's without it (u2netp, u2net, silueta).
     """
+
+    guesses: ClassVar[bool] = True
 
     model: str = "u2netp"
 

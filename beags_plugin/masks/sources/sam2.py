@@ -9,7 +9,7 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -42,6 +42,8 @@ class Sam2Source(MaskSource):
     hub; the detector is loaded only if an object has a text: "auto" is SAM 3 itself, or Grounding DINO for SAM 2.
     device: "auto" prefers CUDA. threshold, strict: see ``two_stage.Retrieval``. local: never use the hub.
     """
+
+    guesses: ClassVar[bool] = True
 
     prompts: Path = Path("prompts.json")
     model: str = "facebook/sam2.1-hiera-small"

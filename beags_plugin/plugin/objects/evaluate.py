@@ -124,6 +124,12 @@ class EvaluatedRun:
     def _notes(self, after: SceneMetrics) -> Iterator[str]:
         if not self.stages["after"].assigned:
             yield "This run has no classes (it is a base alone), so only images are scored."
+        elif not after.masks and self.views.no_truth is not None:
+            what = "nothing is" if self.objects_alone else "only images are"
+            yield (
+                f"A program drew the masks of held-out views, as {self.views.no_truth} says, so {what} scored: delete "
+                "that file if they are right."
+            )
         elif not after.masks and self.complete:
             yield "No held-out view has a mask, so only images are scored."
         elif not after.masks:

@@ -20,7 +20,7 @@ from beags_plugin.data.layout import fitting_layouts
 from beags_plugin.labels.classes import NO_TRUTH, check_names, write_mask
 from beags_plugin.masks.snapping import snap_to_edges
 from beags_plugin.masks.sources import MASK_SOURCES
-from beags_plugin.masks.sources.base import MaskSource, Photo, SourceScene
+from beags_plugin.masks.sources.base import MaskSource, NothingFound, Photo, SourceScene
 from beags_plugin.pictures.masks import overlay
 from beags_plugin.plugin.objects.check_masks import check, options_beside, write_contradictions
 from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
@@ -165,11 +165,13 @@ def make_masks(
         if not shares:
             raise UserError("the mask source gave no mask for any view: check its options.")
         if not any(shares):
-            raise UserError("the mask source found no object in any view: name another source, or check its options.")
+            raise NothingFound(
+                "the mask source found no object in any view: name another source, or check its options."
+            )
         for place, new in unfinished.items():
             _take_the_place(new, place, {image.stem for image in images})
         (masks / NO_TRUTH).unlink(missing_ok=True)
-        if not posed:
+        if source.guesses and not posed:
             (masks / NO_TRUTH).write_text(json.dumps({"made by": type(source).__name__}))
     names = {str(i): name for i, name in sorted(made.names.items())}
     write_whole(classes, lambda file: file.write(json.dumps(names, indent=1).encode()))
@@ -181,7 +183,9 @@ def make_masks(
         report = check(replace(given, masks_path=masks.absolute(), classes_path=classes.absolute()), run=run)
         checked = [*report.lines(), *(str(path) for path in write_contradictions(report, folder))]
     if not posed:
-        checked = [f"No photo has a pose yet, so all got masks; {masks / NO_TRUTH} says that none of them is truth."]
+        checked = ["No photo has a pose yet, so all got masks."]
+        if source.guesses:
+            checked.append(f"{masks / NO_TRUTH} says that those of held-out views will be no truth to evaluate with.")
     return [
         *made.notes,
         f"{len(shares)} masks of {len(photos)} views, {len(names) - 1} objects, which cover "

@@ -104,8 +104,8 @@ class BeagsDataParser(DataParser):
 
     Metadata of its outputs, per view of the split where it is a list: ``points3D_xyz`` [P, 3] float32 in the world
     of the cameras, ``points3D_rgb`` [P, 3] uint8, ``points3D_random`` bool, ``classes`` dict id -> name,
-    ``mask_filenames`` list of Path or None, ``mask_kind`` (see ``data.dataset.MaskKind``), ``masks_are_truth``
-    bool, ``ignore_ids``, ``ground_truth`` (see ``data.ground_truth.GroundTruth``) or None.
+    ``mask_filenames`` list of Path or None, ``mask_kind`` (see ``data.dataset.MaskKind``), ``no_truth`` (the file that
+    says so of the masks) or None, ``ignore_ids``, ``ground_truth`` (see ``data.ground_truth.GroundTruth``) or None.
     """
 
     config: BeagsDataParserConfig
@@ -181,7 +181,7 @@ class BeagsDataParser(DataParser):
             "classes": read_class_names(classes_file, present, config.ignore_ids, *known),
             "mask_filenames": masks,
             "mask_kind": kind,
-            "masks_are_truth": not (folder / NO_TRUTH).exists(),
+            "no_truth": folder / NO_TRUTH if (folder / NO_TRUTH).exists() else None,
             "ignore_ids": tuple(config.ignore_ids),
             "ground_truth": find_ground_truth(
                 scene.root / config.ground_truth_path, scene, views.images, _images_root(scene)

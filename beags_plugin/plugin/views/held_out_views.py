@@ -55,6 +55,11 @@ class HeldOutViews(Sequence[EvalView]):
         chosen = range(len(self))[index]
         return self._view(chosen) if isinstance(chosen, int) else [self._view(i) for i in chosen]
 
+    @property
+    def no_truth(self) -> Path | None:
+        """Return the file that says that a program drew the data's own masks; None where they count as truth."""
+        return self._metadata["no_truth"]
+
     def trained_on(self) -> int:
         """Return the number of these views that are training views too."""
         trained = set(self.manager.train_dataset.image_filenames)
@@ -70,7 +75,7 @@ class HeldOutViews(Sequence[EvalView]):
         truth = self._metadata["ground_truth"] or _NO_TRUTH
         exact = truth["masks"][index] if truth["masks"] else None
         # Where objects were labelled one by one, a view without such masks has no truth: its own mask is no substitute.
-        given = self._metadata["masks_are_truth"] and not truth["visible"]
+        given = self.no_truth is None and not truth["visible"]
         own = self._metadata["mask_filenames"][index] if given else None
         file, kind = (exact, "ids") if exact else (own, self._kind)
         visible = None
