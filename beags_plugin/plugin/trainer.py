@@ -181,8 +181,7 @@ class BeagsTrainer(Trainer):
             self._stop(error)
             raise
         finally:
-            if self.viewer_state is not None:
-                end_rendering(self.viewer_state)
+            end_rendering(self.viewer_state)
         self._release()
 
     def _train(self) -> None:

@@ -52,10 +52,10 @@ def offer_whole_pictures(controls: Any) -> None:
     controls.update_output_options = lambda names: offer([name for name in names if name != "gl_z_buf_depth"])
 
 
-def end_rendering(viewer: Viewer, seconds: float = 30.0) -> None:
-    """End the render threads of every page, waiting at most ``seconds`` for each to finish its picture.
+def end_rendering(viewer: object, seconds: float = 30.0) -> None:
+    """End the render threads of every page of a viewer, waiting at most ``seconds`` for each to finish its picture.
 
-    A render thread inside the rasterizer would abort an interpreter that ends.
+    viewer: nerfstudio's, or None. A render thread inside the rasterizer would abort an interpreter that ends.
     """
     threads = [
         thread
