@@ -21,9 +21,10 @@ from beags_plugin.system.whole_files import write_text_atomically
 ROOT = Path(__file__).resolve().parents[1]
 BEGIN, END = "<!-- made by python -m benchmarks.readme_table -->\n", "<!-- end of the table -->\n"
 GROUPS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
-    ("three generated scenes, base of `beags-fast`", "presets", MEAN, ()),
-    ("fruit, a real capture", "improvements-captures", "fruit", ("assignment alone", "the paper's")),
-    ("a skull, a real capture", "improvements-captures", "dtu_skull", ("assignment alone", "the paper's")),
+    ("five generated tabletops, base of `beags-fast`", "presets", "tabletop", ()),
+    ("four generated rooms, the same", "presets", "room", ()),
+    ("fruit, a real capture (earlier protocol)", "improvements-captures", "fruit", ("assignment alone", "the paper's")),
+    ("a skull, a real capture (the same)", "improvements-captures", "dtu_skull", ("assignment alone", "the paper's")),
 )
 """What a group of rows is called, its file in docs/results, the scene there, ``MEAN`` of all or a family of generated
 scenes, and its variants (or all)."""
