@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 BEGIN, END = "<!-- made by python -m benchmarks.readme_table -->\n", "<!-- end of the table -->\n"
 GROUPS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
     ("five generated tabletops, base of `beags-fast`", "presets", "tabletop", ()),
-    ("four generated rooms, the same", "presets", "room", ()),
+    ("five generated rooms, the same", "presets", "room", ()),
     ("fruit, a real capture (earlier protocol)", "improvements-captures", "fruit", ("assignment alone", "the paper's")),
     ("a skull, a real capture (the same)", "improvements-captures", "dtu_skull", ("assignment alone", "the paper's")),
 )
