@@ -26,8 +26,8 @@ GROUPS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
     ("fruit, a real capture (earlier protocol)", "improvements-captures", "fruit", ("assignment alone", "the paper's")),
     ("a skull, a real capture (the same)", "improvements-captures", "dtu_skull", ("assignment alone", "the paper's")),
 )
-"""What a group of rows is called, its file in docs/results, the scene there, ``MEAN`` of all or a family of generated
-scenes, and its variants (or all)."""
+"""What a group of rows is called, its file in docs/results, the scene or the family of generated scenes there, and its
+variants (or all)."""
 LABELS = {
     "the paper's": "both losses, short, without the background",
     "beags-paper": "`beags-paper`, k by [the rule](docs/method.md#5-the-visibility-voxel-grid)",
@@ -82,7 +82,7 @@ def _rows(path: Path, scene: str, variants: Sequence[str]) -> list[dict[str, Any
     report = json.loads(path.read_text())
     seeded = re.compile(re.escape(scene) + r"( \d+)?")  # of a family, "room 100"
     of_variant: dict[str, list[Mapping[str, Any]]] = {}
-    for row in report["means" if scene == MEAN else "rows"]:
+    for row in report["rows"]:
         if row.get("object", MEAN) == MEAN and seeded.fullmatch(row["scene"]):
             of_variant.setdefault(row["variant"], []).append(row)
     found = {name: _mean(group) for name, group in of_variant.items()}

@@ -63,7 +63,6 @@ def poses_are_their_own(objects: Path, room: Path, masks: Path) -> bool:
     cosine = (between @ between.T - 1) / 2
     if np.median(cosine[np.triu_indices(len(names), 1)]) > np.cos(np.deg2rad(TURN)):
         return False
-    # The room's model also has the features that one of the objects alone lacks, near their outlines: compare shares.
     own, given = (shares_explained(_features(model, masks))[0] for model in models)
     return own > MORE * given
 
