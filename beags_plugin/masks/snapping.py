@@ -1,4 +1,4 @@
-"""Snapping of mask outlines to edges of the photo, an optional step for any source."""
+"""Outlines of masks that lie on edges of the photo."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from beags_plugin.system.errors import UserError
 EPSILON = 1e-2  # variance of colour (0..1) below which the guide counts as flat
 
 
-def snap_to_edges(labels: np.ndarray, photo: np.ndarray, radius: int) -> np.ndarray:
+def snap_to_edges(labels: np.ndarray, photo: np.ndarray, radius: int, second: np.ndarray | None = None) -> np.ndarray:
     """Move outlines of labels [H, W] uint16 to edges of the photo [H, W, 3] uint8 RGB, by a guided filter.
 
-    radius: pixels of the filter's window, and the largest distance of a changed label from an outline. Each class's
-    indicator is filtered with the photo as guide (He et al., "Guided image filtering"); near outlines the class of the
-    largest value is taken. IGNORE stays. Raises ``UserError`` where OpenCV lacks the filter.
+    radius: pixels of the filter's window, and the largest distance of a changed label from an outline. second: another
+    opinion of the labels, [H, W] uint16, which counts as much; wherever it differs, its ids must be near in ``labels``.
+    Each class's indicator is filtered with the photo as guide (He et al., "Guided image filtering"); near outlines the
+    class of the largest value is taken. IGNORE stays. Raises ``UserError`` where OpenCV lacks the filter.
     """
     import cv2
 
@@ -32,7 +33,25 @@ def snap_to_edges(labels: np.ndarray, photo: np.ndarray, radius: int) -> np.ndar
     found = labels.copy()
     for class_id in ids:
         indicator = (labels == class_id).astype(np.float32)
-        value = cv2.ximgproc.guidedFilter(guide, indicator, radius, EPSILON)
-        larger = value > best
-        found[larger], best[larger] = class_id, value[larger]
+        if second is not None:
+            indicator = 0.5 * (indicator + (second == class_id))
+        part = _around(indicator, 4 * radius)
+        value = cv2.ximgproc.guidedFilter(np.ascontiguousarray(guide[part]), indicator[part], radius, EPSILON)
+        larger = value > best[part]
+        found[part][larger], best[part][larger] = class_id, value[larger]
     return np.where(near & (labels != IGNORE), found, labels)
+
+
+def own_outlines(voted: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Return ``own`` [H, W] where a pixel of ``voted`` [H, W] next to it is of that class; else ``voted``."""
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(voted, 1, mode="edge"), (3, 3))
+    return np.where((around == own[..., None, None]).any(axis=(-2, -1)), own, voted)
+
+
+def _around(indicator: np.ndarray, margin: int) -> tuple[slice, slice]:
+    """Return the box of what is not 0 in [H, W], with a margin in pixels: beyond it, the filter gives 0."""
+    spans = []
+    for axis in (1, 0):
+        first, *_, last = np.flatnonzero(indicator.any(axis=axis)).repeat(2)
+        spans.append(slice(max(int(first) - margin, 0), int(last) + 1 + margin))
+    return spans[0], spans[1]

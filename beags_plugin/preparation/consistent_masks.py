@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,6 +16,7 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.masks import REPROJECTIONS
+from beags_plugin.masks.snapping import own_outlines, snap_to_edges
 from beags_plugin.preparation.refiner import Progress
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
@@ -23,9 +25,13 @@ from beags_plugin.system.processes import each_view
 AUTO = "auto"  # pairwise up to the two limits, else voxel
 PAIRWISE_PIXELS = 100_000_000  # in all views; pairwise holds 5 bytes for each: 0.5 GB
 PAIRWISE_PAIRS = 10_000_000_000  # of a voting pixel and a view: 7 to 9 ns each on one core at 256 x 192
+OUTLINE = 1  # pixels: outlines snap no farther
 
 Stage = Callable[[str], AbstractContextManager[Progress | None]]
 """Opens a named stage and returns its progress callback, such as a progress bar."""
+
+Photos = Callable[[int], Tensor]
+"""Returns the photo of a view, [H, W, 3] float32 in 0..1."""
 
 
 @dataclass(frozen=True)
@@ -74,31 +80,56 @@ def masks_as_they_are(labels: LabelMaps, cameras: Sequence[Camera], known: Class
 def reprojected_masks(
     depths: Sequence[Tensor],
     cameras: Sequence[Camera],
-    labels: LabelMaps,
+    masks: LabelMaps,
     known: ClassRanks,
     config,
+    photos: Photos | None,
     progress: Progress | None = None,
 ) -> ConsistentMasks:
     """Return the labels of all views, voted by the views with masks; voted views are held one at a time.
 
     depths: per view [H, W], of the surface, perhaps on disk. config: a ``PreparationConfig`` with a registered
-    reprojection.
+    reprojection. photos: needed for ``config.snap``.
     """
-    given = translated(labels, known, known.ranks)
+    given = translated(masks, known, known.ranks)
     ranked, consistent, confidence = LabelMaps(), LabelMaps(), CompressedMaps()
     reproject = REPROJECTIONS.get(config.reprojection)
     for mask in reproject(depths, cameras, given, len(known), tau=config.tau, progress=progress):
-        ranked.append(mask.labels)
+        labels = mask.labels
+        if config.snap:
+            if photos is None:
+                raise ValueError("outlines cannot snap without photos")
+            labels = with_snapped_outlines(labels, given[len(ranked)], photos(len(ranked)))
+        ranked.append(labels)
         confidence.append((mask.confidence * 255.0 + 0.5).to(torch.uint8))
         if config.min_confidence > 0.0:
             # for the losses alone: the border split looks for the very boundaries that are doubtful
             doubtful = mask.confidence < config.min_confidence
-            consistent.append(_translated(mask.labels, known.class_ids).masked_fill_(doubtful, IGNORE))
+            consistent.append(_translated(labels, known.class_ids).masked_fill_(doubtful, IGNORE))
     if len(ranked) != len(cameras):
         raise ValueError(f"the reprojection {config.reprojection!r} gave {len(ranked)} masks for {len(cameras)} views")
     if config.min_confidence == 0.0:
         consistent = translated(ranked, known, known.class_ids)
     return ConsistentMasks(ranked, consistent, confidence)
+
+
+def with_snapped_outlines(voted: Tensor, own: Tensor | None, photo: Tensor) -> Tensor:
+    """Decide the pixels at outlines by the votes, the view's own mask and the edges of its photo (method, section 10).
+
+    The votes place an outline where the depth of the base has it, some tenth of a pixel outside of the object in all
+    views alike. Own masks err there too, but each otherwise, so that their errors average away.
+
+    voted: [H, W] int, M' of the votes. own: [H, W] int, the mask as given, or None; it counts where a voted pixel next
+    to it has its class. photo: [H, W, 3] float32 in 0..1.
+    """
+    ids = _as_array(voted)
+    second = None if own is None else own_outlines(ids, _as_array(own))
+    pixels = (255.0 * photo + 0.5).to(torch.uint8).cpu().numpy()
+    return torch.from_numpy(snap_to_edges(ids, pixels, OUTLINE, second).astype(np.int32)).to(voted.device)
+
+
+def _as_array(labels: Tensor) -> np.ndarray:
+    return labels.cpu().numpy().astype(np.uint16)
 
 
 def translated(labels: LabelMaps, known: ClassRanks, table: Callable[[Tensor], Tensor]) -> LabelMaps:

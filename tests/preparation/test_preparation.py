@@ -53,6 +53,31 @@ def test_doubtful_pixels_may_be_left_out():
     assert prepared([1, 2, 2, 1, 2], min_confidence=0.7) == [[IGNORE]] * 5
 
 
+def test_outlines_snap_to_photos_which_must_be_there():
+    cameras, names = [CAMERA] * 2, {0: "background", 1: "one"}
+    disc = Surfels.of(
+        torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 2), 1.0),
+        torch.tensor([3.0]), torch.zeros(1, 1, 3),
+    )  # fmt: skip
+    straight = torch.zeros(SIZE, SIZE, dtype=torch.int32)
+    straight[:, SIZE // 2 :] = 1
+    mask = straight.clone()
+    mask[SIZE // 2, SIZE // 2] = 0  # a notch
+    rasterizer, settings = make_rasterizer("torch"), RasterSettings(0.1, 100.0)
+
+    def labels(**photos):
+        config = PreparationConfig(k=1, snap=True)
+        return prepare(disc, cameras, [mask] * 2, names, rasterizer, settings, NoRefiner(), config, **photos).labels
+
+    def photo_of(objects):
+        return lambda index: objects[..., None].expand(-1, -1, 3).float()
+
+    assert all(torch.equal(found, straight) for found in labels(photos=photo_of(straight)))
+    assert all(torch.equal(found, mask) for found in labels(photos=photo_of(mask)))
+    with pytest.raises(ValueError, match="without photos"):
+        labels()
+
+
 @pytest.mark.parametrize(
     ("views", "side", "masks", "expected"),
     [

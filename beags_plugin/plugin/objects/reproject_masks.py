@@ -113,7 +113,8 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
         rendered = render_depths(surfels, cameras, rasterizer, raster_settings(scene), config.depth, progress)
         depths = filed(rendered, surfels.means.device)
     with progress_bar("Reprojecting masks") as progress:
-        masks = reprojected_masks(depths, cameras, given, known_classes(given, classes), config, progress)
+        known = known_classes(given, classes)
+        masks = reprojected_masks(depths, cameras, given, known, config, lambda index: views[index].image, progress)
     assert masks.confidence is not None
     names = [view.name for view in views]
     seconds = time.perf_counter() - start
