@@ -16,6 +16,7 @@ from typing import Any
 from filelock import FileLock
 
 from beags_plugin.bench.trials import Trial
+from beags_plugin.system.child_processes import bound
 from beags_plugin.system.errors import writing
 
 Progress = Callable[[int, int], None]
@@ -99,7 +100,12 @@ class Worker:
             paths = os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH")]))
             environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ, "PYTHONPATH": paths, "COLUMNS": "160"}
             self._process = subprocess.Popen(
-                PROGRAM, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True, env=environment
+                bound(PROGRAM),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+                text=True,
+                env=environment,
             )
         assert self._process.stdin is not None and self._process.stdout is not None
         try:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -98,3 +101,33 @@ def test_a_program_that_cannot_start_leaves_its_complaint_in_the_log(tmp_path, m
             (tmp_path / trial).mkdir()
             assert worker.run(tmp_path / trial) == 1
             assert "no such preset" in (tmp_path / trial / "log.txt").read_text()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the kernel ends a program with its parent on Linux alone")
+def test_the_program_that_runs_trials_ends_with_a_killed_bench(tmp_path):
+    waiting = "import os, sys, time; open('pid', 'w').write(str(os.getpid()) + ' '); time.sleep(600)"
+    bench = (
+        "from pathlib import Path; from beags_plugin.bench import runner; "
+        f"runner.PROGRAM = {[sys.executable, '-c', waiting]!r}; runner.Worker().run(Path('.'))"
+    )
+    process = subprocess.Popen([sys.executable, "-c", bench], cwd=tmp_path)
+    started = tmp_path / "pid"
+    assert _within(60.0, lambda: started.exists() and started.read_text().endswith(" "))
+    process.kill()
+    process.wait()
+    assert _within(60.0, lambda: not _runs(int(started.read_text())))
+
+
+def _within(seconds: float, holds: Callable[[], bool]) -> bool:
+    for _ in range(int(seconds / 0.05)):
+        if holds():
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
