@@ -1,4 +1,4 @@
-"""Outlines of masks that lie on edges of the photo."""
+"""Outlines of masks that follow edges of the photo."""
 
 from __future__ import annotations
 
@@ -8,6 +8,16 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.system.errors import UserError
 
 EPSILON = 1e-2  # variance of colour (0..1) below which the guide counts as flat
+
+
+NO_FILTER = "this OpenCV has no guided filter: run beags doctor, which names the command that repairs it."
+
+
+def can_snap() -> bool:
+    """Return whether OpenCV has the guided filter; plain OpenCV, installed over contrib, has not."""
+    import cv2
+
+    return hasattr(getattr(cv2, "ximgproc", None), "guidedFilter")
 
 
 def snap_to_edges(labels: np.ndarray, photo: np.ndarray, radius: int, second: np.ndarray | None = None) -> np.ndarray:
@@ -20,8 +30,8 @@ def snap_to_edges(labels: np.ndarray, photo: np.ndarray, radius: int, second: np
     """
     import cv2
 
-    if not hasattr(getattr(cv2, "ximgproc", None), "guidedFilter"):
-        raise UserError("this OpenCV has no guided filter: run beags doctor, which names the command that repairs it.")
+    if not can_snap():
+        raise UserError(NO_FILTER)
     ids = [int(i) for i in np.unique(labels) if i != IGNORE]
     if radius < 1 or len(ids) < 2:
         return labels

@@ -19,6 +19,7 @@ from beags_plugin.labels.class_ids import IGNORE, objects_in
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.masks import REPROJECTIONS
+from beags_plugin.masks.snapping import NO_FILTER, can_snap
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.preparation.border_split import BorderSplitConfig, split_at_borders
 from beags_plugin.preparation.consistent_masks import (
@@ -228,6 +229,9 @@ def _consistent_masks(
     if config.reprojection == "none":
         summary.append("reprojection: off, masks used as they are")
         return masks_as_they_are(maps, cameras, known)
+    if config.snap and not can_snap():
+        summary.append(f"outlines are not snapped: {NO_FILTER}")
+        config = replace(config, snap=False)
     method, why = chosen_reprojection(config.reprojection, cameras, maps)
     with stage("Rendering depth") as progress:  # as large as all photos in float
         rendered = render_depths(surfels, cameras, rasterizer, settings, config.depth, progress)

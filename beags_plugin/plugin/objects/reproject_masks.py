@@ -17,6 +17,7 @@ import torch
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import write_mask
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
+from beags_plugin.masks.snapping import can_snap
 from beags_plugin.pictures.masks import Changed, before_and_after
 from beags_plugin.plugin.runs.place import check_data
 from beags_plugin.plugin.runs.read import raster_settings, read_run
@@ -96,7 +97,7 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     config = replace(scene.config.model_config.prepare, **{k: v for k, v in own.items() if v is not None})
     if config.reprojection == "none":
         config = replace(config, reprojection="voxel")
-    config = replace(config, min_confidence=0.0)
+    config = replace(config, min_confidence=0.0, snap=config.snap and can_snap())
     config.check()
     start = time.perf_counter()
     views = manager.views("train")
