@@ -73,9 +73,9 @@ def test_one_command_makes_the_table_from_a_result(clone):
     assert kept["means"][0]["extracted_iou_after"] == 0.912346
     text = (clone / "README.md").read_text()
     head, line, control, failed, *_ = cells(text.partition(readme_table.BEGIN)[2])
-    assert head[2:] == ["extracted IoU, BIoU", "worst object's BIoU", "PSNR", "PSNR shown"]
-    assert control[1:] == ["neither loss", "91.2, 80.0", "50.0", "30.13", "31.00"]
-    assert failed[1:] == ["`beags-fast`", "–, –", "–", "–", "–"] and line[0] == "---"
+    assert head[2:] == ["extracted IoU, BIoU", "worst object's BIoU", "PSNR", "PSNR shown", "removal PSNR, shown"]
+    assert control[1:] == ["neither loss", "91.2, 80.0", "50.0", "30.13", "31.00", "–, –"]
+    assert failed[1:] == ["`beags-fast`", "–, –", "–", "–", "–", "–, –"] and line[0] == "---"
     readme_table.main([], clone)
     assert (clone / "README.md").read_text() == text and text.startswith("# beags")
     assert text.endswith((ROOT / "README.md").read_text().partition(readme_table.END)[2])
