@@ -52,7 +52,7 @@ COLUMNS: tuple[tuple[str, tuple[str, ...], int, float], ...] = (
 """Head, figures, digits, factor; a column without figures is left out."""
 _SOURCE = ("experiment", "preset", "reference", "command", "commit", "machine", "torch", "busy", "quick")
 _ROW = ("scene", "seed", "variant", "failed", "failures", "error_left", "lost_biou", "shown_after", "ssim_after",
-        "removal_remains_after", "cpu_seconds", "own_memory_mb")  # fmt: skip
+        "rendered_biou_after", "removal_remains_after", "cpu_seconds", "own_memory_mb")  # fmt: skip
 
 
 def reduced(report: Mapping[str, Any]) -> dict[str, Any]:

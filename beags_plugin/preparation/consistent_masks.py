@@ -116,8 +116,8 @@ def reprojected_masks(
 def with_snapped_outlines(voted: Tensor, own: Tensor | None, photo: Tensor) -> Tensor:
     """Decide the pixels at outlines by the votes, the view's own mask and the edges of its photo (method, section 10).
 
-    The votes place an outline where the depth of the base has it, some tenth of a pixel outside of the object in all
-    views alike. Own masks err there too, but each otherwise, so that their errors average away.
+    The votes place an outline where the depth of the base has it, more often too far out than too far in. Own masks err
+    there too, but each otherwise, so that their errors average away over the views.
 
     voted: [H, W] int, M' of the votes. own: [H, W] int, the mask as given, or None; it counts where a voted pixel next
     to it has its class. photo: [H, W, 3] float32 in 0..1.

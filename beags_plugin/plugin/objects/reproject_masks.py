@@ -17,7 +17,6 @@ import torch
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import write_mask
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
-from beags_plugin.masks.snapping import can_snap
 from beags_plugin.pictures.masks import Changed, before_and_after
 from beags_plugin.plugin.runs.place import check_data
 from beags_plugin.plugin.runs.read import raster_settings, read_run
@@ -97,7 +96,7 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     config = replace(scene.config.model_config.prepare, **{k: v for k, v in own.items() if v is not None})
     if config.reprojection == "none":
         config = replace(config, reprojection="voxel")
-    config = replace(config, min_confidence=0.0, snap=config.snap and can_snap())
+    config = replace(config, min_confidence=0.0, snap=False)  # a run that is given these masks snaps them
     config.check()
     start = time.perf_counter()
     views = manager.views("train")
@@ -115,7 +114,7 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
         depths = filed(rendered, surfels.means.device)
     with progress_bar("Reprojecting masks") as progress:
         known = known_classes(given, classes)
-        masks = reprojected_masks(depths, cameras, given, known, config, lambda index: views[index].image, progress)
+        masks = reprojected_masks(depths, cameras, given, known, config, None, progress)
     assert masks.confidence is not None
     names = [view.name for view in views]
     seconds = time.perf_counter() - start
