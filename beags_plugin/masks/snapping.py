@@ -8,8 +8,6 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.system.errors import UserError
 
 EPSILON = 1e-2  # variance of colour (0..1) below which the guide counts as flat
-
-
 NO_FILTER = "this OpenCV has no guided filter: run beags doctor, which names the command that repairs it."
 
 
@@ -62,6 +60,6 @@ def _around(indicator: np.ndarray, margin: int) -> tuple[slice, slice]:
     """Return the box of what is not 0 in [H, W], with a margin in pixels: beyond it, the filter gives 0."""
     spans = []
     for axis in (1, 0):
-        first, *_, last = np.flatnonzero(indicator.any(axis=axis)).repeat(2)
-        spans.append(slice(max(int(first) - margin, 0), int(last) + 1 + margin))
+        held = np.flatnonzero(indicator.any(axis=axis))
+        spans.append(slice(max(held[0] - margin, 0), held[-1] + 1 + margin))
     return spans[0], spans[1]
