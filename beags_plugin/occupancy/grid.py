@@ -23,14 +23,15 @@ _HALF = 1 << (_BITS - 1)
 
 
 class VisibilityGrid:
-    """Voxels of all classes that hold lifted points of one class alone.
+    """The voxels that support each class: in the paper those that hold lifted points of this class alone.
 
     D_occ(x, V_phi) is the number of occupied voxels of V_phi among the 27 around x. An empty grid, of a class that is
     never seen or collides everywhere, has D_occ = 0: all of the class is penalised.
 
     voxel_size: world units. origin: [3] float64, corner of voxel (0, 0, 0), world. num_classes: ids lie below it;
         memory and speed depend on the number of classes with voxels.
-    keys: [M] int64, sorted, unique: the occupied voxels, 21 bits per axis. classes: [M] int32, the class of each.
+    keys: [M] int64, sorted: the occupied voxels, 21 bits per axis. classes: [M] int32, the class of each. A voxel that
+        supports several classes comes once for each.
     dense_bytes: see ``DENSE_BYTES``; 0 forces sorted keys. It affects the speed of ``valid`` without the extension.
     """
 
@@ -121,19 +122,12 @@ class VisibilityGrid:
         if (lookup := self._lookup_for(points)) is not None:
             return lookup.count(points, class_ids)
         total = torch.zeros(len(points), dtype=torch.int64, device=points.device)
-        if len(asked := (class_ids != IGNORE).nonzero()[:, 0]) < len(points):
-            total[asked] = self.count(points[asked], class_ids[asked])
-            return total
         usable = (_scaled(points, self.origin, self.voxel_size).abs() < _HALF).all(-1)
-        points = torch.where(usable[:, None], points, self.origin.to(points))
-        voxels = _voxels(points, self.origin, self.voxel_size)
-        for step in itertools.product((-1, 0, 1), repeat=3):
-            neighbour = voxels + voxels.new_tensor(step)
-            near = ((neighbour >= -_HALF) & (neighbour < _HALF)).all(-1) & usable
-            key = _pack(neighbour.clamp(-_HALF, _HALF - 1))
-            position = torch.searchsorted(self.keys, key).clamp_(max=max(len(self.keys) - 1, 0))
-            if len(self.keys):
-                total += near & (self.keys[position] == key) & (self.classes[position] == class_ids)
+        for class_id in class_ids.unique().tolist():
+            own = self.keys[self.classes == class_id]
+            if class_id != IGNORE and len(own):
+                asked = torch.nonzero(usable & (class_ids == class_id))[:, 0]
+                total[asked] = _count(own, _voxels(points[asked], self.origin, self.voxel_size))
         return total
 
     def valid(self, points: Tensor, class_ids: Tensor) -> Tensor:
@@ -239,6 +233,17 @@ class VisibilityGrid:
             return torch.zeros_like(linear, dtype=torch.bool)
         position = torch.searchsorted(self._valid_keys, linear).clamp_(max=len(self._valid_keys) - 1)
         return (self._valid_keys[position] == linear) & known
+
+
+def _count(keys: Tensor, voxels: Tensor) -> Tensor:
+    """Return [P] int64, how many of the 27 voxels around each of ``voxels`` [P, 3] are in the sorted ``keys``."""
+    total = torch.zeros(len(voxels), dtype=torch.int64, device=voxels.device)
+    for step in itertools.product((-1, 0, 1), repeat=3):
+        neighbour = voxels + voxels.new_tensor(step)
+        near = ((neighbour >= -_HALF) & (neighbour < _HALF)).all(-1)
+        key = _pack(neighbour.clamp(-_HALF, _HALF - 1))
+        total += near & (keys[torch.searchsorted(keys, key).clamp_(max=len(keys) - 1)] == key)
+    return total
 
 
 def _scaled(points: Tensor, origin: Tensor, size: float) -> Tensor:

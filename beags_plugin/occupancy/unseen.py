@@ -3,15 +3,15 @@
 In the paper a voxel supports a class only where a view has seen it: space inside things, under them and outside of all
 views counts like space that was seen to be empty. Here a voxel in which no surface was seen, and through which no ray
 has passed, supports the object whose convex hull it lies in, the smallest one; else the background. Hulls are a voxel
-smaller, so that both sides of a contact keep their surfaces.
+smaller, so that both sides of a contact keep their surfaces. What stands in a hollow object goes on where nobody could
+look: unseen space in a mug or a basket supports the smaller objects too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Protocol
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,14 +20,13 @@ from beags_plugin.core.lifting import lift, project
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.occupancy.hulls import GAP, Hull, hulls_of
 from beags_plugin.occupancy.sampling import RADIUS
 
 TAU = 0.02  # of the depth: a ray has not passed what lies so little before its surface, as in reprojection (E5)
 MARGIN = 1.5  # voxels, likewise
 MOST_POINTS = 4096  # of a disc, to find the voxels that it reaches into
-HULL_POINTS = 100_000  # of an object, at most
-GAP = 2.5  # voxels between those of one cluster
-STRAY = 0.05  # of the largest cluster of an object's voxels: smaller ones are no part of it
+HOLLOW = 0.05  # of a hull that rays have passed through; in a hollow object others stand
 _CHUNK_POINTS = 1 << 20  # at a time
 
 
@@ -49,7 +48,7 @@ def with_unseen(
 ) -> VisibilityGrid:
     """Return the grid with the unseen voxels that Gaussians reach into.
 
-    surfels: N Gaussians; class_ids: [N] int32, phi. views: the training views, read twice.
+    surfels: N Gaussians; class_ids: [N] int32, phi. views: the training views, read several times.
     """
     reached = torch.cat([*_reached(grid, surfels, class_ids), grid.keys[:0]]).unique()
     keys = reached[~torch.isin(reached, _seen(grid, views))]
@@ -57,9 +56,12 @@ def with_unseen(
     for view in views:
         passed = _passed(centres, view, MARGIN * grid.voxel_size)
         keys, centres = keys[~passed], centres[~passed]
-    keys, order = torch.cat([grid.keys, keys]).sort()
-    classes = torch.cat([grid.classes, _innermost(grid, centres)])[order]
-    return VisibilityGrid(grid.voxel_size, grid.origin, grid.num_classes, keys, classes)
+    hulls = sorted(hulls_of(grid), key=lambda hull: (hull.volume, hull.class_id))
+    owners = _innermost(hulls, centres, grid.voxel_size)
+    found = [(grid.keys, grid.classes), (keys, owners), *_guests(hulls, keys, owners, views, grid.voxel_size)]
+    together, classes = (torch.cat(parts) for parts in zip(*found, strict=True))
+    together, order = together.sort(stable=True)
+    return VisibilityGrid(grid.voxel_size, grid.origin, grid.num_classes, together, classes[order])
 
 
 def _reached(grid: VisibilityGrid, surfels: Surfels, class_ids: Tensor) -> Iterator[Tensor]:
@@ -112,39 +114,37 @@ def _passed(points: Tensor, view: SeenSurface, margin: float) -> Tensor:
     return inside & (z < (1.0 - TAU) * depth - margin)
 
 
-def _innermost(grid: VisibilityGrid, points: Tensor) -> Tensor:
-    """Return [P] int32, the object with the smallest convex hull around each point; 0 outside of all."""
-    from scipy.spatial import ConvexHull, QhullError
-
+def _innermost(hulls: Sequence[Hull], points: Tensor, depth: float) -> Tensor:
+    """Return [P] int32, the object of the first hull in which each point lies by ``depth``; 0 outside of all."""
     where = points.double().cpu()
-    smallest = torch.full((len(where),), torch.inf, dtype=torch.float64)
     found = torch.zeros(len(where), dtype=torch.int32)
-    for class_id in grid.classes.unique().tolist():
-        if class_id == 0:
-            continue
-        own = grid.centres(grid.keys[grid.classes == class_id]).double().cpu().numpy()
-        try:
-            hull = ConvexHull(_without_strays(own[:: -(-len(own) // HULL_POINTS)], grid.voxel_size))
-        except (QhullError, ValueError):  # few or flat voxels have no inside
-            continue
-        near = (where >= torch.from_numpy(hull.min_bound)).all(1) & (where <= torch.from_numpy(hull.max_bound)).all(1)
-        near &= hull.volume < smallest
-        inside = torch.nonzero(near)[:, 0]
-        for *normal, offset in np.unique(hull.equations, axis=0).tolist():
-            height = where[inside] @ torch.tensor(normal, dtype=torch.float64) + offset
-            inside = inside[height <= -grid.voxel_size]  # the outermost layer is valid by the next one
-        smallest[inside], found[inside] = hull.volume, class_id
+    for hull in hulls:
+        free = torch.nonzero(found == 0)[:, 0]
+        found[free[hull.within(where[free], depth)]] = hull.class_id  # the outermost layer is valid by the next one
     return found.to(points.device)
 
 
-def _without_strays(points: np.ndarray, voxel_size: float) -> np.ndarray:
-    """Return the points [P, 3] without the small clusters beside a large one: a stray Gaussian is no part of a hull."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
+def _guests(
+    hulls: Sequence[Hull], keys: Tensor, owners: Tensor, views: Iterable[SeenSurface], voxel_size: float
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield keys and classes of the unseen voxels in hollow objects, for the smaller objects that may stand in them."""
+    smaller = [
+        [guest for guest in hulls[:rank] if guest.meets(host, GAP * voxel_size)] for rank, host in enumerate(hulls)
+    ]
+    hosts = [rank for rank, guests in enumerate(smaller) if guests and bool((owners == hulls[rank].class_id).any())]
+    for rank, share in zip(hosts, _empty_shares([hulls[rank] for rank in hosts], views, keys, voxel_size), strict=True):
+        inside = keys[owners == hulls[rank].class_id]
+        for guest in smaller[rank] if share > HOLLOW else ():
+            yield inside, torch.full_like(inside, guest.class_id, dtype=torch.int32)
 
-    pairs = cKDTree(points).query_pairs(GAP * voxel_size, output_type="ndarray")
-    ones = np.ones(len(pairs), bool)
-    _, cluster = connected_components(coo_matrix((ones, pairs.T), shape=(len(points), len(points))), directed=False)
-    sizes = np.bincount(cluster, minlength=1)
-    return points[sizes[cluster] >= STRAY * sizes.max()]
+
+def _empty_shares(hulls: Sequence[Hull], views: Iterable[SeenSurface], like: Tensor, voxel_size: float) -> list[float]:
+    """Return the share of each hull's inside that rays have passed; 0 if it has none."""
+    lattices = [hull.lattice() for hull in hulls]
+    inside = [points[hull.within(points, voxel_size)] for hull, points in zip(hulls, lattices, strict=True)]
+    points = torch.cat([*inside, torch.zeros(0, 3)]).to(like.device, torch.float32)
+    passed = torch.zeros(len(points), dtype=torch.bool, device=like.device)
+    for view in views if hulls else ():
+        passed |= _passed(points, view, MARGIN * voxel_size)
+    parts = passed.split([len(points) for points in inside]) if inside else ()
+    return [float(part.double().mean()) if len(part) else 0.0 for part in parts]

@@ -99,6 +99,18 @@ def test_unseen_space_inside_an_object_is_the_objects_that_of_the_smallest_aroun
     assert torch.equal(found.classes[torch.isin(found.keys, grid.keys)], grid.classes)  # what was seen stays
 
 
+@pytest.mark.parametrize("hollow", [True, False])
+def test_what_stands_in_a_hollow_object_goes_on_where_nobody_could_look(hollow: bool):
+    view = wall(6.0)
+    view.depth[10:22, 10:22] = 4.5 if hollow else 3.4  # the bottom of a cup that opens to the camera, or a lid
+    view.depth[15:17, 15:17] = 3.9  # a stick that stands in it
+    stick, cup, far = cube(-0.15, 0.15, 4.0), cube(-0.6, 0.6, 4.0), cube(-0.2, 0.2) + torch.tensor([3.0, 0, 4.0])
+    grid = grid_of(torch.zeros(0, 3), stick, cup, far)
+    asked = discs((0.0, 0.0, 4.35), (0.0, 0.0, 5.2))
+    found = with_unseen(grid, asked, torch.ones(2, dtype=torch.int32), [view])
+    assert valid(found, asked) == [[False, hollow, True, False], [True, False, False, False]]
+
+
 @pytest.mark.parametrize("scales", [(1.0, 1.0), (1.5, 0.01)])
 def test_large_and_long_discs_are_covered(scales):
     surfels = discs((0, 0, 0), (20.0, 0, 0), scales=scales)

@@ -16,12 +16,19 @@ SIZE, CLASSES = 0.25, 5
 
 
 def make_grid(spread: float) -> VisibilityGrid:
-    """A dense cloud of classes 1 to 4 and a sparse one of size ``spread``: if large, no array can hold both."""
+    """A dense cloud of classes 1 to 4 and a sparse one of size ``spread``: if large, no array can hold both.
+
+    Every seventh voxel supports the next class too.
+    """
     g = torch.Generator().manual_seed(3)
     near, far = torch.rand(3000, 3, generator=g) * 4 - 2, (torch.rand(300, 3, generator=g) - 0.5) * spread
     near_ids = (near[:, 0].floor().int() + 2).clamp(0, 3) + 1
     far_ids = torch.randint(1, CLASSES, (300,), generator=g).int()
-    return VisibilityGrid.from_points([(near, near_ids), (far, far_ids)], SIZE, torch.tensor([0.1, -0.2, 0.3]), CLASSES)
+    clouds = [(near, near_ids), (far, far_ids)]
+    grid = VisibilityGrid.from_points(clouds, SIZE, torch.tensor([0.1, -0.2, 0.3]), CLASSES)
+    keys, order = torch.cat([grid.keys, grid.keys[::7]]).sort(stable=True)
+    classes = torch.cat([grid.classes, grid.classes[::7] % (CLASSES - 1) + 1])
+    return VisibilityGrid(SIZE, grid.origin, CLASSES, keys, classes[order])
 
 
 def queries(grid: VisibilityGrid, dtype, count: int = 6000):
