@@ -95,9 +95,10 @@ class Cutter:
                 outside |= ~self._shown_within(view)
         barred = outside[nodes]
         inside, beside = self._bound(marks, barred, name)
-        p = self._walker.potential(inside, beside, barred)
+        behind = self._graph.on_plane_of(beside) & ~self._graph.on_plane_of(inside)
+        p = self._walker.potential(inside, beside, barred, behind)
         if beside.any():
-            p[self._walker.potential(beside, inside, barred) > p] = 0.0
+            p[self._walker.potential(beside, inside, barred, np.zeros_like(behind)) > p] = 0.0
         ends = self._graph.first, self._graph.second
         weights = np.where(barred[ends[0]] | barred[ends[1]], 0.0, self._graph.weights)
         level = self._walker.border_level(p, weights)

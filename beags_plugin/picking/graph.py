@@ -25,6 +25,7 @@ from beags_plugin.core.surfels import Surfels
 NEIGHBOURS = 10
 LEAST_WEIGHT = 0.3  # pixels over all views: less than this is no part of a surface that anybody sees
 CONCAVE, CONVEX, STEP, COLOR, DISTANCE = 30.0, 0.5, 30.0, 2.0, 0.2
+PLANE_HEIGHT, PLANE_SLOPE, PLANE_COSINE = 0.5, 0.02, 0.95  # in s, per unit of distance, of the angle of normals
 FLOOR = 1e-5  # so that no seed's reach ends at a noisy normal
 SMOOTHING_ROUNDS, SMOOTHING_POWER = 2, 8  # neighbours turned by more than 30 degrees have a third of the say or less
 
@@ -35,7 +36,8 @@ class SurfaceGraph:
 
     nodes: [M] int64, the Gaussians that cameras see, ascending. nearest: [N] int64, of each Gaussian the node that is
     nearest to it, itself if it is one. first, second: [P] int64, nodes that are linked, each pair once.
-    weights: [P] float64, w_ij.
+    weights: [P] float64, w_ij. centres, normals: [M, 3] float64, of the nodes, in the scene's units and unit vectors.
+    spacing: s, scene units.
     """
 
     nodes: np.ndarray
@@ -43,6 +45,22 @@ class SurfaceGraph:
     first: np.ndarray
     second: np.ndarray
     weights: np.ndarray
+    centres: np.ndarray
+    normals: np.ndarray
+    spacing: float
+
+    def on_plane_of(self, chosen: np.ndarray) -> np.ndarray:
+        """Return which nodes lie on the tangent plane of one of the nodes ``chosen`` [M] bool, [M] bool.
+
+        A plane's error grows with the distance, by that of the normal.
+        """
+        found = chosen.copy()
+        for centre, normal in zip(self.centres[chosen], self.normals[chosen], strict=True):
+            between = self.centres - centre
+            height = np.abs((between * normal).sum(axis=1))
+            limit = PLANE_HEIGHT * self.spacing + PLANE_SLOPE * np.sqrt((between**2).sum(axis=1))
+            found |= (height < limit) & ((self.normals * normal).sum(axis=1) > PLANE_COSINE)
+        return found
 
 
 def surface_graph(surfels: Surfels, seen: np.ndarray, normals: np.ndarray) -> SurfaceGraph:
@@ -54,7 +72,8 @@ def surface_graph(surfels: Surfels, seen: np.ndarray, normals: np.ndarray) -> Su
     centres, count = means[nodes], len(nodes)
     if count == 0:
         nothing = np.zeros(0, np.int64)
-        return SurfaceGraph(nodes, np.zeros(len(means), np.int64), nothing, nothing, np.zeros(0))
+        vectors = np.zeros((0, 3))
+        return SurfaceGraph(nodes, np.zeros(len(means), np.int64), nothing, nothing, np.zeros(0), vectors, vectors, 1.0)
     tree = cKDTree(centres)
     near = tree.query(centres, k=np.arange(1, min(NEIGHBOURS + 1, count) + 1))[1]
     own = np.arange(count)[:, None]
@@ -68,8 +87,10 @@ def surface_graph(surfels: Surfels, seen: np.ndarray, normals: np.ndarray) -> Su
     nearest[nodes] = np.arange(count)
     others = np.setdiff1d(np.arange(len(means)), nodes)
     nearest[others] = tree.query(means[others])[1]
-    weights = link_weights(centres, smooth, colors.clamp(0.0, 1.0).numpy()[nodes], first, second)
-    return SurfaceGraph(nodes, nearest, first, second, weights)
+    lengths = np.sqrt(((centres[second] - centres[first]) ** 2).sum(axis=1))
+    spacing = max(float(np.median(lengths)) if len(lengths) else 1.0, 1e-30)
+    weights = link_weights(centres / spacing, smooth, colors.clamp(0.0, 1.0).numpy()[nodes], first, second)
+    return SurfaceGraph(nodes, nearest, first, second, weights, centres, smooth, spacing)
 
 
 def smoothed(normals: np.ndarray, seen: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -90,14 +111,13 @@ def smoothed(normals: np.ndarray, seen: np.ndarray, first: np.ndarray, second: n
 def link_weights(
     centres: np.ndarray, normals: np.ndarray, colors: np.ndarray, first: np.ndarray, second: np.ndarray
 ) -> np.ndarray:
-    """Return w_ij [P] of links between M Gaussians; centres, unit normals, colors (0..1): [M, 3]."""
+    """Return w_ij [P] of links between M Gaussians; centres in units of s, unit normals, colors (0..1): [M, 3]."""
     between = centres[second] - centres[first]
     lengths = np.sqrt((between**2).sum(axis=1))
     direction = between / lengths.clip(1e-12)[:, None]
     one, other = ((normals[each] * direction).sum(axis=1) for each in (first, second))
     change = ((colors[first] - colors[second]) ** 2).sum(axis=1)
-    usual = np.median(lengths) if len(lengths) else 1.0
     cost = (
         CONCAVE * (one - other).clip(0) ** 2 + CONVEX * (other - one).clip(0) ** 2 + STEP * (0.5 * (one + other)) ** 2
     )
-    return np.exp(-(cost + COLOR * change + DISTANCE * lengths / max(usual, 1e-30))) + FLOOR
+    return np.exp(-(cost + COLOR * change + DISTANCE * lengths)) + FLOOR

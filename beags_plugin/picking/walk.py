@@ -11,6 +11,7 @@ import numpy as np
 from beags_plugin.picking.graph import SurfaceGraph
 
 LEAK = 2e-3  # beside a link's weight, at most 1
+MORE_LEAK = 5e-2
 TOLERANCE = 1e-4  # of the residual's norm
 MOST_ITERATIONS = 2_000
 LEAST_LEVEL, HIGHEST_LEVEL = 0.1, 0.98  # of a border
@@ -30,14 +31,17 @@ class Walker:
         self._links = csr_array((values, (rows, columns)), shape=(count, count))
         self._degree = np.bincount(rows, values, count) + LEAK
 
-    def potential(self, inside: np.ndarray, outside: np.ndarray, excluded: np.ndarray) -> np.ndarray:
+    def potential(
+        self, inside: np.ndarray, outside: np.ndarray, excluded: np.ndarray, leaking: np.ndarray
+    ) -> np.ndarray:
         """Return p [M] float64, 0..1: 1 ``inside``, 0 ``outside`` or where no walk goes, elsewhere the walk's chance.
 
-        inside, outside, excluded: disjoint [M] bool; no link leads to what is excluded.
-        Solves (D + LEAK - W) p = 0 there by conjugate gradients, preconditioned by the diagonal.
+        inside, outside, excluded: disjoint [M] bool; no link leads to what is excluded. leaking: [M] bool, where a walk
+        ends more often, by ``MORE_LEAK``.
+        Solves (D + leak - W) p = 0 there by conjugate gradients, preconditioned by the diagonal.
         """
         free = ~(inside | outside | excluded)
-        degree = self._degree - self._links @ excluded.astype(np.float64)
+        degree = self._degree - self._links @ excluded.astype(np.float64) + MORE_LEAK * leaking
         p = inside.astype(np.float64)
         residual = np.where(free, self._links @ p, 0.0)
         goal = TOLERANCE**2 * (residual**2).sum()

@@ -137,6 +137,12 @@ def grabcut(content: Any) -> Callable[[Place], Any]:
     return made("grabcut", file("prompts.json", text), "--options prompts=prompts.json --load-config {run}")
 
 
+def cut(**places: Any) -> Callable[[Place], Any]:
+    """Return a mistake in the prompts of the cut, which asks a run for its Gaussians. places: of the cup in view v01."""
+    text = json.dumps({"objects": [{"name": "cup", "prompts": [{"view": "v01", **places}]}]})
+    return made("cut", file("prompts.json", text), "--options prompts=prompts.json --load-config {run}")
+
+
 def boxed(box: list[Any], view: str = "v01") -> dict[str, Any]:
     return {"name": "cup", "prompts": [{"view": view, "box": box}]}
 
@@ -169,6 +175,11 @@ mistakes(
         "GrabCut: a view that does not exist": grabcut(boxed([2, 2, 8, 8], "v99")),
         "GrabCut: prompts broken": grabcut("{"),
         "GrabCut: prompts nested 100,000 deep": grabcut("[" * 100_000),
+        "the cut: no point on the object": cut(box=[2, 2, 8, 8]),
+        "the cut: a point outside of the picture": cut(points=[[100, 100]]),
+        "the cut: a view that does not exist": cut(view="v99", points=[[5, 5]]),
+        "the cut: points that contradict": cut(points=[[6, 6]], outside=[[6, 6]]),
+        "the cut: a point on nothing": cut(points=[[0, 11]]),
         "depth of a run without the run": made("grabcut", GOOD, "--options prompts=prompts.json"),
     },
 )

@@ -123,7 +123,7 @@ def test_the_potential_solves_its_equation_and_lies_between_the_marks(grey):
     count = len(walker._degree)
     inside, outside = np.zeros(count, bool), np.zeros(count, bool)
     inside[count // 2], outside[0] = True, True
-    p = walker.potential(inside, outside, np.zeros(count, bool))
+    p = walker.potential(inside, outside, *np.zeros((2, count), bool))
     free = ~(inside | outside)
     residual = (walker._degree * p - walker._links @ p)[free]
     assert p[inside] == 1 and p[outside] == 0 and (p >= 0).all() and (p <= 1).all()
