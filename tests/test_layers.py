@@ -27,7 +27,7 @@ ROOMS = [
     "refiners",
     "preparation",
     "losses",
-    "occupancy assignment export importers",
+    "occupancy assignment export importers cleaning",
     "rasterizers extraction masks",
     "core",
     "ops",
