@@ -19,6 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from beags_plugin.core.minimum_cut import cut
+
 NUM_EDGES = 10
 """Nearest centres to which a Gaussian is linked, itself among them."""
 FOREGROUND_THRESHOLD = 0.9
@@ -26,7 +28,6 @@ FOREGROUND_THRESHOLD = 0.9
 
 CLUSTERS = 5
 TERMINAL_DECAY = 0.1  # per unit of distance to a cluster; links and colours decay by 1
-FIXED_POINT = 2**16  # scipy's flows are int32; a link is at most 2, a terminal at most 2
 
 
 def members(
@@ -86,36 +87,6 @@ def _likeness(centres: np.ndarray, dc: np.ndarray, chosen: np.ndarray) -> np.nda
     clusters = KMeans(few, n_init=1, random_state=0)  # pyright: ignore[reportArgumentType]  (or "auto")
     nearest = np.min([_distance(centres, mean) for mean in clusters.fit(centres[chosen]).cluster_centers_], axis=0)
     return 0.5 * np.exp(-TERMINAL_DECAY * nearest) + 0.5 * np.exp(-_distance(dc, dc[chosen].mean(axis=0)))
-
-
-def cut(pairs: Tensor, capacities: Tensor, terminals: Tensor) -> Tensor:
-    """Return the object's side of the minimum cut, [N] bool: all nodes that cannot reach the sink, ties among them.
-
-    pairs: [P, 2] int64. capacities: [P] float64, of a link in both directions. terminals: [N, 2] float64.
-    """
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import breadth_first_order, maximum_flow
-
-    count = len(terminals)
-    source, sink = count, count + 1
-    first, second = pairs.numpy().T
-    nodes, links = np.arange(count), _fixed_point(capacities)
-    gain = _fixed_point(terminals[:, 0]) - _fixed_point(terminals[:, 1])  # what both sides pay anyway changes no cut
-    rows = np.concatenate([first, second, np.full(count, source), nodes])
-    columns = np.concatenate([second, first, nodes, np.full(count, sink)])
-    values = np.concatenate([links, links, gain.clip(0), (-gain).clip(0)])
-    there = values > 0
-    shape = (count + 2, count + 2)
-    graph = csr_array((values[there], (rows[there], columns[there])), shape=shape, dtype=np.int32)
-    residual = graph - maximum_flow(graph, source, sink, method="dinic").flow  # without zeros
-    reaching = breadth_first_order(residual.T, sink, return_predecessors=False)
-    inside = np.ones(count + 2, dtype=bool)
-    inside[reaching] = False
-    return torch.from_numpy(inside[:count])
-
-
-def _fixed_point(capacities: Tensor) -> np.ndarray:
-    return (capacities * FIXED_POINT).round().int().numpy()
 
 
 def _finite(values: Tensor) -> np.ndarray:

@@ -9,8 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from beags_plugin.core.minimum_cut import cut
 from beags_plugin.refiners import graph_cut
-from beags_plugin.refiners.graph_cut import cut, members, n_links, terminals
+from beags_plugin.refiners.graph_cut import members, n_links, terminals
 
 
 def on_a_line(*x: float) -> Tensor:

@@ -8,18 +8,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from beags_plugin.core.regions import Ball, Block, HalfSpace, Region
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import load_json, reason
 
 EXAMPLE = '{"objects": [{"name": "cup", "prompts": [{"view": "IMG_1", "box": [10, 20, 90, 80]}]}]}'
 
 
+STROKE_SPACING = 4.0  # pixels between the points that stand for a stroke
+
+
 @dataclass(frozen=True)
 class Prompt:
     """The place of an object in one view.
 
-    box: (left, top, right, bottom) pixels of the image file, or None. points: (x, y) pixels; inside: True for points on
-    the object.
+    box: (left, top, right, bottom) pixels of the image file, or None. points: (x, y) pixels, those along strokes among
+    them; inside: True for points on the object.
     """
 
     box: tuple[float, float, float, float] | None = None
@@ -29,19 +33,25 @@ class Prompt:
 
 @dataclass(frozen=True)
 class PromptedObject:
-    """An object: its class id, its prompts by view (``matching.PhotoNames``), and a text for a detector, or None."""
+    """An object: its class id, its prompts by view (``matching.PhotoNames``), and a text for a detector, or None.
+
+    space: regions of space, in the frame of the input poses, in all of which it lies.
+    """
 
     class_id: int
     name: str
     prompts: Mapping[str, Prompt]
     text: str | None = None
+    space: tuple[Region, ...] = ()
 
 
 def read_prompts(path: Path) -> list[PromptedObject]:
     """Read the objects of a prompts JSON; raise ``UserError`` with file and object.
 
     {"objects": [{"name": ..., "id": optional, "text": optional, "prompts": [{"view": name, "box": [left, top, right,
-    bottom], "points": [[x, y], ...], "outside": [[x, y], ...]}, ...]}, ...]}
+    bottom], "points": [[x, y], ...], "outside": [[x, y], ...], "strokes": [[[x, y], ...], ...],
+    "outside_strokes": [[[x, y], ...], ...]}, ...], "space": [{"box": [[x, y, z], [x, y, z]]},
+    {"sphere": [x, y, z, radius]}, {"plane": [x, y, z, d]}]}, ...]}
     """
     try:
         content = load_json(path)
@@ -78,19 +88,34 @@ def _object(entry: Any, index: int) -> PromptedObject:
         prompts[str(one["view"])] = _prompt(one)
     if not prompts and not text:
         raise ValueError("it has neither prompts nor a text")
-    return PromptedObject(class_id, name, prompts, None if text is None else str(text))
+    space = tuple(_region(one) for one in entry.get("space", []))
+    return PromptedObject(class_id, name, prompts, None if text is None else str(text), space)
+
+
+def _region(entry: Mapping[str, Any]) -> Region:
+    if len(entry) != 1 or not entry.keys() <= {"box", "sphere", "plane"}:
+        raise ValueError(f"{dict(entry)} is none of box, sphere and plane")
+    if "box" in entry:
+        low, high = (tuple(float(value) for value in corner) for corner in entry["box"])
+        return Block(low, high)
+    ((kind, numbers),) = entry.items()
+    x, y, z, last = (float(value) for value in numbers)
+    return Ball((x, y, z), last) if kind == "sphere" else HalfSpace((x, y, z), last)
 
 
 def _prompt(entry: Mapping[str, Any]) -> Prompt:
-    inside, outside = (_points(entry.get(key, [])) for key in ("points", "outside"))
+    inside, outside = (
+        _points(entry.get(points, [])) + tuple(point for line in entry.get(strokes, []) for point in _along(line))
+        for points, strokes in (("points", "strokes"), ("outside", "outside_strokes"))
+    )
     box = None
     if (given := entry.get("box")) is not None:
         left, top, right, bottom = (float(value) for value in given)
         if not (left < right and top < bottom and all(map(math.isfinite, (left, top, right, bottom)))):
             raise ValueError(f"the box {given} is not [left, top, right, bottom]")
         box = (left, top, right, bottom)
-    if box is None and not inside:
-        raise ValueError("a prompt needs a box or points on the object")
+    if box is None and not inside and not outside:
+        raise ValueError("a prompt needs a box or points")
     return Prompt(box, inside + outside, (True,) * len(inside) + (False,) * len(outside))
 
 
@@ -99,3 +124,15 @@ def _points(given: Sequence[Any]) -> tuple[tuple[float, float], ...]:
     if not all(math.isfinite(value) for point in points for value in point):
         raise ValueError(f"the points {given} are not [[x, y], ...]")
     return points
+
+
+def _along(line: Sequence[Any]) -> tuple[tuple[float, float], ...]:
+    """Return points along a stroke's corners, at most ``STROKE_SPACING`` apart."""
+    corners = _points(line)
+    found = corners[:1]
+    for (x, y), (next_x, next_y) in zip(corners, corners[1:], strict=False):
+        steps = max(1, math.ceil(math.hypot(next_x - x, next_y - y) / STROKE_SPACING))
+        found += tuple(
+            (x + (next_x - x) * step / steps, y + (next_y - y) * step / steps) for step in range(1, steps + 1)
+        )
+    return found

@@ -15,8 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from beags_plugin.core.surfels import Surfels
 from beags_plugin.data.files import image_size, list_photos, photo_names
 from beags_plugin.data.layout import fitting_layouts
+from beags_plugin.extraction.frames import to_input_frame
 from beags_plugin.labels.classes import NO_TRUTH, check_names, write_mask
 from beags_plugin.masks.snapping import snap_to_edges
 from beags_plugin.masks.sources import MASK_SOURCES
@@ -25,7 +27,7 @@ from beags_plugin.pictures.masks import overlay
 from beags_plugin.plugin.objects.check_masks import check, options_beside, write_contradictions
 from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
 from beags_plugin.plugin.runs.place import open_run
-from beags_plugin.plugin.runs.read import raster_settings, read_run
+from beags_plugin.plugin.runs.read import raster_settings, read_run, read_transform
 from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParserConfig
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
@@ -38,6 +40,7 @@ class RunGeometry:
     """The surfaces of a trained run, at the size of the photographs: of its training views, then of the others."""
 
     def __init__(self, config_path: Path, data: Path | None = None) -> None:
+        self.folder = config_path.parent
         self.scene = read_run(config_path, None if open_run(config_path).data_path.exists() else data)
         self.manager = data_to_reproject(self.scene, config_path, ReprojectionOptions())
         self.images = list(self.manager.train_dataset.image_filenames)
@@ -55,6 +58,15 @@ class RunGeometry:
     @cached_property
     def _surfels(self):
         return geometry_inputs(self.scene.surfels())
+
+    def surfels(self) -> Surfels:
+        """Return the N Gaussians, in the run's frame."""
+        return self.scene.surfels()
+
+    def input_means(self) -> Tensor:
+        """Return the centres of the Gaussians, [N, 3] float64, in the frame of the input poses."""
+        transform, scale = read_transform(self.folder) or (torch.eye(3, 4), 1.0)
+        return to_input_frame(self.surfels(), transform, scale).means.double()
 
     def depth(self, view: int) -> Tensor:
         """Return [h, w] float32."""

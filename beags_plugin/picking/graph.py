@@ -1,0 +1,103 @@
+"""The graph of a scene's surface: near Gaussians are linked, strongly if nothing between them looks like a border.
+
+Between touching solids a surface has a concave crease (Stein, Schoeler, Papon, Woergoetter, "Object Partitioning using
+Local Convexity", CVPR 2014), or a step from one sheet to another in front of it; within one solid it is flat or convex.
+Of linked Gaussians i and j, mu is the centre, n the normal towards the cameras, c the colour of degree 0, and
+u = (mu_j - mu_i) / |mu_j - mu_i|. The link weighs
+
+    w_ij = 1e-5 + exp(-(30 [(n_i - n_j) . u]+^2 + 0.5 [(n_j - n_i) . u]+^2 + 30 ((n_i + n_j) . u / 2)^2
+                        + 2 |c_i - c_j|^2 + 0.2 |mu_i - mu_j| / s))
+
+with a concave crease, a convex one, a step (0 on a round surface, whose mean normal is square to each chord), the
+colours, and the distance in units of s, the median one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from beags_plugin.core.sh import sh_colors
+from beags_plugin.core.surfels import Surfels
+
+NEIGHBOURS = 10
+LEAST_WEIGHT = 0.3  # pixels over all views: less than this is no part of a surface that anybody sees
+CONCAVE, CONVEX, STEP, COLOR, DISTANCE = 30.0, 0.5, 30.0, 2.0, 0.2
+FLOOR = 1e-5  # so that no seed's reach ends at a noisy normal
+SMOOTHING_ROUNDS, SMOOTHING_POWER = 2, 8  # neighbours turned by more than 30 degrees have a third of the say or less
+
+
+@dataclass(frozen=True)
+class SurfaceGraph:
+    """The linked Gaussians of a scene of N.
+
+    nodes: [M] int64, the Gaussians that cameras see, ascending. nearest: [N] int64, of each Gaussian the node that is
+    nearest to it, itself if it is one. first, second: [P] int64, nodes that are linked, each pair once.
+    weights: [P] float64, w_ij.
+    """
+
+    nodes: np.ndarray
+    nearest: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    weights: np.ndarray
+
+
+def surface_graph(surfels: Surfels, seen: np.ndarray, normals: np.ndarray) -> SurfaceGraph:
+    """Return the graph of N surfels; ``seen`` [N] and ``normals`` [N, 3] as of ``sight.seen_from``; M may be 0."""
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
+
+    nodes = np.flatnonzero(seen > LEAST_WEIGHT)
+    means = torch.nan_to_num(surfels.means.detach().double().cpu(), posinf=0.0, neginf=0.0).numpy()
+    centres, count = means[nodes], len(nodes)
+    if count == 0:
+        nothing = np.zeros(0, np.int64)
+        return SurfaceGraph(nodes, np.zeros(len(means), np.int64), nothing, nothing, np.zeros(0))
+    tree = cKDTree(centres)
+    near = tree.query(centres, k=np.arange(1, min(NEIGHBOURS + 1, count) + 1))[1]
+    own = np.arange(count)[:, None]
+    low, high = np.minimum(near, own), np.maximum(near, own)
+    keys = np.unique((low * count + high)[near != own])
+    first, second = keys // count, keys % count
+    smooth = smoothed(normals[nodes], seen[nodes], first, second)
+    dc = torch.nan_to_num(surfels.sh_dc.detach().double().cpu())
+    colors = sh_colors(dc, dc.new_zeros(len(dc), 0, 3), dc, dc.new_zeros(3), degree=0)
+    nearest = np.empty(len(means), np.int64)
+    nearest[nodes] = np.arange(count)
+    others = np.setdiff1d(np.arange(len(means)), nodes)
+    nearest[others] = tree.query(means[others])[1]
+    weights = link_weights(centres, smooth, colors.clamp(0.0, 1.0).numpy()[nodes], first, second)
+    return SurfaceGraph(nodes, nearest, first, second, weights)
+
+
+def smoothed(normals: np.ndarray, seen: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return unit normals [M, 3] averaged over linked Gaussians that face alike, by the root of their weight seen."""
+    from scipy.sparse import csr_array
+
+    count, say = len(normals), np.sqrt(seen)
+    rows = np.concatenate([first, second, np.arange(count)])
+    columns = np.concatenate([second, first, np.arange(count)])
+    for _ in range(SMOOTHING_ROUNDS):
+        alike = (normals[first] * normals[second]).sum(axis=1).clip(0.0, 1.0) ** SMOOTHING_POWER
+        values = np.concatenate([alike * say[second], alike * say[first], say])
+        mixed = np.asarray(csr_array((values, (rows, columns)), shape=(count, count)) @ normals)
+        normals = mixed / np.sqrt((mixed**2).sum(axis=1, keepdims=True)).clip(1e-12)
+    return normals
+
+
+def link_weights(
+    centres: np.ndarray, normals: np.ndarray, colors: np.ndarray, first: np.ndarray, second: np.ndarray
+) -> np.ndarray:
+    """Return w_ij [P] of links between M Gaussians; centres, unit normals, colors (0..1): [M, 3]."""
+    between = centres[second] - centres[first]
+    lengths = np.sqrt((between**2).sum(axis=1))
+    direction = between / lengths.clip(1e-12)[:, None]
+    one, other = ((normals[each] * direction).sum(axis=1) for each in (first, second))
+    change = ((colors[first] - colors[second]) ** 2).sum(axis=1)
+    usual = np.median(lengths) if len(lengths) else 1.0
+    cost = (
+        CONCAVE * (one - other).clip(0) ** 2 + CONVEX * (other - one).clip(0) ** 2 + STEP * (0.5 * (one + other)) ** 2
+    )
+    return np.exp(-(cost + COLOR * change + DISTANCE * lengths / max(usual, 1e-30))) + FLOOR

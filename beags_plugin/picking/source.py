@@ -1,0 +1,179 @@
+"""Source of masks: objects cut out of a trained scene by prompts, drawn into all training views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Protocol, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.masks.sources.base import Geometry, MadeMasks, MaskSource, Progress, SourceScene
+from beags_plugin.masks.sources.prompts import Prompt, PromptedObject, read_prompts
+from beags_plugin.picking.cutter import Cutter, ViewMarks
+from beags_plugin.picking.sight import spread
+from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+from beags_plugin.rasterizers.rendering import draw_features, geometry_inputs
+from beags_plugin.system.errors import UserError
+
+MARK = 0.003  # of the image diagonal: radius of a marked point
+DRAWN = 0.5  # share of a pixel's light from which on it shows the object
+
+
+class TrainedGeometry(Geometry, Protocol):
+    """A geometry that gives its Gaussians too, and what they are rendered with."""
+
+    rasterizer: Rasterizer
+    settings: RasterSettings
+
+    def surfels(self) -> Surfels:
+        """Return the N Gaussians, in the run's frame."""
+        ...
+
+    def input_means(self) -> Tensor:
+        """Return their centres [N, 3] float64 in the frame of the input poses."""
+        ...
+
+
+@dataclass(frozen=True)
+class CutSource(MaskSource):
+    """Objects cut out of the Gaussians of a run by points, strokes and boxes in one view or more (``picking.cutter``).
+
+    prompts: JSON, see ``prompts.read_prompts``. Points on an object count as points beside the others.
+    """
+
+    needs_run: ClassVar[bool] = True
+    guesses: ClassVar[bool] = True
+
+    prompts: Path = Path("prompts.json")
+
+    def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
+        assert scene.geometry is not None
+        path = scene.below(self.prompts)
+        objects, places = read_prompts(path), scene.places()
+        geometry = cast(TrainedGeometry, scene.geometry)
+        marked = _by_view(scene, objects, places, path)
+        trained = [index for index, place in enumerate(places) if scene.photos[place].trained]
+        surfels = geometry.surfels()
+        cameras = spread([geometry.cameras[index] for index in trained])
+        seen, total = len(cameras), len(cameras) + len(objects) + len(trained)
+        cutter = Cutter(surfels, cameras, geometry.rasterizer, geometry.settings, lambda done, _: progress(done, total))
+        means = geometry.input_means()
+        members = []
+        for done, one in enumerate(objects, start=1):
+            excluded = torch.zeros(len(surfels), dtype=torch.bool)
+            for region in one.space:
+                excluded |= ~region.contains(means).cpu()
+            views = [view_marks(geometry, index, scene, prompts, one) for index, prompts in marked.items()]
+            members.append(cutter.solve([view for view in views if view is not None], excluded, one.name))
+            progress(seen + done, total)
+        left = iter(range(seen + len(objects) + 1, total + 1))
+        names = {0: "background", **{one.class_id: one.name for one in objects}}
+        maps = _drawn(scene, geometry, objects, torch.stack(members, dim=1), lambda: progress(next(left), total))
+        return MadeMasks(names, maps, [])
+
+
+def _drawn(
+    scene: SourceScene,
+    geometry: TrainedGeometry,
+    objects: Sequence[PromptedObject],
+    members: Tensor,
+    one_done: Callable[[], None],
+) -> Iterator[np.ndarray | None]:
+    """Yield per photo the labels [H, W] uint16 of what it shows of the objects, or None if it is not for training.
+
+    members: [N, objects] bool. A pixel shows the object that gives most of its light, if that is more than ``DRAWN``.
+    """
+    ids = np.array([one.class_id for one in objects], np.uint16)
+    inputs = geometry_inputs(geometry.surfels())
+    features = members.to(inputs.means)
+    view_of = {place: index for index, place in enumerate(scene.places())}
+    for place, photo in enumerate(scene.photos):
+        if place not in view_of or not photo.trained:
+            yield None
+            continue
+        camera = geometry.cameras[view_of[place]]
+        with torch.no_grad():
+            share, best = draw_features(geometry.rasterizer, inputs, features, camera, geometry.settings).max(dim=-1)
+        labels = np.where((share > DRAWN).cpu().numpy(), ids[best.cpu().numpy()], np.uint16(0))
+        yield geometry.to_photo(labels, view_of[place])
+        one_done()
+
+
+Prompts = list[tuple[PromptedObject, Prompt]]
+
+
+def _by_view(
+    scene: SourceScene, objects: Sequence[PromptedObject], places: Sequence[int], path: Path
+) -> dict[int, Prompts]:
+    """Return the prompts of each prompted view of the geometry; raise ``UserError`` for one that it has not."""
+    found: dict[int, Prompts] = {}
+    for one in objects:
+        if not any(any(prompt.inside) for prompt in one.prompts.values()):
+            raise UserError(f"{path} gives no point on {one.name}: give at least one in a view that shows it.")
+        for stem, prompt in one.prompts.items():
+            photo = scene.index_of(stem, str(path))
+            if photo not in places or not scene.photos[photo].trained:
+                raise UserError(f"{path} has prompts in {stem}, which is held out: prompt a training view.")
+            _check_inside(scene, photo, prompt, one.name)
+            found.setdefault(places.index(photo), []).append((one, prompt))
+    return found
+
+
+def _check_inside(scene: SourceScene, photo: int, prompt: Prompt, name: str) -> None:
+    width, height = scene.photos[photo].width, scene.photos[photo].height
+    for x, y in prompt.points:
+        if not (0 <= x < width and 0 <= y < height):
+            raise UserError(
+                f"the point [{x:g}, {y:g}] of {name} in {scene.photos[photo].name} lies outside its image of "
+                f"{width}x{height} pixels: correct it."
+            )
+    if prompt.box is not None:
+        left, top, right, bottom = prompt.box
+        if left >= width or top >= height or right <= 0 or bottom <= 0:
+            raise UserError(
+                f"the box {list(prompt.box)} of {name} in {scene.photos[photo].name} lies outside its image of "
+                f"{width}x{height} pixels: correct it."
+            )
+
+
+def view_marks(
+    geometry: Geometry, index: int, scene: SourceScene, prompts: Prompts, whose: PromptedObject
+) -> ViewMarks | None:
+    """Return the marks of an object in view ``index`` of the geometry, without distortion; None if there are none.
+
+    prompts: those of all objects in this view.
+    """
+    photo = scene.photos[scene.places()[index]]
+    width, height = photo.width, photo.height
+    radius = max(1, round(MARK * float(np.hypot(width, height))))
+    numbers = np.full((height, width), IGNORE, np.uint16)
+    inside: list[bool] = []
+    within = None
+    for one, prompt in prompts:
+        if one is whose and prompt.box is not None:
+            left, top, right, bottom = prompt.box
+            column, row = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
+            within = (column >= left) & (column <= right) & (row >= top) & (row <= bottom)
+        for (x, y), on in zip(prompt.points, prompt.inside, strict=True):
+            if one is whose or on:
+                _stamp(numbers, int(x), int(y), radius, len(inside))
+                inside.append(on and one is whose)
+    if not inside and within is None:
+        return None
+    straight = torch.from_numpy(geometry.to_straight(numbers, index).astype(np.int32))
+    if within is not None:
+        within = torch.from_numpy(geometry.to_straight(within.astype(np.uint16), index) == 1)
+    return ViewMarks(photo.name, geometry.cameras[index], straight, tuple(inside), within)
+
+
+def _stamp(numbers: np.ndarray, x: int, y: int, radius: int, number: int) -> None:
+    """Write the number to a pixel, and into the square about it but where an earlier mark is."""
+    part = numbers[max(y - radius, 0) : y + radius + 1, max(x - radius, 0) : x + radius + 1]
+    part[part == IGNORE] = number
+    numbers[y, x] = number

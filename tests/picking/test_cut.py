@@ -1,0 +1,155 @@
+"""The cut of solids on a floor by a few marks."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from touching_solids import SETTINGS, marks, pixel_of, solids, views
+
+from beags_plugin.core.regions import Ball, Block, HalfSpace
+from beags_plugin.picking.cutter import Cutter
+from beags_plugin.picking.walk import Walker
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.system.errors import UserError
+
+GREY = (0.5, 0.5, 0.5)
+COLOURED = {0: (0.6, 0.6, 0.6), 1: (0.8, 0.2, 0.2), 2: (0.2, 0.3, 0.8)}
+LOW_TOP, HIGH_TOP, FLOOR = (-0.2, 0.0, 0.25), (0.15, 0.0, 0.5), (-0.7, 0.3, 0.0)
+
+
+def cutter_of(colors) -> tuple[Cutter, torch.Tensor]:
+    surfels, owner = solids(colors)
+    return Cutter(surfels, views(), make_rasterizer("auto"), SETTINGS), owner
+
+
+@pytest.fixture(scope="module")
+def coloured():
+    return cutter_of(COLOURED)
+
+
+@pytest.fixture(scope="module")
+def grey():
+    return cutter_of(dict.fromkeys(range(3), GREY))
+
+
+def overlap(found: torch.Tensor, exact: torch.Tensor) -> float:
+    return float((found & exact).sum() / (found | exact).sum())
+
+
+@pytest.mark.parametrize("scene", ["coloured", "grey"])
+@pytest.mark.parametrize("solid", [1, 2])
+def test_a_solid_is_cut_from_the_one_that_it_touches_and_from_the_floor(scene, solid, request):
+    """By colours and creases; by creases alone where all is grey."""
+    cutter, owner = request.getfixturevalue(scene)
+    own, other = (LOW_TOP, HIGH_TOP) if solid == 1 else (HIGH_TOP, LOW_TOP)
+    found = cutter.solve([marks(views()[3], [own], [other, FLOOR])])
+    assert overlap(found, owner == solid) > 0.97
+
+
+def test_a_second_cut_after_a_point_beside_takes_the_other_solid_away(grey):
+    cutter, owner = grey
+    camera = views()[3]
+    both = cutter.solve([marks(camera, [LOW_TOP, HIGH_TOP], [FLOOR])])
+    assert overlap(both, owner > 0) > 0.97
+    less = cutter.solve([marks(camera, [LOW_TOP], [HIGH_TOP, FLOOR])])
+    assert overlap(less, owner == 1) > 0.97
+    again = cutter.solve([marks(camera, [LOW_TOP, HIGH_TOP], [FLOOR])])
+    assert torch.equal(both, again), "a cut depends on those before"
+
+
+def test_marks_of_several_views_act_together(coloured):
+    cutter, owner = coloured
+    found = cutter.solve([marks(views()[3], [LOW_TOP]), marks(views()[5], [], [HIGH_TOP, FLOOR])])
+    assert overlap(found, owner == 1) > 0.97
+
+
+def test_what_lies_outside_a_box_is_excluded(coloured):
+    cutter, _ = coloured
+    camera = views()[3]
+    within = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    row, column = pixel_of(camera, LOW_TOP)
+    within[row - 6 : row + 7, column - 6 : column + 7] = True
+    found = cutter.solve([marks(camera, [LOW_TOP], within=within)])
+    surfels, _ = solids(COLOURED)
+    assert found.any()
+    for mean in surfels.means[found]:
+        assert within[pixel_of(camera, tuple(mean.tolist()))]
+
+
+def test_regions_of_space_limit_the_cut(coloured):
+    cutter, owner = coloured
+    means = solids(COLOURED)[0].means.double()
+    halves = [HalfSpace((-1.0, 0.0, 0.0), 0.2), Block((-9, -9, -9), (-0.2, 9, 9)), Ball((-10.2, 0.0, 0.0), 10.0)]
+    for region in halves:
+        outside = ~region.contains(means)
+        found = cutter.solve([marks(views()[3], [(-0.3, 0.0, 0.25)], [FLOOR])], outside)
+        assert found.any() and not (found & outside).any()
+        assert overlap(found, (owner == 1) & ~outside) > 0.95
+
+
+def test_bad_marks_end_with_a_sentence(coloured):
+    cutter, _ = coloured
+    camera = views()[3]
+    with pytest.raises(UserError, match="no point lies on the cup: give at least one"):
+        cutter.solve([marks(camera, [], [FLOOR])], name="the cup")
+    two_views = [marks(camera, [LOW_TOP]), marks(views()[4], [], [LOW_TOP])]
+    with pytest.raises(UserError, match="contradicts another point"):
+        cutter.solve(two_views)
+    sky = marks(camera, [LOW_TOP])
+    sky.numbers[sky.numbers == 0] = 65535
+    sky.numbers[-3:, :3] = 0
+    with pytest.raises(UserError, match="a point on the object in v0 shows nothing"):
+        cutter.solve([sky])
+    nowhere = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    with pytest.raises(UserError, match="lies outside a box or another limit"):
+        cutter.solve([marks(camera, [LOW_TOP], within=nowhere)])
+
+
+def test_a_cut_of_the_whole_scene_is_refused():
+    surfels, owner = solids(COLOURED)
+    camera = views()[3]
+    alone = Cutter(surfels[owner == 1], views(), make_rasterizer("auto"), SETTINGS)
+    with pytest.raises(UserError, match="takes the whole scene"):
+        alone.solve([marks(camera, [LOW_TOP])])
+
+
+def test_the_potential_solves_its_equation_and_lies_between_the_marks(grey):
+    walker: Walker = grey[0]._walker
+    count = len(walker._degree)
+    inside, outside = np.zeros(count, bool), np.zeros(count, bool)
+    inside[count // 2], outside[0] = True, True
+    p = walker.potential(inside, outside, np.zeros(count, bool))
+    free = ~(inside | outside)
+    residual = (walker._degree * p - walker._links @ p)[free]
+    assert p[inside] == 1 and p[outside] == 0 and (p >= 0).all() and (p <= 1).all()
+    assert np.abs(residual).max() < 1e-3 * (walker._links @ inside).max()
+
+
+SCRIPT = """
+import hashlib, sys, torch
+torch.set_num_threads(int(sys.argv[1]))
+from touching_solids import SETTINGS, marks, solids, views
+from beags_plugin.picking.cutter import Cutter
+from beags_plugin.rasterizers import make_rasterizer
+surfels, _ = solids({0: (0.5, 0.5, 0.5), 1: (0.6, 0.5, 0.5), 2: (0.5, 0.5, 0.6)})
+cutter = Cutter(surfels, views(), make_rasterizer("auto"), SETTINGS)
+found = cutter.solve([marks(views()[3], [(-0.2, 0.0, 0.25)])])
+print(hashlib.sha256(cutter._graph.weights.tobytes() + found.numpy().tobytes()).hexdigest())
+"""
+
+
+def test_bits_are_the_same_for_one_and_for_three_threads():
+    digests = set()
+    for threads in ("1", "3"):
+        environment = os.environ | {"OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads}
+        environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
+        done = subprocess.run(
+            [sys.executable, "-c", SCRIPT, threads], capture_output=True, text=True, check=True, env=environment
+        )
+        digests.add(done.stdout)
+    assert len(digests) == 1
