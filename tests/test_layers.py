@@ -27,7 +27,7 @@ ROOMS = [
     "refiners",
     "preparation",
     "losses",
-    "occupancy assignment export importers picking",
+    "occupancy assignment export importers cleaning picking",
     "rasterizers extraction masks",
     "core",
     "ops",

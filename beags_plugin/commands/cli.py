@@ -119,16 +119,24 @@ class Extract:
     """Folder for the runs; extracted/ beside config.yml if left out."""
     json: Path | None = None
     """File that lists what was written."""
+    keep_all: bool = False
+    """Keep Gaussians too that do not belong: spikes outside the object's masks, loose parts that no mask supports."""
+    data: Path | None = None
+    """Folder of the photos, whose cameras tell what belongs, if not where the run was trained on them."""
 
     def run(self) -> None:
         with starting(self):
             from beags_plugin.plugin.objects.extract import extract_objects
         with progress_bar("extracting") as progress:
-            extracted = extract_objects(self.load_config, self.object, self.remove, self.output, progress)
-        write_json(self.json, [vars(done) for done in extracted])
+            extracted = extract_objects(
+                self.load_config, self.object, self.remove, self.output, progress, keep_all=self.keep_all,
+                data=self.data,
+            )  # fmt: skip
+        write_json(self.json, [asdict(done) for done in extracted])
         for done in extracted:
             CONSOLE.print(
-                f"{done.name}: {done.gaussians} Gaussians\n  {done.ply}\n  ns-viewer --load-config {done.config}",
+                f"{done.name}: {counted_gaussians(done.gaussians, done.left_out)}\n  {done.ply}\n"
+                f"  ns-viewer --load-config {done.config}",
                 markup=False,
             )
 
@@ -154,7 +162,10 @@ class Export:
     json: Path | None = None
     """File that lists what was written."""
     data: Path | None = None
-    """Folder of the photos, whose cameras meshes need, if not where the run was trained on them."""
+    """Folder of the photos, whose cameras tell what belongs, and which meshes need, if not where the run was trained
+    on them."""
+    keep_all: bool = False
+    """Keep Gaussians too that do not belong: spikes outside an object's masks, loose parts that no mask supports."""
     mesh: tyro.conf.OmitArgPrefixes[MeshOptions] = MeshOptions()
 
     def run(self) -> None:
@@ -164,11 +175,11 @@ class Export:
         with progress_bar("exporting") as progress:
             exported = export_run(
                 self.load_config, self.object, self.all, self.format, self.frame, self.output, options, progress,
-                whole=self.whole, data=self.data,
+                whole=self.whole, data=self.data, keep_all=self.keep_all,
             )  # fmt: skip
         write_json(self.json, [asdict(one) for one in exported])
         for one in exported:
-            CONSOLE.print(f"{one.name}: {one.gaussians} Gaussians", markup=False)
+            CONSOLE.print(f"{one.name}: {counted_gaussians(one.gaussians, one.left_out)}", markup=False)
             for file in one.files:
                 CONSOLE.print(f"  {file.path or f'no {file.format}: {file.reason}'}", markup=False)
 
@@ -262,6 +273,11 @@ class Doctor:
             print_check(check)
             checks.append(check)
         write_json(self.json, [asdict(check) for check in checks])
+
+
+def counted_gaussians(count: int, left_out: object) -> str:
+    """Return a phrase on an object's Gaussians; left_out: those that do not belong, None where none was looked for."""
+    return f"{count} Gaussians" if left_out is None else f"{count} Gaussians; {left_out}"
 
 
 def write_json(path: Path | None, content: object) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from beags_plugin.cleaning.clean import LeftOut
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import Exporter, ExportItem, NothingToExport, Viewpoints, make_exporter
 from beags_plugin.export.frames import Frame, bounding_box, check_placement
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.select import select_class
+from beags_plugin.labels.class_ids import BACKGROUND
+from beags_plugin.plugin.objects.clean import Cleaner, cleaner_of
 from beags_plugin.plugin.objects.extract import file_name, folder_names, objects_with_gaussians
 from beags_plugin.plugin.runs.place import open_run
 from beags_plugin.plugin.runs.read import (
@@ -50,7 +53,8 @@ class Exported:
     """One object (or the background, or the whole scene) and its files.
 
     class_id: None of the whole scene. center: [3] the point of the world that is the files' origin. low, high: [3] its
-    box, in the files' frame. to_run: the 4 x 4 matrix from the files' frame to the run's normalised one.
+    box, in the files' frame. to_run: the 4 x 4 matrix from the files' frame to the run's normalised one. left_out:
+    Gaussians of the object that do not belong to it; None where none was looked for.
     """
 
     name: str
@@ -61,6 +65,7 @@ class Exported:
     high: list[float]
     to_run: list[list[float]]
     files: list[ExportedFile]
+    left_out: LeftOut | None = None
 
     def to_json(self, folder: Path) -> dict[str, Any]:
         """Return plain values for the manifest in ``folder``."""
@@ -68,6 +73,7 @@ class Exported:
             "name": self.name,
             "class_id": self.class_id,
             "gaussians": self.gaussians,
+            **({} if self.left_out is None else {"left_out_gaussians": asdict(self.left_out)}),
             "center": self.center,
             "box": {"low": self.low, "high": self.high},
             "to_run": self.to_run,
@@ -92,6 +98,7 @@ def export_run(
     progress: Progress | None = None,
     whole: bool = False,
     data: Path | None = None,
+    keep_all: bool = False,
 ) -> list[Exported]:
     """Write files of objects of a run.
 
@@ -100,7 +107,9 @@ def export_run(
     names of exporters. placement: "world", the frame of the input poses (the run's own if it has not kept how that was
     normalised), or "object", the same centred on each object. output: folder; ``exports/`` in the run by default.
     options: format to its exporter's options. progress: receives (done, total) files, and rendered views of the meshes
-    among them. data: if not where they were. Raises ``UserError`` for a mistake, before anything is written.
+    among them. data: if not where they were. keep_all: keep Gaussians too that do not belong to their object
+    (``cleaning.clean``); the background and the whole scene are kept as they are. Raises ``UserError`` for a mistake,
+    before anything is written.
     """
     run, folder = config_path.parent, output or config_path.parent / "exports"
     check_placement(placement)
@@ -121,8 +130,9 @@ def export_run(
     views = None
     if any(exporter.needs_views for exporter in exporters.values()):
         views = training_viewpoints(scene.config, raster_settings(scene), config_path)
-    job = _Job(scene, exporters, frame, placement == "object", views, tolerant=everything)
     names, titles = list(present) if everything else list(dict.fromkeys(objects)), folder_names(scene.classes)
+    cleaner = None if keep_all or not any(map(present.get, names)) else cleaner_of(scene, config_path)
+    job = _Job(scene, exporters, frame, placement == "object", views, everything, cleaner)
     items: list[tuple[str, int | None, str]] = [(name, present[name], titles[present[name]]) for name in names]
     if whole:
         items.append((WHOLE, None, "whole_scene"))
@@ -168,7 +178,7 @@ class _Job:
     """The common settings of all items of an export.
 
     world: frame of the files, but for the shift if they are ``centred``. views: in the run's frame. tolerant: leave out
-    a format for which an item has nothing.
+    a format for which an item has nothing. cleaner: decides what belongs to an object; None: all.
     """
 
     scene: SavedScene
@@ -177,6 +187,7 @@ class _Job:
     centred: bool
     views: Viewpoints | None
     tolerant: bool
+    cleaner: Cleaner | None
 
     def steps(self) -> list[int]:
         """Return the steps of each file of an item: see ``_Steps``."""
@@ -185,9 +196,11 @@ class _Job:
 
     def export(self, name: str, class_id: int | None, stem: Path, steps: _Steps) -> Exported:
         """Write all files of one class (None: of the whole scene), called ``stem`` and their suffixes."""
-        class_ids, chosen = self.scene.members.class_ids, self.scene.surfels()
+        class_ids, chosen, left_out = self.scene.members.class_ids, self.scene.surfels(), None
         if class_id is not None:
             chosen, index = select_class(chosen, self.scene.members, class_id)
+            if self.cleaner is not None and class_id != BACKGROUND:
+                chosen, index, left_out = self.cleaner.clean(chosen, index, class_id)
             class_ids = torch.full_like(class_ids[index], class_id)
         low, high = bounding_box(self.world.surfels(chosen))
         center = (low + high) / 2 if self.centred else torch.zeros(3, dtype=torch.float64)
@@ -200,7 +213,7 @@ class _Job:
             steps.wrote()
         low, high = low - center, high - center
         return Exported(
-            name, class_id, len(chosen), center.tolist(), low.tolist(), high.tolist(), frame.to_run(), files
+            name, class_id, len(chosen), center.tolist(), low.tolist(), high.tolist(), frame.to_run(), files, left_out
         )
 
     def _write(self, label: str, exporter: Exporter, path: Path, item: ExportItem) -> ExportedFile:

@@ -6,16 +6,18 @@ import json
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from beags_plugin.cleaning.clean import LeftOut
 from beags_plugin.core.membership import Membership
 from beags_plugin.extraction.ply import write_ply
 from beags_plugin.extraction.select import remove_class, select_class
+from beags_plugin.plugin.objects.clean import cleaner_of
 from beags_plugin.plugin.runs.checkpoint_file import extra_state
 from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, prepared_digests
 from beags_plugin.plugin.runs.read import SavedScene, read_assigned_run, read_transform
@@ -26,12 +28,16 @@ from beags_plugin.system.whole_files import write_text_atomically
 
 @dataclass(frozen=True)
 class Extracted:
-    """One extracted run: its name, the paths of its config.yml and .ply, and its number of Gaussians."""
+    """One extracted run: its name, the paths of its config.yml and .ply, and its number of Gaussians.
+
+    left_out: Gaussians of the object that do not belong to it; None where none was looked for.
+    """
 
     name: str
     config: Path
     ply: Path
     gaussians: int
+    left_out: LeftOut | None = None
 
 
 def extract_objects(
@@ -40,15 +46,19 @@ def extract_objects(
     remove: bool = False,
     output: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
+    *,
+    keep_all: bool = False,
+    data: Path | None = None,
 ) -> list[Extracted]:
     """Write a run and a .ply per object.
 
     config_path: config.yml of a refined (or assigned) run. objects: names; all that have Gaussians but the background
     if empty. remove: keep all but the object instead. output: folder for the runs; ``extracted/`` in the run by
-    default. progress: receives (done, total) objects. Raises ``UserError`` for an unknown name, before anything is
-    written.
+    default. progress: receives (done, total) objects. keep_all: keep Gaussians too that do not belong to their object
+    (``cleaning.clean``); with ``remove`` they go with it in any case. data: of the run, if not where they were. Raises
+    ``UserError`` for an unknown name, before anything is written.
     """
-    scene = read_assigned_run(config_path)
+    scene = read_assigned_run(config_path, data)
     run, members = config_path.parent, scene.members
     ids = objects_with_gaussians(scene, objects, run)
     names = list(objects) or [name for name, index in ids.items() if index != 0]
@@ -57,20 +67,25 @@ def extract_objects(
     folders, target = folder_names(scene.classes), output or run / "extracted"
     with writing(target):
         target.mkdir(parents=True, exist_ok=True)
+    cleaner = None if keep_all or remove else cleaner_of(scene, config_path)
     prepared = prepared_digests(run)  # shows later if the run was trained again
     written = []
     for name in names:
         surfels, index = select(scene.surfels(), members, ids[name])
+        left_out = None
+        if cleaner is not None:
+            surfels, index, left_out = cleaner.clean(surfels, index, ids[name])
         part = members[index] if remove else Membership(torch.full((len(index),), ids[name], dtype=torch.int32))
         title = folders[ids[name]]
         title = f"without_{title}" if remove else title
         folder = target / title
         config = write_run(scene.config, folder, _rows(scene.state, index, part), scene.step)
-        origin = {"object": name, "removed": remove, "run": str(config_path.absolute()), "prepared": prepared}
+        origin: dict[str, Any] = {"object": name, "removed": remove, "run": str(config_path.absolute())}
+        origin |= {"prepared": prepared, "left_out": None if left_out is None else asdict(left_out)}
         write_text_atomically(json.dumps(origin, indent=2), folder / EXTRACTION_FILE)
         ply = folder / f"{title}.ply"
         write_ply(ply, surfels, part.class_ids, transform)
-        written.append(Extracted(title, config, ply, len(surfels)))
+        written.append(Extracted(title, config, ply, len(surfels), left_out))
         if progress is not None:
             progress(len(written), len(names))
     return written

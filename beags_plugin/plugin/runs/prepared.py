@@ -11,10 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import resize_nearest
 from beags_plugin.labels.classes import read_id_mask, read_mask
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.plugin.runs.layout import PREPARED, last_prepared
+from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED, last_prepared
 from beags_plugin.plugin.views.views import unique_names
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.tensors import load_tensors
@@ -65,6 +66,21 @@ def photos_contradict(run: Path) -> bool:
     """Return whether a run has found that its photos contradict each other outside the masks, as on a turntable."""
     path = run / PREPARED / PREPARATION_REPORT
     return path.exists() and bool(load_json(path).get("residuals", {}).get("contradict", False))
+
+
+def prepared_labels(path: Path, camera: Camera) -> torch.Tensor:
+    """Read the labels [H, W] int32 of a prepared mask; raises ``UserError`` if it does not fit the camera."""
+    if not path.is_file():
+        raise UserError(
+            f"the prepared mask {path} is missing: restore it, or refine again from base/nerfstudio_models."
+        )
+    labels = torch.from_numpy(read_id_mask(path).astype(np.int32))
+    if labels.shape != (camera.height, camera.width):
+        raise UserError(
+            f"the prepared mask {path} is {labels.shape[1]}x{labels.shape[0]} pixels but its view is "
+            f"{camera.width}x{camera.height}: restore the data, or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
+        )
+    return labels
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,13 @@ import numpy as np
 import torch
 from PIL import Image
 
-from beags_plugin.core.cameras import Camera
-from beags_plugin.labels.classes import read_id_mask, write_mask
-from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED
+from beags_plugin.labels.classes import write_mask
+from beags_plugin.plugin.runs.layout import PREPARED
 from beags_plugin.plugin.runs.prepared import PREPARATION_REPORT
 from beags_plugin.plugin.training.contradiction import Residuals
 from beags_plugin.preparation.pipeline import Preparation
 from beags_plugin.system import processes
-from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.errors import writing
 from beags_plugin.system.memory import peak_memory_mb
 from beags_plugin.system.progress import counted, progress_bar
 from beags_plugin.system.whole_files import write_text_atomically, write_whole
@@ -28,21 +27,6 @@ from beags_plugin.system.whole_files import write_text_atomically, write_whole
 def bar(name: str, passing: bool = False) -> AbstractContextManager[Callable[[int, int], None]]:
     """Open a progress bar, in the first of several processes."""
     return progress_bar(name, passing) if processes.rank() == 0 else nullcontext(lambda done, total: None)
-
-
-def prepared_labels(path: Path, camera: Camera) -> torch.Tensor:
-    """Read the labels [H, W] int32 of a prepared mask; raises ``UserError`` if it does not fit the camera."""
-    if not path.is_file():
-        raise UserError(
-            f"the prepared mask {path} is missing: restore it, or refine again from base/nerfstudio_models."
-        )
-    labels = torch.from_numpy(read_id_mask(path).astype(np.int32))
-    if labels.shape != (camera.height, camera.width):
-        raise UserError(
-            f"the prepared mask {path} is {labels.shape[1]}x{labels.shape[0]} pixels but its view is "
-            f"{camera.width}x{camera.height}: restore the data, or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
-        )
-    return labels
 
 
 def save_prepared(prepared: Preparation, names: list[str], folder: Path, fit: Residuals | None = None) -> None:

@@ -17,10 +17,10 @@ from beags_plugin.core.membership import Membership
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED, round_folder
-from beags_plugin.plugin.runs.prepared import read_grid
+from beags_plugin.plugin.runs.prepared import prepared_labels, read_grid
 from beags_plugin.plugin.runs.write import write_run
 from beags_plugin.plugin.training.contradiction import residuals
-from beags_plugin.plugin.training.prepared_files import bar, clear, prepared_labels, save_prepared
+from beags_plugin.plugin.training.prepared_files import bar, clear, save_prepared
 from beags_plugin.plugin.training.resumable import TrainingRun
 from beags_plugin.plugin.training.scene_edits import apply_edit, edit_scene
 from beags_plugin.plugin.training.scene_model import SceneModel
