@@ -101,6 +101,7 @@ def extracted(trained):
 
 
 def test_extraction_writes_a_run_and_a_ply_per_object(trained, extracted):
+    from beags_plugin.plugin.runs.layout import EXTRACTION_FILE
     from beags_plugin.plugin.runs.read import read_assigned_run
 
     folder, _ = trained
@@ -109,11 +110,13 @@ def test_extraction_writes_a_run_and_a_ply_per_object(trained, extracted):
     for config in extracted:
         scene = read_assigned_run(config)
         (index,) = scene.state["class_ids"].unique().tolist()
-        keep = whole.state["class_ids"] == index
-        assert (scene.state["gauss_params.quats"] == whole.state["gauss_params.quats"][keep]).all()
+        own = whole.state["class_ids"] == index
+        quats = scene.state["gauss_params.quats"]
+        assert {*map(tuple, quats.tolist())} <= {*map(tuple, whole.state["gauss_params.quats"][own].tolist())}
+        left_out = json.loads((config.parent / EXTRACTION_FILE).read_text())["left_out"]
         (ply,) = config.parent.glob("*.ply")
         vertex = read_vertices(ply)
-        assert len(vertex) == int(keep.sum())
+        assert len(vertex) == len(quats) == int(own.sum()) - left_out["outside"] - left_out["loose"]
         assert (np.asarray(vertex["class_id"]) == index).all()
         assert {"scale_0", "scale_1", "scale_2"} <= set(vertex.dtype.names)
 
@@ -162,6 +165,7 @@ def test_export_writes_every_object_and_the_background(trained, tmp_path):
 
 def test_removing_an_object_keeps_the_rest(trained):
     from beags_plugin.plugin.objects.extract import extract_objects
+    from beags_plugin.plugin.runs.layout import EXTRACTION_FILE
     from beags_plugin.plugin.runs.read import read_assigned_run
 
     folder, _ = trained
