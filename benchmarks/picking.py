@@ -82,7 +82,7 @@ def clicks(config_path: Path) -> None:
     def solved(index: int, together: bool) -> Tensor:
         own = [marked(cameras[chosen[index]], *points[index])]
         others = [
-            marked(cameras[view], [], on)
+            replace(marked(cameras[view], [], on), of_others=True)
             for other, (view, (on, _)) in enumerate(zip(chosen, points, strict=True))
             if together and other != index
         ]

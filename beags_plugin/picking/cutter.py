@@ -8,7 +8,9 @@ minimises
     E = sum_{i in object} [a_i]- + sum_{i not in it} [a_i]+ + sum_{links between both} w_ij,
     a_i = 0.3 (logit p_i - logit t),
 
-where a Gaussian that a mark shows, or that is excluded, is bound to its side.
+where a Gaussian that a mark shows, or that is excluded, is bound to its side. Walks end more often on the tangent
+planes of what marks show beside the object (a floor goes on in a ring's hole, which no walk reaches), unless these lie
+on other objects, and p is 0 where a walk meets marks beside the object more surely than those on it.
 """
 
 from __future__ import annotations
@@ -46,7 +48,7 @@ class ViewMarks:
 
     name: of the view, for errors. numbers: [h, w] int32, at a marked pixel the number of its mark, else IGNORE.
     inside: per mark whether it lies on the object. within: [h, w] bool, False where a box says that the object is not,
-    or None.
+    or None. of_others: whether the marks lie on other objects, and so all beside this one.
     """
 
     name: str
@@ -54,6 +56,7 @@ class ViewMarks:
     numbers: Tensor
     inside: tuple[bool, ...]
     within: Tensor | None = None
+    of_others: bool = False
 
 
 class Cutter:
@@ -94,8 +97,8 @@ class Cutter:
             if view.within is not None:
                 outside |= ~self._shown_within(view)
         barred = outside[nodes]
-        inside, beside = self._bound(marks, barred, name)
-        behind = self._graph.on_plane_of(beside) & ~self._graph.on_plane_of(inside)
+        inside, beside, ground = self._bound(marks, barred, name)
+        behind = self._graph.on_plane_of(ground) & ~self._graph.on_plane_of(inside)
         p = self._walker.potential(inside, beside, barred, behind)
         if beside.any():
             p[self._walker.potential(beside, inside, barred, np.zeros_like(behind)) > p] = 0.0
@@ -118,12 +121,17 @@ class Cutter:
         terminals = torch.from_numpy(np.stack([belief.clip(0.0), (-belief).clip(0.0)], axis=1))
         return cut(self._pairs, torch.from_numpy(weights), terminals).numpy()
 
-    def _bound(self, marks: Sequence[ViewMarks], excluded: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
+    def _bound(
+        self, marks: Sequence[ViewMarks], excluded: np.ndarray, name: str
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the nodes that the marks bind to the object and to the rest, disjoint [M] bool.
+
+        Third come those bound to the rest that marks which lie on no other object show.
 
         A Gaussian belongs to the kind of mark of which it gives the larger share of the light.
         """
         shares = np.zeros((2, len(excluded)))
+        ground = np.zeros_like(excluded)
         by_mark: list[tuple[str, bool, np.ndarray]] = []
         for view in marks:
             for inside, share in zip(view.inside, self._shares(view), strict=True):
@@ -131,6 +139,7 @@ class Cutter:
                 shown = share >= max(min(LEAST_SHARE, LEAST_OF_LARGEST * largest), LEAST_LIGHT)
                 shares[int(inside)] = np.maximum(shares[int(inside)], np.where(shown, share, 0.0))
                 by_mark.append((view.name, inside, np.where(shown, share, 0.0)))
+                ground |= shown & (not inside and not view.of_others)
         on_object = shares[1] > shares[0]
         beside = (shares[0] >= shares[1]) & (shares[0] > 0)
         for view, inside, light in by_mark:
@@ -141,7 +150,8 @@ class Cutter:
                 raise UserError(f"{where} lies outside a box or another limit of it: correct one of them.")
             if light[on_object if inside else beside].sum() < LEAST_OWN * light.sum():
                 raise UserError(f"{where} contradicts another point at the same place: remove one of them.")
-        return on_object & ~excluded, beside & ~excluded
+        beside &= ~excluded
+        return on_object & ~excluded, beside, beside & ground
 
     def _shares(self, view: ViewMarks) -> np.ndarray:
         """Return the share of each mark's light that each node gives, [marks, M] float64."""

@@ -70,7 +70,7 @@ class CutSource(MaskSource):
             for region in one.space:
                 excluded |= ~region.contains(means).cpu()
             views = [view_marks(geometry, index, scene, prompts, one) for index, prompts in marked.items()]
-            members.append(cutter.solve([view for view in views if view is not None], excluded, one.name))
+            members.append(cutter.solve([marks for each in views for marks in each], excluded, one.name))
             progress(seen + done, total)
         left = iter(range(seen + len(objects) + 1, total + 1))
         names = {0: "background", **{one.class_id: one.name for one in objects}}
@@ -144,32 +144,42 @@ def _check_inside(scene: SourceScene, photo: int, prompt: Prompt, name: str) -> 
 
 def view_marks(
     geometry: Geometry, index: int, scene: SourceScene, prompts: Prompts, whose: PromptedObject
-) -> ViewMarks | None:
-    """Return the marks of an object in view ``index`` of the geometry, without distortion; None if there are none.
+) -> list[ViewMarks]:
+    """Return the marks of an object in view ``index`` of the geometry, without distortion, then those on other objects.
 
-    prompts: those of all objects in this view.
+    prompts: those of all objects in this view. Raises ``UserError`` for a pixel that is on the object and beside it.
     """
     photo = scene.photos[scene.places()[index]]
     width, height = photo.width, photo.height
     radius = max(1, round(MARK * float(np.hypot(width, height))))
-    numbers = np.full((height, width), IGNORE, np.uint16)
-    inside: list[bool] = []
-    within = None
-    for one, prompt in prompts:
-        if one is whose and prompt.box is not None:
-            left, top, right, bottom = prompt.box
-            column, row = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
-            within = (column >= left) & (column <= right) & (row >= top) & (row <= bottom)
-        for (x, y), on in zip(prompt.points, prompt.inside, strict=True):
-            if one is whose or on:
-                _stamp(numbers, int(x), int(y), radius, len(inside))
-                inside.append(on and one is whose)
-    if not inside and within is None:
-        return None
-    straight = torch.from_numpy(geometry.to_straight(numbers, index).astype(np.int32))
-    if within is not None:
-        within = torch.from_numpy(geometry.to_straight(within.astype(np.uint16), index) == 1)
-    return ViewMarks(photo.name, geometry.cameras[index], straight, tuple(inside), within)
+    marked: dict[tuple[int, int], bool] = {}
+    found = []
+    for others in (False, True):
+        numbers = np.full((height, width), IGNORE, np.uint16)
+        inside: list[bool] = []
+        within = None
+        for one, prompt in prompts:
+            if (one is whose) == others:
+                continue
+            if prompt.box is not None and not others:
+                left, top, right, bottom = prompt.box
+                column, row = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
+                box = (column >= left) & (column <= right) & (row >= top) & (row <= bottom)
+                within = torch.from_numpy(geometry.to_straight(box.astype(np.uint16), index) == 1)
+            for (x, y), on in zip(prompt.points, prompt.inside, strict=True):
+                if others and not on:
+                    continue
+                pixel, kind = (int(x), int(y)), on and not others
+                if marked.setdefault(pixel, kind) != kind:
+                    raise UserError(
+                        f"the point [{x:g}, {y:g}] in {photo.name} is both on {whose.name} and beside it: remove one."
+                    )
+                _stamp(numbers, *pixel, radius, len(inside))
+                inside.append(kind)
+        if inside or within is not None:
+            straight = torch.from_numpy(geometry.to_straight(numbers, index).astype(np.int32))
+            found.append(ViewMarks(photo.name, geometry.cameras[index], straight, tuple(inside), within, others))
+    return found
 
 
 def _stamp(numbers: np.ndarray, x: int, y: int, radius: int, number: int) -> None:

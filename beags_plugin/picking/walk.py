@@ -10,8 +10,7 @@ import numpy as np
 
 from beags_plugin.picking.graph import SurfaceGraph
 
-LEAK = 2e-3  # beside a link's weight, at most 1
-MORE_LEAK = 5e-2
+LEAK, MORE_LEAK = 2e-3, 5e-2  # beside a link's weight, at most 1; the second on planes of what is beside the object
 TOLERANCE = 1e-4  # of the residual's norm
 MOST_ITERATIONS = 2_000
 LEAST_LEVEL, HIGHEST_LEVEL = 0.1, 0.98  # of a border

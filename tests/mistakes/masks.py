@@ -138,7 +138,7 @@ def grabcut(content: Any) -> Callable[[Place], Any]:
 
 
 def cut(**places: Any) -> Callable[[Place], Any]:
-    """Return a mistake in the prompts of the cut, which asks a run for its Gaussians. places: of the cup in view v01."""
+    """Return a mistake in the prompts of the cut, which asks a run for its Gaussians. places: of a cup, in view v01."""
     text = json.dumps({"objects": [{"name": "cup", "prompts": [{"view": "v01", **places}]}]})
     return made("cut", file("prompts.json", text), "--options prompts=prompts.json --load-config {run}")
 

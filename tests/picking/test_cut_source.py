@@ -123,7 +123,7 @@ BAD = {
     "a view that does not exist": (lambda run: {**low(run), "prompts": [{"view": "v99", "points": [[1, 1]]}]}, "'v99'"),
     "a point outside of the image": (lambda run: low(run, outside=[[500, 3]]), r"\[500, 3\] of low in v3 lies outside"),
     "a box outside of the image": (lambda run: low(run, box=[500, 3, 600, 9]), "lies outside its image"),
-    "contradicting points": (lambda run: low(run, outside=[run.pixel(3, "low")]), "contradicts another point"),
+    "contradicting points": (lambda run: low(run, outside=[run.pixel(3, "low")]), "is both on low and beside it"),
     "a point outside of its box": (lambda run: low(run, box=[0, 0, 5, 5]), "lies outside a box or another limit"),
     "a region that is none": (lambda run: {**low(run), "space": [{"sphere": [0, 0, 0, -1]}]}, "radius -1.0"),
     "a plane without normal": (lambda run: {**low(run), "space": [{"plane": [0, 0, 0, 1]}]}, "the normal of a plane"),
