@@ -165,7 +165,6 @@ def test_export_writes_every_object_and_the_background(trained, tmp_path):
 
 def test_removing_an_object_keeps_the_rest(trained):
     from beags_plugin.plugin.objects.extract import extract_objects
-    from beags_plugin.plugin.runs.layout import EXTRACTION_FILE
     from beags_plugin.plugin.runs.read import read_assigned_run
 
     folder, _ = trained
