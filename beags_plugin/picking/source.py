@@ -55,7 +55,7 @@ class CutSource(MaskSource):
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
         assert scene.geometry is not None
         path = scene.below(self.prompts)
-        objects, places = read_prompts(path), scene.places()
+        objects, places = read_prompts(path, beside_alone=True), scene.places()
         geometry = cast(TrainedGeometry, scene.geometry)
         marked = _by_view(scene, objects, places, path)
         trained = [index for index, place in enumerate(places) if scene.photos[place].trained]

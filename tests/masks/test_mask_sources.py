@@ -191,6 +191,7 @@ def test_prompts_are_read_and_mistakes_refused(tmp_path):
         ({"objects": [{"name": "a", "prompts": [{"view": "v", "box": [5, 0, 1, 1]}]}]}, "left, top, right, bottom"),
         ({"objects": [{"name": "a", "prompts": [{"view": "v", "box": [0, 0, math.inf, 1]}]}]}, "left, top, right"),
         ({"objects": [{"name": "a", "prompts": [{"view": "v", "points": [[math.nan, 1]]}]}]}, "the points .* are not"),
+        ({"objects": [{"name": "a", "prompts": [{"view": "v", "outside": [[1, 1]]}]}]}, "or points on the object"),
         ({"objects": [{"name": "a", "id": math.inf, "text": "a"}]}, "object 1 .* is wrong"),
         ({"objects": [entry, {**entry, "name": "other"}]}, "the same id"),
         ({"objects": [{**entry, "id": 70000}]}, "not in 1..65534"),

@@ -45,8 +45,10 @@ class PromptedObject:
     space: tuple[Region, ...] = ()
 
 
-def read_prompts(path: Path) -> list[PromptedObject]:
+def read_prompts(path: Path, beside_alone: bool = False) -> list[PromptedObject]:
     """Read the objects of a prompts JSON; raise ``UserError`` with file and object.
+
+    beside_alone: whether a prompt may have points beside the object alone, as one on it in another view will do.
 
     {"objects": [{"name": ..., "id": optional, "text": optional, "prompts": [{"view": name, "box": [left, top, right,
     bottom], "points": [[x, y], ...], "outside": [[x, y], ...], "strokes": [[[x, y], ...], ...],
@@ -65,7 +67,7 @@ def read_prompts(path: Path) -> list[PromptedObject]:
     objects: list[PromptedObject] = []
     for index, entry in enumerate(entries, 1):
         try:
-            objects.append(_object(entry, index))
+            objects.append(_object(entry, index, beside_alone))
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
             raise UserError(
                 f"object {index} of the prompts {path} is wrong ({reason(error)}): write e.g. {EXAMPLE}."
@@ -76,7 +78,7 @@ def read_prompts(path: Path) -> list[PromptedObject]:
     return objects
 
 
-def _object(entry: Any, index: int) -> PromptedObject:
+def _object(entry: Any, index: int, beside_alone: bool) -> PromptedObject:
     name, text = str(entry["name"]), entry.get("text")
     class_id = int(entry.get("id", index))
     if not 1 <= class_id < 65535:
@@ -85,7 +87,7 @@ def _object(entry: Any, index: int) -> PromptedObject:
     for one in entry.get("prompts", []):
         if str(one["view"]) in prompts:
             raise ValueError(f"view {one['view']} comes twice")
-        prompts[str(one["view"])] = _prompt(one)
+        prompts[str(one["view"])] = _prompt(one, beside_alone)
     if not prompts and not text:
         raise ValueError("it has neither prompts nor a text")
     space = tuple(_region(one) for one in entry.get("space", []))
@@ -103,7 +105,7 @@ def _region(entry: Mapping[str, Any]) -> Region:
     return Ball((x, y, z), last) if kind == "sphere" else HalfSpace((x, y, z), last)
 
 
-def _prompt(entry: Mapping[str, Any]) -> Prompt:
+def _prompt(entry: Mapping[str, Any], beside_alone: bool) -> Prompt:
     inside, outside = (
         _points(entry.get(points, [])) + tuple(point for line in entry.get(strokes, []) for point in _along(line))
         for points, strokes in (("points", "strokes"), ("outside", "outside_strokes"))
@@ -114,8 +116,8 @@ def _prompt(entry: Mapping[str, Any]) -> Prompt:
         if not (left < right and top < bottom and all(map(math.isfinite, (left, top, right, bottom)))):
             raise ValueError(f"the box {given} is not [left, top, right, bottom]")
         box = (left, top, right, bottom)
-    if box is None and not inside and not outside:
-        raise ValueError("a prompt needs a box or points")
+    if box is None and not inside and not (beside_alone and outside):
+        raise ValueError("a prompt needs a box or points on the object")
     return Prompt(box, inside + outside, (True,) * len(inside) + (False,) * len(outside))
 
 
