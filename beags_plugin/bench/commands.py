@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Union
 import tyro
 
 from beags_plugin.bench.options import ExperimentOptions
+from beags_plugin.bench.paper.options import PaperBench
 
 
 @dataclass
@@ -55,7 +56,7 @@ SHIPPED = {
 """Commands by experiment, with the sentence of their help."""
 
 if TYPE_CHECKING:
-    Measurement = ShippedExperiment | ExperimentFile
+    Measurement = ShippedExperiment | ExperimentFile | PaperBench
 else:
     Measurement = Union[  # noqa: UP007  (of a tuple)
         tuple(
@@ -65,5 +66,8 @@ else:
             ]
             for name, sentence in SHIPPED.items()
         )
-        + (Annotated[ExperimentFile, tyro.conf.subcommand("file")],)
+        + (
+            Annotated[ExperimentFile, tyro.conf.subcommand("file")],
+            Annotated[PaperBench, tyro.conf.subcommand("paper")],
+        )
     ]
