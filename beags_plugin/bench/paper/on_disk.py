@@ -44,8 +44,8 @@ class SceneOnDisk:
     """One scene of a data set.
 
     scene: to train on, or None where the folder or a part is missing that training needs. missing: sentences, what is
-    missing and where it belongs, of these parts. notes: likewise, of what only the figures lack. pixels: of all training views, as
-    they are trained on. views: number of training views.
+    missing and where it belongs, of these parts. notes: likewise, of what only the figures lack. views: number of
+    training views. pixels: of all of them, as they are trained on.
     """
 
     data_set: PaperDataSet
@@ -165,9 +165,8 @@ def _truth_notes(data_set: PaperDataSet, name: str, folder: Path, held_out: Mapp
     classes = [each for class_id, each in held_out["classes"].items() if class_id != 0]
     wanted = list(data_set.scenes[name]) or classes
     if unnamed := [each for each in wanted if each not in classes]:
-        notes.append(
-            f"no class is called {', '.join(map(repr, unnamed))}: name the ids of the masks in {folder / 'classes.json'}"
-        )
+        names = ", ".join(map(repr, unnamed))
+        notes.append(f"no class is called {names}: name the ids of the masks in {folder / 'classes.json'}")
     wanted = [each for each in wanted if each in classes]  # no other can be scored
     truth = held_out["ground_truth"] or {"masks": [], "visible": {}, "silhouettes": {}}
     own = held_out["no_truth"] is None and not truth["visible"] and any(held_out["mask_filenames"])

@@ -7,8 +7,8 @@ from pathlib import Path
 
 
 @dataclass
-class PaperBench:
-    """The paper's tables: its methods on its data sets, as far as they are on disk. What is missing is listed."""
+class PaperOptions:
+    """Which of the paper's methods to run on which of its data sets, and how."""
 
     data_root: Path
     """Folder that holds the data sets' folders: mip360, llff, lerf, 3dovs (docs/evaluation.md)."""
@@ -32,8 +32,3 @@ class PaperBench:
     """File for all figures; <output>/paper.json if left out."""
     csv: Path | None = None
     """File for all figures as a table; <output>/paper.csv if left out."""
-
-    def run(self) -> None:
-        from beags_plugin.bench.paper.run import run_paper
-
-        run_paper(self)

@@ -16,7 +16,7 @@ from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.paper.data_sets import METHODS, PaperDataSet, paper_folder, read_data_sets
 from beags_plugin.bench.paper.forecast import forecast
 from beags_plugin.bench.paper.on_disk import TRUTH, SceneOnDisk, Sizes, find_scenes
-from beags_plugin.bench.paper.options import PaperBench
+from beags_plugin.bench.paper.options import PaperOptions
 from beags_plugin.bench.paper.tables import (
     KINDS,
     Outcomes,
@@ -41,7 +41,7 @@ CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may ho
 NEWLY_MEASURED = "measured.json"  # in a trial's folder: which truth its figures are of, and the figures if made anew
 
 
-def run_paper(options: PaperBench) -> Outcomes | None:
+def run_paper(options: PaperOptions) -> Outcomes | None:
     """List what is missing, print the plan, run what is on disk, and print the tables; None with ``options.plan``.
 
     Raises ``UserError`` for a mistake in the options. A trial that fails is a row with the reason.
@@ -91,7 +91,7 @@ def run_paper(options: PaperBench) -> Outcomes | None:
     return outcomes
 
 
-def _methods(options: PaperBench) -> Experiment:
+def _methods(options: PaperOptions) -> Experiment:
     """Return the experiment of the methods, as the options want it."""
     experiment = load_experiment(str(paper_folder() / f"{METHODS}.toml"))
     wanted = ExperimentOptions(preset=options.preset, variants=options.methods, quick=options.quick)
@@ -150,7 +150,7 @@ def _truth(run: VariantTrial, outcomes: Mapping[str, Outcome]) -> str | None:
     return "both" if len(truths) > 1 else next(iter(truths), None)
 
 
-def _lines(experiment: Experiment, options: PaperBench, outcomes: Outcomes) -> list[str]:
+def _lines(experiment: Experiment, options: PaperOptions, outcomes: Outcomes) -> list[str]:
     """Return what readers of the tables must know, and the failures."""
     lines = []
     if options.quick or options.downscale != 1.0 or experiment.preset != "beags-paper":
@@ -186,9 +186,6 @@ def _report(
                 }
                 for kind in KINDS
             },
-            "paper": {
-                kind: {name: list(pair) for name, pair in data_set.figures.get(kind, {}).items()} for kind in KINDS
-            },
-            "psnr": {"paper": data_set.psnr and list(data_set.psnr)},
+            "paper": {kind: dict(data_set.figures.get(kind, {})) for kind in KINDS} | {"psnr": data_set.psnr},
         }
     return report
