@@ -167,6 +167,8 @@ def _truth_notes(data_set: PaperDataSet, name: str, folder: Path, held_out: Mapp
     if unnamed := [each for each in wanted if each not in classes]:
         names = ", ".join(map(repr, unnamed))
         notes.append(f"no class is called {names}: name the ids of the masks in {folder / 'classes.json'}")
+    elif any(each == f"class_{class_id}" for class_id, each in held_out["classes"].items()):
+        notes.append(f"the names of the ids of the masks belong in {folder / 'classes.json'}")
     wanted = [each for each in wanted if each in classes]  # no other can be scored
     truth = held_out["ground_truth"] or {"masks": [], "visible": {}, "silhouettes": {}}
     own = held_out["no_truth"] is None and not truth["visible"] and any(held_out["mask_filenames"])

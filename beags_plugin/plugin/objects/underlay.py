@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from beags_plugin.plugin.objects.extract import file_name, objects_with_gaussian
 from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
 from beags_plugin.plugin.runs.place import open_run
 from beags_plugin.plugin.runs.read import raster_settings, read_assigned_run
+from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.system.errors import UserError, writing
@@ -76,7 +78,7 @@ def write_underlays(
             _save(folder / _folder_of(name) / path, as_photo)
             if progress is not None:
                 progress(index * len(parts) + number + 1, len(views) * len(parts))
-    parser = manager.config.dataparser
+    parser = cast(BeagsDataParserConfig, manager.config.dataparser)
     truth = Path(parser.data) / parser.ground_truth_path
     return Underlays(folder, len(views) * len(parts), truth / "silhouettes")
 
