@@ -170,6 +170,7 @@ def test_ours_stand_beside_the_papers(capsys):
     assert "bea-gs 60.0 / 60.0 89.4 / 83.6 trace3d – 85.9 / 80.1" in text
     assert "bea-gs 60.0 / 60.0 92.0 / 88.5 trace3d – 88.3 / 83.1" in text and "instascene – 76.1 / 67.1" in text
     assert "bea-gs 25.0 / 24.0 25.2 / 25.0 trace3d – –" in text
+    assert "* fewer" not in text and "+ some" not in text
 
 
 def test_means_that_are_not_the_papers_are_marked(capsys):
@@ -177,6 +178,7 @@ def test_means_that_are_not_the_papers_are_marked(capsys):
     text = tables_text(Outcomes(rows, {("lerf/ramen", "bea-gs"): "both"}), capsys)
     assert "bea-gs 50.0 / 50.0*+ 89.4 / 83.6" in text and "bea-gs 50.0 / 50.0* 92.0 / 88.5" in text
     assert "bea-gs 25.0 / 24.0* 25.2" in text and "trace3d – 85.9" in text
+    assert "* fewer scenes than" in text and "+ some or all extracted objects" in text
     failed = [ResultRow(Variant("bea-gs"), "lerf/ramen", 42, dict.fromkeys(FIGURES), {}, "it broke")]
     assert "bea-gs failed 89.4 / 83.6" in tables_text(Outcomes(failed, {}), capsys)
 

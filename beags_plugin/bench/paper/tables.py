@@ -104,8 +104,12 @@ def paper_tables(data_sets: Sequence[PaperDataSet], methods: Sequence[str], outc
         if shown:
             printed.append(plain_table(f"{kind.capitalize()}: {what}; IoU / BIoU, %", ["method", *heads], rows))
     printed.append(_psnr_table([each for each in data_sets if "psnr" in each.metrics], methods, outcomes))
-    printed.append("* fewer scenes than the data set's file names: not to be compared with the paper's mean.")
-    printed.append("+ some or all extracted objects are compared with visible masks: their silhouettes are missing.")
+    legends = {
+        "*": "fewer scenes than the data set's file names: not to be compared with the paper's mean.",
+        "+": "some or all extracted objects are compared with visible masks: their silhouettes are missing.",
+    }
+    cells = [str(cell) for table in printed if not isinstance(table, str) for c in table.columns for cell in c.cells]
+    printed += [f"{mark} {what}" for mark, what in legends.items() if any(mark in cell for cell in cells)]
     return printed
 
 

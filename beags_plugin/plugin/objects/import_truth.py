@@ -32,7 +32,9 @@ def import_truth(
     it. Raises ``UserError`` before anything is written: for no photo of a mask's name, or masks in other proportions.
     """
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
-        scene, views = BeagsDataParser(data).posed_views()
+        parser = BeagsDataParser(data)
+        scene, views = parser.posed_views()
+        held_out = {views.images[index] for index in parser.views_of_split(views, "test")}
     photos = {image.stem: image for image in views.images}
     folder = scene.poses.images if isinstance(scene.poses, ColmapModel) else views.images[0].parent
     names = camera_names(scene.root, folder)
@@ -64,6 +66,11 @@ def import_truth(
     for index, each in enumerate(objects, start=1):
         if each.scribbles is not None and (image := photo(each.scribbles.view)) is not None:
             entries.append(_prompts(index, each.name, each.scribbles, image))
+            if image in held_out:
+                lines.append(
+                    f"{each.name}: its scribbles are on {image.stem}, which is held out, so no mask may be made from it: "
+                    f"prompt in another photo (correct {PROMPTS})."
+                )
     there = [path for path in (*masks, *([prompts] if entries else [])) if path.exists()]
     if there and not overwrite:
         raise UserError(f"{there[0]} exists already: add --overwrite, or remove it.")
