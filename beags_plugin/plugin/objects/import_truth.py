@@ -68,8 +68,8 @@ def import_truth(
             entries.append(_prompts(index, each.name, each.scribbles, image))
             if image in held_out:
                 lines.append(
-                    f"{each.name}: its scribbles are on {image.stem}, which is held out, so no mask may be made from it: "
-                    f"prompt in another photo (correct {PROMPTS})."
+                    f"{each.name}: its scribbles are on {image.stem}, which is held out, so no mask may be made from "
+                    f"it: prompt in another photo (correct {PROMPTS})."
                 )
     there = [path for path in (*masks, *([prompts] if entries else [])) if path.exists()]
     if there and not overwrite:
