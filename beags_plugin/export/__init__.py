@@ -11,6 +11,7 @@ EXPORTERS = Registry(
         "compressed-ply": "beags_plugin.export.compressed_ply:CompressedPlyExporter",
         "sog": "beags_plugin.export.sog:SogExporter",
         "spz": "beags_plugin.export.spz:SpzExporter",
+        "html": "beags_plugin.export.web_page:WebPageExporter",
         "glb": "beags_plugin.export.mesh:GlbExporter",
         "obj": "beags_plugin.export.mesh:ObjExporter",
     },
