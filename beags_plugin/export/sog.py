@@ -78,7 +78,8 @@ def _means(means: np.ndarray, images: dict[str, np.ndarray]) -> dict[str, Any]:
 def _in_table(values: np.ndarray) -> tuple[list[float], np.ndarray]:
     """Return 256 values and the places in them of values of any shape, uint8."""
     table = table_of(values.reshape(-1), _TABLE)
-    return table.tolist(), nearest(table, values).astype(np.uint8)
+    digits = [float(f"{value:.6g}") for value in table]  # a file of a small object would be half digits
+    return digits, nearest(table, values).astype(np.uint8)
 
 
 def _bands(rest: np.ndarray, images: dict[str, np.ndarray]) -> dict[str, Any]:

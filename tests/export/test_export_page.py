@@ -34,7 +34,6 @@ from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.sample.views import make_views
 from beags_plugin.system.errors import UserError
 
-
 DRAWN = 215  # of 255: darker pixels are the object's, on white
 
 
