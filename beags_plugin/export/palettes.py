@@ -52,8 +52,14 @@ def palette_of(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     count = min(max(_ALL, len(vectors) // _SHARE), _MOST)
     clusters = MiniBatchKMeans(
-        count, init="random", n_init=1, random_state=0, batch_size=_BATCH, max_iter=_PASSES, reassignment_ratio=0.0
-    )  # pyright: ignore[reportArgumentType]
+        count,
+        init="random",
+        n_init=1,  # pyright: ignore[reportArgumentType]  (or "auto")
+        random_state=0,
+        batch_size=_BATCH,
+        max_iter=_PASSES,
+        reassignment_ratio=0.0,
+    )
     with threadpool_limits(1):
-        labels = clusters.fit_predict(vectors.astype(np.float32))
-    return clusters.cluster_centers_.astype(np.float64), labels.astype(np.int64)
+        labels = np.asarray(clusters.fit_predict(vectors.astype(np.float32)))
+    return np.asarray(clusters.cluster_centers_, np.float64), labels.astype(np.int64)

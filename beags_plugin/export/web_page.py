@@ -106,7 +106,7 @@ def splat_buffer(values: SplatValues, middle: np.ndarray, radius: float) -> np.n
 def _covariance_roots(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
     """Return L of R diag(s^2) R^T = L L^T, column by column, [N, 6]; by a QR decomposition, as the discs are flat."""
     rotations = rotation_from_quat(torch.from_numpy(quats)).numpy()
-    upper = np.linalg.qr((rotations * scales[:, None, :]).swapaxes(1, 2), mode="r")
+    upper = np.asarray(np.linalg.qr((rotations * scales[:, None, :]).swapaxes(1, 2), mode="r"))
     return upper[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
 
 
