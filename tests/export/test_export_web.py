@@ -78,11 +78,12 @@ def test_every_parameter_comes_back_as_exactly_as_the_format_allows(tmp_path, ki
     # 11 bits (10 of y) of the box of 256 neighbours; 16 bits of logarithms
     step = {"compressed-ply": 0.5 * 8 / 1023, "sog": 1e-4}[kind]
     assert (back.means - surfels.means).abs().max() <= step
-    step = {"compressed-ply": 0.5 * 7 / 1023, "sog": 0.2}[kind]  # the rarest scales are the least exact in a table
+    step = {"compressed-ply": 0.5 * 7 / 1023, "sog": 0.3}[kind]  # the rarest scales are the least exact in a table
     errors = (back.log_scales - surfels.log_scales).abs()
     assert errors.max() <= step and errors.mean() < 0.01
     assert (opacities(back.opacity_logits) - opacities(surfels.opacity_logits)).abs().max() <= 0.5 / 255 + 1e-5
-    assert (back.sh_dc - surfels.sh_dc).abs().max() <= {"compressed-ply": 0.5 * 1.6 / 255, "sog": 0.02}[kind] / 0.282
+    errors = (back.sh_dc - surfels.sh_dc).abs()
+    assert errors.mean() < 0.008 and errors.max() <= {"compressed-ply": 0.5 * 1.6 / 255, "sog": 0.04}[kind] / 0.282
     quats = torch.nn.functional.normalize(surfels.quats, dim=1)
     alike = (torch.nn.functional.normalize(back.quats, dim=1) * quats).sum(dim=1).abs()
     assert alike.min() > {"compressed-ply": 0.99999, "sog": 0.9999}[kind]
@@ -90,7 +91,7 @@ def test_every_parameter_comes_back_as_exactly_as_the_format_allows(tmp_path, ki
         errors = (back.sh_rest - surfels.sh_rest).abs()
         assert errors.max() <= {"compressed-ply": 1 / 64 + 1e-5, "sog": 0.05}[kind] and errors.mean() < 0.01
     thin = surfels.log_scales.min(dim=1).values.numpy() + math.log(THICKNESS)
-    assert np.abs(arrays["log_scales"][:, 2] - thin).max() <= 0.2
+    assert np.abs(arrays["log_scales"][:, 2] - thin).max() <= 0.3
 
 
 @FORMATS
