@@ -8,7 +8,10 @@ EXPORTERS = Registry(
     {
         "ply": "beags_plugin.export.splats:PlyExporter",
         "ply-2dgs": "beags_plugin.export.splats:SurfelPlyExporter",
+        "compressed-ply": "beags_plugin.export.compressed_ply:CompressedPlyExporter",
+        "sog": "beags_plugin.export.sog:SogExporter",
         "spz": "beags_plugin.export.spz:SpzExporter",
+        "html": "beags_plugin.export.web_page:WebPageExporter",
         "glb": "beags_plugin.export.mesh:GlbExporter",
         "obj": "beags_plugin.export.mesh:ObjExporter",
     },

@@ -18,6 +18,7 @@ import torch
 
 from beags_plugin.core.surfels import Surfels, opacities
 from beags_plugin.export.base import Exporter, ExportItem
+from beags_plugin.export.splat_values import finite_surfels
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.frames import to_input_frame
 from beags_plugin.extraction.ply import THICKNESS
@@ -59,10 +60,7 @@ class SpzExporter(Exporter):
         # Of a disc's own axes two are turned too, which leaves it as it is: so do those tools, and the .ply comes back.
         quats = surfels.quats.detach() * surfels.quats.new_tensor([1.0, 1.0, -1.0, -1.0])
         turned = replace(to_input_frame(surfels, half_turn, 1.0), quats=quats)
-        finite = torch.cat(
-            [value.flatten(1) for value in (turned.means, turned.quats, turned.log_scales, turned.sh)], 1
-        )
-        turned = turned[finite.isfinite().all(dim=1) & turned.opacity_logits.isfinite()]
+        turned = finite_surfels(turned)
         means = turned.means.double().cpu().numpy()
         bits = fractional_bits(float(np.abs(means).max(initial=0.0)))
         fixed = np.round(means * 2.0**bits).astype("<i4")

@@ -11,10 +11,22 @@ from torch import Tensor
 
 from beags_plugin.ops import extension
 
+_refused: list[str] = []  # why this process does without it, though it is there
 
-@cache
+
+def refuse(reason: str) -> None:
+    """Do without the module from now on, for a reason in one sentence: it does not work on this machine's GPU."""
+    _refused[:] = [reason]
+
+
 def status() -> tuple[ModuleType | None, str | None]:
     """Return ``beags_plugin._native.cuda``, or one sentence on why it cannot be used here."""
+    return (None, _refused[0]) if _refused else present()
+
+
+@cache
+def present() -> tuple[ModuleType | None, str | None]:
+    """Return what ``status`` does, whatever has been refused."""
     module, reason = extension.status()
     if module is None:
         return None, reason

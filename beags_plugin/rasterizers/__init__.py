@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from beags_plugin.rasterizers import first_contact
 from beags_plugin.rasterizers.interface import Rasterizer
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.registry import Registry
@@ -22,7 +23,8 @@ def make_rasterizer(name: str = "auto") -> Rasterizer:
     """Return the backend called ``name``; raises ``UserError`` if it cannot run here.
 
     "auto" takes the best one for the CPU. Where there is a GPU, tensors that lie there go to the CUDA backend, or if
-    that cannot run to the torch one, for nerfstudio's commands load a run onto any GPU.
+    that cannot run, or has failed its trial (``first_contact``), to the torch one, for nerfstudio's commands load a run
+    onto any GPU.
     """
     if name != "auto":
         backend = RASTERIZERS.get(name)
@@ -33,6 +35,8 @@ def make_rasterizer(name: str = "auto") -> Rasterizer:
         backend = RASTERIZERS.get(candidate)
         if backend.unavailable() is None:
             on_gpu = RASTERIZERS.get("cuda")
+            if on_gpu.unavailable() is None:
+                first_contact.settle()  # makes it unavailable where it cannot be trusted
             if on_gpu.unavailable() is not None:
                 import torch
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import math
-import struct
 
 import numpy as np
 import pytest
@@ -17,66 +16,16 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import ExportItem, make_exporter
 from beags_plugin.export.spz import fractional_bits
 from beags_plugin.system.errors import UserError
-
-SH_COUNT = {0: 0, 1: 3, 2: 8, 3: 15}
+from benchmarks.splat_readers import SH_SIGNS, in_ply_axes, surfels_of
+from benchmarks.splat_readers import read_spz as read
 
 
 def write(path, surfels: Surfels, **options) -> dict:
     return make_exporter("spz", **options).write(path, ExportItem("cup", surfels, torch.zeros(len(surfels))))
 
 
-def read(path) -> dict[str, np.ndarray]:
-    """The arrays of a version 2 file, in its own axes (right, up, backward), one number at a time."""
-    data = gzip.decompress(path.read_bytes())
-    magic, version, count, degree, bits, flags, reserved = struct.unpack_from("<IIIBBBB", data)
-    assert (magic, version, flags, reserved) == (0x5053474E, 2, 0, 0)
-    at = 16
-
-    def take(number: int) -> bytes:
-        nonlocal at
-        at += number
-        assert at <= len(data)
-        return data[at - number : at]
-
-    positions = [int.from_bytes(take(3), "little", signed=True) / 2**bits for _ in range(3 * count)]
-    alphas = [byte / 255 for byte in take(count)]
-    colors = [(byte / 255 - 0.5) / 0.15 for byte in take(3 * count)]
-    scales = [byte / 16 - 10 for byte in take(3 * count)]
-    quats = []
-    for _ in range(count):
-        x, y, z = (byte / 127.5 - 1 for byte in take(3))
-        quats.append((math.sqrt(max(0.0, 1 - x * x - y * y - z * z)), x, y, z))
-    sh = [(byte - 128) / 128 for byte in take(3 * SH_COUNT[degree] * count)]
-    assert at == len(data)
-    return {
-        "means": np.array(positions).reshape(count, 3),
-        "alphas": np.array(alphas),
-        "sh_dc": np.array(colors).reshape(count, 3),
-        "log_scales": np.array(scales).reshape(count, 3),
-        "quats": np.array(quats).reshape(count, 4),
-        "sh_rest": np.array(sh).reshape(count, SH_COUNT[degree], 3),  # colour is the inner axis
-    }
-
-
-# The sign of each basis function (in the files' order) when y and z are turned over: those of its y and z factors.
-SH_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])
-
-
-def in_ply_axes(arrays: dict[str, np.ndarray]) -> Surfels:
-    """As a reader turns them to the axes of .ply files: y and z change their signs."""
-
-    def tensor(values: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values)).float()
-
-    rest = arrays["sh_rest"]
-    return Surfels(
-        tensor(arrays["means"] * [1, -1, -1]),
-        tensor(arrays["quats"] * [1, 1, -1, -1]),
-        tensor(arrays["log_scales"][:, :2]),
-        torch.logit(tensor(arrays["alphas"]), eps=1e-6),
-        tensor(arrays["sh_dc"]),
-        tensor(rest * SH_SIGNS[: rest.shape[1], None]),
-    )
+def read_back(path) -> Surfels:
+    return surfels_of(in_ply_axes(read(path)))
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -84,7 +33,7 @@ def test_every_parameter_comes_back_as_exactly_as_the_format_allows(tmp_path, de
     surfels = random_surfels(count=50, degree=degree)
     facts = write(tmp_path / "cup.spz", surfels, first_band_bits=8, other_bands_bits=8)
     arrays = read(tmp_path / "cup.spz")
-    back = in_ply_axes(arrays)
+    back = surfels_of(in_ply_axes(arrays))
     assert facts["sh_degree"] == back.sh_degree == degree
     step = 2.0 ** -facts["fractional_bits"]
     assert (back.means - surfels.means).abs().max() <= step and step < 1e-5
@@ -144,14 +93,14 @@ def test_a_known_gaussian_has_known_bytes(tmp_path):
 def test_a_read_file_looks_the_same(tmp_path):
     surfels, _ = discs()
     write(tmp_path / "scene.spz", surfels)
-    back = in_ply_axes(read(tmp_path / "scene.spz"))
+    back = read_back(tmp_path / "scene.spz")
     for eye in ((2.0, 1.0, 1.5), (-1.0, 2.0, -0.5)):
         camera = camera_at(eye)
         before = drawn(surfels, camera)
         assert before.std() > 0.1 and psnr(before, drawn(back, camera)) > 28
     fine = {"first_band_bits": 8, "other_bands_bits": 8}
     write(tmp_path / "fine.spz", surfels, **fine)
-    assert psnr(before, drawn(in_ply_axes(read(tmp_path / "fine.spz")), camera)) > 32
+    assert psnr(before, drawn(read_back(tmp_path / "fine.spz"), camera)) > 32
 
 
 def test_the_same_bytes_again_and_much_smaller_than_a_ply(tmp_path):

@@ -10,6 +10,7 @@ import subprocess
 import tempfile
 import time
 import urllib.request
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 
@@ -61,6 +62,7 @@ class Page:
             target = self._wait_for(lambda: self._page_target(port))
             self._socket = connect(target, max_size=None, compression=None)
             self._number = 0
+            self.asked: list[str] = []  # addresses that the page has asked for since ``follow``
             self.resize(width, height)
         except BaseException:
             self._end()
@@ -99,10 +101,24 @@ class Page:
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:
             reply = json.loads(self._socket.recv(timeout=SECONDS))
+            if reply.get("method") == "Network.requestWillBeSent":
+                self.asked.append(reply["params"]["request"]["url"])
             if reply.get("id") == self._number:
                 if "error" in reply:
                     raise RuntimeError(f"{method}: {reply['error']}")
                 return reply["result"]
+
+    def follow(self, url: str) -> None:
+        """Go to ``url``, and keep what it asks for in ``asked``."""
+        self._send("Network.enable")
+        self._send("Page.navigate", url=url)
+        end = time.monotonic() + SECONDS
+        while time.monotonic() < end:
+            with suppress(RuntimeError):  # between two pages there is none to answer
+                if self.evaluate("document.readyState == 'complete' && location.href") == url:
+                    return
+            time.sleep(0.2)
+        raise TimeoutError(f"{url} was not loaded within {SECONDS:g} s")
 
     def evaluate(self, script: str):
         """Return the value of a JavaScript expression."""

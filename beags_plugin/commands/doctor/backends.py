@@ -43,6 +43,19 @@ def rasterizer(name: str) -> Check:
     return Check(title, False, sentence + avoided, required, REBUILD)
 
 
+def first_contact_check() -> Check:
+    """Check that the CUDA backend agrees with the torch reference: try it anew, and keep what comes of it."""
+    from beags_plugin.rasterizers import first_contact
+
+    name, contact = "CUDA trial", first_contact.this_machine()
+    if contact is None:
+        return Check(name, False, "none: the CUDA rasterizer cannot run here", False)
+    found = first_contact.verdict(contact, anew=True)
+    if found.reason:
+        return Check(name, False, first_contact.refusal(found), False)
+    return Check(name, True, f"{found.gpus} draws what the torch reference draws ({found.seconds:g} s)", False)
+
+
 _AVOIDED = {  # ways to run without a backend that fails
     "native": "BEAGS_NATIVE=0 in the environment avoids it",
     "cuda": "training with --machine.device-type cpu avoids it",

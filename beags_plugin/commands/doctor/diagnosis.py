@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from beags_plugin.commands.doctor.backends import rasterizers
+from beags_plugin.commands.doctor.backends import first_contact_check, rasterizers
 from beags_plugin.commands.doctor.check import Check, first_line
 
 _OPENCV = "pip install --force-reinstall --no-deps opencv-contrib-python-headless==4.10.0.84"
@@ -25,6 +25,7 @@ def diagnose() -> Iterator[Check]:
     for check in (_python, _nvcc, _presets, _opencv, _torch, _cuda, _nerfstudio, _open3d):
         yield _safely(check)
     yield from map(_safely, rasterizers())
+    yield _safely(first_contact_check)
 
 
 def checks_of_data(data: Path | None) -> Iterator[Check]:

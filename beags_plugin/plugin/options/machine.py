@@ -6,11 +6,13 @@ import torch
 from nerfstudio.configs.base_config import MachineConfig
 
 from beags_plugin.ops import cuda_extension
+from beags_plugin.rasterizers import first_contact
 from beags_plugin.system.errors import UserError
 
 
 def default_device() -> str:
-    """Return the default device: "cuda" where there is a GPU that our kernels can use, else "cpu"."""
+    """Return the default device: "cuda" where there is a GPU on which our kernels have passed a trial, else "cpu"."""
+    first_contact.settle()
     return "cpu" if cuda_extension.status()[1] else "cuda"
 
 
