@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Union
 import tyro
 
 from beags_plugin.bench.options import ExperimentOptions
+from beags_plugin.bench.paper.options import PaperOptions
 
 
 @dataclass
@@ -36,6 +37,16 @@ class ExperimentFile(ExperimentOptions):
         run_experiment(str(self.file), self)
 
 
+@dataclass
+class PaperBench(PaperOptions):
+    """The paper's tables: its methods on its data sets, as far as they are on disk. What is missing is listed."""
+
+    def run(self) -> None:
+        from beags_plugin.bench.paper.run import run_paper
+
+        run_paper(self)
+
+
 SHIPPED = {
     "ablation": "What each part gives: assignment alone, without each of reprojection, boundary and occupancy loss, "
     "all.",
@@ -55,7 +66,7 @@ SHIPPED = {
 """Commands by experiment, with the sentence of their help."""
 
 if TYPE_CHECKING:
-    Measurement = ShippedExperiment | ExperimentFile
+    Measurement = ShippedExperiment | ExperimentFile | PaperBench
 else:
     Measurement = Union[  # noqa: UP007  (of a tuple)
         tuple(
@@ -65,5 +76,8 @@ else:
             ]
             for name, sentence in SHIPPED.items()
         )
-        + (Annotated[ExperimentFile, tyro.conf.subcommand("file")],)
+        + (
+            Annotated[ExperimentFile, tyro.conf.subcommand("file")],
+            Annotated[PaperBench, tyro.conf.subcommand("paper")],
+        )
     ]

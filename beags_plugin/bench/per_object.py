@@ -19,10 +19,8 @@ _LARGEST = ("peak_memory_mb", "own_memory_mb")
 
 def object_names(scene: TrialScene) -> list[str]:
     """Return the names of a scene's objects, by ascending id; raises ``UserError`` for data that cannot be read."""
-    from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
-
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
-        outputs = BeagsDataParserConfig(data=scene.data).setup().get_dataparser_outputs("train")
+        outputs = scene.parser().setup().get_dataparser_outputs("train")
     return [name for class_id, name in sorted(outputs.metadata["classes"].items()) if class_id != 0]
 
 

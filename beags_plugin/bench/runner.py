@@ -69,6 +69,7 @@ def _run(trial: Trial, folder: Path, base: Outcome | None, worker: Worker) -> Ou
             "preset": trial.preset,
             "data": str(trial.scene.data.absolute()),
             "downscale": trial.scene.downscale,
+            "options": dict(trial.scene.options),
             "masks": None if trial.masks is None else str(trial.masks.absolute()),
             "base": None if base is None else str((base.folder / "run").absolute()),
             "seed": trial.seed,

@@ -7,9 +7,9 @@ import io
 import json
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,19 +20,38 @@ from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
 
+if TYPE_CHECKING:
+    from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+
 SEEDS = {"choosing": (0, 1, 2), "reporting": (100, 101, 102, 103, 104)}
 """Seeds of generated scenes. No choice is made by a result on those for reporting."""
 
 
 @dataclass(frozen=True)
 class TrialScene:
-    """A scene to train on. digest: changes with the content of ``data``. seed: of the damage to its masks."""
+    """A scene to train on.
+
+    digest: changes with the content of ``data``. seed: of the damage to its masks. options: of ``beags-data``, by name,
+    as plain values.
+    """
 
     name: str
     data: Path
     downscale: float
     digest: str
     seed: int = 0
+    options: Mapping[str, Any] = field(default_factory=dict, hash=False)
+
+    def parser(self) -> BeagsDataParserConfig:
+        """Return the data parser's config, without ``downscale``."""
+        from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+
+        return BeagsDataParserConfig(data=self.data, **parser_options(self.options))
+
+
+def parser_options(plain: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options of ``beags-data`` with paths in place of their texts."""
+    return {name: Path(value) if name.endswith("_path") else value for name, value in plain.items()}
 
 
 def sample_scene(folder: Path, family: str, seed: int, options: Mapping[str, Any]) -> TrialScene:
@@ -73,7 +92,6 @@ def damaged_masks(scene: TrialScene, degree: float, folder: Path) -> Path:
     the view's name decide the damage. At degree 1 a sample gets its default masks. Masks of held-out views stay as
     they are. An existing folder of the same damage is used again.
     """
-    from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
     from beags_plugin.sample import degrade
 
     degradation = degrade.degradation_of_degree(degree)
@@ -81,7 +99,7 @@ def damaged_masks(scene: TrialScene, degree: float, folder: Path) -> Path:
     target = folder / f"masks-{value_digest([scene.digest, scene.seed, degree, code])[:12]}"
     if _is_whole(target):
         return target
-    parser = BeagsDataParserConfig(data=scene.data).setup()
+    parser = scene.parser().setup()
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
         splits = {split: parser.get_dataparser_outputs(split) for split in ("test", "train")}
     stems = [Path(file).stem for file in splits["train"].image_filenames]
@@ -117,14 +135,13 @@ def class_masks(scene: TrialScene, count: int, folder: Path) -> Path:
 
     from beags_plugin.core.lifting import project
     from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
-    from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 
     code = Path(__file__).read_text("utf8")
     target = folder / f"classes-{value_digest([scene.digest, count, code])[:12]}"
     if _is_whole(target):
         return target
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
-        outputs = BeagsDataParserConfig(data=scene.data).setup().get_dataparser_outputs("train")
+        outputs = scene.parser().setup().get_dataparser_outputs("train")
     points = outputs.metadata["points3D_xyz"]
     cells = KMeans(count, n_init=1, random_state=0).fit_predict(points.numpy())  # pyright: ignore[reportArgumentType]
     for index, image in enumerate(outputs.image_filenames):

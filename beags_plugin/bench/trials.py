@@ -48,6 +48,7 @@ class Trial:
                 "code": self.code,
                 "masks": self.masks and self.masks.name,  # a digest in itself
                 "base": self.base and self.base.digest,
+                **({"options": dict(self.scene.options)} if self.scene.options else {}),
             }
         )
 

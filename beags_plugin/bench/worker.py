@@ -122,6 +122,7 @@ def run(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
 
 def trial_config(request: dict[str, Any], run_folder: Path) -> BeagsTrainerConfig:
     """Return the preset's config with the trial's overrides, data and seed."""
+    from beags_plugin.bench.scenes import parser_options
     from beags_plugin.plugin.presets import preset_config
 
     config = preset_config(request["preset"], request["overrides"], Path("trial.json"))
@@ -133,6 +134,8 @@ def trial_config(request: dict[str, Any], run_folder: Path) -> BeagsTrainerConfi
     data.train_cameras_sampling_seed = request["seed"]
     parser = cast("BeagsDataParserConfig", data.dataparser)
     parser.data = Path(request["data"])
+    for name, value in parser_options(request.get("options", {})).items():
+        setattr(parser, name, value)
     parser.downscale_factor = (parser.downscale_factor or 1.0) * request[
         "downscale"
     ]  # a variant may shrink the images further

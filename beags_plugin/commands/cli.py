@@ -186,7 +186,10 @@ class Export:
 
 @dataclass
 class Render:
-    """Render objects: a turntable, a contact sheet, assignment alone beside the refined object, or a camera path."""
+    """Render objects: a turntable, a contact sheet, assignment alone beside the refined object, or a camera path.
+
+    Or, with --underlay, each alone in every held-out view, to draw its silhouette over.
+    """
 
     load_config: Path
     """A trained run: its folder, or config.yml in it."""
@@ -194,13 +197,19 @@ class Render:
     """Names of the objects; all but the background if left out."""
     format: str = "video"
     """video (.mp4 or .gif), sheet (.png or .jpg), or before-after (any of these, by the name of the file)."""
+    underlay: bool = False
+    """Write <object>/<photo>.png: each object alone over the faded photo, in every held-out view, as large as the
+    photo. Draw its silhouette over it, white on black, and beags eval reads it (docs/evaluation.md)."""
     output: Path | None = None
-    """The file; in renders/ beside config.yml if left out."""
+    """The file (with --underlay the folder); in renders/ beside config.yml if left out."""
     data: Path | None = None
     """Folder of the photos, whose cameras say what is up, if not where the run was trained on them."""
     options: tyro.conf.OmitArgPrefixes[RenderOptions] = RenderOptions()
 
     def run(self) -> None:
+        if self.underlay:
+            self._underlay()
+            return
         with starting(self):
             from beags_plugin.plugin.objects.render import render_run
         with progress_bar("rendering") as progress:
@@ -208,6 +217,22 @@ class Render:
                 self.load_config, self.object, self.format, self.output, self.options, progress, self.data
             )
         CONSOLE.print(f"{self.format}: {path}", markup=False)
+
+    def _underlay(self) -> None:
+        if self.format != "video" or self.options != RenderOptions():
+            raise UserError(
+                "an underlay has the cameras and sizes of the held-out photos: give --underlay no other option "
+                "than --load-config, --object, --output and --data."
+            )
+        with starting(self):
+            from beags_plugin.plugin.objects.underlay import write_underlays
+        with progress_bar("rendering") as progress:
+            made = write_underlays(self.load_config, self.object, self.output, progress, self.data)
+        CONSOLE.print(
+            f"underlay: {made.count} pictures in {made.folder}\n  Fill each object white on a black layer over them, "
+            f"parts that others hide too; save it as\n  {made.silhouettes}/<object>/<photo>.png; beags eval reads it.",
+            markup=False,
+        )
 
 
 @dataclass

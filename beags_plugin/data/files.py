@@ -184,6 +184,13 @@ def files_of_views(folder: Path, images: Sequence[Path], images_root: Path) -> l
     return files
 
 
+def same_proportions(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Return whether two images (width, height) may be copies of one: a smaller copy rounds each side by a pixel."""
+    (width, height), (other_width, other_height) = size, other
+    expected = other_width * height / width
+    return abs(expected - other_height) <= 1.0 + expected / other_width
+
+
 def check_same_size(masks: Sequence[Path | None], sizes: Sequence[tuple[int, int]]) -> None:
     """Raise ``UserError`` for the first mask that differs in size from its image (width, height)."""
     for mask, (width, height) in zip(masks, sizes, strict=True):

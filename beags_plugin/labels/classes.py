@@ -15,6 +15,8 @@ from beags_plugin.system.reading.text import load_json, reason
 
 NO_TRUTH = "no_truth.json"
 """In a folder of masks: a program drew those of all views, so that held-out ones are no truth to evaluate with."""
+SHADES = slice(32, 224)  # values of 8 bits that are neither black nor white
+MOST_SHADED, LEAST_SHADES = 0.25, 64  # share of a mask's pixels with shades, and number of shades: more is a picture
 _ID_MODES = {"1", "L", "P", "I", "I;16", "I;16L", "I;16B"}  # Pillow's names of images with one integer per pixel
 _COLOR_MODES = {"RGB", "RGBA", "LA"}
 
@@ -44,7 +46,7 @@ def read_binary_mask(path: Path | str) -> np.ndarray:
 
     In 8-bit grey or colour images that reach 128, pixels are inside from 128 on, as outlines may be blended. In other
     images, such as labels 0 and 1, all but 0 and IGNORE is inside. Alpha is ignored.
-    Raises ``UserError`` for any other file.
+    Raises ``UserError`` for any other file, a photo among them.
     """
     mode, values = _read_pixels(path)
     if mode in _COLOR_MODES:
@@ -52,8 +54,16 @@ def read_binary_mask(path: Path | str) -> np.ndarray:
     elif mode not in _ID_MODES or values.ndim != 2:
         raise UserError(f"the mask {path} is of mode {mode}: save it as grey PNG.")
     if mode in {"L", *_COLOR_MODES} and values.max(initial=0) >= 128:
+        if _is_picture(values):
+            raise UserError(f"the mask {path} is a picture: fill the object white on black, without the photo below.")
         return values >= 128
     return (values != 0) & (values != IGNORE)
+
+
+def _is_picture(values: np.ndarray) -> bool:
+    """Return whether many pixels have many shades; blended outlines are few, labels have few values."""
+    counts = np.bincount(values.ravel(), minlength=256)[SHADES]
+    return bool(counts.sum() > MOST_SHADED * values.size and np.count_nonzero(counts) > LEAST_SHADES)
 
 
 def read_mask(path: Path | str, kind: str, ignore_ids: Iterable[int] = ()) -> np.ndarray:

@@ -163,6 +163,7 @@ def test_variants_share_bases_and_nothing_else(experiment):
         {"masks": Path("other")},
         {"scene": TrialScene("a", Path("/nowhere"), 2.0, "1")},
         {"scene": TrialScene("a", Path("/nowhere"), 1.0, "2")},
+        {"scene": TrialScene("a", Path("/nowhere"), 1.0, "1", options={"layout": "llff"})},
     ],
 )
 def test_a_trial_is_another_when_anything_that_matters_changes(change):

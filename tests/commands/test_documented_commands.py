@@ -119,7 +119,8 @@ def training_config(words: list[str]):
 def check_beags(words: list[str]) -> None:
     name = " ".join(words[:2]) if words[0] == "masks" else words[0]
     if name in RUN:
-        cli.main([*words, *([] if "--camera-path" in words else RUN[name])])  # which has a size of its own
+        sized = {"--camera-path", "--underlay"} & set(words)  # which have sizes of their own
+        cli.main([*words, *([] if sized else RUN[name])])
         return
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
     parsed_by_tyro(cli.Command, words, config=config)

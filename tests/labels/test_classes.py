@@ -66,6 +66,20 @@ def test_binary_masks_of_all_kinds(tmp_path, array, inside):
     assert ones.dtype == np.uint16 and np.array_equal(ones, np.asarray(inside, int))
 
 
+def test_a_picture_is_no_binary_mask(tmp_path):
+    """Blended outlines and a single grey are masks; many shades in many pixels are not."""
+    picture = np.random.default_rng(0).integers(80, 180, (40, 60, 3), dtype=np.uint8)
+    Image.fromarray(picture).save(tmp_path / "photo.png")
+    with pytest.raises(UserError, match="photo.png is a picture: fill the object white on black") as raised:
+        read_binary_mask(tmp_path / "photo.png")
+    assert "\n" not in str(raised.value)
+    ramp = np.clip(np.arange(600) - 170, 0, 255).astype(np.uint8)  # 192 of 1000 pixels are shades
+    outline = np.concatenate([ramp, np.full(400, 255, np.uint8)])[None].repeat(3, axis=0)
+    for name, array in (("blended", outline), ("grey", np.where(outline > 128, np.uint8(200), np.uint8(0)))):
+        Image.fromarray(array).save(tmp_path / f"{name}.png")
+        assert (read_binary_mask(tmp_path / f"{name}.png") == (array >= 128)).all()
+
+
 def test_one_bit_images_are_ids_0_and_1(tmp_path):
     Image.fromarray(np.array([[True, False]])).save(tmp_path / "a.png")
     assert read_id_mask(tmp_path / "a.png").tolist() == [[1, 0]]

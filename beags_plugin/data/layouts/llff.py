@@ -75,6 +75,14 @@ def nvos_target(root: Path, folder: Path) -> tuple[str, ...]:
     target = NVOS_TARGETS.get(root.name.lower())
     if target is None:
         return ()
+    return (camera_names(root, folder).get(target, target),)
+
+
+def camera_names(root: Path, folder: Path) -> dict[str, str]:
+    """Return the stem of each file of the camera to that of its copy in ``folder``, as far as they are known.
+
+    Those of LLFF's smaller copies: see ``nvos_target``. Files of ``folder`` itself keep their names.
+    """
     stems = [path.stem for path in list_images(folder)]
     pairs = dict(zip((path.stem for path in _originals(root, len(stems))), stems, strict=False))
     if (root / ORIGINAL_NAMES).is_file():
@@ -85,7 +93,7 @@ def nvos_target(root: Path, folder: Path) -> tuple[str, ...]:
                 f"{root / ORIGINAL_NAMES} cannot be read ({reason(error)}): restore or remove it."
             ) from error
         pairs |= {Path(names[1]).stem: Path(names[0]).stem for names in lines if len(names) == 2}
-    return (target,) if target in stems else (pairs.get(target, target),)
+    return pairs | {stem: stem for stem in stems}
 
 
 def _originals(root: Path, count: int) -> list[Path]:

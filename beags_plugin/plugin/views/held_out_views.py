@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.data.files import image_size
+from beags_plugin.data.files import image_size, same_proportions
 from beags_plugin.data.ground_truth import GroundTruth
 from beags_plugin.evaluation.records import EvalView
 from beags_plugin.labels.class_ids import IGNORE, resize_nearest
@@ -123,8 +123,7 @@ class HeldOutViews(Sequence[EvalView]):
     def _check_proportions(self, what: str, file: Path, size: tuple[int, int], view: int) -> None:
         """Raise ``UserError`` if a file of width and height ``size`` has other proportions than the photograph."""
         (width, height), (own_width, own_height) = image_size(self.manager.eval_dataset.image_filenames[view]), size
-        expected = own_width * height / width  # a smaller copy rounds each side by up to a pixel
-        if abs(expected - own_height) > 1.0 + expected / own_width:
+        if not same_proportions((width, height), size):
             raise UserError(
                 f"the {what} {file} is {own_width}x{own_height} pixels but its image is {width}x{height}: "
                 f"make it in the proportions of the image."

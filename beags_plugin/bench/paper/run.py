@@ -1,0 +1,191 @@
+"""``beags bench paper``: from the folders on disk to the paper's tables."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from beags_plugin.bench.experiment import Experiment, load_experiment
+from beags_plugin.bench.options import ExperimentOptions
+from beags_plugin.bench.paper.data_sets import METHODS, PaperDataSet, paper_folder, read_data_sets
+from beags_plugin.bench.paper.forecast import forecast
+from beags_plugin.bench.paper.on_disk import TRUTH, SceneOnDisk, Sizes, find_scenes
+from beags_plugin.bench.paper.options import PaperOptions
+from beags_plugin.bench.paper.tables import (
+    KINDS,
+    Outcomes,
+    mean_row,
+    missing_lines,
+    paper_tables,
+    plan_lines,
+    plan_table,
+)
+from beags_plugin.bench.provenance import busy_note
+from beags_plugin.bench.report import provenance, write_csv, write_json
+from beags_plugin.bench.results import report_json, table_rows
+from beags_plugin.bench.run import TABLE_WIDTH, adapted, rows_of
+from beags_plugin.bench.runner import Outcome, run_trials
+from beags_plugin.bench.trials import VariantTrial, plan, steps_of
+from beags_plugin.system.digests import code_digest, folder_digest
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.progress import progress_bar
+from beags_plugin.system.whole_files import write_text_atomically
+
+CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
+NEWLY_MEASURED = "measured.json"  # in a trial's folder: which truth its figures are of, and the figures if made anew
+
+
+def run_paper(options: PaperOptions) -> Outcomes | None:
+    """List what is missing, print the plan, run what is on disk, and print the tables; None with ``options.plan``.
+
+    Raises ``UserError`` for a mistake in the options. A trial that fails is a row with the reason.
+    """
+    if not (math.isfinite(options.downscale) and options.downscale >= 1.0):
+        raise UserError(f"downscale is {options.downscale}: give 1 (the paper's sizes) or more.")
+    data_sets = read_data_sets(options.data_set)
+    experiment = _methods(options)
+    scenes = find_scenes(
+        data_sets, options.data_root, options.output, Sizes(options.downscale, options.quick), options.scenes
+    )
+    for line in missing_lines(scenes):
+        CONSOLE.print(line)
+    present = [scene for scene in scenes if scene.scene is not None]
+    if not present:
+        raise UserError(f"no scene in {options.data_root} is complete: the lines above say what belongs where.")
+    runs = plan(experiment, [scene.scene for scene in present if scene.scene is not None], {}, code_digest())
+    trials_folder = options.output / "trials"
+    wide = Console(width=max(CONSOLE.width, TABLE_WIDTH), highlight=False, markup=False)
+    forecasts = forecast(present, runs, trials_folder)
+    wide.print(plan_table(forecasts))
+    for line in plan_lines(forecasts):
+        CONSOLE.print(line)
+    if options.plan:
+        return None
+    source = provenance()
+    busy = busy_note(int(source["machine"]["cores"]))  # before the trials: they keep the machine busy
+    trials = [trial for run in runs for trial in run.trials]
+    finished = {trial.digest for trial in trials if (trials_folder / trial.folder_name / "result.json").exists()}
+    with progress_bar("Training, in steps") as progress:
+        found = run_trials(trials, trials_folder, steps_of, progress)
+    found = _measured(runs, found, finished)
+    rows = rows_of(runs, found)
+    outcomes = Outcomes(rows, {(run.scene.name, run.variant.name): _truth(run, found) for run in runs})
+    methods = [variant.name for variant in experiment.variants]
+    for table in paper_tables(data_sets, methods, outcomes):
+        (CONSOLE if isinstance(table, str) else wide).print(table)
+    for line in _lines(experiment, options, outcomes):
+        CONSOLE.print(line)
+    files = {kind: getattr(options, kind) or options.output / f"paper.{kind}" for kind in ("json", "csv")}
+    about = {**source, "busy": busy, "quick": options.quick, "downscale": options.downscale}
+    report = {**report_json(experiment, rows, about), "data_sets": _report(data_sets, scenes, methods, outcomes)}
+    write_json(files["json"], report)
+    write_csv(files["csv"], table_rows(rows))
+    for kind, path in files.items():
+        CONSOLE.print(f"{kind}: {path}")
+    return outcomes
+
+
+def _methods(options: PaperOptions) -> Experiment:
+    """Return the experiment of the methods, as the options want it."""
+    experiment = load_experiment(str(paper_folder() / f"{METHODS}.toml"))
+    wanted = ExperimentOptions(preset=options.preset, variants=options.methods, quick=options.quick)
+    return dataclasses.replace(adapted(experiment, wanted), name="paper")
+
+
+def _measured(runs: Sequence[VariantTrial], outcomes: Mapping[str, Outcome], finished: set[str]) -> dict[str, Outcome]:
+    """Return the outcomes with figures of the truth that is on disk now: masks may be drawn after the training.
+
+    finished: digests of the trials that had ended before.
+    """
+    measured = dict(outcomes)
+    changed = []
+    for run in runs:
+        truth = folder_digest(run.scene.data / TRUTH) if (run.scene.data / TRUTH).is_dir() else ""
+        for trial in run.trials:
+            outcome = outcomes[trial.digest]
+            if outcome.result is None:
+                continue
+            note = _read(outcome.folder / NEWLY_MEASURED)
+            if trial.digest not in finished:
+                write_text_atomically(json.dumps({"truth": truth}), outcome.folder / NEWLY_MEASURED)
+            elif note.get("truth") != truth:
+                changed.append((trial.digest, truth))
+            else:
+                measured[trial.digest] = dataclasses.replace(
+                    outcome, result={**outcome.result, **note.get("figures", {})}
+                )
+    if changed:
+        from beags_plugin.bench.measure import measure_run
+
+        with progress_bar("Scoring anew") as progress:
+            for done, (digest, truth) in enumerate(changed):
+                progress(done, len(changed))
+                outcome = outcomes[digest]
+                assert outcome.result is not None
+                figures = measure_run(outcome.folder / "run" / "config.yml")
+                content = json.dumps({"truth": truth, "figures": figures})
+                write_text_atomically(content, outcome.folder / NEWLY_MEASURED)
+                measured[digest] = dataclasses.replace(outcome, result={**outcome.result, **figures})
+            progress(len(changed), len(changed))
+    return measured
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+
+
+def _truth(run: VariantTrial, outcomes: Mapping[str, Outcome]) -> str | None:
+    """Return what the extracted masks of a run were compared with; None where nothing was."""
+    results = (outcomes[trial.digest].result for trial in run.trials)
+    truths = {result["evaluation"]["extracted_truth"] for result in results if result is not None} - {None}
+    return "both" if len(truths) > 1 else next(iter(truths), None)
+
+
+def _lines(experiment: Experiment, options: PaperOptions, outcomes: Outcomes) -> list[str]:
+    """Return what readers of the tables must know, and the failures."""
+    lines = []
+    if options.quick or options.downscale != 1.0 or experiment.preset != "beags-paper":
+        how = "in a trial run" if options.quick else f"with {experiment.preset}, sizes / {options.downscale:g}"
+        lines.append(f"Trained {how}: ours are not figures of the paper's protocol.")
+    lines.append("Acc, single scenes and objects are in the files. experiments/paper/ says what the paper leaves open.")
+    return lines + [f"failed: {row.variant.name} on {row.scene}: {row.failed}" for row in outcomes.rows if row.failed]
+
+
+def _report(
+    data_sets: Sequence[PaperDataSet], scenes: Sequence[SceneOnDisk], methods: Sequence[str], outcomes: Outcomes
+) -> dict[str, Any]:
+    """Return, by data set, {"title", "open", "scenes": {name: [truth]}, "missing", "ours", "paper", "psnr"}."""
+    report = {}
+    for data_set in data_sets:
+        own = [scene for scene in scenes if scene.data_set.name == data_set.name]
+        rows = {method: mean_row(data_set, method, outcomes) for method in methods}
+        report[data_set.name] = {
+            "title": data_set.title,
+            "open": dict(data_set.open),
+            "scenes": [scene.name for scene in own if scene.scene is not None],
+            "missing": missing_lines(own),
+            "extracted_truth": {
+                f"{scene} {method}": truth
+                for (scene, method), truth in outcomes.truths.items()
+                if scene.split("/")[0] == data_set.name
+            },
+            "ours": {
+                kind: {
+                    method: [row.figures[f"{kind}_{metric}_after"] for metric in ("acc", "iou", "biou")]
+                    for method, row in rows.items()
+                    if row is not None
+                }
+                for kind in KINDS
+            },
+            "paper": {kind: dict(data_set.figures.get(kind, {})) for kind in KINDS} | {"psnr": data_set.psnr},
+        }
+    return report
