@@ -67,6 +67,7 @@ class WebPageExporter(Exporter):
 
 def recording(item: ExportItem, seen: SeenColors) -> bytes:
     """Return viser's recording of one moment: the Gaussians in a ball of radius 1, and the camera."""
+    from msgspec import msgpack  # as viser does it
     from viser import _messages as messages  # pinned by nerfstudio; the public interface wants a server's port
 
     low, high = (end.numpy() for end in bounding_box(item.surfels))
@@ -82,8 +83,6 @@ def recording(item: ExportItem, seen: SeenColors) -> bytes:
         messages.SetCameraPositionMessage(_three(distance * _unit(seen.eye - middle))),
         messages.SetCameraLookAtMessage((0.0, 0.0, 0.0)),
     ]
-    from msgspec import msgpack  # as viser does it
-
     content = {
         "loopStartIndex": None,
         "durationSeconds": 0.0,

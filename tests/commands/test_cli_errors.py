@@ -81,8 +81,8 @@ SENTENCES = {
     f"export --load-config {RUN}": "nothing to export is named: use --all, --whole, or --object with one of "
     "background, cup, box.",
     f"export --load-config {RUN} --all --object cup": "--all exports every object: leave --object out.",
-    f"export --load-config {RUN} --object cup --format stl": "there is no exporter 'stl': choose one of glb, obj, ply, "
-    "ply-2dgs, spz.",
+    f"export --load-config {RUN} --object cup --format stl": "there is no exporter 'stl': choose one of "
+    "compressed-ply, glb, html, obj, ply, ply-2dgs, sog, spz.",
     f"export --load-config {RUN} --object cup --frame moon": "there is no frame 'moon': choose one of world, object.",
     f"export --load-config {RUN} --object cup --format glb --resolution 0": "resolution is 0: give 8 to 4096 voxels "
     "along the longest side.",

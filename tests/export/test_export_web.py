@@ -89,7 +89,7 @@ def test_every_parameter_comes_back_as_exactly_as_the_format_allows(tmp_path, ki
     assert alike.min() > {"compressed-ply": 0.99999, "sog": 0.9999}[kind]
     if degree:
         errors = (back.sh_rest - surfels.sh_rest).abs()
-        assert errors.max() <= {"compressed-ply": 1 / 64 + 1e-5, "sog": 0.05}[kind] and errors.mean() < 0.01
+        assert errors.max() <= {"compressed-ply": 1 / 64 + 1e-5, "sog": 0.2}[kind] and errors.mean() < 0.01
     thin = surfels.log_scales.min(dim=1).values.numpy() + math.log(THICKNESS)
     assert np.abs(arrays["log_scales"][:, 2] - thin).max() <= 0.3
 
@@ -192,7 +192,7 @@ def test_colours_of_transparent_gaussians_stay(tmp_path):
     surfels = random_surfels(count=300)
     surfels.opacity_logits[:] = -20.0
     back = surfels_of(read_sog(write(tmp_path, "sog", surfels)))
-    assert (back.sh_dc - in_order(surfels).sh_dc).abs().max() < 0.05
+    assert (back.sh_dc - in_order(surfels).sh_dc).abs().mean() < 0.005
 
 
 def test_many_gaussians_share_a_palette(tmp_path):

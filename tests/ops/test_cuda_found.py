@@ -12,13 +12,13 @@ from beags_plugin.ops import cuda_extension, extension
 
 @pytest.fixture
 def found(monkeypatch):
-    """``cuda_extension.status`` on a machine with a GPU; driver, needed: CUDA versions, as CUDA counts."""
+    """``cuda_extension.present`` on a machine with a GPU; driver, needed: CUDA versions, as CUDA counts."""
 
     def ask(driver: int, needed: int):
         cuda = SimpleNamespace(driver_version=lambda: driver, needed_driver_version=lambda: needed)
         monkeypatch.setattr(extension, "status", lambda: (SimpleNamespace(cuda=cuda), None))
         monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-        module, reason = cuda_extension.status.__wrapped__()
+        module, reason = cuda_extension.present.__wrapped__()
         assert (module is cuda) == (reason is None)
         return reason
 
@@ -37,4 +37,13 @@ def test_a_driver_that_is_too_old_is_named(found):
 
 def test_a_module_without_kernels_says_how_to_get_them(monkeypatch):
     monkeypatch.setattr(extension, "status", lambda: (SimpleNamespace(), None))
-    assert "install the CUDA toolkit" in cuda_extension.status.__wrapped__()[1]
+    assert "install the CUDA toolkit" in cuda_extension.present.__wrapped__()[1]
+
+
+def test_what_is_refused_is_not_used_though_it_is_there(monkeypatch):
+    module = SimpleNamespace()
+    monkeypatch.setattr(cuda_extension, "present", lambda: (module, None))
+    monkeypatch.setattr(cuda_extension, "_refused", [])
+    assert cuda_extension.load() is module
+    cuda_extension.refuse("it draws nonsense.")
+    assert cuda_extension.status() == (None, "it draws nonsense.") and cuda_extension.load() is None
