@@ -22,7 +22,7 @@ from nerfstudio.viewer.viewer_elements import (
 from beags_plugin.core.membership import Membership
 from beags_plugin.export import EXPORTERS
 from beags_plugin.plugin.runs.picked import with_picked
-from beags_plugin.plugin.viewer.aim import frame_of, look, side_of_photos
+from beags_plugin.plugin.viewer.aim import frame_of, look, look_as, side_of_photos
 from beags_plugin.plugin.viewer.export import ShownFiles
 from beags_plugin.plugin.viewer.legend import LegendRow, escaped, legend, unique_labels
 from beags_plugin.plugin.viewer.pick_tab import PickTab
@@ -177,7 +177,11 @@ class ObjectPanel(ViewerElement[None]):
         wanted = [class_id for class_id in self.labels.values() if (class_id if first else class_id == chosen)]
         if not wanted and not first:
             self.note("object", f"Nothing to centre on: {NO_CLASSES}")
-        if client is None or run is None or not wanted:
+        if client is None or run is None:
+            return
+        if not wanted:
+            if first and self.pick_tab is not None:  # objects are still to be picked
+                look_as(client, run.cameras)
             return
         frame = frame_of(*self.viewing.whole(), wanted, run.cameras)
         look(client, frame, side_of_photos(frame, run.cameras) if first else None)

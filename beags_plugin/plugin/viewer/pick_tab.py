@@ -7,14 +7,13 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from viser import Icon
 
 from beags_plugin.export import EXPORTERS
 from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.picking.cutter import ViewMarks
 from beags_plugin.plugin.viewer.export import ShownFiles
 from beags_plugin.plugin.viewer.legend import LegendRow, escaped, legend, unique_labels
-from beags_plugin.plugin.viewer.pick_work import PickWork
+from beags_plugin.plugin.viewer.pick_work import FIRST_COLOR, PickWork
 from beags_plugin.plugin.viewer.pointing import WORLD, box_mark, click_mark
 from beags_plugin.plugin.viewer.serving import another_tab
 from beags_plugin.plugin.viewer.viewing import Viewing
@@ -54,7 +53,7 @@ class PickTab:
         self.work = PickWork(viewing, self.report, self.refresh)
         gui = server.gui
         formats = EXPORTERS.names()
-        with another_tab(gui, "Pick", Icon.HAND_CLICK):
+        with another_tab(gui, "Pick"):
             self.picked = gui.add_dropdown("Picked", ["object 1"], hint="What the next click is about")
             self.name = gui.add_text("Name", "object 1")
             self.new = gui.add_button("Another object")
@@ -191,7 +190,7 @@ class PickTab:
 
     def _write(self) -> None:
         rows = [
-            LegendRow(place + 1, one.name, int(one.members.sum()))
+            LegendRow(place + FIRST_COLOR, one.name, int(one.members.sum()))
             for place, one in enumerate(self.work.picks.objects)
             if one.members is not None
         ]

@@ -23,6 +23,7 @@ from beags_plugin.plugin.viewer.viewing import Paint, Viewing
 from beags_plugin.system.errors import UserError
 
 _CHOSEN, _OTHERS = 0.65, 0.4  # of the colour, over what has been picked
+FIRST_COLOR = 3  # of ``colorize``: one that few things have
 _MOST = 0.5  # of the scene: a cut that takes more is doubtful
 Step = Callable[[Picks], Picks]
 
@@ -165,9 +166,9 @@ class PickWork:
                 message = f"{str(error)[:1].upper()}{str(error)[1:]} Nothing has been changed."
             except Exception as error:  # nobody else sees an exception of a thread
                 message = f"Nothing has been changed ({type(error).__name__}: {error})."
+            self._viewing.paint = self._paint()
             if message:
                 self._report(message)
-            self._viewing.paint = self._paint()
             self._changed()
 
     def _cutter(self) -> Cutter:
@@ -188,7 +189,7 @@ class PickWork:
         if all(one.members is None for one in picks.objects):
             return None
         owners = picks.owners(self._viewing.model.num_points)
-        table = torch.from_numpy(colorize(np.arange(1, len(picks.objects) + 1)[None])[0]).float() / 255.0
+        table = torch.from_numpy(colorize(np.arange(len(picks.objects))[None] + FIRST_COLOR)[0]).float() / 255.0
         strength = torch.where(owners == picks.place, _CHOSEN, _OTHERS) * (owners >= 0)
         only = None
         if self.alone and picks.chosen.members is not None:

@@ -33,13 +33,13 @@ def first_folder(gui: GuiApi, label: str) -> Iterator[Any]:
     gui._set_container_id(inner)
 
 
-def another_tab(gui: GuiApi, label: str, icon: Any) -> GuiTabHandle:
+def another_tab(gui: GuiApi, label: str) -> GuiTabHandle:
     """Add a tab beside those of nerfstudio's panel; return it, for ``with``."""
     from viser import GuiTabHandle
 
     folders: Any = gui._container_handle_from_id
     tab = next(handle for handle in folders.values() if isinstance(handle, GuiTabHandle))
-    return tab._parent.add_tab(label, icon)
+    return tab._parent.add_tab(label)
 
 
 def set_pace(viewer: Viewer, client_id: int, pace: Pace) -> None:
