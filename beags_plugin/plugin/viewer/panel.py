@@ -19,18 +19,16 @@ from nerfstudio.viewer.viewer_elements import (
     ViewerSlider,
 )
 
-from beags_plugin.core.membership import Membership
 from beags_plugin.export import EXPORTERS
-from beags_plugin.plugin.runs.picked import with_picked
 from beags_plugin.plugin.viewer.aim import frame_of, look, look_as, side_of_photos
 from beags_plugin.plugin.viewer.export import ShownFiles
 from beags_plugin.plugin.viewer.legend import LegendRow, escaped, legend, unique_labels
 from beags_plugin.plugin.viewer.pick_tab import PickTab
+from beags_plugin.plugin.viewer.pick_work import take_picked
 from beags_plugin.plugin.viewer.picking import pick
 from beags_plugin.plugin.viewer.serving import end_when_interrupted, first_folder, offer_whole_pictures, set_pace
 from beags_plugin.plugin.viewer.viewed_run import ViewedRun
 from beags_plugin.plugin.viewer.viewing import NO_CLASSES, Viewing
-from beags_plugin.system.errors import UserError
 
 if TYPE_CHECKING:
     from nerfstudio.data.scene_box import OrientedBox
@@ -121,8 +119,8 @@ class ObjectPanel(ViewerElement[None]):
         """Begin work with a viewer that has installed the panel."""
         self.viewer, self._link = viewer, link
         run = ViewedRun(Path(viewer.log_filename).parent.absolute(), viewer.pipeline.datamanager)  # type: ignore[arg-type]
-        if viewer.trainer is None:
-            self._take_picked(run.folder)
+        if viewer.trainer is None and (damaged := take_picked(self.viewing.model, run.folder)):
+            self.note("picked", damaged)
         self.viewing.attach(run, viewer.trainer is not None, viewer.train_lock)
         self.viewing.wanted, self.viewing.crop_box = self._wanted, self._crop_box
         if viewer.trainer is None and self._server is not None:  # Gaussians that are trained have no fixed numbers
@@ -136,19 +134,6 @@ class ObjectPanel(ViewerElement[None]):
         if viewer.trainer is None:
             end_when_interrupted(viewer.viser_server)
         threading.Thread(target=self._follow, name="beags panel", daemon=True).start()
-
-    def _take_picked(self, run: Path) -> None:
-        """Give the Gaussians the classes that were picked in an earlier session."""
-        model = self.viewing.model
-        try:
-            picked = with_picked(trained := model.state_dict(), run)
-        except UserError as error:
-            self.note("picked", str(error))
-            return
-        if picked is not trained:
-            extra = picked["_extra_state"]
-            model.take_members(Membership(picked["class_ids"], extra.get("objects")))
-            model.classes = dict(extra["classes"])
 
     def listen(self, wanted: bool) -> None:
         """Begin or end to wait for the click that picks.

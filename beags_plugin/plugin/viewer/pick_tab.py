@@ -14,7 +14,7 @@ from beags_plugin.picking.cutter import ViewMarks
 from beags_plugin.plugin.viewer.export import ShownFiles
 from beags_plugin.plugin.viewer.legend import LegendRow, escaped, legend, unique_labels
 from beags_plugin.plugin.viewer.pick_work import FIRST_COLOR, PickWork
-from beags_plugin.plugin.viewer.pointing import WORLD, box_mark, click_mark
+from beags_plugin.plugin.viewer.pointing import box_mark, click_mark
 from beags_plugin.plugin.viewer.serving import another_tab
 from beags_plugin.plugin.viewer.viewing import Viewing
 
@@ -104,8 +104,8 @@ class PickTab:
         """Mark what is under the cursor."""
         if self._boxing:
             return
-        inside, origin = not self.excludes.value, [x / WORLD for x in event.ray_origin]
-        self._mark(lambda _: click_mark(origin, event.ray_direction, event.client.camera, inside, self.work.drawn()))
+        inside, position, camera = not self.excludes.value, event.screen_pos, event.client.camera
+        self._mark(lambda _: click_mark(position, camera, inside, self.work.drawn()))
 
     def take_box(self, wanted: bool) -> None:
         """Begin or end to wait for a box; the page holds its camera still meanwhile."""

@@ -13,11 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from beags_plugin.core.membership import Membership
 from beags_plugin.labels.colors import colorize
 from beags_plugin.picking.cutter import Cutter
 from beags_plugin.picking.picks import Picks
 from beags_plugin.plugin.objects.picked_masks import save_masks
-from beags_plugin.plugin.runs.picked import write_picked
+from beags_plugin.plugin.runs.picked import with_picked, write_picked
+from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.viewer.choice import Visible
 from beags_plugin.plugin.viewer.viewing import Paint, Viewing
 from beags_plugin.system.errors import UserError
@@ -26,6 +28,20 @@ _CHOSEN, _OTHERS = 0.65, 0.4  # of the colour, over what has been picked
 FIRST_COLOR = 3  # of ``colorize``: one that few things have
 _MOST = 0.5  # of the scene: a cut that takes more is doubtful
 Step = Callable[[Picks], Picks]
+
+
+def take_picked(model: SceneModel, run: Path) -> str | None:
+    """Give a model the classes that were picked in an earlier session; return a sentence if their file is damaged."""
+    trained = model.state_dict()
+    try:
+        picked = with_picked(trained, run)
+    except UserError as error:
+        return str(error)
+    if picked is not trained:
+        extra = picked["_extra_state"]
+        model.take_members(Membership(picked["class_ids"], extra.get("objects")))
+        model.classes = dict(extra["classes"])
+    return None
 
 
 class PickWork:

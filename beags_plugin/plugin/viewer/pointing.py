@@ -26,17 +26,17 @@ _DIAGONAL = 1000.0  # pixels of a page, whatever its size: marks are as large as
 _LEAST_SIDE = 0.01  # of the page: a smaller box was no box, but a click
 
 
-def click_mark(
-    origin: Sequence[float], direction: Sequence[float], camera: CameraHandle, inside: bool, drawn: Tensor | None
-) -> ViewMarks:
+def click_mark(position: Sequence[float], camera: CameraHandle, inside: bool, drawn: Tensor | None) -> ViewMarks:
     """Return the mark of a click on the object, or beside it.
 
-    origin, direction: of the ray through the pixel, in nerfstudio's world. camera: of the page. drawn: see
-    ``ViewMarks``.
+    position: (x, y) in 0..1 of the page; the ray that viser 0.2.7 sends with a click on a node is another. camera: of
+    the page. drawn: see ``ViewMarks``.
     """
+    page = page_camera(camera)
+    pixel = torch.tensor([position[0] * page.width, position[1] * page.height, 1.0], dtype=torch.float64)
+    direction = page.rotation.double().T @ torch.linalg.solve(page.K.double(), pixel)
     pixels = 2 * round(MARK * _DIAGONAL) + 1
-    height = _DIAGONAL / math.hypot(1.0, camera.aspect)
-    view = camera_along(origin, direction, pixels, height / (2 * math.tan(camera.fov / 2)))
+    view = camera_along(page.center.tolist(), direction.tolist(), pixels, float(page.K[1, 1]))
     return ViewMarks(_NAME, view, torch.zeros(pixels, pixels, dtype=torch.int32), (inside,), drawn=drawn)
 
 

@@ -63,13 +63,17 @@ def done(tab, text: str, seconds: float = 120.0) -> str:
     return tab.note
 
 
+def position(point) -> tuple[float, float]:
+    """Return where the page shows a point of the world, (x, y) in 0..1."""
+    camera = page_camera(page())
+    x, y, z = (camera.K @ (camera.rotation @ torch.tensor(point) + camera.translation)).tolist()
+    return x / z / camera.width, y / z / camera.height
+
+
 def click(tab, point, text: str, exclude: bool = False) -> str:
     """Click on a point of the world, and wait for what the panel says."""
-    origin = VIEW.center.double().numpy()
-    direction = np.array(point) - origin
     tab.excludes.value, tab.note = exclude, ""
-    client = SimpleNamespace(camera=page())
-    tab.clicked(SimpleNamespace(ray_origin=tuple(WORLD * origin), ray_direction=tuple(direction), client=client))
+    tab.clicked(SimpleNamespace(screen_pos=position(point), client=SimpleNamespace(camera=page())))
     return done(tab, text)
 
 
@@ -126,9 +130,7 @@ def test_only_what_is_picked_is_shown_and_exported(opened):
 
 def test_a_box_limits_the_object_and_excludes(opened):
     tab, _ = opened()
-    middle = page_camera(page())
-    local = middle.K @ (middle.rotation @ torch.tensor(POINTS["high"]) + middle.translation)
-    x, y = float(local[0] / local[2] / middle.width), float(local[1] / local[2] / middle.height)
+    x, y = position(POINTS["high"])
 
     def drag(half: float, exclude: bool, text: str) -> str:
         tab.excludes.value, tab.note = exclude, ""
