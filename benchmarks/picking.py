@@ -1,11 +1,13 @@
-"""Quality and speed of the cut by prompts: python -m benchmarks.picking clicks RUN [RUN ...] | speed [N].
+"""Quality and speed of the cut by prompts: python -m benchmarks.picking clicks RUN [RUN ...] | growth RUN | speed [N].
 
 clicks: for each object of the data of trained runs, three points on it and two beside it are placed in the training
 view that shows most of it, by its exact masks (``placed``); the cut is drawn into the held-out views, and its mean IoU
 with their exact masks printed: with these points alone; together, where the points on the other objects count as points
 beside this one, as in a file that prompts all; and the limit, Gaussians of the class that most of their light falls on
 in all exact training masks, which is about as good as masks drawn from these Gaussians get. Then the IoU of each object
-alone and together. speed: the time of the parts of a cut of N Gaussians (100,000).
+alone and together. growth: the mean IoU of the Gaussians themselves with that limit, of cuts by one point on and none
+beside, and by all, as they are, after steps of growing and shrinking, and with a ring of neighbours more or less.
+speed: the time of the parts of a cut of N Gaussians (100,000).
 """
 
 from __future__ import annotations
@@ -63,17 +65,13 @@ def placed(ids: np.ndarray, class_id: int) -> tuple[Pixels, Pixels]:
 
 def clicks(config_path: Path) -> None:
     """Print a row of a table for a run: mean IoU, and that of each object."""
-    from beags_plugin.assignment.contributions import contributions
-    from beags_plugin.labels.classes import read_id_mask
     from beags_plugin.picking.cutter import Cutter
     from beags_plugin.plugin.objects.evaluate import EvaluatedRun
     from beags_plugin.system.errors import UserError
 
     run = EvaluatedRun(config_path)
-    views, surfels = run.views, run.stages["after"].surfels()
-    cameras = views.cameras("train")
-    photos = views.manager.train_dataset.image_filenames
-    exact = [read_id_mask(p.parents[1] / f"ground_truth/masks/{p.stem}.png").astype(np.int32) for p in photos]
+    surfels, cameras = run.stages["after"].surfels(), run.views.cameras("train")
+    exact = exact_masks(run)
     objects = [class_id for class_id in run.classes if class_id]
     cutter = Cutter(surfels, cameras, run.rasterizer, run.settings)
     chosen = [int(np.argmax([(ids == class_id).sum() for ids in exact])) for class_id in objects]
@@ -93,12 +91,65 @@ def clicks(config_path: Path) -> None:
             return torch.zeros(len(surfels), dtype=torch.bool)
 
     alone, together = ([solved(i, other) for i in range(len(objects))] for other in (False, True))
-    tables = [torch.from_numpy(ids) for ids in exact]
-    best, _, _ = contributions(surfels, cameras, tables, run.rasterizer, run.settings, max(run.classes) + 1).largest()
+    best = owners(run, exact)
     sets = alone, together, [best == class_id for class_id in objects]
     one, all_, limit = (overlaps(run, surfels, members, objects) for members in sets)
     each = ", ".join(f"{run.classes[c]} {a:.1f} {b:.1f}" for c, a, b in zip(objects, one, all_, strict=True))
     print(f"| {run.name} | {np.mean(one):.1f} | {np.mean(all_):.1f} | {np.mean(limit):.1f} | {each} |", flush=True)
+
+
+def exact_masks(run) -> list[np.ndarray]:
+    """Return the exact masks of a run's training views, [H, W] int32."""
+    from beags_plugin.labels.classes import read_id_mask
+
+    photos = run.views.manager.train_dataset.image_filenames
+    return [read_id_mask(p.parents[1] / f"ground_truth/masks/{p.stem}.png").astype(np.int32) for p in photos]
+
+
+def owners(run, exact: Sequence[np.ndarray]) -> Tensor:
+    """Return the class on which most of each Gaussian's light falls in exact masks, [N]."""
+    from beags_plugin.assignment.contributions import contributions
+
+    surfels, tables = run.stages["after"].surfels(), [torch.from_numpy(ids) for ids in exact]
+    classes = max(int(ids[ids != 65535].max()) for ids in exact) + 1
+    return contributions(
+        surfels, run.views.cameras("train"), tables, run.rasterizer, run.settings, classes
+    ).largest()[0]  # fmt: skip
+
+
+def growth(config_path: Path) -> None:
+    """Print the mean IoU in per cent for each way to change a cut's size; a base without classes will do."""
+    from beags_plugin.picking.cutter import Cutter
+    from beags_plugin.picking.picks import GROWTH
+    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
+
+    run = EvaluatedRun(config_path)
+    surfels, cameras, exact = run.stages["after"].surfels(), run.views.cameras("train"), exact_masks(run)
+    best, cutter = owners(run, exact).cpu(), Cutter(surfels, cameras, run.rasterizer, run.settings)
+    found: dict[str, list[float]] = {}
+    for class_id in sorted({int(each) for ids in exact for each in np.unique(ids)} - {0, 65535}):
+        view, truth = int(np.argmax([(ids == class_id).sum() for ids in exact])), best == class_id
+        on, beside = placed(exact[view], class_id)
+        for points in ((on[:1], []), (on, beside)):
+            marks = [marked(cameras[view], *points)]
+            cuts = {f"{steps:+d} steps": cutter.solve(marks, growth=GROWTH * steps) for steps in (-2, -1, 0, 1, 2, 4)}
+            cuts["a ring less"], cuts["a ring more"] = ringed(cutter, cuts["+0 steps"])
+            for name, members in cuts.items():
+                found.setdefault(name, []).append(100 * float((members & truth).sum() / (members | truth).sum()))
+    print(f"{len(surfels)} Gaussians, {len(found['+0 steps'])} cuts")
+    for name, values in found.items():
+        print(f"| {name} | {np.mean(values):.1f} |")
+
+
+def ringed(cutter, members: Tensor) -> tuple[Tensor, Tensor]:
+    """Return members [N] bool without those that are linked to others, and with all that are linked to them."""
+    graph = cutter._graph
+    own = members.numpy()[graph.nodes]
+    less, more = own.copy(), own.copy()
+    for one, other in ((graph.first, graph.second), (graph.second, graph.first)):
+        less[one[~own[other]]] = False
+        more[one[own[other]]] = True
+    return torch.from_numpy(less[graph.nearest]), torch.from_numpy(more[graph.nearest])
 
 
 def marked(camera, on: Pixels, beside: Pixels):
@@ -163,6 +214,8 @@ if __name__ == "__main__":
             print("| scene | alone | together | limit | objects |\n|---|---|---|---|---|")
             for each in runs:
                 clicks(Path(each))
+        case ["growth", run]:
+            growth(Path(run))
         case ["speed", *size] if len(size) < 2:
             speed(int(size[0]) if size else SPEED_GAUSSIANS)
         case _:

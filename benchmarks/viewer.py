@@ -1,8 +1,9 @@
 """Pictures per second of nerfstudio's viewer while the camera moves: its server and a client, without a browser.
 
-python benchmarks/viewer.py [--load-config RUN/config.yml] [--gaussians 84000] [--seconds 10] [--isolate]
+python benchmarks/viewer.py [--load-config RUN/config.yml] [--gaussians 84000] [--seconds 10] [--isolate] [--cut]
 
-Twice: with the sizes of pictures that nerfstudio chooses, and with ours.
+Twice: with the sizes of pictures that nerfstudio chooses, and with ours. With --cut, both while objects are picked
+without a pause, as the tab Pick does it.
 """
 
 from __future__ import annotations
@@ -156,6 +157,31 @@ def measure(viewer: Any, port: int, middle: list[float], seconds: float, ours: b
     return count / wall
 
 
+def cut_on(viewing: Any, seconds: list[float]) -> None:
+    """Cut an object out of the shown scene again and again, in a thread; seconds: receives how long each cut took."""
+    import torch
+
+    from beags_plugin.picking.cutter import Cutter, ViewMarks
+    from beags_plugin.plugin.viewer.picking import camera_along
+
+    model, surfels = viewing.model, viewing.whole()[0]
+    middle = surfels.means.median(dim=0).values
+    views = [camera_along([0.0, 0.0, 0.0], middle.tolist(), 480, 400.0)]
+    began = time.perf_counter()
+    cutter = Cutter(surfels, views, model.rasterizer, model.settings())
+    print(f"made once in {time.perf_counter() - began:.1f} s")
+    view = camera_along([0.0, 0.0, 0.0], middle.tolist(), 7, 600.0)
+    mark = ViewMarks("view", view, torch.zeros(7, 7, dtype=torch.int32), (True,))
+
+    def work() -> None:
+        while True:
+            began = time.perf_counter()
+            cutter.solve([mark])
+            seconds.append(time.perf_counter() - began)
+
+    threading.Thread(target=work, daemon=True).start()
+
+
 def main() -> None:
     """Print the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -163,6 +189,7 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=84_000, help="of the synthetic scene")
     parser.add_argument("--seconds", type=float, default=10.0, help="of each measurement")
     parser.add_argument("--isolate", action="store_true", help="show one object alone")
+    parser.add_argument("--cut", action="store_true", help="pick objects meanwhile")
     options = parser.parse_args()
     from nerfstudio.utils.eval_utils import eval_setup  # first, or nerfstudio's imports go round in a circle
 
@@ -196,8 +223,13 @@ def main() -> None:
             model.viewing.choice = model.viewing.choice.isolate(1)
         machine = describe_machine()
         print(f"{len(model.means):,} Gaussians; {machine}; {busy_note(int(machine['cores'])) or 'nothing else runs'}")
+        cuts: list[float] = []
+        if options.cut:
+            cut_on(model.viewing, cuts)
         middle = model.means.detach().median(dim=0).values.tolist()
         rates = [measure(viewer, port, middle, options.seconds, ours, stages) for ours in (False, True)]
+        if cuts:
+            print(f"{len(cuts)} cuts meanwhile, {statistics.median(cuts):.2f} s each")
         print(f"ours over nerfstudio's: {rates[1] / rates[0]:.2f}")
         sys.stdout.flush()
     os._exit(0)  # see the viewer's panel

@@ -6,11 +6,12 @@ a few marks reach over the surface: with p of ``walk.Walker``, its level t and t
 minimises
 
     E = sum_{i in object} [a_i]- + sum_{i not in it} [a_i]+ + sum_{links between both} w_ij,
-    a_i = 0.3 (logit p_i - logit t),
+    a_i = 0.3 (logit p_i - logit t + g),
 
-where a Gaussian that a mark shows, or that is excluded, is bound to its side. Walks end more often on the tangent
-planes of what marks show beside the object (a floor goes on in a ring's hole, which no walk reaches), unless these lie
-on other objects, and p is 0 where a walk meets marks beside the object more surely than those on it.
+where g is how much it shall grow, and a Gaussian that a mark shows, or that is excluded, is bound to its side. Walks
+end more often on the tangent planes of what marks show beside the object (a floor goes on in a ring's hole, which no
+walk reaches), unless these lie on other objects, and p is 0 where a walk meets marks beside the object more surely than
+those on it.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ LEAST_LIGHT = 0.02  # unless it is next to nothing
 LEAST_OWN = 0.5  # of that light from Gaussians which no mark of the other kind shows better
 BELIEF = 0.3  # of the logit of p, beside links of at most 1
 BOUND = 1e3  # more than all links of a Gaussian can be worth
+NOTHING = -30.0  # logit of an opacity that no picture shows
 LIMIT = 1e-6  # of p, so that its logit is finite
 
 
@@ -48,7 +50,8 @@ class ViewMarks:
 
     name: of the view, for errors. numbers: [h, w] int32, at a marked pixel the number of its mark, else IGNORE.
     inside: per mark whether it lies on the object. within: [h, w] bool, False where a box says that the object is not,
-    or None. of_others: whether the marks lie on other objects, and so all beside this one.
+    or None. of_others: whether the marks lie on other objects, and so all beside this one. drawn: [N] bool, the
+    Gaussians that the view shows, or None for all.
     """
 
     name: str
@@ -57,6 +60,7 @@ class ViewMarks:
     inside: tuple[bool, ...]
     within: Tensor | None = None
     of_others: bool = False
+    drawn: Tensor | None = None
 
 
 class Cutter:
@@ -81,21 +85,25 @@ class Cutter:
         self._pairs = torch.from_numpy(np.stack([self._graph.first, self._graph.second], axis=1))
         self._walker = Walker(self._graph)
 
-    def solve(self, marks: Sequence[ViewMarks], excluded: Tensor | None = None, name: str = "the object") -> Tensor:
+    def solve(
+        self,
+        marks: Sequence[ViewMarks],
+        excluded: Tensor | None = None,
+        name: str = "the object",
+        growth: float = 0.0,
+    ) -> Tensor:
         """Return which Gaussians belong to the object, [N] bool on the CPU; the same whatever was solved before.
 
-        excluded: [N] bool, Gaussians that do not, or None. name: of the object, for errors. Raises ``UserError`` if no
-        mark lies on the object or on a Gaussian, if marks contradict one another, or if all Gaussians belong to it.
+        excluded: [N] bool, Gaussians that do not, or None. name: of the object, for errors. growth: g; a larger one
+        takes the same Gaussians and more, a negative one fewer. Raises ``UserError`` if no mark lies on the object or
+        on a Gaussian, if marks contradict one another, or if all Gaussians belong to it.
         """
         if not any(inside for view in marks for inside in view.inside):
             raise UserError(f"no point lies on {name}: give at least one in a view that shows it.")
         nodes = self._graph.nodes
-        outside = np.zeros(len(self._inputs.means), dtype=bool)
+        outside = self.outside(marks).numpy()
         if excluded is not None:
             outside |= excluded.cpu().numpy()
-        for view in marks:
-            if view.within is not None:
-                outside |= ~self._shown_within(view)
         barred = outside[nodes]
         inside, beside, ground = self._bound(marks, barred, name)
         behind = self._graph.on_plane_of(ground) & ~self._graph.on_plane_of(inside)
@@ -105,18 +113,37 @@ class Cutter:
         ends = self._graph.first, self._graph.second
         weights = np.where(barred[ends[0]] | barred[ends[1]], 0.0, self._graph.weights)
         level = self._walker.border_level(p, weights)
-        found = self._minimum(p, level, weights, inside, beside | barred)
+        found = self._minimum(p, level, growth, weights, inside, beside | barred)
         if found.all():
             raise UserError(f"the cut of {name} takes the whole scene: mark points beside it, or draw a box about it.")
         members = found[self._graph.nearest] & ~outside
         return torch.from_numpy(members)
 
+    def outside(self, marks: Sequence[ViewMarks]) -> Tensor:
+        """Return which Gaussians lie outside of a box of the marks, [N] bool on the CPU."""
+        found = np.zeros(len(self._inputs.means), dtype=bool)
+        for view in marks:
+            if view.within is not None:
+                found |= ~self._shown_within(view)
+        return torch.from_numpy(found)
+
+    def shown_share(self, view: ViewMarks, among: Tensor) -> float:
+        """Return the share of the light of a view's marks that comes from Gaussians ``among`` [N] bool; 0 without."""
+        light = self._shares(view).sum(axis=0)
+        return float(light[among.cpu().numpy()[self._graph.nodes]].sum() / max(light.sum(), 1e-12))
+
     def _minimum(
-        self, p: np.ndarray, level: float, weights: np.ndarray, inside: np.ndarray, beside: np.ndarray
+        self,
+        p: np.ndarray,
+        level: float,
+        growth: float,
+        weights: np.ndarray,
+        inside: np.ndarray,
+        beside: np.ndarray,
     ) -> np.ndarray:
         """Return the side of the object, [M] bool; ``inside`` and ``beside`` are bound to theirs."""
         p, t = p.clip(LIMIT, 1.0 - LIMIT), min(max(level, LIMIT), 1.0 - LIMIT)
-        belief = BELIEF * (np.log(p / (1.0 - p)) - np.log(t / (1.0 - t)))
+        belief = BELIEF * (np.log(p / (1.0 - p)) - np.log(t / (1.0 - t)) + growth)
         belief[inside], belief[beside] = BOUND, -BOUND
         terminals = torch.from_numpy(np.stack([belief.clip(0.0), (-belief).clip(0.0)], axis=1))
         return cut(self._pairs, torch.from_numpy(weights), terminals).numpy()
@@ -155,10 +182,15 @@ class Cutter:
 
     def _shares(self, view: ViewMarks) -> np.ndarray:
         """Return the share of each mark's light that each node gives, [marks, M] float64."""
-        count = len(view.inside)
+        count, inputs = len(view.inside), self._inputs
+        if count == 0:
+            return np.zeros((0, len(self._graph.nodes)))
+        if view.drawn is not None:  # what cannot be seen stops no light
+            unseen = ~view.drawn.to(inputs.means.device)
+            inputs = replace(inputs, opacity_logits=inputs.opacity_logits.masked_fill(unseen, NOTHING))
         with torch.no_grad():
             keys, weights = self._rasterizer.sparse_class_contributions(
-                self._inputs, view.camera, self._settings, view.numbers, count
+                inputs, view.camera, self._settings, view.numbers, count
             )
         pixels = torch.bincount(view.numbers[view.numbers != IGNORE].long(), minlength=count).double().cpu().numpy()
         found = np.zeros((count, len(self._inputs.means)))

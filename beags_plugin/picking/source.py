@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import ClassVar, Protocol, cast
 
@@ -11,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.masks.sources.base import Geometry, MadeMasks, MaskSource, Progress, SourceScene
 from beags_plugin.masks.sources.prompts import Prompt, PromptedObject, read_prompts
 from beags_plugin.picking.cutter import Cutter, ViewMarks
@@ -74,14 +76,42 @@ class CutSource(MaskSource):
             progress(seen + done, total)
         left = iter(range(seen + len(objects) + 1, total + 1))
         names = {0: "background", **{one.class_id: one.name for one in objects}}
-        maps = _drawn(scene, geometry, objects, torch.stack(members, dim=1), lambda: progress(next(left), total))
+        ids = [one.class_id for one in objects]
+        maps = _drawn(scene, geometry, ids, torch.stack(members, dim=1), lambda: progress(next(left), total))
         return MadeMasks(names, maps, [])
+
+
+@dataclass(frozen=True)
+class DrawnSource(MaskSource):
+    """Objects whose Gaussians are known, drawn into all training views as those of a cut are.
+
+    members: of the run's N Gaussians. names: of the classes.
+    """
+
+    needs_run: ClassVar[bool] = True
+    guesses: ClassVar[bool] = True
+
+    members: Membership
+    names: Mapping[int, str]
+
+    def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
+        assert scene.geometry is not None
+        geometry = cast(TrainedGeometry, scene.geometry)
+        if (now := len(geometry.surfels())) != len(self.members):
+            raise UserError(
+                f"the scene on disk has {now} Gaussians, not the {len(self.members)} that are shown: open it again."
+            )
+        ids = [class_id for class_id in self.members.present() if class_id != BACKGROUND]
+        masks = torch.stack([self.members.of(class_id) for class_id in ids], dim=1)
+        total, steps = sum(scene.photos[place].trained for place in scene.places()), count(1)
+        maps = _drawn(scene, geometry, ids, masks, lambda: progress(next(steps), total))
+        return MadeMasks({BACKGROUND: "background", **{each: self.names[each] for each in ids}}, maps, [])
 
 
 def _drawn(
     scene: SourceScene,
     geometry: TrainedGeometry,
-    objects: Sequence[PromptedObject],
+    class_ids: Sequence[int],
     members: Tensor,
     one_done: Callable[[], None],
 ) -> Iterator[np.ndarray | None]:
@@ -89,7 +119,7 @@ def _drawn(
 
     members: [N, objects] bool. A pixel shows the object that gives most of its light, if that is more than ``DRAWN``.
     """
-    ids = np.array([one.class_id for one in objects], np.uint16)
+    ids = np.array(class_ids, np.uint16)
     inputs = geometry_inputs(geometry.surfels())
     features = members.to(inputs.means)
     view_of = {place: index for index, place in enumerate(scene.places())}

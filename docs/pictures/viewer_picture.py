@@ -54,10 +54,10 @@ class Picture:
             page.wait_for_text("Output render split")
             page.choose("Output render split", "class_map")
             page.choose("Object", self.object)
-            Image.fromarray(_settled(page)).save(self.output, quality=85, optimize=True)
+            Image.fromarray(settled(page)).save(self.output, quality=85, optimize=True)
 
 
-def _settled(page: Page, seconds: float = 15.0) -> np.ndarray:
+def settled(page: Page, seconds: float = 15.0) -> np.ndarray:
     """What the page shows once it has been the same for a while; coarse pictures come before fine ones."""
     shown, since = _pixels(page), time.monotonic()
 

@@ -172,6 +172,20 @@ class Page:
         button = f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() == {json.dumps(label)})"
         self.wait(lambda: self.evaluate(f"(() => {{ const b = {button}; b?.click(); return Boolean(b); }})()"))
 
+    def open_tab(self, label: str) -> None:
+        """Open the tab of that name, once it is there."""
+        tab = f"[...document.querySelectorAll('[role=tab]')].find(t => t.innerText.trim() == {json.dumps(label)})"
+        self.wait(lambda: self.evaluate(f"(() => {{ const t = {tab}; t?.click(); return Boolean(t); }})()"))
+
+    def write(self, label: str, text: str) -> None:
+        """Write into the text field called ``label``."""
+        self._wait_for_control(label)
+        self.evaluate(
+            f"(() => {{ const e = {_labelled(label)};"
+            " Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value')"
+            f".set.call(e, {json.dumps(text)}); e.dispatchEvent(new Event('input', {{bubbles: true}})); }})()"
+        )
+
     def tick(self, label: str) -> None:
         """Tick or untick the box called ``label``, the first of that name."""
         self._wait_for_control(label)

@@ -18,6 +18,7 @@ from beags_plugin.export.base import Viewpoints
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.runs.checkpoint_file import model_state, read_checkpoint
 from beags_plugin.plugin.runs.layout import TRANSFORM_FILE, newest_checkpoint
+from beags_plugin.plugin.runs.picked import with_picked
 from beags_plugin.plugin.runs.place import check_data, open_run
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
@@ -54,14 +55,16 @@ class SavedScene:
 
 
 def read_run(config_path: Path, data: Path | None = None) -> SavedScene:
-    """Read a run's newest checkpoint; raises ``UserError`` if the run is incomplete or the file is damaged.
+    """Read a run's newest checkpoint, with what was picked in the viewer (``runs.picked``).
+
+    Raises ``UserError`` if the run is incomplete or a file is damaged.
 
     data: its data, if not where they were.
     """
     config = open_run(config_path, data)
     path = newest_checkpoint(config.get_checkpoint_dir())
     checkpoint = read_checkpoint(path)
-    state = model_state(checkpoint, path)
+    state = with_picked(model_state(checkpoint, path), config_path.parent)
     return SavedScene(config, state, checkpoint["step"], state["_extra_state"]["classes"])
 
 

@@ -55,3 +55,18 @@ def look(client: ClientHandle, frame: OrbitFrame, away: Tensor | None = None) ->
         camera.up_direction = frame.up.numpy()
         camera.position = _WORLD * place(frame, away, camera.fov, camera.aspect).numpy()
         camera.look_at = _WORLD * frame.center.numpy()
+
+
+def look_as(client: ClientHandle, cameras: Sequence[Camera]) -> None:
+    """Turn a page's camera to what the training cameras look at, from where the first of them stands."""
+    centers = torch.stack([camera.center.double() for camera in cameras])
+    forwards = torch.stack([camera.rotation[2].double() for camera in cameras])
+    aside = torch.eye(3, dtype=torch.float64) - forwards[:, :, None] * forwards[:, None, :]  # square to what each looks
+    middle = torch.linalg.lstsq(aside.reshape(-1, 3), (aside @ centers[:, :, None]).reshape(-1, 1)).solution[:, 0]
+    distance = float((middle - centers[0]) @ forwards[0])
+    if not distance > 0 or not bool(middle.isfinite().all()):  # they look apart, as in a room from its middle
+        distance = 1.0
+    with client.atomic():
+        client.camera.up_direction = -cameras[0].rotation[1].double().numpy()
+        client.camera.position = _WORLD * centers[0].numpy()
+        client.camera.look_at = _WORLD * (centers[0] + distance * forwards[0]).numpy()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from beags_plugin.plugin.viewer.choice import Visible
 from beags_plugin.plugin.viewer.viewing import Viewing
 from beags_plugin.system.errors import UserError
 
@@ -15,13 +16,20 @@ from beags_plugin.system.errors import UserError
 class ShownFiles:
     """Writer of the part that ``viewing`` shows, in a thread of its own, one file at a time.
 
-    title, format_name: return the file's name and its format. report: receives sentences on the progress.
+    title, format_name: return the file's name and its format. report: receives sentences on the progress. part: returns
+    the Gaussians of the file; what is shown in full, if None.
     """
 
     def __init__(
-        self, viewing: Viewing, title: Callable[[], str], format_name: Callable[[], str], report: Callable[[str], None]
+        self,
+        viewing: Viewing,
+        title: Callable[[], str],
+        format_name: Callable[[], str],
+        report: Callable[[str], None],
+        part: Callable[[], Visible] | None = None,
     ) -> None:
         self._viewing = viewing
+        self._part = part or (lambda: viewing.copy(rest=False))
         self._title = title
         self._format_name = format_name
         self._report = report
@@ -47,17 +55,17 @@ class ShownFiles:
         self._report(message)
 
     def write(self) -> Path:
-        """Write what is shown in full, inside the crop box; return the file. Raises ``UserError``."""
+        """Write the part; return the file. Raises ``UserError``."""
         from beags_plugin.plugin.objects.export import export_shown
 
         viewing = self._viewing
         if viewing.run is None:
             raise UserError("no viewer shows this scene: use beags export.")
-        scene = viewing.copy(rest=False)
+        scene = self._part()
         config_path = viewing.run.folder / "config.yml"
         with torch.no_grad():
             return export_shown(
-                config_path, scene.surfels, scene.class_ids, f"shown_{self._title()}", self._format_name(),
+                config_path, scene.surfels, scene.class_ids, self._title(), self._format_name(),
                 viewing.model.settings(), self.report_views,
             )  # fmt: skip
 

@@ -20,9 +20,11 @@ from nerfstudio.viewer.viewer_elements import (
 )
 
 from beags_plugin.export import EXPORTERS
-from beags_plugin.plugin.viewer.aim import frame_of, look, side_of_photos
+from beags_plugin.plugin.viewer.aim import frame_of, look, look_as, side_of_photos
 from beags_plugin.plugin.viewer.export import ShownFiles
 from beags_plugin.plugin.viewer.legend import LegendRow, escaped, legend, unique_labels
+from beags_plugin.plugin.viewer.pick_tab import PickTab
+from beags_plugin.plugin.viewer.pick_work import take_picked
 from beags_plugin.plugin.viewer.picking import pick
 from beags_plugin.plugin.viewer.serving import end_when_interrupted, first_folder, offer_whole_pictures, set_pace
 from beags_plugin.plugin.viewer.viewed_run import ViewedRun
@@ -66,6 +68,8 @@ class ObjectPanel(ViewerElement[None]):
         self.viewer: Viewer | None = None
         self._link: ViewerLink | None = None
         self._listening = False
+        self._server: ViserServer | None = None
+        self.pick_tab: PickTab | None = None
         self._legend: Any = None
         self._status: Any = None
         self._counted: tuple | None = None
@@ -94,7 +98,7 @@ class ObjectPanel(ViewerElement[None]):
     def install(self, viser_server: ViserServer) -> None:
         """Add the controls to the page, as its first folder: see ``ViewerElement.install``."""
         self.refresh_objects()
-        gui = viser_server.gui
+        self._server, gui = viser_server, viser_server.gui
         with first_folder(gui, "Objects") as self._folder:
             self.object.install(viser_server)
             self.next_click.install(viser_server)
@@ -115,8 +119,12 @@ class ObjectPanel(ViewerElement[None]):
         """Begin work with a viewer that has installed the panel."""
         self.viewer, self._link = viewer, link
         run = ViewedRun(Path(viewer.log_filename).parent.absolute(), viewer.pipeline.datamanager)  # type: ignore[arg-type]
+        if viewer.trainer is None and (damaged := take_picked(self.viewing.model, run.folder)):
+            self.note("picked", damaged)
         self.viewing.attach(run, viewer.trainer is not None, viewer.train_lock)
         self.viewing.wanted, self.viewing.crop_box = self._wanted, self._crop_box
+        if viewer.trainer is None and self._server is not None:  # Gaussians that are trained have no fixed numbers
+            self.pick_tab = PickTab(self._server, self.viewing, lambda: self.labels, self._redraw)
         if run.note is not None:
             self.note("run", run.note)
         offer_whole_pictures(viewer.control_panel)
@@ -154,7 +162,11 @@ class ObjectPanel(ViewerElement[None]):
         wanted = [class_id for class_id in self.labels.values() if (class_id if first else class_id == chosen)]
         if not wanted and not first:
             self.note("object", f"Nothing to centre on: {NO_CLASSES}")
-        if client is None or run is None or not wanted:
+        if client is None or run is None:
+            return
+        if not wanted:
+            if first and self.pick_tab is not None:  # objects are still to be picked
+                look_as(client, run.cameras)
             return
         frame = frame_of(*self.viewing.whole(), wanted, run.cameras)
         look(client, frame, side_of_photos(frame, run.cameras) if first else None)
@@ -222,9 +234,9 @@ class ObjectPanel(ViewerElement[None]):
         names = {class_id: label for label, class_id in self.labels.items()}
         choice = self.viewing.choice
         if choice.isolated is not None:
-            return names.get(choice.isolated, f"class_{choice.isolated}")
+            return f"shown_{names.get(choice.isolated, f'class_{choice.isolated}')}"
         away = [name for class_id, name in names.items() if not choice.in_full(class_id)]
-        return f"without_{'_'.join(away[:3])}" if away else "scene"
+        return f"shown_without_{'_'.join(away[:3])}" if away else "shown_scene"
 
     # -- following the scene -------------------------------------------------------------------------------------------
 

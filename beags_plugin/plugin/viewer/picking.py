@@ -14,8 +14,11 @@ from beags_plugin.rasterizers.rendering import geometry_inputs
 _FOCAL = 1000.0  # of the one rendered pixel: about that of a full-screen view, so that it is as sharp
 
 
-def camera_along(origin: Sequence[float], direction: Sequence[float]) -> Camera:
-    """Return a view of one pixel that looks from ``origin`` along ``direction`` (world; of any length but 0)."""
+def camera_along(origin: Sequence[float], direction: Sequence[float], pixels: int = 1, focal: float = _FOCAL) -> Camera:
+    """Return a view of few pixels that looks from ``origin`` along ``direction`` (world; of any length but 0).
+
+    pixels: on each side. focal: their focal length.
+    """
     position, along = (torch.tensor([float(x) for x in point], dtype=torch.float64) for point in (origin, direction))
     forward = along / along.norm()
     aside = torch.zeros(3, dtype=torch.float64)
@@ -25,8 +28,8 @@ def camera_along(origin: Sequence[float], direction: Sequence[float]) -> Camera:
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
-    K = torch.tensor([[_FOCAL, 0.0, 0.5], [0.0, _FOCAL, 0.5], [0.0, 0.0, 1.0]])
-    return Camera(viewmat.float(), K, 1, 1)
+    K = torch.tensor([[focal, 0.0, pixels / 2], [0.0, focal, pixels / 2], [0.0, 0.0, 1.0]])
+    return Camera(viewmat.float(), K, pixels, pixels)
 
 
 @torch.no_grad()

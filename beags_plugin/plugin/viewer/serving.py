@@ -15,7 +15,7 @@ from beags_plugin.plugin.viewer.pace import Pace
 
 if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
-    from viser import GuiApi, ViserServer
+    from viser import GuiApi, GuiTabHandle, ViserServer
 
 
 @contextmanager
@@ -31,6 +31,15 @@ def first_folder(gui: GuiApi, label: str) -> Iterator[Any]:
     with gui.add_folder(label, order=-1.0):
         yield outer
     gui._set_container_id(inner)
+
+
+def another_tab(gui: GuiApi, label: str) -> GuiTabHandle:
+    """Add a tab beside those of nerfstudio's panel; return it, for ``with``."""
+    from viser import GuiTabHandle
+
+    folders: Any = gui._container_handle_from_id
+    tab = next(handle for handle in folders.values() if isinstance(handle, GuiTabHandle))
+    return tab._parent.add_tab(label)
 
 
 def set_pace(viewer: Viewer, client_id: int, pace: Pace) -> None:

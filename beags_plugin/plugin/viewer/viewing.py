@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
@@ -65,10 +65,28 @@ def scene_outputs(model: SceneModel, camera: Camera) -> dict[str, Tensor]:
     return outputs
 
 
-def plain_outputs(model: SceneModel, scene: Visible, camera: Camera, background: Tensor) -> dict[str, Tensor]:
+@dataclass(frozen=True)
+class Paint:
+    """What has been picked, as a viewer shows it: in colours over those of the scene of N Gaussians.
+
+    colors: [N, 3] float32. strength: [N] float32, 0..1, of the colour. only: [N] bool, the Gaussians that are left, or
+    None for all.
+    """
+
+    colors: Tensor
+    strength: Tensor
+    only: Tensor | None = None
+
+
+def plain_outputs(
+    model: SceneModel, scene: Visible, camera: Camera, background: Tensor, paint: Paint | None = None
+) -> dict[str, Tensor]:
     """Render the pictures that every run has: see ``scene_outputs``."""
     background = background.to(model.device)
     inputs = surfel_inputs(scene.surfels, camera, model.active_sh_degree())
+    if paint is not None:
+        index = slice(None) if scene.index is None else scene.index
+        inputs = replace(inputs, colors=inputs.colors.lerp(paint.colors[index], paint.strength[index][:, None]))
     render = model.rasterizer.rasterize(inputs, camera, model.settings(), background)
     assert render.depth is not None and render.normal is not None  # the settings ask for geometry
     return {
@@ -118,7 +136,7 @@ class Viewing:
 
     background: [3], the viewer's. listed: names of ``CHANNELS`` that this run offers; the same ones as long as a viewer
     runs. wanted: returns those that it shows now. crop_box: returns the viewer's. run: the run's files. notes: remarks
-    on the pictures of the last rendering. pace: of the rendering.
+    on the pictures of the last rendering. pace: of the rendering. paint: what has been picked.
     """
 
     def __init__(self, model: SceneModel) -> None:
@@ -132,6 +150,7 @@ class Viewing:
         self.shares: Shares | None = None
         self.notes: dict[str, str] = {}
         self.pace = Pace()
+        self.paint: Paint | None = None
         self.lock = threading.Lock()
         self._rest_until = 0.0
 
@@ -157,10 +176,13 @@ class Viewing:
         self.listed = tuple(name for name in CHANNELS if available[name])
 
     def shown(self, rest: bool = True) -> Visible:
-        """Return the Gaussians that the choice leaves; rest: False leaves the faded ones out."""
+        """Return the Gaussians that choice and paint leave; rest: False leaves the faded ones out."""
         model = self.model
         choice = self.choice if bool(model.assigned) else Choice(min_opacity=self.choice.min_opacity)
-        return shown(model.surfels().detach(), model.members(), choice, rest, within(model, self.crop_box()))
+        inside, paint = within(model, self.crop_box()), self.paint
+        if paint is not None and paint.only is not None:
+            inside = paint.only if inside is None else inside & paint.only
+        return shown(model.surfels().detach(), model.members(), choice, rest, inside)
 
     def outputs(self, camera: Camera) -> dict[str, Tensor]:
         """Render every picture that the viewer lists; those that it does not show at present are left black."""
@@ -169,7 +191,7 @@ class Viewing:
         wanted = self.wanted() & frozenset(self.listed)
         scene = self.shown()
         background = model.background_color if self.background is None else self.background
-        outputs = plain_outputs(model, scene, camera, background)
+        outputs = plain_outputs(model, scene, camera, background, self.paint)
         del outputs["background"]
         black = camera.K.new_zeros(1, 1, 1)
         for name in self.listed:

@@ -1,0 +1,201 @@
+"""The tab Pick of a viewer: objects are pointed at in the picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from beags_plugin.export import EXPORTERS
+from beags_plugin.labels.class_ids import BACKGROUND
+from beags_plugin.picking.cutter import ViewMarks
+from beags_plugin.plugin.viewer.export import ShownFiles
+from beags_plugin.plugin.viewer.legend import LegendRow, escaped, legend, unique_labels
+from beags_plugin.plugin.viewer.pick_work import FIRST_COLOR, PickWork
+from beags_plugin.plugin.viewer.pointing import box_mark, click_mark
+from beags_plugin.plugin.viewer.serving import another_tab
+from beags_plugin.plugin.viewer.viewing import Viewing
+
+if TYPE_CHECKING:
+    from viser import SceneNodePointerEvent, ScenePointerEvent, ViserServer
+
+_AROUND = "/beags_picking"  # name of the box around the scene that takes clicks
+_FAR = 1e4  # viser's units: half of its side, beyond what a page draws
+_OF_RUN = "{} (of the run)"  # an object that can be corrected
+_INSIDES = [
+    (0, 3, 1), (0, 2, 3), (4, 5, 7), (4, 7, 6), (0, 1, 5), (0, 5, 4),
+    (2, 7, 3), (2, 6, 7), (0, 6, 2), (0, 4, 6), (1, 3, 7), (1, 7, 5),
+]  # fmt: skip
+"""Triangles of a cube whose corners are in binary order, seen from inside: an outline for the mouse shows nothing."""
+_HELP = "Tick Click to pick, and click on an object; the mouse still turns the camera."
+
+
+class PickTab:
+    """Controls that say what the next click on the picture means, and what becomes of what has been picked.
+
+    labels: returns the run's objects that have Gaussians, label to class id. redraw: asks for new pictures.
+    """
+
+    def __init__(
+        self, server: ViserServer, viewing: Viewing, labels: Callable[[], dict[str, int]], redraw: Callable[[], None]
+    ) -> None:
+        self.server = server
+        self.viewing = viewing
+        self.note = _HELP
+        self._labels = labels
+        self._redraw = redraw
+        self._around: Any = None
+        self._boxing = False
+        self._entries: dict[str, tuple[str, int]] = {}
+        self._text = ""
+        self.work = PickWork(viewing, self.report, self.refresh)
+        gui = server.gui
+        formats = EXPORTERS.names()
+        with another_tab(gui, "Pick"):
+            self.picked = gui.add_dropdown("Picked", ["object 1"], hint="What the next click is about")
+            self.name = gui.add_text("Name", "object 1")
+            self.new = gui.add_button("Another object")
+            self.clicks = gui.add_checkbox("Click to pick", False, hint="A drag turns the camera all the same")
+            self.excludes = gui.add_checkbox("Exclude", False, hint="What is clicked or boxed does not belong to it")
+            self.box = gui.add_button("Drag a box", hint="Nothing outside of it belongs to the object")
+            self.size = gui.add_button_group("Size", ["Grow", "Shrink"])
+            self.undo = gui.add_button("Undo")
+            self.alone = gui.add_checkbox("Only what is picked", False)
+            self._status = gui.add_markdown("")
+            self.format = gui.add_dropdown("As", formats, "ply" if "ply" in formats else formats[0])
+            self.export = gui.add_button("Export the picked object")
+            self.masks = gui.add_button("Save as masks", hint="Of all objects, for the training views")
+            self.keep = gui.add_button("Keep in the run", hint="As its objects, for every command")
+        self.files = ShownFiles(viewing, self._title, lambda: self.format.value, self.report, self.work.part)
+        self._listen()
+        self.refresh()
+
+    def _listen(self) -> None:
+        self.picked.on_update(lambda _: self._choose(self.picked.value))
+        self.name.on_update(lambda _: self._rename(self.name.value))
+        self.new.on_click(lambda _: self.work.change(lambda picks: picks.another()))
+        self.clicks.on_update(lambda _: self.take_clicks(self.clicks.value))
+        self.box.on_click(lambda _: self.take_box(not self._boxing))
+        self.size.on_click(lambda event: self._grow({"Grow": 1, "Shrink": -1}[event.target.value]))
+        self.undo.on_click(lambda _: self.work.undo())
+        self.alone.on_update(lambda _: self.work.show_alone(self.alone.value))
+        self.export.on_click(lambda _: self.files.start())
+        self.masks.on_click(lambda _: self.work.save_masks())
+        self.keep.on_click(lambda _: self.work.keep())
+
+    # -- pointing ----------------------------------------------------------------------------------------------------
+
+    def take_clicks(self, wanted: bool) -> None:
+        """Begin or end to take clicks on the picture: a box around the scene does, seen from inside by nobody."""
+        if wanted == (self._around is not None):
+            return
+        if not wanted:
+            self._around.remove()
+            self._around = None
+            return
+        corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
+        faces = np.array(_INSIDES, np.uint32)
+        self._around = self.server.scene.add_mesh_simple(_AROUND, _FAR * corners, faces, opacity=0.0)
+        self._around.on_click(self.clicked)
+
+    def clicked(self, event: SceneNodePointerEvent) -> None:
+        """Mark what is under the cursor."""
+        if self._boxing:
+            return
+        inside, position, camera = not self.excludes.value, event.screen_pos, event.client.camera
+        self._mark(lambda _: click_mark(position, camera, inside, self.work.drawn()))
+
+    def take_box(self, wanted: bool) -> None:
+        """Begin or end to wait for a box; the page holds its camera still meanwhile."""
+        if wanted == self._boxing:
+            return
+        self._boxing = wanted
+        if wanted:
+            self.server.scene.on_pointer_event("rect-select")(self.boxed)
+            self.report("Drag a box over the picture; press again to leave it.")
+        else:
+            self.server.scene.remove_pointer_callback()
+            self.report(_HELP)
+
+    def boxed(self, event: ScenePointerEvent) -> None:
+        """Mark a box."""
+        self.take_box(False)
+        inside, corners, camera = not self.excludes.value, event.screen_pos, event.client.camera
+
+        def mark(pointed: bool) -> ViewMarks:
+            return box_mark(corners, camera, inside, self.work.drawn(), inside and not pointed)
+
+        self._mark(mark)
+
+    def _mark(self, mark: Callable[[bool], ViewMarks]) -> None:
+        self.report("Cutting ...")
+        self.work.cut(
+            lambda cutter, picks: picks.marked(cutter, mark(any(any(each.inside) for each in picks.chosen.marks)))
+        )
+
+    def _grow(self, steps: int) -> None:
+        self.report("Cutting ...")
+        self.work.cut(lambda cutter, picks: picks.grown(cutter, steps))
+
+    # -- objects -----------------------------------------------------------------------------------------------------
+
+    def _choose(self, label: str) -> None:
+        kind, number = self._entries.get(label, ("", 0))
+        if kind == "picked":
+            self.work.change(lambda picks: picks.choose(number))
+        elif kind == "run":
+            members = self.viewing.model.members().of(number).cpu()
+            name = self.viewing.model.classes[number]
+            self.work.change(lambda picks: picks.correcting(name, number, members))
+
+    def _rename(self, name: str) -> None:
+        if name != self.work.picks.chosen.name:
+            self.work.change(lambda picks: picks.named(name))
+
+    def _title(self) -> str:
+        return f"picked_{self.work.picks.chosen.name}"
+
+    # -- what the tab shows ------------------------------------------------------------------------------------------
+
+    def report(self, text: str) -> None:
+        """Show a sentence below the controls, in place of the last one."""
+        self.note = text
+        self._write()
+
+    def refresh(self) -> None:
+        """Show what has been picked."""
+        picks = self.work.picks
+        corrected = {one.class_id for one in picks.objects}
+        places = unique_labels({place: one.name for place, one in enumerate(picks.objects)})
+        entries = {label: ("picked", place) for label, place in places.items()}
+        for label, class_id in self._labels().items():
+            if class_id != BACKGROUND and class_id not in corrected:
+                entries[_OF_RUN.format(label)] = ("run", class_id)
+        self._entries = entries
+        with suppress(KeyError):  # the viewer is being closed
+            if tuple(entries) != tuple(self.picked.options):
+                self.picked.options = tuple(entries)
+            self._set(self.picked, next(label for label, place in places.items() if place == picks.place))
+            self._set(self.name, picks.chosen.name)
+            self._set(self.alone, self.work.alone)
+        self._write()
+        self._redraw()
+
+    @staticmethod
+    def _set(control: Any, value: Any) -> None:
+        if control.value != value:
+            control.value = value
+
+    def _write(self) -> None:
+        rows = [
+            LegendRow(place + FIRST_COLOR, one.name, int(one.members.sum()))
+            for place, one in enumerate(self.work.picks.objects)
+            if one.members is not None
+        ]
+        text = "\n\n".join([*([legend(rows)] if rows else []), escaped(self.note)])
+        if text != self._text:
+            with suppress(KeyError):
+                self._status.content = text
+            self._text = text

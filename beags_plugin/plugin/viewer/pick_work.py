@@ -1,0 +1,214 @@
+"""Picking in a viewer: what has been picked, and the slow work for it in a thread of its own."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.core.membership import Membership
+from beags_plugin.labels.colors import colorize
+from beags_plugin.picking.cutter import Cutter
+from beags_plugin.picking.picks import Picks
+from beags_plugin.plugin.objects.picked_masks import save_masks
+from beags_plugin.plugin.runs.picked import with_picked, write_picked
+from beags_plugin.plugin.training.scene_model import SceneModel
+from beags_plugin.plugin.viewer.choice import Visible
+from beags_plugin.plugin.viewer.viewing import Paint, Viewing
+from beags_plugin.system.errors import UserError
+
+_CHOSEN, _OTHERS = 0.65, 0.4  # of the colour, over what has been picked
+FIRST_COLOR = 3  # of ``colorize``: one that few things have
+_MOST = 0.5  # of the scene: a cut that takes more is doubtful
+Step = Callable[[Picks], Picks]
+
+
+def take_picked(model: SceneModel, run: Path) -> str | None:
+    """Give a model the classes that were picked in an earlier session; return a sentence if their file is damaged."""
+    trained = model.state_dict()
+    try:
+        picked = with_picked(trained, run)
+    except UserError as error:
+        return str(error)
+    if picked is not trained:
+        extra = picked["_extra_state"]
+        model.take_members(Membership(picked["class_ids"], extra.get("objects")))
+        model.classes = dict(extra["classes"])
+    return None
+
+
+class PickWork:
+    """What has been picked of a scene that is trained no longer; each method returns at once.
+
+    One thread does the steps in their order, so that neither pictures nor the page wait for a cut. A step that fails
+    changes nothing. report: receives sentences. changed: is called after every step.
+    """
+
+    def __init__(self, viewing: Viewing, report: Callable[[str], None], changed: Callable[[], None]) -> None:
+        self.picks = Picks()
+        self.alone = False
+        self._viewing = viewing
+        self._report = report
+        self._changed = changed
+        self._history: list[Picks] = []
+        self._made: Cutter | None = None
+        self._steps: queue.SimpleQueue[Callable[[], str]] = queue.SimpleQueue()
+        threading.Thread(target=self._work, name="beags pick", daemon=True).start()
+
+    # -- steps -------------------------------------------------------------------------------------------------------
+
+    def cut(self, step: Callable[[Cutter, Picks], Picks]) -> None:
+        """Pick anew, by a step that cuts, and can be undone."""
+
+        def do() -> str:
+            cutter, began = self._cutter(), time.perf_counter()
+            former, self.picks = self.picks, step(cutter, self.picks)
+            self._history.append(former)
+            return self._summary(former.chosen.members, time.perf_counter() - began)
+
+        self._steps.put(do)
+
+    def change(self, step: Step) -> None:
+        """Choose or name an object, which undoing leaves alone."""
+
+        def do() -> str:
+            self.picks = step(self.picks)
+            return ""
+
+        self._steps.put(do)
+
+    def undo(self) -> None:
+        """Take the last cut back."""
+
+        def do() -> str:
+            if not self._history:
+                raise UserError("there is nothing to undo.")
+            names, former = [one.name for one in self.picks.objects], self._history.pop()
+            named = tuple(replace(one, name=name) for one, name in zip(former.objects, names, strict=False))
+            self.picks = replace(former, objects=(*named, *self.picks.objects[len(named) :]))
+            return self._summary()
+
+        self._steps.put(do)
+
+    def show_alone(self, alone: bool) -> None:
+        """Show the chosen object without the rest, or with it."""
+
+        def do() -> str:
+            self.alone = alone
+            return ""
+
+        self._steps.put(do)
+
+    def save_masks(self) -> None:
+        """Draw all objects into masks of the training views; see ``picked_masks.save_masks``."""
+
+        def do() -> str:
+            viewing = self._viewing
+            members, names = self.picks.applied(viewing.model.members(), viewing.model.classes)
+            self._report("Drawing masks of all training views ...")
+            return " ".join(save_masks(self._run() / "config.yml", members, names))
+
+        self._steps.put(do)
+
+    def keep(self) -> None:
+        """Make what has been picked objects of the run, which remembers them; nothing of it can be undone then."""
+
+        def do() -> str:
+            viewing, model = self._viewing, self._viewing.model
+            members, names = self.picks.applied(model.members(), model.classes)
+            path = write_picked(self._run(), model.means, members, names)
+            with viewing.lock:
+                model.take_members(members)
+                model.classes = names
+            self.picks, self._history, self.alone = Picks(), [], False
+            return f"Kept in {path}: the objects are the run's now, for every command."
+
+        self._steps.put(do)
+
+    # -- reading -----------------------------------------------------------------------------------------------------
+
+    def drawn(self) -> Tensor | None:
+        """Return which of the N Gaussians the viewer shows, [N] bool; None: all."""
+        index = self._viewing.shown().index
+        if index is None:
+            return None
+        found = torch.zeros(self._viewing.model.num_points, dtype=torch.bool)
+        found[index.cpu()] = True
+        return found
+
+    def part(self) -> Visible:
+        """Return the chosen object's Gaussians, for a file; raises ``UserError`` if it has none."""
+        members = self.picks.chosen.members
+        if members is None:
+            raise UserError(f"nothing of {self.picks.chosen.name} has been picked yet: click on it first.")
+        surfels = self._viewing.whole()[0]
+        index = members.nonzero()[:, 0].to(surfels.means.device)
+        return Visible(surfels[index], torch.ones(len(index), dtype=torch.int32, device=index.device), index)
+
+    def _run(self) -> Path:
+        assert self._viewing.run is not None  # the panel that picks is made for one
+        return self._viewing.run.folder
+
+    def _summary(self, former: Tensor | None = None, seconds: float | None = None) -> str:
+        one = self.picks.chosen
+        if one.members is None:
+            return f"{one.name}: nothing yet."
+        count = int(one.members.sum())
+        more = (
+            ""
+            if former is None
+            else f", {int((one.members & ~former).sum()):,} more and "
+            + (f"{int((former & ~one.members).sum()):,} fewer than before")
+        )
+        much = ", more than half of the scene: exclude what is beside it" if count > _MOST * len(one.members) else ""
+        took = "" if seconds is None else f" ({seconds:.1f} s)"
+        return f"{one.name}: {count:,} Gaussians{more}{much}{took}."
+
+    # -- the thread --------------------------------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        while True:
+            step = self._steps.get()
+            try:
+                message = step()
+            except UserError as error:
+                message = f"{str(error)[:1].upper()}{str(error)[1:]} Nothing has been changed."
+            except Exception as error:  # nobody else sees an exception of a thread
+                message = f"Nothing has been changed ({type(error).__name__}: {error})."
+            self._viewing.paint = self._paint()
+            if message:
+                self._report(message)
+            self._changed()
+
+    def _cutter(self) -> Cutter:
+        viewing = self._viewing
+        if self._made is None:
+            assert viewing.run is not None
+            surfels, model = viewing.whole()[0], viewing.model
+
+            def progress(done: int, total: int) -> None:
+                self._report(f"Getting ready, once: {done} of {total} views are seen.")
+
+            self._made = Cutter(surfels, viewing.run.cameras, model.rasterizer, model.settings(), progress)
+        return self._made
+
+    def _paint(self) -> Paint | None:
+        """Return the colours of what has been picked."""
+        picks, device = self.picks, self._viewing.model.device
+        if all(one.members is None for one in picks.objects):
+            return None
+        owners = picks.owners(self._viewing.model.num_points)
+        table = torch.from_numpy(colorize(np.arange(len(picks.objects))[None] + FIRST_COLOR)[0]).float() / 255.0
+        strength = torch.where(owners == picks.place, _CHOSEN, _OTHERS) * (owners >= 0)
+        only = None
+        if self.alone and picks.chosen.members is not None:
+            only = picks.chosen.members.to(device)
+            strength = torch.zeros_like(strength)
+        return Paint(table[owners.clamp_min(0)].to(device), strength.float().to(device), only)

@@ -1,0 +1,77 @@
+"""Clicks and boxes on a viewer's page as marks of the cut."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.picking.cutter import ViewMarks
+from beags_plugin.picking.source import MARK
+from beags_plugin.plugin.viewer.picking import camera_along
+from beags_plugin.system.errors import UserError
+
+if TYPE_CHECKING:
+    from viser import CameraHandle
+
+WORLD = 10.0  # viser's units in one of nerfstudio's: VISER_NERFSTUDIO_SCALE_RATIO, whose module is slow to import
+_NAME = "the viewer"
+_DIAGONAL = 1000.0  # pixels of a page, whatever its size: marks are as large as those in photos
+_LEAST_SIDE = 0.01  # of the page: a smaller box was no box, but a click
+
+
+def click_mark(position: Sequence[float], camera: CameraHandle, inside: bool, drawn: Tensor | None) -> ViewMarks:
+    """Return the mark of a click on the object, or beside it.
+
+    position: (x, y) in 0..1 of the page; the ray that viser 0.2.7 sends with a click on a node is another. camera: of
+    the page. drawn: see ``ViewMarks``.
+    """
+    page = page_camera(camera)
+    pixel = torch.tensor([position[0] * page.width, position[1] * page.height, 1.0], dtype=torch.float64)
+    direction = page.rotation.double().T @ torch.linalg.solve(page.K.double(), pixel)
+    pixels = 2 * round(MARK * _DIAGONAL) + 1
+    view = camera_along(page.center.tolist(), direction.tolist(), pixels, float(page.K[1, 1]))
+    return ViewMarks(_NAME, view, torch.zeros(pixels, pixels, dtype=torch.int32), (inside,), drawn=drawn)
+
+
+def box_mark(
+    corners: Sequence[Sequence[float]], camera: CameraHandle, inside: bool, drawn: Tensor | None, pointing: bool
+) -> ViewMarks:
+    """Return the mark of a box outside of which, or (``inside`` False) within which nothing belongs to the object.
+
+    corners: two opposite ones, (x, y) in 0..1 of the page. pointing: whether the middle of the box is a point on the
+    object. Raises ``UserError`` for a box of next to no size.
+    """
+    (left, right), (top, bottom) = (sorted(corner[axis] for corner in corners) for axis in (0, 1))
+    if min(right - left, bottom - top) < _LEAST_SIDE:
+        raise UserError("that was no box: press the button again, and drag over the picture.")
+    view = page_camera(camera)
+    column, row = np.arange(view.width) + 0.5, np.arange(view.height)[:, None] + 0.5
+    left, right, top, bottom = left * view.width, right * view.width, top * view.height, bottom * view.height
+    box = torch.from_numpy((column >= left) & (column <= right) & (row >= top) & (row <= bottom))
+    numbers = torch.full((view.height, view.width), IGNORE, dtype=torch.int32)
+    if not pointing:
+        return ViewMarks(_NAME, view, numbers, (), box if inside else ~box, drawn=drawn)
+    x, y, radius = int((left + right) / 2), int((top + bottom) / 2), round(MARK * _DIAGONAL)
+    numbers[max(y - radius, 0) : y + radius + 1, max(x - radius, 0) : x + radius + 1] = 0
+    return ViewMarks(_NAME, view, numbers, (True,), box, drawn=drawn)
+
+
+def page_camera(camera: CameraHandle) -> Camera:
+    """Return a page's camera in nerfstudio's world, for pictures of ``_DIAGONAL`` pixels."""
+    from viser.transforms import SO3
+
+    height = max(1, round(_DIAGONAL / math.hypot(1.0, camera.aspect)))
+    width = max(1, round(height * camera.aspect))
+    rotation = torch.from_numpy(SO3(camera.wxyz).as_matrix().T.copy())
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ torch.from_numpy(camera.position / WORLD)
+    focal = height / (2 * math.tan(camera.fov / 2))
+    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return Camera(viewmat.float(), K, width, height)

@@ -1,0 +1,138 @@
+"""Objects are picked in ns-viewer, in a headless Chromium: clicks at pixels of a known scene give the known objects."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from solid_runs import write_solids, write_solids_run
+from touching_solids import solids
+
+pytest.importorskip("nerfstudio")
+
+from browser import NEEDED, Page
+from viewer_pages import HEIGHT, WIDTH, awaited, differing, picture, varied, viewed
+
+from beags_plugin.extraction.ply import read_ply
+from beags_plugin.labels.classes import read_id_mask
+from beags_plugin.plugin.objects.extract import extract_objects
+from beags_plugin.system.child_processes import bound
+
+pytestmark = NEEDED
+RED, BLUE = (0, 1, 2), (2, 0, 1)  # channels of the low and the high block, the strongest first
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory):
+    """Yield config.yml and owners of a run without classes or masks, and a page of its viewer with the tab open."""
+    root = tmp_path_factory.mktemp("picked")
+    config, owner = write_solids_run(root / "run", write_solids(root / "lab"))
+    with viewed(config, root / "log.txt") as address, Page(address, WIDTH, HEIGHT) as page:
+        page.open_tab("Pick")
+        page.press("Hide Train Cams")  # a click on one would go there
+        whole = awaited(page, lambda now: varied(now) > 2)
+        page.drag((160, 300), (170, 300))  # the first picture may be that of a page of another size
+        awaited(page, lambda now: varied(now) > 2 and differing(now, whole) > 0.002)
+        page.tick("Click to pick")
+        yield config, owner, page
+
+
+def middle_of(page: Page, channels: tuple[int, int, int]) -> tuple[float, float]:
+    """Return the middle of the largest thing of a colour, in pixels of the page."""
+    seen = picture(page)
+    strong = seen[..., channels[0]] > 1.6 * np.maximum(seen[..., channels[1]], seen[..., channels[2]])
+    rows, columns = strong.nonzero()
+    assert len(rows) > 200
+    return float(np.median(columns)), 60 + float(np.median(rows))
+
+
+def summary(page: Page, name: str, after: str = "") -> int:
+    """Return the number of Gaussians that the panel gives for an object, once it does and no longer reads ``after``."""
+    page.wait(lambda: re.search(rf"{name}: [\d,]+ Gaussians", page.text()) and (not after or after not in page.text()))
+    return int(re.search(rf"{name}: ([\d,]+) Gaussians", page.text())[1].replace(",", ""))
+
+
+def overlap(found: torch.Tensor, exact: torch.Tensor) -> float:
+    return float((found & exact).sum() / (found | exact).sum())
+
+
+def test_objects_are_picked_saved_refined_and_kept(served):
+    config, owner, page = served
+    run, lab = config.parent, config.parent.parent / "lab"
+    whole = picture(page)
+    red, blue = middle_of(page, RED), middle_of(page, BLUE)
+
+    page.click(*red)
+    low = summary(page, "object 1")
+    painted = awaited(page, lambda now: differing(now, whole) > 0.01)
+    page.press("Export the picked object")
+    page.wait_for_text("Exported to")
+    (file,) = (run / "exports").glob("picked_*.ply")
+    means = torch.cdist(read_ply(file)[0].means.double(), solids(dict.fromkeys(range(3), (0.5,) * 3))[0].means.double())
+    found = torch.zeros(len(owner), dtype=torch.bool)
+    found[means.argmin(dim=1)] = True
+    assert len(means) == low and overlap(found, owner == 1) > 0.95
+
+    page.tick("Exclude")
+    page.click(*red)
+    page.wait_for_text("contradicts another point")
+    page.wait_for_text("Nothing has been changed")
+    page.tick("Exclude")
+    page.write("Name", "low")
+    page.wait(lambda: page.chosen("Picked") == "low")
+    page.drag((100, 200), (130, 210))  # turns the camera, and picks nothing
+    turned = awaited(page, lambda now: differing(now, painted) > 0.01)
+    blue = middle_of(page, BLUE)
+
+    page.press("Another object")
+    page.wait(lambda: page.chosen("Picked") == "object 1")
+    page.press("Drag a box")
+    page.wait_for_text("Drag a box over the picture")
+    page.drag((blue[0] - 60, blue[1] - 60), (blue[0] + 60, blue[1] + 60))
+    boxed = summary(page, "object 1")
+    page.press("Undo")
+    page.wait_for_text("object 1: nothing yet")
+    page.click(*blue)
+    high = summary(page, "object 1", "nothing yet")
+    assert 0.2 * high < boxed <= high
+    awaited(page, lambda now: differing(now, turned) > 0.01)
+    page.press("Undo")
+    page.wait_for_text("object 1: nothing yet")
+    awaited(page, lambda now: differing(now, turned) < 0.002)
+    page.click(*blue)
+    assert summary(page, "object 1", "nothing yet") == high
+    page.write("Name", "high")
+    page.wait(lambda: page.chosen("Picked") == "high")
+    page.tick("Only what is picked")
+    awaited(page, lambda now: varied(now) > 2 and (now.max(axis=2) < 10).mean() > 0.3)
+    page.tick("Only what is picked")
+
+    page.press("Save as masks")
+    page.wait_for_text("Saved ", 300)
+    page.wait_for_text("ns-train beags-refine")
+    names = json.loads((lab / "classes.json").read_text())
+    assert sorted(names.values()) == ["background", "high", "low"]
+    masks = sorted((lab / "masks").glob("*.png"))
+    assert masks and all(set(np.unique(read_id_mask(path))) >= {0, 1} for path in masks)
+
+    page.press("Keep in the run")
+    page.wait_for_text("Kept in")
+    page.open_tab("Control")
+    page.choose("Object", "low")
+    (extracted,) = extract_objects(config, ["low"], keep_all=True)
+    assert extracted.gaussians == low
+
+    command = [
+        sys.executable, "-c", "from nerfstudio.scripts.train import entrypoint; entrypoint()", "beags-refine",
+        "--data", lab, "--load-dir", run / "nerfstudio_models", "--run-dir", run.parent / "refined",
+        "--machine.device-type", "cpu", "--vis", "tensorboard", "--pipeline.model.refine-steps", "5",
+    ]  # fmt: skip
+    done = subprocess.run(bound(command), capture_output=True, text=True, timeout=500)
+    assert done.returncode == 0, done.stderr[-2000:]
+    (extracted,) = extract_objects(run.parent / "refined/config.yml", ["low"], keep_all=True)
+    assert extracted.gaussians > 0.8 * low

@@ -1,0 +1,272 @@
+"""The tab Pick in nerfstudio's own viewer, without a browser: its work, its messages and its files."""
+
+from __future__ import annotations
+
+import json
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from solid_runs import COLOURED, POINTS, write_solids, write_solids_run
+from touching_solids import SETTINGS, solids, views
+
+pytest.importorskip("nerfstudio")
+
+from viewer_windows import Window
+from viser.transforms import SO3
+
+from beags_plugin.extraction.ply import read_ply
+from beags_plugin.labels.classes import read_id_mask
+from beags_plugin.plugin.objects.export import export_run
+from beags_plugin.plugin.objects.extract import extract_objects
+from beags_plugin.plugin.runs.picked import PICKED_FILE
+from beags_plugin.plugin.runs.read import read_run
+from beags_plugin.plugin.viewer.pointing import WORLD, page_camera
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.rendering import geometry_inputs
+from beags_plugin.system.errors import UserError
+
+VIEW = views()[3]
+
+
+@pytest.fixture
+def opened(tmp_path):
+    """Yield what opens the viewer of a run of the solids, and closes it in the end."""
+    windows = []
+
+    def open_run(assigned: bool = False, config=None):
+        if config is None:
+            config, _ = write_solids_run(tmp_path / "run", write_solids(tmp_path / "lab"), assigned)
+        windows.append(Window(config))
+        return windows[-1].panel.pick_tab, config
+
+    yield open_run
+    for window in windows:
+        window.close()
+
+
+def page(view=VIEW):
+    """Return the camera of a page that looks as a view does."""
+    wxyz = SO3.from_matrix(view.rotation.double().T.numpy()).wxyz
+    fov = 2 * np.arctan(view.height / 2 / float(view.K[1, 1]))
+    return SimpleNamespace(wxyz=wxyz, position=WORLD * view.center.double().numpy(), fov=fov, aspect=1.0)
+
+
+def done(tab, text: str, seconds: float = 120.0) -> str:
+    """Return the panel's sentence, once it holds ``text``."""
+    end = time.monotonic() + seconds
+    while text not in tab.note:
+        assert time.monotonic() < end, tab.note
+        time.sleep(0.02)
+    return tab.note
+
+
+def position(point) -> tuple[float, float]:
+    """Return where the page shows a point of the world, (x, y) in 0..1."""
+    camera = page_camera(page())
+    x, y, z = (camera.K @ (camera.rotation @ torch.tensor(point) + camera.translation)).tolist()
+    return x / z / camera.width, y / z / camera.height
+
+
+def click(tab, point, text: str, exclude: bool = False) -> str:
+    """Click on a point of the world, and wait for what the panel says."""
+    tab.excludes.value, tab.note = exclude, ""
+    tab.clicked(SimpleNamespace(screen_pos=position(point), client=SimpleNamespace(camera=page())))
+    return done(tab, text)
+
+
+def press(tab, action, text: str) -> str:
+    tab.note = ""
+    action()
+    return done(tab, text)
+
+
+def overlap(found, exact) -> float:
+    return float((found & exact).sum() / (found | exact).sum())
+
+
+OWNER = solids(COLOURED)[1]
+
+
+def test_a_page_sees_what_the_view_sees():
+    camera = page_camera(page())
+    assert (camera.viewmat - VIEW.viewmat).abs().max() < 1e-5
+
+
+def test_clicks_paint_the_object_and_are_undone(opened):
+    tab, config = opened()
+    viewing = tab.viewing
+    assert "(" in click(tab, POINTS["low"], "Gaussians") and overlap(tab.work.picks.chosen.members, OWNER == 1) > 0.95
+    painted = viewing.paint
+    assert torch.equal(painted.strength > 0, tab.work.picks.chosen.members) and painted.only is None
+    assert "Nothing has been changed" in click(tab, POINTS["low"], "contradicts", exclude=True)
+    assert viewing.paint.strength.equal(painted.strength)
+    assert "fewer" in press(tab, lambda: tab._grow(-8), "Gaussians")
+    press(tab, tab.work.undo, "Gaussians")
+    assert tab.work.picks.chosen.growth == 0
+    press(tab, tab.work.undo, "nothing yet")
+    press(tab, tab.work.undo, "Nothing has been changed")
+    assert viewing.paint is None
+
+
+def test_only_what_is_picked_is_shown_and_exported(opened):
+    tab, config = opened()
+    assert "click on it first" in press(tab, tab.files.start, "Not exported")
+    click(tab, POINTS["high"], "Gaussians")
+    tab.work.show_alone(True)
+    end = time.monotonic() + 60
+    while len(tab.viewing.shown().surfels) == len(OWNER):
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    assert torch.equal(tab.viewing.shown().index, tab.work.picks.chosen.members.nonzero()[:, 0])
+    press(tab, tab.files.start, "Exported to")
+    surfels, _ = read_ply(config.parent / "exports/picked_object_1.ply")
+    exact = solids(COLOURED)[0].means[tab.work.picks.chosen.members]
+    torch.testing.assert_close(surfels.means, exact)
+    click(tab, POINTS["low"], "shows nothing")  # it is not drawn
+
+
+def test_a_box_limits_the_object_and_excludes(opened):
+    tab, _ = opened()
+    x, y = position(POINTS["high"])
+
+    def drag(half: float, exclude: bool, text: str) -> str:
+        tab.excludes.value, tab.note = exclude, ""
+        tab.take_box(True)
+        corners = ((x + half, y + half), (x - half, y - half))
+        tab.boxed(SimpleNamespace(screen_pos=corners, client=SimpleNamespace(camera=page())))
+        return done(tab, text)
+
+    assert "Nothing has been changed" in drag(0.001, False, "was no box")
+    drag(0.06, False, "Gaussians")
+    small = tab.work.picks.chosen.members
+    assert small.any() and overlap(small, (OWNER == 2) & small) == 1 and small.sum() < (OWNER == 2).sum() / 2
+    press(tab, tab.work.undo, "nothing yet")
+    drag(0.06, True, "No point lies on")
+    click(tab, POINTS["low"], "Gaussians")
+    click(tab, (0.3, 0.2, 0.5), "Gaussians")
+    before = tab.work.picks.chosen.members
+    drag(0.06, True, "Gaussians")
+    after = tab.work.picks.chosen.members
+    assert not (small & after).any() and (before & after).sum() > 0.3 * before.sum()
+    assert tab.server.scene._scene_pointer_cb is None  # the page turns again
+
+
+def test_the_box_around_the_scene_is_seen_from_inside_and_taken_away(opened):
+    tab, _ = opened()
+    tab.take_clicks(True)
+    tab.take_clicks(True)
+    assert tab._around is not None and len(tab._around._impl.click_cb) == 1
+    tab.take_clicks(False)
+    assert tab._around is None
+    from beags_plugin.plugin.viewer.pick_tab import _INSIDES
+
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    for a, b, c in corners[np.array(_INSIDES)]:
+        assert np.cross(b - a, c - a) @ a < 0
+
+
+def test_masks_are_saved_for_training_views_and_never_over_others(opened):
+    tab, config = opened()
+    lab = config.parent.parent / "lab"
+    assert "nothing has been picked" in press(tab, tab.work.save_masks, "Nothing has been changed").lower()
+    click(tab, POINTS["low"], "Gaussians")
+    tab.work.change(lambda picks: picks.named("low").another())
+    click(tab, POINTS["high"], "Gaussians")
+    tab.work.change(lambda picks: picks.named("low"))
+    assert "two objects called 'low'" in press(tab, tab.work.save_masks, "Nothing has been changed")
+    assert not (lab / "masks").exists()
+    tab.work.change(lambda picks: picks.named("high"))
+    assert "beags-refine" in press(tab, tab.work.save_masks, "Saved")
+    assert json.loads((lab / "classes.json").read_text()) == {"0": "background", "1": "low", "2": "high"}
+    files = sorted((lab / "masks").glob("*.png"))
+    cameras = {f"v{index}": camera for index, camera in enumerate(views()[3:] + views()[:3])}
+    assert 0 < len(files) < len(cameras), "held-out views have none"
+    inputs = geometry_inputs(solids(COLOURED)[0], OWNER.int())
+    for file in files:
+        light = make_rasterizer("auto").class_channels(inputs, cameras[file.stem], SETTINGS, 3)
+        exact = torch.where(light.amax(dim=-1) > 0.5, light.argmax(dim=-1), 0).numpy()
+        found = read_id_mask(file)
+        for number in (1, 2):
+            if (exact == number).sum() > 50:
+                assert ((found == number) & (exact == number)).sum() > 0.9 * (
+                    (found == number) | (exact == number)
+                ).sum()
+    click(tab, (0.3, 0.2, 0.5), "Gaussians")
+    assert "Replaced" in press(tab, tab.work.save_masks, "beags-refine")
+    files[0].write_bytes(files[1].read_bytes())  # mended by hand
+    mended = files[0].read_bytes()
+    said = press(tab, tab.work.save_masks, "--masks-path")
+    assert "has masks already" in said and files[0].read_bytes() == mended
+    assert len(list((config.parent / "picked/masks").glob("*.png"))) == len(files)
+
+
+def test_what_is_kept_is_the_runs_for_every_command(opened):
+    tab, config = opened()
+    run = config.parent
+    click(tab, POINTS["low"], "Gaussians")
+    tab.work.change(lambda picks: picks.named("low"))
+    low = tab.work.picks.chosen.members
+    press(tab, tab.work.keep, "Kept in")
+    assert tab.work.picks.changed() == [] and "low (of the run)" in _options(tab, "low (of the run)")
+    press(tab, tab.work.undo, "nothing to undo")
+    scene = read_run(config)
+    assert scene.assigned and torch.equal(scene.members.of(1), low) and scene.classes[1] == "low"
+    (extracted,) = extract_objects(config, ["low"])
+    (exported,) = export_run(config, ["low"], keep_all=True)
+    assert 0 < extracted.gaussians <= exported.gaussians == int(low.sum())
+
+    again, _ = opened(config=config)
+    model = again.viewing.model
+    assert bool(model.assigned) and torch.equal(model.members().of(1), low) and model.classes[1] == "low"
+    checkpoint = next((run / "nerfstudio_models").glob("*.ckpt"))
+    content = torch.load(checkpoint, weights_only=False)
+    content["pipeline"]["_model.gauss_params.means"] += 0.1
+    torch.save(content, checkpoint)
+    assert not read_run(config).assigned, "another training has other Gaussians"
+    (run / PICKED_FILE).write_bytes(b"no file of torch")
+    with pytest.raises(UserError, match=r"picked\.pt, what was picked in the viewer, is damaged"):
+        read_run(config)
+    broken, _ = opened(config=config)
+    assert "damaged" in broken.viewing.model.viewer_panel.notes["picked"]
+
+
+def _options(tab, wanted: str) -> tuple[str, ...]:
+    end = time.monotonic() + 60
+    while wanted not in tab.picked.options:
+        tab.viewing.model.viewer_panel.refresh_objects()
+        tab.refresh()
+        assert time.monotonic() < end, tab.picked.options
+        time.sleep(0.05)
+    return tab.picked.options
+
+
+def test_an_object_of_the_run_is_corrected_and_the_run_remembers(opened):
+    """The low block has floor about it: a click takes that away."""
+    tab, config = opened(assigned=True)
+    before = read_run(config).members
+    assert overlap(before.of(1), OWNER == 1) < 0.9
+    _options(tab, "low (of the run)")
+    tab._choose("low (of the run)")
+    end = time.monotonic() + 60
+    while tab.work.picks.chosen.class_id != 1:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    click(tab, (-0.7, 0.3, 0.0), "Gaussians", exclude=True)
+    press(tab, tab.work.keep, "Kept in")
+    after = read_run(config)
+    assert overlap(after.members.of(1), OWNER == 1) > 0.95 and after.classes == {0: "background", 1: "low", 2: "high"}
+    assert torch.equal(after.members.of(2), before.of(2))
+    assert torch.equal(tab.viewing.model.members().class_ids, after.members.class_ids)
+
+
+def test_a_training_has_no_tab(tmp_path):
+    config, _ = write_solids_run(tmp_path / "run", write_solids(tmp_path / "lab"))
+    trainer = SimpleNamespace(training_state="training")
+    window = Window(config, trainer)
+    try:
+        assert window.panel.pick_tab is None
+    finally:
+        window.close()
