@@ -154,8 +154,8 @@ class Export:
     whole: bool = False
     """The whole scene in one file; without --object and --all it needs no classes."""
     format: tuple[str, ...] = ("ply",)
-    """ply (viewers of 3D Gaussians), ply-2dgs (the official 2DGS code), spz, compressed-ply, sog (all small), html (a page
-    to send), glb, obj (meshes), or your own."""
+    """ply (viewers of 3D Gaussians), ply-2dgs (the official 2DGS code), spz, compressed-ply, sog (all small), html (a
+    page to send), glb, obj (meshes), or your own."""
     frame: str = "world"
     """world, that of the input poses; or object, the same with the middle of the object's box as origin."""
     output: Path | None = None

@@ -137,7 +137,10 @@ def try_in_child(backend: str, devices: Sequence[str], seconds: float = _SECONDS
     if done.returncode != 0 or not lines:
         last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
         return f"drawing a small scene failed ({last})"
-    return str(json.loads(lines[-1]))
+    try:
+        return str(json.loads(lines[-1]))
+    except ValueError:
+        return f"drawing a small scene ended without a result ({lines[-1]})"
 
 
 @cache

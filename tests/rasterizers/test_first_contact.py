@@ -82,6 +82,7 @@ def test_a_child_that_crashes_or_fails():
     reason = try_in_child("tried_backends:Raises", ["cpu"])
     assert reason == "drawing a small scene failed (and more)"
     assert "No module named 'no_such'" in try_in_child("no_such:Thing", ["cpu"])
+    assert try_in_child("tried_backends:Chatters", ["cpu"]).endswith("ended without a result (Bye.)")
 
 
 def test_a_child_that_hangs_is_ended():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import time
@@ -50,3 +51,9 @@ class Hangs(NativeRasterizer):
 class Raises(NativeRasterizer):
     def rasterize(self, *args, **kwargs):
         raise RuntimeError("CUDA error: an illegal memory access was encountered\nand more")
+
+
+class Chatters(NativeRasterizer):
+    def __init__(self) -> None:
+        super().__init__()
+        atexit.register(print, "Bye.")
