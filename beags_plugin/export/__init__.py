@@ -11,5 +11,7 @@ EXPORTERS = Registry(
         "spz": "beags_plugin.export.spz:SpzExporter",
         "glb": "beags_plugin.export.mesh:GlbExporter",
         "obj": "beags_plugin.export.mesh:ObjExporter",
+        "stl": "beags_plugin.export.printing:StlExporter",
+        "3mf": "beags_plugin.export.printing:ThreeMfExporter",
     },
 )
