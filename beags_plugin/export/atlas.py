@@ -9,7 +9,7 @@ import numpy as np
 
 from beags_plugin.export.fusion import Mesh
 
-GAP = 4  # texels between charts, so that two levels of mipmaps do not mix them
+GAP = 2  # texels between charts; what is between them is filled with the colours of the nearest
 _ROWS = 256  # of texels that are looked up at a time
 
 
@@ -55,9 +55,9 @@ def unwrapped(mesh: Mesh, size: int) -> Atlas:
     pack.resolution, pack.padding, pack.bilinear, pack.create_image = size, GAP, True, False
     atlas.generate(xatlas.ChartOptions(), pack)
     source, faces, uv = atlas[0]
-    side = max(size, atlas.width, atlas.height)  # xatlas may need a little more than it was asked to take
+    side = max(atlas.width, atlas.height)  # xatlas may take a little more than it was asked to
     uv = uv.astype(np.float64) * [atlas.width / side, atlas.height / side]
-    return Atlas(source.astype(np.int64), faces.astype(np.int64), uv, side)
+    return Atlas(source.astype(np.int64), faces.astype(np.int64), uv, size)
 
 
 def texels(atlas: Atlas) -> Texels:

@@ -16,7 +16,7 @@ from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.export.texture import Texture, textured
 from beags_plugin.extraction.files import whole_file
 
-FEWEST, MOST, PER_GAUSSIAN = 1000, 50_000, 20
+FEWEST, MOST, PER_GAUSSIAN = 1000, 20_000, 20
 """Triangles where no number of them was asked for."""
 
 

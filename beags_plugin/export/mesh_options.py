@@ -29,7 +29,7 @@ class MeshOptions:
     smallest_part: float = 0.01
     """Meshes: loose parts with fewer triangles than this share of the largest part's are left out."""
     triangles: int = 0
-    """Meshes: most triangles; 0 stands for 20 for each Gaussian, but at least 1,000 and at most 50,000."""
+    """Meshes: most triangles; 0 stands for 20 for each Gaussian, but at least 1,000 and at most 20,000."""
     texture: Literal["photos", "none"] = "photos"
     """Colours of a .glb: a texture from the photos, or none: those of the splats at the vertices."""
     texture_size: int = 0
