@@ -1,10 +1,10 @@
 """Meshes of trained runs against photos and exact shapes: python -m benchmarks.meshes RUN [OBJECT ...].
 
-For each object (all, if none is named) of a run of a generated scene: its mesh with a texture, with colours of vertices, and closed; drawn
-by four rays a pixel into the held-out views. PSNR is over the pixels well inside the object's exact masks that mesh and
-splats both cover, its mean over views; covered is the share of the masks' pixels that the mesh covers. Chamfer is the
-mean of the two mean distances between mesh and exact surface, the underside too, in per cent of the object's longest
-side.
+For each object (all, if none is named) of a run of a generated scene: its mesh with a texture, with colours of
+vertices, and closed; drawn by four rays a pixel into the held-out views. PSNR is over the pixels well inside the
+object's exact masks that mesh and splats both cover, its mean over views; covered is the share of the masks' pixels
+that the mesh covers. Chamfer is the mean of the two mean distances between mesh and exact surface, the underside too,
+in per cent of the object's longest side.
 """
 
 from __future__ import annotations
