@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,6 +23,7 @@ _SHARPEN = 3  # the power of a view's weight: more follow the best view, fewer b
 _PRIOR = 1e-6  # weight of the splats' colour, beside 1 of a photo that looks straight on at a pixel for a texel
 _SAMPLES = 8000  # places that exposures are compared at
 _DARK, _BRIGHT = 0.02, 0.95  # light: outside, noise and clipping tell nothing of exposure
+_ALIKE = 0.05  # standard deviation of log exposures below which they are not told from errors of the surface
 _RIDGE = 1e-3  # of all views' mean evidence, for views that share no place with others
 
 
@@ -47,22 +48,30 @@ class Baked:
     exposures: np.ndarray
 
 
-def baked(places: Places, mesh: Mesh, photos: Sequence[Photo], prior: np.ndarray) -> Baked:
+def baked(
+    places: Places,
+    mesh: Mesh,
+    photos: Sequence[Photo],
+    prior: np.ndarray,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Baked:
     """Return the colours of places on a mesh as photos show them.
 
     A photo shows a place if its pixel is well inside the item's mask, nothing of the scene stands before it, and the
     mesh itself does not hide it. Its weight is the third power of the pixels that it has for the area between places.
-    prior: [P, 3] sRGB 0..1, the colours where no photo shows anything.
+    prior: [P, 3] sRGB 0..1, the colours where no photo shows anything. progress: receives (done, total) photos, each of
+    which is looked at twice.
     """
     caster = surface_of(mesh)
     step = max(1, len(places.points) // _SAMPLES)
-    exposures = _exposures(places[::step], mesh, caster, photos)
+    exposures = _exposures(places[::step], mesh, caster, photos, lambda done: progress(done, 2 * len(photos)))
     total = _PRIOR * linear_from_srgb(prior)
     weights = np.full(len(places.points), _PRIOR)
-    for photo, exposure in zip(photos, exposures, strict=True):
+    for done, (photo, exposure) in enumerate(zip(photos, exposures, strict=True), start=1):
         index, light, weight = _seen(places, mesh, caster, photo)
         total[index] += weight[:, None] * light / exposure
         weights[index] += weight
+        progress(len(photos) + done, 2 * len(photos))
     return Baked(srgb_from_linear(total / weights[:, None]), weights > _PRIOR, exposures)
 
 
@@ -114,7 +123,9 @@ def _interpolated(image: Tensor, xy: np.ndarray) -> np.ndarray:
     return (1 - v) * top + v * ((1 - u) * pixels[below, x] + u * pixels[below, right])
 
 
-def _exposures(places: Places, mesh: Mesh, caster: Any, photos: Sequence[Photo]) -> np.ndarray:
+def _exposures(
+    places: Places, mesh: Mesh, caster: Any, photos: Sequence[Photo], progress: Callable[[int], None]
+) -> np.ndarray:
     """Return [V, 3], how many times as bright as the mean each photo shows places, by colour.
 
     Least squares: log light of place p in photo v = log colour of p + log exposure of v, weighted. The colours are
@@ -127,10 +138,12 @@ def _exposures(places: Places, mesh: Mesh, caster: Any, photos: Sequence[Photo])
         usable = (light > _DARK) & (light < _BRIGHT)
         logs[index, view] = np.log(np.where(usable, light, 1.0))
         weights[index, view] = usable * np.minimum(weight, 1.0)[:, None] ** (1 / _SHARPEN)
+        progress(view + 1)
     found = np.zeros((count, 3))
     for channel in range(3):
         found[:, channel] = _even(logs[..., channel], weights[..., channel])
-    return np.exp(np.round(found - found.mean(axis=0), 5))
+    found -= found.mean(axis=0)
+    return np.exp(np.round(np.where(found.std(axis=0) < _ALIKE, 0.0, found), 5))
 
 
 def _even(logs: np.ndarray, weights: np.ndarray) -> np.ndarray:

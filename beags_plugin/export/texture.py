@@ -15,6 +15,7 @@ from beags_plugin.export.baking import Places, baked
 from beags_plugin.export.base import Photo
 from beags_plugin.export.fusion import Mesh
 from beags_plugin.export.surface import area_vectors, vertex_normals
+from beags_plugin.system.progress import progress_bar
 
 SMALLEST, LARGEST = 128, 4096  # sides of textures that are chosen here
 _FILLED = 0.6  # share of an atlas that its charts take, about
@@ -44,7 +45,8 @@ def textured(mesh: Mesh, photos: Sequence[Photo], size: int) -> Texture:
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     area = np.linalg.norm(area_vectors(mesh), axis=1).sum()
     places = Places(at.of(mesh.vertices), normals, math.sqrt(area / max(len(at.rows), 1)))
-    found = baked(places, mesh, photos, at.of(mesh.colors))
+    with progress_bar("Colours from photos", passing=True) as progress:
+        found = baked(places, mesh, photos, at.of(mesh.colors), progress)
     image = picture(atlas, at, found.colors)
     return Texture(atlas, image, float(found.seen.mean()) if len(found.seen) else 0.0, found.exposures)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,11 @@ from beags_plugin.sample.scene import Thing
 from beags_plugin.sample.views import make_views
 from beags_plugin.system.errors import UserError
 
-OPTIONS = {"resolution": 96, "truncation": 4.0}  # the cup's wall is 9 voxels thick: its two sides stay apart
+OPTIONS: dict[str, Any] = {
+    "resolution": 96,
+    "truncation": 4.0,
+    "triangles": 1_000_000,
+}  # the cup's wall is 9 voxels thick: its two sides stay apart
 
 
 def cameras(count: int = 24) -> list[Camera]:
