@@ -19,6 +19,7 @@ from beags_plugin.commands.process import Process
 from beags_plugin.commands.starting import check_arguments, starting
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.export.mesh_options import MeshOptions
+from beags_plugin.export.pose_options import PoseOptions
 from beags_plugin.pictures.options import RenderOptions
 from beags_plugin.system.errors import UserError, refused, silence_libraries
 from beags_plugin.system.progress import progress_bar
@@ -155,7 +156,7 @@ class Export:
     """The whole scene in one file; without --object and --all it needs no classes."""
     format: tuple[str, ...] = ("ply",)
     """ply (viewers of 3D Gaussians), ply-2dgs (the official 2DGS code), spz, compressed-ply, sog (all small), html (a
-    page to send), glb, obj (meshes), or your own."""
+    page to send), glb, obj (meshes), stl, 3mf (to print), or your own."""
     frame: str = "world"
     """world, that of the input poses; or object, the same with the middle of the object's box as origin."""
     output: Path | None = None
@@ -167,22 +168,23 @@ class Export:
     on them."""
     keep_all: bool = False
     """Keep Gaussians too that do not belong: spikes outside an object's masks, loose parts that no mask supports."""
+    pose: tyro.conf.OmitArgPrefixes[PoseOptions] = PoseOptions()
     mesh: tyro.conf.OmitArgPrefixes[MeshOptions] = MeshOptions()
 
     def run(self) -> None:
         with starting(self):
             from beags_plugin.plugin.objects.export import export_run
-        options = {name: asdict(self.mesh) for name in ("glb", "obj")}
+        options = {name: asdict(self.mesh) for name in ("glb", "obj", "stl", "3mf")}
         with progress_bar("exporting") as progress:
             exported = export_run(
                 self.load_config, self.object, self.all, self.format, self.frame, self.output, options, progress,
-                whole=self.whole, data=self.data, keep_all=self.keep_all,
+                whole=self.whole, data=self.data, keep_all=self.keep_all, pose=self.pose,
             )  # fmt: skip
         write_json(self.json, [asdict(one) for one in exported])
         for one in exported:
             CONSOLE.print(f"{one.name}: {counted_gaussians(one.gaussians, one.left_out)}", markup=False)
             for file in one.files:
-                CONSOLE.print(f"  {file.path or f'no {file.format}: {file.reason}'}", markup=False)
+                CONSOLE.print(f"  {file}", markup=False)
 
 
 @dataclass

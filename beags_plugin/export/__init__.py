@@ -14,5 +14,7 @@ EXPORTERS = Registry(
         "html": "beags_plugin.export.web_page:WebPageExporter",
         "glb": "beags_plugin.export.mesh:GlbExporter",
         "obj": "beags_plugin.export.mesh:ObjExporter",
+        "stl": "beags_plugin.export.printing:StlExporter",
+        "3mf": "beags_plugin.export.printing:ThreeMfExporter",
     },
 )

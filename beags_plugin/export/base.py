@@ -30,11 +30,27 @@ class Viewpoints:
 
 
 @dataclass(frozen=True)
+class Photo:
+    """A training photo and what it shows of an item; what returns tensors may read files.
+
+    camera: in the frame of the file. image: [H, W, 3] float32 in 0..1, sRGB. own: [H, W] bool, the item's mask.
+    depth: [H, W] of the whole scene, in the file's units along z, 0 where nothing is.
+    """
+
+    camera: Camera
+    image: Callable[[], Tensor]
+    own: Callable[[], Tensor]
+    depth: Callable[[], Tensor]
+
+
+@dataclass(frozen=True)
 class ExportItem:
     """An object or the background to export, in the frame of the file.
 
     name: as the user calls it. surfels: N surfels. class_ids: [N] int32, phi.
     views: of the training photos; None unless an exporter ``needs_views``.
+    photos: of the item; None unless an exporter ``needs_photos``, or where there are none, as ``no_photos`` says.
+    in_metres: whether the frame's unit is a metre; else it is unknown.
     shared: what exporters of one item keep for each other, such as the mesh that two file types hold.
     on_render: is called, by an exporter that ``needs_views``, with the number of views rendered so far.
     """
@@ -45,16 +61,26 @@ class ExportItem:
     views: Viewpoints | None = None
     shared: dict[Any, Any] = field(default_factory=dict)
     on_render: Callable[[int], None] = lambda done: None
+    photos: Sequence[Photo] | None = None
+    no_photos: str = "no photos were given"
+    in_metres: bool = False
 
 
 class Exporter(ABC):
     """One file format. Subclasses are frozen dataclasses; their own fields, all with defaults, are their options.
 
     suffix: how the files' names end. needs_views: whether it renders the item from the views of the training photos.
+    needs_metres: whether its files state a unit of length.
     """
 
     suffix: ClassVar[str]
     needs_views: ClassVar[bool] = False
+    needs_metres: ClassVar[bool] = False
+
+    @property
+    def needs_photos(self) -> bool:
+        """Return whether it looks at the photos themselves."""
+        return False
 
     @classmethod
     def unavailable(cls) -> str | None:

@@ -41,6 +41,20 @@ class Frame:
         rotation, shift = self.transform[:, :3], self.transform[:, 3:]
         return replace(self, transform=torch.cat([rotation, shift + rotation @ center.double()[:, None]], dim=1))
 
+    def turned(self, rotation: Tensor) -> Frame:
+        """Return this frame turned: what is x here is ``rotation`` [3, 3] x there."""
+        turned, shift = self.transform[:, :3] @ rotation.double().T, self.transform[:, 3:]
+        return replace(self, transform=torch.cat([turned, shift], dim=1))
+
+    def scaled(self, factor: float) -> Frame:
+        """Return this frame in other units: what is x here is ``factor`` x there."""
+        transform = torch.cat([self.transform[:, :3], factor * self.transform[:, 3:]], dim=1)
+        return Frame(transform, self.scale / factor)
+
+    def points(self, points: Tensor) -> Tensor:
+        """Return points [P, 3] float64 of the run's frame in this one."""
+        return (points / self.scale - self.transform[:, 3]) @ self.transform[:, :3]
+
     def surfels(self, surfels: Surfels) -> Surfels:
         """Return surfels of the run's frame in this one."""
         return to_input_frame(surfels, self.transform, self.scale)
@@ -57,6 +71,10 @@ class Frame:
         """Return viewpoints of the run's frame in this one."""
         settings = replace(views.settings, near=views.settings.near / self.scale, far=views.settings.far / self.scale)
         return Viewpoints([self.camera(camera) for camera in views.cameras], views.rasterizer, settings)
+
+    def in_run(self, points: Tensor) -> Tensor:
+        """Return points [P, 3] float64 of this frame in the run's."""
+        return self.scale * (points @ self.transform[:, :3].T + self.transform[:, 3])
 
     def to_run(self) -> list[list[float]]:
         """Return the 4 x 4 matrix that takes points of this frame to the run's."""

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
-from beags_plugin.system.errors import UserError
+from beags_plugin.system.errors import UserError, check_choice
 
 MOST_VOXELS = 4096  # along a side; memory_mb bounds their number besides
+LARGEST_TEXTURE = 8192  # texels along a side
+TEXTURES = ("photos", "none")
 
 
 @dataclass(frozen=True)
@@ -24,9 +27,15 @@ class MeshOptions:
     min_views: int = 3
     """Meshes: views that must show a surface (all, if there are fewer)."""
     smallest_part: float = 0.01
-    """Meshes: loose parts with fewer faces than this share of the largest part's are left out."""
-    faces: int = 0
-    """Meshes: most faces (triangles); 0 stands for 20 for each Gaussian, and 1,000 at least."""
+    """Meshes: loose parts with fewer triangles than this share of the largest part's are left out."""
+    triangles: int = 0
+    """Meshes: most triangles; 0 stands for 20 for each Gaussian, but at least 1,000 and at most 20,000."""
+    texture: Literal["photos", "none"] = "photos"
+    """Colours of a .glb: a texture from the photos, or none: those of the splats at the vertices."""
+    texture_size: int = 0
+    """Texels along a side of the texture; 0 chooses what suits the photos."""
+    watertight: bool = False
+    """Meshes: close the surface where no view saw it, such as underneath; .stl and .3mf always are."""
 
     def __post_init__(self) -> None:
         if not 8 <= self.resolution <= MOST_VOXELS:
@@ -39,5 +48,10 @@ class MeshOptions:
             raise UserError(f"min_views is {self.min_views}: a surface needs at least 1 view.")
         if not 0.0 <= self.smallest_part <= 1.0:
             raise UserError(f"smallest_part is {self.smallest_part}: it must lie in 0..1.")
-        if self.faces != 0 and self.faces < 100:
-            raise UserError(f"faces is {self.faces}: give at least 100, or 0 for 20 for each Gaussian.")
+        if self.triangles != 0 and self.triangles < 100:
+            raise UserError(f"triangles is {self.triangles}: give at least 100, or 0 for 20 for each Gaussian.")
+        check_choice(self.texture, TEXTURES, "texture")
+        if self.texture_size != 0 and not 16 <= self.texture_size <= LARGEST_TEXTURE:
+            raise UserError(
+                f"texture_size is {self.texture_size}: give 16 to {LARGEST_TEXTURE} texels along a side, or 0."
+            )

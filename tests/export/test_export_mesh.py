@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,9 +22,9 @@ from beags_plugin.core.lifting import project
 from beags_plugin.export import fusion
 from beags_plugin.export.base import ExportItem, NothingToExport, Viewpoints, make_exporter
 from beags_plugin.export.close_up import close_up
+from beags_plugin.export.color import linear_from_srgb
 from beags_plugin.export.frames import bounding_box
 from beags_plugin.export.fusion import Mesh, _grid_mb, decimated, sorted_mesh, voxel_size, without_small_parts
-from beags_plugin.export.glb import linear_from_srgb
 from beags_plugin.export.mesh import GlbExporter
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.rasterizers import make_rasterizer
@@ -32,7 +33,11 @@ from beags_plugin.sample.scene import Thing
 from beags_plugin.sample.views import make_views
 from beags_plugin.system.errors import UserError
 
-OPTIONS = {"resolution": 96, "truncation": 4.0}  # the cup's wall is 9 voxels thick: its two sides stay apart
+OPTIONS: dict[str, Any] = {
+    "resolution": 96,
+    "truncation": 4.0,
+    "triangles": 1_000_000,
+}  # the cup's wall is 9 voxels thick: its two sides stay apart
 
 
 def cameras(count: int = 24) -> list[Camera]:
@@ -85,7 +90,10 @@ def test_faces_look_outwards_and_colours_are_those_of_the_place(thing, mesh):
 
 def test_a_glb_is_read_back(item, mesh, tmp_path):
     facts = make_exporter("glb", **OPTIONS).write(tmp_path / "cup.glb", item)
-    assert facts == {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "voxel": mesh.voxel}
+    assert facts == {
+        "vertices": len(mesh.vertices), "triangles": len(mesh.faces), "voxel": mesh.voxel,
+        "texture": "none, as no photos were given",
+    }  # fmt: skip
     (read,) = trimesh.load(tmp_path / "cup.glb", process=False).geometry.values()
     y_up = np.stack([mesh.vertices[:, 0], mesh.vertices[:, 2], -mesh.vertices[:, 1]], axis=1)
     assert np.allclose(read.vertices, y_up, atol=1e-6) and np.array_equal(read.faces, mesh.faces)
@@ -146,7 +154,7 @@ def test_a_small_object_gets_few_faces_and_the_option_another_number(item):
     """Faces in proportion to the Gaussians, as a cup of 400 is not drawn better by 100,000."""
     discs = item.surfels[::100]
     some = replace(item, surfels=replace(discs, log_scales=discs.log_scales + 2.5), shared={})
-    for options, most in (({}, 20 * len(some.surfels)), ({"faces": 1000}, 1000)):
+    for options, most in (({}, 20 * len(some.surfels)), ({"triangles": 1000}, 1000)):
         assert 0.97 * most <= len(GlbExporter(resolution=64, **options).mesh(some).faces) <= most
 
 
@@ -264,7 +272,7 @@ def test_without_open3d_a_user_error_explains_it(monkeypatch):
         ({"truncation": 0.5}, "truncation is 0.5: it must lie in 1..64"),
         ({"memory_mb": 1.0}, "memory_mb is 1.0: give the voxel grid at least 50 MB"),
         ({"min_views": 0}, "min_views is 0: a surface needs at least 1 view"),
-        ({"faces": 99}, "faces is 99: give at least 100, or 0 for 20 for each Gaussian"),
+        ({"triangles": 99}, "triangles is 99: give at least 100, or 0 for 20 for each Gaussian"),
         ({"smallest_part": float("nan")}, "smallest_part is nan: it must lie in 0..1"),
     ],
 )

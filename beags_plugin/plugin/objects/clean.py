@@ -10,19 +10,8 @@ from torch import Tensor
 from beags_plugin.cleaning.clean import LeftOut, clean
 from beags_plugin.cleaning.silhouettes import MaskedViews
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.labels.label_maps import LabelMaps
-from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, last_prepared, preparing_run
-from beags_plugin.plugin.runs.prepared import prepared_labels
-from beags_plugin.plugin.runs.read import SavedScene, data_of_run, raster_settings
-from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
-from beags_plugin.plugin.views.views import unique_names
-from beags_plugin.preparation.consistent_masks import render_depths
-from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.system.errors import UserError
-from beags_plugin.system.filed_tensors import filed
-from beags_plugin.system.progress import progress_bar
-
-MOST_VIEWS = 100  # evenly chosen ones; more would tell little more, and take longer
+from beags_plugin.plugin.objects.shown import Unshown, shown_scene
+from beags_plugin.plugin.runs.read import SavedScene
 
 
 @dataclass(frozen=True)
@@ -48,33 +37,8 @@ class Cleaner:
 
 
 def cleaner_of(scene: SavedScene, config_path: Path) -> Cleaner:
-    """Return the cleaner of a run, with its masks after reprojection and the cameras of its data.
-
-    scene: read from ``config_path``. The depth of the whole scene is rendered once for each view, and kept on disk.
-    """
-    run = config_path.parent
-    if (run / EXTRACTION_FILE).exists():
-        return Cleaner(None, "the run is part of a scene, which does not show what hides it")
-    folder = last_prepared(preparing_run(run))
-    if not (folder / "grid.pt").exists():
-        return Cleaner(None, "the run has kept no masks")
+    """Return the cleaner of a run, with its masks after reprojection and the cameras of its data."""
     try:
-        manager = data_of_run(scene.config, config_path, split="val")
-    except UserError:
-        return Cleaner(None, "the run's data cannot be read (--data names their folder)")
-    dataset = manager.train_dataset
-    chosen = range(0, len(dataset), -(-len(dataset) // MOST_VIEWS))
-    cameras = [camera_from_nerfstudio(dataset.cameras, index) for index in chosen]
-    names = [unique_names(dataset.image_filenames)[index] for index in chosen]
-    try:
-        labels = LabelMaps(
-            prepared_labels(folder / "masks" / f"{name}.png", camera)
-            for name, camera in zip(names, cameras, strict=True)
-        )
-    except UserError:
-        return Cleaner(None, "the masks that the run has kept do not fit its data")
-    rasterizer, settings = make_rasterizer(scene.config.model_config.rasterizer), raster_settings(scene)
-    with progress_bar("Rendering depth", passing=True) as progress:
-        surfels = scene.surfels().detach()
-        depths = filed(render_depths(surfels, cameras, rasterizer, settings, "median", progress), surfels.means.device)
-    return Cleaner(MaskedViews(cameras, labels, depths, rasterizer, settings))
+        return Cleaner(shown_scene(scene, config_path).views)
+    except Unshown as doubt:
+        return Cleaner(None, str(doubt))

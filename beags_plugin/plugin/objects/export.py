@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
-from beags_plugin.cleaning.clean import LeftOut
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.export.base import Exporter, ExportItem, NothingToExport, Viewpoints, make_exporter
-from beags_plugin.export.frames import Frame, bounding_box, check_placement
+from beags_plugin.export.base import ExportItem, make_exporter
+from beags_plugin.export.frames import Frame, check_placement
+from beags_plugin.export.pose_options import PoseOptions
 from beags_plugin.extraction.files import whole_file
-from beags_plugin.extraction.select import select_class
-from beags_plugin.labels.class_ids import BACKGROUND
-from beags_plugin.plugin.objects.clean import Cleaner, cleaner_of
+from beags_plugin.plugin.objects.export_job import ExportJob, Progress, Shown, Steps
+from beags_plugin.plugin.objects.exported import Exported
 from beags_plugin.plugin.objects.extract import file_name, folder_names, objects_with_gaussians
+from beags_plugin.plugin.objects.pose import metres_per_unit
 from beags_plugin.plugin.runs.place import open_run
 from beags_plugin.plugin.runs.read import (
-    SavedScene,
     raster_settings,
     read_assigned_run,
     read_run,
@@ -35,56 +32,6 @@ from beags_plugin.system.errors import UserError
 
 MANIFEST = "manifest.json"
 WHOLE = "whole scene"  # the name of the file that holds all Gaussians
-Progress = Callable[[int, int], None]
-
-
-@dataclass(frozen=True)
-class ExportedFile:
-    """One file: its format, its path and its exporter's facts; path None: nothing to write, for ``reason``."""
-
-    format: str
-    path: Path | None
-    facts: dict[str, Any]
-    reason: str = ""
-
-
-@dataclass(frozen=True)
-class Exported:
-    """One object (or the background, or the whole scene) and its files.
-
-    class_id: None of the whole scene. center: [3] the point of the world that is the files' origin. low, high: [3] its
-    box, in the files' frame. to_run: the 4 x 4 matrix from the files' frame to the run's normalised one. left_out:
-    Gaussians of the object that do not belong to it; None where none was looked for.
-    """
-
-    name: str
-    class_id: int | None
-    gaussians: int
-    center: list[float]
-    low: list[float]
-    high: list[float]
-    to_run: list[list[float]]
-    files: list[ExportedFile]
-    left_out: LeftOut | None = None
-
-    def to_json(self, folder: Path) -> dict[str, Any]:
-        """Return plain values for the manifest in ``folder``."""
-        return {
-            "name": self.name,
-            "class_id": self.class_id,
-            "gaussians": self.gaussians,
-            **({} if self.left_out is None else {"left_out_gaussians": asdict(self.left_out)}),
-            "center": self.center,
-            "box": {"low": self.low, "high": self.high},
-            "to_run": self.to_run,
-            "files": [
-                {"format": file.format, "path": file.path.relative_to(folder).as_posix()}
-                | {"bytes": file.path.stat().st_size, **file.facts}
-                for file in self.files
-                if file.path is not None
-            ],
-            "left_out": [{"format": file.format, "reason": file.reason} for file in self.files if file.path is None],
-        }
 
 
 def export_run(
@@ -99,6 +46,7 @@ def export_run(
     whole: bool = False,
     data: Path | None = None,
     keep_all: bool = False,
+    pose: PoseOptions | None = None,
 ) -> list[Exported]:
     """Write files of objects of a run.
 
@@ -108,11 +56,13 @@ def export_run(
     normalised), or "object", the same centred on each object. output: folder; ``exports/`` in the run by default.
     options: format to its exporter's options. progress: receives (done, total) files, and rendered views of the meshes
     among them. data: if not where they were. keep_all: keep Gaussians too that do not belong to their object
-    (``cleaning.clean``); the background and the whole scene are kept as they are. Raises ``UserError`` for a mistake,
-    before anything is written.
+    (``cleaning.clean``); the background and the whole scene are kept as they are. pose: where objects stand and how
+    large they are. Raises ``UserError`` for a mistake, before anything is written.
     """
-    run, folder = config_path.parent, output or config_path.parent / "exports"
+    run, folder, pose = config_path.parent, output or config_path.parent / "exports", pose or PoseOptions()
     check_placement(placement)
+    if pose.centre and placement == "object":
+        raise UserError("--centre puts the origin under objects, --frame object into their middle: leave one out.")
     exporters = {name: make_exporter(name, **(options or {}).get(name, {})) for name in formats}
     if not exporters:
         raise UserError("no format is named: name one with --format.")
@@ -125,18 +75,28 @@ def export_run(
         raise UserError(
             f"nothing to export is named: use --all, --whole, or --object with one of {', '.join(present)}."
         )
+    for name, exporter in exporters.items():
+        if exporter.needs_metres and not pose.scale_by:
+            raise UserError(
+                f"a {name} file is in millimetres, but the size of the scene is not known: give a length with "
+                '--scale-by, such as "frame_0012:340,215 frame_0012:512,220 12 cm".'
+            )
     transform = read_transform(run)
     frame = Frame.of_run() if transform is None else Frame(*transform)
     views = None
     if any(exporter.needs_views for exporter in exporters.values()):
         views = training_viewpoints(scene.config, raster_settings(scene), config_path)
     names, titles = list(present) if everything else list(dict.fromkeys(objects)), folder_names(scene.classes)
-    cleaner = None if keep_all or not any(map(present.get, names)) else cleaner_of(scene, config_path)
-    job = _Job(scene, exporters, frame, placement == "object", views, everything, cleaner)
+    metres = None
+    if (length := pose.length()) is not None:
+        metres = metres_per_unit(length, scene, config_path, frame)
+    shown = Shown(scene, config_path)
+    cleaner = None if keep_all or not any(map(present.get, names)) else shown.cleaner()
+    job = ExportJob(scene, exporters, frame, metres, placement == "object", pose, views, everything, cleaner, shown)
     items: list[tuple[str, int | None, str]] = [(name, present[name], titles[present[name]]) for name in names]
     if whole:
         items.append((WHOLE, None, "whole_scene"))
-    steps = _Steps(job.steps(), len(items), progress or (lambda done, total: None))
+    steps = Steps(job.steps(), len(items), progress or (lambda done, total: None))
     exported = [job.export(name, class_id, folder / title, steps) for name, class_id, title in items]
     if everything:
         world = "run" if transform is None else "input"
@@ -144,85 +104,12 @@ def export_run(
             "run": str(config_path.absolute()),
             "frame": placement,
             "world": world,
+            **({} if metres is None else {"unit": "metre", "metres_per_world_unit": metres}),
             "objects": [one.to_json(folder) for one in exported],
         }
         with whole_file(folder / MANIFEST) as part:
             part.write_text(json.dumps(content, indent=2), "utf8")
     return exported
-
-
-class _Steps:
-    """Reports the progress of an export: a step for each file, and before it one for each view that it renders.
-
-    of_a_piece: steps of each exporter's file.
-    """
-
-    def __init__(self, of_a_piece: Sequence[int], items: int, report: Progress) -> None:
-        self._of_files = list(of_a_piece) * items
-        self._file = 0
-        self._report = report
-        self.on_render(0)
-
-    def on_render(self, views: int) -> None:
-        """Report the rendered views of the present file."""
-        self._report(sum(self._of_files[: self._file]) + views, sum(self._of_files))
-
-    def wrote(self) -> None:
-        """Report the present file as done."""
-        self._file += 1
-        self.on_render(0)
-
-
-@dataclass(frozen=True)
-class _Job:
-    """The common settings of all items of an export.
-
-    world: frame of the files, but for the shift if they are ``centred``. views: in the run's frame. tolerant: leave out
-    a format for which an item has nothing. cleaner: decides what belongs to an object; None: all.
-    """
-
-    scene: SavedScene
-    exporters: Mapping[str, Exporter]
-    world: Frame
-    centred: bool
-    views: Viewpoints | None
-    tolerant: bool
-    cleaner: Cleaner | None
-
-    def steps(self) -> list[int]:
-        """Return the steps of each file of an item: see ``_Steps``."""
-        views = 0 if self.views is None else len(self.views.cameras)
-        return [1 + (views if exporter.needs_views else 0) for exporter in self.exporters.values()]
-
-    def export(self, name: str, class_id: int | None, stem: Path, steps: _Steps) -> Exported:
-        """Write all files of one class (None: of the whole scene), called ``stem`` and their suffixes."""
-        class_ids, chosen, left_out = self.scene.members.class_ids, self.scene.surfels(), None
-        if class_id is not None:
-            chosen, index = select_class(chosen, self.scene.members, class_id)
-            if self.cleaner is not None and class_id != BACKGROUND:
-                chosen, index, left_out = self.cleaner.clean(chosen, index, class_id)
-            class_ids = torch.full_like(class_ids[index], class_id)
-        low, high = bounding_box(self.world.surfels(chosen))
-        center = (low + high) / 2 if self.centred else torch.zeros(3, dtype=torch.float64)
-        frame = self.world.centred(center)
-        views = None if self.views is None else frame.views(self.views)
-        item = ExportItem(name, frame.surfels(chosen), class_ids, views, on_render=steps.on_render)
-        files = []
-        for label, exporter in self.exporters.items():
-            files.append(self._write(label, exporter, stem.with_name(f"{stem.name}.{exporter.suffix}"), item))
-            steps.wrote()
-        low, high = low - center, high - center
-        return Exported(
-            name, class_id, len(chosen), center.tolist(), low.tolist(), high.tolist(), frame.to_run(), files, left_out
-        )
-
-    def _write(self, label: str, exporter: Exporter, path: Path, item: ExportItem) -> ExportedFile:
-        try:
-            return ExportedFile(label, path, exporter.write(path, item))
-        except NothingToExport as error:
-            if not self.tolerant:
-                raise
-            return ExportedFile(label, None, {}, str(error))
 
 
 def export_shown(

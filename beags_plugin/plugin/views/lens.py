@@ -72,13 +72,7 @@ def redistort_labels(
     K = _intrinsics(distorted, index, width, height)
     new_K = _intrinsics(straight, index, labels.shape[1], labels.shape[0])
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    pixels = np.stack([columns, rows], axis=2).reshape(-1, 1, 2)
-    fisheye, lens = _opencv_lens(distorted, index)
-    if fisheye:
-        found = cv2.fisheye.undistortPoints(pixels, K, lens, None, new_K)
-    else:
-        exact = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-4)
-        found = cv2.undistortPointsIter(pixels, K, lens, np.eye(3), new_K, exact)
+    found = _straight(np.stack([columns, rows], axis=2).reshape(-1, 2), distorted, index, K, new_K)
     maps = found.reshape(height, width, 2).astype(np.float32)
     return _nearest(labels, maps[..., 0], maps[..., 1], border)
 
@@ -152,3 +146,22 @@ def _intrinsics(cameras: Cameras, index: int, width: int, height: int) -> np.nda
 
 def _nearest(labels: np.ndarray, x: np.ndarray, y: np.ndarray, border: int) -> np.ndarray:
     return cv2.remap(labels, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=(border,))
+
+
+def straight_point(point: np.ndarray, distorted: Cameras, straight: Cameras, index: int) -> np.ndarray:
+    """Return where a pixel [2] (centres at + 0.5) of a distorted view is in the straight one, [2] float64."""
+    if not has_lens(distorted, index):
+        return point
+    sizes = [(int(cameras.width[index]), int(cameras.height[index])) for cameras in (distorted, straight)]
+    K, new_K = (_intrinsics(cameras, index, *size) for cameras, size in zip((distorted, straight), sizes, strict=True))
+    return _straight(point[None] - 0.5, distorted, index, K, new_K)[0] + 0.5
+
+
+def _straight(pixels: np.ndarray, distorted: Cameras, index: int, K: np.ndarray, new_K: np.ndarray) -> np.ndarray:
+    """Return where pixels [P, 2] (centres at whole numbers) of a view with a lens are in the straight one of new_K."""
+    fisheye, lens = _opencv_lens(distorted, index)
+    pixels = np.ascontiguousarray(pixels.reshape(-1, 1, 2))
+    if fisheye:
+        return cv2.fisheye.undistortPoints(pixels, K, lens, None, new_K)[:, 0]
+    exact = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-4)
+    return cv2.undistortPointsIter(pixels, K, lens, np.eye(3), new_K, exact)[:, 0]

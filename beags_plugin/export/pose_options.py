@@ -1,0 +1,86 @@
+"""Options of where exported objects stand and how large they are, and what their texts mean."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+from beags_plugin.system.errors import UserError
+
+METRES = {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254, "ft": 0.3048}
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_POINT = rf"(?:[^\s:][^:]*:{_NUMBER},{_NUMBER}|{_NUMBER},{_NUMBER},{_NUMBER})"
+_SCALE = re.compile(rf"\s*({_POINT})\s+({_POINT})\s+({_NUMBER})\s*({'|'.join(METRES)})\s*")
+
+
+@dataclass(frozen=True)
+class PhotoPoint:
+    """A pixel of a photo: its view's name, and x to the right and y down from the middle of the first pixel."""
+
+    view: str
+    x: float
+    y: float
+
+
+Point = PhotoPoint | tuple[float, float, float]
+"""A place that a photo shows, or coordinates in the input's world."""
+
+
+@dataclass(frozen=True)
+class KnownLength:
+    """Two points that are ``metres`` apart."""
+
+    first: Point
+    second: Point
+    metres: float
+
+
+@dataclass(frozen=True)
+class PoseOptions:
+    """Options of where objects stand and how large they are."""
+
+    up: str = ""
+    """Turn objects so that z is up: plane, at right angles to the plane that each stands on; or the direction x,y,z of
+    the input's world that shall be up."""
+    centre: bool = False
+    """Put the origin under the middle of each object, where it stands."""
+    scale_by: str = ""
+    """Give files a size: "A B 12 cm", two points and the length between them in mm, cm, m, in or ft. A point is a
+    photo's pixel, frame_0012:340,215, or x,y,z of the input's world."""
+
+    def __post_init__(self) -> None:
+        self.direction()
+        self.length()
+
+    def direction(self) -> tuple[float, float, float] | None:
+        """Return the direction of ``up``; None for a plane or nothing. Raises ``UserError`` for another text."""
+        if self.up in ("", "plane"):
+            return None
+        parts = self.up.split(",")
+        numbers = [float(part) for part in parts if re.fullmatch(_NUMBER, part.strip())]
+        if not (len(parts) == len(numbers) == 3 and 0 < math.hypot(*numbers) < math.inf):
+            raise UserError(f"up is {self.up!r}: give plane, or a direction such as 0,0,1.")
+        return numbers[0], numbers[1], numbers[2]
+
+    def length(self) -> KnownLength | None:
+        """Return the known length of ``scale_by``; None without one. Raises ``UserError`` for another text."""
+        if not self.scale_by:
+            return None
+        match = _SCALE.fullmatch(self.scale_by)
+        if match is None:
+            raise UserError(
+                f"scale_by is {self.scale_by!r}: give two points, a length and its unit, such as "
+                '"frame_0012:340,215 frame_0012:512,220 12 cm".'
+            )
+        first, second, number, unit = match.groups()
+        metres = float(number) * METRES[unit]
+        if not 0 < metres < math.inf:
+            raise UserError(f"scale_by is {self.scale_by!r}: the length must be above 0.")
+        return KnownLength(_point(first), _point(second), metres)
+
+
+def _point(text: str) -> Point:
+    view, colon, numbers = text.rpartition(":")
+    values = [float(number) for number in numbers.split(",")]
+    return PhotoPoint(view, values[0], values[1]) if colon else (values[0], values[1], values[2])

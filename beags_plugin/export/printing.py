@@ -1,0 +1,56 @@
+"""Closed meshes for printers, in millimetres: .stl and .3mf."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from beags_plugin.export.base import ExportItem
+from beags_plugin.export.mesh import MeshExporter
+from beags_plugin.extraction.files import whole_file
+
+MILLIMETRES = 1000.0  # in a metre
+
+
+@dataclass(frozen=True)
+class PrintExporter(MeshExporter):
+    """A closed surface in millimetres, z up, written by trimesh."""
+
+    needs_metres: ClassVar[bool] = True
+    closes: ClassVar[bool] = True
+
+    @classmethod
+    def unavailable(cls) -> str | None:
+        try:
+            import lxml  # noqa: F401
+            import networkx  # noqa: F401
+            import trimesh  # noqa: F401
+        except ImportError as error:
+            return f"trimesh or what it needs cannot be loaded ({error}); pip install trimesh lxml networkx."
+        return super().unavailable()
+
+    def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
+        import trimesh
+
+        made = self.made(item)
+        solid = trimesh.Trimesh(MILLIMETRES * made.mesh.vertices, made.mesh.faces, process=False)
+        content: Any = trimesh.Scene({item.name: solid}).export(file_type=self.suffix)
+        with whole_file(path) as part:
+            part.write_bytes(content)
+        sides = solid.extents.round(2).tolist()
+        return made.facts() | {"unit": "millimetre", "sides": sides, "watertight": bool(solid.is_watertight)}
+
+
+@dataclass(frozen=True)
+class StlExporter(PrintExporter):
+    """Binary .stl, which states no unit; slicers take millimetres."""
+
+    suffix: ClassVar[str] = "stl"
+
+
+@dataclass(frozen=True)
+class ThreeMfExporter(PrintExporter):
+    """3D Manufacturing Format, which states its unit."""
+
+    suffix: ClassVar[str] = "3mf"

@@ -1,0 +1,40 @@
+"""The photos of an object of a run, for textures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from beags_plugin.export.base import Photo
+from beags_plugin.export.frames import Frame
+from beags_plugin.plugin.objects.shown import ShownScene
+
+
+def photos_of(shown: ShownScene, class_id: int | None, frame: Frame) -> Sequence[Photo]:
+    """Return the photos of a class (None: of all of them) in ``frame``; images, masks and depth are read when used."""
+
+    def photo(view: int) -> Photo:
+        return Photo(
+            frame.camera(shown.views.cameras[view]),
+            partial(_image, shown, view),
+            partial(_own, shown, view, class_id),
+            _depth(shown, view, frame.scale),
+        )
+
+    return [photo(view) for view in range(len(shown.views.cameras))]
+
+
+def _image(shown: ShownScene, view: int) -> Tensor:
+    return shown.photos[view].image.cpu()
+
+
+def _own(shown: ShownScene, view: int, class_id: int | None) -> Tensor:
+    labels = shown.views.labels[view].cpu()
+    return torch.ones_like(labels, dtype=torch.bool) if class_id is None else labels == class_id
+
+
+def _depth(shown: ShownScene, view: int, scale: float) -> Callable[[], Tensor]:
+    return lambda: shown.views.depths[view].cpu() / scale

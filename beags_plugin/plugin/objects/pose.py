@@ -1,0 +1,113 @@
+"""Where exported objects of a run stand, and how large they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.lifting import lift
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.data.files import image_size
+from beags_plugin.export.base import NothingToExport
+from beags_plugin.export.frames import Frame, bounding_box
+from beags_plugin.export.pose_options import KnownLength, PhotoPoint, Point
+from beags_plugin.export.standing import Plane, standing_plane
+from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.plugin.objects.shown import ShownScene
+from beags_plugin.plugin.runs.read import SavedScene, data_of_run, raster_settings
+from beags_plugin.plugin.views.datamanager import BeagsDataManager, Split
+from beags_plugin.plugin.views.dataset import BeagsDataset
+from beags_plugin.plugin.views.views import unique_names
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
+from beags_plugin.system.errors import UserError, meant
+
+_VIEWS = 24  # that are lifted to find a plane
+_POINTS = 4000  # of each of them, at most
+
+
+def plane_under(name: str, part: Surfels, class_id: int, shown: ShownScene, frame: Frame) -> Plane:
+    """Return the plane that an object stands on, in ``frame``.
+
+    part: its Gaussians, in the run's frame. Raises ``NothingToExport`` if the training views show none.
+    """
+    low, high = bounding_box(frame.surfels(part))
+    middle, reach = (low + high) / 2, float((high - low).max())
+    around, own, ups = [], [], []
+    views = shown.views
+    for view in range(0, len(views.cameras), -(-len(views.cameras) // _VIEWS)):
+        camera, labels, depth = frame.camera(views.cameras[view]), views.labels[view], views.depths[view]
+        points = lift(depth.double() / frame.scale, camera.to(torch.float64))
+        seen = (depth > 0) & ((points - middle).abs().amax(dim=-1) < 2 * reach)
+        ups.append(-camera.rotation[1].double())
+        for mask, found in (
+            (seen & (labels == class_id), own),
+            (seen & (labels != class_id) & (labels != IGNORE), around),
+        ):
+            chosen = points[mask]
+            found.append(chosen[:: max(1, len(chosen) // _POINTS)])
+    plane = standing_plane(torch.cat(around), torch.cat(own), torch.stack(ups).mean(dim=0))
+    if plane is None:
+        raise NothingToExport(
+            f"no plane is seen that {name!r} stands on: name the direction that is up, such as --up 0,0,1."
+        )
+    return plane
+
+
+def metres_per_unit(length: KnownLength, scene: SavedScene, config_path: Path, world: Frame) -> float:
+    """Return how many metres a unit of ``world`` is, by a known length in it.
+
+    Raises ``UserError`` for a photo or pixel that is not there, or points that coincide.
+    """
+    manager = None
+    if any(isinstance(point, PhotoPoint) for point in (length.first, length.second)):
+        manager = data_of_run(scene.config, config_path, split="test")
+    first, second = (_place(point, scene, manager, world) for point in (length.first, length.second))
+    apart = float((first - second).norm())
+    if not apart > 0:
+        raise UserError("the two points of scale_by are the same: give two that are apart.")
+    return length.metres / apart
+
+
+def _place(point: Point, scene: SavedScene, manager: BeagsDataManager | None, world: Frame) -> Tensor:
+    """Return the place [3] float64 of a point in ``world``."""
+    if not isinstance(point, PhotoPoint):
+        return torch.tensor(point, dtype=torch.float64)
+    assert manager is not None
+    camera, x, y = _pixel(point, manager)
+    surfels = scene.surfels().detach()
+    render = make_rasterizer(scene.config.model_config.rasterizer).rasterize(
+        geometry_inputs(surfels), camera, raster_settings(scene), surfels.means.new_zeros(3)
+    )
+    depth = float(surface_depth(render, "median")[int(y), int(x)])
+    if not depth > 0:
+        raise UserError(f"nothing solid is at {point.view}:{point.x:g},{point.y:g}: choose another pixel of scale_by.")
+    ray = torch.linalg.solve(camera.K.double(), torch.tensor([x, y, 1.0], dtype=torch.float64))
+    in_run = camera.rotation.double().T @ (depth * ray - camera.translation.double())
+    return world.points(in_run[None])[0]
+
+
+def _pixel(point: PhotoPoint, manager: BeagsDataManager) -> tuple[Camera, float, float]:
+    """Return the straight camera of a photo, and where the pixel of its file is in it (centres at + 0.5)."""
+    known = []
+    datasets: dict[Split, BeagsDataset] = {"train": manager.train_dataset, "eval": manager.eval_dataset}
+    for split, dataset in datasets.items():
+        files = dataset.image_filenames
+        for index, name in enumerate(unique_names(files)):
+            known.append(name)
+            if point.view in (name, files[index].name):
+                width, height = image_size(files[index])
+                if not (-0.5 <= point.x < width - 0.5 and -0.5 <= point.y < height - 0.5):
+                    raise UserError(f"{point.view} has {width} x {height} pixels: {point.x:g},{point.y:g} is not one.")
+                share = torch.tensor([(point.x + 0.5) / width, (point.y + 0.5) / height], dtype=torch.float64)
+                camera, (x, y) = manager.straightened(share.numpy(), index, split)
+                if not (0 <= x < camera.width and 0 <= y < camera.height):
+                    raise UserError(
+                        f"{point.view}:{point.x:g},{point.y:g} lies outside of the photo without its lens distortion: "
+                        "choose another pixel of scale_by."
+                    )
+                return camera, x, y
+    raise UserError(f"no photo is called {point.view!r}{meant(point.view, known)}: name one such as {known[0]}.")

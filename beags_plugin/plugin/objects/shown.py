@@ -1,0 +1,81 @@
+"""What the training views of a run on disk show: masks, depth of the whole scene, photos."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from beags_plugin.cleaning.silhouettes import MaskedViews
+from beags_plugin.labels.label_maps import LabelMaps
+from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, last_prepared, preparing_run
+from beags_plugin.plugin.runs.prepared import prepared_labels
+from beags_plugin.plugin.runs.read import SavedScene, data_of_run, raster_settings
+from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
+from beags_plugin.plugin.views.datamanager import BeagsDataManager
+from beags_plugin.plugin.views.views import View, unique_names
+from beags_plugin.preparation.consistent_masks import render_depths
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.filed_tensors import filed
+from beags_plugin.system.progress import progress_bar
+
+MOST_VIEWS = 100  # evenly chosen ones; more would tell little more, and take longer
+
+
+class Unshown(Exception):
+    """The masks or views of a run cannot be had; the message is a clause that says why."""
+
+
+@dataclass(frozen=True)
+class ShownScene:
+    """Training views of a run: at most ``MOST_VIEWS``.
+
+    names: of the views. views: their cameras, masks after reprojection and depth, in the frame of the run.
+    manager, chosen: where their photos are.
+    """
+
+    names: list[str]
+    views: MaskedViews
+    manager: BeagsDataManager
+    chosen: range
+
+    @cached_property
+    def photos(self) -> list[View]:
+        """Return the views with their photos, which are read when this is first used."""
+        every = self.manager.views("train")
+        return [every[index] for index in self.chosen]
+
+
+def shown_scene(scene: SavedScene, config_path: Path) -> ShownScene:
+    """Return what training views of a run show.
+
+    scene: read from ``config_path``. The depth of the whole scene is rendered once for each view, and kept on disk.
+    Raises ``Unshown`` for a run whose masks or data cannot be had.
+    """
+    run = config_path.parent
+    if (run / EXTRACTION_FILE).exists():
+        raise Unshown("the run is part of a scene, which does not show what hides it")
+    folder = last_prepared(preparing_run(run))
+    if not (folder / "grid.pt").exists():
+        raise Unshown("the run has kept no masks")
+    try:
+        manager = data_of_run(scene.config, config_path, split="val")
+    except UserError as error:
+        raise Unshown("the run's data cannot be read (--data names their folder)") from error
+    dataset = manager.train_dataset
+    chosen = range(0, len(dataset), -(-len(dataset) // MOST_VIEWS))
+    cameras = [camera_from_nerfstudio(dataset.cameras, index) for index in chosen]
+    names = [unique_names(dataset.image_filenames)[index] for index in chosen]
+    try:
+        labels = LabelMaps(
+            prepared_labels(folder / "masks" / f"{name}.png", camera)
+            for name, camera in zip(names, cameras, strict=True)
+        )
+    except UserError as error:
+        raise Unshown("the masks that the run has kept do not fit its data") from error
+    rasterizer, settings = make_rasterizer(scene.config.model_config.rasterizer), raster_settings(scene)
+    with progress_bar("Rendering depth", passing=True) as progress:
+        surfels = scene.surfels().detach()
+        depths = filed(render_depths(surfels, cameras, rasterizer, settings, "median", progress), surfels.means.device)
+    return ShownScene(names, MaskedViews(cameras, labels, depths, rasterizer, settings), manager, chosen)

@@ -1,0 +1,191 @@
+"""Textures and closed meshes: a box with known colours, photographed with known exposures."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+open3d = pytest.importorskip("open3d")
+trimesh = pytest.importorskip("trimesh")
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.lifting import pixel_rays
+from beags_plugin.export.atlas import picture, texels, unwrapped
+from beags_plugin.export.baking import Places, baked
+from beags_plugin.export.base import Photo
+from beags_plugin.export.closing import closed
+from beags_plugin.export.color import linear_from_srgb, srgb_from_linear
+from beags_plugin.export.fusion import Mesh, decimated
+from beags_plugin.export.glb import glb_bytes
+from beags_plugin.export.surface import area_vectors, vertex_normals
+from beags_plugin.export.texture import textured
+
+VOXEL = 0.02
+EXPOSURES = np.array([0.7, 0.9, 1.0, 1.1, 1.3, 1.05])
+
+
+def light_at(points: np.ndarray) -> np.ndarray:
+    """Light of each place, between 0.2 and 0.6."""
+    return 0.4 + 0.2 * np.sin(9.0 * points + np.array([0.0, 1.0, 2.0]))
+
+
+def a_box(bottom: bool = True) -> Mesh:
+    """A box of side 0.8 about the origin in small triangles, of a wrong, even colour."""
+    box = trimesh.creation.box((0.8, 0.8, 0.8))
+    for _ in range(4):
+        box = box.subdivide()
+    faces, vertices = np.array(box.faces), np.array(box.vertices)
+    if not bottom:
+        faces = faces[(vertices[faces][:, :, 2] > -0.39).any(axis=1)]
+    return Mesh(vertices, faces, np.full((len(vertices), 3), 0.9, np.float32), VOXEL)
+
+
+def camera_from(eye: tuple[float, float, float], size: int = 160) -> Camera:
+    forward = -np.array(eye) / np.linalg.norm(eye)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = [right, np.cross(forward, right), forward]
+    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    K = torch.tensor([[1.2 * size, 0, size / 2], [0, 1.2 * size, size / 2], [0, 0, 1.0]])
+    return Camera(torch.from_numpy(viewmat).float(), K, size, size)
+
+
+def photo_of(mesh: Mesh, camera: Camera, exposure: float, screen: bool = False) -> Photo:
+    """Photograph the mesh in ``light_at``'s colours; screen: something red stands before its left half."""
+    scene = open3d.t.geometry.RaycastingScene()
+    tensor = open3d.core.Tensor
+    scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.faces.astype(np.uint32)))
+    ways = (pixel_rays(camera, torch.zeros(1)).reshape(-1, 3) @ camera.rotation).numpy()
+    origin = camera.center.numpy()
+    t = scene.cast_rays(tensor(np.concatenate([np.broadcast_to(origin, ways.shape), ways], axis=1)))["t_hit"].numpy()
+    hit = np.isfinite(t)
+    light = np.zeros((len(t), 3))
+    light[hit] = exposure * light_at(origin + ways[hit] * t[hit, None])
+    shape = (camera.height, camera.width)
+    image = torch.from_numpy(srgb_from_linear(light).reshape(*shape, 3)).float()
+    depth, own = torch.from_numpy(np.where(hit, t, 0.0).reshape(shape)).float(), torch.from_numpy(hit.reshape(shape))
+    if screen:  # the mask says nothing of it, the depth does
+        image[:, : camera.width // 2] = torch.tensor([1.0, 0.0, 0.0])
+        depth[:, : camera.width // 2] = 1.0
+    return Photo(camera, lambda: image, lambda: own, lambda: depth)
+
+
+EYES = [(2, 1, 1.5), (-1, 2, 1.2), (-2, -1, 1.5), (1, -2, 1.3), (1.5, 1.6, 2.0), (-1.2, -1.5, 1.9)]
+
+
+@pytest.fixture(scope="module")
+def box() -> Mesh:
+    return a_box()
+
+
+def photos_of(box: Mesh, **options) -> list[Photo]:
+    return [photo_of(box, camera_from(eye), e, **options) for eye, e in zip(EYES, EXPOSURES, strict=True)]
+
+
+def places_of(box: Mesh) -> Places:
+    middles, areas = box.vertices[box.faces].mean(axis=1), area_vectors(box)
+    return Places(middles, areas / np.linalg.norm(areas, axis=1, keepdims=True), 0.01)
+
+
+def test_exposures_are_evened_out_and_colours_are_those_of_the_places(box):
+    places = places_of(box)
+    found = baked(places, box, photos_of(box), np.full((len(places.points), 3), 0.9))
+    relative = EXPOSURES / np.exp(np.log(EXPOSURES).mean())
+    assert np.abs(found.exposures / relative[:, None] - 1).max() < 0.02
+    top = places.points[:, 2] > 0.39
+    below = places.points[:, 2] < -0.39
+    assert found.seen[top].mean() > 0.9 and not found.seen[below].any()
+    right = srgb_from_linear(light_at(places.points) * np.exp(np.log(EXPOSURES).mean()))
+    assert np.abs(found.colors - right)[found.seen].mean() < 0.005
+    assert np.abs(found.colors[below] - 0.9).max() < 1e-6  # what the splats say, where no photo shows anything
+
+
+def test_what_stands_before_the_object_leaves_no_colour(box):
+    places = places_of(box)
+    found = baked(places, box, photos_of(box, screen=True), np.full((len(places.points), 3), 0.5))
+    red = (found.colors[:, 0] > 0.85) & (found.colors[:, 1] < 0.2)
+    assert found.seen.mean() > 0.4 and not red.any()
+
+
+def test_the_object_hides_itself():
+    """A place behind a wall that looks at the camera is not seen through it."""
+    wall = a_box()
+    far = Mesh(wall.vertices + [3.0, 0.0, 0.0], wall.faces, wall.colors, VOXEL)
+    both = Mesh(
+        np.concatenate([wall.vertices, far.vertices]), np.concatenate([wall.faces, far.faces + len(wall.vertices)]),
+        np.concatenate([wall.colors, far.colors]), VOXEL,
+    )  # fmt: skip
+    photo = photo_of(wall, camera_from((-3.0, 0.01, 0.0)), 1.0)
+    photo = Photo(
+        photo.camera, photo.image, lambda: torch.ones(160, 160, dtype=torch.bool), lambda: torch.zeros(160, 160)
+    )
+    behind = Places(np.array([[2.6, 0.0, 0.0], [-0.4, 0.0, 0.0]]), np.array([[-1.0, 0.0, 0.0]] * 2), 0.01)
+    assert baked(behind, both, [photo], np.full((2, 3), 0.5)).seen.tolist() == [False, True]
+
+
+def test_a_texture_shows_the_photos_at_every_place(box):
+    """Read back as a reader of glTF reads it: at the uv of a face, between texels, also at seams."""
+    texture = textured(box, photos_of(box), 512)
+    atlas = texture.atlas
+    assert np.array_equal(atlas.source[atlas.faces], box.faces) and atlas.size == 512
+    assert texture.image.shape == (512, 512, 3) and atlas.uv.min() >= 0 and atlas.uv.max() <= 1
+    corners = box.vertices[box.faces]
+    top = (corners[:, :, 2] > 0.39).all(axis=1) & (np.abs(corners[:, :, :2]).max(axis=(1, 2)) < 0.35)
+    for weights in ([1 / 3, 1 / 3, 1 / 3], [0.9, 0.1, 0.0]):  # in the middle of faces, and on their edges
+        at = np.einsum("c,fcd->fd", weights, atlas.uv[atlas.faces[top]]) * 512 - 0.5
+        column, row = np.round(at).astype(int).T
+        shown = linear_from_srgb(texture.image[row, column] / 255)
+        place = np.einsum("c,fcd->fd", weights, corners[top])
+        assert np.abs(shown - light_at(place) * np.exp(np.log(EXPOSURES).mean())).mean() < 0.012
+
+
+def test_texels_lie_where_the_picture_says_and_gaps_are_filled(box):
+    few = decimated(box, 200)
+    atlas = unwrapped(few, 128)
+    at = texels(atlas)
+    assert 0.3 < len(at.rows) / 128**2 < 0.95
+    image = picture(atlas, at, 0.5 + at.of(few.vertices))
+    assert np.abs(image[at.rows, at.columns] / 255 - 0.5 - at.of(few.vertices)).max() < 0.01
+    empty = np.ones((128, 128), bool)
+    empty[at.rows, at.columns] = False
+    assert image[empty].any(axis=1).all()  # no black
+    again = unwrapped(few, 128)
+    assert np.array_equal(again.uv, atlas.uv) and np.array_equal(again.faces, atlas.faces)
+
+
+@pytest.mark.parametrize("with_texture", [False, True])
+def test_a_glb_is_read_by_another_project(box, tmp_path, with_texture):
+    texture = textured(box, photos_of(box), 128) if with_texture else None
+    (tmp_path / "box.glb").write_bytes(glb_bytes(box, "box", texture))
+    (read,) = trimesh.load(tmp_path / "box.glb", process=False).geometry.values()
+    source = np.arange(len(box.vertices)) if texture is None else texture.atlas.source
+    y_up = box.vertices[source][:, [0, 2, 1]] * [1.0, 1.0, -1.0]
+    assert np.allclose(read.vertices, y_up, atol=1e-6)
+    normals = vertex_normals(box)[source][:, [0, 2, 1]] * [1.0, 1.0, -1.0]
+    assert np.allclose(read.vertex_normals, normals, atol=1e-6)
+    if texture is not None:
+        picture_read = np.asarray(read.visual.material.baseColorTexture.convert("RGB"))
+        assert np.array_equal(picture_read, texture.image)
+        assert np.allclose(read.visual.uv, texture.atlas.uv * [1, -1] + [0, 1], atol=1e-6)  # its v goes upwards
+    raw = (tmp_path / "box.glb").read_bytes()
+    content = json.loads(raw[20 : 20 + int.from_bytes(raw[12:16], "little")])
+    assert all(view["byteOffset"] % 4 == 0 for view in content["bufferViews"])
+    assert content["buffers"][0]["byteLength"] == len(raw) - 28 - int.from_bytes(raw[12:16], "little")
+
+
+def test_a_box_without_bottom_is_closed_flat_and_keeps_its_sides():
+    open_box = a_box(bottom=False)
+    assert not trimesh.Trimesh(open_box.vertices, open_box.faces).is_watertight
+    found = closed(open_box)
+    few = decimated(found.mesh, 2000)
+    for mesh in (found.mesh, few):
+        solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        assert solid.is_watertight and solid.is_winding_consistent
+        assert solid.volume == pytest.approx(0.8**3, rel=0.03)
+        assert np.abs(solid.bounds - [[-0.4] * 3, [0.4] * 3]).max() < 2 * VOXEL
+    assert 0.1 < found.invented_share < 0.2  # one of six sides
+    assert np.abs(found.mesh.vertices[found.invented][:, 2] + 0.4).max() < 2 * VOXEL
