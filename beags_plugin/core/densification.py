@@ -49,6 +49,16 @@ class DensifyConfig:
     pixels_per_surfel: float = 0.0
     """Training pixels that each Gaussian needs at least, against overfitting of few images; 0, as officially, sets no
     bound."""
+    agreeing_views: int = 0
+    """Views that must agree before a Gaussian is cloned or split: at least half of its weight lies in pixels of high
+    error there. 0, as officially, asks none."""
+    error_views: int = 8
+    """Training views that are asked, chosen anew each time."""
+    prune_unseen: float = 0.0
+    """Gaussians whose weights over all pixels of all training views add up to less than this go, in pixels; 0 keeps
+    them."""
+    prune_unseen_every: int = 1_500
+    """Steps between two such prunings, from ``start`` to ``stop``."""
 
     def scaled(self, factor: float) -> DensifyConfig:
         """Return the same for a run ``factor`` times as long: its steps are scaled, within the smallest intervals."""
@@ -63,6 +73,7 @@ class DensifyConfig:
             stop=steps(self.stop),
             prune_scale_after=steps(self.prune_scale_after),
             reset_every=steps(self.reset_every, LEAST_RESET_EVERY),
+            prune_unseen_every=max(steps(self.prune_unseen_every, LEAST_EVERY), 1),
         )
 
     def bounded(self, pixels: int) -> DensifyConfig:
@@ -75,6 +86,11 @@ class DensifyConfig:
     def grows_at(self, done: int) -> bool:
         """Return whether the scene is densified after ``done`` steps."""
         return self.start < done < self.stop and done % self.every == 0
+
+    def prunes_unseen_at(self, done: int) -> bool:
+        """Return whether Gaussians that no view shows go after ``done`` steps."""
+        wanted = self.prune_unseen > 0 and self.start < done < self.stop
+        return wanted and done % self.prune_unseen_every == 0
 
     def resets_at(self, done: int) -> bool:
         """Return whether opacities are reset after ``done`` steps."""
@@ -140,15 +156,24 @@ def length_units(means: Tensor, camera_centers: Tensor, extent: float, config: D
 
 
 def densify(
-    surfels: Surfels, mean_gradient: Tensor, units: Tensor, config: DensifyConfig, step: int, generator: torch.Generator
+    surfels: Surfels,
+    mean_gradient: Tensor,
+    units: Tensor,
+    config: DensifyConfig,
+    step: int,
+    generator: torch.Generator,
+    may_grow: Tensor | None = None,
 ) -> Densified:
     """Clone, split, prune.
 
     surfels: N surfels without gradients. mean_gradient: [N]. units: [N] of ``length_units``. step: for
-    ``prune_scale_after``. At least one surfel always remains.
+    ``prune_scale_after``. may_grow: [N] bool, those that may be cloned or split; None for all. At least one surfel
+    always remains.
     """
     size = surfels.log_scales.exp().amax(dim=-1)
-    chosen = _within_budget(mean_gradient >= GRADIENT_THRESHOLD, mean_gradient, config.max_surfels)
+    wanted = mean_gradient >= GRADIENT_THRESHOLD
+    wanted = wanted if may_grow is None else wanted & may_grow
+    chosen = _within_budget(wanted, mean_gradient, config.max_surfels)
     small = size <= CLONE_SCALE * units
     edited = _grow(surfels, chosen & small, chosen & ~small, generator)
 

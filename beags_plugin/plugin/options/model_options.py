@@ -15,6 +15,7 @@ from tyro.conf import Suppress
 from beags_plugin.core.densification import DensifyConfig
 from beags_plugin.core.sh import MAX_DEGREE
 from beags_plugin.plugin.options.loss_spec import LossSpec
+from beags_plugin.plugin.options.pyramid import PyramidConfig
 from beags_plugin.plugin.options.schedule import PhaseSchedule
 from beags_plugin.preparation.border_split import BorderSplitConfig
 from beags_plugin.preparation.pipeline import PreparationConfig
@@ -67,6 +68,8 @@ class BeagsModelConfig(ModelConfig):
     """The terms of the training loss by name."""
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     """When and how the base grows and prunes its Gaussians."""
+    pyramid: PyramidConfig = field(default_factory=PyramidConfig)
+    """Small photos first, in the base."""
     prepare: PreparationConfig = field(default_factory=PreparationConfig)
     """Options of mask reprojection and of the voxel grids."""
     split: BorderSplitConfig = field(default_factory=BorderSplitConfig)
@@ -96,6 +99,7 @@ class BeagsModelConfig(ModelConfig):
             raise UserError(f"position_lr is {self.position_lr}: give two learning rates above 0.")
         if not 0 <= self.refine_position_lr_factor < math.inf:
             raise UserError(f"refine_position_lr_factor is {self.refine_position_lr_factor}: give 0 or more.")
+        self.pyramid.check()
         make_refiner(self.refiner, self.refiner_options)
 
     def schedule(self) -> PhaseSchedule:

@@ -8,6 +8,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from torch.optim import Adam
 
 from beags_plugin.core.cameras import camera_extent
+from beags_plugin.plugin.options.pyramid import small_size
 from beags_plugin.plugin.options.schedule import log_linear
 from beags_plugin.plugin.training.densifier import Densifier
 from beags_plugin.plugin.training.monitor import Curves
@@ -27,9 +28,8 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
     adam = cast(SceneOptimizer, attributes.optimizers).adam
     model.seed = trainer.config.machine.seed
     model.extent = camera_extent(datamanager.train_dataset.cameras.camera_to_worlds).to(model.device)
-    cameras = datamanager.train_dataset.cameras
-    pixels = int((cameras.height * cameras.width).sum())
-    densifier = Densifier(model, adam, pixels, cameras.camera_to_worlds[:, :3, 3])
+    shrink(model, datamanager)
+    densifier = Densifier(model, adam, datamanager)
     switch = RefinementSwitch(model, trainer, datamanager)
     switch.check()
     switch.ask_steps()
@@ -64,6 +64,16 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
         TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before),
         TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], after),
     ]
+
+
+def shrink(model: SceneModel, datamanager: BeagsDataManager) -> None:
+    """Have the data manager give the sizes of the model's pyramid."""
+    pyramid = model.config.pyramid
+
+    def size_at(step: int, width: int, height: int) -> tuple[int, int]:
+        return small_size(width, height, pyramid.factor(step, model.schedule))
+
+    datamanager.shrink(size_at if pyramid.start > 1.0 else None)
 
 
 def _curves(model: SceneModel, trainer: TrainingRun, datamanager: BeagsDataManager) -> Curves | None:
