@@ -91,10 +91,11 @@ def _line(row: CurveRow, end: Mapping[str, float] | None) -> dict[str, Any]:
     line: dict[str, Any] = {"scene": row.scene, "seed": row.seed, "variant": row.variant, "failed": row.failed}
     line |= {name: None if last is None else last[key] for name, key in _ENDS.items()}
     line["peak_memory_mb"] = row.peak_memory_mb
-    known = last is not None and end is not None
-    line["behind"] = end["psnr"] - last["psnr"] if known else None
-    line["gaussians_share"] = last["gaussians"] / end["gaussians"] if known else None
-    line["cpu_share"] = last["cpu_seconds"] / end["cpu_seconds"] if known else None
+    line |= {"behind": None, "gaussians_share": None, "cpu_share": None}
+    if last is not None and end is not None:
+        line["behind"] = end["psnr"] - last["psnr"]
+        line["gaussians_share"] = last["gaussians"] / end["gaussians"]
+        line["cpu_share"] = last["cpu_seconds"] / end["cpu_seconds"]
     for margin in MARGINS:
         taken = None if end is None else seconds_to(row.curve, end["psnr"] - margin)
         line[f"cpu_to_-{margin}"] = taken

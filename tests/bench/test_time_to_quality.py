@@ -11,11 +11,10 @@ pytest.importorskip("nerfstudio")
 
 sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed
 
-from benchmarks.base_training import CurveRow
-from benchmarks.time_to_quality import cells, plot, report_lines, run, seconds_to
-
 from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.system.errors import UserError
+from benchmarks.base_training import CurveRow
+from benchmarks.time_to_quality import cells, plot, report_lines, run, seconds_to
 
 
 def curve(*points, gaussians=100):

@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import Tensor
 from torch.optim import Adam
 
 from beags_plugin.core.densification import Densified, GradientStatistics, densify, length_units, reset_opacity
-from beags_plugin.plugin.training.view_errors import high_errors, shown_weights
 from beags_plugin.plugin.training.scene_edits import edit_scene, move_adam_state
 from beags_plugin.plugin.training.scene_model import SceneModel
+from beags_plugin.plugin.training.view_errors import high_errors, shown_weights
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system import processes
 

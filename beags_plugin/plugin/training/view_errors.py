@@ -31,7 +31,7 @@ def high_errors(model: SceneModel, datamanager: BeagsDataManager, views: Sequenc
 
 @torch.no_grad()
 def shown_weights(model: SceneModel, datamanager: BeagsDataManager, step: int) -> Tensor:
-    """Return [N] float64, the sum of each Gaussian's w_i over all pixels of all training views as ``step`` sees them."""
+    """Return [N] float64, each Gaussian's sum of w_i over all pixels of all training views as ``step`` sees them."""
     inputs = geometry_inputs(model.surfels())
     found = torch.zeros(model.num_points, dtype=torch.float64, device=model.device)
     for index in range(len(datamanager.train_dataset)):

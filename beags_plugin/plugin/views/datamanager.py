@@ -81,7 +81,6 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
             lens.straighten(dataset.cameras)
         self.train_cameras = self.train_dataset.cameras.to(self.device)
         self._cameras: dict[int, Camera] = {}
-        self._size_at: SizeAt | None = None
         self._small = SmallViews(keep=not isinstance(self.cached_train, StreamedViews))
         self._present: list[list[int]] | None = None  # objects of each training view's labels, once they are replaced
         # nerfstudio samples evaluation views by Python's global generator, which others use too.
@@ -185,8 +184,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
 
     def shrink(self, size_at: SizeAt | None) -> None:
         """Train on photos of the sizes of ``size_at`` from here on; None: on whole ones."""
-        self._size_at = size_at
-        self._small.clear()
+        self._small.shrink(size_at)
 
     def training_view(self, index: int, step: int) -> tuple[Camera, dict]:
         """Return camera and batch of a training view as ``step`` would see them; the order of views stays as it is."""
@@ -194,24 +192,14 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
 
     def training_camera(self, index: int, step: int) -> Camera:
         """Return the camera of a training view as ``step`` would see it."""
-        camera = self._camera(index)
-        return camera if (size := self._size(camera, step)) is None else self._small.camera(index, size, camera)
-
-    def _size(self, camera: Camera, step: int) -> tuple[int, int] | None:
-        """Return width and height of what ``step`` sees of a view with this whole camera; None for all of it."""
-        if self._size_at is None:
-            return None
-        size = self._size_at(step, camera.width, camera.height)
-        return None if size == (camera.width, camera.height) else size
+        return self._small.camera(index, self._camera(index), step)
 
     def _seen(self, index: int, held: dict, step: int) -> tuple[Camera, dict]:
-        """Return what ``step`` sees of a view whose data are ``held`` in the cache: camera and batch."""
-        camera, whole = self._camera(index), self._on_device(held)
-        data = objects_alone(whole) if self.config.photos == "objects" else whole
-        if (size := self._size(camera, step)) is None:
-            self._small.clear()
-            return camera, data
-        return self._small.camera(index, size, camera), self._small.batch(index, size, data)
+        """Return camera and batch that ``step`` sees of a view whose data are ``held`` in the cache."""
+        camera, data = self._camera(index), self._on_device(held)
+        if self.config.photos == "objects":
+            data = objects_alone(data)
+        return self.training_camera(index, step), self._small.batch(index, camera, data, step)
 
     def _camera(self, index: int) -> Camera:
         """Return a training view's camera, whole, on the device; the host knows its numbers: no step fetches them."""

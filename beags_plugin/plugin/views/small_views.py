@@ -19,7 +19,7 @@ _FULL = 1.0 - 1e-4  # share of a small pixel from which all of it counts as cove
 
 
 class SmallViews:
-    """Small batches and cameras of training views.
+    """Small batches and cameras of training views, in steps that see small ones; else they are whole.
 
     They are made from whole ones when they are first asked for, and kept as long as the size of that view stays. keep:
     whether batches are kept; cameras always are.
@@ -27,34 +27,46 @@ class SmallViews:
 
     def __init__(self, keep: bool) -> None:
         self._keep = keep
+        self._size_at: SizeAt | None = None
         self._batches: dict[int, dict[str, Any]] = {}
         self._cameras: dict[int, Camera] = {}
 
-    def batch(self, index: int, size: tuple[int, int], whole: dict[str, Any]) -> dict[str, Any]:
-        """Return a view's batch at ``size`` (width, height): of ``whole``, which ``BeagsDataManager`` describes.
+    def shrink(self, size_at: SizeAt | None) -> None:
+        """Give the sizes of ``size_at`` from here on; None: whole views."""
+        self._size_at = size_at
+        self._batches.clear()
 
-        Photos, and alpha, on black as they come, are averaged; labels take the id at each new pixel's centre. A small
-        pixel is ``inside`` or ``known`` where all of it is.
-        """
-        kept = self._batches.get(index)
-        if kept is not None and kept["image"].shape[:2] == size[::-1]:
-            return dict(kept)
-        small = {name: _small(name, value, size) for name, value in whole.items()}
-        if self._keep:
-            self._batches[index] = small
-        return dict(small)
-
-    def camera(self, index: int, size: tuple[int, int], whole: Camera) -> Camera:
-        """Return the camera of ``whole`` at ``size`` (width, height), on the same device."""
+    def camera(self, index: int, whole: Camera, step: int) -> Camera:
+        """Return what ``step`` sees of the camera ``whole`` of a view, on the same device."""
+        if (size := self._size(whole, step)) is None:
+            return whole
         kept = self._cameras.get(index)
         if kept is None or (kept.width, kept.height) != size:
             kept = self._cameras[index] = small_camera(whole, size)
         return kept
 
-    def clear(self) -> None:
-        """Keep nothing: photos are whole from here on."""
-        self._batches.clear()
-        self._cameras.clear()
+    def batch(self, index: int, camera: Camera, whole: dict[str, Any], step: int) -> dict[str, Any]:
+        """Return what ``step`` sees of a view's batch ``whole``, which ``BeagsDataManager`` describes.
+
+        camera: of the whole view. Photos, and alpha, on black as they come, are averaged; labels take the id at each
+        new pixel's centre. A small pixel is ``inside`` or ``known`` where all of it is.
+        """
+        if (size := self._size(camera, step)) is None:
+            self._batches.clear()  # photos do not shrink again
+            return whole
+        kept = self._batches.get(index)
+        if kept is None or kept["image"].shape[:2] != size[::-1]:
+            kept = {name: _small(name, value, size) for name, value in whole.items()}
+            if self._keep:
+                self._batches[index] = kept
+        return dict(kept)
+
+    def _size(self, camera: Camera, step: int) -> tuple[int, int] | None:
+        """Return width and height of what ``step`` sees of a view with this whole camera; None for all of it."""
+        if self._size_at is None:
+            return None
+        size = self._size_at(step, camera.width, camera.height)
+        return None if size == (camera.width, camera.height) else size
 
 
 def small_camera(camera: Camera, size: tuple[int, int]) -> Camera:

@@ -57,19 +57,22 @@ def test_photos_are_averaged_and_what_is_known_shrinks():
     inside[:, :5] = True
     labels = torch.arange(48, dtype=torch.int32).reshape(6, 8)
     whole = {"image": image, "labels": labels, "inside": inside, "alpha": 255 * inside.byte(), "image_idx": 3}
+    camera = Camera(torch.eye(4), torch.eye(3), 8, 6)
     views = SmallViews(keep=True)
-    small = views.batch(0, (4, 3), whole)
+    assert views.batch(0, camera, whole, 0) is whole
+    views.shrink(lambda step, width, height: [(4, 3), (4, 3), (2, 3), (width, height)][step])
+    small = views.batch(0, camera, whole, 0)
     exact = image.float().reshape(3, 2, 4, 2, 3).mean((1, 3))
     assert small["image"].dtype == torch.uint8 and (small["image"].float() - exact).abs().max() <= 0.5
     assert small["inside"].tolist() == [[True, True, False, False]] * 3  # the third pixel is covered by half
     assert small["alpha"][0].tolist() in ([255, 255, 127, 0], [255, 255, 128, 0])
     assert small["labels"].tolist() == labels[1::2, 1::2].tolist() and small["labels"].dtype == torch.int32
     assert small["image_idx"] == 3
-    assert views.batch(0, (4, 3), {"image": None})["image"] is small["image"]  # kept
+    assert views.batch(0, camera, {"image": None}, 1)["image"] is small["image"]  # kept
     floats = {"image": image.float() / 255}
-    assert torch.allclose(views.batch(0, (2, 3), floats)["image"], exact.reshape(3, 2, 2, 3).mean(2) / 255, atol=1e-6)
-    views.clear()
-    assert views.batch(0, (8, 3), floats)["image"].shape == (3, 8, 3)
+    smaller = views.batch(0, camera, floats, 2)["image"]
+    assert torch.allclose(smaller, exact.reshape(3, 2, 2, 3).mean(2) / 255, atol=1e-6)
+    assert views.batch(0, camera, floats, 3) is floats and not views._batches  # nothing is kept of what is over
 
 
 def test_a_small_camera_renders_the_average_of_the_whole_picture():
@@ -87,9 +90,7 @@ def test_a_small_camera_renders_the_average_of_the_whole_picture():
     )
     small = small_camera(camera, (80, 90))
     rasterizer, settings = make_rasterizer("torch"), RasterSettings(0.01, 100.0, geometry=False)
-    whole, found = (
-        rasterizer.rasterize(scene, each, settings, torch.zeros(3)).color for each in (camera, small)
-    )
+    whole, found = (rasterizer.rasterize(scene, each, settings, torch.zeros(3)).color for each in (camera, small))
     averaged = whole.reshape(90, 2, 80, 3, 3).mean((1, 3))
     error = (found - averaged).abs()
     assert error.mean() < 1e-3 and error.max() < 0.02
