@@ -76,6 +76,9 @@ class BeagsModelConfig(ModelConfig):
     """Which Gaussians at class borders are split before refinement; none unless rounds is 1 or more."""
     position_lr: Suppress[tuple[float, float]] = (1.6e-4, 1.6e-6)
     """First and last learning rate of the positions, log-linear, times the scene's extent."""
+    base_lr_factor: float = 1.0
+    """Factor of the learning rates of the base, but for opacities, in its first step, for bases that are shorter than
+    the official ones; it falls to 1, log-linear, by the end of the base. A base that polishes takes none."""
     refine_position_lr_factor: float = 1.0
     """Factor of the positions' learning rate while refining; 1, as in the paper, is the end of the base schedule."""
     near: Suppress[float] = 0.01
@@ -97,6 +100,8 @@ class BeagsModelConfig(ModelConfig):
             raise UserError(f"near is {self.near} and far {self.far}: near must lie above 0 and below far.")
         if not all(0 < rate < math.inf for rate in self.position_lr):
             raise UserError(f"position_lr is {self.position_lr}: give two learning rates above 0.")
+        if not 0 < self.base_lr_factor < math.inf:
+            raise UserError(f"base_lr_factor is {self.base_lr_factor}: give a factor above 0.")
         if not 0 <= self.refine_position_lr_factor < math.inf:
             raise UserError(f"refine_position_lr_factor is {self.refine_position_lr_factor}: give 0 or more.")
         self.pyramid.check()
