@@ -49,11 +49,6 @@ class DensifyConfig:
     pixels_per_surfel: float = 0.0
     """Training pixels that each Gaussian needs at least, against overfitting of few images; 0, as officially, sets no
     bound."""
-    agreeing_views: int = 0
-    """Views that must agree before a Gaussian is cloned or split: at least half of its weight lies in pixels of high
-    error there. 0, as officially, asks none."""
-    error_views: int = 8
-    """Training views that are asked, chosen anew each time."""
     prune_unseen: float = 0.0
     """Gaussians whose weights over all pixels of all training views add up to less than this go, in pixels; 0 keeps
     them."""
@@ -156,24 +151,15 @@ def length_units(means: Tensor, camera_centers: Tensor, extent: float, config: D
 
 
 def densify(
-    surfels: Surfels,
-    mean_gradient: Tensor,
-    units: Tensor,
-    config: DensifyConfig,
-    step: int,
-    generator: torch.Generator,
-    may_grow: Tensor | None = None,
+    surfels: Surfels, mean_gradient: Tensor, units: Tensor, config: DensifyConfig, step: int, generator: torch.Generator
 ) -> Densified:
     """Clone, split, prune.
 
     surfels: N surfels without gradients. mean_gradient: [N]. units: [N] of ``length_units``. step: for
-    ``prune_scale_after``. may_grow: [N] bool, those that may be cloned or split; None for all. At least one surfel
-    always remains.
+    ``prune_scale_after``. At least one surfel always remains.
     """
     size = surfels.log_scales.exp().amax(dim=-1)
-    wanted = mean_gradient >= GRADIENT_THRESHOLD
-    wanted = wanted if may_grow is None else wanted & may_grow
-    chosen = _within_budget(wanted, mean_gradient, config.max_surfels)
+    chosen = _within_budget(mean_gradient >= GRADIENT_THRESHOLD, mean_gradient, config.max_surfels)
     small = size <= CLONE_SCALE * units
     edited = _grow(surfels, chosen & small, chosen & ~small, generator)
 

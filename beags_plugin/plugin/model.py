@@ -96,12 +96,23 @@ class BeagsModel(SceneModel):
 
     # -- losses and metrics --------------------------------------------------------------------------------------------
 
+    def _truth(self, batch: dict[str, Any], background: Tensor) -> Tensor:
+        """Return the photograph [H, W, 3], with the background behind what is transparent."""
+        image = self.get_gt_img(batch["image"])
+        if "alpha" in batch:  # it comes on black
+            image = image + (1.0 - self.get_gt_img(batch["alpha"])[..., None]) * background
+        return image
+
+    def get_gt_img(self, image: Tensor) -> Tensor:
+        """Return the image [H, W, C] float in 0..1 on the model's device; never downscaled."""
+        return (image.float() / 255.0 if image.dtype == torch.uint8 else image).to(self.device)
+
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
         """Return the number of Gaussians and, in a step whose metrics are read, PSNR of the rendered view."""
         metrics: dict[str, Any] = {"gaussian_count": self.num_points}
         if self.measuring:
             with torch.no_grad():
-                image = self.truth(batch, outputs["background"])
+                image = self._truth(batch, outputs["background"])
                 metrics["psnr"] = psnr(where_known(outputs["rgb"], image, batch), image)
         return metrics
 
@@ -109,7 +120,7 @@ class BeagsModel(SceneModel):
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
     ) -> dict[str, Tensor]:
         """Return each active term by name, weighted."""
-        image = self.truth(batch, outputs["background"])
+        image = self._truth(batch, outputs["background"])
         if not self.training or self.last_render is None:
             return {"photometric": (outputs["rgb"] - image).abs().mean()}
         inputs = LossInputs(
@@ -150,7 +161,7 @@ class BeagsModel(SceneModel):
         self, outputs: dict[str, Any], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Return PSNR and SSIM of an evaluation view, and pictures for tensorboard."""
-        image = self.truth(batch, outputs["background"])
+        image = self._truth(batch, outputs["background"])
         metrics = {"psnr": float(psnr(outputs["rgb"], image)), "ssim": float(ssim(outputs["rgb"], image))}
         images = {"img": torch.cat([image, outputs["rgb"]], dim=1)}
         if "class_map" in outputs:

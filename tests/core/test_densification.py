@@ -203,16 +203,6 @@ def test_the_bound_by_pixels():
     assert replace(config, max_surfels=90).bounded(1000).max_surfels == 20
 
 
-def test_only_surfels_that_may_grow_do_and_they_alone_use_the_budget():
-    surfels = scene([SMALL] * 4, [0.5] * 4)
-    gradients, units = torch.tensor([HIGH, 4 * HIGH, 2 * HIGH, LOW]), torch.full((4,), EXTENT)
-    may = torch.tensor([True, False, True, True])
-    edited = densify(surfels, gradients, units, CONFIG, 1000, generator(), may)
-    assert edited.source[edited.fresh].tolist() == [0, 2]
-    edited = densify(surfels, gradients, units, replace(CONFIG, max_surfels=5), 1000, generator(), may)
-    assert edited.source[edited.fresh].tolist() == [2]
-
-
 def test_the_unseen_are_pruned_between_start_and_stop_in_scaled_intervals():
     config = replace(CONFIG, prune_unseen=0.5)
     steps = [done for done in range(1, 20_000) if config.prunes_unseen_at(done)]

@@ -22,8 +22,6 @@ class PyramidConfig:
     levels: int = 2
     """Number of smaller sizes, all for as many steps, each larger than the one before by the same factor: with a start
     of 4, a quarter and a half for 2; more come nearer to a smooth growth."""
-    surfels: bool = False
-    """Let the bound of densify.pixels_per_surfel grow with the pixels of the photos."""
 
     def check(self) -> None:
         """Raise ``UserError`` for a value with which training cannot work."""

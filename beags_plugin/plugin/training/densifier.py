@@ -10,21 +10,21 @@ from torch.optim import Adam
 from beags_plugin.core.densification import Densified, GradientStatistics, densify, length_units, reset_opacity
 from beags_plugin.plugin.training.scene_edits import edit_scene, move_adam_state
 from beags_plugin.plugin.training.scene_model import SceneModel
-from beags_plugin.plugin.training.view_errors import high_errors, shown_weights
+from beags_plugin.plugin.training.shown_weights import shown_weights
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system import processes
 
 
 class Densifier:
-    """Grows and prunes the base by the screen gradients that it gathers, and by the errors of views it looks at."""
+    """Grows and prunes the base by the screen gradients that it gathers, and by what views show."""
 
     def __init__(self, model: SceneModel, adam: Adam, datamanager: BeagsDataManager) -> None:
         self.model = model
         self.datamanager = datamanager
         cameras = datamanager.train_dataset.cameras
         self.camera_centers = cameras.camera_to_worlds[:, :3, 3]  # [V, 3] world
-        self.pixels = int((cameras.height * cameras.width).sum())  # of all whole training images
-        self.config = model.config.densify.scaled(model.schedule.scale)
+        pixels = int((cameras.height * cameras.width).sum())  # of all whole training images
+        self.config = model.config.densify.scaled(model.schedule.scale).bounded(pixels)
         self.adam = adam
         self.statistics = GradientStatistics(model.num_points, model.device)
 
@@ -60,29 +60,17 @@ class Densifier:
             self._reset_opacity()
 
     def _densify(self, step: int) -> None:
-        model, generator = self.model, self.model.generator(step)
+        model = self.model
         surfels = model.surfels().detach()
         processes.add_up([self.statistics.total, self.statistics.views])
-        config = self.config.bounded(self._pixels(step))
-        units = length_units(surfels.means, self.camera_centers, float(model.extent), config)
-        may_grow = None
-        if config.agreeing_views > 0:
-            views = torch.randperm(len(self.camera_centers), generator=generator)[: config.error_views]
-            found = high_errors(model, self.datamanager, views.tolist(), step)
-            may_grow = found.agreeing >= config.agreeing_views
-        self._edit(densify(surfels, self.statistics.mean(), units, config, step, generator, may_grow))
+        units = length_units(surfels.means, self.camera_centers, float(model.extent), self.config)
+        self._edit(densify(surfels, self.statistics.mean(), units, self.config, step, model.generator(step)))
 
     def _prune_unseen(self, step: int) -> None:
         """Remove the Gaussians that hardly show in any training view."""
         shown = shown_weights(self.model, self.datamanager, step)
         scene = Densified.unchanged(self.model.surfels().detach())
         self._edit(scene.only(shown >= self.config.prune_unseen))
-
-    def _pixels(self, step: int) -> int:
-        """Return the pixels of all training images that the bound of the number of Gaussians follows."""
-        pyramid = self.model.config.pyramid
-        factor = pyramid.factor(step, self.model.schedule) if pyramid.surfels else 1.0
-        return int(self.pixels / factor**2)
 
     def _edit(self, edited: Densified) -> None:
         model = self.model

@@ -130,17 +130,6 @@ class SceneModel(SplatfactoModel):
         """Return a generator seeded by (seed, step), so that a resumed run samples as the uninterrupted one."""
         return torch.Generator().manual_seed(self.seed * 1_000_003 + step)
 
-    def truth(self, batch: dict[str, Any], background: Tensor) -> Tensor:
-        """Return the photograph [H, W, 3], with the background behind what is transparent."""
-        image = self.get_gt_img(batch["image"])
-        if "alpha" in batch:  # it comes on black
-            image = image + (1.0 - self.get_gt_img(batch["alpha"])[..., None]) * background
-        return image
-
-    def get_gt_img(self, image: Tensor) -> Tensor:
-        """Return the image [H, W, C] float in 0..1 on the model's device; never downscaled."""
-        return (image.float() / 255.0 if image.dtype == torch.uint8 else image).to(self.device)
-
     # -- Gaussians ---------------------------------------------------------------------------------------------------
 
     @property

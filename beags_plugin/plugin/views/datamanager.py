@@ -186,10 +186,6 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         """Train on photos of the sizes of ``size_at`` from here on; None: on whole ones."""
         self._small.shrink(size_at)
 
-    def training_view(self, index: int, step: int) -> tuple[Camera, dict]:
-        """Return camera and batch of a training view as ``step`` would see them; the order of views stays as it is."""
-        return self._seen(index, dict(self.cached_train[index]), step)
-
     def training_camera(self, index: int, step: int) -> Camera:
         """Return the camera of a training view as ``step`` would see it."""
         return self._small.camera(index, self._camera(index), step)
