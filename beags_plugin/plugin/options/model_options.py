@@ -77,8 +77,8 @@ class BeagsModelConfig(ModelConfig):
     position_lr: Suppress[tuple[float, float]] = (1.6e-4, 1.6e-6)
     """First and last learning rate of the positions, log-linear, times the scene's extent."""
     base_lr_factor: float = 1.0
-    """Factor of the learning rates of the base, but for opacities, in its first step, for bases that are shorter than
-    the official ones; it falls to 1, log-linear, by the end of the base. A base that polishes takes none."""
+    """Factor of all learning rates of the base but that of opacities, for a base that is shorter than the official one;
+    a base that polishes takes none."""
     refine_position_lr_factor: float = 1.0
     """Factor of the positions' learning rate while refining; 1, as in the paper, is the end of the base schedule."""
     near: Suppress[float] = 0.01

@@ -96,7 +96,7 @@ def own_learning_rates(model: SceneModel, adam: Adam, step: int) -> None:
 def set_learning_rates(model: SceneModel, adam: Adam, configs: dict[str, Any], step: int) -> None:
     """Set every group's learning rate for this step."""
     progress, refining = model.schedule.progress(step), model.schedule.refining(step)
-    faster = 1.0 if refining or model.schedule.warm else log_linear(model.config.base_lr_factor, 1.0, progress)
+    faster = 1.0 if refining or model.schedule.warm else model.config.base_lr_factor
     for group in adam.param_groups:
         rate = configs[group["name"]]["optimizer"].lr
         if group["name"] == "means":
