@@ -157,7 +157,8 @@ def plot(path: Path, rows: Sequence[CurveRow], reference: str) -> None:
             panel.set_xscale("log")
             panel.set_title(f"{scene}: {title}", fontsize="medium")
         axes[-1][column].set_xlabel("CPU seconds")
-    axes[0][0].legend(fontsize="small")
+    handles = [axes[0][0].plot([], [], ".-", color=f"C{number}")[0] for number in range(len(variants))]
+    figure.legend(handles, variants, loc="outside lower center", fontsize="small", ncols=2)
     save_figure(path, figure)
 
 
