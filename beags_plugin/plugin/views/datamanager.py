@@ -174,7 +174,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         metadata = camera.metadata or {}
         index = metadata["cam_idx"]
         own_camera, data = self._seen(index, data, step)
-        if own_camera.width != int(camera.width) or own_camera.height != int(camera.height):
+        if own_camera is not self._camera(index):
             resize_cameras(camera, *(torch.full_like(camera.width, n) for n in (own_camera.width, own_camera.height)))
         own = {"labels": data["labels"], "camera": own_camera, "objects_alone": "inside" in data}
         camera.metadata = metadata | own
