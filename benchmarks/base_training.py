@@ -79,21 +79,30 @@ def run_base(name: str, options: ExperimentOptions) -> list[CurveRow]:
     """
     experiment = adapted(load_experiment(name), options)
     source = {**provenance(), "quick": options.quick}  # before the trials: they keep the machine busy
-    trials = plan(experiment, scenes_of(experiment, options), code_digest())
-    with progress_bar("Training, in steps") as progress:
-        outcomes = run_trials([trial for _, trial in trials], options.output / "trials", steps_of, progress)
-    rows = [read_row(variant, trial, outcomes[trial.digest]) for variant, trial in trials]
+    rows = train_rows(experiment, options)
     lines = report_lines(rows, experiment.reference)
     wide = Console(width=max(CONSOLE.width, TABLE_WIDTH), highlight=False, markup=False)
     wide.print(plain_table(f"{experiment.name}, {experiment.preset}", _COLUMNS, [cells(line) for line in lines]))
     files = options.files(experiment.name)
-    curves = [{"scene": row.scene, "seed": row.seed, "variant": row.variant, "curve": row.curve} for row in rows]
-    write_json(files["json"], {**experiment.header(), **source, "rows": lines, "curves": curves})
+    write_json(files["json"], {**experiment.header(), **source, "rows": lines, "curves": curve_json(rows)})
     write_csv(files["csv"], lines)
     plot(files["picture"], rows)
     for kind, path in files.items():
         CONSOLE.print(f"{kind}: {path}")
     return rows
+
+
+def train_rows(experiment: Experiment, options: ExperimentOptions) -> list[CurveRow]:
+    """Run the bases of an experiment that are not done; returns a row for each, scene after scene."""
+    trials = plan(experiment, scenes_of(experiment, options), code_digest())
+    with progress_bar("Training, in steps") as progress:
+        outcomes = run_trials([trial for _, trial in trials], options.output / "trials", steps_of, progress)
+    return [read_row(variant, trial, outcomes[trial.digest]) for variant, trial in trials]
+
+
+def curve_json(rows: Sequence[CurveRow]) -> list[dict[str, Any]]:
+    """Return the curves of all rows as a result file holds them."""
+    return [{"scene": row.scene, "seed": row.seed, "variant": row.variant, "curve": row.curve} for row in rows]
 
 
 def plan(experiment: Experiment, scenes: Sequence[TrialScene], code: str) -> list[tuple[Variant, Trial]]:

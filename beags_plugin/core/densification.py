@@ -49,6 +49,11 @@ class DensifyConfig:
     pixels_per_surfel: float = 0.0
     """Training pixels that each Gaussian needs at least, against overfitting of few images; 0, as officially, sets no
     bound."""
+    prune_unseen: float = 0.0
+    """Gaussians whose weights over all pixels of all training views add up to less than this go, in pixels; 0 keeps
+    them."""
+    prune_unseen_every: int = 1_500
+    """Steps between two such prunings, from ``start`` to ``stop``."""
 
     def scaled(self, factor: float) -> DensifyConfig:
         """Return the same for a run ``factor`` times as long: its steps are scaled, within the smallest intervals."""
@@ -63,6 +68,7 @@ class DensifyConfig:
             stop=steps(self.stop),
             prune_scale_after=steps(self.prune_scale_after),
             reset_every=steps(self.reset_every, LEAST_RESET_EVERY),
+            prune_unseen_every=max(steps(self.prune_unseen_every, LEAST_EVERY), 1),
         )
 
     def bounded(self, pixels: int) -> DensifyConfig:
@@ -75,6 +81,11 @@ class DensifyConfig:
     def grows_at(self, done: int) -> bool:
         """Return whether the scene is densified after ``done`` steps."""
         return self.start < done < self.stop and done % self.every == 0
+
+    def prunes_unseen_at(self, done: int) -> bool:
+        """Return whether Gaussians that no view shows go after ``done`` steps."""
+        wanted = self.prune_unseen > 0 and self.start < done < self.stop
+        return wanted and done % self.prune_unseen_every == 0
 
     def resets_at(self, done: int) -> bool:
         """Return whether opacities are reset after ``done`` steps."""

@@ -198,7 +198,10 @@ class BeagsTrainer(Trainer):
                 "to refine a base, this one or <run>/base/nerfstudio_models, load it with beags-refine."
             )
         self._estimate = Estimate(
-            str(self.config.method_name), self.config.max_num_iterations, chosen=self._start_step == 0
+            str(self.config.method_name),
+            self.config.max_num_iterations,
+            chosen=self._start_step == 0,
+            small=self.config.model_config.pyramid.factor(self._start_step, self.schedule) > 1.0,
         )
         remove_unfinished(self.base_dir)
         (self.base_dir / REPORT_FILE).unlink(missing_ok=True)  # it marks the run as complete

@@ -25,7 +25,8 @@ def experiment(tmp_path):
 
 WITH_QUALITY = [name for name in experiment_names() if name != "classes"]  # which measures cost alone
 # experiments whose figures are reported; by all others something is chosen
-REPORTING = {"presets", "compare", "compare-consistent"}
+REPORTING = {"presets", "compare", "compare-consistent", "time-to-quality"}
+BASES = {"base", "time-to-quality"}  # that refine nothing
 
 
 @pytest.mark.parametrize("name", WITH_QUALITY)
@@ -53,7 +54,7 @@ def test_rows_named_after_presets_refine_as_these_do():
         assert {key for key, value in vars(own).items() if value != getattr(preset, key)} <= base, row.name
 
 
-@pytest.mark.parametrize("name", [name for name in WITH_QUALITY if name != "base"])  # that refines nothing
+@pytest.mark.parametrize("name", [name for name in WITH_QUALITY if name not in BASES])
 def test_every_length_of_refinement_has_its_control(name):
     """A gain in PSNR is one over as many steps with no loss of masks; where figures are reported, at equal rates."""
     lengths: dict[bool, set[tuple[int, float]]] = {True: set(), False: set()}

@@ -201,3 +201,12 @@ def test_the_bound_by_pixels():
     assert config.bounded(1000).max_surfels == 20 and config.bounded(10).max_surfels == 1
     assert replace(config, max_surfels=7).bounded(1000).max_surfels == 7
     assert replace(config, max_surfels=90).bounded(1000).max_surfels == 20
+
+
+def test_the_unseen_are_pruned_between_start_and_stop_in_scaled_intervals():
+    config = replace(CONFIG, prune_unseen=0.5)
+    steps = [done for done in range(1, 20_000) if config.prunes_unseen_at(done)]
+    assert steps == list(range(1_500, 15_000, 1_500))
+    tenth = config.scaled(0.1)
+    assert [done for done in range(1, 2_000) if tenth.prunes_unseen_at(done)] == list(range(150, 1_500, 150))
+    assert not any(CONFIG.prunes_unseen_at(done) for done in steps)

@@ -15,6 +15,7 @@ from tyro.conf import Suppress
 from beags_plugin.core.densification import DensifyConfig
 from beags_plugin.core.sh import MAX_DEGREE
 from beags_plugin.plugin.options.loss_spec import LossSpec
+from beags_plugin.plugin.options.pyramid import PyramidConfig
 from beags_plugin.plugin.options.schedule import PhaseSchedule
 from beags_plugin.preparation.border_split import BorderSplitConfig
 from beags_plugin.preparation.pipeline import PreparationConfig
@@ -67,12 +68,17 @@ class BeagsModelConfig(ModelConfig):
     """The terms of the training loss by name."""
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     """When and how the base grows and prunes its Gaussians."""
+    pyramid: PyramidConfig = field(default_factory=PyramidConfig)
+    """Small photos first, in the base."""
     prepare: PreparationConfig = field(default_factory=PreparationConfig)
     """Options of mask reprojection and of the voxel grids."""
     split: BorderSplitConfig = field(default_factory=BorderSplitConfig)
     """Which Gaussians at class borders are split before refinement; none unless rounds is 1 or more."""
     position_lr: Suppress[tuple[float, float]] = (1.6e-4, 1.6e-6)
     """First and last learning rate of the positions, log-linear, times the scene's extent."""
+    base_lr_factor: float = 1.0
+    """Factor of all learning rates of the base but that of opacities, for a base that is shorter than the official one;
+    a base that polishes takes none."""
     refine_position_lr_factor: float = 1.0
     """Factor of the positions' learning rate while refining; 1, as in the paper, is the end of the base schedule."""
     near: Suppress[float] = 0.01
@@ -94,8 +100,11 @@ class BeagsModelConfig(ModelConfig):
             raise UserError(f"near is {self.near} and far {self.far}: near must lie above 0 and below far.")
         if not all(0 < rate < math.inf for rate in self.position_lr):
             raise UserError(f"position_lr is {self.position_lr}: give two learning rates above 0.")
+        if not 0 < self.base_lr_factor < math.inf:
+            raise UserError(f"base_lr_factor is {self.base_lr_factor}: give a factor above 0.")
         if not 0 <= self.refine_position_lr_factor < math.inf:
             raise UserError(f"refine_position_lr_factor is {self.refine_position_lr_factor}: give 0 or more.")
+        self.pyramid.check()
         make_refiner(self.refiner, self.refiner_options)
 
     def schedule(self) -> PhaseSchedule:

@@ -8,6 +8,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from torch.optim import Adam
 
 from beags_plugin.core.cameras import camera_extent
+from beags_plugin.plugin.options.pyramid import small_size
 from beags_plugin.plugin.options.schedule import log_linear
 from beags_plugin.plugin.training.densifier import Densifier
 from beags_plugin.plugin.training.monitor import Curves
@@ -27,9 +28,8 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
     adam = cast(SceneOptimizer, attributes.optimizers).adam
     model.seed = trainer.config.machine.seed
     model.extent = camera_extent(datamanager.train_dataset.cameras.camera_to_worlds).to(model.device)
-    cameras = datamanager.train_dataset.cameras
-    pixels = int((cameras.height * cameras.width).sum())
-    densifier = Densifier(model, adam, pixels, cameras.camera_to_worlds[:, :3, 3])
+    shrink(model, datamanager)
+    densifier = Densifier(model, adam, datamanager)
     switch = RefinementSwitch(model, trainer, datamanager)
     switch.check()
     switch.ask_steps()
@@ -66,6 +66,16 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
     ]
 
 
+def shrink(model: SceneModel, datamanager: BeagsDataManager) -> None:
+    """Have the data manager give the sizes of the model's pyramid."""
+    pyramid = model.config.pyramid
+
+    def size_at(step: int, width: int, height: int) -> tuple[int, int]:
+        return small_size(width, height, pyramid.factor(step, model.schedule))
+
+    datamanager.shrink(size_at if pyramid.start > 1.0 else None)
+
+
 def _curves(model: SceneModel, trainer: TrainingRun, datamanager: BeagsDataManager) -> Curves | None:
     """Return the writer of this run's curves; None where nobody would read them."""
     config = trainer.config
@@ -86,9 +96,10 @@ def own_learning_rates(model: SceneModel, adam: Adam, step: int) -> None:
 def set_learning_rates(model: SceneModel, adam: Adam, configs: dict[str, Any], step: int) -> None:
     """Set every group's learning rate for this step."""
     progress, refining = model.schedule.progress(step), model.schedule.refining(step)
+    faster = 1.0 if refining or model.schedule.warm else model.config.base_lr_factor
     for group in adam.param_groups:
         rate = configs[group["name"]]["optimizer"].lr
         if group["name"] == "means":
             rate = log_linear(*model.config.position_lr, progress) * model.extent_on_host()
             rate *= model.config.refine_position_lr_factor if refining and model.own_training is None else 1.0
-        group["lr"] = rate
+        group["lr"] = rate if group["name"] == "opacities" else rate * faster

@@ -5,24 +5,25 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import Tensor
 from torch.optim import Adam
 
-from beags_plugin.core.densification import GradientStatistics, densify, length_units, reset_opacity
+from beags_plugin.core.densification import Densified, GradientStatistics, densify, length_units, reset_opacity
 from beags_plugin.plugin.training.scene_edits import edit_scene, move_adam_state
 from beags_plugin.plugin.training.scene_model import SceneModel
+from beags_plugin.plugin.training.shown_weights import shown_weights
+from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system import processes
 
 
 class Densifier:
-    """Grows and prunes the base by the screen gradients that it gathers.
+    """Grows and prunes the base by the screen gradients that it gathers, and by what views show."""
 
-    pixels: of all training images. camera_centers: [V, 3] world.
-    """
-
-    def __init__(self, model: SceneModel, adam: Adam, pixels: int, camera_centers: Tensor) -> None:
+    def __init__(self, model: SceneModel, adam: Adam, datamanager: BeagsDataManager) -> None:
         self.model = model
-        self.camera_centers = camera_centers
+        self.datamanager = datamanager
+        cameras = datamanager.train_dataset.cameras
+        self.camera_centers = cameras.camera_to_worlds[:, :3, 3]  # [V, 3] world
+        pixels = int((cameras.height * cameras.width).sum())  # of all whole training images
         self.config = model.config.densify.scaled(model.schedule.scale).bounded(pixels)
         self.adam = adam
         self.statistics = GradientStatistics(model.num_points, model.device)
@@ -53,6 +54,8 @@ class Densifier:
             self.statistics.add(last.screen_shift.grad.norm(dim=-1), last.render.visible)
         if config.grows_at(done):
             self._densify(done)
+        if config.prunes_unseen_at(done):
+            self._prune_unseen(done)
         if config.resets_at(done):
             self._reset_opacity()
 
@@ -61,7 +64,16 @@ class Densifier:
         surfels = model.surfels().detach()
         processes.add_up([self.statistics.total, self.statistics.views])
         units = length_units(surfels.means, self.camera_centers, float(model.extent), self.config)
-        edited = densify(surfels, self.statistics.mean(), units, self.config, step, model.generator(step))
+        self._edit(densify(surfels, self.statistics.mean(), units, self.config, step, model.generator(step)))
+
+    def _prune_unseen(self, step: int) -> None:
+        """Remove the Gaussians that hardly show in any training view."""
+        shown = shown_weights(self.model, self.datamanager, step)
+        scene = Densified.unchanged(self.model.surfels().detach())
+        self._edit(scene.only(shown >= self.config.prune_unseen))
+
+    def _edit(self, edited: Densified) -> None:
+        model = self.model
         edit_scene(model, self.adam, edited)
         self.statistics = GradientStatistics(model.num_points, model.device)
         model.last_render = None

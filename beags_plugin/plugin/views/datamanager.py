@@ -25,10 +25,11 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE, objects_in
 from beags_plugin.labels.label_maps import CompressedMap, to_compact, to_int32
 from beags_plugin.plugin.views import lens
-from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
+from beags_plugin.plugin.views.cameras import camera_from_nerfstudio, resize_cameras
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig, absolute
 from beags_plugin.plugin.views.dataset import BeagsDataset
 from beags_plugin.plugin.views.objects_alone import objects_alone
+from beags_plugin.plugin.views.small_views import SizeAt, SmallViews
 from beags_plugin.plugin.views.streaming import Lazy, StreamedViews
 from beags_plugin.plugin.views.views import View, unique_names
 from beags_plugin.system import processes
@@ -80,6 +81,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
             lens.straighten(dataset.cameras)
         self.train_cameras = self.train_dataset.cameras.to(self.device)
         self._cameras: dict[int, Camera] = {}
+        self._small = SmallViews(keep=not isinstance(self.cached_train, StreamedViews))
         self._present: list[list[int]] | None = None  # objects of each training view's labels, once they are replaced
         # nerfstudio samples evaluation views by Python's global generator, which others use too.
         self._eval_order = random.Random(config.train_cameras_sampling_seed)
@@ -178,17 +180,34 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         self._pass_over(processes.size() - own - 1)
         if isinstance(self.cached_train, StreamedViews):
             self.cached_train.expect(self.train_unseen_cameras)
-        whole = self._on_device(data)
-        data = objects_alone(whole) if self.config.photos == "objects" else whole
         metadata = camera.metadata or {}
-        own = {"labels": data["labels"], "camera": self._camera(metadata["cam_idx"])}
-        camera.metadata = metadata | own | {"objects_alone": "inside" in data}
+        index = metadata["cam_idx"]
+        own_camera, data = self._seen(index, data, step)
+        if own_camera is not self._camera(index):
+            resize_cameras(camera, *(torch.full_like(camera.width, n) for n in (own_camera.width, own_camera.height)))
+        own = {"labels": data["labels"], "camera": own_camera, "objects_alone": "inside" in data}
+        camera.metadata = metadata | own
         if self._present is not None:
-            data["present"] = self._present[metadata["cam_idx"]]
+            data["present"] = self._present[index]
         return camera, data
 
+    def shrink(self, size_at: SizeAt | None) -> None:
+        """Train on photos of the sizes of ``size_at`` from here on; None: on whole ones."""
+        self._small.shrink(size_at)
+
+    def training_camera(self, index: int, step: int) -> Camera:
+        """Return the camera of a training view as ``step`` would see it."""
+        return self._small.camera(index, self._camera(index), step)
+
+    def _seen(self, index: int, held: dict, step: int) -> tuple[Camera, dict]:
+        """Return camera and batch that ``step`` sees of a view whose data are ``held`` in the cache."""
+        camera, data = self._camera(index), self._on_device(held)
+        if self.config.photos == "objects":
+            data = objects_alone(data)
+        return self.training_camera(index, step), self._small.batch(index, camera, data, step)
+
     def _camera(self, index: int) -> Camera:
-        """Return a training view's camera on the device; the host knows its numbers, so that no step fetches them."""
+        """Return a training view's camera, whole, on the device; the host knows its numbers: no step fetches them."""
         if index not in self._cameras:
             self._cameras[index] = camera_from_nerfstudio(self.train_dataset.cameras, index).to(self.device)
         return self._cameras[index]

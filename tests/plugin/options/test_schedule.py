@@ -156,6 +156,14 @@ def test_official_learning_rates(model):
     model.schedule = PhaseSchedule(30_000, 3_000, 30_000)
     assert rates(30_000) == pytest.approx({"means": 2.5 * 1.6e-4 * 100**-0.9 * 10, **constant})
 
+    refined = rates(30_000)
+    model.config.base_lr_factor = 4.0
+    assert rates(30_000) == refined  # the base's alone, and not that of opacities
+    found, official = rates(15_000), {"means": 2.5 * 1.6e-5, **constant}
+    assert found == pytest.approx({name: rate * (1 if name == "opacities" else 4) for name, rate in official.items()})
+    model.schedule = PhaseSchedule(30_000, 3_000, 30_000, warm=True)
+    assert rates(0)["scales"] == pytest.approx(0.005)  # polishing learns little
+
 
 def test_only_steps_of_growth_gather_gradients(model):
     from types import SimpleNamespace
@@ -170,7 +178,8 @@ def test_only_steps_of_growth_gather_gradients(model):
     camera = Cameras(pose, one, one, torch.tensor([16.0]), torch.tensor([12.0]), 32, 24)
     model.train()
     model.schedule, model.extent = PhaseSchedule(30_000, 0, 30_000), torch.tensor(1.0)
-    densifier = Densifier(model, {}, 1000, torch.zeros(1, 3))
+    data = SimpleNamespace(train_dataset=SimpleNamespace(cameras=camera))
+    densifier = Densifier(model, {}, data)
 
     def gathered(step):
         before = float(densifier.statistics.total.sum())

@@ -1,0 +1,83 @@
+"""What shortens a base: small photos first, faster rates, pruning of what no view shows."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+pytest.importorskip("nerfstudio")
+
+from resumed_runs import STEPS, Killed, assert_same_run, checkpoint_of, interrupted, kill_at, resume_to_end, run_to_end
+from resumed_runs import short_config as usual_config
+
+from beags_plugin.plugin.options import pyramid
+from beags_plugin.plugin.training import densifier
+
+SHORT = {
+    "pipeline.model.pyramid.start": 3.0,
+    "pipeline.model.pyramid.until": 0.8,
+    "pipeline.model.pyramid.levels": 3,
+    "pipeline.model.base_lr_factor": 3.0,
+    "pipeline.model.densify.prune_unseen": 0.1,
+    "pipeline.model.densify.prune_unseen_every": 12,
+}
+
+
+@pytest.fixture(autouse=True)
+def tiny_photos(monkeypatch):
+    monkeypatch.setattr(pyramid, "LEAST_SIDE", 4)  # the photos of these runs are tiny
+
+
+@pytest.fixture
+def data(short_run):
+    return short_run / "data"
+
+
+def test_a_base_of_all_means_is_resumed_bit_for_bit(data, tmp_path, monkeypatch):
+    from beags_plugin.plugin.model import BeagsModel
+
+    sizes, outputs = [], BeagsModel._training_outputs
+
+    def seen(self, cameras):
+        sizes.append((self.step, cameras.metadata["camera"].width, int(cameras.width)))
+        found = outputs(self, cameras)
+        assert found["rgb"].shape[1] == sizes[-1][1]
+        return found
+
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    with monkeypatch.context() as patch:
+        patch.setattr(BeagsModel, "_training_outputs", seen)
+        run_to_end(usual_config(data, whole, **SHORT))
+    own, cameras = zip(*((a, b) for _, a, b in sizes), strict=True)
+    assert own == cameras and list(own) == sorted(own) and len(set(own)) == 4
+    last = max(step for step, width, _ in sizes if width < own[-1])
+    assert last == 0.8 * STEPS[0] - 1, last  # and refinement sees whole photos
+    interrupted(data, killed, monkeypatch, lambda patch: kill_at(patch, 17), **SHORT)
+    for step in (33, 44):
+        with monkeypatch.context() as patch:
+            kill_at(patch, step)
+            with pytest.raises(Killed):
+                resume_to_end(killed)
+    resume_to_end(killed)
+    assert_same_run(killed, whole)
+
+
+def test_what_no_view_shows_goes_and_what_shows_stays(data, tmp_path, monkeypatch):
+    """Before the pruning some Gaussians are moved behind all cameras: these go, and no others."""
+    calls, shown = [], densifier.shown_weights
+
+    def hidden(model, datamanager, step):
+        model.gauss_params["means"].data[::4] = 1e4
+        calls.append(shown(model, datamanager, step))
+        assert (calls[-1][::4] == 0).all()
+        return calls[-1]
+
+    monkeypatch.setattr(densifier, "shown_weights", hidden)
+    options = {"pipeline.model.densify.prune_unseen": 1e-3, "pipeline.model.densify.prune_unseen_every": 12,
+               "pipeline.model.densify.stop": 13, "pipeline.model.densify.start": 11,
+               "pipeline.model.refine_steps": 0}  # fmt: skip
+    run_to_end(usual_config(data, tmp_path / "run", **options))
+    (weights,) = calls
+    means = checkpoint_of(tmp_path / "run")["pipeline"]["_model.gauss_params.means"]
+    assert len(means) == int((weights >= 1e-3).sum()) < len(weights) and means.abs().max() < 1e3
+    assert torch.isfinite(means).all()
