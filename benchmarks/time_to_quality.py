@@ -155,6 +155,7 @@ def plot(path: Path, rows: Sequence[CurveRow], reference: str) -> None:
                     for margin in MARGINS:
                         panel.axhline(y[-1] - margin, color="0.6", lw=0.8, ls=":")
             panel.set_xscale("log")
+            panel.xaxis.set_minor_formatter("")  # a short axis has no room for these
             panel.set_title(f"{scene}: {title}", fontsize="medium")
         axes[-1][column].set_xlabel("CPU seconds")
     handles = [axes[0][0].plot([], [], ".-", color=f"C{number}")[0] for number in range(len(variants))]
