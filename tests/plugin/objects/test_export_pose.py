@@ -98,11 +98,11 @@ def test_pixels_of_photos_give_the_scale(tmp_path):
         (["--format", "3mf"], "a 3mf file is in millimetres, but the size of the scene is not known"),
         (["--scale-by", "0,0,0 0,0,0 1 m"], "the two points of scale_by are the same"),
         (["--scale-by", "nowhere:1,1 v01:2,2 1 m"], "no photo is called 'nowhere': name one such as v0"),
-        (["--scale-by", "v01:1,1 v01:2,5000 1 m"], "v01 has 20 x 12 pixels: 2,5000 is not one"),
+        (["--scale-by", "v01:2,5000 v01:1,1 1 m"], "v01 has 20 x 12 pixels: 2,5000 is not one"),
         (["--centre", "--frame", "object"], "leave one out"),
         (
             ["--up", "plane"],
-            "what 'cup' stands on is unknown, as the run has kept no masks: name a direction",
+            "what 'cup' stands on is not known, as the run has kept no masks: name the direction",
         ),
     ],
 )
