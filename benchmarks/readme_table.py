@@ -20,6 +20,7 @@ from beags_plugin.system.whole_files import write_text_atomically
 
 ROOT = Path(__file__).resolve().parents[1]
 BEGIN, END = "<!-- made by python -m benchmarks.readme_table -->\n", "<!-- end of the table -->\n"
+FAST = ("assignment alone", "as long as beags-fast, neither loss", "beags-fast")
 LONGER = ("as long as beags, neither loss", "beags")
 ACCURATE = ("beags-accurate",)  # in rooms not measured since outlines are snapped
 PAPER = ("as long as beags-paper, neither loss", "beags-paper")
@@ -30,13 +31,12 @@ GROUPS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
     ("five generated rooms, base of `beags-fast`", "presets", "room", ()),
     ("the same scenes, bases trained anew, longer", "presets-rooms", "room", LONGER),
     ("the same, as in the paper", "presets-paper", "room", PAPER),
-    ("fruit, a real capture (earlier protocol)", "improvements-captures", "fruit", ("assignment alone", "the paper's")),
-    ("a skull, a real capture (the same)", "improvements-captures", "dtu_skull", ("assignment alone", "the paper's")),
+    ("fruit, a real capture", "presets-captures", "fruit", FAST),
+    ("a skull, a real capture", "presets-captures", "dtu_skull", FAST),
 )
 """What a group of rows is called, its file in docs/results, the scene or the family of generated scenes there, and its
 variants (or all)."""
 LABELS = {
-    "the paper's": "both losses, short, without the background",
     "beags-paper": "`beags-paper`, k by [the rule](docs/method.md#5-the-visibility-voxel-grid)",
 }
 WORST = "worst_biou_after"
