@@ -60,13 +60,14 @@ RUN = {  # in this order; the command in README.md: flags that are appended
 STARTED = ("beags sample", "beags resume RUN")
 ELSEWHERE = {
     "ns-train <preset> --data X": "the two lines of ns-train are run",
-    "beags export --load-config C --all [--format ply spz glb]": "a line with --all is run",
+    "beags export --load-config C --all [--format ply sog glb html]": "a line with --all is run",
     "beags eval --load-config C [C ...]": "a line of it is run",
     "beags extract --load-config C [--object NAME ...] [--remove]": "a line of it is run",
     "beags render --load-config C [--object NAME ...] [--format before-after]": "a line of it is run",
     "ns-viewer --load-config C": "a line of it is run",
     "beags process --data PHOTOS_OR_VIDEO --output-dir X": "this scene has no texture; test_process.py runs it",
     "beags bench ablation [--data X ...]": "trains for minutes; test_bench_running.py runs experiments to their tables",
+    "beags bench paper --data-root ROOT [--plan]": "needs the paper's data; test_paper_bench.py runs it on small trees",
     "make demo": "beags demo is run; what make calls is looked at below",
     "make demo DATA=walk.mp4": "the same",
     "make test": "runs these tests",
