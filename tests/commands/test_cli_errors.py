@@ -44,6 +44,7 @@ SENTENCES = {
     "resume {tmp}/run": "{tmp}/run holds a scene without the state of its training: resume the run that it comes from, "
     "or refine it: ns-train beags-refine --load-dir {tmp}/run/nerfstudio_models.",
     # masks
+    "masks truth --data {tmp}/lab": "give one of --nvos and --spin-nerf the folder of the downloaded masks.",
     "masks check": "no scene is named: give --data its folder, or --load-config a run trained on it.",
     "masks check --data {tmp}/nowhere": NO_DATA,
     "masks check --load-config {tmp}/absent.yml": NO_FILE,
@@ -81,8 +82,10 @@ SENTENCES = {
     f"export --load-config {RUN}": "nothing to export is named: use --all, --whole, or --object with one of "
     "background, cup, box.",
     f"export --load-config {RUN} --all --object cup": "--all exports every object: leave --object out.",
-    f"export --load-config {RUN} --object cup --format stl": "there is no exporter 'stl': choose one of "
-    "compressed-ply, glb, html, obj, ply, ply-2dgs, sog, spz.",
+    f"export --load-config {RUN} --object cup --format step": "there is no exporter 'step': choose one of "
+    "3mf, compressed-ply, glb, html, obj, ply, ply-2dgs, sog, spz, stl.",
+    f"export --load-config {RUN} --object cup --format stl": "a stl file is in millimetres, but the size of the scene is "
+    'not known: give a length with --scale-by, such as "frame_0012:340,215 frame_0012:512,220 12 cm".',
     f"export --load-config {RUN} --object cup --frame moon": "there is no frame 'moon': choose one of world, object.",
     f"export --load-config {RUN} --object cup --format glb --resolution 0": "resolution is 0: give 8 to 4096 voxels "
     "along the longest side.",
@@ -114,7 +117,7 @@ SENTENCES = {
     "file or directory): name an existing file of that kind.",
     "bench file ablatoin --output {tmp}/bench": "there is no experiment 'ablatoin' (did you mean ablation?): "
     "choose one of ablation, base, classes, compare, compare-consistent, depth, improvements, masks, occupancy, "
-    "outlines, presets, sensitivity, tradeoff, or name a .toml file.",
+    "outlines, presets, sensitivity, time-to-quality, tradeoff, or name a .toml file.",
     # doctor
     "doctor --json {tmp}/file/x.json": "{tmp}/file/x.json cannot be written (File exists): choose another place.",
 }

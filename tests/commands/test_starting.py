@@ -27,7 +27,7 @@ AT_ONCE = {  # arguments: the beginning of the sentence
     f"masks reproject --load-config {RUN} --method voxle": "there is no reprojection 'voxle' (did you mean voxel?)",
     "extract --load-config {tmp}/absent.yml": "{tmp}/absent.yml cannot be read",
     "extract --load-config {tmp}/lab": "{tmp}/lab/config.yml cannot be read",
-    f"export --load-config {RUN} --all --format stl": "there is no exporter 'stl'",
+    f"export --load-config {RUN} --all --format step": "there is no exporter 'step'",
     "render --load-config {tmp}/notes.yml": "{tmp}/notes.yml is not a run of ns-train beags",
     f"render --load-config {RUN} --format sheets": "there is no format 'sheets' (did you mean sheet?)",
     "eval --load-config {tmp}/run {tmp}/notes.yml": "{tmp}/notes.yml is not a run of ns-train beags",
