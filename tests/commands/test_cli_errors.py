@@ -84,8 +84,8 @@ SENTENCES = {
     f"export --load-config {RUN} --all --object cup": "--all exports every object: leave --object out.",
     f"export --load-config {RUN} --object cup --format step": "there is no exporter 'step': choose one of "
     "3mf, compressed-ply, glb, html, obj, ply, ply-2dgs, sog, spz, stl.",
-    f"export --load-config {RUN} --object cup --format stl": "a stl file is in millimetres, but the size of the scene is "
-    'not known: give a length with --scale-by, such as "frame_0012:340,215 frame_0012:512,220 12 cm".',
+    f"export --load-config {RUN} --object cup --format stl": "a .stl file is in millimetres, but the size of the "
+    'scene is not known: give a length with --scale-by, such as "frame_0012:340,215 frame_0012:512,220 12 cm".',
     f"export --load-config {RUN} --object cup --frame moon": "there is no frame 'moon': choose one of world, object.",
     f"export --load-config {RUN} --object cup --format glb --resolution 0": "resolution is 0: give 8 to 4096 voxels "
     "along the longest side.",

@@ -78,7 +78,7 @@ def export_run(
     for name, exporter in exporters.items():
         if exporter.needs_metres and not pose.scale_by:
             raise UserError(
-                f"a {name} file is in millimetres, but the size of the scene is not known: give a length with "
+                f"a .{name} file is in millimetres, but the size of the scene is not known: give a length with "
                 '--scale-by, such as "frame_0012:340,215 frame_0012:512,220 12 cm".'
             )
     transform = read_transform(run)

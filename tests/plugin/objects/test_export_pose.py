@@ -95,7 +95,7 @@ def test_pixels_of_photos_give_the_scale(tmp_path):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["--format", "3mf"], "a 3mf file is in millimetres, but the size of the scene is not known"),
+        (["--format", "3mf"], "a .3mf file is in millimetres, but the size of the scene is not known"),
         (["--scale-by", "0,0,0 0,0,0 1 m"], "the two points of scale_by are the same"),
         (["--scale-by", "nowhere:1,1 v01:2,2 1 m"], "no photo is called 'nowhere': name one such as v0"),
         (["--scale-by", "v01:2,5000 v01:1,1 1 m"], "v01 has 20 x 12 pixels: 2,5000 is not one"),
