@@ -178,13 +178,16 @@ class Page:
         self.wait(lambda: self.evaluate(f"(() => {{ const t = {tab}; t?.click(); return Boolean(t); }})()"))
 
     def write(self, label: str, text: str) -> None:
-        """Write into the text field called ``label``."""
-        self._wait_for_control(label)
-        self.evaluate(
-            f"(() => {{ const e = {_labelled(label)};"
+        """Write into the text field beside ``label``, which names none by its id."""
+        found = f"[...document.querySelectorAll('label')].find(l => l.innerText.trim() == {json.dumps(label)})"
+        done = (
+            f"(() => {{ let e = {found}; while (e && !e.querySelector('input')) e = e.parentElement;"
+            " if (!e) return false; const input = e.querySelector('input');"
             " Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value')"
-            f".set.call(e, {json.dumps(text)}); e.dispatchEvent(new Event('input', {{bubbles: true}})); }})()"
+            f".set.call(input, {json.dumps(text)});"
+            " input.dispatchEvent(new Event('input', {bubbles: true})); return true; })()"
         )
+        self.wait(lambda: self.evaluate(done))
 
     def tick(self, label: str) -> None:
         """Tick or untick the box called ``label``, the first of that name."""

@@ -110,8 +110,9 @@ class PickWork:
         """Draw all objects into masks of the training views; see ``picked_masks.save_masks``."""
 
         def do() -> str:
-            viewing = self._viewing
-            members, names = self.picks.applied(viewing.model.members(), viewing.model.classes)
+            members, names = self._viewing.model.members(), self._viewing.model.classes
+            if self.picks.changed() or not any(members.present()):  # there may be objects of the run alone
+                members, names = self.picks.applied(members, names)
             self._report("Drawing masks of all training views ...")
             return " ".join(save_masks(self._run() / "config.yml", members, names))
 

@@ -212,6 +212,7 @@ def test_what_is_kept_is_the_runs_for_every_command(opened):
     press(tab, tab.work.keep, "Kept in")
     assert tab.work.picks.changed() == [] and "low (of the run)" in _options(tab, "low (of the run)")
     press(tab, tab.work.undo, "nothing to undo")
+    press(tab, tab.work.save_masks, "Saved")
     scene = read_run(config)
     assert scene.assigned and torch.equal(scene.members.of(1), low) and scene.classes[1] == "low"
     (extracted,) = extract_objects(config, ["low"])
