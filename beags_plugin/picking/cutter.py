@@ -91,11 +91,13 @@ class Cutter:
         excluded: Tensor | None = None,
         name: str = "the object",
         growth: float = 0.0,
+        part: bool = False,
     ) -> Tensor:
         """Return which Gaussians belong to the object, [N] bool on the CPU; the same whatever was solved before.
 
         excluded: [N] bool, Gaussians that do not, or None. name: of the object, for errors. growth: g; a larger one
-        takes the same Gaussians and more, a negative one fewer. Raises ``UserError`` if no mark lies on the object or
+        takes the same Gaussians and more, a negative one fewer. part: whether the object is not all of what is neither
+        excluded nor outside of a box. Raises ``UserError`` if no mark lies on the object or
         on a Gaussian, if marks contradict one another, or if all Gaussians belong to it.
         """
         if not any(inside for view in marks for inside in view.inside):
@@ -112,7 +114,7 @@ class Cutter:
             p[self._walker.potential(beside, inside, barred, np.zeros_like(behind)) > p] = 0.0
         ends = self._graph.first, self._graph.second
         weights = np.where(barred[ends[0]] | barred[ends[1]], 0.0, self._graph.weights)
-        level = self._walker.border_level(p, weights)
+        level = self._walker.border_level(p, weights, part)
         found = self._minimum(p, level, growth, weights, inside, beside | barred)
         if found.all():
             raise UserError(f"the cut of {name} takes the whole scene: mark points beside it, or draw a box about it.")

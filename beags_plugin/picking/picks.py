@@ -151,8 +151,8 @@ def _corrected(cutter: Cutter, one: Picked, others: Sequence[ViewMarks]) -> Tens
         flipped = [
             replace(mark, inside=tuple(not each for each in mark.inside), within=None) for mark in (*taking, *on)
         ]
-        part = f"what is taken from {one.name}"
-        members = members & ~cutter.solve(flipped, name=part, growth=-GROWTH * one.growth)
+        name = f"what is taken from {one.name}"
+        members = members & ~cutter.solve(flipped, ~members, name, -GROWTH * one.growth, part=True)
     elif not on and not bool((outside & members).any()):
         raise UserError(f"nothing of {one.name} is there: click on what shall be taken from it.")
     if on:
