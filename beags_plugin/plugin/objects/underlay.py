@@ -24,6 +24,7 @@ from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.whole_files import write_whole
 
 FADED = 0.35  # share of the photo in what lies around the object; the rest is grey
 GREY = 0.5
@@ -93,4 +94,4 @@ def _save(path: Path, picture: np.ndarray) -> None:
 
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(picture).save(path)
+        write_whole(path, lambda file: Image.fromarray(picture).save(file, format="PNG"))

@@ -14,7 +14,7 @@ from beags_plugin.picking.cutter import ViewMarks
 from beags_plugin.plugin.viewer.export import ShownFiles
 from beags_plugin.plugin.viewer.legend import LegendRow, escaped, legend, unique_labels
 from beags_plugin.plugin.viewer.pick_work import FIRST_COLOR, PickWork
-from beags_plugin.plugin.viewer.pointing import box_mark, click_mark
+from beags_plugin.plugin.viewer.pointing import box_mark, click_mark, page_camera
 from beags_plugin.plugin.viewer.serving import another_tab
 from beags_plugin.plugin.viewer.viewing import Viewing
 
@@ -73,14 +73,14 @@ class PickTab:
         self.refresh()
 
     def _listen(self) -> None:
-        self.picked.on_update(lambda _: self._choose(self.picked.value))
-        self.name.on_update(lambda _: self._rename(self.name.value))
+        self.picked.on_update(_by_user(lambda: self._choose(self.picked.value)))
+        self.name.on_update(_by_user(lambda: self._rename(self.name.value)))
         self.new.on_click(lambda _: self.work.change(lambda picks: picks.another()))
         self.clicks.on_update(lambda _: self.take_clicks(self.clicks.value))
         self.box.on_click(lambda _: self.take_box(not self._boxing))
         self.size.on_click(lambda event: self._grow({"Grow": 1, "Shrink": -1}[event.target.value]))
         self.undo.on_click(lambda _: self.work.undo())
-        self.alone.on_update(lambda _: self.work.show_alone(self.alone.value))
+        self.alone.on_update(_by_user(lambda: self.work.show_alone(self.alone.value)))
         self.export.on_click(lambda _: self.files.start())
         self.masks.on_click(lambda _: self.work.save_masks())
         self.keep.on_click(lambda _: self.work.keep())
@@ -104,7 +104,7 @@ class PickTab:
         """Mark what is under the cursor."""
         if self._boxing:
             return
-        inside, position, camera = not self.excludes.value, event.screen_pos, event.client.camera
+        inside, position, camera = not self.excludes.value, event.screen_pos, page_camera(event.client.camera)
         self._mark(lambda _: click_mark(position, camera, inside, self.work.drawn()))
 
     def take_box(self, wanted: bool) -> None:
@@ -122,7 +122,7 @@ class PickTab:
     def boxed(self, event: ScenePointerEvent) -> None:
         """Mark a box."""
         self.take_box(False)
-        inside, corners, camera = not self.excludes.value, event.screen_pos, event.client.camera
+        inside, corners, camera = not self.excludes.value, event.screen_pos, page_camera(event.client.camera)
 
         def mark(pointed: bool) -> ViewMarks:
             return box_mark(corners, camera, inside, self.work.drawn(), inside and not pointed)
@@ -199,3 +199,13 @@ class PickTab:
             with suppress(KeyError):
                 self._status.content = text
             self._text = text
+
+
+def _by_user(listener: Callable[[], None]) -> Callable[[Any], None]:
+    """Return a listener that leaves alone what the program itself has written to a control."""
+
+    def heard(event: Any) -> None:
+        if event.client_id is not None:
+            listener()
+
+    return heard

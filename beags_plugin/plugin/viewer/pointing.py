@@ -26,13 +26,12 @@ _DIAGONAL = 1000.0  # pixels of a page, whatever its size: marks are as large as
 _LEAST_SIDE = 0.01  # of the page: a smaller box was no box, but a click
 
 
-def click_mark(position: Sequence[float], camera: CameraHandle, inside: bool, drawn: Tensor | None) -> ViewMarks:
+def click_mark(position: Sequence[float], page: Camera, inside: bool, drawn: Tensor | None) -> ViewMarks:
     """Return the mark of a click on the object, or beside it.
 
-    position: (x, y) in 0..1 of the page; the ray that viser 0.2.7 sends with a click on a node is another. camera: of
-    the page. drawn: see ``ViewMarks``.
+    position: (x, y) in 0..1 of the page; the ray that viser 0.2.7 sends with a click on a node is another. page: see
+    ``page_camera``. drawn: see ``ViewMarks``.
     """
-    page = page_camera(camera)
     pixel = torch.tensor([position[0] * page.width, position[1] * page.height, 1.0], dtype=torch.float64)
     direction = page.rotation.double().T @ torch.linalg.solve(page.K.double(), pixel)
     pixels = 2 * round(MARK * _DIAGONAL) + 1
@@ -41,7 +40,7 @@ def click_mark(position: Sequence[float], camera: CameraHandle, inside: bool, dr
 
 
 def box_mark(
-    corners: Sequence[Sequence[float]], camera: CameraHandle, inside: bool, drawn: Tensor | None, pointing: bool
+    corners: Sequence[Sequence[float]], page: Camera, inside: bool, drawn: Tensor | None, pointing: bool
 ) -> ViewMarks:
     """Return the mark of a box outside of which, or (``inside`` False) within which nothing belongs to the object.
 
@@ -51,20 +50,19 @@ def box_mark(
     (left, right), (top, bottom) = (sorted(corner[axis] for corner in corners) for axis in (0, 1))
     if min(right - left, bottom - top) < _LEAST_SIDE:
         raise UserError("that was no box: press the button again, and drag over the picture.")
-    view = page_camera(camera)
-    column, row = np.arange(view.width) + 0.5, np.arange(view.height)[:, None] + 0.5
-    left, right, top, bottom = left * view.width, right * view.width, top * view.height, bottom * view.height
+    column, row = np.arange(page.width) + 0.5, np.arange(page.height)[:, None] + 0.5
+    left, right, top, bottom = left * page.width, right * page.width, top * page.height, bottom * page.height
     box = torch.from_numpy((column >= left) & (column <= right) & (row >= top) & (row <= bottom))
-    numbers = torch.full((view.height, view.width), IGNORE, dtype=torch.int32)
+    numbers = torch.full((page.height, page.width), IGNORE, dtype=torch.int32)
     if not pointing:
-        return ViewMarks(_NAME, view, numbers, (), box if inside else ~box, drawn=drawn)
+        return ViewMarks(_NAME, page, numbers, (), box if inside else ~box, drawn=drawn)
     x, y, radius = int((left + right) / 2), int((top + bottom) / 2), round(MARK * _DIAGONAL)
     numbers[max(y - radius, 0) : y + radius + 1, max(x - radius, 0) : x + radius + 1] = 0
-    return ViewMarks(_NAME, view, numbers, (True,), box, drawn=drawn)
+    return ViewMarks(_NAME, page, numbers, (True,), box, drawn=drawn)
 
 
 def page_camera(camera: CameraHandle) -> Camera:
-    """Return a page's camera in nerfstudio's world, for pictures of ``_DIAGONAL`` pixels."""
+    """Return a page's camera in nerfstudio's world as it is now, for pictures of ``_DIAGONAL`` pixels."""
     from viser.transforms import SO3
 
     height = max(1, round(_DIAGONAL / math.hypot(1.0, camera.aspect)))
