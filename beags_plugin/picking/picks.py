@@ -93,21 +93,23 @@ class Picks:
     def applied(self, members: Membership, names: Mapping[int, str]) -> tuple[Membership, dict[int, str]]:
         """Return the classes of N Gaussians once all is picked, and their names.
 
-        members, names: as before. New objects get new ids. What several of the picked ones hold is the last one's, and
-        what was taken from an object is the background's. Raises ``UserError`` if nothing was picked, and for a name
-        that is empty or another object's.
+        members, names: as before. New objects get new ids, or that of a class of their name without Gaussians. What
+        several of the picked ones hold is the last one's, and what was taken from an object is the background's. Raises
+        ``UserError`` if nothing was picked, and for a name that is empty or another object's.
         """
         changed = self.changed()
         if not changed:
             raise UserError("nothing has been picked yet: tick Click to pick, and click on an object.")
         given = {BACKGROUND: "background", **names}
+        there = {BACKGROUND, *members.present()}
         masks: dict[int, Tensor] = {}
         for one in changed:
             assert one.members is not None
-            class_id = max(given) + 1 if one.class_id is None else one.class_id
             name = one.name.strip()
             if not name or not name.isprintable():
                 raise UserError("an object has no name: give it one, of plain text on one line.")
+            free = [each for each, other in given.items() if other == name and each not in there | set(masks)]
+            class_id = (free or [max(given) + 1])[0] if one.class_id is None else one.class_id
             if name in (other for each, other in given.items() if each != class_id):
                 raise UserError(f"there are two objects called {name!r}: name one of them otherwise.")
             given[class_id] = name

@@ -22,9 +22,9 @@ class Picture:
     """config.yml of a run; a base will do."""
     output: Path = Path("docs/images/pick.jpg")
     """The file."""
-    click: tuple[int, int] = (420, 420)
+    click: tuple[int, int] = (655, 530)
     """Pixel of the window, across and down, on the object."""
-    name: str = "cup"
+    name: str = "cone"
     """What it is called."""
     width: int = 1280
     height: int = 900

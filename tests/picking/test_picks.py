@@ -122,6 +122,16 @@ def test_the_last_object_has_what_two_hold_and_shared_gaussians_are_known(scene)
     assert not members.of(7).any()
 
 
+def test_an_object_gets_the_id_that_the_masks_of_the_data_give_to_its_name(scene):
+    _, owner = scene
+    objects = tuple(
+        replace(Picks().chosen, name=n, marks=(on(LOW),), members=owner == i) for i, n in ((1, "a"), (2, "b"))
+    )
+    known = {0: "background", 3: "b", 4: "c"}
+    members, names = Picks(objects).applied(Membership(torch.zeros(len(owner), dtype=torch.int32)), known)
+    assert names == {**known, 5: "a"} and torch.equal(members.class_ids.long(), (owner == 1) * 5 + (owner == 2) * 3)
+
+
 @pytest.mark.parametrize(
     ("names", "message"), [(("a", "a"), "two objects called 'a'"), (("a", " "), "has no name"), (("cup", "a"), "cup")]
 )
@@ -129,6 +139,6 @@ def test_names_are_checked(scene, names, message):
     _, owner = scene
     objects = tuple(replace(Picks().chosen, name=name, marks=(on(LOW),), members=owner == 1) for name in names)
     with pytest.raises(UserError, match=message):
-        Picks(objects).applied(Membership(torch.zeros(len(owner), dtype=torch.int32)), {0: "background", 1: "cup"})
+        Picks(objects).applied(Membership((owner == 0).int()), {0: "background", 1: "cup"})
     with pytest.raises(UserError, match="nothing has been picked"):
         Picks().applied(Membership(torch.zeros(4, dtype=torch.int32)), {})

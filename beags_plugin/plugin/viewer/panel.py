@@ -124,7 +124,7 @@ class ObjectPanel(ViewerElement[None]):
         self.viewing.attach(run, viewer.trainer is not None, viewer.train_lock)
         self.viewing.wanted, self.viewing.crop_box = self._wanted, self._crop_box
         if viewer.trainer is None and self._server is not None:  # Gaussians that are trained have no fixed numbers
-            self.pick_tab = PickTab(self._server, self.viewing, lambda: self.labels, self._redraw)
+            self.pick_tab = PickTab(self._server, self.viewing, self._listed, self._redraw)
         if run.note is not None:
             self.note("run", run.note)
         offer_whole_pictures(viewer.control_panel)
@@ -293,6 +293,10 @@ class ObjectPanel(ViewerElement[None]):
             self.object.set_options(options)
             if former not in options:  # the first object, rather than the background
                 self.object.value = next((label for label in options if self.labels.get(label)), options[0])
+
+    def _listed(self) -> dict[str, int]:
+        self.refresh_objects()
+        return self.labels
 
     def note(self, about: str, text: str) -> None:
         """Show a note below the controls, in place of the last one about the same."""

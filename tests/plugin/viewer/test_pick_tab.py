@@ -237,8 +237,6 @@ def test_what_is_kept_is_the_runs_for_every_command(opened):
 def _options(tab, wanted: str) -> tuple[str, ...]:
     end = time.monotonic() + 60
     while wanted not in tab.picked.options:
-        tab.viewing.model.viewer_panel.refresh_objects()
-        tab.refresh()
         assert time.monotonic() < end, tab.picked.options
         time.sleep(0.05)
     return tab.picked.options
