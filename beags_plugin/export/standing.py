@@ -10,11 +10,7 @@ import torch
 from torch import Tensor
 
 _REACH = 0.5  # of the object's size: how far around its foot points count
-_BAND = (
-    0.5,
-    0.25,
-    0.1,
-)  # of the size: how far above or below the foot points count; each round knows up better
+_BAND = (0.5, 0.25, 0.1)  # of the size: how far from the foot points count, up or down; each round knows up better
 _FLAT = 0.01  # of the size: distance from the plane up to which a point lies on it
 _STEEPEST = 1.5  # rise of the plane against the former up direction: 56 degrees
 _FEWEST, _SHARE = 50, 0.2  # points on the plane, at least; and of those around the foot

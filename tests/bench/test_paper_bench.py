@@ -98,6 +98,19 @@ def test_truth_drawn_later_is_scored_without_training_again(finished, monkeypatc
     assert "Scoring anew" not in (run_paper(options) and printed(capsys))
 
 
+def test_a_drawing_that_is_refused_is_a_row_with_the_reason(finished, capsys):
+    options, before = finished
+    drawing = next((options.data_root / "llff/fern/ground_truth/silhouettes").rglob("*.png"))
+    kept = drawing.read_bytes()
+    drawing.write_bytes(b"no picture")
+    again = run_paper(options)
+    failed = [row.failed for row in again.rows if row.failed]
+    assert failed and all(str(drawing) in reason for reason in failed) and len(again.rows) == len(before.rows)
+    assert "failed: " in printed(capsys)
+    drawing.write_bytes(kept)
+    assert [row.figures for row in run_paper(options).rows] == [row.figures for row in before.rows]
+
+
 def test_the_plan_starts_nothing_and_knows_what_is_done(finished, tmp_path, monkeypatch, capsys):
     options, _ = finished
     monkeypatch.setattr(paper_run, "run_trials", None)

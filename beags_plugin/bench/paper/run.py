@@ -128,7 +128,11 @@ def _measured(runs: Sequence[VariantTrial], outcomes: Mapping[str, Outcome], fin
                 progress(done, len(changed))
                 outcome = outcomes[digest]
                 assert outcome.result is not None
-                figures = measure_run(outcome.folder / "run" / "config.yml")
+                try:
+                    figures = measure_run(outcome.folder / "run" / "config.yml")
+                except UserError as error:  # a drawing that is no mask: a row with the reason
+                    measured[digest] = dataclasses.replace(outcome, result=None, failed=str(error))
+                    continue
                 content = json.dumps({"truth": truth, "figures": figures})
                 write_text_atomically(content, outcome.folder / NEWLY_MEASURED)
                 measured[digest] = dataclasses.replace(outcome, result={**outcome.result, **figures})

@@ -92,22 +92,29 @@ def _place(point: Point, scene: SavedScene, manager: BeagsDataManager | None, wo
 
 def _pixel(point: PhotoPoint, manager: BeagsDataManager) -> tuple[Camera, float, float]:
     """Return the straight camera of a photo, and where the pixel of its file is in it (centres at + 0.5)."""
-    known = []
     datasets: dict[Split, BeagsDataset] = {"train": manager.train_dataset, "eval": manager.eval_dataset}
+    files: dict[Path, tuple[Split, int]] = {}  # without held-out photos, both splits have the same
     for split, dataset in datasets.items():
-        files = dataset.image_filenames
-        for index, name in enumerate(unique_names(files)):
-            known.append(name)
-            if point.view in (name, files[index].name):
-                width, height = image_size(files[index])
-                if not (-0.5 <= point.x < width - 0.5 and -0.5 <= point.y < height - 0.5):
-                    raise UserError(f"{point.view} has {width} x {height} pixels: {point.x:g},{point.y:g} is not one.")
-                share = torch.tensor([(point.x + 0.5) / width, (point.y + 0.5) / height], dtype=torch.float64)
-                camera, (x, y) = manager.straightened(share.numpy(), index, split)
-                if not (0 <= x < camera.width and 0 <= y < camera.height):
-                    raise UserError(
-                        f"{point.view}:{point.x:g},{point.y:g} lies outside of the photo without its lens distortion: "
-                        "choose another pixel of scale_by."
-                    )
-                return camera, x, y
-    raise UserError(f"no photo is called {point.view!r}{meant(point.view, known)}: name one such as {known[0]}.")
+        for index, file in enumerate(dataset.image_filenames):
+            files.setdefault(Path(file), (split, index))
+    by_name = dict(zip(unique_names(list(files)), files, strict=True))
+    same = [name for name, file in by_name.items() if file.name == point.view]
+    names = [point.view] if point.view in by_name else same
+    if not names:
+        known = list(by_name)
+        raise UserError(f"no photo is called {point.view!r}{meant(point.view, known)}: name one such as {known[0]}.")
+    if len(names) > 1:
+        raise UserError(f"{len(names)} photos are called {point.view!r}: name one of {', '.join(names)}.")
+    file = by_name[names[0]]
+    split, index = files[file]
+    width, height = image_size(file)
+    if not (-0.5 <= point.x < width - 0.5 and -0.5 <= point.y < height - 0.5):
+        raise UserError(f"{point.view} has {width} x {height} pixels: {point.x:g},{point.y:g} is not one.")
+    share = torch.tensor([(point.x + 0.5) / width, (point.y + 0.5) / height], dtype=torch.float64)
+    camera, (x, y) = manager.straightened(share.numpy(), index, split)
+    if not (0 <= x < camera.width and 0 <= y < camera.height):
+        raise UserError(
+            f"{point.view}:{point.x:g},{point.y:g} lies outside of the photo without its lens distortion: "
+            "choose another pixel of scale_by."
+        )
+    return camera, x, y

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,10 +19,13 @@ from beags_plugin.commands.cli import main
 from beags_plugin.core.membership import Membership
 from beags_plugin.export.base import Viewpoints
 from beags_plugin.export.frames import Frame
+from beags_plugin.export.pose_options import PhotoPoint
 from beags_plugin.extraction.ply import read_ply
 from beags_plugin.extraction.select import select_class
+from beags_plugin.plugin.objects.pose import _pixel
 from beags_plugin.plugin.runs.read import read_run, read_transform
 from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.system.errors import UserError
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +95,14 @@ def test_pixels_of_photos_give_the_scale(tmp_path):
     export(config, "--all", "--scale-by", f"{first} {second} 3 m", "--output", str(tmp_path / "out"))
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
     assert manifest["metres_per_world_unit"] == pytest.approx(3 / apart, rel=1e-4)
+
+
+def test_a_file_name_of_two_photos_is_refused():
+    files = [[Path("cam0/1.png"), Path("cam1/1.png")], [Path("cam2/2.png")]]
+    train, held_out = (SimpleNamespace(image_filenames=each) for each in files)
+    manager: Any = SimpleNamespace(train_dataset=train, eval_dataset=held_out)
+    with pytest.raises(UserError, match="2 photos are called '1.png': name one of cam0_1, cam1_1"):
+        _pixel(PhotoPoint("1.png", 0.0, 0.0), manager)
 
 
 @pytest.mark.parametrize(
