@@ -1,13 +1,15 @@
 """Whether the CUDA backend may serve where nobody asked for it by name: it must first agree with the torch reference.
 
 The first time that "auto" would take it on a machine, ``trial`` runs in a process of its own. What comes of it is kept
-for this build on these GPUs with this driver. If it differs, crashes or takes too long, everything runs without it.
+for this build on these GPUs with this driver. If it differs, crashes or takes too long, everything runs without it. A
+GPU whose memory others have filled is tried again by the next command.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -27,6 +29,8 @@ from beags_plugin.system.whole_files import write_text_atomically
 TRUST = "BEAGS_TRUST_CUDA"
 """Environment variable: with "1", the CUDA backend is taken without a trial."""
 
+_FULL = "out of memory"  # in what torch says of a GPU that others have filled
+_RAISED = re.compile(r"[\w.]+(Error|Exception)\b")
 _SECONDS = 180.0  # of a trial; most of it goes by while torch is imported and kernels are loaded
 _BACKEND = "beags_plugin.rasterizers.cuda:CudaRasterizer"
 _START = "import json, runpy, sys; sys.path[:] = json.loads(sys.argv.pop(1)); "
@@ -106,6 +110,8 @@ def verdict(contact: Contact, anew: bool = False, say: Callable[[str], None] | N
     began = time.monotonic()
     reason = try_in_child(contact.backend, contact.devices)
     found = Verdict(reason, contact.gpus, round(time.monotonic() - began, 1))
+    if _FULL in reason:
+        return found
     with suppress(OSError):  # a home that cannot be written to: the next command tries again
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text_atomically(json.dumps(asdict(found) | {"driver": contact.driver}, indent=2), path)
@@ -135,8 +141,9 @@ def try_in_child(backend: str, devices: Sequence[str], seconds: float = _SECONDS
             return f"drawing a small scene ended with {signal.Signals(-done.returncode).name}"
     lines = done.stdout.strip().splitlines()
     if done.returncode != 0 or not lines:
-        last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
-        return f"drawing a small scene failed ({last})"
+        said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+        raised = [line for line in said if _RAISED.match(line)]  # an exception's first line says what went wrong
+        return f"drawing a small scene failed ({(raised or said)[-1]})"
     try:
         return str(json.loads(lines[-1]))
     except ValueError:

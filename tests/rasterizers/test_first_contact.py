@@ -80,7 +80,8 @@ def test_a_child_that_agrees_and_one_that_differs():
 def test_a_child_that_crashes_or_fails():
     assert try_in_child("tried_backends:Crashes", ["cpu"]) == "drawing a small scene ended with SIGSEGV"
     reason = try_in_child("tried_backends:Raises", ["cpu"])
-    assert reason == "drawing a small scene failed (and more)"
+    illegal = "RuntimeError: CUDA error: an illegal memory access was encountered"
+    assert reason == f"drawing a small scene failed ({illegal})"
     assert "No module named 'no_such'" in try_in_child("no_such:Thing", ["cpu"])
     assert try_in_child("tried_backends:Chatters", ["cpu"]).endswith("ended without a result (Bye.)")
 
@@ -112,6 +113,13 @@ def test_a_bad_verdict_is_kept_too_and_renewed_when_the_build_changes():
     assert "image depth differs" in verdict(mended).reason  # the build is said to be the same
     assert verdict(replace(mended, build="2")).reason == ""
     assert verdict(mended, anew=True).reason == "" and verdict(mended).reason == ""
+
+
+def test_a_gpu_that_others_have_filled_is_tried_again():
+    full = contact("OutOfMemory")
+    assert "out of memory" in verdict(full).reason
+    assert not full.file().exists()
+    assert verdict(replace(full, backend="tried_backends:Agrees")).reason == ""
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"reason": "", "gpus": "X", "seconds": "soon"}'])

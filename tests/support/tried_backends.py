@@ -53,6 +53,11 @@ class Raises(NativeRasterizer):
         raise RuntimeError("CUDA error: an illegal memory access was encountered\nand more")
 
 
+class OutOfMemory(NativeRasterizer):
+    def rasterize(self, *args, **kwargs):
+        raise RuntimeError("CUDA error: out of memory\nFor debugging consider passing CUDA_LAUNCH_BLOCKING=1")
+
+
 class Chatters(NativeRasterizer):
     def __init__(self) -> None:
         super().__init__()

@@ -9,7 +9,6 @@ from pathlib import Path
 from beags_plugin.cleaning.silhouettes import MaskedViews
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, last_prepared, preparing_run
-from beags_plugin.plugin.runs.picked import PICKED_FILE
 from beags_plugin.plugin.runs.prepared import prepared_labels
 from beags_plugin.plugin.runs.read import SavedScene, data_of_run, raster_settings
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
@@ -57,7 +56,7 @@ def shown_scene(scene: SavedScene, config_path: Path) -> ShownScene:
     run = config_path.parent
     if (run / EXTRACTION_FILE).exists():
         raise Unshown("the run is part of a scene, which does not show what hides it")
-    if (run / PICKED_FILE).exists():
+    if scene.picked:
         raise Unshown("its objects were picked in the viewer, and the masks that the run has kept are of others")
     folder = last_prepared(preparing_run(run))
     if not (folder / "grid.pt").exists():

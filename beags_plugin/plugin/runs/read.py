@@ -30,12 +30,16 @@ from beags_plugin.system.reading.text import load_json, reason
 
 @dataclass(frozen=True)
 class SavedScene:
-    """A trained run on disk: config, model state (tensors by name), step and class names."""
+    """A trained run on disk: config, model state (tensors by name), step and class names.
+
+    picked: whether the classes are those picked in the viewer, not those that the run trained.
+    """
 
     config: BeagsTrainerConfig
     state: dict[str, Any]
     step: int
     classes: dict[int, str]
+    picked: bool = False
 
     def surfels(self) -> Surfels:
         """Return the scene's N Gaussians."""
@@ -64,8 +68,9 @@ def read_run(config_path: Path, data: Path | None = None) -> SavedScene:
     config = open_run(config_path, data)
     path = newest_checkpoint(config.get_checkpoint_dir())
     checkpoint = read_checkpoint(path)
-    state = with_picked(model_state(checkpoint, path), config_path.parent)
-    return SavedScene(config, state, checkpoint["step"], state["_extra_state"]["classes"])
+    trained = model_state(checkpoint, path)
+    state = with_picked(trained, config_path.parent)
+    return SavedScene(config, state, checkpoint["step"], state["_extra_state"]["classes"], state is not trained)
 
 
 def read_assigned_run(config_path: Path, data: Path | None = None) -> SavedScene:

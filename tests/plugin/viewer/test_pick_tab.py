@@ -214,7 +214,7 @@ def test_what_is_kept_is_the_runs_for_every_command(opened):
     press(tab, tab.work.undo, "nothing to undo")
     press(tab, tab.work.save_masks, "Saved")
     scene = read_run(config)
-    assert scene.assigned and torch.equal(scene.members.of(1), low) and scene.classes[1] == "low"
+    assert scene.picked and scene.assigned and torch.equal(scene.members.of(1), low) and scene.classes[1] == "low"
     (extracted,) = extract_objects(config, ["low"])
     (exported,) = export_run(config, ["low"], keep_all=True)
     assert 0 < extracted.gaussians <= exported.gaussians == int(low.sum())
@@ -226,7 +226,8 @@ def test_what_is_kept_is_the_runs_for_every_command(opened):
     content = torch.load(checkpoint, weights_only=False)
     content["pipeline"]["_model.gauss_params.means"] += 0.1
     torch.save(content, checkpoint)
-    assert not read_run(config).assigned, "another training has other Gaussians"
+    trained_on = read_run(config)
+    assert not trained_on.assigned and not trained_on.picked, "another training has other Gaussians"
     (run / PICKED_FILE).write_bytes(b"no file of torch")
     with pytest.raises(UserError, match=r"picked\.pt, what was picked in the viewer, is damaged"):
         read_run(config)
