@@ -22,7 +22,7 @@ class ExperimentOptions:
     downscale: float | None = None
     """Divide the image size of --data by this; chosen for a quick run if left out."""
     variants: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--methods"])] = ()
-    """Which of the experiment's variants to run, besides the one that it compares with; all if left out."""
+    """Which of the experiment's variants to run, besides the one that it compares with; "all", or left out: all."""
     quick: bool = False
     """Try the experiment out in a minute or two: tiny scenes, few steps, figures that mean nothing."""
     output: Path = Path("outputs/bench")

@@ -26,6 +26,7 @@ TABLE_WIDTH = 220  # a narrow terminal breaks the lines, which is better than ce
 QUICK_SAMPLE = {"width": 96, "height": 72, "num_train": 16, "num_test": 3}
 QUICK_BASE = {"base_steps": 220, "schedule_steps": 0, "densify.start": 50, "densify.stop": 180}
 QUICK_REFINE = {"refine_steps": 10}
+EVERY = "all"  # of --variants, where no variant is called that
 QUICK_MOST = 30  # steps of variants that say how many
 
 
@@ -89,8 +90,8 @@ def _other_masks(scene: TrialScene, variant: Variant, folder: Path) -> Path | No
 
 def adapted(experiment: Experiment, options: ExperimentOptions) -> Experiment:
     """Return the experiment with another preset or, for --quick, so small that its figures mean nothing."""
-    if options.variants:
-        known = [variant.name for variant in experiment.variants]
+    known = [variant.name for variant in experiment.variants]
+    if options.variants and (EVERY in known or EVERY not in options.variants):
         known += [name for name in dict.fromkeys(each.split(", ")[0] for each in known) if name not in known]
         for name in options.variants:
             check_choice(name, known, "variant", f" of {experiment.name}")

@@ -106,3 +106,11 @@ def test_quick_keeps_the_ends_of_sweeps_and_trains_a_few_steps(experiment):
     assert steps_of(trial) == 7 and steps_of(trial.base) < 300
     with pytest.raises(UserError, match="no preset 'beags-huge'"):
         adapted(experiment, ExperimentOptions(preset="beags-huge"))
+
+
+def test_all_names_every_variant_unless_one_is_called_that():
+    compared, ablation = load_experiment("compare"), load_experiment("ablation")
+    assert adapted(compared, ExperimentOptions(variants=("all",))).variants == compared.variants
+    assert adapted(compared, ExperimentOptions(variants=("flashsplat", "all"))).variants == compared.variants
+    chosen = adapted(ablation, ExperimentOptions(variants=("all",))).variants
+    assert [variant.name for variant in chosen] == ["assignment alone", "all"]
