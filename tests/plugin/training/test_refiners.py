@@ -39,6 +39,7 @@ UNTRAINED = {
     "none": {},
     "flashsplat": {"gamma": -0.9},
     "gaussiancut": {"num_edges": 3, "foreground_threshold": 0.6},
+    "dr-splat": {"top_k": 2},
 }
 OWN: dict[str, dict] = {
     "cob-gs": {"epochs": 6, "tau": 0.4, "threshold": 0.2},  # both objects claim some Gaussians
