@@ -25,6 +25,7 @@ REFINERS = Registry(
         "gaussian-grouping": "beags_plugin.refiners.gaussian_grouping:GaussianGroupingRefiner",
         "objectgs": "beags_plugin.refiners.objectgs:ObjectGsRefiner",
         "dr-splat": "beags_plugin.refiners.dr_splat:DrSplatRefiner",
+        "opengaussian": "beags_plugin.refiners.opengaussian:OpenGaussianRefiner",
     },
 )
 
