@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -66,8 +67,12 @@ def contributions(
     num_classes: int,
     progress: Callable[[int, int], None] | None = None,
     counts: bool = False,
+    largest: tuple[int, int] | None = None,
 ) -> Contributions:
     """Return C of the scene (E6), or with ``counts`` the numbers of pixels in place of the weights there.
+
+    largest: numbers ``most`` and ``within``, where of each pixel only the largest weights count; see
+    ``Rasterizer.sparse_top_contributions``.
 
     surfels: N Gaussians. labels: per camera [H, W] int32 class ids below ``num_classes`` or IGNORE, or None.
     Memory is linear in the (Gaussian, class) pairs that occur. Raises ``UserError`` for ids out of range.
@@ -76,6 +81,8 @@ def contributions(
     inputs = geometry_inputs(surfels)
     # float64, for thousands of small weights; sparse, as a table of all classes would be mostly zeros
     product = rasterizer.sparse_class_pixel_counts if counts else rasterizer.sparse_class_contributions
+    if largest is not None:
+        product = partial(rasterizer.sparse_top_contributions, most=largest[0], within=largest[1])
     total = SparseSums() if extension.supports(surfels.means) else TorchSparseSums(surfels.means.device)
 
     def of_view(index: int) -> tuple[Tensor, Tensor]:

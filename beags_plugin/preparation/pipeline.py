@@ -183,6 +183,7 @@ def prepare(
         config.depth,
         config.unseen,
         config.votes,
+        stage,
     )
     k = config.neighbours(cameras)
 

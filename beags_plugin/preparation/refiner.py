@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -14,7 +15,7 @@ from beags_plugin.core.densification import Densified
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.preparation.own_training import OwnTraining, TrainedScene
+from beags_plugin.preparation.own_training import OwnTraining, Stage, TrainedScene
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 
 Progress = Callable[[int, int], None]
@@ -30,7 +31,7 @@ class AssignedScene:
     objects: their ids, ascending, without the background.
     contributions: C of E6, of the base. scale: units of the run's frame per unit of the input poses'.
     depth: the depth of the surface: see ``rasterizers.rendering.surface_depth``.
-    unseen, votes: see ``PreparationConfig``.
+    unseen, votes: see ``PreparationConfig``. stage: opens a progress bar with a title.
     """
 
     surfels: Surfels
@@ -47,6 +48,7 @@ class AssignedScene:
     depth: str = "median"
     unseen: bool = False
     votes: bool = False
+    stage: Stage = lambda title: nullcontext()
 
 
 @dataclass(frozen=True)

@@ -154,6 +154,21 @@ class CudaRasterizer(KernelRasterizer):
         labels = check_image("labels", labels, camera)
         return TorchRasterizer().sparse_class_pixel_counts(inputs, camera, settings, labels, num_classes, min_weight)
 
+    def sparse_top_contributions(
+        self,
+        inputs: SurfelInputs,
+        camera: Camera,
+        settings: RasterSettings,
+        labels: Tensor,
+        num_classes: int,
+        most: int,
+        within: int,
+    ) -> tuple[Tensor, Tensor]:
+        """See ``Rasterizer.sparse_top_contributions``; there is no kernel: the torch reference sums, on the GPU."""
+        labels = check_image("labels", labels, camera)
+        what = (inputs, camera, settings, labels, num_classes, most, within)
+        return TorchRasterizer().sparse_top_contributions(*what)
+
     @torch.no_grad()
     def class_map(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int

@@ -37,6 +37,9 @@ class DeviceDispatchRasterizer(Rasterizer):
     def sparse_class_pixel_counts(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor]:
         return self._backend(inputs).sparse_class_pixel_counts(inputs, *args, **kwargs)
 
+    def sparse_top_contributions(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor]:
+        return self._backend(inputs).sparse_top_contributions(inputs, *args, **kwargs)
+
     def class_map(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor]:
         return self._backend(inputs).class_map(inputs, *args, **kwargs)
 

@@ -191,6 +191,23 @@ class Rasterizer(ABC):
         """
 
     @abstractmethod
+    def sparse_top_contributions(
+        self,
+        inputs: SurfelInputs,
+        camera: Camera,
+        settings: RasterSettings,
+        labels: Tensor,  # [H, W] int32 class ids, or IGNORE
+        num_classes: int,
+        most: int,
+        within: int,
+    ) -> tuple[Tensor, Tensor]:
+        """Return ``sparse_class_contributions`` where of each pixel only the ``most`` largest w_i count.
+
+        They are chosen, of equal ones the nearer, among the first ``within`` (at least 1, as ``most``) that the pixel
+        has. No gradient.
+        """
+
+    @abstractmethod
     def class_map(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
     ) -> tuple[Tensor, Tensor]:

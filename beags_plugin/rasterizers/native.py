@@ -139,6 +139,24 @@ class NativeRasterizer(KernelRasterizer):
         return keys, counts.int()
 
     @torch.no_grad()
+    def sparse_top_contributions(
+        self,
+        inputs: SurfelInputs,
+        camera: Camera,
+        settings: RasterSettings,
+        labels: Tensor,
+        num_classes: int,
+        most: int,
+        within: int,
+    ) -> tuple[Tensor, Tensor]:
+        """See ``Rasterizer.sparse_top_contributions``."""
+        inputs = inputs.checked().detached()
+        labels = check_image("labels", labels, camera)
+        frame, _ = _frame(inputs, camera, settings)
+        found = frame.sparse_top_contributions(labels, num_classes, most, within, extension.threads())
+        return _listed(found, inputs.means)
+
+    @torch.no_grad()
     def class_map(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
     ) -> tuple[Tensor, Tensor]:

@@ -112,6 +112,26 @@ class TorchRasterizer(Rasterizer):
         keys, counts = sparse_table(table, labels, num_classes)
         return keys, counts.int()
 
+    def sparse_top_contributions(
+        self,
+        inputs: SurfelInputs,
+        camera: Camera,
+        settings: RasterSettings,
+        labels: Tensor,
+        num_classes: int,
+        most: int,
+        within: int,
+    ) -> tuple[Tensor, Tensor]:
+        def largest(weights: Tensor) -> Tensor:
+            first = torch.where((weights > 0).cumsum(dim=-1) <= within, weights, torch.zeros_like(weights))
+            rank = first.sort(dim=-1, descending=True, stable=True).indices.argsort(dim=-1)  # of equals, the nearer
+            return torch.where(rank < most, first, torch.zeros_like(first))
+
+        def table(slots: Tensor, count: int) -> Tensor:
+            return self._class_sums(inputs, camera, settings, slots, count, largest)
+
+        return sparse_table(table, labels, num_classes)
+
     @torch.no_grad()
     def _class_sums(
         self,

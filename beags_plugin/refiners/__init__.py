@@ -24,6 +24,8 @@ REFINERS = Registry(
         "gaussiancut": "beags_plugin.refiners.gaussiancut:GaussianCutRefiner",
         "gaussian-grouping": "beags_plugin.refiners.gaussian_grouping:GaussianGroupingRefiner",
         "objectgs": "beags_plugin.refiners.objectgs:ObjectGsRefiner",
+        "dr-splat": "beags_plugin.refiners.dr_splat:DrSplatRefiner",
+        "opengaussian": "beags_plugin.refiners.opengaussian:OpenGaussianRefiner",
     },
 )
 

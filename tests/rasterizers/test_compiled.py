@@ -137,6 +137,11 @@ def test_products_are_the_references(compiled, name):
             each.sparse_class_pixel_counts(*what, scene.target, CLASSES, least) for each in (compiled, expected)
         )
         assert all(torch.equal(*pair) for pair in zip(found, true, strict=True))
+    for most in (2, 45):
+        found, true = (
+            each.sparse_top_contributions(*what, scene.target, CLASSES, most, 9) for each in (compiled, expected)
+        )
+        assert torch.equal(found[0], true[0]) and error(found[1], true[1]) < 1e-9
     assert torch.equal(compiled.dominant_gaussian(*what), expected.dominant_gaussian(*what))
     (classes, share), (true_classes, true_share) = (each.class_map(*what, CLASSES) for each in (compiled, expected))
     assert torch.equal(classes, true_classes)

@@ -56,6 +56,7 @@ def test_any_number_of_threads_gives_the_same_bits(dtype, threads):
         results += [backend.class_contributions(*products, scene.target, CLASSES), backend.dominant_gaussian(*products)]
         results += list(backend.class_map(*products, CLASSES))
         results += backend.sparse_class_pixel_counts(*products, scene.target, CLASSES, 0.1)
+        results += backend.sparse_top_contributions(*products, scene.target, CLASSES, 3, 100)
         runs.append(results)
     for other in runs[1:]:
         assert all(torch.equal(a, b) for a, b in zip(runs[0], other, strict=True))

@@ -64,6 +64,7 @@ def draw():
         tables += NativeRasterizer().sparse_class_contributions(*what)
         for least in (0.0, 0.1):
             tables += NativeRasterizer().sparse_class_pixel_counts(*what, least)
+        tables += NativeRasterizer().sparse_top_contributions(*what, 3, 100)
         results.append([image.detach() for image in images] + list(grads) + tables)
     return results
 

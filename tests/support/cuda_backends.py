@@ -77,6 +77,11 @@ class CudaOnCpuTensors(Rasterizer):
         keys, counts = self.cuda.sparse_class_pixel_counts(*what)
         return keys.cpu(), counts.cpu()
 
+    def sparse_top_contributions(self, inputs, camera, settings, labels, num_classes, most, within):
+        what = (_to_gpu(inputs), camera, settings, labels.cuda(), num_classes, most, within)
+        keys, sums = self.cuda.sparse_top_contributions(*what)
+        return keys.cpu(), sums.cpu()
+
     def class_map(self, inputs, camera, settings, num_classes):
         classes, share = self.cuda.class_map(_to_gpu(inputs), camera, settings, num_classes)
         return classes.cpu(), share.cpu()

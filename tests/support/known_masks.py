@@ -38,6 +38,9 @@ class Squares(Rasterizer):
     def sparse_class_pixel_counts(self, inputs, camera, settings, labels, num_classes, min_weight=0.0):
         raise NotImplementedError
 
+    def sparse_top_contributions(self, inputs, camera, settings, labels, num_classes, most, within):
+        raise NotImplementedError
+
     def class_map(self, inputs, camera, settings, num_classes):
         raise NotImplementedError
 

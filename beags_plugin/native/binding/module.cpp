@@ -116,6 +116,13 @@ void bind(nb::module_& m, const char* name) {
           },
           "labels"_a, "num_classes"_a, "min_weight"_a, "threads"_a)
       .def(
+          "sparse_top_contributions",
+          [](const Frame<T>& self, Ids labels, int num_classes, int most, int within, int threads) {
+            nb::gil_scoped_release release;
+            return self.sparse_top_contributions(labels.data(), num_classes, most, within, threads);
+          },
+          "labels"_a, "num_classes"_a, "most"_a, "within"_a, "threads"_a)
+      .def(
           "class_map",
           [](const Frame<T>& self, int num_classes, Array<int32_t> classes, Out share, int threads) {
             nb::gil_scoped_release release;

@@ -64,6 +64,9 @@ class Frame {
   Contributions<T> sparse_class_contributions(const int32_t* labels, int num_classes, int threads) const;
   // Counts pixels of w > min_weight in place of summing w; exact up to 2^24.
   Contributions<T> sparse_class_pixel_counts(const int32_t* labels, int num_classes, T min_weight, int threads) const;
+  // Sums of each pixel only the `most` largest w, of equal ones the nearer, of the first `within` that it has.
+  Contributions<T> sparse_top_contributions(const int32_t* labels, int num_classes, int most, int within,
+                                            int threads) const;
   // Finds each pixel's class. classes, share: [height, width]. Class ids lie in 0 .. num_classes - 1.
   void class_map(int num_classes, int32_t* classes, T* share, int threads) const;
   // Renders the sums of w by class, [height, width, num_classes], zero on entry. keep: for its backward.
@@ -89,8 +92,9 @@ class Frame {
     std::vector<int64_t> row_of;   // [records], where the sums of a record start, in the order of its tile's labels
     std::vector<int32_t> tile_of;  // [records]
   };
-  // min_weight: null for sums of w, else what the counted pixels exceed.
-  LabelSums label_sums(const int32_t* labels, int num_classes, const T* min_weight, int threads) const;
+  // query: what the kernel needs beside labels and sums.
+  LabelSums label_sums(const int32_t* labels, int num_classes, void (*kernel)(const Job<T>&, const Query<T>&, int),
+                       Query<T> query, int threads) const;
   Contributions<T> sparse(const LabelSums& found, int num_classes, int threads) const;
   // Calls work(query, tile) for every tile; the query numbers the classes of its Gaussians and has zeros to sum into.
   template <class Work>

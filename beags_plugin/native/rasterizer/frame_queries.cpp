@@ -8,7 +8,8 @@
 namespace beags {
 
 template <class T>
-typename Frame<T>::LabelSums Frame<T>::label_sums(const int32_t* labels, int num_classes, const T* min_weight,
+typename Frame<T>::LabelSums Frame<T>::label_sums(const int32_t* labels, int num_classes,
+                                                  void (*kernel)(const Job<T>&, const Query<T>&, int), Query<T> query,
                                                   int threads) const {
   LabelSums found;
   // Numbers each tile's labels 0, 1, ..: a tile rarely has more than a few.
@@ -35,14 +36,11 @@ typename Frame<T>::LabelSums Frame<T>::label_sums(const int32_t* labels, int num
     slot_start[tile + 1] = slot_start[tile] + (bins_.tile_start[tile + 1] - bins_.tile_start[tile]) * num_slots[tile];
   }
   found.sums.assign(slot_start[tiles()], T(0));
-  Query<T> query{};
   query.slots = slots.data();
   query.num_slots = num_slots.data();
   query.slot_start = slot_start.data();
   query.sums = found.sums.data();
   const Job<T> job = this->job();
-  if (min_weight) query.min_weight = *min_weight;
-  const auto kernel = min_weight ? kernels<T>().class_pixel_counts : kernels<T>().class_contributions;
   for_each_tile(threads, [&](int tile) { kernel(job, query, tile); });
 
   found.row_of.resize(num_pairs());
@@ -59,7 +57,7 @@ typename Frame<T>::LabelSums Frame<T>::label_sums(const int32_t* labels, int num
 
 template <class T>
 void Frame<T>::class_contributions(const int32_t* labels, int num_classes, T* out, int threads) const {
-  const LabelSums found = label_sums(labels, num_classes, nullptr, threads);
+  const LabelSums found = label_sums(labels, num_classes, kernels<T>().class_contributions, {}, threads);
   const int team = num_surfels_ < kTeamSurfels ? 1 : threads;
   // Determinism: one thread sums each Gaussian's records, in the order of their tiles.
 #pragma omp parallel for num_threads(team) schedule(dynamic, kChunk)
@@ -73,13 +71,24 @@ void Frame<T>::class_contributions(const int32_t* labels, int num_classes, T* ou
 
 template <class T>
 Contributions<T> Frame<T>::sparse_class_contributions(const int32_t* labels, int num_classes, int threads) const {
-  return sparse(label_sums(labels, num_classes, nullptr, threads), num_classes, threads);
+  return sparse(label_sums(labels, num_classes, kernels<T>().class_contributions, {}, threads), num_classes, threads);
 }
 
 template <class T>
 Contributions<T> Frame<T>::sparse_class_pixel_counts(const int32_t* labels, int num_classes, T min_weight,
                                                      int threads) const {
-  return sparse(label_sums(labels, num_classes, &min_weight, threads), num_classes, threads);
+  Query<T> query{};
+  query.min_weight = min_weight;
+  return sparse(label_sums(labels, num_classes, kernels<T>().class_pixel_counts, query, threads), num_classes, threads);
+}
+
+template <class T>
+Contributions<T> Frame<T>::sparse_top_contributions(const int32_t* labels, int num_classes, int most, int within,
+                                                    int threads) const {
+  Query<T> query{};
+  query.most = most;
+  query.within = within;
+  return sparse(label_sums(labels, num_classes, kernels<T>().top_contributions, query, threads), num_classes, threads);
 }
 
 template <class T>

@@ -37,6 +37,7 @@ constexpr Kernels<T> make_kernels() {
           backward_colors<true, T>,
           class_sums<false, T>,
           class_sums<true, T>,
+          top_contributions<T>,
           class_map<T>,
           class_channels<T>,
           class_channels_backward<T>,

@@ -136,6 +136,7 @@ struct Query {
   const int64_t* slot_start;  // [tiles] into sums
   T* sums;                    // of tile t: [pairs of t, num_slots[t]]
   T min_weight;               // class_pixel_counts: pixels of larger w count
+  int most, within;           // top_contributions: the most w of a pixel that count, of its first ones
   int32_t* classes;           // class_map, dominant_gaussian: [height, width]
   T* share;                   // class_map: [height, width]
   T* channels;                // class_channels: [height, width, num_channels]
@@ -164,6 +165,7 @@ struct Kernels {
   void (*backward_features)(const Job<T>&, int tile);  // towards the features alone
   void (*class_contributions)(const Job<T>&, const Query<T>&, int tile);
   void (*class_pixel_counts)(const Job<T>&, const Query<T>&, int tile);
+  void (*top_contributions)(const Job<T>&, const Query<T>&, int tile);
   void (*class_map)(const Job<T>&, const Query<T>&, int tile);
   void (*class_channels)(const Job<T>&, const Query<T>&, int tile);
   void (*class_channels_backward)(const Job<T>&, const Query<T>&, int tile);

@@ -1,0 +1,247 @@
+"""OpenGaussian: features of Gaussians that agree within the masks of a view, and codebooks of them.
+
+Wu et al., "OpenGaussian: Towards Point-Level 3D Gaussian-based Open Vocabulary Understanding", NeurIPS 2024. A feature
+f_i [6] is drawn as phi(f) = (f / |f| + 1) / 2, F(u) = sum_i w_i phi(f_i), with A(u) = sum_i w_i. In a view with the
+masks P_1 .. P_n, the background's among them, and the means mu_m of F over the pixels of P_m where A > 0.7,
+
+    cohesion    = mean over m of the mean over P_m of |F(u) - mu_m|,
+    separation  = sum over a != b of w_ab / (1 + |mu_a - mu_b|^2) / (n (n - 1)),   w_ab = 0.1 + 0.9 rank / (n - 1),
+
+rank being the place of b among the others of a, the nearest last. Codebooks are k-means of f and positions, then of f
+within a cluster. A Gaussian drawn with the feature q of its centre leaves the gradient by q to f.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import embedding, pad
+
+from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.losses.reduction import grouped_sums, ordered_sum
+
+CHANNELS = 6
+SOLID = 0.7  # alpha above which a pixel shows something
+LEAST_WEIGHT = 0.1  # of a pair of masks
+LLOYD_STEPS = 5
+MAX_VARIANCE = 0.006  # of drawn features within a mask whose mean can be trusted
+LARGE_AREA = 0.8  # of the largest mask of the view: such masks are trusted whatever their variance
+MATCH_SCORE = 0.2  # that a mask must exceed to name a leaf
+
+
+def drawn_form(features: Tensor) -> Tensor:
+    """Return phi(f) [N, 6] in 0..1; that of 0 is 1/2."""
+    return (features / _length(features) + 1.0) / 2.0
+
+
+def _length(rows: Tensor) -> Tensor:
+    """Return [.., 1], whose gradient at 0 is 0."""
+    return rows.square().sum(dim=-1, keepdim=True).clamp_min(1e-24).sqrt()
+
+
+@dataclass(frozen=True)
+class MaskedPixels:
+    """The masks of one view, of P pixels: n of them, one for each class that it shows.
+
+    classes: [n] int64, ranks, ascending. places: [P] int64, of each pixel the mask, or n where there is none.
+    areas: [n] int64.
+    """
+
+    classes: Tensor
+    places: Tensor
+    areas: Tensor
+
+    @classmethod
+    def of(cls, ranks: Tensor) -> MaskedPixels:
+        """Return those of a map [H, W] int of ranks, or IGNORE, which is no mask."""
+        flat = ranks.reshape(-1).long()
+        flat = flat.masked_fill(flat == IGNORE, -1) + 1
+        counts = torch.bincount(flat, minlength=1)[1:]
+        classes = counts.nonzero()[:, 0]
+        place = counts.new_full((len(counts) + 1,), len(classes))
+        place[classes + 1] = torch.arange(len(classes), device=flat.device)
+        return cls(classes, place[flat], counts[classes])
+
+    def __len__(self) -> int:
+        return len(self.classes)
+
+    @property
+    def labelled(self) -> Tensor:
+        """Return [P] bool."""
+        return self.places < len(self)
+
+    def sums(self, rows: Tensor) -> Tensor:
+        """Return [n, C], the sums over each mask of values [P, C]; differentiable."""
+        return grouped_sums(rows, self.places, len(self) + 1)[:-1]
+
+    def spread(self, values: Tensor) -> Tensor:
+        """Return [P, C], of each pixel the value [n, C] of its mask, 0 where there is none; differentiable."""
+        return embedding(self.places, pad(values, (0, 0, 0, 1)))
+
+    def means(self, rows: Tensor, chosen: Tensor | None = None) -> Tensor:
+        """Return [n, C], the mean over each mask of values [P, C], where ``chosen`` [P] bool; 0 of no pixel."""
+        if chosen is None:
+            return self.sums(rows) / self.areas[:, None]
+        weights = chosen.to(rows.dtype)[:, None]
+        return self.sums(rows * weights) / self.sums(weights).clamp_min(1.0)
+
+
+def cohesion(drawn: Tensor, means: Tensor, masks: MaskedPixels) -> Tensor:
+    """Return the mean over masks of the mean distance of their pixels [P, 6] from the mask's mean [n, 6]."""
+    distances = _length(drawn - masks.spread(means))[:, 0]
+    shares = pad(1.0 / masks.areas.to(drawn.dtype), (0, 1))[masks.places]
+    return ordered_sum(distances * shares) / max(len(masks), 1)
+
+
+def separation(means: Tensor, late: bool = False) -> Tensor:
+    """Return how near the means [n, C] of different masks are, 0 of a single one.
+
+    late: in the second half of the training weights below 0.9 become 0.1.
+    """
+    count = len(means)
+    if count < 2:
+        return ordered_sum(means) * 0.0
+    inverse = 1.0 / (1.0 + (means[:, None] - means).square().sum(dim=-1))
+    ranked = inverse.detach().clone().fill_diagonal_(0.0)
+    ranks = ranked.argsort(dim=1, stable=True).argsort(dim=1)
+    weights = LEAST_WEIGHT + (1.0 - LEAST_WEIGHT) * ranks / (count - 1)
+    if late:
+        weights = torch.where(weights < 0.9, LEAST_WEIGHT, weights)
+    return ordered_sum(weights.fill_diagonal_(0.0) * inverse) / (count * (count - 1))
+
+
+@dataclass(frozen=True)
+class PseudoMasks:
+    """The masks of all views as pseudo labels: M of them.
+
+    views, classes: [M] int64, the classes as ranks. means: [M, 6], of drawn features. kept: [M] bool, whether these
+    agree within the mask, or it is large.
+    """
+
+    views: Tensor
+    classes: Tensor
+    means: Tensor
+    kept: Tensor
+
+    @classmethod
+    def none(cls, like: Tensor) -> PseudoMasks:
+        """Return those of no view; like: features."""
+        nothing = torch.zeros(0, dtype=torch.int64, device=like.device)
+        return cls(nothing, nothing, like.new_zeros(0, CHANNELS), nothing.bool())
+
+    @classmethod
+    def of_view(cls, view: int, drawn: Tensor, masks: MaskedPixels) -> PseudoMasks:
+        """Return those of one view; drawn: [P, 6], F."""
+        means = masks.means(drawn)
+        variance = masks.means((drawn - masks.spread(means)).square()).mean(dim=1)
+        large = masks.areas > LARGE_AREA * masks.areas.max() if len(masks) else masks.areas > 0
+        return cls(torch.full_like(masks.classes, view), masks.classes, means, (variance <= MAX_VARIANCE) | large)
+
+    @classmethod
+    def joined(cls, parts: list[PseudoMasks]) -> PseudoMasks:
+        """Return those of all views."""
+        return cls(*(torch.cat(values) for values in zip(*(vars(part).values() for part in parts), strict=True)))
+
+    def of(self, view: int) -> PseudoMasks:
+        """Return those of one view, in the order of ``MaskedPixels``."""
+        own = self.views == view
+        return PseudoMasks(*(values[own] for values in vars(self).values()))
+
+
+def label_loss(
+    drawn: Tensor,
+    alpha: Tensor,
+    masks: MaskedPixels,
+    labels: PseudoMasks,
+    squared: bool = False,
+    exclude_dropped: bool = False,
+) -> Tensor:
+    """Return the mean over labelled solid pixels of |F - G|_1, G being the mean of the pixel's mask, or 0 if dropped.
+
+    drawn: [P, 6]. alpha: [P]. squared: of |F - G|^2 instead. exclude_dropped: pixels of dropped masks do not count.
+    """
+    difference = drawn - masks.spread(labels.means * labels.kept[:, None])
+    distances = (difference.square() if squared else difference.abs()).sum(dim=1)
+    counted = (alpha > SOLID) & masks.labelled
+    if exclude_dropped:
+        counted &= pad(labels.kept, (0, 1))[masks.places]
+    return ordered_sum(distances * counted) / counted.sum().clamp_min(1)
+
+
+def straight_through(features: Tensor, centres: Tensor) -> Tensor:
+    """Return the centres [N, 6] of features [N, 6], which get the gradient by them as it is."""
+    return centres.detach() + (features - features.detach())
+
+
+def nearest_centres(vectors: Tensor, centres: Tensor) -> Tensor:
+    """Return [N] int64, of each vector [N, D] the nearest of centres [k, D]."""
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
+
+    cloud = torch.nan_to_num(vectors.detach().cpu().double(), nan=0.0, posinf=0.0, neginf=0.0).numpy()
+    tree = cKDTree(centres.cpu().double().numpy())
+    return torch.from_numpy(tree.query(cloud, workers=torch.get_num_threads())[1]).long().to(vectors.device)
+
+
+def lloyd(vectors: Tensor, centres: Tensor, steps: int = LLOYD_STEPS) -> tuple[Tensor, Tensor]:
+    """Return centres [k, D] after steps of k-means from ``centres``, and the nearest of each vector, [N] int64.
+
+    A centre that no vector is nearest to becomes 0, as in the source.
+    """
+    for _ in range(steps):
+        ids = nearest_centres(vectors, centres)
+        counts = torch.bincount(ids, minlength=len(centres)).clamp_min(1)
+        centres = grouped_sums(torch.nan_to_num(vectors), ids, len(centres)) / counts[:, None]
+    return centres, nearest_centres(vectors, centres)
+
+
+def first_centres(vectors: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Return [count, D], vectors [N, D] drawn without replacement, and zeros where there are fewer."""
+    chosen = torch.randperm(len(vectors), generator=generator)[:count].to(vectors.device)
+    return pad(vectors[chosen], (0, 0, 0, count - len(chosen)))
+
+
+def fine_clusters(drawn: Tensor, silhouette: Tensor, masks: MaskedPixels, labels: PseudoMasks, most: int = 10) -> int:
+    """Return how many pseudo masks of a view a cluster, drawn alone, shows: see ``opengaussian``.
+
+    drawn: [P, 6]. silhouette: [P] bool. Masks count that it covers by more than a fifth and whose means are like its
+    own over the common pixels.
+    """
+    covered = masks.sums(silhouette.to(drawn.dtype)[:, None])[:, 0] / masks.areas
+    difference = masks.means(drawn, silhouette) - labels.means
+    alike = (difference.abs().sum(dim=1) < 0.9) & (difference.square().sum(dim=1) < 0.25)
+    return min(int((labels.kept & (covered > 0.2) & alike).sum()), most)
+
+
+def matched_mask(drawn: Tensor, silhouette: Tensor, masks: MaskedPixels, labels: PseudoMasks) -> int | None:
+    """Return the place of the pseudo mask that a leaf, drawn alone, shows best, or None.
+
+    The score is IoU (1 - |mean F over the silhouette - mean of the mask|_1). drawn: [P, 6]. silhouette: [P] bool.
+    """
+    area = silhouette.sum()
+    if not len(masks) or area == 0:
+        return None
+    common = masks.sums(silhouette.to(torch.float64)[:, None])[:, 0]
+    mean = grouped_sums(drawn, (~silhouette).long(), 2)[0] / area
+    likeness = 1.0 - (mean - labels.means).abs().sum(dim=1).double()
+    scores = (common / (area + masks.areas - common) * likeness).masked_fill(~labels.kept, 0.0)
+    best = int(scores.argmax())
+    return best if float(scores[best]) > MATCH_SCORE else None
+
+
+def inliers(points: Tensor, factor: float = 1.0) -> Tensor:
+    """Return [n] bool: the mean squared distance from the nearest K = floor(sqrt(n)) is not far above the others'.
+
+    points: [n, 3]. Bound: mean plus ``factor`` times the standard deviation of all these distances. A point is the
+    nearest of itself.
+    """
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
+
+    if len(points) < 2:
+        return torch.ones(len(points), dtype=torch.bool, device=points.device)
+    cloud = torch.nan_to_num(points.detach().cpu().double(), nan=0.0, posinf=0.0, neginf=0.0).numpy()
+    wanted = list(range(1, int(len(cloud) ** 0.5) + 1))
+    squares = cKDTree(cloud).query(cloud, k=wanted, workers=torch.get_num_threads())[0] ** 2
+    inside = squares.mean(axis=1) <= squares.mean() + factor * squares.std()
+    return torch.from_numpy(inside).to(points.device)
