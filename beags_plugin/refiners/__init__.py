@@ -24,6 +24,7 @@ REFINERS = Registry(
         "gaussiancut": "beags_plugin.refiners.gaussiancut:GaussianCutRefiner",
         "gaussian-grouping": "beags_plugin.refiners.gaussian_grouping:GaussianGroupingRefiner",
         "objectgs": "beags_plugin.refiners.objectgs:ObjectGsRefiner",
+        "sagd": "beags_plugin.refiners.sagd:SagdRefiner",
     },
 )
 
