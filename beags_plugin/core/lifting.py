@@ -7,6 +7,8 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 
+MARGIN = 1.3
+
 
 def pixel_rays(camera: Camera, like: Tensor) -> Tensor:
     """Return camera-space points at depth 1 under the pixel centres: K^-1 (i + 0.5, j + 0.5, 1).
@@ -43,6 +45,35 @@ def project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     homogeneous = _times(in_camera, camera.K.to(points).T)
     z = in_camera[..., 2]
     return homogeneous[..., :2] / z[..., None], z
+
+
+def pixels_under(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+    """Return which points lie in the picture and in front of the camera, and in which pixels.
+
+    points: [P, 3] float. Returns three of [S] int64: places among the points, ascending, rows and columns of pixels.
+    """
+    xy, z = project(points, camera)
+    inside = (z > 0) & (xy >= 0).all(dim=-1) & (xy[:, 0] < camera.width) & (xy[:, 1] < camera.height)
+    places = inside.nonzero()[:, 0]
+    column, row = xy[places].long().unbind(dim=-1)
+    return places, row, column
+
+
+def project_directions(directions: Tensor, points: Tensor, camera: Camera) -> Tensor:
+    """Return J W d: the pixels, [P, 2], by which a point moves per step along a direction, to first order.
+
+    As in splatting of 3D Gaussians, J is that of the nearest point within ``MARGIN`` of the picture's half width and
+    height, lest it grow without bound.
+
+    directions, points: [P, 3] float, points in front of the camera.
+    """
+    W, K = camera.rotation.to(points).T, camera.K.to(points)
+    x, y, z = (_times(points, W) + camera.translation.to(points)).unbind(-1)
+    dx, dy, dz = _times(directions, W).unbind(-1)
+    reach_x, reach_y = (MARGIN * size / (2 * float(K[k, k])) for k, size in enumerate((camera.width, camera.height)))
+    moved_x = (dx - (x / z).clamp(-reach_x, reach_x) * dz) / z
+    moved_y = (dy - (y / z).clamp(-reach_y, reach_y) * dz) / z
+    return torch.stack([K[0, 0] * moved_x + K[0, 1] * moved_y, K[1, 1] * moved_y], dim=-1)
 
 
 def _times(rows: Tensor, matrix: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from beags_plugin.assignment.sparse_sums import TorchSparseSums, largest_in_rows
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.lifting import project
+from beags_plugin.core.lifting import pixels_under
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 
 LABELS = ("e6", "majority", "nonzero")  # the first is the default
@@ -43,10 +43,7 @@ def labels_by_majority(
     for camera, mask in zip(cameras, labels, strict=True):
         if mask is None:
             continue
-        xy, z = project(points, camera)
-        inside = (z > 0) & (xy >= 0).all(dim=-1) & (xy[:, 0] < camera.width) & (xy[:, 1] < camera.height)
-        seen = inside.nonzero()[:, 0]
-        column, row = xy[seen].long().unbind(dim=-1)
+        seen, row, column = pixels_under(points, camera)
         found = mask[row, column].long()
         keys = (seen * num_classes + found)[found != IGNORE]
         votes.add(keys, torch.ones_like(keys, dtype=torch.float64))

@@ -48,6 +48,8 @@ OWN: dict[str, dict] = {
     "objectgs": {"labels": "nonzero"},
     "opengaussian": {"coarse": 2, "fine": 2, "min_gaussians": 1, "min_leaf": 1, "max_scale": 9.0, "min_views": 1},
 }
+EDITING = {"sagd": {"threshold": 0.3, "gd_interval": 2}}
+PLACES = ["/gauss_params.means", "/gauss_params.scales"]
 BASE_STEPS = STEPS[0]
 
 
@@ -76,7 +78,7 @@ def refined(data, tmp_path_factory):
 
     def run(name: str) -> Path:
         if name not in made:
-            options = {**UNTRAINED, **OWN}[name]
+            options = {**UNTRAINED, **OWN, **EDITING}[name]
             run_to_end(short_config(data, folder / name, **overrides(name, **options)))
             made[name] = folder / name
         return made[name]
@@ -157,6 +159,24 @@ def test_objectgs_trains_the_scene_but_not_its_classes(refined):
     assert (phi != 0).sum() > (e6 != 0).sum(), "one pixel of an object makes one of it"
 
 
+def test_sagd_draws_members_at_rims_into_their_objects(refined, data, tmp_path, capsys):
+    """Nothing is trained: only places and sizes of members change, and without decomposition not even those."""
+    run = refined("sagd")
+    base, after = read_run(run / "base/config.yml"), read_run(run / "config.yml")
+    assert differences(parameters(base.state), parameters(after.state)) == PLACES
+    moved = (base.surfels().means != after.surfels().means).any(dim=1)
+    shrunk = after.surfels().log_scales < base.surfels().log_scales
+    assert 0 < moved.sum() and torch.equal(moved, shrunk.all(dim=1)) and torch.equal(moved, shrunk.any(dim=1))
+    assert after.members.objects is None and bool((after.members.class_ids[moved] != 0).all())
+    capsys.readouterr()
+    options = {**EDITING["sagd"], "gd_interval": -1}
+    run_to_end(short_config(data, tmp_path / "run", **overrides("sagd", **options)))
+    assert "decomposition" not in capsys.readouterr().out
+    without = read_run(tmp_path / "run/config.yml")
+    assert not differences(parameters(base.state), parameters(without.state))
+    assert torch.equal(without.members.class_ids, after.members.class_ids)
+
+
 def test_a_joint_base_grows_with_the_classes_of_its_seeds(data, tmp_path, monkeypatch):
     """Clones and splits inherit; a killed run ends as the whole one; there is no refinement."""
     changes, edits = overrides("objectgs", joint=True), []
@@ -190,11 +210,11 @@ def test_a_joint_base_grows_with_the_classes_of_its_seeds(data, tmp_path, monkey
 @pytest.mark.parametrize(
     ("name", "step"),
     # of cob-gs also where the next object begins, and after a checkpoint that follows this
-    [*((name, step) for name in OWN for step in (0, 2, 7)), ("cob-gs", 14), ("cob-gs", 20)],
+    [*((name, step) for name in OWN for step in (0, 2, 7)), ("cob-gs", 14), ("cob-gs", 20), ("sagd", 0)],
 )
 def test_a_killed_run_ends_as_the_whole_one(refined, data, tmp_path, monkeypatch, name, step):
     run = tmp_path / "run"
-    changes = overrides(name, **OWN[name])
+    changes = overrides(name, **{**OWN, **EDITING}[name])
     interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, BASE_STEPS + step), **changes)
     resume_to_end(run)
     found = differences(without_clocks(checkpoint_of(run)), without_clocks(checkpoint_of(refined(name))))
