@@ -157,7 +157,7 @@ class Closed(GlbExporter):
     """As glb, closed."""
 
     suffix: ClassVar[str] = "closed.glb"
-    watertight: bool = True
+    closes: ClassVar[bool] = True
 
 
 VARIANTS = {"glb": "texture", "glb-colors": "vertex colours", "glb-closed": "texture, closed"}

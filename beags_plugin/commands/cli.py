@@ -168,6 +168,9 @@ class Export:
     on them."""
     keep_all: bool = False
     """Keep Gaussians too that do not belong: spikes outside an object's masks, loose parts that no mask supports."""
+    close: bool = False
+    """Close objects where no photo shows them, such as underneath, with Gaussians or triangles that a .ply and a .glb
+    mark as invented; .stl and .3mf are always closed."""
     pose: tyro.conf.OmitArgPrefixes[PoseOptions] = PoseOptions()
     mesh: tyro.conf.OmitArgPrefixes[MeshOptions] = MeshOptions()
 
@@ -179,10 +182,11 @@ class Export:
             exported = export_run(
                 self.load_config, self.object, self.all, self.format, self.frame, self.output, options, progress,
                 whole=self.whole, data=self.data, keep_all=self.keep_all, pose=self.pose,
+                closing=self.mesh if self.close else None,
             )  # fmt: skip
         write_json(self.json, [asdict(one) for one in exported])
         for one in exported:
-            CONSOLE.print(f"{one.name}: {counted_gaussians(one.gaussians, one.left_out)}", markup=False)
+            CONSOLE.print(str(one), markup=False)
             for file in one.files:
                 CONSOLE.print(f"  {file}", markup=False)
 

@@ -51,6 +51,8 @@ class ExportItem:
     views: of the training photos; None unless an exporter ``needs_views``.
     photos: of the item; None unless an exporter ``needs_photos``, or where there are none, as ``no_photos`` says.
     in_metres: whether the frame's unit is a metre; else it is unknown.
+    close: whether meshes shall be closed where no photo shows the item.
+    invented: [N] bool, surfels that close it there; None where it was not asked to be closed.
     shared: what exporters of one item keep for each other, such as the mesh that two file types hold.
     on_render: is called, by an exporter that ``needs_views``, with the number of views rendered so far.
     """
@@ -64,18 +66,22 @@ class ExportItem:
     photos: Sequence[Photo] | None = None
     no_photos: str = "no photos were given"
     in_metres: bool = False
+    close: bool = False
+    invented: Tensor | None = None
 
 
 class Exporter(ABC):
     """One file format. Subclasses are frozen dataclasses; their own fields, all with defaults, are their options.
 
     suffix: how the files' names end. needs_views: whether it renders the item from the views of the training photos.
-    needs_metres: whether its files state a unit of length.
+    needs_metres: whether its files state a unit of length. holds_gaussians: whether they hold Gaussians; where objects
+    are closed, its items then have more of these, and else it closes them itself.
     """
 
     suffix: ClassVar[str]
     needs_views: ClassVar[bool] = False
     needs_metres: ClassVar[bool] = False
+    holds_gaussians: ClassVar[bool] = True
 
     @property
     def needs_photos(self) -> bool:

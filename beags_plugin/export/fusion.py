@@ -83,17 +83,21 @@ def fuse(
     """
     low, high = bounding_box(surfels)
     voxel = voxel_size(low, high, resolution, truncation, memory_mb)
-    grid = _new_grid()
+    nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32), voxel)
+    grid, seen = _new_grid(), False
     for done, camera in enumerate(views.cameras, start=1):
         close = close_up(camera, low, high, views.settings.near, PIXELS_PER_VOXEL * resolution)
         depth, color = _draw(surfels, close, views, low - truncation * voxel, high + truncation * voxel)
         if bool((depth > 0).any()):
             _integrate(grid, depth / voxel, color, _in_voxels(close, low, voxel), truncation)
+            seen = True
         on_render(done)
+    if not seen:  # Open3D ends with an error
+        return nothing
     weight = min(min_views, len(views.cameras)) - 0.5
     mesh = grid.extract_triangle_mesh(weight_threshold=weight)
     if "positions" not in mesh.vertex or not len(mesh.vertex.positions):
-        return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32), voxel)
+        return nothing
     vertices = mesh.vertex.positions.numpy().astype(np.float64) * voxel + low.numpy()
     colors = np.clip(mesh.vertex.colors.numpy(), 0.0, 1.0)
     return sorted_mesh(Mesh(vertices, mesh.triangle.indices.numpy().astype(np.int64), colors, voxel))

@@ -25,11 +25,12 @@ _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 _LINEAR, _LINEAR_MIPMAP_LINEAR, _CLAMP_TO_EDGE = 9729, 9987, 33071
 
 
-def glb_bytes(mesh: Mesh, name: str, texture: Texture | None = None) -> bytes:
+def glb_bytes(mesh: Mesh, name: str, texture: Texture | None = None, invented: np.ndarray | None = None) -> bytes:
     """Return the file's content: one node, one mesh with normals, one unlit material.
 
     Colours are those of the texture, a .png, or without it linear 16-bit ones of the vertices. The mesh has z up and
     the file y, as glTF demands: the places are turned, as some readers ignore nodes' matrices.
+    invented: [V] bool; with it vertices have the attribute ``_INVENTED``, 1 where nothing but closing put them.
     """
     parts = _Parts()
     source = np.arange(len(mesh.vertices)) if texture is None else texture.atlas.source
@@ -55,6 +56,9 @@ def glb_bytes(mesh: Mesh, name: str, texture: Texture | None = None) -> bytes:
             "samplers": [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP_LINEAR, **clamp}],
             "images": [{"bufferView": parts.view(_png(texture.image)), "mimeType": "image/png"}],
         }
+    if invented is not None:
+        # floats, as every reader takes them; names of an application's own begin with an underscore
+        attributes["_INVENTED"] = parts.accessor(invented[source].astype("<f4"), _FLOAT, "SCALAR")
     indices = parts.accessor(faces.astype("<u4").reshape(-1), _UNSIGNED_INT, "SCALAR", target=_ELEMENT_ARRAY_BUFFER)
     primitive = {"attributes": attributes, "indices": indices, "material": 0}
     unlit = {"extensions": {"KHR_materials_unlit": {}}, "doubleSided": True}

@@ -9,10 +9,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from beags_plugin.export.base import Exporter, ExportItem, NothingToExport
-from beags_plugin.export.closing import closed
+from beags_plugin.export.closing import Closed, closed
 from beags_plugin.export.fusion import Mesh, decimated, fuse, without_small_parts
 from beags_plugin.export.glb import glb_bytes
 from beags_plugin.export.mesh_options import MeshOptions
+from beags_plugin.export.surface import area_vectors
 from beags_plugin.export.texture import Texture, textured
 from beags_plugin.extraction.files import whole_file
 
@@ -20,17 +21,53 @@ FEWEST, MOST, PER_GAUSSIAN = 1000, 20_000, 20
 """Triangles where no number of them was asked for."""
 
 
+def seen_surface(item: ExportItem, options: MeshOptions) -> Mesh:
+    """Return the surface that the training views see of an item rendered alone, maybe of no face; made once."""
+    if item.views is None:
+        raise ValueError("a surface needs the views of the training photos")
+    chosen = options.resolution, options.truncation, options.memory_mb, options.min_views
+    fused = item.shared.get(("fused", chosen))
+    if fused is None:
+        fused = item.shared["fused", chosen] = fuse(item.surfels, item.views, *chosen, item.on_render)
+    return without_small_parts(fused, options.smallest_part)
+
+
+def closed_surface(item: ExportItem, options: MeshOptions) -> Closed:
+    """Return the closed surface of an item; raises ``NothingToExport`` where there is none."""
+    mesh = seen_surface(item, options)
+    if not len(mesh.faces):
+        raise _unseen(item, options)
+    solid = closed(mesh)
+    if solid is None:
+        raise NothingToExport(
+            f"the surface of {item.name!r} encloses nothing, so it cannot be closed: export it without --close, as "
+            "splats or .glb."
+        )
+    return solid
+
+
+def _unseen(item: ExportItem, options: MeshOptions) -> NothingToExport:
+    return NothingToExport(
+        f"no surface of {item.name!r} is seen in {options.min_views} training views: "
+        "lower --min-views, or export it as splats."
+    )
+
+
 @dataclass(frozen=True)
 class MadeMesh:
-    """A mesh; closed_share: of its area that no view showed, None of one that was not closed."""
+    """A mesh; invented: [V] bool, vertices where no view showed a surface, None of a mesh that was not closed."""
 
     mesh: Mesh
-    closed_share: float | None = None
+    invented: np.ndarray | None = None
 
     def facts(self) -> dict[str, Any]:
-        """Return the manifest's entries about it."""
+        """Return the manifest's entries about it; closed_share: of its area, where all corners are invented."""
         found = {"vertices": len(self.mesh.vertices), "triangles": len(self.mesh.faces), "voxel": self.mesh.voxel}
-        return found if self.closed_share is None else found | {"closed_share": round(self.closed_share, 4)}
+        if self.invented is None:
+            return found
+        areas = np.linalg.norm(area_vectors(self.mesh), axis=1)
+        share = areas[self.invented[self.mesh.faces].all(axis=1)].sum() / max(areas.sum(), 1e-300)
+        return found | {"closed_share": round(float(share), 4)}
 
 
 @dataclass(frozen=True)
@@ -38,47 +75,44 @@ class MeshExporter(MeshOptions, Exporter):
     """The surface that the training views see of an item rendered alone; all file types hold the same mesh."""
 
     needs_views: ClassVar[bool] = True
+    holds_gaussians: ClassVar[bool] = False
     closes: ClassVar[bool] = False
 
     @classmethod
     def unavailable(cls) -> str | None:
-        try:
-            import open3d  # noqa: F401
-        except (ImportError, OSError) as error:  # a system library that it needs may be missing
-            return f"Open3D cannot be loaded ({error}); pip install open3d, which needs libX11 and libGL."
-        return None
+        return open3d_missing()
 
     def mesh(self, item: ExportItem) -> Mesh:
         """Return the mesh of ``item``, made once for each set of options; raise ``NothingToExport`` without a face."""
         return self.made(item).mesh
 
     def made(self, item: ExportItem) -> MadeMesh:
-        """Return the mesh of ``item`` and how much of it was closed; as ``mesh``."""
-        closing = self.watertight or self.closes
+        """Return the mesh of ``item`` and what of it is invented; as ``mesh``."""
+        closing = item.close or self.closes
         key = ("mesh", closing, *astuple(self))
         if key not in item.shared:
             item.shared[key] = self._made(item, closing)
-        made = item.shared[key]
-        if not len(made.mesh.faces):
-            raise NothingToExport(
-                f"no surface of {item.name!r} is seen in {self.min_views} training views: "
-                "lower --min-views, or export it as splats."
-            )
-        return made
+        return item.shared[key]
 
     def _made(self, item: ExportItem, closing: bool) -> MadeMesh:
-        if item.views is None:
-            raise ValueError("a mesh needs the views of the training photos")
-        options = self.resolution, self.truncation, self.memory_mb, self.min_views
-        fused = item.shared.get(("fused", options))
-        if fused is None:
-            fused = item.shared["fused", options] = fuse(item.surfels, item.views, *options, item.on_render)
-        mesh, share = without_small_parts(fused, self.smallest_part), None
-        if closing and len(mesh.faces):
-            solid = closed(mesh)
-            mesh, share = without_small_parts(solid.mesh, self.smallest_part), solid.invented_share
         most = self.triangles or min(MOST, max(FEWEST, PER_GAUSSIAN * len(item.surfels)))
-        return MadeMesh(decimated(mesh, most), share)
+        if closing:
+            solid = closed_surface(item, self)
+            mesh = decimated(without_small_parts(solid.mesh, self.smallest_part), most)
+            return MadeMesh(mesh, solid.invented_at(mesh.vertices))
+        mesh = seen_surface(item, self)
+        if not len(mesh.faces):
+            raise _unseen(item, self)
+        return MadeMesh(decimated(mesh, most))
+
+
+def open3d_missing() -> str | None:
+    """Return None if Open3D can be loaded, else one sentence: why not and what to install."""
+    try:
+        import open3d  # noqa: F401
+    except (ImportError, OSError) as error:  # a system library that it needs may be missing
+        return f"Open3D cannot be loaded ({error}); pip install open3d, which needs libX11 and libGL."
+    return None
 
 
 @dataclass(frozen=True)
@@ -95,7 +129,7 @@ class GlbExporter(MeshExporter):
         made = self.made(item)
         texture, facts = self._texture(made.mesh, item)
         with whole_file(path) as part:
-            part.write_bytes(glb_bytes(made.mesh, item.name, texture))
+            part.write_bytes(glb_bytes(made.mesh, item.name, texture, made.invented))
         return made.facts() | {"texture": facts}
 
     def _texture(self, mesh: Mesh, item: ExportItem) -> tuple[Texture | None, dict[str, Any] | str]:

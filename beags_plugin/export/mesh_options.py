@@ -34,8 +34,6 @@ class MeshOptions:
     """Colours of a .glb: a texture from the photos, or none: those of the splats at the vertices."""
     texture_size: int = 0
     """Texels along a side of the texture; 0 chooses what suits the photos."""
-    watertight: bool = False
-    """Meshes: close the surface where no view saw it, such as underneath; .stl and .3mf always are."""
 
     def __post_init__(self) -> None:
         if not 8 <= self.resolution <= MOST_VOXELS:

@@ -17,7 +17,7 @@ class PlyExporter(Exporter):
     suffix: ClassVar[str] = "ply"
 
     def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
-        write_ply(path, item.surfels, item.class_ids)
+        write_ply(path, item.surfels, item.class_ids, invented=item.invented)
         return {}
 
 
@@ -28,5 +28,5 @@ class SurfelPlyExporter(Exporter):
     suffix: ClassVar[str] = "2dgs.ply"
 
     def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
-        write_ply(path, item.surfels, item.class_ids, layout="2dgs")
+        write_ply(path, item.surfels, item.class_ids, layout="2dgs", invented=item.invented)
         return {}

@@ -28,6 +28,7 @@ def write_ply(
     class_ids: Tensor | None = None,
     transform: tuple[Tensor, float] | None = None,
     layout: Literal["3dgs", "2dgs"] = "3dgs",
+    invented: Tensor | None = None,
 ) -> None:
     """Write surfels as a binary splat .ply: 3DGS's or 2DGS's columns, then ``class_id`` (int32) if there are class ids.
 
@@ -37,8 +38,8 @@ def write_ply(
     the official code expects for its default SH degree 3.
 
     surfels: N surfels. class_ids: [N] integer, phi. transform: the dataparser's ([3, 4], scale); with it the
-    file is in the frame of the input poses, without it in the surfels' own. Raises ``UserError`` if the file cannot be
-    written.
+    file is in the frame of the input poses, without it in the surfels' own. invented: [N] bool, the last column, of
+    uchar 0 or 1. Raises ``UserError`` if the file cannot be written.
     """
     if transform is not None:
         surfels = to_input_frame(surfels, *transform)
@@ -47,6 +48,8 @@ def write_ply(
         if class_ids.shape != (len(surfels),):
             raise ValueError(f"class_ids must be [{len(surfels)}], not {list(class_ids.shape)}")
         columns["class_id"] = class_ids.detach().cpu().numpy().astype("<i4")
+    if invented is not None:
+        columns["invented"] = invented.cpu().numpy().astype("u1")
     table = np.empty(len(surfels), dtype=[(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():
         table[name] = values

@@ -1,4 +1,4 @@
-"""Textures and closed meshes: a box with known colours, photographed with known exposures."""
+"""Textures: a box with known colours, photographed with known exposures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from beags_plugin.core.lifting import pixel_rays
 from beags_plugin.export.atlas import picture, texels, unwrapped
 from beags_plugin.export.baking import Places, baked
 from beags_plugin.export.base import Photo
-from beags_plugin.export.closing import closed
 from beags_plugin.export.color import linear_from_srgb, srgb_from_linear
 from beags_plugin.export.fusion import Mesh, decimated
 from beags_plugin.export.glb import glb_bytes
@@ -175,17 +174,3 @@ def test_a_glb_is_read_by_another_project(box, tmp_path, with_texture):
     content = json.loads(raw[20 : 20 + int.from_bytes(raw[12:16], "little")])
     assert all(view["byteOffset"] % 4 == 0 for view in content["bufferViews"])
     assert content["buffers"][0]["byteLength"] == len(raw) - 28 - int.from_bytes(raw[12:16], "little")
-
-
-def test_a_box_without_bottom_is_closed_flat_and_keeps_its_sides():
-    open_box = a_box(bottom=False)
-    assert not trimesh.Trimesh(open_box.vertices, open_box.faces).is_watertight
-    found = closed(open_box)
-    few = decimated(found.mesh, 2000)
-    for mesh in (found.mesh, few):
-        solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-        assert solid.is_watertight and solid.is_winding_consistent
-        assert solid.volume == pytest.approx(0.8**3, rel=0.03)
-        assert np.abs(solid.bounds - [[-0.4] * 3, [0.4] * 3]).max() < 2 * VOXEL
-    assert 0.1 < found.invented_share < 0.2  # one of six sides
-    assert np.abs(found.mesh.vertices[found.invented][:, 2] + 0.4).max() < 2 * VOXEL

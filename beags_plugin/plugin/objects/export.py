@@ -13,6 +13,8 @@ from torch import Tensor
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import ExportItem, make_exporter
 from beags_plugin.export.frames import Frame, check_placement
+from beags_plugin.export.mesh import open3d_missing
+from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.export.pose_options import PoseOptions
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.plugin.objects.export_job import ExportJob, Progress, Shown, Steps
@@ -47,6 +49,7 @@ def export_run(
     data: Path | None = None,
     keep_all: bool = False,
     pose: PoseOptions | None = None,
+    closing: MeshOptions | None = None,
 ) -> list[Exported]:
     """Write files of objects of a run.
 
@@ -57,7 +60,8 @@ def export_run(
     options: format to its exporter's options. progress: receives (done, total) files, and rendered views of the meshes
     among them. data: if not where they were. keep_all: keep Gaussians too that do not belong to their object
     (``cleaning.clean``); the background and the whole scene are kept as they are. pose: where objects stand and how
-    large they are. Raises ``UserError`` for a mistake, before anything is written.
+    large they are. closing: close objects where no photo shows them, by the surface that these options lead to; the
+    background and the whole scene are not closed. Raises ``UserError`` for a mistake, before anything is written.
     """
     run, folder, pose = config_path.parent, output or config_path.parent / "exports", pose or PoseOptions()
     check_placement(placement)
@@ -84,7 +88,9 @@ def export_run(
     transform = read_transform(run)
     frame = Frame.of_run() if transform is None else Frame(*transform)
     views = None
-    if any(exporter.needs_views for exporter in exporters.values()):
+    if closing is not None and (reason := open3d_missing()):
+        raise UserError(f"objects cannot be closed here: {reason}")
+    if closing is not None or any(exporter.needs_views for exporter in exporters.values()):
         views = training_viewpoints(scene.config, raster_settings(scene), config_path)
     names, titles = list(present) if everything else list(dict.fromkeys(objects)), folder_names(scene.classes)
     metres = None
@@ -92,7 +98,9 @@ def export_run(
         metres = metres_per_unit(length, scene, config_path, frame)
     shown = Shown(scene, config_path)
     cleaner = None if keep_all or not any(map(present.get, names)) else shown.cleaner()
-    job = ExportJob(scene, exporters, frame, metres, placement == "object", pose, views, everything, cleaner, shown)
+    job = ExportJob(
+        scene, exporters, frame, metres, placement == "object", pose, views, everything, cleaner, shown, closing
+    )
     items: list[tuple[str, int | None, str]] = [(name, present[name], titles[present[name]]) for name in names]
     if whole:
         items.append((WHOLE, None, "whole_scene"))

@@ -11,7 +11,9 @@ import torch
 
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import Exporter, ExportItem, NothingToExport, Photo, Viewpoints
+from beags_plugin.export.closing_surfels import with_closing
 from beags_plugin.export.frames import Frame, bounding_box
+from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.export.pose_options import PoseOptions
 from beags_plugin.export.standing import turn_to_z
 from beags_plugin.extraction.select import select_class
@@ -27,24 +29,24 @@ Progress = Callable[[int, int], None]
 
 
 class Steps:
-    """Reports the progress of an export: a step for each file, and before it one for each view that it renders.
+    """Reports the progress of an export: a step for each piece, and before it one for each view that it renders.
 
-    of_a_piece: steps of each exporter's file.
+    of_a_piece: steps of each piece of an item: of its closing, if any, and of its files.
     """
 
     def __init__(self, of_a_piece: Sequence[int], items: int, report: Progress) -> None:
-        self._of_files = list(of_a_piece) * items
-        self._file = 0
+        self._of_pieces = list(of_a_piece) * items
+        self._piece = 0
         self._report = report
         self.on_render(0)
 
     def on_render(self, views: int) -> None:
-        """Report the rendered views of the present file."""
-        self._report(sum(self._of_files[: self._file]) + views, sum(self._of_files))
+        """Report the rendered views of the present piece."""
+        self._report(sum(self._of_pieces[: self._piece]) + views, sum(self._of_pieces))
 
-    def wrote(self) -> None:
-        """Report the present file as done."""
-        self._file += 1
+    def finish(self) -> None:
+        """Report the present piece as done."""
+        self._piece += 1
         self.on_render(0)
 
 
@@ -77,7 +79,8 @@ class ExportJob:
 
     world: the input's frame. metres: of a unit of it, None if files keep its unit. centred: the origin is the middle of
     each item. views: in the run's frame. tolerant: leave out a format for which an item has nothing. cleaner: decides
-    what belongs to an object; None: all.
+    what belongs to an object; None: all. closing: how the surfaces of objects are made that tell what no photo shows
+    and shall be closed; None: nothing is closed.
     """
 
     scene: SavedScene
@@ -90,11 +93,16 @@ class ExportJob:
     tolerant: bool
     cleaner: Cleaner | None
     shown: Shown
+    closing: MeshOptions | None
 
     def steps(self) -> list[int]:
-        """Return the steps of each file of an item: see ``Steps``."""
+        """Return the steps of each piece of an item: see ``Steps``."""
         views = 0 if self.views is None else len(self.views.cameras)
-        return [1 + (views if exporter.needs_views else 0) for exporter in self.exporters.values()]
+        files = [1 + (views if exporter.needs_views else 0) for exporter in self.exporters.values()]
+        return [1 + views, *files] if self._adds_gaussians() else files
+
+    def _adds_gaussians(self) -> bool:
+        return self.closing is not None and any(exporter.holds_gaussians for exporter in self.exporters.values())
 
     def export(self, name: str, class_id: int | None, stem: Path, steps: Steps) -> Exported:
         """Write all files of one class (None: of the whole scene), called ``stem`` and their suffixes."""
@@ -115,20 +123,29 @@ class ExportJob:
         item = ExportItem(
             name, frame.surfels(chosen), class_ids, views, on_render=steps.on_render, photos=photos,
             no_photos=no_photos, in_metres=self.metres is not None,
+            close=self.closing is not None and class_id not in (None, BACKGROUND),
         )  # fmt: skip
+        of_splats, added = item, None
+        if self.closing is not None and self._adds_gaussians():
+            if item.close and doubt is None:
+                of_splats, added = with_closing(item, self.closing)
+            steps.finish()
         files = []
         for label, exporter in self.exporters.items():
             path = stem.with_name(f"{stem.name}.{exporter.suffix}")
+            of_file = of_splats if exporter.holds_gaussians else item
             files.append(
-                self._write(label, exporter, path, item) if doubt is None else ExportedFile(label, None, {}, str(doubt))
+                self._write(label, exporter, path, of_file)
+                if doubt is None
+                else ExportedFile(label, None, {}, str(doubt))
             )
-            steps.wrote()
+            steps.finish()
         low, high = bounding_box(item.surfels)
         origin, above = self.world.points(frame.in_run(torch.tensor([[0.0] * 3, [0.0, 0.0, 1.0]], dtype=torch.float64)))
         up = (above - origin) / (above - origin).norm()
         return Exported(
             name, class_id, len(chosen), origin.tolist(), up.tolist(), low.tolist(), high.tolist(), frame.to_run(),
-            files, left_out,
+            files, left_out, added,
         )  # fmt: skip
 
     def _frame(self, name: str, part: Surfels, class_id: int | None) -> Frame:

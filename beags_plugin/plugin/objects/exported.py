@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from beags_plugin.cleaning.clean import LeftOut
+from beags_plugin.export.closing_surfels import Added
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Exported:
     class_id: None of the whole scene. center: [3] the point of the world that is the files' origin. up: [3] the
     direction of the world that is the files' z. low, high: [3] its box, in the files' frame. to_run: the 4 x 4 matrix
     from the files' frame to the run's normalised one. left_out: Gaussians of the object that do not belong to it; None
-    where none was looked for.
+    where none was looked for. added: Gaussians that close it in its splat files; None where none were asked for.
     """
 
     name: str
@@ -59,6 +60,12 @@ class Exported:
     to_run: list[list[float]]
     files: list[ExportedFile]
     left_out: LeftOut | None = None
+    added: Added | None = None
+
+    def __str__(self) -> str:
+        """Return a line for users."""
+        facts = [f"{self.gaussians} Gaussians", *(str(each) for each in (self.left_out, self.added) if each)]
+        return f"{self.name}: {'; '.join(facts)}"
 
     def to_json(self, folder: Path) -> dict[str, Any]:
         """Return plain values for the manifest in ``folder``."""
@@ -67,6 +74,7 @@ class Exported:
             "class_id": self.class_id,
             "gaussians": self.gaussians,
             **({} if self.left_out is None else {"left_out_gaussians": asdict(self.left_out)}),
+            **({} if self.added is None else {"closing_gaussians": asdict(self.added)}),
             "center": self.center,
             "up": self.up,
             "box": {"low": self.low, "high": self.high},

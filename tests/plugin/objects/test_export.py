@@ -22,6 +22,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.export import EXPORTERS
 from beags_plugin.export.base import Exporter, ExportItem, Viewpoints, make_exporter
 from beags_plugin.export.frames import Frame, bounding_box
+from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.ply import read_ply
 from beags_plugin.extraction.select import select_class
@@ -187,6 +188,50 @@ def test_meshes_of_a_run_lie_where_its_discs_are(trained, tmp_path, monkeypatch)
     assert all("is seen in 3 training views" in one["left_out"][0]["reason"] for one in manifest["objects"])
     with pytest.raises(SystemExit):  # named alone it is a mistake
         main([*arguments, str(tmp_path / "none"), "--object", "cup"])
+
+
+def test_closed_objects_say_what_is_invented(trained, tmp_path, capsys):
+    """A column of the .ply, an attribute of the .glb; the background and the whole scene stay as they are."""
+    trimesh = pytest.importorskip("trimesh")
+    pytest.importorskip("open3d")
+    steps: list[tuple[int, int]] = []
+    arguments = ["export", "--load-config", str(trained), "--resolution", "48", "--min-views", "1", "--format", "ply"]
+    main([*arguments, "ply-2dgs", "spz", "glb", "--all", "--whole", "--close", "--output", str(tmp_path)])
+    said = " ".join(capsys.readouterr().out.split())
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    for one in manifest["objects"]:
+        plain = [read_vertices(tmp_path / file["path"]) for file in one["files"] if file["format"].startswith("ply")]
+        mesh = next(file for file in one["files"] if file["format"] == "glb")
+        (read,) = trimesh.load(tmp_path / mesh["path"], process=False).geometry.values()
+        if one["name"] == "background" or one["class_id"] is None:
+            assert "closing_gaussians" not in one and all(len(table) == one["gaussians"] for table in plain)
+            assert all("invented" not in (table.dtype.names or ()) for table in plain)
+            assert "_INVENTED" not in read.vertex_attributes
+            continue
+        added = one["closing_gaussians"]["gaussians"]
+        assert added > 0 and f"; {added} more close what no photo shows" in said
+        for table in plain:
+            assert len(table) == one["gaussians"] + added and table["invented"].sum() == added
+            assert not table["invented"][: one["gaussians"]].any() and set(table["class_id"]) == {one["class_id"]}
+        assert np.ravel(read.vertex_attributes["_INVENTED"]).any() and 0 <= mesh["closed_share"] < 1
+    surfels, ids = read_ply(tmp_path / "cup.ply")  # other readers pass over the column
+    assert ids is not None and len(surfels) == len(ids)
+    export_run(
+        trained, ["cup", "box"], formats=("ply", "spz"), output=tmp_path / "again", closing=MeshOptions(resolution=16),
+        progress=lambda *counts: steps.append(counts),
+    )  # fmt: skip
+    assert [done for done, _ in steps] == [0, *range(1, 9), 9, 10, *range(11, 20), 20][: len(steps)]
+    assert steps[-1] == (20, 20)
+
+
+def test_closing_needs_the_data_and_leaves_nothing_without(tmp_path, capsys):
+    pytest.importorskip("open3d")
+    config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"))
+    (tmp_path / "lab").rename(tmp_path / "away")
+    with pytest.raises(SystemExit) as stopped:
+        main(["export", "--load-config", str(config), "--all", "--close"])
+    assert stopped.value.code == 2 and "lab: name their place with --data" in capsys.readouterr().out
+    assert not (config.parent / "exports").exists()
 
 
 def test_the_progress_of_meshes_counts_their_views(trained, tmp_path):

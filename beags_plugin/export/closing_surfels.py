@@ -1,0 +1,118 @@
+"""Gaussians of what no photo shows of an object: flat ones on the parts of its closed surface that are invented."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from beags_plugin.core.densification import SH_C0
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.export.base import ExportItem, NothingToExport
+from beags_plugin.export.closing import Closed
+from beags_plugin.export.mesh import closed_surface
+from beags_plugin.export.mesh_options import MeshOptions
+from beags_plugin.export.surface import area_vectors
+
+_OPACITY = 0.99
+_SIGMA = 0.75  # standard deviation over the distance between neighbours: three of them hide what is between
+_INWARD = 0.5  # distance between neighbours over that from the rim
+_FINEST = 1.5  # distance between neighbours over that between the surface's corners
+_HALF = 1.2  # standard deviations from its middle at which an opaque Gaussian is half transparent
+_LARGEST = 1 / 12  # distance between neighbours over the closed surface's longest side
+_SAME_SIDE = 0.5  # least cosine between the normals of places of one side
+
+
+@dataclass(frozen=True)
+class Added:
+    """gaussians: their number. doubt: why nothing could be closed, or ""."""
+
+    gaussians: int
+    doubt: str = ""
+
+    def __str__(self) -> str:
+        """Return a phrase for users."""
+        if self.doubt:
+            return f"nothing closed, as {self.doubt}"
+        return f"{self.gaussians} more close what no photo shows" if self.gaussians else "nothing to close"
+
+
+def with_closing(item: ExportItem, options: MeshOptions) -> tuple[ExportItem, Added]:
+    """Return an item with Gaussians where no photo shows it, by the closed surface that the options lead to."""
+    own = torch.zeros(len(item.surfels), dtype=torch.bool)
+    try:
+        solid = closed_surface(item, options)
+    except NothingToExport as error:
+        return replace(item, invented=own), Added(0, str(error).partition(":")[0])
+    more = closing_surfels(solid, item.surfels)
+    both = Surfels(
+        **{name: torch.cat([getattr(item.surfels, name).detach(), added]) for name, added in vars(more).items()}
+    )
+    ids = torch.cat([item.class_ids, item.class_ids[:1].expand(len(more))])
+    invented = torch.cat([own, torch.ones(len(more), dtype=torch.bool)])
+    return replace(item, surfels=both, class_ids=ids, invented=invented), Added(len(more))
+
+
+def closing_surfels(solid: Closed, like: Surfels) -> Surfels:
+    """Return flat Gaussians on the invented parts of a closed surface, small at its rims and larger inside.
+
+    Each has the colour of its place from every side: degree 0, though they have the bands of ``like``, the object's.
+    """
+    points, normals, colors, apart = _spread(solid)
+    count, means = len(points), like.means
+    quats = _quats_to(normals)
+    logs = np.log(_SIGMA * apart)[:, None].repeat(2, axis=1)
+
+    def tensor(values: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(values).to(means.dtype)
+
+    return Surfels(
+        tensor(points),
+        tensor(quats),
+        tensor(logs),
+        tensor(np.full(count, np.log(_OPACITY / (1.0 - _OPACITY)))),
+        tensor((colors - 0.5) / SH_C0),
+        torch.zeros(count, like.sh_rest.shape[1], 3, dtype=means.dtype),
+    )
+
+
+def _spread(solid: Closed) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return places [P, 3] over the invented parts, unit normals and colours [P, 3] there, and distances [P].
+
+    Every place of these parts but those at the rim is as near to one of them as the distance there says. They are taken
+    in order, the farthest from the rim first; a place is left out if one that was taken is near enough.
+    """
+    from scipy.spatial import cKDTree
+
+    mesh, invented = solid.mesh, solid.invented
+    faces = mesh.faces[invented[mesh.faces].any(axis=1)]
+    nothing = np.zeros((0, 3))
+    if not len(faces):
+        return nothing, nothing, nothing, np.zeros(0)
+    points, colors = (each[faces].mean(axis=1, dtype=np.float64) for each in (mesh.vertices, mesh.colors))
+    normals = area_vectors(replace(mesh, faces=faces))
+    areas = np.linalg.norm(normals, axis=1)
+    normals /= np.maximum(areas, 1e-300)[:, None]
+    spacing = float(np.sqrt(2.0 * np.median(areas)))  # of the faces' corners
+    rim = np.unique(faces[~invented[faces]])
+    inward = cKDTree(mesh.vertices[rim]).query(points)[0] if len(rim) else np.full(len(points), np.inf)
+    longest = float(np.ptp(mesh.vertices, axis=0).max())
+    apart = np.clip(_INWARD * inward, _FINEST * spacing, max(_LARGEST * longest, _FINEST * spacing))
+    # up to the rim, but not beyond it: the object's own Gaussians begin there
+    tree, open_ = cKDTree(points), (areas > 0) & (inward > _HALF * _SIGMA * apart)
+    taken = []
+    for place in np.lexsort((*points.T, -np.round(inward / spacing, 3))):
+        if open_[place]:
+            taken.append(place)
+            near = np.array(tree.query_ball_point(points[place], apart[place]))
+            open_[near[normals[near] @ normals[place] > _SAME_SIDE]] = False
+    return points[taken], normals[taken], colors[taken], apart[taken]
+
+
+def _quats_to(normals: np.ndarray) -> np.ndarray:
+    """Return unit quaternions [P, 4] wxyz of turns that take z to unit normals [P, 3], by the shortest way."""
+    x, y, z = normals.T
+    quats = np.stack([1.0 + z, -y, x, np.zeros_like(z)], axis=1)  # 1 + cosine, and z x normal
+    quats[z < -1.0 + 1e-9] = [0.0, 1.0, 0.0, 0.0]  # half a turn about any level axis
+    return quats / np.linalg.norm(quats, axis=1, keepdims=True)
