@@ -11,6 +11,8 @@ from typing import Any
 import tyro
 from rich.console import Console
 
+from beags_plugin.bench.engines import make_engine
+from beags_plugin.bench.engines.interface import Outcome
 from beags_plugin.bench.experiment import Experiment, Variant, load_experiment
 from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.report import (
@@ -23,7 +25,7 @@ from beags_plugin.bench.report import (
     write_json,
 )
 from beags_plugin.bench.run import TABLE_WIDTH, adapted, scenes_of
-from beags_plugin.bench.runner import Outcome, run_trials
+from beags_plugin.bench.runner import run_trials
 from beags_plugin.bench.scenes import TrialScene
 from beags_plugin.bench.trials import MODEL, Trial, steps_of
 from beags_plugin.plugin.training.monitor import CURVE
@@ -95,8 +97,9 @@ def run_base(name: str, options: ExperimentOptions) -> list[CurveRow]:
 def train_rows(experiment: Experiment, options: ExperimentOptions) -> list[CurveRow]:
     """Run the bases of an experiment that are not done; returns a row for each, scene after scene."""
     trials = plan(experiment, scenes_of(experiment, options), code_digest())
-    with progress_bar("Training, in steps") as progress:
-        outcomes = run_trials([trial for _, trial in trials], options.output / "trials", steps_of, progress)
+    engine = make_engine(options.engine, options.address)
+    with engine, progress_bar("Training, in steps") as progress:
+        outcomes = run_trials([trial for _, trial in trials], options.output / "trials", steps_of, engine, progress)
     return [read_row(variant, trial, outcomes[trial.digest]) for variant, trial in trials]
 
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from beags_plugin.bench.engines.interface import Outcome
 from beags_plugin.bench.report import new_figure, save_figure
-from beags_plugin.bench.runner import Outcome
 from beags_plugin.bench.trials import VariantTrial
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.colors import colorize

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from beags_plugin.bench.engines.interface import Outcome
 from beags_plugin.bench.per_object import OBJECT
-from beags_plugin.bench.runner import Outcome
 from beags_plugin.bench.trials import OPTIONS, Trial, VariantTrial
 
 _SIDE = 150  # pixels of a cell

@@ -9,8 +9,18 @@ from typing import Annotated
 import tyro
 
 
+@dataclass(kw_only=True)
+class EngineOptions:
+    """Where trials run."""
+
+    engine: str = "local"
+    """What runs the trials: local (this machine, one after the other)."""
+    address: str | None = None
+    """Address of the engine's cluster."""
+
+
 @dataclass
-class ExperimentOptions:
+class ExperimentOptions(EngineOptions):
     """Run an experiment: many short trainings on common bases. An interrupted experiment continues."""
 
     data: tuple[Path, ...] = ()

@@ -8,13 +8,15 @@ from pathlib import Path
 
 from rich.console import Console
 
+from beags_plugin.bench.engines import make_engine
+from beags_plugin.bench.engines.interface import Outcome
 from beags_plugin.bench.experiment import Experiment, Variant, check_keys, load_experiment
 from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.per_object import merged
 from beags_plugin.bench.provenance import busy_note
 from beags_plugin.bench.report import provenance, write_csv, write_json
 from beags_plugin.bench.results import ResultRow, make_row, report_json, table_rows
-from beags_plugin.bench.runner import Outcome, run_trials
+from beags_plugin.bench.runner import run_trials
 from beags_plugin.bench.scenes import TrialScene, class_masks, damaged_masks, given_scenes, sample_scene
 from beags_plugin.bench.trials import MODEL, VariantTrial, plan, steps_of
 from beags_plugin.system.digests import code_digest
@@ -42,6 +44,7 @@ def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
     from beags_plugin.bench.tables import tables
 
     experiment = adapted(load_experiment(name), options)
+    engine = make_engine(options.engine, options.address)
     source = provenance()
     busy = busy_note(int(source["machine"]["cores"]))  # before the trials: they keep the machine busy
     if busy:
@@ -54,10 +57,9 @@ def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
         if (made := _other_masks(scene, variant, options.output / "scenes")) is not None
     }
     runs = plan(experiment, scenes, masks, code_digest())
-    with progress_bar("Training, in steps") as progress:
-        outcomes = run_trials(
-            [trial for run in runs for trial in run.trials], options.output / "trials", steps_of, progress
-        )
+    trials = [trial for run in runs for trial in run.trials]
+    with engine, progress_bar("Training, in steps") as progress:
+        outcomes = run_trials(trials, options.output / "trials", steps_of, engine, progress)
     rows = rows_of(runs, outcomes)
     wide = Console(width=max(CONSOLE.width, TABLE_WIDTH), highlight=False, markup=False)
     for table in tables(experiment, rows):

@@ -12,7 +12,7 @@ pytest.importorskip("nerfstudio")
 
 from experiment_files import written
 
-from beags_plugin.bench import runner
+from beags_plugin.bench.engines import trial_folder
 from beags_plugin.bench.experiment import load_experiment
 from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.run import run_experiment
@@ -90,7 +90,7 @@ def test_a_second_call_trains_only_what_failed(miniature, monkeypatch):
         ran.append(json.loads((folder / "trial.json").read_text())["overrides"])
         return 1
 
-    monkeypatch.setattr(runner.Worker, "run", fail_again)
+    monkeypatch.setattr(trial_folder.Worker, "run", fail_again)
     again = run_experiment(path, options)
     assert [overrides["pipeline.model.prepare.k"] for overrides in ran] == [0]
     assert [row.figures for row in again] == [row.figures for row in rows]

@@ -15,13 +15,13 @@ pytest.importorskip("nerfstudio")
 
 from experiment_files import GOOD, masks_of, scene, written
 
+from beags_plugin.bench.engines.interface import Outcome
 from beags_plugin.bench.experiment import Variant, load_experiment
 from beags_plugin.bench.front import pareto_front, plot_front
 from beags_plugin.bench.pictures import plot_experiment
 from beags_plugin.bench.report import write_csv, write_json
 from beags_plugin.bench.results import COLUMNS, FIGURES, ResultRow, error_left, make_row, means, report_json, table_rows
 from beags_plugin.bench.run import rows_of
-from beags_plugin.bench.runner import Outcome
 from beags_plugin.bench.tables import memory_line, per_million_pixels, tables
 from beags_plugin.bench.trials import VariantTrial, plan
 from beags_plugin.evaluation.records import FIGURES as METRICS

@@ -15,7 +15,8 @@ pytest.importorskip("nerfstudio")
 
 from experiment_files import scene
 
-from beags_plugin.bench import runner
+from beags_plugin.bench.engines import local, trial_folder
+from beags_plugin.bench.engines.local import LocalEngine
 from beags_plugin.bench.runner import run_trials
 from beags_plugin.bench.trials import Trial
 
@@ -27,10 +28,7 @@ class FakeWorker:
         self.ran: list[dict] = []
         self.interrupt_at = -1
 
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
+    def end(self):
         pass
 
     def run(self, folder: Path) -> int:
@@ -51,7 +49,7 @@ class FakeWorker:
 @pytest.fixture
 def worker(monkeypatch):
     fake = FakeWorker()
-    monkeypatch.setattr(runner, "Worker", lambda: fake)
+    monkeypatch.setattr(local, "Worker", lambda: fake)
     return fake
 
 
@@ -60,14 +58,19 @@ def trials(*overrides: dict) -> list[Trial]:
     return [Trial(scene(), "beags-tiny", own, 0, "code", base=base) for own in overrides]
 
 
+def run(wanted: list[Trial], folder: Path, progress: Callable[[int, int], None] | None = None):
+    with LocalEngine(None) as engine:
+        return run_trials(wanted, folder, lambda _: 1, engine, progress)
+
+
 def test_an_interrupted_experiment_resumes(tmp_path, worker):
     wanted = trials({"x": 1}, {"x": 2}, {"x": 3})
     worker.interrupt_at = 2  # the base, the first, and then no more
     with pytest.raises(KeyboardInterrupt):
-        run_trials(wanted, tmp_path, lambda _: 1)
+        run(wanted, tmp_path)
     worker.interrupt_at = -1
     reported = []
-    outcomes = run_trials(wanted, tmp_path, lambda _: 1, lambda done, total: reported.append((done, total)))
+    outcomes = run(wanted, tmp_path, lambda done, total: reported.append((done, total)))
     assert [request["overrides"] for request in worker.ran] == [{"base": True}, {"x": 1}, {"x": 2}, {"x": 3}]
     assert reported == [(1, 4), (2, 4), (3, 4), (4, 4)]
     for trial in wanted:
@@ -80,7 +83,7 @@ def test_an_interrupted_experiment_resumes(tmp_path, worker):
 def test_a_failed_trial_has_a_reason_and_is_tried_again(tmp_path, worker):
     wanted = trials({"fail": 1}, {"x": 1}, {"die": 1})
     for _ in range(2):
-        outcomes = run_trials(wanted, tmp_path, lambda _: 1)
+        outcomes = run(wanted, tmp_path)
         assert [outcomes[trial.digest].failed for trial in wanted[:2]] == ["k is 0.", None]
         assert "exit code -9" in outcomes[wanted[2].digest].failed
     assert len(worker.ran) == 4 + 2
@@ -89,26 +92,27 @@ def test_a_failed_trial_has_a_reason_and_is_tried_again(tmp_path, worker):
 def test_a_failed_base_fails_what_starts_from_it(tmp_path, worker):
     base = Trial(scene(), "beags-tiny", {"fail": 1}, 0, "code")
     refined = Trial(scene(), "beags-tiny", {"x": 1}, 0, "code", base=base)
-    outcome = run_trials([refined], tmp_path, lambda _: 1)[refined.digest]
+    outcome = run([refined], tmp_path)[refined.digest]
     assert outcome.failed == "its base failed: k is 0." and len(worker.ran) == 1
 
 
 def test_a_program_that_cannot_start_leaves_its_complaint_in_the_log(tmp_path, monkeypatch):
     complaint = "import sys; sys.exit('no such preset')"
-    monkeypatch.setattr(runner, "PROGRAM", [sys.executable, "-c", complaint])
-    with runner.Worker() as worker:
-        for trial in ("a", "b"):  # it is started anew for the next one
-            (tmp_path / trial).mkdir()
-            assert worker.run(tmp_path / trial) == 1
-            assert "no such preset" in (tmp_path / trial / "log.txt").read_text()
+    monkeypatch.setattr(trial_folder, "PROGRAM", [sys.executable, "-c", complaint])
+    worker = trial_folder.Worker()
+    for trial in ("a", "b"):  # it is started anew for the next one
+        (tmp_path / trial).mkdir()
+        assert worker.run(tmp_path / trial) == 1
+        assert "no such preset" in (tmp_path / trial / "log.txt").read_text()
+    worker.end()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the kernel ends a program with its parent on Linux alone")
 def test_the_program_that_runs_trials_ends_with_a_killed_bench(tmp_path):
     waiting = "import os, sys, time; open('pid', 'w').write(str(os.getpid()) + ' '); time.sleep(600)"
     bench = (
-        "from pathlib import Path; from beags_plugin.bench import runner; "
-        f"runner.PROGRAM = {[sys.executable, '-c', waiting]!r}; runner.Worker().run(Path('.'))"
+        "from pathlib import Path; from beags_plugin.bench.engines import trial_folder; "
+        f"trial_folder.PROGRAM = {[sys.executable, '-c', waiting]!r}; trial_folder.Worker().run(Path('.'))"
     )
     process = subprocess.Popen([sys.executable, "-c", bench], cwd=tmp_path)
     started = tmp_path / "pid"

@@ -13,7 +13,7 @@ from experiment_files import scene as trial_scene
 from paper_trees import write_tree
 
 from beags_plugin.bench import run as bench_run
-from beags_plugin.bench import runner
+from beags_plugin.bench.engines import trial_folder
 from beags_plugin.bench.experiment import Variant
 from beags_plugin.bench.paper import run as paper_run
 from beags_plugin.bench.paper.data_sets import read_data_sets
@@ -81,7 +81,7 @@ def test_truth_drawn_later_is_scored_without_training_again(finished, monkeypatc
     def no_worker(*_):
         raise AssertionError("a trial ran again")
 
-    monkeypatch.setattr(runner.Worker, "run", no_worker)
+    monkeypatch.setattr(trial_folder.Worker, "run", no_worker)
     silhouettes = options.data_root / "llff/fern/ground_truth/silhouettes"
     kept = options.output / "kept"
     shutil.move(silhouettes, kept)

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from beags_plugin.bench.options import EngineOptions
+
 
 @dataclass
-class PaperOptions:
+class PaperOptions(EngineOptions):
     """Which of the paper's methods to run on which of its data sets, and how."""
 
     data_root: Path

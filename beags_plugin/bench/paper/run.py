@@ -11,6 +11,8 @@ from typing import Any
 
 from rich.console import Console
 
+from beags_plugin.bench.engines import make_engine
+from beags_plugin.bench.engines.interface import Outcome
 from beags_plugin.bench.experiment import Experiment, load_experiment
 from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.paper.data_sets import METHODS, PaperDataSet, paper_folder, read_data_sets
@@ -30,7 +32,7 @@ from beags_plugin.bench.provenance import busy_note
 from beags_plugin.bench.report import provenance, write_csv, write_json
 from beags_plugin.bench.results import report_json, table_rows
 from beags_plugin.bench.run import TABLE_WIDTH, adapted, rows_of
-from beags_plugin.bench.runner import Outcome, run_trials
+from beags_plugin.bench.runner import run_trials
 from beags_plugin.bench.trials import VariantTrial, plan, steps_of
 from beags_plugin.system.digests import code_digest, folder_digest
 from beags_plugin.system.errors import UserError
@@ -50,6 +52,7 @@ def run_paper(options: PaperOptions) -> Outcomes | None:
         raise UserError(f"downscale is {options.downscale}: give 1 (the paper's sizes) or more.")
     data_sets = read_data_sets(options.data_set)
     experiment = _methods(options)
+    engine = make_engine(options.engine, options.address)
     scenes = find_scenes(
         data_sets, options.data_root, options.output, Sizes(options.downscale, options.quick), options.scenes
     )
@@ -71,8 +74,8 @@ def run_paper(options: PaperOptions) -> Outcomes | None:
     busy = busy_note(int(source["machine"]["cores"]))  # before the trials: they keep the machine busy
     trials = [trial for run in runs for trial in run.trials]
     finished = {trial.digest for trial in trials if (trials_folder / trial.folder_name / "result.json").exists()}
-    with progress_bar("Training, in steps") as progress:
-        found = run_trials(trials, trials_folder, steps_of, progress)
+    with engine, progress_bar("Training, in steps") as progress:
+        found = run_trials(trials, trials_folder, steps_of, engine, progress)
     found = _measured(runs, found, finished)
     rows = rows_of(runs, found)
     outcomes = Outcomes(rows, {(run.scene.name, run.variant.name): _truth(run, found) for run in runs})
