@@ -11,12 +11,15 @@ import tyro
 
 @dataclass(kw_only=True)
 class EngineOptions:
-    """Where trials run."""
+    """Where trials run, and whether they do."""
 
+    plan: bool = False
+    """Only print the trials, and the hours, memory and disk that they will take."""
     engine: str = "local"
-    """What runs the trials: local (this machine, one after the other)."""
+    """What runs the trials: local (this machine, one after the other) or ray (a Ray cluster; docs/cluster.md)."""
     address: str | None = None
-    """Address of the engine's cluster."""
+    """Address of the Ray cluster: auto (the one that this machine is part of), or host:port; if left out, Ray is
+    started on this machine alone."""
 
 
 @dataclass

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from beags_plugin.bench.scenes import TrialScene
@@ -54,9 +54,13 @@ def merged(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         "evaluation": evaluation,
         "seconds": seconds,
         "gaussians": _mean(result["gaussians"] for result in results.values()),
-        **{name: sum(result[name] for result in results.values()) for name in _SUMS},
+        **{name: _sum([result[name] for result in results.values()]) for name in _SUMS},
         **{name: max(result[name] for result in results.values()) for name in _LARGEST},
     }
+
+
+def _sum(values: Sequence[float | None]) -> float | None:
+    return None if None in values else sum(value for value in values if value is not None)
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

@@ -60,7 +60,8 @@ def make_row(
     seconds = {**result["seconds"], "base training": base["seconds"]["base training"]}
     figures |= {f"seconds {stage}": seconds.get(stage) for stage in STAGES}
     figures |= {name: result[name] for name in (*_COSTS, *_MASKS, *_SCALE)}
-    figures[_TOTAL] = base["cpu_seconds"] + result["cpu_seconds"]
+    parts = (base["cpu_seconds"], result["cpu_seconds"])  # None: it was interrupted
+    figures[_TOTAL] = None if None in parts else sum(parts)
     objects = {name: _masks(found) for name, found in evaluation["objects"].items()}
     after, before = "extracted_biou_after", "extracted_biou_before"
     pairs = [(of[before], of[after]) for of in objects.values()]

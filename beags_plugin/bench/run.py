@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
 
-from beags_plugin.bench.engines import make_engine
-from beags_plugin.bench.engines.interface import Outcome
+from beags_plugin.bench.engines import open_engine
+from beags_plugin.bench.engines.interface import Engine, Outcome
 from beags_plugin.bench.experiment import Experiment, Variant, check_keys, load_experiment
+from beags_plugin.bench.forecast import Forecast, SceneForecast
 from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.per_object import merged
+from beags_plugin.bench.plan_table import plan_lines, plan_table
 from beags_plugin.bench.provenance import busy_note
 from beags_plugin.bench.report import provenance, write_csv, write_json
 from beags_plugin.bench.results import ResultRow, make_row, report_json, table_rows
 from beags_plugin.bench.runner import run_trials
-from beags_plugin.bench.scenes import TrialScene, class_masks, damaged_masks, given_scenes, sample_scene
+from beags_plugin.bench.scenes import TrialScene, class_masks, damaged_masks, given_scenes, sample_scene, scene_size
 from beags_plugin.bench.trials import MODEL, VariantTrial, plan, steps_of
 from beags_plugin.system.digests import code_digest
 from beags_plugin.system.errors import UserError, check_choice
@@ -35,7 +37,8 @@ QUICK_MOST = 30  # steps of variants that say how many
 def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
     """Run the trials of an experiment that are not done, print its tables and write its files; returns the rows.
 
-    Raises ``UserError`` for a mistake in the experiment or the options. A trial that fails is a row with the reason.
+    With ``options.plan`` it prints the plan; no trial runs, and there are no rows. Raises ``UserError`` for a mistake
+    in the experiment or the options. A trial that fails is a row with the reason.
     """
     from beags_plugin.bench.confidence import plot_confidence
     from beags_plugin.bench.front import plot_front
@@ -44,29 +47,32 @@ def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
     from beags_plugin.bench.tables import tables
 
     experiment = adapted(load_experiment(name), options)
-    engine = make_engine(options.engine, options.address)
     source = provenance()
     busy = busy_note(int(source["machine"]["cores"]))  # before the trials: they keep the machine busy
     if busy:
         CONSOLE.print(f"Note: {busy}.")
-    scenes = scenes_of(experiment, options)
-    masks = {
-        (scene.name, variant.name): made
-        for scene in scenes
-        for variant in experiment.variants
-        if (made := _other_masks(scene, variant, options.output / "scenes")) is not None
-    }
-    runs = plan(experiment, scenes, masks, code_digest())
-    trials = [trial for run in runs for trial in run.trials]
-    with engine, progress_bar("Training, in steps") as progress:
-        outcomes = run_trials(trials, options.output / "trials", steps_of, engine, progress)
+    with open_engine(options) as engine:
+        scenes = scenes_of(experiment, options)
+        masks = {
+            (scene.name, variant.name): made
+            for scene in scenes
+            for variant in experiment.variants
+            if (made := _other_masks(scene, variant, options.output / "scenes")) is not None
+        }
+        runs = plan(experiment, scenes, masks, code_digest())
+        trials_folder = options.output / "trials"
+        forecast = Forecast(runs, {scene.name: scene_size(scene) for scene in scenes}, trials_folder)
+        print_plan(forecast.scenes(), "--scenes 1", options.plan)
+        if options.plan:
+            return []
+        outcomes = trained(runs, trials_folder, engine, forecast)
     rows = rows_of(runs, outcomes)
-    wide = Console(width=max(CONSOLE.width, TABLE_WIDTH), highlight=False, markup=False)
     for table in tables(experiment, rows):
-        wide.print(table)
+        _wide().print(table)
     files = options.files(experiment.name)
     picture = files["picture"]
-    write_json(files["json"], report_json(experiment, rows, {**source, "busy": busy, "quick": options.quick}))
+    about = {**source, "busy": busy, "quick": options.quick, "processors": processors(outcomes)}
+    write_json(files["json"], report_json(experiment, rows, about))
     write_csv(files["csv"], table_rows(rows))
     plot_experiment(picture, experiment, rows)
     if experiment.confidence:
@@ -81,6 +87,34 @@ def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
     for kind, path in files.items():
         CONSOLE.print(f"{kind}: {path}")
     return rows
+
+
+def print_plan(forecasts: Sequence[SceneForecast], smallest: str, table: bool) -> None:
+    """Print what the trials will take; smallest: see ``plan_lines``. table: scene by scene too."""
+    if table:
+        _wide().print(plan_table(forecasts))
+    for line in plan_lines(forecasts, smallest):
+        CONSOLE.print(line)
+
+
+def trained(runs: Sequence[VariantTrial], folder: Path, engine: Engine, forecast: Forecast) -> dict[str, Outcome]:
+    """Run the trials that are not done, with a progress bar; folder: of all trials. Returns outcomes by digest."""
+    trials = [trial for run in runs for trial in run.trials]
+    with progress_bar("Training, in steps") as progress:
+        outcomes = run_trials(trials, folder, steps_of, engine, progress, forecast.needs)
+    if len(found := processors(outcomes)) > 1:
+        CONSOLE.print(f"Note: trials ran on {' and '.join(found)}, which round in different ways.")
+    return outcomes
+
+
+def processors(outcomes: Mapping[str, Outcome]) -> list[str]:
+    """Return the names of the processors, or GPUs, that trained."""
+    results = [outcome.result for outcome in outcomes.values() if outcome.result is not None]
+    return sorted({result["processor"] for result in results if "processor" in result})
+
+
+def _wide() -> Console:
+    return Console(width=max(CONSOLE.width, TABLE_WIDTH), highlight=False, markup=False)
 
 
 def _other_masks(scene: TrialScene, variant: Variant, folder: Path) -> Path | None:

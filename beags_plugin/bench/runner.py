@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from beags_plugin.bench.engines.interface import Engine, Job, Outcome
+from beags_plugin.bench.engines.interface import Engine, Job, Needs, Outcome
 from beags_plugin.bench.engines.trial_folder import finished
 from beags_plugin.bench.trials import Trial
 
@@ -18,12 +19,13 @@ def run_trials(
     weight: Callable[[Trial], int],
     engine: Engine,
     progress: Progress | None = None,
+    needs: Callable[[Trial], Needs] = lambda _: Needs(),
 ) -> dict[str, Outcome]:
     """Run every trial, and its base before it, unless it is done; returns outcomes by digest.
 
     folder: holds a folder for each trial. weight: share of a trial in the progress, e.g. its number of steps. engine:
-    a context that was entered. The other trials run although one fails. The next call runs again what failed or was
-    interrupted.
+    a context that was entered. needs: forecast of a trial, asked for when it begins. The other trials run although one
+    fails. The next call runs again what failed, and goes on with what was interrupted.
     """
     queue = {trial.digest: trial for wanted in trials for trial in (wanted.base, wanted) if trial is not None}
     jobs = {digest: _job(order, trial, folder.absolute()) for order, (digest, trial) in enumerate(queue.items())}
@@ -37,7 +39,7 @@ def run_trials(
             if (outcome := _without_running(job, outcomes)) is not None:
                 ended.append((job, outcome))
             else:
-                engine.start(job)
+                engine.start(replace(job, needs=needs(job.trial)))
                 running += 1
         if not ended:
             ended.append(engine.wait())

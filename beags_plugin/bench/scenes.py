@@ -49,6 +49,24 @@ class TrialScene:
         return BeagsDataParserConfig(data=self.data, **parser_options(self.options))
 
 
+@dataclass(frozen=True)
+class SceneSize:
+    """What a scene has to train on: the number of views, and of pixels in all of them, as they are trained on."""
+
+    views: int
+    pixels: int
+
+
+def scene_size(scene: TrialScene) -> SceneSize:
+    """Read the size of a scene that is on disk; raises ``UserError`` for data that cannot be read."""
+    parser = scene.parser()
+    parser.downscale_factor = scene.downscale
+    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
+        outputs = parser.setup().get_dataparser_outputs("train")
+    pixels = outputs.cameras.width.long() * outputs.cameras.height.long()
+    return SceneSize(len(outputs.image_filenames), int(pixels.sum()))
+
+
 def parser_options(plain: Mapping[str, Any]) -> dict[str, Any]:
     """Return options of ``beags-data`` with paths in place of their texts."""
     return {name: Path(value) if name.endswith("_path") else value for name, value in plain.items()}

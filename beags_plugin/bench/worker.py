@@ -1,8 +1,10 @@
 """Trials, each in a process of its own: ``python -m beags_plugin.bench.worker`` reads their folders, a line each.
 
-A trial's folder holds trial.json. The worker trains into FOLDER/run, measures, and writes FOLDER/result.json, or
-FOLDER/failed.json with the reason in a sentence. The output goes to FOLDER/log.txt. For each folder the program
-prints the exit code of the process that it forked: imports, which take longer than a short trial, are done once.
+A line says how far to run a trial ("trained" or "scored") and names its folder, which holds trial.json. The worker
+trains into FOLDER/run and writes FOLDER/trained.json, measures and writes FOLDER/result.json, or FOLDER/failed.json
+with the reason in a sentence. What an interrupted attempt has saved there, it does not do again. The output goes to
+FOLDER/log.txt. For each folder the program prints the exit code of the process that it forked: imports, which take
+longer than a short trial, are done once.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from beags_plugin.bench.engines.trial_folder import INTERRUPTED, TRAINED, read_json
 from beags_plugin.system.child_processes import end_with_parent
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.whole_files import write_text_atomically
@@ -30,7 +33,8 @@ def serve() -> None:
     for line in sys.stdin:
         child = os.fork()
         if child == 0:
-            os._exit(_in_child(Path(line.rstrip("\n"))))
+            until, _, folder = line.rstrip("\n").partition(" ")
+            os._exit(_in_child(Path(folder), until))
         _, status = os.waitpid(child, 0)
         print(os.waitstatus_to_exitcode(status), flush=True)
 
@@ -47,17 +51,19 @@ def _import_everything() -> None:
     extension.load()
 
 
-def _in_child(folder: Path) -> int:
+def _in_child(folder: Path, until: str) -> int:
     """Run the trial in ``folder`` with its output in a file; returns the exit code."""
     end_with_parent()  # the program that waits for the trial
     code = 1
     try:
-        with open(folder / "log.txt", "wb") as log, open(os.devnull) as nothing:
+        with open(folder / "log.txt", "ab") as log, open(os.devnull) as nothing:
             os.dup2(nothing.fileno(), 0)
             os.dup2(log.fileno(), 1)
             os.dup2(log.fileno(), 2)
-        code = _trial(folder)
-    except BaseException:  # an interrupt too must not continue in the loop of the parent
+        code = _trial(folder, until)
+    except KeyboardInterrupt:  # the training has saved itself
+        code = INTERRUPTED
+    except BaseException:  # whatever it is must not continue in the loop of the parent
         traceback.print_exc()
     finally:
         sys.stdout.flush()
@@ -65,11 +71,21 @@ def _in_child(folder: Path) -> int:
     return code
 
 
-def _trial(folder: Path) -> int:
+def _trial(folder: Path, until: str) -> int:
     """Run ``folder/trial.json`` and write its result; returns the exit code."""
     request = json.loads((folder / "trial.json").read_text())
     try:
-        name, content = "result", run(request, folder / "run")
+        trained = read_json(folder / "trained.json")
+        if trained is None:
+            trained = train_trial(request, folder / "run")
+            if request["base"] is not None:
+                write_text_atomically(json.dumps(trained, indent=1), folder / "trained.json")
+        if request["base"] is None:
+            name, content = "result", trained
+        elif until == TRAINED:
+            return 0
+        else:
+            name, content = "result", {**trained, **measure(folder / "run")}
     except UserError as error:
         name, content = "failed", {"failed": str(error)}
     except Exception as error:  # whatever goes wrong is a row of the table, and the other trials run
@@ -79,18 +95,24 @@ def _trial(folder: Path) -> int:
     return int(name == "failed")
 
 
-def run(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
-    """Train and measure.
+def measure(run_folder: Path) -> dict[str, Any]:
+    """Return the figures of ``measure.measure_run``."""
+    from beags_plugin.bench.measure import measure_run
+
+    return measure_run(run_folder / "config.yml")
+
+
+def train_trial(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
+    """Train, or go on with a training that was interrupted.
 
     Returns {"steps", "gaussians", "seconds": {stage: s}, "cpu_seconds", "peak_memory_mb", "own_memory_mb" (the peak
-    without the loaded program)}. A refinement adds "summary" (a line per stage), "voxel_size", "training_pixels" and
-    the figures of ``measure.measure_run``.
+    without the loaded program), "processor"}. cpu_seconds is None after an interruption: what was killed has not said
+    how much it took. A refinement adds "summary" (a line per stage), "voxel_size" and "training_pixels".
     """
-    from beags_plugin.bench.measure import measure_run
     from beags_plugin.data.files import image_size
     from beags_plugin.plugin.runs.checkpoint_file import read_checkpoint
-    from beags_plugin.plugin.runs.launch import train
-    from beags_plugin.plugin.runs.layout import newest_checkpoint
+    from beags_plugin.plugin.runs.launch import resume, train
+    from beags_plugin.plugin.runs.layout import REPORT_FILE, newest_checkpoint
     from beags_plugin.plugin.runs.prepared import grid_state
     from beags_plugin.refiners import make_refiner
     from beags_plugin.system.memory import peak_memory_mb
@@ -98,10 +120,14 @@ def run(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
     start_memory_mb = peak_memory_mb()
     config = trial_config(request, run_folder)
     model = config.model_config
-    train(config)
+    again = any(config.get_checkpoint_dir().glob("step-*.ckpt"))
+    if not again:
+        train(config)
+    elif not (run_folder / REPORT_FILE).exists():
+        resume(run_folder)
     # CPU time does not grow while other programs have the cores
-    result: dict[str, Any] = {"cpu_seconds": time.process_time()}
-    result |= json.loads((run_folder / "training.json").read_text())
+    result: dict[str, Any] = {"cpu_seconds": None if again else time.process_time(), "processor": _processor(config)}
+    result |= json.loads((run_folder / REPORT_FILE).read_text())
     result["own_memory_mb"] = result["peak_memory_mb"] - start_memory_mb
     checkpoint = read_checkpoint(newest_checkpoint(config.get_checkpoint_dir()))
     result["gaussians"] = len(checkpoint["pipeline"]["_model.class_ids"])
@@ -117,7 +143,17 @@ def run(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
     result["voxel_size"] = float(grid["voxel_size"]) if grid else None
     sizes = [image_size(path) for path in (prepared / "masks").rglob("*.png")]
     result["training_pixels"] = sum(width * height for width, height in sizes)
-    return {**result, **measure_run(run_folder / "config.yml")}
+    return result
+
+
+def _processor(config: BeagsTrainerConfig) -> str:
+    """Return the name of what computed: others round in another way."""
+    import torch
+
+    from beags_plugin.bench.provenance import describe_machine
+
+    on_gpu = config.machine.device_type == "cuda" and torch.cuda.is_available()
+    return torch.cuda.get_device_name() if on_gpu else str(describe_machine()["cpu"])
 
 
 def trial_config(request: dict[str, Any], run_folder: Path) -> BeagsTrainerConfig:

@@ -15,6 +15,7 @@ from experiment_files import written
 from beags_plugin.bench.engines import trial_folder
 from beags_plugin.bench.experiment import load_experiment
 from beags_plugin.bench.options import ExperimentOptions
+from beags_plugin.bench.results import STAGES
 from beags_plugin.bench.run import run_experiment
 
 MINIATURE = """
@@ -86,7 +87,7 @@ def test_a_second_call_trains_only_what_failed(miniature, monkeypatch):
     path, options, rows = miniature
     ran = []
 
-    def fail_again(self, folder: Path) -> int:
+    def fail_again(self, folder: Path, until: str) -> int:
         ran.append(json.loads((folder / "trial.json").read_text())["overrides"])
         return 1
 
@@ -94,6 +95,26 @@ def test_a_second_call_trains_only_what_failed(miniature, monkeypatch):
     again = run_experiment(path, options)
     assert [overrides["pipeline.model.prepare.k"] for overrides in ran] == [0]
     assert [row.figures for row in again] == [row.figures for row in rows]
+
+
+def test_what_an_interruption_left_is_not_trained_again(miniature):
+    """One trial was killed before its scores, one in its last step: both end with the same figures."""
+    path, options, rows = miniature
+    lost = {"damage = 0": ("result",), "damage = 2": ("result", "trained", "run/training")}
+    files = options.output.glob("trials/*-refined-*/result.json")
+    results = {file.parent: json.loads(file.read_text()) for file in files}
+    for row in (row for row in rows if row.variant.name in lost):
+        psnr = row.figures["psnr_after"]
+        (folder,) = [each for each, result in results.items() if result["evaluation"]["psnr"]["after"] == psnr]
+        for name in lost[row.variant.name]:
+            (folder / f"{name}.json").unlink()
+    again = run_experiment(path, options)
+    clocks = {"cpu_seconds", "cpu_seconds total", "peak_memory_mb", "own_memory_mb", *map("seconds {}".format, STAGES)}
+    for before, after in zip(rows, again, strict=True):
+        interrupted = after.variant.name == "damage = 2"
+        changed = {name for name, value in before.figures.items() if value != after.figures[name]}
+        assert changed <= (clocks if interrupted else set()), after.variant.name
+        assert after.failed or (after.figures["cpu_seconds"] is None) == interrupted
 
 
 def test_the_file_in_the_documentation_is_an_experiment(tmp_path):

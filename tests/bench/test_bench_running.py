@@ -27,14 +27,18 @@ class FakeWorker:
     def __init__(self) -> None:
         self.ran: list[dict] = []
         self.interrupt_at = -1
+        self.saves = False
 
     def end(self):
         pass
 
-    def run(self, folder: Path) -> int:
+    def run(self, folder: Path, until: str) -> int:
         request = json.loads((folder / "trial.json").read_text())
         if len(self.ran) == self.interrupt_at:
             (folder / "half").write_text("done")
+            if self.saves:
+                (folder / "run/nerfstudio_models").mkdir(parents=True)
+                (folder / "run/nerfstudio_models/step-000000007.ckpt").touch()
             raise KeyboardInterrupt
         self.ran.append(request)
         if "fail" in request["overrides"]:
@@ -78,6 +82,20 @@ def test_an_interrupted_experiment_resumes(tmp_path, worker):
         assert outcome.failed is None and outcome.result == {"digest": trial.digest}
         assert not (outcome.folder / "half").exists()
     assert worker.ran[1]["base"] == str(outcomes[wanted[0].base.digest].folder / "run")
+
+
+def test_an_interrupted_trial_that_saved_goes_on_unless_it_is_another_one(tmp_path, worker):
+    wanted = trials({"x": 1})
+    worker.interrupt_at, worker.saves = 1, True
+    with pytest.raises(KeyboardInterrupt):
+        run(wanted, tmp_path)
+    worker.interrupt_at = -1
+    folder = run(wanted, tmp_path)[wanted[0].digest].folder
+    assert (folder / "half").exists() and (folder / "result.json").exists()
+    (folder / "result.json").unlink()
+    (folder / "trial.json").write_text("{}")
+    run(wanted, tmp_path)
+    assert not (folder / "half").exists() and (folder / "result.json").exists()
 
 
 def test_a_failed_trial_has_a_reason_and_is_tried_again(tmp_path, worker):

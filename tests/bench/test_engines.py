@@ -94,7 +94,7 @@ def test_what_is_done_is_not_given_to_an_engine_again(tmp_path):
 def test_engines_are_chosen_by_name_before_anything_is_made(tmp_path, monkeypatch):
     path = written(tmp_path, GOOD)
     for options, sentence in {
-        ("locale", None): r"there is no engine 'locale' \(did you mean local\?\): choose one of local\.",
+        ("locale", None): r"there is no engine 'locale' \(did you mean local\?\): choose one of local, ray\.",
         ("local", "auto"): "--address auto is of a cluster: add --engine ray, or leave it out.",
     }.items():
         engine, address = options

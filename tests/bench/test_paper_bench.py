@@ -15,13 +15,14 @@ from paper_trees import write_tree
 from beags_plugin.bench import run as bench_run
 from beags_plugin.bench.engines import trial_folder
 from beags_plugin.bench.experiment import Variant
+from beags_plugin.bench.forecast import TEMPORARY_BYTES
 from beags_plugin.bench.paper import run as paper_run
 from beags_plugin.bench.paper.data_sets import read_data_sets
-from beags_plugin.bench.paper.forecast import TEMPORARY_BYTES, forecast
 from beags_plugin.bench.paper.on_disk import SceneOnDisk
 from beags_plugin.bench.paper.options import PaperOptions
-from beags_plugin.bench.paper.run import run_paper
-from beags_plugin.bench.paper.tables import Outcomes, paper_tables, plan_lines
+from beags_plugin.bench.paper.run import forecast_of, run_paper
+from beags_plugin.bench.paper.tables import Outcomes, paper_tables
+from beags_plugin.bench.plan_table import plan_lines
 from beags_plugin.bench.results import FIGURES, ResultRow
 from beags_plugin.bench.trials import Trial, VariantTrial
 from beags_plugin.commands import cli
@@ -113,7 +114,7 @@ def test_a_drawing_that_is_refused_is_a_row_with_the_reason(finished, capsys):
 
 def test_the_plan_starts_nothing_and_knows_what_is_done(finished, tmp_path, monkeypatch, capsys):
     options, _ = finished
-    monkeypatch.setattr(paper_run, "run_trials", None)
+    monkeypatch.setattr(paper_run, "trained", None)
     for name in ("llff", "lerf"):
         shutil.copytree(options.data_root / name, tmp_path / "data" / name)
     arguments = ["bench", "paper", "--data-root", str(tmp_path / "data"), "--quick", "--methods", "bea-gs", "--plan"]
@@ -148,15 +149,15 @@ def test_the_plan_scales_what_finished_trials_took(tmp_path):
         (folder / trial.folder_name).mkdir(parents=True)
         (folder / trial.folder_name / "result.json").write_text(result_of(seconds, memory))
         (folder / trial.folder_name / "scene").write_bytes(bytes(2_000_000))
-    room, garden = forecast(scenes, runs, folder)
+    room, garden = forecast_of(scenes, runs, folder)[0].scenes()
     assert (room.trials, room.done, room.unknown, room.hours) == (3, 2, ("cob-gs",), 0.0)
     assert (garden.trials, garden.done, garden.unknown) == (3, 0, ("cob-gs",))
     assert garden.hours == pytest.approx(3 * (100 + 360) / 3600) and garden.memory_mb == 900.0
     assert garden.temporary_mb == TEMPORARY_BYTES * 3 and garden.disk_mb == pytest.approx(54 + 3 * 4, rel=1e-3)
-    assert "of cob-gs are known once" in plan_lines([room, garden])[1]
-    known = forecast(scenes, [run for run in runs if run.variant is variant], folder)
-    assert plan_lines(known)[1].startswith("Some 0.38 hours, 900 MB of memory and 0.01 GB of disk")
-    assert plan_lines(known[:1]) == ["2 trials, 0 of them not done."]
+    assert "of cob-gs are known once" in plan_lines([room, garden], "--scenes")[1]
+    known = forecast_of(scenes, [run for run in runs if run.variant is variant], folder)[0].scenes()
+    assert plan_lines(known, "")[1].startswith("Some 0.38 hours, 900 MB of memory and 0.01 GB of disk")
+    assert plan_lines(known[:1], "") == ["2 trials, 0 of them not done."]
 
 
 def row(scene: str, method: str, **figures: float) -> ResultRow:

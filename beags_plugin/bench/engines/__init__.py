@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from beags_plugin.system.errors import UserError
@@ -9,11 +11,15 @@ from beags_plugin.system.registry import Registry
 
 if TYPE_CHECKING:
     from beags_plugin.bench.engines.interface import Engine
+    from beags_plugin.bench.options import EngineOptions
 
 ENGINES = Registry(
     "engine",
     "beags.engines",
-    {"local": "beags_plugin.bench.engines.local:LocalEngine"},
+    {
+        "local": "beags_plugin.bench.engines.local:LocalEngine",
+        "ray": "beags_plugin.bench.engines.ray_cluster:RayEngine",
+    },
 )
 
 
@@ -26,3 +32,17 @@ def make_engine(name: str, address: str | None = None) -> Engine:
     if reason := kind.unavailable():
         raise UserError(reason)
     return kind(address)
+
+
+@contextmanager
+def open_engine(options: EngineOptions) -> Iterator[Engine]:
+    """Open the engine of the options, and close it at the end; for a plan nothing is opened.
+
+    Raises ``UserError`` for an engine that cannot run here, or whose cluster is not reached.
+    """
+    engine = make_engine(options.engine, options.address)
+    if options.plan:
+        yield engine
+    else:
+        with engine:
+            yield engine

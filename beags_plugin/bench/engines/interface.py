@@ -11,6 +11,14 @@ from beags_plugin.bench.trials import Trial
 
 
 @dataclass(frozen=True)
+class Needs:
+    """What a trial is expected to take. cores: that it keeps busy; None: not known. memory_mb: the largest."""
+
+    cores: int | None = None
+    memory_mb: float = 1000.0  # of the loaded program alone: 900
+
+
+@dataclass(frozen=True)
 class Job:
     """A trial to run.
 
@@ -22,6 +30,7 @@ class Job:
     trial: Trial
     folder: Path
     base: Path | None = None
+    needs: Needs = Needs()
 
     @property
     def request(self) -> dict[str, Any]:
@@ -42,11 +51,15 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome of a trial: the content of result.json, or the reason of its failure in a sentence."""
+    """The outcome of a trial: the content of result.json, or the reason of its failure in a sentence.
+
+    killed: it failed because a signal ended it, as when memory ran out; what it had saved is still there.
+    """
 
     folder: Path
     result: dict[str, Any] | None
     failed: str | None = None
+    killed: bool = False
 
 
 class Engine(ABC):

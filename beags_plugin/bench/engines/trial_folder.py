@@ -5,43 +5,75 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import IO, Any
 
 from filelock import FileLock
 
 from beags_plugin.bench.engines.interface import Outcome
+from beags_plugin.plugin.training.memory_guard import LEAST_FREE_MB, free_disk_mb
 from beags_plugin.system.child_processes import bound
 from beags_plugin.system.errors import writing
+from beags_plugin.system.lock import LOCK
 
 PROGRAM = [sys.executable, "-m", "beags_plugin.bench.worker"]
+TRAINED, SCORED = "trained", "scored"
+"""How far to run a trial: until its training ends, or to the scores of its refinement."""
+INTERRUPTED = 128 + signal.SIGTERM
+"""Exit code of a trial that SIGTERM ended after it saved its training."""
+_PATIENCE = 60.0  # seconds for a training whose program was killed, to save and end
 
 
-def run_in_folder(folder: Path, request: dict[str, Any], worker: Worker) -> Outcome:
+def run_in_folder(folder: Path, request: dict[str, Any], worker: Worker, until: str = SCORED) -> Outcome:
     """Run the trial that ``request`` describes (``Job.request``), unless it is done, and return its outcome.
 
-    Raises ``UserError`` where nothing can be written.
+    until: ``SCORED``, or ``TRAINED``; the result is then only that of the training. An attempt that a kill or a power
+    cut ended goes on from what it saved. Raises ``UserError`` where nothing can be written.
     """
+    content = folder / f"{'trained' if until == TRAINED and request['base'] is not None else 'result'}.json"
     with writing(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         lock = FileLock(folder.parent / f".{folder.name}.lock").acquire()
     with lock:  # the second of two programs that want the same trial waits, and finds it done
-        if (result := finished(folder)) is not None:
+        if (result := finished(folder) or read_json(content)) is not None:
             return Outcome(folder, result)
-        if folder.exists():
-            shutil.rmtree(folder)  # left by an interrupted or failed trial
-        with writing(folder):
-            folder.mkdir(parents=True)
-            (folder / "trial.json").write_text(json.dumps(request, indent=1))
-        code = worker.run(folder)
-        if (result := finished(folder)) is not None:
+        if _goes_on(folder, request):
+            _wait_for_end(folder / "run")
+        else:
+            with writing(folder):
+                if folder.exists():
+                    shutil.rmtree(folder)  # left by an interrupted or failed trial
+                folder.mkdir(parents=True)
+                (folder / "trial.json").write_text(json.dumps(request, indent=1))
+        code = worker.run(folder, until)
+        if (result := read_json(content)) is not None:
             return Outcome(folder, result)
-        failed = read_json(folder / "failed.json")
-        reason = failed["failed"] if failed else f"it ended with exit code {code}; {folder / 'log.txt'} says more."
-        return Outcome(folder, None, reason)
+        if (failed := read_json(folder / "failed.json")) is not None:
+            return Outcome(folder, None, failed["failed"])
+        full = f"; its disk has {free:.0f} MB left" if (free := free_disk_mb(folder)) < LEAST_FREE_MB else ""
+        reason = f"it ended with exit code {code}{full}; {folder / 'log.txt'} says more."
+        return Outcome(folder, None, reason, killed=(code < 0 or code == INTERRUPTED) and not full)
+
+
+def _goes_on(folder: Path, request: dict[str, Any]) -> bool:
+    """Return whether the folder holds an attempt at this very trial that was ended from outside and can go on."""
+    saved = (folder / "trained.json").exists() or any((folder / "run" / "nerfstudio_models").glob("step-*.ckpt"))
+    same = read_json(folder / "trial.json") == json.loads(json.dumps(request))
+    return saved and same and not (folder / "failed.json").exists()
+
+
+def _wait_for_end(run: Path) -> None:
+    """Wait for a training that still saves: its own program, which waited for it, was killed."""
+    if (run / LOCK).exists():
+        with suppress(OSError):  # of a lock (a Timeout is one too): the training says so itself
+            FileLock(run / LOCK).acquire(timeout=_PATIENCE).lock.release()
 
 
 def finished(folder: Path) -> dict[str, Any] | None:
@@ -58,18 +90,23 @@ def read_json(path: Path) -> dict[str, Any] | None:
 
 
 class Worker:
-    """The program that runs trials, ``worker.serve``; the first trial starts it, ``end`` ends it."""
+    """The program that runs trials, ``worker.serve``; the first trial starts it, ``end`` ends it.
 
-    def __init__(self) -> None:
+    environment: variables of its own, besides those of this process.
+    """
+
+    def __init__(self, environment: Mapping[str, str] = MappingProxyType({})) -> None:
+        self._environment = environment
         self._process: subprocess.Popen[str] | None = None
         self._errors: IO[bytes] | None = None  # of the program itself; trials have logs
 
-    def run(self, folder: Path) -> int:
-        """Run the trial in ``folder``; returns the exit code of its process, negative for a signal."""
+    def run(self, folder: Path, until: str = SCORED) -> int:
+        """Run the trial in ``folder`` (see ``run_in_folder``); returns its exit code, negative for a signal."""
         if self._process is None:
             package = str(Path(__file__).resolve().parents[3])  # the worker imports this very package
             paths = os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH")]))
-            environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ, "PYTHONPATH": paths, "COLUMNS": "160"}
+            environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ, **self._environment}
+            environment |= {"PYTHONPATH": paths, "COLUMNS": "160"}
             self._errors = tempfile.TemporaryFile()  # noqa: SIM115
             self._process = subprocess.Popen(
                 bound(PROGRAM),
@@ -81,7 +118,7 @@ class Worker:
             )
         assert self._process.stdin is not None and self._process.stdout is not None and self._errors is not None
         try:
-            print(folder.absolute(), file=self._process.stdin, flush=True)
+            print(until, folder.absolute(), file=self._process.stdin, flush=True)
             return int(self._process.stdout.readline())
         except (OSError, ValueError):  # the program itself is gone
             process, self._process = self._process, None

@@ -20,8 +20,6 @@ class PaperOptions(EngineOptions):
     """Which methods of experiments/paper/methods.toml; all if left out."""
     scenes: tuple[str, ...] = ()
     """Which scenes, by name; all if left out."""
-    plan: bool = False
-    """Only print what is missing, the trials, and the hours, memory and disk that they will take."""
     preset: str | None = None
     """What to train with instead of beags-paper: a preset of method_configs/; figures are then not the paper's."""
     downscale: float = 1.0

@@ -11,12 +11,12 @@ from typing import Any
 
 from rich.console import Console
 
-from beags_plugin.bench.engines import make_engine
-from beags_plugin.bench.engines.interface import Outcome
+from beags_plugin.bench.engines import open_engine
+from beags_plugin.bench.engines.interface import Engine, Outcome
 from beags_plugin.bench.experiment import Experiment, load_experiment
+from beags_plugin.bench.forecast import Forecast
 from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.paper.data_sets import METHODS, PaperDataSet, paper_folder, read_data_sets
-from beags_plugin.bench.paper.forecast import forecast
 from beags_plugin.bench.paper.on_disk import TRUTH, SceneOnDisk, Sizes, find_scenes
 from beags_plugin.bench.paper.options import PaperOptions
 from beags_plugin.bench.paper.tables import (
@@ -25,15 +25,13 @@ from beags_plugin.bench.paper.tables import (
     mean_row,
     missing_lines,
     paper_tables,
-    plan_lines,
-    plan_table,
 )
 from beags_plugin.bench.provenance import busy_note
 from beags_plugin.bench.report import provenance, write_csv, write_json
 from beags_plugin.bench.results import report_json, table_rows
-from beags_plugin.bench.run import TABLE_WIDTH, adapted, rows_of
-from beags_plugin.bench.runner import run_trials
-from beags_plugin.bench.trials import VariantTrial, plan, steps_of
+from beags_plugin.bench.run import TABLE_WIDTH, adapted, print_plan, processors, rows_of, trained
+from beags_plugin.bench.scenes import SceneSize
+from beags_plugin.bench.trials import VariantTrial, plan
 from beags_plugin.system.digests import code_digest, folder_digest
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import progress_bar
@@ -52,7 +50,14 @@ def run_paper(options: PaperOptions) -> Outcomes | None:
         raise UserError(f"downscale is {options.downscale}: give 1 (the paper's sizes) or more.")
     data_sets = read_data_sets(options.data_set)
     experiment = _methods(options)
-    engine = make_engine(options.engine, options.address)
+    with open_engine(options) as engine:
+        return _run(options, data_sets, experiment, engine)
+
+
+def _run(
+    options: PaperOptions, data_sets: Sequence[PaperDataSet], experiment: Experiment, engine: Engine
+) -> Outcomes | None:
+    """Do what ``run_paper`` does, with the engine."""
     scenes = find_scenes(
         data_sets, options.data_root, options.output, Sizes(options.downscale, options.quick), options.scenes
     )
@@ -63,35 +68,42 @@ def run_paper(options: PaperOptions) -> Outcomes | None:
         raise UserError(f"no scene in {options.data_root} is complete: the lines above say what belongs where.")
     runs = plan(experiment, [scene.scene for scene in present if scene.scene is not None], {}, code_digest())
     trials_folder = options.output / "trials"
-    wide = Console(width=max(CONSOLE.width, TABLE_WIDTH), highlight=False, markup=False)
-    forecasts = forecast(present, runs, trials_folder)
-    wide.print(plan_table(forecasts))
-    for line in plan_lines(forecasts):
-        CONSOLE.print(line)
+    forecast, titles = forecast_of(present, runs, trials_folder)
+    print_plan(forecast.scenes(titles), "--scenes with the smallest scene", True)
     if options.plan:
         return None
     source = provenance()
     busy = busy_note(int(source["machine"]["cores"]))  # before the trials: they keep the machine busy
     trials = [trial for run in runs for trial in run.trials]
     finished = {trial.digest for trial in trials if (trials_folder / trial.folder_name / "result.json").exists()}
-    with engine, progress_bar("Training, in steps") as progress:
-        found = run_trials(trials, trials_folder, steps_of, engine, progress)
+    found = trained(runs, trials_folder, engine, forecast)
     found = _measured(runs, found, finished)
     rows = rows_of(runs, found)
     outcomes = Outcomes(rows, {(run.scene.name, run.variant.name): _truth(run, found) for run in runs})
     methods = [variant.name for variant in experiment.variants]
+    wide = Console(width=max(CONSOLE.width, TABLE_WIDTH), highlight=False, markup=False)
     for table in paper_tables(data_sets, methods, outcomes):
         (CONSOLE if isinstance(table, str) else wide).print(table)
     for line in _lines(experiment, options, outcomes):
         CONSOLE.print(line)
     files = {kind: getattr(options, kind) or options.output / f"paper.{kind}" for kind in ("json", "csv")}
     about = {**source, "busy": busy, "quick": options.quick, "downscale": options.downscale}
+    about["processors"] = processors(found)
     report = {**report_json(experiment, rows, about), "data_sets": _report(data_sets, scenes, methods, outcomes)}
     write_json(files["json"], report)
     write_csv(files["csv"], table_rows(rows))
     for kind, path in files.items():
         CONSOLE.print(f"{kind}: {path}")
     return outcomes
+
+
+def forecast_of(
+    scenes: Sequence[SceneOnDisk], runs: Sequence[VariantTrial], folder: Path
+) -> tuple[Forecast, dict[str, str]]:
+    """Return the forecast of the trials in ``folder``, and titles of the scenes by name."""
+    found = {scene.scene.name: scene for scene in scenes if scene.scene is not None}
+    sizes = {name: SceneSize(scene.views, scene.pixels) for name, scene in found.items()}
+    return Forecast(runs, sizes, folder), {n: f"{scene.data_set.title}, {scene.name}" for n, scene in found.items()}
 
 
 def _methods(options: PaperOptions) -> Experiment:

@@ -1,4 +1,4 @@
-"""The paper's tables with ours beside them, the plan, and what is missing, for a terminal."""
+"""The paper's tables with ours beside them, and what is missing, for a terminal."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from beags_plugin.bench.paper.data_sets import PaperDataSet
-from beags_plugin.bench.paper.forecast import SceneForecast
 from beags_plugin.bench.paper.on_disk import SceneOnDisk
 from beags_plugin.bench.report import number, plain_table
 from beags_plugin.bench.results import ResultRow, means
@@ -44,48 +43,6 @@ def missing_lines(scenes: Sequence[SceneOnDisk]) -> list[str]:
             title = f"{scene.data_set.title}, {scene.name}"
             lines += [f"missing: {title}: {what}" for what in scene.missing]
             lines += [f"note: {title}: {what}" for what in scene.notes]
-    return lines
-
-
-def plan_table(forecasts: Sequence[SceneForecast]) -> Table:
-    """Return the trials of each scene and what they will take; a dash where nothing of the kind has finished."""
-    rows = []
-    for each in forecasts:
-        known = each.trials - each.done > 0 and not each.unknown
-        spent = each.trials == each.done
-        rows.append(
-            [
-                f"{each.scene.data_set.title}, {each.scene.name}",
-                str(each.trials),
-                str(each.done),
-                str(each.scene.views),
-                number(each.scene.pixels / 1e6, 1),
-                number(each.hours, 2) if known or spent else _MISSING,
-                number(each.memory_mb, 0) if known else _MISSING,
-                number(each.disk_mb / 1e3, 2) if known or spent else _MISSING,
-                number(each.temporary_mb / 1e3, 2),
-            ]
-        )
-    heads = ("scene", "trials", "done", "views", "10^6\npixels", "hours", "memory\nMB", "disk\nGB", "of it\ntemporary")
-    return plain_table("Trials and what is left of them", heads, rows)
-
-
-def plan_lines(forecasts: Sequence[SceneForecast]) -> list[str]:
-    """Return the sums over all scenes, and which kinds of trials nothing is known of."""
-    left = sum(each.trials - each.done for each in forecasts)
-    lines = [f"{sum(each.trials for each in forecasts)} trials, {left} of them not done."]
-    if unknown := list(dict.fromkeys(kind for each in forecasts for kind in each.unknown)):
-        lines.append(
-            f"Hours, memory and disk of {', '.join(unknown)} are known once one of each has finished here (--scenes "
-            "with the smallest scene); they are then scaled by the training pixels."
-        )
-    elif left:
-        hours, disk = sum(each.hours for each in forecasts), sum(each.disk_mb - each.temporary_mb for each in forecasts)
-        memory = max(each.memory_mb for each in forecasts)
-        lines.append(
-            f"Some {hours:.2f} hours, {memory:.0f} MB of memory and {disk / 1e3:.2f} GB of disk, by the finished "
-            "trials of each kind, scaled by the training pixels (memory: the largest so far)."
-        )
     return lines
 
 

@@ -1,0 +1,72 @@
+"""Folders that travel as bytes to and from nodes that do not share them, and the paths in what comes back."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import os
+import shutil
+import tarfile
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+from beags_plugin.system.errors import writing
+from beags_plugin.system.whole_files import write_text_atomically
+
+
+def pack(folder: Path, only: Collection[str] = ()) -> bytes:
+    """Return a folder as an uncompressed tar file (photos and checkpoints are no smaller), without locks.
+
+    only: names of the files in it to take; all if empty.
+    """
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w") as tar:
+        for path in sorted(folder.rglob("[!.]*")):
+            if path.is_file() and (not only or str(path.relative_to(folder)) in only):
+                tar.add(path.resolve(), path.relative_to(folder).as_posix(), recursive=False)
+    return buffer.getvalue()
+
+
+def unpack(parcel: bytes, folder: Path) -> None:
+    """Make ``folder`` hold what ``pack`` took, all at once; raises ``UserError`` where the disk does not let it."""
+    part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+    with writing(folder):
+        shutil.rmtree(part, ignore_errors=True)
+        try:
+            part.mkdir(parents=True)
+            with tarfile.open(fileobj=io.BytesIO(parcel)) as tar:
+                tar.extraction_filter = getattr(tarfile, "data_filter", None)  # not in the first Pythons 3.10
+                tar.extractall(part)
+            if folder.exists():
+                shutil.rmtree(folder)
+            part.rename(folder)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)  # of a full disk
+
+
+def relocate(folder: Path, moved: Mapping[Path, Path]) -> None:
+    """Let the configs of the runs below ``folder`` name the places here. moved: folders here by those on the node."""
+    import yaml
+
+    from beags_plugin.plugin.options.config import CONFIG_FILE
+    from beags_plugin.plugin.runs.run_config import load_run_config
+
+    for path in sorted(folder.rglob(CONFIG_FILE)):
+        write_text_atomically(yaml.dump(_relocated(load_run_config(path), moved)), path)
+
+
+def _relocated(value: Any, moved: Mapping[Path, Path]) -> Any:
+    """Return a config's value with its paths moved; a dataclass is changed itself."""
+    if isinstance(value, Path):
+        for there, here in moved.items():
+            if value.is_relative_to(there):
+                return here / value.relative_to(there)
+    elif isinstance(value, dict):
+        return {key: _relocated(each, moved) for key, each in value.items()}
+    elif isinstance(value, (list, tuple)):
+        return type(value)(_relocated(each, moved) for each in value)
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        for name, each in vars(value).items():
+            value.__dict__[name] = _relocated(each, moved)
+    return value

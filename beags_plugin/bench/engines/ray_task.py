@@ -1,0 +1,176 @@
+"""What a node of a Ray cluster does for a trial: it trains it, or scores what was trained.
+
+It works in the trial's folder where it sees that of the command (shared storage), else in a folder of its own, and
+then it returns what it made. Photos, masks and bases that it does not see are sent to it once.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock
+
+from beags_plugin.bench.engines.interface import Outcome
+from beags_plugin.bench.engines.parcels import pack, unpack
+from beags_plugin.bench.engines.trial_folder import Worker, run_in_folder
+from beags_plugin.plugin.training.memory_guard import LEAST_FREE_MB, free_disk_mb
+from beags_plugin.system.digests import code_digest, folder_digest
+from beags_plugin.system.errors import UserError, writing
+
+FOLDERS = ("data", "masks", "base")
+"""Entries of a trial's request that are folders which the trial reads."""
+_OF_FAILURES = ("failed.json", "log.txt", "trial.json")
+
+
+@dataclass(frozen=True)
+class Input:
+    """A folder that a trial reads. path: where the command sees it. digest: ``folder_digest`` there.
+
+    parcel: a reference to its bytes, or None as long as no node lacked it.
+    """
+
+    path: str
+    digest: str
+    parcel: Any = None
+
+
+@dataclass(frozen=True)
+class Task:
+    """One step of a trial, for one node.
+
+    folder: of the trial, as the command sees it. mark: a file beside it, and what it holds: a node that reads the same
+    shares the folder. request: ``Job.request``. until: ``TRAINED`` or ``SCORED``. code: digest of the command's code.
+    environment: variables of the trial. inputs: by name in the request. trained: reference to the bytes of the folder
+    once it was trained, if another node did that on its own disk.
+    """
+
+    folder: str
+    mark: tuple[str, str]
+    request: Mapping[str, Any]
+    until: str
+    code: str
+    environment: Mapping[str, str]
+    inputs: Mapping[str, Input]
+    trained: Any = None
+
+
+@dataclass(frozen=True)
+class Report:
+    """How a task ended.
+
+    node, host: who did it. outcome: None where it was not done: ``lacks`` names inputs to send, or ``unfit`` says in a
+    sentence why this node can do none. shared: whether the files are in the trial's folder. moved: places on the
+    node by those of the command, where they differ.
+    """
+
+    node: str
+    host: str
+    outcome: Outcome | None = None
+    lacks: tuple[str, ...] = ()
+    unfit: str | None = None
+    shared: bool = True
+    moved: Mapping[str, str] = field(default_factory=dict)
+
+
+def perform(task: Task, node: str, fetch: Callable[[Any], bytes]) -> tuple[Report, bytes | None]:
+    """Do the task; returns how it ended and, where the trial's folder is not shared, its bytes.
+
+    node: id of the node in its cluster. fetch: returns the bytes of a reference.
+    """
+    host = socket.gethostname()
+    if _code() != task.code:
+        return Report(node, host, unfit=f"{host} has another version of beags: install the same wheel there"), None
+    shared = _reads(*task.mark)
+    own = _own_folder(node)
+    folder = Path(task.folder) if shared else own / "trials" / Path(task.folder).name
+    if not shared and (free := free_disk_mb(own)) < LEAST_FREE_MB:
+        return Report(node, host, unfit=f"the disk of {own} on {host} has {free:.0f} MB left: free some space"), None
+    try:
+        places = {name: _place(each, own / "inputs", fetch) for name, each in task.inputs.items()}
+        if lacks := tuple(name for name, place in places.items() if place is None):
+            return Report(node, host, lacks=lacks), None
+        moved = {each.path: str(places[name]) for name, each in task.inputs.items()}
+        moved = {there: here for there, here in {**moved, task.folder: str(folder)}.items() if there != here}
+        request = {**task.request, **{name: str(place) for name, place in places.items()}}
+        if not shared and task.trained is not None:
+            unpack(fetch(task.trained), folder)
+        outcome = run_in_folder(folder, request, _worker(task.environment), task.until)
+    except UserError as error:
+        return Report(node, host, Outcome(Path(task.folder), None, f"{error} (on {host})"), shared=shared), None
+    if outcome.killed:
+        return Report(node, host, outcome, shared=shared), None
+    if shared:
+        return Report(node, host, outcome, moved=moved), None
+    if outcome.failed and free_disk_mb(own) < LEAST_FREE_MB:
+        shutil.rmtree(folder, ignore_errors=True)
+        return Report(node, host, unfit=f"{outcome.failed} (on {host})"), None
+    parcel = pack(folder, _OF_FAILURES if outcome.failed else ())
+    shutil.rmtree(folder, ignore_errors=True)
+    return Report(node, host, outcome, shared=False, moved=moved), parcel
+
+
+def forget(node: str, digests: Mapping[str, Any]) -> None:
+    """Remove the inputs of these digests that this node was sent."""
+    for digest in digests:
+        shutil.rmtree(_own_folder(node) / "inputs" / digest, ignore_errors=True)
+
+
+def _own_folder(node: str) -> Path:
+    """Return the folder of this user and node on its disk (TMPDIR); raises ``UserError`` if it is another user's."""
+    user = str(os.getuid()) if hasattr(os, "getuid") else ""
+    folder = Path(tempfile.gettempdir()) / f"beags-{user}-{node[:16]}"
+    with writing(folder):
+        folder.mkdir(mode=0o700, exist_ok=True)
+    if folder.is_symlink() or (user and str(folder.stat().st_uid) != user):
+        raise UserError(f"{folder} is another user's: remove it, or name a place for temporary files with TMPDIR.")
+    return folder
+
+
+def _reads(path: str, content: str) -> bool:
+    try:
+        return Path(path).read_text() == content
+    except OSError:
+        return False
+
+
+def _place(wanted: Input, kept: Path, fetch: Callable[[Any], bytes]) -> Path | None:
+    """Return where this node has an input: the very folder, or what it was sent; None if it has to be sent."""
+    path = Path(wanted.path)
+    if path.is_dir() and folder_digest(path) == wanted.digest:
+        return path
+    copy = kept / wanted.digest
+    with writing(copy):
+        kept.mkdir(exist_ok=True)
+    with FileLock(kept / f".{wanted.digest}.lock"):  # another task of this node may unpack it
+        if not copy.exists():
+            if wanted.parcel is None:
+                return None
+            unpack(fetch(wanted.parcel), copy)
+    return copy
+
+
+@lru_cache(None)
+def _code() -> str:
+    return code_digest()
+
+
+_program: tuple[dict[str, str], Worker] | None = None
+
+
+def _worker(environment: Mapping[str, str]) -> Worker:
+    """Return the program that runs trials with these variables; it ends with this process, or for one with others."""
+    global _program
+    wanted = {**environment, "CUDA_VISIBLE_DEVICES": os.environ.get("CUDA_VISIBLE_DEVICES", "")}  # by Ray, for the task
+    if _program is None or _program[0] != wanted:
+        if _program is not None:
+            _program[1].end()
+        _program = wanted, Worker(environment)
+    return _program[1]
