@@ -166,7 +166,7 @@ def test_sagd_draws_members_at_rims_into_their_objects(refined, data, tmp_path, 
     assert differences(parameters(base.state), parameters(after.state)) == PLACES
     moved = (base.surfels().means != after.surfels().means).any(dim=1)
     shrunk = after.surfels().log_scales < base.surfels().log_scales
-    assert 0 < moved.sum() and torch.equal(moved, shrunk.all(dim=1)) and torch.equal(moved, shrunk.any(dim=1))
+    assert moved.sum() > 0 and torch.equal(moved, shrunk.all(dim=1)) and torch.equal(moved, shrunk.any(dim=1))
     assert after.members.objects is None and bool((after.members.class_ids[moved] != 0).all())
     capsys.readouterr()
     options = {**EDITING["sagd"], "gd_interval": -1}
