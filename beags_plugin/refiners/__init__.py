@@ -26,6 +26,7 @@ REFINERS = Registry(
         "objectgs": "beags_plugin.refiners.objectgs:ObjectGsRefiner",
         "dr-splat": "beags_plugin.refiners.dr_splat:DrSplatRefiner",
         "opengaussian": "beags_plugin.refiners.opengaussian:OpenGaussianRefiner",
+        "instascene": "beags_plugin.refiners.instascene:InstaSceneRefiner",
     },
 )
 
