@@ -32,7 +32,7 @@ RATE = 0.025  # of the features: Adam with eps 1e-15, constant
 SAMPLES = 32_768
 SINGLE, MULTI, SPACE, UNFILTERED = 0.5e-6, 1e-6, 2.5e-6, 1e-6  # weights; only their ratios matter to Adam
 TOGETHER, INTERVAL = 5, 10  # views that are contrasted together, in every tenth step
-FEATURES, VIEWS, PROTOTYPES, PIXELS, SEVERAL, SEEDS = range(6)  # purposes of random numbers
+FEATURES, VIEWS, PROTOTYPES, PIXELS, ALL_PIXELS, SEVERAL, SEVERAL_PIXELS, SEEDS = range(8)  # purposes of random numbers
 
 
 @dataclass(frozen=True)
@@ -112,12 +112,12 @@ class ContrastTraining(OwnTraining):
         least = 0 if self.options.consider_negative else 1
         terms = {"single": SINGLE * self._of_pixels([drawn], [filtered], least, step, PIXELS)}
         if self.fixed is not None:
-            terms["unfiltered"] = UNFILTERED * self._of_pixels([drawn], [ranks], least, step, PIXELS)
+            terms["unfiltered"] = UNFILTERED * self._of_pixels([drawn], [ranks], least, step, ALL_PIXELS)
         if step % INTERVAL == 0:
             several = self._several(step)
             images = [self.drawing.channels(each, units) for each in several]
             maps = [self._ranks(each) for each in several]
-            terms["multi"] = MULTI * self._of_pixels(images, maps, 1, step, SEVERAL, self.fixed)
+            terms["multi"] = MULTI * self._of_pixels(images, maps, 1, step, SEVERAL_PIXELS, self.fixed)
         seeds = ((self.seed_classes > 0) & self._seen(view)).nonzero()[:, 0]
         chosen = seeds[self._chosen(len(seeds), step, SEEDS)]
         own = prototypes.rows_of(units, chosen)
@@ -167,10 +167,9 @@ class ContrastTraining(OwnTraining):
         scene, inputs, count = self.scene, self.drawing.inputs, len(self.ranks)
 
         def trace(view: int) -> mask_tracking.TracedView:
-            ranks = self._ranks(view)
             camera = scene.cameras[view]
-            labels = ranks.masked_fill(ranks == IGNORE, count).int().view(camera.height, camera.width)
-            what = (inputs, camera, scene.settings, labels, count + 1, mask_tracking.MIN_WEIGHT)
+            labels = self._ranks(view).view(camera.height, camera.width)
+            what = (inputs, camera, scene.settings, labels, count, mask_tracking.MIN_WEIGHT)
             return mask_tracking.TracedView.of_counts(*scene.rasterizer.sparse_class_pixel_counts(*what), count)
 
         with scene.stage("Tracing Gaussians") as progress:
@@ -190,7 +189,7 @@ class ContrastTraining(OwnTraining):
         """Return views in a row, in the order of their names; without those that have no mask."""
         count = len(self.scene.cameras)
         most = min(TOGETHER, count)
-        start = int(torch.randint(count - most + 1, (), generator=self.scene.generator(step, VIEWS)))
+        start = int(torch.randint(count - most + 1, (), generator=self.scene.generator(step, SEVERAL)))
         return [view for view in range(start, start + most) if view in set(self.masked)]
 
     def _ranks(self, view: int) -> Tensor:

@@ -1,11 +1,12 @@
 """InstaScene's tracking: which Gaussians a mask is made of, which masks hold several objects, and seeds of objects.
 
 Yang et al., "InstaScene: Towards Complete 3D Instance Decomposition and Reconstruction from Cluttered Scenes",
-ICCV 2025. Gaussian i is traced in view v, to class c, iff w_i > 0.1 at a pixel there, of class c. A mask (v, c) of an
-object is made of the set Q of Gaussians traced to it, if there are at least 50. In another view v' each of Q has the
-class, among those of objects, to which it is traced with most pixels, or 0. The mask shows in v' unless more than 0.7
-of Q have 0; it is contained there if more than 0.8 of the others have one class, else split. It is under-segmented if
-it shows nowhere, or is split in more than 0.3 of the views where it shows. With F_c the views with other masks of c,
+ICCV 2025. Gaussian i is traced in view v, to class c, iff w_i > 0.1 at a pixel there, of class c. Only labelled pixels
+count, the background being a class. A mask (v, c) of an object is made of the set Q of Gaussians traced to it, if there
+are at least 50. In another view v' each of Q has the class, among those of objects, to which it is traced with most
+pixels, or 0. The mask shows in v' unless more than 0.7 of Q have 0; it is contained there if more than 0.8 of the
+others have one class, else split. It is under-segmented if it shows nowhere, or is split in more than 0.3 of the views
+where it shows. With F_c the views with other masks of c,
 
     seeds of c = { i:  sum over F_c of [i traced to c in v]  >  0.5 sum over F_c of [i traced in v] },
 
@@ -41,10 +42,9 @@ class TracedView:
 
     @classmethod
     def of_counts(cls, keys: Tensor, counts: Tensor, num_classes: int) -> TracedView:
-        """Make it of pixel counts, keys i * (num_classes + 1) + c; c is ``num_classes`` at unlabelled pixels."""
-        rows, columns = keys // (num_classes + 1), keys % (num_classes + 1)
-        known = columns < num_classes
-        return cls(torch.unique_consecutive(rows).int(), rows[known].int(), columns[known].int(), counts[known].int())
+        """Make it of pixel counts, keys i * num_classes + c, ascending."""
+        rows, columns = keys // num_classes, keys % num_classes
+        return cls(torch.unique_consecutive(rows).int(), rows.int(), columns.int(), counts.int())
 
     def strongest(self, count: int, ground: bool = False) -> Tensor:
         """Return [count] int64: of each Gaussian the object to which it is traced with most pixels, 0 without any.
