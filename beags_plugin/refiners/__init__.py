@@ -27,6 +27,7 @@ REFINERS = Registry(
         "dr-splat": "beags_plugin.refiners.dr_splat:DrSplatRefiner",
         "opengaussian": "beags_plugin.refiners.opengaussian:OpenGaussianRefiner",
         "sagd": "beags_plugin.refiners.sagd:SagdRefiner",
+        "instascene": "beags_plugin.refiners.instascene:InstaSceneRefiner",
     },
 )
 

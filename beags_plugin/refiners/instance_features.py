@@ -170,6 +170,22 @@ def label_loss(
     return ordered_sum(distances * counted) / counted.sum().clamp_min(1)
 
 
+@dataclass
+class Codebook:
+    """Clusters and leaves; leaf j * fine + l is the l-th of cluster j.
+
+    coarse: [k1, 9] centres. clusters: [N] int64. fine: [k1, k2, 6] centres. leaves: [N] int64, k1 * k2 before a
+    Gaussian's cluster had its turn. used: [k1] int64, leaves of each. occurs: [V, k1] bool, where a cluster shows.
+    """
+
+    coarse: Tensor
+    clusters: Tensor
+    fine: Tensor
+    leaves: Tensor
+    used: Tensor
+    occurs: Tensor
+
+
 def straight_through(features: Tensor, centres: Tensor) -> Tensor:
     """Return the centres [N, 6] of features [N, 6], which get the gradient by them as it is."""
     return centres.detach() + (features - features.detach())
@@ -187,7 +203,8 @@ def nearest_centres(vectors: Tensor, centres: Tensor) -> Tensor:
 def lloyd(vectors: Tensor, centres: Tensor, steps: int = LLOYD_STEPS) -> tuple[Tensor, Tensor]:
     """Return centres [k, D] after steps of k-means from ``centres``, and the nearest of each vector, [N] int64.
 
-    A centre that no vector is nearest to becomes 0, as in the source.
+    A centre that no vector is nearest to becomes 0, as in the source. scikit-learn's k-means would move it elsewhere,
+    and adds up in an order that depends on the threads.
     """
     for _ in range(steps):
         ids = nearest_centres(vectors, centres)

@@ -81,22 +81,6 @@ class OpenGaussianRefiner(Refiner):
         return CodebookTraining(scene, self)
 
 
-@dataclass
-class Codebook:
-    """Clusters and leaves; leaf j * fine + l is the l-th of cluster j.
-
-    coarse: [k1, 9] centres. clusters: [N] int64. fine: [k1, k2, 6] centres. leaves: [N] int64, k1 * k2 before a
-    Gaussian's cluster had its turn. used: [k1] int64, leaves of each. occurs: [V, k1] bool, where a cluster shows.
-    """
-
-    coarse: Tensor
-    clusters: Tensor
-    fine: Tensor
-    leaves: Tensor
-    used: Tensor
-    occurs: Tensor
-
-
 class CodebookTraining(OwnTraining):
     """Trains a feature of each Gaussian; the scene stays as it is."""
 
@@ -117,7 +101,7 @@ class CodebookTraining(OwnTraining):
         self.fine_interval = max(round(FINE_INTERVAL * self.turn_steps / TURN), 1)
         self.masks = parts.PseudoMasks.none(self.features)
         whole, (k1, k2) = torch.zeros(count, dtype=torch.int64, device=device), (options.coarse, options.fine)
-        self.book = Codebook(
+        self.book = parts.Codebook(
             coarse=first.new_zeros(k1, parts.CHANNELS + 3, device=device),
             clusters=whole,
             fine=first.new_zeros(k1, k2, parts.CHANNELS, device=device),
@@ -259,10 +243,12 @@ class CodebookTraining(OwnTraining):
         shown = torch.zeros_like(self.scene.class_ids())
         if options.rule == "classes":
             table = shown.new_zeros(options.coarse * options.fine + 1)  # the last: in no leaf
-            for leaf, rank in leaf_labels.classes_of_leaves(votes, options.min_views).items():
+            named = leaf_labels.classes_of_leaves(votes, options.min_views)
+            for leaf, rank in named.items():
                 table[leaf] = self.ranks.ids[rank]
-            named = len(leaf_labels.classes_of_leaves(votes, options.min_views))
-            say(f"  leaves: {named} of {len(torch.unique(leaves))} look like a mask in {options.min_views} views")
+            inside = float(torch.isin(leaves, leaves.new_tensor(list(named))).double().mean())
+            like = f"{len(named)} of {len(torch.unique(leaves))} look like a mask in {options.min_views} views or more"
+            say(f"  leaves: {like}; they hold {inside:.0%} of the Gaussians, and the others have no class")
             return Membership(table[leaves])
         masks, surfels, centres = {}, self.scene.surfels().detach(), self.book.fine.flatten(0, 1)
         for rank, class_id in enumerate(self.ranks.ids.tolist()):
@@ -304,4 +290,4 @@ class CodebookTraining(OwnTraining):
             self.features.copy_(state["features"])
         self.adam.load_state_dict(state["adam"])
         self.masks = parts.PseudoMasks(**{name: values.to(device) for name, values in state["masks"].items()})
-        self.book = Codebook(**{name: values.to(device) for name, values in state["book"].items()})
+        self.book = parts.Codebook(**{name: values.to(device) for name, values in state["book"].items()})

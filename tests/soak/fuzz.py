@@ -111,7 +111,6 @@ def everything(rasterizer: Rasterizer, scene: Scene) -> dict[str, Tensor]:
     for name, (keys, sums) in (
         ("contributions", rasterizer.sparse_class_contributions(*what)),
         ("pixel counts", rasterizer.sparse_class_pixel_counts(*what, 0.1)),
-        ("largest contributions", rasterizer.sparse_top_contributions(*what, 3, 20)),
     ):
         surfels, classes = keys // scene.num_classes, keys % scene.num_classes
         for which, values in ((name, sums), (f"{name} by class", sums * torch.cos(classes.to(scene.inputs.means)))):

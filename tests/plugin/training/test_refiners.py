@@ -47,6 +47,7 @@ OWN: dict[str, dict] = {
     "gaussian-grouping": {"threshold": 0.25},
     "objectgs": {"labels": "nonzero"},
     "opengaussian": {"coarse": 2, "fine": 2, "min_gaussians": 1, "min_leaf": 1, "max_scale": 9.0, "min_views": 1},
+    "instascene": {"min_gaussians": 2, "samples": 500, "cosine": 0.8},
 }
 EDITING = {"sagd": {"threshold": 0.3, "gd_interval": 2}}
 PLACES = ["/gauss_params.means", "/gauss_params.scales"]
@@ -96,7 +97,7 @@ def test_a_refiner_that_trains_nothing_keeps_the_base_bit_for_bit(refined, name)
     assert found.before is not None and found.before.psnr == found.after.psnr
 
 
-@pytest.mark.parametrize("name", ["opengaussian"])
+@pytest.mark.parametrize("name", ["opengaussian", "instascene"])
 def test_a_refiner_that_learns_features_keeps_the_base_bit_for_bit(refined, name):
     run = refined(name)
     base, after = read_run(run / "base/config.yml"), read_run(run / "config.yml")
@@ -130,7 +131,7 @@ def test_objects_that_overlap_go_through_evaluation_extraction_and_export(refine
     assert int(left.sum()) == int((members.of(objects[1]) & ~members.of(objects[0])).sum()) > 0
 
 
-@pytest.mark.parametrize("name", ["gaussian-grouping", "objectgs", "opengaussian"])
+@pytest.mark.parametrize("name", ["gaussian-grouping", "objectgs", "opengaussian", "instascene"])
 def test_ids_far_apart_and_threads_change_nothing(refined, data, tmp_path, name):
     """The same masks with the ids 300 and 40000 for 1 and 2, trained with three threads."""
     far = {0: 0, 1: 300, 2: 40_000}

@@ -1,0 +1,175 @@
+"""InstaScene's tracking: which Gaussians a mask is made of, which masks hold several objects, and seeds of objects.
+
+Yang et al., "InstaScene: Towards Complete 3D Instance Decomposition and Reconstruction from Cluttered Scenes",
+ICCV 2025. Gaussian i is traced in view v, to class c, iff w_i > 0.1 at a pixel there, of class c. Only labelled pixels
+count, the background being a class. A mask (v, c) of an object is made of the set Q of Gaussians traced to it, if there
+are at least 50. In another view v' each of Q has the class, among those of objects, to which it is traced with most
+pixels, or 0. The mask shows in v' unless more than 0.7 of Q have 0; it is contained there if more than 0.8 of the
+others have one class, else split. It is under-segmented if it shows nowhere, or is split in more than 0.3 of the views
+where it shows. With F_c the views with other masks of c,
+
+    seeds of c = { i:  sum over F_c of [i traced to c in v]  >  0.5 sum over F_c of [i traced in v] },
+
+if F_c has two views. An under-segmented mask of which more than 0.8 are seeds of one class is taken back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+MIN_WEIGHT = 0.1
+MIN_GAUSSIANS = 50
+HIDDEN, CONTAINED, SPLIT, SEEDED, TAKEN_BACK = 0.7, 0.8, 0.3, 0.5, 0.8
+LEAST_VIEWS = 2  # of F_c
+
+
+@dataclass(frozen=True)
+class TracedView:
+    """The Gaussians that are traced in one view.
+
+    traced: [T] int32, ascending. members, classes, counts: [M] int32, traced to a class, ranks from 0 (background),
+    with so many pixels; ascending by Gaussian, then class.
+    """
+
+    traced: Tensor
+    members: Tensor
+    classes: Tensor
+    counts: Tensor
+
+    @classmethod
+    def of_counts(cls, keys: Tensor, counts: Tensor, num_classes: int) -> TracedView:
+        """Make it of pixel counts, keys i * num_classes + c, ascending."""
+        rows, columns = keys // num_classes, keys % num_classes
+        return cls(torch.unique_consecutive(rows).int(), rows.int(), columns.int(), counts.int())
+
+    def strongest(self, count: int, ground: bool = False) -> Tensor:
+        """Return [count] int64: of each Gaussian the object to which it is traced with most pixels, 0 without any.
+
+        Ties go to the lower class. ground: whether the background takes part, as an object of its own.
+        """
+        own = torch.ones_like(self.classes, dtype=torch.bool) if ground else self.classes > 0
+        members, classes, counts = self.members[own].long(), self.classes[own].long(), self.counts[own]
+        most = counts.new_zeros(count).scatter_reduce(0, members, counts, "amax")
+        leads = counts == most[members]
+        beyond = int(classes.max()) + 2 if len(classes) else 1
+        found = classes.new_full((count,), beyond)
+        found = found.scatter_reduce(0, members[leads], classes[leads] + int(ground), "amin")
+        return found.masked_fill(found == beyond, 0)
+
+
+@dataclass(frozen=True)
+class TrackedMasks:
+    """What tracking says.
+
+    seeds: of each class, by rank, its seeds [S] int64, ascending; none of the background. suspect: (view, rank) of the
+    masks that are under-segmented.
+    """
+
+    seeds: tuple[Tensor, ...]
+    suspect: frozenset[tuple[int, int]]
+
+    def seed_classes(self, count: int) -> Tensor:
+        """Return [count] int64, of each Gaussian the lowest class that has it as a seed, else 0."""
+        found = torch.zeros(count, dtype=torch.int64, device=self.seeds[0].device)
+        for rank in reversed(range(1, len(self.seeds))):
+            found[self.seeds[rank]] = rank
+        return found
+
+    def filtered(self, view: int, ranks: Tensor) -> Tensor:
+        """Return the map of a view with its under-segmented masks set to the background."""
+        for each, rank in sorted(self.suspect):
+            if each == view:
+                ranks = ranks.masked_fill(ranks == rank, 0)
+        return ranks
+
+
+def tracked_masks(
+    views: list[TracedView],
+    count: int,
+    num_classes: int,
+    min_gaussians: int = MIN_GAUSSIANS,
+    ground_votes: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> TrackedMasks:
+    """Track the masks of all views through all views.
+
+    count: of Gaussians. num_classes: ranks, the background's included. ground_votes: whether Gaussians on the
+    background count as of an object of its own, as the source's masks of the ground would have them.
+    """
+    masks, sets = _masks(views, min_gaussians)
+    split, shown = _splits(views, sets, count, ground_votes, progress)
+    under = (shown == 0) | (split > SPLIT * shown)
+    kept = [mask for mask, bad in zip(masks, under.tolist(), strict=True) if not bad]
+    seeds = _seeds(views, kept, count, num_classes)
+    suspect = under.nonzero()[:, 0].tolist()
+    best = torch.zeros(len(masks), dtype=torch.int64)
+    for each in seeds[1:]:
+        if len(each):
+            is_seed = torch.zeros(count, dtype=torch.bool, device=each.device)
+            is_seed[each] = True
+            for place in suspect:
+                best[place] = max(int(best[place]), int(is_seed[sets[place].long()].sum()))
+    left = [masks[place] for place in suspect if not int(best[place]) > TAKEN_BACK * len(sets[place])]
+    return TrackedMasks(seeds, frozenset(left))
+
+
+def _masks(views: list[TracedView], min_gaussians: int) -> tuple[list[tuple[int, int]], list[Tensor]]:
+    """Return (view, rank) of the masks of objects that are tracked, and of each its Gaussians, Q."""
+    masks, sets = [], []
+    for view, found in enumerate(views):
+        for rank in torch.unique(found.classes).tolist():
+            own = found.members[found.classes == rank]
+            if rank > 0 and len(own) >= min_gaussians:
+                masks.append((view, rank))
+                sets.append(own)
+    return masks, sets
+
+
+def _splits(
+    views: list[TracedView], sets: list[Tensor], count: int, ground: bool, progress: Callable[[int, int], None] | None
+) -> tuple[Tensor, Tensor]:
+    """Return of each mask the number of views in which it is split, and of those in which it shows, [masks] int64."""
+    if not sets:
+        return torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
+    device = sets[0].device
+    sizes = torch.tensor([len(each) for each in sets], device=device)
+    members = torch.cat(sets)
+    owners = torch.arange(len(sets), device=device, dtype=torch.int32).repeat_interleave(sizes)
+    split, shown = torch.zeros_like(sizes), torch.zeros_like(sizes)
+    for done, view in enumerate(views, start=1):
+        found = view.strongest(count, ground)[members.long()]
+        known = found > 0
+        width = int(found.max()) + 1
+        pairs, counts = torch.unique(owners[known].long() * width + found[known], return_counts=True)
+        largest = torch.zeros_like(sizes).scatter_reduce(0, pairs // width, counts, "amax")
+        total = torch.bincount(owners[known].long(), minlength=len(sets))
+        visible = (sizes - total) <= HIDDEN * sizes
+        shown += visible
+        split += visible & ~(largest > CONTAINED * total)
+        if progress:
+            progress(done, len(views))
+    return split, shown
+
+
+def _seeds(
+    views: list[TracedView], kept: Iterable[tuple[int, int]], count: int, num_classes: int
+) -> tuple[Tensor, ...]:
+    """Return the seeds of each class, by the views of its masks that are not under-segmented."""
+    device = views[0].traced.device
+    own_views: list[list[int]] = [[] for _ in range(num_classes)]
+    for view, rank in kept:
+        own_views[rank].append(view)
+    seeds = []
+    for rank, those in enumerate(own_views):
+        to_class = torch.zeros(count, dtype=torch.int32, device=device)
+        anywhere = torch.zeros_like(to_class)
+        for view in those if len(those) >= LEAST_VIEWS else []:
+            found = views[view]
+            to_class[found.members[found.classes == rank].long()] += 1
+            anywhere[found.traced.long()] += 1
+        seeds.append((to_class / (anywhere + 1e-6) > SEEDED).nonzero()[:, 0])
+    return tuple(seeds)
