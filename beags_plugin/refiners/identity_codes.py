@@ -47,7 +47,8 @@ class Classifier(nn.Linear):
     """Logits [..., K] of codes [..., 16], with the same bits and gradients for any number of threads."""
 
     def forward(self, input: Tensor) -> Tensor:
-        return ordered_linear(input, self.weight, self.bias)
+        bias = self.weight.new_zeros(len(self.weight)) if self.bias is None else self.bias
+        return ordered_linear(input, self.weight, bias)
 
 
 def initial_codes(count: int, generator: torch.Generator) -> Tensor:
@@ -55,11 +56,12 @@ def initial_codes(count: int, generator: torch.Generator) -> Tensor:
     return (torch.rand(count, CHANNELS, generator=generator) - 0.5) / SH_C0
 
 
-def initial_classifier(num_classes: int, generator: torch.Generator) -> Classifier:
+def initial_classifier(num_classes: int, generator: torch.Generator, bias: bool = True) -> Classifier:
     """Return the classifier of codes as torch would start it, uniform within 1/4, but drawn from ``generator``."""
-    layer = Classifier(CHANNELS, num_classes, device="meta").to_empty(device="cpu")  # draws nothing from torch's own
+    # on "meta" it draws nothing from torch's own
+    layer = Classifier(CHANNELS, num_classes, bias=bias, device="meta").to_empty(device="cpu")
     with torch.no_grad():
-        for values in (layer.weight, layer.bias):
+        for values in layer.parameters():
             values.uniform_(-(CHANNELS**-0.5), CHANNELS**-0.5, generator=generator)
     return layer
 
