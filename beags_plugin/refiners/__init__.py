@@ -25,6 +25,7 @@ REFINERS = Registry(
         "gaussian-grouping": "beags_plugin.refiners.gaussian_grouping:GaussianGroupingRefiner",
         "objectgs": "beags_plugin.refiners.objectgs:ObjectGsRefiner",
         "sagd": "beags_plugin.refiners.sagd:SagdRefiner",
+        "ilgs": "beags_plugin.refiners.ilgs:IlgsRefiner",
         "unified-lift": "beags_plugin.refiners.unified_lift:UnifiedLiftRefiner",
     },
 )

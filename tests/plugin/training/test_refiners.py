@@ -45,6 +45,7 @@ OWN: dict[str, dict] = {
     "trace3d": {"min_pixels": 2},
     "gaussian-grouping": {"threshold": 0.25},
     "objectgs": {"labels": "nonzero"},
+    "ilgs": {"threshold": 0.02},
     "unified-lift": {"codes": 200, "threshold": 0.02},  # many random codes, some of which are of an object
 }
 EDITING = {"sagd": {"threshold": 0.3, "gd_interval": 2}}
@@ -120,7 +121,7 @@ def test_objects_that_overlap_go_through_evaluation_extraction_and_export(refine
     assert int(left.sum()) == int((members.of(objects[1]) & ~members.of(objects[0])).sum()) > 0
 
 
-@pytest.mark.parametrize("name", ["gaussian-grouping", "objectgs", "unified-lift"])
+@pytest.mark.parametrize("name", ["gaussian-grouping", "objectgs", "ilgs", "unified-lift"])
 def test_ids_far_apart_and_threads_change_nothing(refined, data, tmp_path, name):
     """The same masks with the ids 300 and 40000 for 1 and 2, trained with three threads."""
     far = {0: 0, 1: 300, 2: 40_000}
