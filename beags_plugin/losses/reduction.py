@@ -51,6 +51,27 @@ def ordered_linear(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     return product.view(*rows.shape[:-1], len(weight))
 
 
+def ordered_outer_sum(first: Tensor, second: Tensor) -> Tensor:
+    """Return first.T @ second, bit for bit the same for any number of threads; no gradient of its own.
+
+    first: [P, A] float. second: [P, B]. Returns [A, B].
+    """
+    parts = torch.bmm(_blocks(first).transpose(1, 2), _blocks(second))
+    sums = parts.flatten(1).T.contiguous().sum(dim=1)  # a row for each entry, none of which is split
+    return sums.view(first.shape[1], second.shape[1])
+
+
+def group_sums(values: Tensor, groups: Tensor, count: int) -> Tensor:
+    """Return the sums of the rows of each group, in order of the rows whatever the number of threads; differentiable.
+
+    values: [P, C] float. groups: [P] int64 below ``count``. Returns [count, C] float64, 0 for a group without rows.
+    """
+    width = values.shape[1]
+    places = (groups[:, None] * width + torch.arange(width, device=groups.device)).flatten()
+    zeros = torch.zeros(count * width, dtype=torch.float64, device=values.device)
+    return zeros.index_add(0, places, values.double().flatten()).view(count, width)
+
+
 class _RowProduct(torch.autograd.Function):
     """rows @ matrix.T by many small products, each of which a thread takes as a whole; a large one would be split."""
 
@@ -62,9 +83,7 @@ class _RowProduct(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
         rows, matrix = ctx.saved_tensors
-        parts = torch.bmm(_blocks(grad).transpose(1, 2), _blocks(rows))
-        sums = parts.flatten(1).T.contiguous().sum(dim=1)  # a row for each entry, none of which is split
-        return _times(grad, matrix), sums.view_as(matrix)
+        return _times(grad, matrix), ordered_outer_sum(grad, rows)
 
 
 def _times(rows: Tensor, matrix: Tensor) -> Tensor:

@@ -28,6 +28,8 @@ REFINERS = Registry(
         "opengaussian": "beags_plugin.refiners.opengaussian:OpenGaussianRefiner",
         "sagd": "beags_plugin.refiners.sagd:SagdRefiner",
         "instascene": "beags_plugin.refiners.instascene:InstaSceneRefiner",
+        "ilgs": "beags_plugin.refiners.ilgs:IlgsRefiner",
+        "unified-lift": "beags_plugin.refiners.unified_lift:UnifiedLiftRefiner",
     },
 )
 

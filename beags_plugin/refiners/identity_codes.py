@@ -39,6 +39,7 @@ THRESHOLD = 0.3  # of an object in space
 THRESHOLD_2D = 0.2  # of an object's picture
 HULL = True
 IQR_FACTOR = 1.0
+LEAST_INLIERS = 5  # of a hull
 
 Classify = Callable[[Tensor], Tensor]
 
@@ -47,7 +48,8 @@ class Classifier(nn.Linear):
     """Logits [..., K] of codes [..., 16], with the same bits and gradients for any number of threads."""
 
     def forward(self, input: Tensor) -> Tensor:
-        return ordered_linear(input, self.weight, self.bias)
+        bias = self.weight.new_zeros(len(self.weight)) if self.bias is None else self.bias
+        return ordered_linear(input, self.weight, bias)
 
 
 def initial_codes(count: int, generator: torch.Generator) -> Tensor:
@@ -55,11 +57,12 @@ def initial_codes(count: int, generator: torch.Generator) -> Tensor:
     return (torch.rand(count, CHANNELS, generator=generator) - 0.5) / SH_C0
 
 
-def initial_classifier(num_classes: int, generator: torch.Generator) -> Classifier:
+def initial_classifier(num_classes: int, generator: torch.Generator, bias: bool = True) -> Classifier:
     """Return the classifier of codes as torch would start it, uniform within 1/4, but drawn from ``generator``."""
-    layer = Classifier(CHANNELS, num_classes, device="meta").to_empty(device="cpu")  # draws nothing from torch's own
+    # on "meta" it draws nothing from torch's own
+    layer = Classifier(CHANNELS, num_classes, bias=bias, device="meta").to_empty(device="cpu")
     with torch.no_grad():
-        for values in (layer.weight, layer.bias):
+        for values in layer.parameters():
             values.uniform_(-(CHANNELS**-0.5), CHANNELS**-0.5, generator=generator)
     return layer
 
@@ -136,11 +139,11 @@ def members(
     return chosen | inside_hull(means, chosen) if hull else chosen
 
 
-def inside_hull(means: Tensor, chosen: Tensor) -> Tensor:
+def inside_hull(means: Tensor, chosen: Tensor, least: int = LEAST_INLIERS, else_all: bool = False) -> Tensor:
     """Return [N] bool: the centre lies inside the convex hull of the chosen ones that are no outliers.
 
     An outlier lies, along any axis, more than an interquartile range beyond the quartiles. All False where fewer than
-    five inliers in general position are left.
+    ``least`` in general position are left; with ``else_all`` outliers stay where fewer than that would be left.
     means: [N, 3]. chosen: [N] bool.
     """
     import numpy as np
@@ -149,14 +152,15 @@ def inside_hull(means: Tensor, chosen: Tensor) -> Tensor:
     nobody = torch.zeros_like(chosen)
     centers = means.detach().double().cpu().numpy()
     cloud = centers[chosen.cpu().numpy()]
-    if len(cloud) < 5:
+    if len(cloud) < least:
         return nobody
     low, high = np.quantile(cloud, [0.25, 0.75], axis=0)
     reach = IQR_FACTOR * (high - low)
-    cloud = cloud[((cloud >= low - reach) & (cloud <= high + reach)).all(axis=1)]
-    if len(cloud) < 5:
+    inliers = cloud[((cloud >= low - reach) & (cloud <= high + reach)).all(axis=1)]
+    if len(inliers) < least and not else_all:
         return nobody
     try:
-        return torch.from_numpy(Delaunay(cloud).find_simplex(centers) >= 0).to(chosen.device)
+        hull = Delaunay(inliers if len(inliers) >= least else cloud)
+        return torch.from_numpy(hull.find_simplex(centers) >= 0).to(chosen.device)
     except QhullError:  # all in a plane
         return nobody

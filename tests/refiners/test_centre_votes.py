@@ -61,7 +61,7 @@ def test_the_views_that_a_share_is_of():
 
 
 def test_larger_shares_win_and_ties_go_to_the_lower_id():
-    """Objects 2 and 4, which the first view alone shows, have all their votes in column 0; 3 has most in column 1."""
+    """Object 4, which the first view alone shows, has all of its votes in column 0; 3 has all of its in column 1."""
     masks = [mask(4, 2, 0, 0, 0, 0, 0, 0), mask(3, 3, 0, 0, 0, 0, 0, 0), mask(2, 3, 0, 0, 0, 0, 0, 0)]
     found = votes(points(0, 1), masks, "seen", threshold=0.4)
     assert found == [4, 3]
@@ -116,7 +116,7 @@ def test_a_disc_is_drawn_into_the_mask(columns, center, depth, turn):
 
 
 def test_the_major_axis_is_the_longer_scale_wherever_it_points():
-    """A quarter turn with the scales changed over is the same disc."""
+    """A quarter turn with the scales changed over is the same disc; both ends of an upright one lie inside."""
     one, _ = decomposed(disc(20, 20, 4, 1), range(23))
     other, changed = decomposed(disc(20, 20, 1, 4, turn=1.0), range(23))
     assert changed == [0]

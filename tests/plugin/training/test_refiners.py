@@ -48,6 +48,8 @@ OWN: dict[str, dict] = {
     "objectgs": {"labels": "nonzero"},
     "opengaussian": {"coarse": 2, "fine": 2, "min_gaussians": 1, "min_leaf": 1, "max_scale": 9.0, "min_views": 1},
     "instascene": {"min_gaussians": 2, "samples": 500, "cosine": 0.8},
+    "ilgs": {"threshold": 0.02},
+    "unified-lift": {"codes": 200, "threshold": 0.02},  # many random codes, some of which are of an object
 }
 EDITING = {"sagd": {"threshold": 0.3, "gd_interval": 2}}
 PLACES = ["/gauss_params.means", "/gauss_params.scales"]
@@ -131,7 +133,9 @@ def test_objects_that_overlap_go_through_evaluation_extraction_and_export(refine
     assert int(left.sum()) == int((members.of(objects[1]) & ~members.of(objects[0])).sum()) > 0
 
 
-@pytest.mark.parametrize("name", ["gaussian-grouping", "objectgs", "opengaussian", "instascene"])
+@pytest.mark.parametrize(
+    "name", ["gaussian-grouping", "objectgs", "opengaussian", "instascene", "ilgs", "unified-lift"]
+)
 def test_ids_far_apart_and_threads_change_nothing(refined, data, tmp_path, name):
     """The same masks with the ids 300 and 40000 for 1 and 2, trained with three threads."""
     far = {0: 0, 1: 300, 2: 40_000}
@@ -158,6 +162,15 @@ def test_objectgs_trains_the_scene_but_not_its_classes(refined):
     e6, phi = base.members.class_ids, after.members.class_ids
     assert after.members.objects is None and torch.equal(phi[e6 != 0], e6[e6 != 0])
     assert (phi != 0).sum() > (e6 != 0).sum(), "one pixel of an object makes one of it"
+
+
+def test_unified_lift_keeps_the_base_bit_for_bit(refined):
+    run = refined("unified-lift")
+    base, after = read_run(run / "base/config.yml"), read_run(run / "config.yml")
+    assert not differences(parameters(base.state), parameters(after.state))
+    assert after.members.objects is not None and any(len(each) for each in after.members.objects.values())
+    found = evaluate_run(run / "config.yml")
+    assert found.before is not None and found.before.psnr == found.after.psnr
 
 
 def test_sagd_draws_members_at_rims_into_their_objects(refined, data, tmp_path, capsys):
