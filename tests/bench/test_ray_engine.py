@@ -108,7 +108,7 @@ def run(tmp_path, monkeypatch):
         with RayEngine(None) as engine:
             engine.start(job)
             found, outcome = engine.wait()
-        assert found is job and not list((tmp_path / "trials").glob(".shared*"))
+            assert found is job
         return outcome, fake, said
 
     return run
@@ -147,6 +147,14 @@ def test_a_trial_that_fails_by_itself_is_not_repeated(run):
     }.items():
         outcome, fake, _ = run(answer)
         assert outcome.failed == reason and len(fake.tasks) == 1
+
+
+def test_a_reason_names_the_log_where_it_lies_now(run, tmp_path):
+    def answer(task, _):
+        failed = Outcome(Path("/node/t"), None, "it ended with exit code 1; /node/t/log.txt says more.")
+        return Report("one", "host", failed, shared=False, moved={task.folder: "/node/t"}), None
+
+    assert run(answer)[0].failed == f"it ended with exit code 1; {tmp_path}/trials/t/log.txt says more."
 
 
 def test_an_unfit_node_is_left_out_and_without_others_the_trial_fails(run):

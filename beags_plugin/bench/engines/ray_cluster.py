@@ -25,6 +25,7 @@ MOST_ATTEMPTS = 4  # at a task whose worker or node is lost
 USUAL_CORES = 4  # of a trial of which nothing is known
 STORE_BYTES = 256 << 20  # of the object store of a cluster that this command starts: its one node shares the folder
 LOOK_SECONDS = 30.0  # between two looks at the cluster while nothing ends
+MARK = ".mark"  # file of the folder of all trials, whose content tells it from others
 _PASSED_ON = ("OMP_WAIT_POLICY",)  # and all that begin with BEAGS_
 
 
@@ -74,13 +75,14 @@ class RayEngine(Engine):
         self._running: dict[Any, _Running] = {}
         self._parcels: dict[str, Any] = {}  # references by digest of the folder
         self._unfit: dict[str, str] = {}  # sentences by node
-        self._mark: tuple[str, str] = ("", secrets.token_hex(16))
+        self._mark: tuple[str, str] | None = None
         self._waits = False
 
     def __enter__(self) -> RayEngine:
         import ray
 
         self._ray = ray
+        os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")  # of parcels that nobody fetches
         if not ray.is_initialized():
             self._connect()
             self._own = True
@@ -89,7 +91,6 @@ class RayEngine(Engine):
 
     def _connect(self) -> None:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray's rule to come, which it warns about
         quiet = {"log_to_driver": False, "logging_level": "error"}
         if self._address is None:
             self._ray.init(address="local", include_dashboard=False, object_store_memory=STORE_BYTES, **quiet)
@@ -112,8 +113,6 @@ class RayEngine(Engine):
                 ray.cancel(report, force=True)
         if self._parcels:
             self._forget()
-        if self._mark[0]:
-            Path(self._mark[0]).unlink(missing_ok=True)
         if self._own:
             ray.shutdown()
 
@@ -133,10 +132,11 @@ class RayEngine(Engine):
 
     def start(self, job: Job) -> None:
         """Give the job to the cluster."""
-        if not self._mark[0]:
-            path = job.folder.parent / f".shared-{self._mark[1][:12]}"
-            write_text_atomically(self._mark[1], path)
-            self._mark = str(path), self._mark[1]
+        if self._mark is None:
+            path = job.folder.parent / MARK
+            if not path.exists():
+                write_text_atomically(secrets.token_hex(16), path)
+            self._mark = str(path), path.read_text()
         self._submit(_Running(job, SCORED if job.base is None else TRAINED))
 
     def wait(self) -> tuple[Job, Outcome]:
@@ -152,6 +152,7 @@ class RayEngine(Engine):
 
     def _submit(self, running: _Running) -> None:
         job = running.job
+        assert self._mark is not None
         request = job.request
         inputs = {name: Path(request[name]) for name in FOLDERS if request[name] is not None}
         digests = {name: folder_digest(path) for name, path in inputs.items()}
@@ -214,7 +215,10 @@ class RayEngine(Engine):
             unpack(parcel, job.folder)
         if report.moved and outcome.failed is None:
             relocate(job.folder, {Path(there): Path(here) for here, there in report.moved.items()})
-        return replace(outcome, folder=job.folder)
+        failed = outcome.failed
+        for here, there in report.moved.items():
+            failed = failed and failed.replace(there, here)
+        return replace(outcome, folder=job.folder, failed=failed)
 
     def _again(self, running: _Running, reason: str) -> Outcome | None:
         if running.attempt >= MOST_ATTEMPTS:
