@@ -22,6 +22,7 @@ from beags_plugin.plugin.training.memory_guard import LEAST_FREE_MB, free_disk_m
 from beags_plugin.system.child_processes import bound
 from beags_plugin.system.errors import writing
 from beags_plugin.system.lock import LOCK
+from beags_plugin.system.whole_files import write_text_atomically
 
 PROGRAM = [sys.executable, "-m", "beags_plugin.bench.worker"]
 TRAINED, SCORED = "trained", "scored"
@@ -47,12 +48,10 @@ def run_in_folder(folder: Path, request: dict[str, Any], worker: Worker, until: 
         if _goes_on(folder, request):
             _wait_for_end(folder / "run")
             (folder / "failed.json").unlink(missing_ok=True)
-        else:
+        elif folder.exists():
             with writing(folder):
-                if folder.exists():
-                    shutil.rmtree(folder)  # left by an interrupted or failed trial
-                folder.mkdir(parents=True)
-                (folder / "trial.json").write_text(json.dumps(request, indent=1))
+                shutil.rmtree(folder)  # left by an interrupted or failed trial
+        write_text_atomically(json.dumps(request, indent=1), folder / "trial.json")
         code = worker.run(folder, until)
         if (result := read_json(content)) is not None:
             return Outcome(folder, result)
