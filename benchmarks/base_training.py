@@ -30,7 +30,7 @@ from beags_plugin.bench.scenes import TrialScene
 from beags_plugin.bench.trials import MODEL, Trial, steps_of
 from beags_plugin.plugin.training.monitor import CURVE
 from beags_plugin.system.digests import code_digest
-from beags_plugin.system.errors import print_user_errors_plainly
+from beags_plugin.system.errors import UserError, print_user_errors_plainly
 from beags_plugin.system.progress import progress_bar
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
@@ -97,6 +97,8 @@ def run_base(name: str, options: ExperimentOptions) -> list[CurveRow]:
 def train_rows(experiment: Experiment, options: ExperimentOptions) -> list[CurveRow]:
     """Run the bases of an experiment that are not done; returns a row for each, scene after scene."""
     trials = plan(experiment, scenes_of(experiment, options), code_digest())
+    if options.plan:
+        raise UserError("--plan is of beags bench: leave it out here.")
     engine = make_engine(options.engine, options.address)
     with engine, progress_bar("Training, in steps") as progress:
         outcomes = run_trials([trial for _, trial in trials], options.output / "trials", steps_of, engine, progress)

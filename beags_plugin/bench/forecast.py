@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -71,28 +71,29 @@ class Forecast:
 
     def scenes(self, titles: Mapping[str, str] | None = None) -> list[SceneForecast]:
         """Return a forecast for each scene. titles: of scenes, if not their names."""
-        known = self._known()
+        known = self._known({kind for kind, _ in self._kinds.values()})
         return [self._scene(name, (titles or {}).get(name, name), known) for name in self._sizes]
 
     def needs(self, trial: Trial) -> Needs:
         """Return what a trial is expected to take; memory is the largest measured, more for more training pixels."""
         pixels = self._sizes[trial.scene.name].pixels
-        if not (costs := self._known().get(self._kinds[trial.digest][0], [])):
+        kind = self._kinds[trial.digest][0]
+        if not (costs := self._known([kind]).get(kind, [])):
             return Needs(None, PROGRAM_MB + PIXEL_BYTES * pixels / 1e6)
         larger = [max(pixels / cost.pixels - 1.0, 0.0) for cost in costs]
         memory = max(cost.memory_mb + cost.own_memory_mb * more for cost, more in zip(costs, larger, strict=True))
         cores = [cost.cores for cost in costs if cost.cores is not None]
         return Needs(max(1, math.ceil(max(cores) - 0.25)) if cores else None, memory)
 
-    def _known(self) -> dict[tuple[str, str], list[Cost]]:
-        """Return the costs of finished trials by kind; looks for those that have finished since."""
+    def _known(self, kinds: Container[tuple[str, str]]) -> dict[tuple[str, str], list[Cost]]:
+        """Return the costs of finished trials of these kinds; looks for those that have finished since."""
         known: dict[tuple[str, str], list[Cost]] = {}
         for digest, (kind, trial) in self._kinds.items():
-            if digest not in self._costs:
+            if kind in kinds and digest not in self._costs:
                 pixels = self._sizes[trial.scene.name].pixels
                 if (cost := _cost(self._folder / trial.folder_name, pixels)) is not None:
                     self._costs[digest] = cost
-            if digest in self._costs:
+            if kind in kinds and digest in self._costs:
                 known.setdefault(kind, []).append(self._costs[digest])
         return known
 

@@ -13,6 +13,7 @@ pytest.importorskip("nerfstudio")
 from experiment_files import written
 
 from beags_plugin.bench.engines import trial_folder
+from beags_plugin.bench.engines.ray_cluster import RayEngine
 from beags_plugin.bench.experiment import load_experiment
 from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.results import STAGES
@@ -81,6 +82,21 @@ def test_trials_are_trained_measured_and_reported(miniature):
     assert options.csv.read_text().count("\n") == 1 + len(report["rows"]) + len(report["means"])
     for name in ("mine.png", "mine-confidence.png"):
         assert (options.output / name).stat().st_size > 10_000
+
+
+def test_the_plan_runs_nothing_and_knows_what_is_done(miniature, tmp_path, monkeypatch, capsys):
+    path, options, _ = miniature
+    monkeypatch.setattr(trial_folder.Worker, "run", None)
+    plan = ExperimentOptions(output=tmp_path / "out", plan=True, engine="ray", address="127.0.0.1:1")
+    monkeypatch.setattr(RayEngine, "unavailable", lambda: None)
+    assert run_experiment(path, plan) == []
+    text = " ".join(capsys.readouterr().out.split())
+    assert "tabletop 5 5 0 8 0.0 – – –" in text and "5 trials, 5 of them not done." in text
+    assert "of base, alone, broken, damage = 0, damage = 2 are known once one of each has finished here" in text
+    assert sorted(each.name for each in (tmp_path / "out").iterdir()) == ["scenes"]
+    assert run_experiment(path, ExperimentOptions(output=options.output, plan=True)) == []
+    text = " ".join(capsys.readouterr().out.split())
+    assert "tabletop 5 5 4 8" in text and "5 trials, 1 of them not done." in text and "disk of broken are" in text
 
 
 def test_a_second_call_trains_only_what_failed(miniature, monkeypatch):

@@ -13,7 +13,6 @@ from experiment_files import scene as trial_scene
 from paper_trees import write_tree
 
 from beags_plugin.bench import run as bench_run
-from beags_plugin.bench.engines import trial_folder
 from beags_plugin.bench.experiment import Variant
 from beags_plugin.bench.forecast import TEMPORARY_BYTES
 from beags_plugin.bench.paper import run as paper_run
@@ -76,19 +75,15 @@ def test_each_scene_is_trained_as_its_data_set_says(finished):
     }
 
 
-def test_truth_drawn_later_is_scored_without_training_again(finished, monkeypatch, capsys):
+def test_truth_drawn_later_is_scored_without_training_again(finished, capsys):
     options, before = finished
-
-    def no_worker(*_):
-        raise AssertionError("a trial ran again")
-
-    monkeypatch.setattr(trial_folder.Worker, "run", no_worker)
+    trainings = {path: path.stat().st_mtime_ns for path in options.output.glob("trials/*/run/training.json")}
     silhouettes = options.data_root / "llff/fern/ground_truth/silhouettes"
     kept = options.output / "kept"
     shutil.move(silhouettes, kept)
     again = run_paper(options)
     text = printed(capsys)
-    assert "Scoring anew" in text and "silhouettes of fern belong in" in text
+    assert "2 trials are scored again, without training" in text and "silhouettes of fern belong in" in text
     assert again.truths["llff/fern", "bea-gs"] == "visible" and again.truths["lerf/figurines", "bea-gs"] == "silhouette"
     ious = [[row.figures["extracted_iou_after"] for row in found.rows] for found in (before, again)]
     assert ious[0][:2] != ious[1][:2] and ious[0][2:] == ious[1][2:]
@@ -96,7 +91,8 @@ def test_truth_drawn_later_is_scored_without_training_again(finished, monkeypatc
     back = run_paper(options)
     assert [row.figures for row in back.rows] == [row.figures for row in before.rows]
     capsys.readouterr()
-    assert "Scoring anew" not in (run_paper(options) and printed(capsys))
+    assert "scored again" not in (run_paper(options) and printed(capsys))
+    assert {path: path.stat().st_mtime_ns for path in trainings} == trainings and len(trainings) == 6
 
 
 def test_a_drawing_that_is_refused_is_a_row_with_the_reason(finished, capsys):
@@ -109,7 +105,7 @@ def test_a_drawing_that_is_refused_is_a_row_with_the_reason(finished, capsys):
     assert failed and all(str(drawing) in reason for reason in failed) and len(again.rows) == len(before.rows)
     assert "failed: " in printed(capsys)
     drawing.write_bytes(kept)
-    assert [row.figures for row in run_paper(options).rows] == [row.figures for row in before.rows]
+    assert [row.figures for row in run_paper(options).rows] == [row.figures for row in before.rows], "and still trained"
 
 
 def test_the_plan_starts_nothing_and_knows_what_is_done(finished, tmp_path, monkeypatch, capsys):

@@ -18,7 +18,7 @@ from beags_plugin.bench.engines import make_engine, ray_cluster
 from beags_plugin.bench.engines.interface import Job, Needs, Outcome
 from beags_plugin.bench.engines.parcels import pack
 from beags_plugin.bench.engines.ray_cluster import MOST_ATTEMPTS, RayEngine
-from beags_plugin.bench.engines.ray_task import Report, Task
+from beags_plugin.bench.engines.ray_task import TRAINED_FOLDER, Report, Task
 from beags_plugin.bench.engines.trial_folder import SCORED, TRAINED
 from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.run import run_experiment
@@ -108,7 +108,7 @@ def run(tmp_path, monkeypatch):
         with RayEngine(None) as engine:
             engine.start(job)
             found, outcome = engine.wait()
-        assert found is job and not list((tmp_path / "trials").glob(".shared*"))
+            assert found is job
         return outcome, fake, said
 
     return run
@@ -147,6 +147,26 @@ def test_a_trial_that_fails_by_itself_is_not_repeated(run):
     }.items():
         outcome, fake, _ = run(answer)
         assert outcome.failed == reason and len(fake.tasks) == 1
+
+
+def test_what_was_trained_is_trained_again_only_if_it_is_lost(run, tmp_path):
+    class TaskLacksObject(RayTaskError):
+        cause = WorkerCrashedError("the node that held it is gone")
+
+    def answer(task, number):
+        return TaskLacksObject() if number == 1 else ended(task, shared=False)
+
+    outcome, fake, said = run(answer)
+    assert [task.until for _, task in fake.tasks] == [TRAINED, SCORED, TRAINED, SCORED] and outcome.result
+    assert said == ["t: what it needs was lost; it is started again."]
+    (tmp_path / "trials/t").mkdir()
+    (tmp_path / "trials/t/trained.json").write_text("{}")
+
+    def lacking(task, number):
+        return Report("one", "host", lacks=(TRAINED_FOLDER,)) if number == 0 else ended(task)
+
+    outcome, fake, _ = run(lacking)
+    assert [task.until for _, task in fake.tasks] == [SCORED, SCORED] and fake.tasks[1][1].trained == ("sent", 0)
 
 
 def test_an_unfit_node_is_left_out_and_without_others_the_trial_fails(run):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,8 +17,10 @@ from beags_plugin.bench.engines import ray_task, trial_folder
 from beags_plugin.bench.engines.interface import Needs
 from beags_plugin.bench.engines.parcels import pack, relocate, unpack
 from beags_plugin.bench.engines.ray_cluster import USUAL_CORES, share
-from beags_plugin.bench.engines.ray_task import Input, Task, perform
+from beags_plugin.bench.engines.ray_task import TRAINED_FOLDER, Input, Task, perform
 from beags_plugin.bench.engines.trial_folder import SCORED, TRAINED
+from beags_plugin.plugin.presets import preset_config
+from beags_plugin.plugin.runs.run_config import load_run_config
 from beags_plugin.system.digests import folder_digest
 
 
@@ -33,6 +37,12 @@ class FakeWorker:
         self.ran.append((until, request["data"]))
         run = folder / "run/nerfstudio_models"
         run.mkdir(parents=True, exist_ok=True)
+        config = preset_config("beags-tiny", {}, Path("t"))
+        if (run.parent / "config.yml").exists():
+            config = load_run_config(run.parent / "config.yml")
+            assert config.data_config.dataparser.data == Path(request["data"]) and config.run_dir == run.parent
+        config.data_config.dataparser.data, config.run_dir = Path(request["data"]), run.parent
+        (run.parent / "config.yml").write_text(yaml.dump(config))
         (run / "step-000000001.ckpt").write_bytes((Path(request["data"]) / "photo.png").read_bytes())
         (folder / "log.txt").write_text("trained")
         if self.fails:
@@ -61,7 +71,7 @@ def task(tmp_path):
         (tmp_path / name).write_bytes(content)
     (tmp_path / "trials/.shared").write_text("secret")
 
-    def make(until=SCORED, shared=True, sees=True, parcels=False, **more) -> Task:
+    def make(until=TRAINED, shared=True, sees=True, parcels=False, **more) -> Task:
         folders = {"data": tmp_path / "scene", "base": tmp_path / "trials/base/run"}
         inputs = {
             name: Input(str(path), folder_digest(path) + ("" if sees else "x"), pack(path) if parcels else None)
@@ -80,9 +90,9 @@ def same(parcel: bytes) -> bytes:
 
 def test_a_node_that_shares_the_folder_works_in_it(tmp_path, worker, task):
     report, parcel = perform(task(), "node", same)
-    assert parcel is None and report.shared and report.outcome.result == {"steps": 3} and not report.moved
-    assert json.loads((tmp_path / "trials/t/result.json").read_text()) == {"steps": 3}
-    assert worker.ran == [(SCORED, str(tmp_path / "scene"))]
+    assert parcel is None and report.shared and report.outcome.result == {"steps": 3}
+    assert json.loads((tmp_path / "trials/t/trained.json").read_text()) == {"steps": 3}
+    assert worker.ran == [(TRAINED, str(tmp_path / "scene"))]
     assert perform(task(), "node", same)[0].outcome.result == {"steps": 3} and len(worker.ran) == 1, "it is done"
 
 
@@ -96,22 +106,29 @@ def test_a_node_asks_for_what_it_does_not_see_and_keeps_it(tmp_path, worker, tas
     assert not (tmp_path / "trials/t").exists() and not list((tmp_path / "disk").glob("*/trials/t"))
     unpack(parcel, tmp_path / "back")
     assert (tmp_path / "back/run/nerfstudio_models/step-000000001.ckpt").read_bytes() == b"photo"
-    moved = {here: Path(there) for here, there in report.moved.items()}
-    assert set(moved) == {str(tmp_path / name) for name in ("scene", "trials/base/run", "trials/t")}
-    assert all(place.is_relative_to(tmp_path / "disk") for place in moved.values())
+    config = load_run_config(tmp_path / "back/run/config.yml")
+    assert config.data_config.dataparser.data == tmp_path / "scene" and config.run_dir == tmp_path / "trials/t/run"
+    assert Path(worker.ran[0][1]).is_relative_to(tmp_path / "disk")
     (own,) = (tmp_path / "disk").iterdir()
     assert own.stat().st_mode & 0o777 == 0o700, "other users do not read it"
     ray_task.forget("node", dict.fromkeys(each.digest for each in task(sees=False).inputs.values()))
     assert not [path for path in (own / "inputs").iterdir() if path.is_dir()]
 
 
-def test_scores_of_another_node_go_on_from_what_was_trained(tmp_path, worker, task):
-    _, trained = perform(task(TRAINED, shared=False), "one", same)
-    report, parcel = perform(task(SCORED, shared=False, trained=trained), "other", same)
-    assert [until for until, _ in worker.ran] == [TRAINED, SCORED]
-    unpack(parcel, tmp_path / "back")
-    assert (tmp_path / "back/trained.json").exists() and (tmp_path / "back/result.json").exists()
-    assert report.outcome.result == {"steps": 3}
+@pytest.mark.parametrize("shared", [False, True])
+def test_scores_of_another_node_go_on_from_what_was_trained(tmp_path, worker, task, shared):
+    """Neither node sees photos and base; the second one sees the trial's folder, or not."""
+    _, trained = perform(task(TRAINED, shared=False, sees=False, parcels=True), "one", same)
+    shutil.rmtree(next((tmp_path / "disk").glob("beags-*")))
+    scores = task(SCORED, shared=shared, sees=False, parcels=True)
+    assert perform(scores, "other", same)[0].lacks == (TRAINED_FOLDER,)
+    report, parcel = perform(replace(scores, trained=trained), "other", same)
+    assert [until for until, _ in worker.ran] == [TRAINED, SCORED] and report.outcome.result == {"steps": 3}
+    if not shared:
+        unpack(parcel, tmp_path / "trials/t")
+    assert (tmp_path / "trials/t/trained.json").exists() and (tmp_path / "trials/t/result.json").exists()
+    config = load_run_config(tmp_path / "trials/t/run/config.yml")
+    assert config.data_config.dataparser.data == tmp_path / "scene" and config.run_dir == tmp_path / "trials/t/run"
 
 
 def test_a_failure_comes_back_with_its_log(tmp_path, worker, task):
@@ -131,7 +148,7 @@ def test_a_killed_trial_goes_on_from_its_checkpoint(tmp_path, worker, task):
     worker.code = 0
     assert perform(task(), "other", same)[0].outcome.result == {"steps": 3} and kept.exists()
     other = task()
-    (tmp_path / "trials/t/result.json").unlink()
+    (tmp_path / "trials/t/trained.json").unlink()
     other.request["digest"] = "e"
     perform(other, "node", same)
     assert not kept.exists(), "another trial begins anew"
@@ -164,9 +181,6 @@ def test_a_trial_that_fills_the_shared_disk_is_named(tmp_path, worker, task, mon
 
 
 def test_configs_that_come_back_name_the_places_here(tmp_path):
-    from beags_plugin.plugin.presets import preset_config
-    from beags_plugin.plugin.runs.run_config import load_run_config
-
     config = preset_config("beags-tiny", {}, Path("t"))
     config.run_dir, config.load_dir = Path("/node/trials/t/run"), Path("/node/inputs/b/nerfstudio_models")
     config.data_config.dataparser.data = Path("/node/inputs/d")

@@ -1,4 +1,4 @@
-"""Folders that travel as bytes to and from nodes that do not share them, and the paths in what comes back."""
+"""Folders that travel as bytes to and from nodes that do not share them, and the paths in them."""
 
 from __future__ import annotations
 
@@ -46,12 +46,15 @@ def unpack(parcel: bytes, folder: Path) -> None:
 
 
 def relocate(folder: Path, moved: Mapping[Path, Path]) -> None:
-    """Let the configs of the runs below ``folder`` name the places here. moved: folders here by those on the node."""
+    """Let the configs of the runs below ``folder`` name other places. moved: new places by old ones, both folders."""
     import yaml
 
     from beags_plugin.plugin.options.config import CONFIG_FILE
     from beags_plugin.plugin.runs.run_config import load_run_config
 
+    if not moved:
+        return
+    moved = dict(sorted(moved.items(), key=lambda pair: -len(pair[0].parts)))  # a folder in another one goes first
     for path in sorted(folder.rglob(CONFIG_FILE)):
         write_text_atomically(yaml.dump(_relocated(load_run_config(path), moved)), path)
 
@@ -59,9 +62,9 @@ def relocate(folder: Path, moved: Mapping[Path, Path]) -> None:
 def _relocated(value: Any, moved: Mapping[Path, Path]) -> Any:
     """Return a config's value with its paths moved; a dataclass is changed itself."""
     if isinstance(value, Path):
-        for there, here in moved.items():
-            if value.is_relative_to(there):
-                return here / value.relative_to(there)
+        for old, new in moved.items():
+            if value.is_relative_to(old):
+                return new / value.relative_to(old)
     elif isinstance(value, dict):
         return {key: _relocated(each, moved) for key, each in value.items()}
     elif isinstance(value, (list, tuple)):

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from beags_plugin.bench.engines.interface import Engine, Job, Needs, Outcome
-from beags_plugin.bench.engines.parcels import pack, relocate, unpack
-from beags_plugin.bench.engines.ray_task import FOLDERS, Input, Report, Task
+from beags_plugin.bench.engines.parcels import pack, unpack
+from beags_plugin.bench.engines.ray_task import FOLDERS, TRAINED_FOLDER, Input, Report, Task
 from beags_plugin.bench.engines.trial_folder import SCORED, TRAINED
 from beags_plugin.system.digests import folder_digest
 from beags_plugin.system.errors import UserError
@@ -25,6 +25,7 @@ MOST_ATTEMPTS = 4  # at a task whose worker or node is lost
 USUAL_CORES = 4  # of a trial of which nothing is known
 STORE_BYTES = 256 << 20  # of the object store of a cluster that this command starts: its one node shares the folder
 LOOK_SECONDS = 30.0  # between two looks at the cluster while nothing ends
+MARK = ".mark"  # file of the folder of all trials, whose content tells it from others
 _PASSED_ON = ("OMP_WAIT_POLICY",)  # and all that begin with BEAGS_
 
 
@@ -74,13 +75,14 @@ class RayEngine(Engine):
         self._running: dict[Any, _Running] = {}
         self._parcels: dict[str, Any] = {}  # references by digest of the folder
         self._unfit: dict[str, str] = {}  # sentences by node
-        self._mark: tuple[str, str] = ("", secrets.token_hex(16))
+        self._mark: tuple[str, str] | None = None
         self._waits = False
 
     def __enter__(self) -> RayEngine:
         import ray
 
         self._ray = ray
+        os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")  # of parcels that nobody fetches
         if not ray.is_initialized():
             self._connect()
             self._own = True
@@ -89,7 +91,6 @@ class RayEngine(Engine):
 
     def _connect(self) -> None:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray's rule to come, which it warns about
         quiet = {"log_to_driver": False, "logging_level": "error"}
         if self._address is None:
             self._ray.init(address="local", include_dashboard=False, object_store_memory=STORE_BYTES, **quiet)
@@ -112,8 +113,6 @@ class RayEngine(Engine):
                 ray.cancel(report, force=True)
         if self._parcels:
             self._forget()
-        if self._mark[0]:
-            Path(self._mark[0]).unlink(missing_ok=True)
         if self._own:
             ray.shutdown()
 
@@ -133,11 +132,17 @@ class RayEngine(Engine):
 
     def start(self, job: Job) -> None:
         """Give the job to the cluster."""
-        if not self._mark[0]:
-            path = job.folder.parent / f".shared-{self._mark[1][:12]}"
-            write_text_atomically(self._mark[1], path)
-            self._mark = str(path), self._mark[1]
-        self._submit(_Running(job, SCORED if job.base is None else TRAINED))
+        if self._mark is None:
+            path = job.folder.parent / MARK
+            if not path.exists():
+                write_text_atomically(secrets.token_hex(16), path)
+            self._mark = str(path), path.read_text()
+        self._submit(self._from_the_start(job))
+
+    @staticmethod
+    def _from_the_start(job: Job, attempt: int = 1) -> _Running:
+        is_trained = job.base is None or (job.folder / "trained.json").exists()
+        return _Running(job, SCORED if is_trained else TRAINED, attempt=attempt)
 
     def wait(self) -> tuple[Job, Outcome]:
         """Wait for the cluster; a task that was lost, or whose node is unfit, is given to it again."""
@@ -152,6 +157,7 @@ class RayEngine(Engine):
 
     def _submit(self, running: _Running) -> None:
         job = running.job
+        assert self._mark is not None
         request = job.request
         inputs = {name: Path(request[name]) for name in FOLDERS if request[name] is not None}
         digests = {name: folder_digest(path) for name, path in inputs.items()}
@@ -181,18 +187,15 @@ class RayEngine(Engine):
         try:
             report: Report = ray.get(reference)
         except ray.exceptions.RayTaskError as error:
+            if isinstance(error.cause, ray.exceptions.RayError):  # the node that held what was sent
+                return self._again(self._from_the_start(job, running.attempt), "what it needs was lost")
             return Outcome(job.folder, None, f"its task failed: {_first_line(error.cause or error)}")
         except ray.exceptions.RayError as error:
             return self._again(running, f"its worker was lost ({type(error).__name__})")
         if report.unfit is not None:
             return self._elsewhere(running, report.node, report.unfit)
         if report.lacks:
-            for name in report.lacks:
-                folder = Path(job.request[name])
-                self._parcels.setdefault(folder_digest(folder), None)
-                self._parcels[folder_digest(folder)] = ray.put(pack(folder))
-            self._submit(running)
-            return None
+            return self._sent(running, report.lacks)
         outcome = report.outcome
         assert outcome is not None
         if outcome.killed:
@@ -201,20 +204,24 @@ class RayEngine(Engine):
             self._submit(replace(running, until=SCORED, trained=None if report.shared else running.parcel, attempt=1))
             return None
         try:
-            return self._brought(running, report, outcome)
+            if not report.shared and (parcel := ray.get(running.parcel)) is not None:
+                unpack(parcel, job.folder)
+            return replace(outcome, folder=job.folder)
         except ray.exceptions.RayError as error:
             return self._again(running, f"its result was lost ({type(error).__name__})")
         except UserError as error:  # the disk of this machine, perhaps
             return Outcome(job.folder, None, str(error))
 
-    def _brought(self, running: _Running, report: Report, outcome: Outcome) -> Outcome:
-        """Return the outcome with its files in the job's folder, whose configs name the places of this machine."""
-        job = running.job
-        if not report.shared and (parcel := self._ray.get(running.parcel)) is not None:
-            unpack(parcel, job.folder)
-        if report.moved and outcome.failed is None:
-            relocate(job.folder, {Path(there): Path(here) for here, there in report.moved.items()})
-        return replace(outcome, folder=job.folder)
+    def _sent(self, running: _Running, lacks: Sequence[str]) -> None:
+        """Pack what a node lacks, and give the task to the cluster again."""
+        for name in lacks:
+            if name == TRAINED_FOLDER:
+                running = replace(running, trained=self._ray.put(pack(running.job.folder)))
+                continue
+            folder = Path(running.job.request[name])
+            if (digest := folder_digest(folder)) not in self._parcels:
+                self._parcels[digest] = self._ray.put(pack(folder))
+        self._submit(running)
 
     def _again(self, running: _Running, reason: str) -> Outcome | None:
         if running.attempt >= MOST_ATTEMPTS:

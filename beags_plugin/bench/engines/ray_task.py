@@ -1,7 +1,8 @@
 """What a node of a Ray cluster does for a trial: it trains it, or scores what was trained.
 
 It works in the trial's folder where it sees that of the command (shared storage), else in a folder of its own, and
-then it returns what it made. Photos, masks and bases that it does not see are sent to it once.
+then it returns what it made. Photos, masks and bases that it does not see are sent to it once. Configs of runs name the
+places of the command wherever they are not in use.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import shutil
 import socket
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,14 +20,16 @@ from typing import Any
 from filelock import FileLock
 
 from beags_plugin.bench.engines.interface import Outcome
-from beags_plugin.bench.engines.parcels import pack, unpack
-from beags_plugin.bench.engines.trial_folder import Worker, run_in_folder
+from beags_plugin.bench.engines.parcels import pack, relocate, unpack
+from beags_plugin.bench.engines.trial_folder import SCORED, Worker, run_in_folder
 from beags_plugin.plugin.training.memory_guard import LEAST_FREE_MB, free_disk_mb
 from beags_plugin.system.digests import code_digest, folder_digest
 from beags_plugin.system.errors import UserError, writing
 
 FOLDERS = ("data", "masks", "base")
 """Entries of a trial's request that are folders which the trial reads."""
+TRAINED_FOLDER = "trained folder"
+"""What a node lacks, besides inputs, that scores what another one trained."""
 _OF_FAILURES = ("failed.json", "log.txt", "trial.json")
 
 
@@ -66,9 +69,8 @@ class Task:
 class Report:
     """How a task ended.
 
-    node, host: who did it. outcome: None where it was not done: ``lacks`` names inputs to send, or ``unfit`` says in a
-    sentence why this node can do none. shared: whether the files are in the trial's folder. moved: places on the
-    node by those of the command, where they differ.
+    node, host: who did it. outcome: None where it was not done: ``lacks`` names what to send, or ``unfit`` says in a
+    sentence why this node can do none. shared: whether the files are in the trial's folder.
     """
 
     node: str
@@ -77,7 +79,6 @@ class Report:
     lacks: tuple[str, ...] = ()
     unfit: str | None = None
     shared: bool = True
-    moved: Mapping[str, str] = field(default_factory=dict)
 
 
 def perform(task: Task, node: str, fetch: Callable[[Any], bytes]) -> tuple[Report, bytes | None]:
@@ -95,26 +96,33 @@ def perform(task: Task, node: str, fetch: Callable[[Any], bytes]) -> tuple[Repor
         return Report(node, host, unfit=f"the disk of {own} on {host} has {free:.0f} MB left: free some space"), None
     try:
         places = {name: _place(each, own / "inputs", fetch) for name, each in task.inputs.items()}
-        if lacks := tuple(name for name, place in places.items() if place is None):
-            return Report(node, host, lacks=lacks), None
-        moved = {each.path: str(places[name]) for name, each in task.inputs.items()}
-        moved = {there: here for there, here in {**moved, task.folder: str(folder)}.items() if there != here}
+        lacks = [name for name, place in places.items() if place is None]
+        if task.until == SCORED and task.request["base"] is not None and not (folder / "trained.json").exists():
+            if task.trained is None:
+                lacks.append(TRAINED_FOLDER)
+            elif not lacks:
+                unpack(fetch(task.trained), folder)
+        if lacks:
+            return Report(node, host, lacks=tuple(lacks)), None
+        moved = {Path(each.path): place for name, each in task.inputs.items() if (place := places[name]) is not None}
+        moved = {there: here for there, here in {**moved, Path(task.folder): folder}.items() if there != here}
+        relocate(folder, moved)
         request = {**task.request, **{name: str(place) for name, place in places.items()}}
-        if not shared and task.trained is not None:
-            unpack(fetch(task.trained), folder)
         outcome = run_in_folder(folder, request, _worker(task.environment), task.until)
+        if outcome.killed:
+            return Report(node, host, outcome, shared=shared), None
+        relocate(folder, {here: there for there, here in moved.items()})
     except UserError as error:
         return Report(node, host, Outcome(Path(task.folder), None, f"{error} (on {host})"), shared=shared), None
-    if outcome.killed:
-        return Report(node, host, outcome, shared=shared), None
     if shared:
-        return Report(node, host, outcome, moved=moved), None
+        return Report(node, host, outcome), None
     if outcome.failed and free_disk_mb(own) < LEAST_FREE_MB:
         shutil.rmtree(folder, ignore_errors=True)
         return Report(node, host, unfit=f"{outcome.failed} (on {host})"), None
-    parcel = pack(folder, _OF_FAILURES if outcome.failed else ())
+    parcel = pack(folder, _OF_FAILURES if outcome.failed and not (folder / "trained.json").exists() else ())
     shutil.rmtree(folder, ignore_errors=True)
-    return Report(node, host, outcome, shared=False, moved=moved), parcel
+    failed = outcome.failed and outcome.failed.replace(str(folder), task.folder)  # where its log will lie
+    return Report(node, host, replace(outcome, failed=failed), shared=False), parcel
 
 
 def forget(node: str, digests: Mapping[str, Any]) -> None:

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import IO, Any
@@ -22,6 +22,7 @@ from beags_plugin.plugin.training.memory_guard import LEAST_FREE_MB, free_disk_m
 from beags_plugin.system.child_processes import bound
 from beags_plugin.system.errors import writing
 from beags_plugin.system.lock import LOCK
+from beags_plugin.system.whole_files import write_text_atomically
 
 PROGRAM = [sys.executable, "-m", "beags_plugin.bench.worker"]
 TRAINED, SCORED = "trained", "scored"
@@ -40,18 +41,17 @@ def run_in_folder(folder: Path, request: dict[str, Any], worker: Worker, until: 
     content = folder / f"{'trained' if until == TRAINED and request['base'] is not None else 'result'}.json"
     with writing(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(folder.parent / f".{folder.name}.lock").acquire()
+        lock = _lock(folder.parent / f".{folder.name}.lock")
     with lock:  # the second of two programs that want the same trial waits, and finds it done
         if (result := finished(folder) or read_json(content)) is not None:
             return Outcome(folder, result)
         if _goes_on(folder, request):
             _wait_for_end(folder / "run")
-        else:
+            (folder / "failed.json").unlink(missing_ok=True)
+        elif folder.exists():
             with writing(folder):
-                if folder.exists():
-                    shutil.rmtree(folder)  # left by an interrupted or failed trial
-                folder.mkdir(parents=True)
-                (folder / "trial.json").write_text(json.dumps(request, indent=1))
+                shutil.rmtree(folder)  # left by an interrupted or failed trial
+        write_text_atomically(json.dumps(request, indent=1), folder / "trial.json")
         code = worker.run(folder, until)
         if (result := read_json(content)) is not None:
             return Outcome(folder, result)
@@ -62,11 +62,28 @@ def run_in_folder(folder: Path, request: dict[str, Any], worker: Worker, until: 
         return Outcome(folder, None, reason, killed=(code < 0 or code == INTERRUPTED) and not full)
 
 
+def _lock(path: Path) -> AbstractContextManager[object]:
+    """Wait for a lock and hold it; hold nothing where the disk has no locks, as some network disks."""
+    try:
+        return FileLock(path).acquire()
+    except NotImplementedError:
+        return nullcontext()
+    except OSError as error:
+        if error.filename is not None:  # the file cannot be opened
+            raise
+        return nullcontext()
+
+
 def _goes_on(folder: Path, request: dict[str, Any]) -> bool:
-    """Return whether the folder holds an attempt at this very trial that was ended from outside and can go on."""
-    saved = (folder / "trained.json").exists() or any((folder / "run" / "nerfstudio_models").glob("step-*.ckpt"))
-    same = read_json(folder / "trial.json") == json.loads(json.dumps(request))
-    return saved and same and not (folder / "failed.json").exists()
+    """Return whether the folder holds an attempt at this trial that was ended from outside, or was trained.
+
+    A training goes on with the very same request. One that has ended is scored, wherever its folder has been moved.
+    """
+    former = read_json(folder / "trial.json") or {}
+    if (folder / "trained.json").exists():
+        return former.get("digest") == request["digest"]
+    saved = any((folder / "run" / "nerfstudio_models").glob("step-*.ckpt"))
+    return saved and former == json.loads(json.dumps(request)) and not (folder / "failed.json").exists()
 
 
 def _wait_for_end(run: Path) -> None:

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from beags_plugin.bench.engines import open_engine
 from beags_plugin.bench.engines.interface import Engine, Outcome
+from beags_plugin.bench.engines.trial_folder import finished
 from beags_plugin.bench.experiment import Experiment, load_experiment
 from beags_plugin.bench.forecast import Forecast
 from beags_plugin.bench.options import ExperimentOptions
@@ -34,11 +35,10 @@ from beags_plugin.bench.scenes import SceneSize
 from beags_plugin.bench.trials import VariantTrial, plan
 from beags_plugin.system.digests import code_digest, folder_digest
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
-NEWLY_MEASURED = "measured.json"  # in a trial's folder: which truth its figures are of, and the figures if made anew
+SCORED_BY = "measured.json"  # in a trial's folder: which truth its figures are of
 
 
 def run_paper(options: PaperOptions) -> Outcomes | None:
@@ -74,10 +74,12 @@ def _run(
         return None
     source = provenance()
     busy = busy_note(int(source["machine"]["cores"]))  # before the trials: they keep the machine busy
-    trials = [trial for run in runs for trial in run.trials]
-    finished = {trial.digest for trial in trials if (trials_folder / trial.folder_name / "result.json").exists()}
+    truths = _truths(runs)
+    _score_again(runs, truths, trials_folder)
     found = trained(runs, trials_folder, engine, forecast)
-    found = _measured(runs, found, finished)
+    for digest, truth in truths.items():
+        if found[digest].result is not None:
+            write_text_atomically(json.dumps({"truth": truth}), found[digest].folder / SCORED_BY)
     rows = rows_of(runs, found)
     outcomes = Outcomes(rows, {(run.scene.name, run.variant.name): _truth(run, found) for run in runs})
     methods = [variant.name for variant in experiment.variants]
@@ -113,46 +115,26 @@ def _methods(options: PaperOptions) -> Experiment:
     return dataclasses.replace(adapted(experiment, wanted), name="paper")
 
 
-def _measured(runs: Sequence[VariantTrial], outcomes: Mapping[str, Outcome], finished: set[str]) -> dict[str, Outcome]:
-    """Return the outcomes with figures of the truth that is on disk now: masks may be drawn after the training.
+def _truths(runs: Sequence[VariantTrial]) -> dict[str, str]:
+    """Return a digest of the truth that is on disk now, for each trial; masks may be drawn after the training."""
+    found = {run.scene.name: run.scene.data / TRUTH for run in runs}
+    digests = {name: folder_digest(folder) if folder.is_dir() else "" for name, folder in found.items()}
+    return {trial.digest: digests[run.scene.name] for run in runs for trial in run.trials}
 
-    finished: digests of the trials that had ended before.
-    """
-    measured = dict(outcomes)
-    changed = []
-    for run in runs:
-        truth = folder_digest(run.scene.data / TRUTH) if (run.scene.data / TRUTH).is_dir() else ""
-        for trial in run.trials:
-            outcome = outcomes[trial.digest]
-            if outcome.result is None:
-                continue
-            note = _read(outcome.folder / NEWLY_MEASURED)
-            if trial.digest not in finished:
-                write_text_atomically(json.dumps({"truth": truth}), outcome.folder / NEWLY_MEASURED)
-            elif note.get("truth") != truth:
-                changed.append((trial.digest, truth))
-            else:
-                measured[trial.digest] = dataclasses.replace(
-                    outcome, result={**outcome.result, **note.get("figures", {})}
-                )
+
+def _score_again(runs: Sequence[VariantTrial], truths: Mapping[str, str], folder: Path) -> None:
+    """Let trials be scored again whose truth has changed since: they keep their training, but not the result."""
+    changed = 0
+    for trial in (trial for run in runs for trial in run.trials):
+        place = folder / trial.folder_name
+        if (result := finished(place)) is None or _read(place / SCORED_BY).get("truth") == truths[trial.digest]:
+            continue
+        if not (place / "trained.json").exists():  # of an older version
+            write_text_atomically(json.dumps(result), place / "trained.json")
+        (place / "result.json").unlink()
+        changed += 1
     if changed:
-        from beags_plugin.bench.measure import measure_run
-
-        with progress_bar("Scoring anew") as progress:
-            for done, (digest, truth) in enumerate(changed):
-                progress(done, len(changed))
-                outcome = outcomes[digest]
-                assert outcome.result is not None
-                try:
-                    figures = measure_run(outcome.folder / "run" / "config.yml")
-                except UserError as error:  # a drawing that is no mask: a row with the reason
-                    measured[digest] = dataclasses.replace(outcome, result=None, failed=str(error))
-                    continue
-                content = json.dumps({"truth": truth, "figures": figures})
-                write_text_atomically(content, outcome.folder / NEWLY_MEASURED)
-                measured[digest] = dataclasses.replace(outcome, result={**outcome.result, **figures})
-            progress(len(changed), len(changed))
-    return measured
+        CONSOLE.print(f"{changed} trials are scored again, without training: their truth has changed.")
 
 
 def _read(path: Path) -> dict[str, Any]:
