@@ -117,7 +117,7 @@ def code_masses(classify: Classify, drawn: Tensor, group: Tensor, count: int, co
         logits = classify(drawn[rows])
         largest[rows] = logits.argmax(dim=1)
         one_hot = torch.nn.functional.one_hot(group[rows], count).to(drawn)
-        masses += ordered_outer_sum(one_hot, logits.log_softmax(dim=1).exp())
+        masses += ordered_outer_sum(one_hot, logits.softmax(dim=1))
     return masses, largest
 
 
