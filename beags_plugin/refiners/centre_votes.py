@@ -49,12 +49,12 @@ def members(
 
     points: [N, 3], centres. labels: per camera [H, W] int class ids below ``num_classes`` or IGNORE. A view in which
     all is IGNORE has no vote, nor has one that has IGNORE under a centre, about that one. Memory is linear in the
-    (Gaussian, object) pairs that occur.
+    (Gaussian, object) pairs that occur; masks are read one at a time.
     """
-    views = [(camera, mask) for camera, mask in zip(cameras, labels, strict=True) if bool((mask != IGNORE).any())]
+    views = [view for view, mask in enumerate(labels) if bool((mask != IGNORE).any())]
     found, unlabelled = TorchSparseSums(points.device), torch.zeros(len(points), device=points.device)
-    for camera, mask in views:
-        places, row, column = pixels_under(points, camera)
+    for view in views:
+        places, row, column, mask = *pixels_under(points, cameras[view]), labels[view]
         label = mask[row, column].long()
         unlabelled[places[label == IGNORE]] += 1
         keys = (places * num_classes + label)[(label != IGNORE) & (label != BACKGROUND)]
@@ -65,8 +65,8 @@ def members(
         asked = len(views) - unlabelled.double()[rows]
     else:
         asked = torch.zeros_like(counts)
-        for camera, mask in views:  # again, now that the pairs are known
-            places, row, column = pixels_under(points, camera)
+        for view in views:  # again, now that the pairs are known
+            places, row, column, mask = *pixels_under(points, cameras[view]), labels[view]
             voting = torch.zeros(len(points), dtype=torch.bool, device=points.device)
             voting[places] = mask[row, column] != IGNORE
             shown = torch.zeros(num_classes, dtype=torch.bool, device=points.device)

@@ -40,7 +40,7 @@ RULES = ("softmax", "argmax")
 code is the object's. The first is the default."""
 CODES = 256
 
-AT_ONCE = 2**22  # numbers in memory: 16 MB
+AT_ONCE = 2**22  # logits, or other numbers of pixels, that are held at a time: 16 MB
 
 
 def sampled(count: int, generator: torch.Generator) -> Tensor:
@@ -117,7 +117,7 @@ def code_masses(classify: Classify, drawn: Tensor, group: Tensor, count: int, co
         logits = classify(drawn[rows])
         largest[rows] = logits.argmax(dim=1)
         one_hot = torch.nn.functional.one_hot(group[rows], count).to(drawn)
-        masses += ordered_outer_sum(one_hot, logits.log_softmax(dim=1).exp())
+        masses += ordered_outer_sum(one_hot, logits.softmax(dim=1))
     return masses, largest
 
 
@@ -134,7 +134,7 @@ def matching(masses: Tensor) -> Tensor:
 
 
 def code_entropy(classify: Classify, drawn: Tensor, labels: Tensor, outputs: int) -> Tensor:
-    """Return the cross-entropy of each pixel, [P]; no more logits are held than ``AT_ONCE`` and a part's own.
+    """Return the cross-entropy of each pixel, [P]; the logits of some pixels are held at a time, see ``AT_ONCE``.
 
     drawn: [P, C]; gradients reach it and the classifier. labels: [P] int below ``outputs``, or IGNORE as the pixels
     that get 0.

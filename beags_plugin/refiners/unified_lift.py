@@ -119,7 +119,8 @@ class CodebookTraining(OwnTraining):
             tables += table
         owner = object_codebook.owners(tables)
         owned, used = torch.unique(owner[owner >= 0]).tolist(), int((tables.sum(dim=0) > 0).sum())
-        lost = [scene.names[c] for rank, c in enumerate(self.ranks.ids.tolist()) if rank not in owned]
+        seen = (tables.sum(dim=1) > 0).tolist()
+        lost = [scene.names[c] for rank, c in enumerate(self.ranks.ids.tolist()) if seen[rank] and rank not in owned]
         without = f"; none is of {', '.join(lost)}: train longer (refine_steps)" if lost else ""
         say(f"  codebook: {used} codes are used, {int((owner >= 0).sum())} of them are of one class{without}")
         if options.rule == "argmax":

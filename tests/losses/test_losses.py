@@ -17,7 +17,7 @@ from beags_plugin.losses.boundary import BoundaryLoss
 from beags_plugin.losses.distortion import DistortionLoss
 from beags_plugin.losses.normal import NormalConsistencyLoss, depth_normals
 from beags_plugin.losses.photometric import PhotometricLoss, blur, ssim, ssim_map
-from beags_plugin.losses.reduction import ordered_mean, ordered_sum
+from beags_plugin.losses.reduction import group_sums, ordered_mean, ordered_outer_sum, ordered_sum
 from beags_plugin.system.errors import UserError
 
 
@@ -124,6 +124,16 @@ def test_ordered_sums():
         assert float(ordered_sum(values)) == pytest.approx(float(values.sum()))
     assert float(ordered_mean(torch.zeros(0))) == 0.0
     assert torch.autograd.gradcheck(lambda x: ordered_sum(x**2), _random(2000)[:1500].requires_grad_(), fast_mode=True)
+
+
+def test_sums_of_groups_and_of_outer_products():
+    values, others = _random(5_000).view(-1, 4), _random(3_750, seed=1).view(-1, 3)
+    groups = torch.arange(1_250) % 7
+    one_hot = torch.nn.functional.one_hot(groups, 9).to(values)
+    torch.testing.assert_close(group_sums(values, groups, 9), one_hot.T @ values)  # two groups without rows
+    torch.testing.assert_close(ordered_outer_sum(values, others), values.T @ others)
+    assert torch.autograd.gradcheck(lambda x: group_sums(x**2, groups, 9), values.requires_grad_(), fast_mode=True)
+    assert group_sums(torch.zeros(0, 2), groups[:0], 3).tolist() == [[0.0, 0.0]] * 3
 
 
 def test_photometric_does_not_depend_on_threads():

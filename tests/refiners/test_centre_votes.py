@@ -182,6 +182,38 @@ def test_members_of_several_objects_at_once_and_one_by_one():
         assert torch.equal(alone.log_scales[0], after.log_scales[index])
 
 
+@pytest.mark.parametrize("threads", [2, 3])
+def test_threads_change_no_bit(threads):
+    count, generator = 50_000, torch.Generator().manual_seed(0)
+    xy = 0.4 * torch.rand(count, 2, generator=generator) - 0.2
+    surfels = Surfels(
+        torch.cat([xy, 1.0 + torch.rand(count, 1, generator=generator)], dim=1),
+        torch.randn(count, 4, generator=generator),
+        torch.rand(count, 2, generator=generator) - 4.0,
+        torch.zeros(count),
+        torch.zeros(count, 3),
+        torch.zeros(count, 0, 3),
+    )
+    labels = torch.randint(4, (SIZE, SIZE), generator=generator).int()
+    masks = [labels, torch.full_like(labels, 2)]
+
+    def run() -> list[torch.Tensor]:
+        class_ids = members(surfels.means, [camera(SIZE)] * 2, masks, 4, 0.4)
+        after, changed = decompose(surfels, class_ids, camera(SIZE), labels)
+        assert len(changed) > 10_000
+        return [class_ids, after.means, after.log_scales, changed]
+
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        one = run()
+        torch.set_num_threads(threads)
+        several = run()
+    finally:
+        torch.set_num_threads(before)
+    assert [torch.equal(a, b) for a, b in zip(one, several, strict=True)] == [True] * 4
+
+
 def test_directions_project_as_their_points_do():
     view = replace(camera(SIZE), K=camera(SIZE).K + torch.tensor([[0, 3.0, 1], [0, 7, -2], [0, 0, 0]]).double())
     generator = torch.Generator().manual_seed(0)
