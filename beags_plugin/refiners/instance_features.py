@@ -234,8 +234,10 @@ def fine_clusters(drawn: Tensor, silhouette: Tensor, masks: MaskedPixels, labels
 def matched_mask(drawn: Tensor, silhouette: Tensor, masks: MaskedPixels, labels: PseudoMasks) -> int | None:
     """Return the place of the pseudo mask that a leaf, drawn alone, shows best, or None.
 
-    The score is IoU (1 - |mean F over the silhouette - mean of the mask|_1). drawn: [P, 6]. silhouette: [P] bool.
+    The score is IoU (1 - |mean F over the silhouette - mean of the mask|_1), over labelled pixels. drawn: [P, 6].
+    silhouette: [P] bool.
     """
+    silhouette = silhouette & masks.labelled
     area = silhouette.sum()
     if not len(masks) or area == 0:
         return None

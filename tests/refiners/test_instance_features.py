@@ -96,10 +96,10 @@ def test_lloyd_moves_centres_and_empties_become_zero():
 
 
 def test_the_best_mask_must_score():
-    """Eight pixels, 1 on the first four and 2 on the others, and a silhouette of 0, 1, 2 and 4."""
-    masks, silhouette = masks_of(1, 1, 1, 1, 2, 2, 2, 2), torch.zeros(8, dtype=torch.bool)
-    silhouette[[0, 1, 2, 4]] = True
-    drawn = column(0.5, 0.5, 0.5, 9, 0.5, 9, 9, 9)
+    """Nine pixels, 1 on the first four, 2 on four, one unlabelled, and a silhouette of 0, 1, 2, 4 and that one."""
+    masks, silhouette = masks_of(1, 1, 1, 1, 2, 2, 2, 2, IGNORE), torch.zeros(9, dtype=torch.bool)
+    silhouette[[0, 1, 2, 4, 8]] = True
+    drawn = column(0.5, 0.5, 0.5, 9, 0.5, 9, 9, 9, 9)
 
     def matched(first: float, second: float = 0.5, kept: bool = True) -> int | None:
         means = column(first, second)
@@ -110,7 +110,7 @@ def test_the_best_mask_must_score():
     assert matched(1.3) is None  # 0.12 and 0.143
     assert matched(0.6, kept=False) is None
     nothing = parts.PseudoMasks.none(drawn)
-    assert parts.matched_mask(drawn, silhouette, masks_of(*[IGNORE] * 8), nothing) is None
+    assert parts.matched_mask(drawn, silhouette, masks_of(*[IGNORE] * 9), nothing) is None
 
 
 def test_a_cluster_has_as_many_leaves_as_masks_that_it_covers_alike():
