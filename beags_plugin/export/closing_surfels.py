@@ -6,14 +6,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from beags_plugin.core.densification import SH_C0
+from beags_plugin.core.lifting import project
+from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import ExportItem, NothingToExport, Viewpoints
 from beags_plugin.export.closing import Closed
 from beags_plugin.export.mesh import closed_surface, seen_surface
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.export.surface import area_vectors
+from beags_plugin.rasterizers.rendering import surfel_inputs
 
 _OPACITY = 0.99
 _SIGMA = 0.75  # standard deviation over the distance between neighbours: three of them hide what is between
@@ -49,7 +53,10 @@ def with_closing(item: ExportItem, options: MeshOptions) -> tuple[ExportItem, Ad
         solid = closed_surface(item, mesh)
     except NothingToExport as error:
         return replace(item, invented=own), Added(0, str(error).partition(":")[0])
-    more = closing_surfels(solid, item.surfels, _pixel(item.views, solid.mesh.vertices))
+    assert item.views is not None  # the surface was seen from there
+    pixel = _pixel(item.views, solid.mesh.vertices)
+    more = closing_surfels(solid, item.surfels, pixel)
+    more = more[_within(more, item.surfels, item.views, pixel)]
     both = Surfels(
         **{name: torch.cat([getattr(item.surfels, name).detach(), added]) for name, added in vars(more).items()}
     )
@@ -58,12 +65,34 @@ def with_closing(item: ExportItem, options: MeshOptions) -> tuple[ExportItem, Ad
     return replace(item, surfels=both, class_ids=ids, invented=invented), Added(len(more))
 
 
-def _pixel(views: Viewpoints | None, points: np.ndarray) -> float:
-    """Return how large a pixel is at a thing of points [P, 3], the median over the views; 0 without any."""
+def _pixel(views: Viewpoints, points: np.ndarray) -> float:
+    """Return how large a pixel is at a thing of points [P, 3], the median over the views."""
     middle = torch.from_numpy((points.min(axis=0) + points.max(axis=0)) / 2)
-    cameras = () if views is None else views.cameras
-    sizes = [float((camera.center.double() - middle).norm()) / camera.focal for camera in cameras]
-    return float(np.median(sizes)) if sizes else 0.0
+    return float(np.median([float((each.center.double() - middle).norm()) / each.focal for each in views.cameras]))
+
+
+@torch.no_grad()
+def _within(more: Surfels, own: Surfels, views: Viewpoints, pixel: float) -> Tensor:
+    """Return [M] bool, which Gaussians lie inside the outline of an object's own ones in every view.
+
+    Holes of an outline count as inside: they are what is to be closed.
+    """
+    from scipy.ndimage import binary_fill_holes
+
+    axes = rotation_from_quat(more.quats)[:, :, :2].mT.double()
+    reach = _HALF * more.log_scales[:, :1].double().exp().clamp(min=_ON_SCREEN * pixel)[..., None]
+    around = torch.cat([reach * axes, -reach * axes], dim=1)
+    points = torch.cat([more.means[:, None].double(), more.means[:, None].double() + around], dim=1)
+    inside = torch.ones(len(more), dtype=torch.bool)
+    for camera in views.cameras:
+        drawn = views.rasterizer.rasterize(surfel_inputs(own, camera), camera, views.settings, own.means.new_zeros(3))
+        outline = torch.from_numpy(binary_fill_holes((drawn.alpha > 0.5).numpy()))
+        xy, z = project(points.reshape(-1, 3), camera.to(torch.float64))
+        limit = torch.tensor([camera.width, camera.height])
+        framed = (z > 0) & ((xy >= 0) & (xy < limit)).all(dim=1)
+        column, row = xy.nan_to_num().floor().long().clamp(min=0).minimum(limit - 1).T
+        inside &= (outline[row, column] | ~framed).reshape(len(more), -1).all(dim=1)
+    return inside
 
 
 def closing_surfels(solid: Closed, like: Surfels, pixel: float) -> Surfels:
@@ -77,7 +106,7 @@ def closing_surfels(solid: Closed, like: Surfels, pixel: float) -> Surfels:
     quats = _quats_to(normals)
     logs = np.log(_SIGMA * apart)[:, None].repeat(2, axis=1)
 
-    def tensor(values: np.ndarray) -> torch.Tensor:
+    def tensor(values: np.ndarray) -> Tensor:
         return torch.from_numpy(values).to(means.dtype)
 
     return Surfels(
