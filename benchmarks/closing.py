@@ -137,9 +137,9 @@ class Painter:
 
 def apart(points: np.ndarray, exact: np.ndarray) -> float:
     """Return the mean of both mean distances, in per cent of the longest side of the exact points [P, 3]."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    there, back = cKDTree(points).query(exact)[0].mean(), cKDTree(exact).query(points)[0].mean()
+    there, back = KDTree(points).query(exact)[0].mean(), KDTree(exact).query(points)[0].mean()
     return float(100 * (there + back) / 2 / np.ptp(exact, axis=0).max())
 
 

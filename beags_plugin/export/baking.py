@@ -64,18 +64,18 @@ def baked(
     """
     caster = surface_of(mesh)
     step = max(1, len(places.points) // _SAMPLES)
-    exposures = _exposures(places[::step], mesh, caster, photos, lambda done: progress(done, 2 * len(photos)))
+    exposures = exposures_of(places[::step], mesh, caster, photos, lambda done: progress(done, 2 * len(photos)))
     total = _PRIOR * linear_from_srgb(prior)
     weights = np.full(len(places.points), _PRIOR)
     for done, (photo, exposure) in enumerate(zip(photos, exposures, strict=True), start=1):
-        index, light, weight = _seen(places, mesh, caster, photo)
+        index, light, weight = places_seen(places, mesh, caster, photo)
         total[index] += weight[:, None] * light / exposure
         weights[index] += weight
         progress(len(photos) + done, 2 * len(photos))
     return Baked(srgb_from_linear(total / weights[:, None]), weights > _PRIOR, exposures)
 
 
-def _seen(places: Places, mesh: Mesh, caster: Any, photo: Photo) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def places_seen(places: Places, mesh: Mesh, caster: Any, photo: Photo) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return which places a photo shows, [M] int64, their light [M, 3] there and its weights [M]."""
     camera = photo.camera
     xy, z = (values.numpy() for values in project(torch.from_numpy(places.points), camera.to(torch.float64)))
@@ -90,7 +90,7 @@ def _seen(places: Places, mesh: Mesh, caster: Any, photo: Photo) -> tuple[np.nda
     depth = photo.depth().numpy()[row, column]
     index = index[_well_inside(photo.own())[row, column] & ~((depth > 0) & (depth < (1.0 - HIDES) * z[index]))]
     index = index[~_hidden(caster, mesh, places[index], camera.center.double().numpy())]
-    light = linear_from_srgb(_interpolated(photo.image(), xy[index]))
+    light = linear_from_srgb(interpolated(photo.image(), xy[index]))
     pixels = cosine[index] * (camera.focal * places.spacing / z[index]) ** 2  # for the area of a place
     return index, light, np.minimum(pixels, 4.0) ** _SHARPEN
 
@@ -111,7 +111,7 @@ def _hidden(caster: Any, mesh: Mesh, places: Places, center: np.ndarray) -> np.n
     return caster.test_occlusions(open3d.core.Tensor(rays), 0.0, 1.0).numpy()
 
 
-def _interpolated(image: Tensor, xy: np.ndarray) -> np.ndarray:
+def interpolated(image: Tensor, xy: np.ndarray) -> np.ndarray:
     """Return [M, 3] float64, an image [H, W, 3] at pixel coordinates [M, 2], between the four nearest centres."""
     height, width = image.shape[:2]
     pixels = image.double().numpy()
@@ -123,7 +123,7 @@ def _interpolated(image: Tensor, xy: np.ndarray) -> np.ndarray:
     return (1 - v) * top + v * ((1 - u) * pixels[below, x] + u * pixels[below, right])
 
 
-def _exposures(
+def exposures_of(
     places: Places, mesh: Mesh, caster: Any, photos: Sequence[Photo], progress: Callable[[int], None]
 ) -> np.ndarray:
     """Return [V, 3], how many times as bright as the mean each photo shows places, by colour.
@@ -134,7 +134,7 @@ def _exposures(
     count = len(photos)
     logs, weights = (np.zeros((len(places.points), count, 3)) for _ in range(2))
     for view, photo in enumerate(photos):
-        index, light, weight = _seen(places, mesh, caster, photo)
+        index, light, weight = places_seen(places, mesh, caster, photo)
         usable = (light > _DARK) & (light < _BRIGHT)
         logs[index, view] = np.log(np.where(usable, light, 1.0))
         weights[index, view] = usable * np.minimum(weight, 1.0)[:, None] ** (1 / _SHARPEN)

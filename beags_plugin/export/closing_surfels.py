@@ -6,20 +6,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from beags_plugin.core.densification import SH_C0
+from beags_plugin.core.lifting import project
+from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.export.base import ExportItem, NothingToExport
+from beags_plugin.export.base import ExportItem, NothingToExport, Viewpoints
 from beags_plugin.export.closing import Closed
-from beags_plugin.export.mesh import closed_surface
+from beags_plugin.export.mesh import closed_surface, seen_surface
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.export.surface import area_vectors
+from beags_plugin.rasterizers.rendering import surfel_inputs
 
 _OPACITY = 0.99
 _SIGMA = 0.75  # standard deviation over the distance between neighbours: three of them hide what is between
 _INWARD = 0.5  # distance between neighbours over that from the rim
 _FINEST = 1.5  # distance between neighbours over that between the surface's corners
 _HALF = 1.2  # standard deviations from its middle at which an opaque Gaussian is half transparent
+_ON_SCREEN = 0.71  # pixels: the standard deviation that a Gaussian is drawn with at least (2DGS's low-pass filter)
 _LARGEST = 1 / 12  # distance between neighbours over the closed surface's longest side
 _SAME_SIDE = 0.5  # least cosine between the normals of places of one side
 
@@ -42,10 +47,16 @@ def with_closing(item: ExportItem, options: MeshOptions) -> tuple[ExportItem, Ad
     """Return an item with Gaussians where no photo shows it, by the closed surface that the options lead to."""
     own = torch.zeros(len(item.surfels), dtype=torch.bool)
     try:
-        solid = closed_surface(item, options)
+        mesh = seen_surface(item, options)  # where the splats are; photos would place it elsewhere
+        if not len(mesh.faces):
+            raise NothingToExport(f"no surface of {item.name!r} is seen in {options.min_views} training views")
+        solid = closed_surface(item, mesh)
     except NothingToExport as error:
         return replace(item, invented=own), Added(0, str(error).partition(":")[0])
-    more = closing_surfels(solid, item.surfels)
+    assert item.views is not None  # the surface was seen from there
+    pixel = _pixel(item.views, solid.mesh.vertices)
+    more = closing_surfels(solid, item.surfels, pixel)
+    more = more[_within(more, item.surfels, item.views, pixel)]
     both = Surfels(
         **{name: torch.cat([getattr(item.surfels, name).detach(), added]) for name, added in vars(more).items()}
     )
@@ -54,17 +65,48 @@ def with_closing(item: ExportItem, options: MeshOptions) -> tuple[ExportItem, Ad
     return replace(item, surfels=both, class_ids=ids, invented=invented), Added(len(more))
 
 
-def closing_surfels(solid: Closed, like: Surfels) -> Surfels:
+def _pixel(views: Viewpoints, points: np.ndarray) -> float:
+    """Return how large a pixel is at a thing of points [P, 3], the median over the views."""
+    middle = torch.from_numpy((points.min(axis=0) + points.max(axis=0)) / 2)
+    return float(np.median([float((each.center.double() - middle).norm()) / each.focal for each in views.cameras]))
+
+
+@torch.no_grad()
+def _within(more: Surfels, own: Surfels, views: Viewpoints, pixel: float) -> Tensor:
+    """Return [M] bool, which Gaussians lie inside the outline of an object's own ones in every view.
+
+    Holes of an outline count as inside: they are what is to be closed.
+    """
+    from scipy.ndimage import binary_fill_holes
+
+    axes = rotation_from_quat(more.quats)[:, :, :2].mT.double()
+    reach = _HALF * more.log_scales[:, :1].double().exp().clamp(min=_ON_SCREEN * pixel)[..., None]
+    around = torch.cat([reach * axes, -reach * axes], dim=1)
+    points = torch.cat([more.means[:, None].double(), more.means[:, None].double() + around], dim=1)
+    inside = torch.ones(len(more), dtype=torch.bool)
+    for camera in views.cameras:
+        drawn = views.rasterizer.rasterize(surfel_inputs(own, camera), camera, views.settings, own.means.new_zeros(3))
+        outline = torch.from_numpy(binary_fill_holes((drawn.alpha > 0.5).numpy()))
+        xy, z = project(points.reshape(-1, 3), camera.to(torch.float64))
+        limit = torch.tensor([camera.width, camera.height])
+        framed = (z > 0) & ((xy >= 0) & (xy < limit)).all(dim=1)
+        column, row = xy.nan_to_num().floor().long().clamp(min=0).minimum(limit - 1).T
+        inside &= (outline[row, column] | ~framed).reshape(len(more), -1).all(dim=1)
+    return inside
+
+
+def closing_surfels(solid: Closed, like: Surfels, pixel: float) -> Surfels:
     """Return flat Gaussians on the invented parts of a closed surface, small at its rims and larger inside.
 
     Each has the colour of its place from every side: degree 0, though they have the bands of ``like``, the object's.
+    pixel: size of a pixel of the photos at the surface; no Gaussian is drawn much smaller than that.
     """
-    points, normals, colors, apart = _spread(solid)
+    points, normals, colors, apart = _spread(solid, pixel)
     count, means = len(points), like.means
     quats = _quats_to(normals)
     logs = np.log(_SIGMA * apart)[:, None].repeat(2, axis=1)
 
-    def tensor(values: np.ndarray) -> torch.Tensor:
+    def tensor(values: np.ndarray) -> Tensor:
         return torch.from_numpy(values).to(means.dtype)
 
     return Surfels(
@@ -77,13 +119,13 @@ def closing_surfels(solid: Closed, like: Surfels) -> Surfels:
     )
 
 
-def _spread(solid: Closed) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _spread(solid: Closed, pixel: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return places [P, 3] over the invented parts, unit normals and colours [P, 3] there, and distances [P].
 
     Every place of these parts but those at the rim is as near to one of them as the distance there says. They are taken
     in order, the farthest from the rim first; a place is left out if one that was taken is near enough.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     mesh, invented = solid.mesh, solid.invented
     faces = mesh.faces[invented[mesh.faces].any(axis=1)]
@@ -96,11 +138,13 @@ def _spread(solid: Closed) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarr
     normals /= np.maximum(areas, 1e-300)[:, None]
     spacing = float(np.sqrt(2.0 * np.median(areas)))  # of the faces' corners
     rim = np.unique(faces[~invented[faces]])
-    inward = cKDTree(mesh.vertices[rim]).query(points)[0] if len(rim) else np.full(len(points), np.inf)
+    inward = KDTree(mesh.vertices[rim]).query(points)[0] if len(rim) else np.full(len(points), np.inf)
     longest = float(np.ptp(mesh.vertices, axis=0).max())
-    apart = np.clip(_INWARD * inward, _FINEST * spacing, max(_LARGEST * longest, _FINEST * spacing))
+    finest = max(_FINEST * spacing, pixel)
+    apart = np.clip(_INWARD * inward, finest, max(_LARGEST * longest, finest))
     # up to the rim, but not beyond it: the object's own Gaussians begin there
-    tree, open_ = cKDTree(points), (areas > 0) & (inward > _HALF * _SIGMA * apart)
+    reach = _HALF * np.maximum(_SIGMA * apart, _ON_SCREEN * pixel)
+    tree, open_ = KDTree(points), (areas > 0) & (inward > reach)
     taken = []
     for place in np.lexsort((*points.T, -np.round(inward / spacing, 3))):
         if open_[place]:

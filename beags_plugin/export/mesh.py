@@ -13,9 +13,11 @@ from beags_plugin.export.closing import Closed, closed
 from beags_plugin.export.fusion import Mesh, decimated, fuse, without_small_parts
 from beags_plugin.export.glb import glb_bytes
 from beags_plugin.export.mesh_options import MeshOptions
+from beags_plugin.export.placing import Placed, placed
 from beags_plugin.export.surface import area_vectors
 from beags_plugin.export.texture import Texture, textured
 from beags_plugin.extraction.files import whole_file
+from beags_plugin.system.progress import progress_bar
 
 FEWEST, MOST, PER_GAUSSIAN = 1000, 20_000, 20
 """Triangles where no number of them was asked for."""
@@ -32,11 +34,29 @@ def seen_surface(item: ExportItem, options: MeshOptions) -> Mesh:
     return without_small_parts(fused, options.smallest_part)
 
 
-def closed_surface(item: ExportItem, options: MeshOptions) -> Closed:
-    """Return the closed surface of an item; raises ``NothingToExport`` where there is none."""
+def placed_surface(item: ExportItem, options: MeshOptions) -> Placed:
+    """Return the seen surface where the photos place it, if there are any; raises ``NothingToExport`` without a face.
+
+    It is made once for each set of options.
+    """
     mesh = seen_surface(item, options)
     if not len(mesh.faces):
-        raise _unseen(item, options)
+        raise NothingToExport(
+            f"no surface of {item.name!r} is seen in {options.min_views} training views: "
+            "lower --min-views, or export it as splats."
+        )
+    if not item.photos:
+        return Placed(mesh, 0.0)
+    chosen = options.resolution, options.truncation, options.memory_mb, options.min_views, options.smallest_part
+    found = item.shared.get(("placed", chosen))
+    if found is None:
+        with progress_bar("Placing the surface", passing=True) as progress:
+            found = item.shared["placed", chosen] = placed(mesh, item.photos, progress)
+    return found
+
+
+def closed_surface(item: ExportItem, mesh: Mesh) -> Closed:
+    """Return a surface of an item closed; raises ``NothingToExport`` if it encloses nothing."""
     solid = closed(mesh)
     if solid is None:
         raise NothingToExport(
@@ -46,23 +66,22 @@ def closed_surface(item: ExportItem, options: MeshOptions) -> Closed:
     return solid
 
 
-def _unseen(item: ExportItem, options: MeshOptions) -> NothingToExport:
-    return NothingToExport(
-        f"no surface of {item.name!r} is seen in {options.min_views} training views: "
-        "lower --min-views, or export it as splats."
-    )
-
-
 @dataclass(frozen=True)
 class MadeMesh:
-    """A mesh; invented: [V] bool, vertices where no view showed a surface, None of a mesh that was not closed."""
+    """A mesh; pixels: that photos moved its places outwards, in the mean, 0 without photos.
+
+    invented: [V] bool, vertices where no view showed a surface, None of a mesh that was not closed.
+    """
 
     mesh: Mesh
+    pixels: float
     invented: np.ndarray | None = None
 
     def facts(self) -> dict[str, Any]:
         """Return the manifest's entries about it; closed_share: of its area, where all corners are invented."""
         found = {"vertices": len(self.mesh.vertices), "triangles": len(self.mesh.faces), "voxel": self.mesh.voxel}
+        if self.pixels:
+            found["moved_pixels"] = round(self.pixels, 3)
         if self.invented is None:
             return found
         areas = np.linalg.norm(area_vectors(self.mesh), axis=1)
@@ -72,11 +91,18 @@ class MadeMesh:
 
 @dataclass(frozen=True)
 class MeshExporter(MeshOptions, Exporter):
-    """The surface that the training views see of an item rendered alone; all file types hold the same mesh."""
+    """The surface that the training views see of an item rendered alone, placed by the photos, if there are any.
+
+    All file types hold the same mesh.
+    """
 
     needs_views: ClassVar[bool] = True
     holds_gaussians: ClassVar[bool] = False
     closes: ClassVar[bool] = False
+
+    @property
+    def needs_photos(self) -> bool:
+        return True
 
     @classmethod
     def unavailable(cls) -> str | None:
@@ -96,14 +122,12 @@ class MeshExporter(MeshOptions, Exporter):
 
     def _made(self, item: ExportItem, closing: bool) -> MadeMesh:
         most = self.triangles or min(MOST, max(FEWEST, PER_GAUSSIAN * len(item.surfels)))
+        surface = placed_surface(item, self)
         if closing:
-            solid = closed_surface(item, self)
+            solid = closed_surface(item, surface.mesh)
             mesh = decimated(without_small_parts(solid.mesh, self.smallest_part), most)
-            return MadeMesh(mesh, solid.invented_at(mesh.vertices))
-        mesh = seen_surface(item, self)
-        if not len(mesh.faces):
-            raise _unseen(item, self)
-        return MadeMesh(decimated(mesh, most))
+            return MadeMesh(mesh, surface.pixels, solid.invented_at(mesh.vertices))
+        return MadeMesh(decimated(surface.mesh, most), surface.pixels)
 
 
 def open3d_missing() -> str | None:
@@ -120,10 +144,6 @@ class GlbExporter(MeshExporter):
     """Binary glTF 2.0: Blender, three.js, game engines."""
 
     suffix: ClassVar[str] = "glb"
-
-    @property
-    def needs_photos(self) -> bool:
-        return self.texture == "photos"
 
     def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
         made = self.made(item)

@@ -88,7 +88,7 @@ def test_a_box_without_bottom_is_closed_flat_and_keeps_its_sides():
         assert np.abs(solid.bounds - [[-HALF] * 3, [HALF] * 3]).max() < 2 * VOXEL
         invented = found.invented_at(mesh.vertices)
         assert np.abs(mesh.vertices[invented][:, 2] + HALF).max() < 2 * VOXEL
-        assert 0.1 < MadeMesh(mesh, invented).facts()["closed_share"] < 0.2  # one of six sides
+        assert 0.1 < MadeMesh(mesh, 0.0, invented).facts()["closed_share"] < 0.2  # one of six sides
     assert np.array_equal(found.invented_at(found.mesh.vertices), found.invented)
 
 
@@ -104,20 +104,23 @@ def test_a_closed_hole_has_the_colours_of_its_rim():
 
 def test_gaussians_close_the_hole_and_are_its_only_new_ones():
     surfels = discs_on(a_box(bottom=False))
-    more = closing_surfels(closed_box(), surfels)
+    more = closing_surfels(closed_box(), surfels, 0.0)
     assert 50 < len(more) < 2000 and more.sh_degree == 1 and not more.sh_rest.any()
     assert (more.means[:, 2] + HALF).abs().max() < 2 * VOXEL
     normals = rotation_from_quat(more.quats)[:, :, 2]
     inner = more.means[:, :2].abs().amax(dim=1) < HALF - 0.1
     assert inner.any() and normals[inner, 2].max() < -0.99  # outwards
     assert more.log_scales[inner].mean() > more.log_scales[~inner].mean() and opacities(more.opacity_logits).min() > 0.9
-    again = closing_surfels(closed_box(), surfels)
+    again = closing_surfels(closed_box(), surfels, 0.0)
     assert torch.equal(again.means, more.means) and torch.equal(again.sh_dc, more.sh_dc)
+    coarse = closing_surfels(closed_box(), surfels, 0.06)  # a pixel of three voxels
+    assert 20 < len(coarse) < len(more) and coarse.means[:, :2].abs().max() < more.means[:, :2].abs().max()
     camera = camera_at((0.2, 0.3, -3.0))
     rasterizer = make_rasterizer("auto")
 
     def depth(part: Surfels) -> torch.Tensor:
         drawn = rasterizer.rasterize(surfel_inputs(part, camera), camera, SETTINGS, torch.zeros(3))
+        assert drawn.median_depth is not None
         return torch.where(drawn.alpha > 0.5, drawn.median_depth, 0.0)
 
     whole = depth(discs_on(a_box(bottom=True)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from beags_plugin.export.base import Photo
 from beags_plugin.export.color import linear_from_srgb, srgb_from_linear
 from beags_plugin.export.fusion import Mesh, decimated
 from beags_plugin.export.glb import glb_bytes
+from beags_plugin.export.placing import placed
 from beags_plugin.export.surface import area_vectors, vertex_normals
 from beags_plugin.export.texture import textured
 
@@ -174,3 +176,30 @@ def test_a_glb_is_read_by_another_project(box, tmp_path, with_texture):
     content = json.loads(raw[20 : 20 + int.from_bytes(raw[12:16], "little")])
     assert all(view["byteOffset"] % 4 == 0 for view in content["bufferViews"])
     assert content["buffers"][0]["byteLength"] == len(raw) - 28 - int.from_bytes(raw[12:16], "little")
+
+
+PIXEL = 2.7 / 192  # of the photos at the box, about
+
+
+@pytest.mark.parametrize("inwards", [1.0, -1.0])
+def test_photos_place_a_surface_that_lies_a_pixel_off(box, inwards):
+    """Also with exposures that differ; the bottom, which no photo sees, goes along with what is beside it."""
+    off = replace(box, vertices=box.vertices - inwards * PIXEL * vertex_normals(box))
+    steps: list[tuple[int, int]] = []
+    found = placed(off, photos_of(box), lambda *counts: steps.append(counts))
+    assert found.pixels == pytest.approx(inwards, abs=0.35) and steps[-1] == (24, 24)
+    assert np.array_equal(found.mesh.faces, box.faces)
+    seen = box.vertices[:, 2] > -0.38
+    flat = seen & (np.sort(np.abs(box.vertices), axis=1)[:, 1] < 0.3)  # not on an edge, where normals are between two
+    before, after = (np.abs(np.abs(each.vertices).max(axis=1) - 0.4)[flat] / PIXEL for each in (off, found.mesh))
+    assert before.min() > 0.9 and np.median(after) < 0.25 and np.quantile(after, 0.9) < 0.5
+    again = placed(off, photos_of(box))
+    assert np.array_equal(again.mesh.vertices, found.mesh.vertices)
+
+
+def test_a_surface_of_one_colour_or_of_two_photos_stays(box):
+    grey = Mesh(box.vertices, box.faces, box.colors, VOXEL)
+    plain = [replace(photo, image=lambda: torch.full((160, 160, 3), 0.4)) for photo in photos_of(box)]
+    assert abs(placed(grey, plain).pixels) < 0.05
+    few = placed(box, photos_of(box)[:2])
+    assert few.pixels == 0.0 and few.mesh is box
