@@ -202,6 +202,16 @@ def test_nodes_that_share_nothing_are_sent_what_they_lack(alone, cluster, tmp_pa
     assert not list(Path(os.environ.get("TMPDIR", "/tmp")).glob("beags-*/inputs/*-seen-elsewhere"))
 
 
+def test_without_an_address_this_machine_is_the_cluster(alone, tmp_path):
+    path, expected = alone
+    options = ExperimentOptions(scenes=1, variants=("alone",), output=tmp_path / "out", engine="ray")
+    assert not ray.is_initialized()
+    rows = run_experiment(path, options)
+    assert not ray.is_initialized(), "it has ended with the command"
+    wanted = [row for row in figures(expected)["rows"] if row["scene"] == rows[0].scene and row["variant"] == "alone"]
+    assert figures(report_of(options.output))["rows"] == wanted
+
+
 def test_a_cluster_that_is_not_there_is_one_sentence(tmp_path):
     for address in ("127.0.0.1:1", "auto"):
         options = ExperimentOptions(output=tmp_path / "out", engine="ray", address=address)

@@ -174,7 +174,7 @@ def test_an_unfit_node_is_left_out_and_without_others_the_trial_fails(run):
         return Report("one", "host", unfit="its disk is full") if number == 0 else ended(task)
 
     outcome, fake, said = run(answer)
-    assert outcome.result and said == ["A node is left out: its disk is full."]
+    assert outcome.result and said == ["A node is left out: its disk is full"]
     assert "label_selector" not in fake.tasks[0][0]
     assert [asked["label_selector"] for asked, _ in fake.tasks[1:]] == [{"ray.io/node-id": "!in(one)"}] * 2
     both = iter(("one", "two"))

@@ -233,7 +233,7 @@ class RayEngine(Engine):
     def _elsewhere(self, running: _Running, node: str, reason: str) -> Outcome | None:
         """Give the task to another node; if all are unfit, the job fails."""
         if node not in self._unfit:
-            say(f"A node is left out: {reason}.")
+            say(f"A node is left out: {reason}")
             self._unfit[node] = reason
         if not self._nodes(fit=True):
             return Outcome(running.job.folder, None, f"no node of the cluster can run it; of the last one: {reason}")
