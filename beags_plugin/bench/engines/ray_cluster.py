@@ -93,7 +93,13 @@ class RayEngine(Engine):
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         quiet = {"log_to_driver": False, "logging_level": "error"}
         if self._address is None:
-            self._ray.init(address="local", include_dashboard=False, object_store_memory=STORE_BYTES, **quiet)
+            try:
+                self._ray.init(address="local", include_dashboard=False, object_store_memory=STORE_BYTES, **quiet)
+            except Exception as error:  # its processes have 15 seconds to begin
+                raise UserError(
+                    f"Ray cannot start on this machine ({_first_line(error)}): try again when it is less busy, or "
+                    "leave --engine out."
+                ) from error
             return
         host, _, port = self._address.rpartition(":")
         try:
