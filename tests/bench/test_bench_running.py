@@ -98,6 +98,16 @@ def test_an_interrupted_trial_that_saved_goes_on_unless_it_is_another_one(tmp_pa
     assert not (folder / "half").exists() and (folder / "result.json").exists()
 
 
+@pytest.mark.parametrize("error", [NotImplementedError(), OSError(37, "No locks available")])
+def test_a_disk_without_locks_is_no_obstacle(tmp_path, worker, monkeypatch, error):
+    def acquire(*_, **__):
+        raise error
+
+    monkeypatch.setattr(trial_folder.FileLock, "acquire", acquire)
+    wanted = trials({"x": 1})
+    assert run(wanted, tmp_path)[wanted[0].digest].failed is None and len(worker.ran) == 2
+
+
 def test_a_failed_trial_has_a_reason_and_is_tried_again(tmp_path, worker):
     wanted = trials({"fail": 1}, {"x": 1}, {"die": 1})
     for _ in range(2):

@@ -174,7 +174,7 @@ def test_an_unfit_node_is_left_out_and_without_others_the_trial_fails(run):
         return Report("one", "host", unfit="its disk is full") if number == 0 else ended(task)
 
     outcome, fake, said = run(answer)
-    assert outcome.result and said == ["A node is left out: its disk is full."]
+    assert outcome.result and said == ["A node is left out: its disk is full"]
     assert "label_selector" not in fake.tasks[0][0]
     assert [asked["label_selector"] for asked, _ in fake.tasks[1:]] == [{"ray.io/node-id": "!in(one)"}] * 2
     both = iter(("one", "two"))
@@ -222,3 +222,10 @@ def test_without_ray_or_its_cluster_there_is_one_sentence(tmp_path, monkeypatch)
     with pytest.raises(UserError, match=r"there is no Ray cluster at 127\.0\.0\.1:1 \(.*refused\): start one") as error:
         make_engine("ray", "127.0.0.1:1").__enter__()
     assert "\n" not in str(error.value) and not (tmp_path / "out").exists()
+
+    def init(**_):
+        raise RuntimeError("The node timed out during startup.\nand more")
+
+    fake.init = init
+    with pytest.raises(UserError, match=r"Ray cannot start on this machine \(The node timed out during startup\.\)"):
+        make_engine("ray").__enter__()

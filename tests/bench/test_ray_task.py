@@ -22,6 +22,7 @@ from beags_plugin.bench.engines.trial_folder import SCORED, TRAINED
 from beags_plugin.plugin.presets import preset_config
 from beags_plugin.plugin.runs.run_config import load_run_config
 from beags_plugin.system.digests import folder_digest
+from beags_plugin.system.errors import UserError
 
 
 class FakeWorker:
@@ -162,6 +163,16 @@ def test_a_node_that_is_unfit_says_so(tmp_path, worker, task, monkeypatch):
     assert "has 3 MB left: free some space" in perform(task(shared=False), "node", same)[0].unfit
     assert perform(task(), "node", same)[0].outcome.result, "the shared disk is another one"
     assert not list((tmp_path / "disk").glob("*/trials/t")) and len(worker.ran) == 1
+
+
+def test_a_node_without_room_for_what_it_is_sent_is_left_out(tmp_path, worker, task, monkeypatch):
+    def full(*_):
+        raise UserError("inputs cannot be written (No space left on device): free some space.")
+
+    monkeypatch.setattr(ray_task, "unpack", full)
+    for shared in (False, True):
+        report, _ = perform(task(shared=shared, sees=False, parcels=True), "node", same)
+        assert report.unfit.startswith("inputs cannot be written") and not worker.ran
 
 
 def test_a_trial_that_fills_the_disk_of_its_node_leaves_it(tmp_path, worker, task, monkeypatch):

@@ -93,7 +93,13 @@ class RayEngine(Engine):
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         quiet = {"log_to_driver": False, "logging_level": "error"}
         if self._address is None:
-            self._ray.init(address="local", include_dashboard=False, object_store_memory=STORE_BYTES, **quiet)
+            try:
+                self._ray.init(address="local", include_dashboard=False, object_store_memory=STORE_BYTES, **quiet)
+            except Exception as error:  # its processes have 15 seconds to begin
+                raise UserError(
+                    f"Ray cannot start on this machine ({_first_line(error)}): try again when it is less busy, or "
+                    "leave --engine out."
+                ) from error
             return
         host, _, port = self._address.rpartition(":")
         try:
@@ -233,7 +239,7 @@ class RayEngine(Engine):
     def _elsewhere(self, running: _Running, node: str, reason: str) -> Outcome | None:
         """Give the task to another node; if all are unfit, the job fails."""
         if node not in self._unfit:
-            say(f"A node is left out: {reason}.")
+            say(f"A node is left out: {reason}")
             self._unfit[node] = reason
         if not self._nodes(fit=True):
             return Outcome(running.job.folder, None, f"no node of the cluster can run it; of the last one: {reason}")

@@ -88,13 +88,13 @@ def perform(task: Task, node: str, fetch: Callable[[Any], bytes]) -> tuple[Repor
     """
     host = socket.gethostname()
     if _code() != task.code:
-        return Report(node, host, unfit=f"{host} has another version of beags: install the same wheel there"), None
+        return Report(node, host, unfit=f"{host} has another version of beags: install the same wheel there."), None
     shared = _reads(*task.mark)
-    own = _own_folder(node)
-    folder = Path(task.folder) if shared else own / "trials" / Path(task.folder).name
-    if not shared and (free := free_disk_mb(own)) < LEAST_FREE_MB:
-        return Report(node, host, unfit=f"the disk of {own} on {host} has {free:.0f} MB left: free some space"), None
     try:
+        own = _own_folder(node)
+        folder = Path(task.folder) if shared else own / "trials" / Path(task.folder).name
+        if not shared and (free := free_disk_mb(own)) < LEAST_FREE_MB:
+            raise UserError(f"the disk of {own} has {free:.0f} MB left: free some space.")
         places = {name: _place(each, own / "inputs", fetch) for name, each in task.inputs.items()}
         lacks = [name for name, place in places.items() if place is None]
         if task.until == SCORED and task.request["base"] is not None and not (folder / "trained.json").exists():
@@ -102,8 +102,11 @@ def perform(task: Task, node: str, fetch: Callable[[Any], bytes]) -> tuple[Repor
                 lacks.append(TRAINED_FOLDER)
             elif not lacks:
                 unpack(fetch(task.trained), folder)
-        if lacks:
-            return Report(node, host, lacks=tuple(lacks)), None
+    except UserError as error:  # another node may have more room
+        return Report(node, host, unfit=f"{error} (on {host})"), None
+    if lacks:
+        return Report(node, host, lacks=tuple(lacks)), None
+    try:
         moved = {Path(each.path): place for name, each in task.inputs.items() if (place := places[name]) is not None}
         moved = {there: here for there, here in {**moved, Path(task.folder): folder}.items() if there != here}
         relocate(folder, moved)
