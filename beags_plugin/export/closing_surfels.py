@@ -55,14 +55,15 @@ def with_closing(item: ExportItem, options: MeshOptions) -> tuple[ExportItem, Ad
         return replace(item, invented=own), Added(0, str(error).partition(":")[0])
     assert item.views is not None  # the surface was seen from there
     pixel = _pixel(item.views, solid.mesh.vertices)
-    more = closing_surfels(solid, item.surfels, pixel)
-    more = more[_within(more, item.surfels, item.views, pixel)]
+    wanted = closing_surfels(solid, item.surfels, pixel)
+    more = wanted[_within(wanted, item.surfels, item.views, pixel)]
+    doubt = "all Gaussians there would leave its outline" if len(wanted) and not len(more) else ""
     both = Surfels(
         **{name: torch.cat([getattr(item.surfels, name).detach(), added]) for name, added in vars(more).items()}
     )
     ids = torch.cat([item.class_ids, item.class_ids[:1].expand(len(more))])
     invented = torch.cat([own, torch.ones(len(more), dtype=torch.bool)])
-    return replace(item, surfels=both, class_ids=ids, invented=invented), Added(len(more))
+    return replace(item, surfels=both, class_ids=ids, invented=invented), Added(len(more), doubt)
 
 
 def _pixel(views: Viewpoints, points: np.ndarray) -> float:
@@ -91,7 +92,7 @@ def _within(more: Surfels, own: Surfels, views: Viewpoints, pixel: float) -> Ten
         limit = torch.tensor([camera.width, camera.height])
         framed = (z > 0) & ((xy >= 0) & (xy < limit)).all(dim=1)
         column, row = xy.nan_to_num().floor().long().clamp(min=0).minimum(limit - 1).T
-        inside &= (outline[row, column] | ~framed).reshape(len(more), -1).all(dim=1)
+        inside &= (outline[row, column] | ~framed).reshape(points.shape[:2]).all(dim=1)
     return inside
 
 

@@ -68,8 +68,8 @@ def _moved(mesh: Mesh, photos: Sequence[Photo], progress: Callable[[int], None])
     tree = KDTree(_spots(mesh, normals)[chosen])
 
     def near(rows: Any) -> np.ndarray:
-        index = tree.query(_spots(mesh, normals)[rows], k=min(_NEIGHBOURS, len(chosen)))[1]
-        return np.reshape(index, (len(index), -1))
+        spots = _spots(mesh, normals)[rows]
+        return np.reshape(tree.query(spots, k=min(_NEIGHBOURS, len(chosen)))[1], (len(spots), -1))
 
     among = near(chosen)
     smooth = normals[chosen][among].sum(axis=1)

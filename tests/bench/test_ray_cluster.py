@@ -79,6 +79,7 @@ def cluster():
     """A cluster of three nodes with a core each."""
     from ray.cluster_utils import Cluster
 
+    ends = signal.getsignal(signal.SIGTERM)  # Ray sets its own, also for the tests that follow in this process
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         node = {"num_cpus": 1, "num_gpus": 0, "object_store_memory": STORE}
@@ -94,6 +95,7 @@ def cluster():
         yield made
         ray.shutdown()
         made.shutdown()
+        signal.signal(signal.SIGTERM, ends)
 
 
 def report_of(output: Path) -> dict:
@@ -173,7 +175,8 @@ def test_twelve_trials_on_three_nodes_give_the_figures_of_one_machine(alone, clu
     rows = run_experiment(path, options)
     thread.join(60.0)
 
-    assert begun and lost.keys() == {"worker", "node"} and sum(node["Alive"] for node in ray.nodes()) == 2
+    assert begun and lost.keys() == {"worker", "node"}
+    until(lambda: sum(node["Alive"] for node in ray.nodes()) == 2, 60.0)  # heartbeats tell, some seconds later
     report = report_of(output)
     assert len(list(output.glob("trials/*/result.json"))) == 10 and len(list(output.glob("trials/*/trial.json"))) == 12
     reasons = [row.failed for row in rows if row.variant.name == "broken"]

@@ -143,6 +143,14 @@ def test_an_item_is_closed_and_says_which_gaussians_are_invented():
     assert len(top.surfels) == len(item.surfels) and "encloses nothing" in str(none)
 
 
+def test_a_closed_surface_that_wants_no_gaussian_adds_none(monkeypatch):
+    item = item_of(discs_on(a_box(bottom=False)))
+    monkeypatch.setattr("beags_plugin.export.closing_surfels.closing_surfels", lambda solid, like, pixel: like[:0])
+    found, added = with_closing(item, MeshOptions(resolution=48, min_views=1))
+    assert str(added) == "nothing to close" and len(found.surfels) == len(item.surfels)
+    assert found.invented is not None and not found.invented.any()
+
+
 @pytest.mark.parametrize("count", [1, 10])
 def test_a_few_gaussians_are_closed_or_told_why_not(count):
     generator = torch.Generator().manual_seed(count)

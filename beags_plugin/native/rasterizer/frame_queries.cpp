@@ -1,5 +1,6 @@
 // Answers a frame's queries, which have no gradient (sections 3 and 5).
 #include <algorithm>
+#include <vector>
 
 #include "rasterizer/extent.h"
 #include "rasterizer/frame.h"
@@ -41,7 +42,13 @@ typename Frame<T>::LabelSums Frame<T>::label_sums(const int32_t* labels, int num
   query.slot_start = slot_start.data();
   query.sums = found.sums.data();
   const Job<T> job = this->job();
-  for_each_tile(threads, [&](int tile) { kernel(job, query, tile); });
+  for_each_tile(threads, [&](int tile) {
+    const int64_t pairs = bins_.tile_start[tile + 1] - bins_.tile_start[tile];
+    std::vector<Contribution<T>> work(kTilePixels * std::min<int64_t>(query.within, pairs));
+    Query<T> own = query;
+    own.found = work.data();
+    kernel(job, own, tile);
+  });
 
   found.row_of.resize(num_pairs());
   found.tile_of.resize(num_pairs());

@@ -1,9 +1,6 @@
 // Answers queries of one tile, which have no gradient (sections 3 and 5). Included once for each instruction set.
 #pragma once
 
-#include <algorithm>
-#include <vector>
-
 #include "rasterizer/backward.h"
 #include "rasterizer/composite.h"
 
@@ -69,22 +66,14 @@ void class_sums(const Job<T>& job, const Query<T>& query, int tile) {
   });
 }
 
-// A Gaussian's w at a pixel.
-template <class T>
-struct Contribution {
-  T w;
-  int32_t pair;
-};
-
 // Sums by pair and label as class_sums, but of each pixel only the `most` largest w, of equal ones the nearer, of the
-// first `within` that it has.
+// first `within` that it has. `query.found` has room for these.
 template <class T>
 void top_contributions(const Job<T>& job, const Query<T>& query, int tile) {
   const int num_slots = query.num_slots[tile];
   if (num_slots == 0) return;
   const int64_t pairs = job.tile_start[tile + 1] - job.tile_start[tile];
-  const int64_t room = std::min<int64_t>(query.within, pairs);
-  std::vector<Contribution<T>> found(kTilePixels * room);
+  const int64_t room = query.within < pairs ? query.within : pairs;
   int counts[kTilePixels] = {};
   Walk<T> walk(job, tile);
   composite<0>(job, tile, walk, [&](int k, const Splat<T>&, const Hits<T>& hits, int i, Real<T> w, Real<T>) {
@@ -92,22 +81,27 @@ void top_contributions(const Job<T>& job, const Query<T>& query, int tile) {
     store(lanes, w);
     for (int lane = 0; lane < kLanes<T>; ++lane) {
       const int pixel = hits.pack[i] * kLanes<T> + lane;
-      if (lanes[lane] > T(0) && counts[pixel] < room) found[pixel * room + counts[pixel]++] = {lanes[lane], k};
+      if (lanes[lane] > T(0) && counts[pixel] < room) query.found[pixel * room + counts[pixel]++] = {lanes[lane], k};
     }
   });
   T* sums = query.sums + query.slot_start[tile];
   for_each_pixel(job, tile, [&](int64_t at, int pack, int lane) {
     const int pixel = pack * kLanes<T> + lane, slot = query.slots[at];
     if (slot < 0) return;
-    Contribution<T>* first = found.data() + pixel * room;
-    const int kept = std::min(query.most, counts[pixel]);
-    if (kept < counts[pixel]) {
-      std::nth_element(first, first + kept, first + counts[pixel],
-                       [](const Contribution<T>& a, const Contribution<T>& b) {
-                         return a.w > b.w || (a.w == b.w && a.pair < b.pair);
-                       });
+    Contribution<T>* found = query.found + pixel * room;
+    for (int i = 0; i < counts[pixel] && i < query.most; ++i) {
+      if (counts[pixel] > query.most) {  // brings the largest of the rest to the front
+        int best = i;
+        for (int other = i + 1; other < counts[pixel]; ++other) {
+          const bool larger = found[other].w > found[best].w;
+          if (larger || (found[other].w == found[best].w && found[other].pair < found[best].pair)) best = other;
+        }
+        const Contribution<T> largest = found[best];
+        found[best] = found[i];
+        found[i] = largest;
+      }
+      sums[static_cast<int64_t>(found[i].pair) * num_slots + slot] += found[i].w;
     }
-    for (int i = 0; i < kept; ++i) sums[static_cast<int64_t>(first[i].pair) * num_slots + slot] += first[i].w;
   });
 }
 

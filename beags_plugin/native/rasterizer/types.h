@@ -127,6 +127,13 @@ struct Job {
   T* feature_records;          // [pairs, num_features]
 };
 
+// A Gaussian's w at a pixel; pair: its place among those of the tile.
+template <class T>
+struct Contribution {
+  T w;
+  int32_t pair;
+};
+
 // A query, which has no gradient (sections 3 and 5).
 template <class T>
 struct Query {
@@ -137,6 +144,7 @@ struct Query {
   T* sums;                    // of tile t: [pairs of t, num_slots[t]]
   T min_weight;               // class_pixel_counts: pixels of larger w count
   int most, within;           // top_contributions: the most w of a pixel that count, of its first ones
+  Contribution<T>* found;     // top_contributions: room for 256 times `within`, or times the pairs of t if fewer
   int32_t* classes;           // class_map, dominant_gaussian: [height, width]
   T* share;                   // class_map: [height, width]
   T* channels;                // class_channels: [height, width, num_channels]
