@@ -214,12 +214,14 @@ def test_without_an_address_this_machine_is_the_cluster(alone, tmp_path):
     path, expected = alone
     options = ExperimentOptions(scenes=1, variants=("alone",), output=tmp_path / "out", engine="ray")
     assert not ray.is_initialized()
+    before = signal.getsignal(signal.SIGTERM)
     try:
         rows = run_experiment(path, options)
     except UserError as error:
         assert str(error).startswith("Ray cannot start on this machine (") and "\n" not in str(error)
         pytest.skip(str(error))
     assert not ray.is_initialized(), "it has ended with the command"
+    assert signal.getsignal(signal.SIGTERM) == before, "Ray's handler has gone with it"
     wanted = [row for row in figures(expected)["rows"] if row["scene"] == rows[0].scene and row["variant"] == "alone"]
     assert figures(report_of(options.output))["rows"] == wanted
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib.util
 import os
 import secrets
+import signal
 import socket
+import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -71,6 +73,7 @@ class RayEngine(Engine):
         self._address = address
         self._ray: Any = None
         self._own = False  # whether leaving ends the connection
+        self._on_sigterm: Any = None  # what SIGTERM did before Ray set a handler of its own
         self._task: Any = None
         self._running: dict[Any, _Running] = {}
         self._parcels: dict[str, Any] = {}  # references by digest of the folder
@@ -84,7 +87,12 @@ class RayEngine(Engine):
         self._ray = ray
         os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")  # of parcels that nobody fetches
         if not ray.is_initialized():
-            self._connect()
+            self._on_sigterm = signal.getsignal(signal.SIGTERM)
+            try:
+                self._connect()
+            except UserError:
+                self._give_sigterm_back()
+                raise
             self._own = True
         self._task = ray.remote(num_returns=2, max_retries=0)(_perform)
         return self
@@ -121,6 +129,11 @@ class RayEngine(Engine):
             self._forget()
         if self._own:
             ray.shutdown()
+            self._give_sigterm_back()
+
+    def _give_sigterm_back(self) -> None:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, self._on_sigterm or signal.SIG_DFL)
 
     def _forget(self) -> None:
         """Let every node remove what it was sent."""
