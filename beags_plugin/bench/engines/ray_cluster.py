@@ -82,7 +82,7 @@ class RayEngine(Engine):
         self._waits = False
 
     def __enter__(self) -> RayEngine:
-        import ray
+        import ray  # pyright: ignore[reportMissingImports]  (an extra)
 
         self._ray = ray
         os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")  # of parcels that nobody fetches
@@ -137,7 +137,7 @@ class RayEngine(Engine):
 
     def _forget(self) -> None:
         """Let every node remove what it was sent."""
-        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy  # pyright: ignore[reportMissingImports]
 
         ray = self._ray
         task = ray.remote(num_cpus=0)(_forget)
@@ -273,7 +273,7 @@ class RayEngine(Engine):
 
 
 def _perform(task: Task) -> tuple[Report, bytes | None]:
-    import ray
+    import ray  # pyright: ignore[reportMissingImports]
 
     from beags_plugin.bench.engines.ray_task import perform
 
@@ -281,7 +281,7 @@ def _perform(task: Task) -> tuple[Report, bytes | None]:
 
 
 def _forget(digests: Mapping[str, Any]) -> None:
-    import ray
+    import ray  # pyright: ignore[reportMissingImports]
 
     from beags_plugin.bench.engines.ray_task import forget
 
