@@ -144,6 +144,7 @@ def inside_hull(means: Tensor, chosen: Tensor, least: int = LEAST_INLIERS, else_
 
     An outlier lies, along any axis, more than an interquartile range beyond the quartiles. All False where fewer than
     ``least`` in general position are left; with ``else_all`` outliers stay where fewer than that would be left.
+    Centres that are not finite never take part.
     means: [N, 3]. chosen: [N] bool.
     """
     import numpy as np
@@ -151,7 +152,7 @@ def inside_hull(means: Tensor, chosen: Tensor, least: int = LEAST_INLIERS, else_
 
     nobody = torch.zeros_like(chosen)
     centers = means.detach().double().cpu().numpy()
-    cloud = centers[chosen.cpu().numpy()]
+    cloud = centers[chosen.cpu().numpy() & np.isfinite(centers).all(axis=1)]
     if len(cloud) < least:
         return nobody
     low, high = np.quantile(cloud, [0.25, 0.75], axis=0)

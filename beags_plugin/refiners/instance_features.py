@@ -191,11 +191,16 @@ def straight_through(features: Tensor, centres: Tensor) -> Tensor:
     return centres.detach() + (features - features.detach())
 
 
+def _finite(vectors: Tensor) -> Tensor:
+    """Return vectors whose NaN and infinite numbers, those of broken Gaussians, count as 0."""
+    return torch.nan_to_num(vectors, nan=0.0, posinf=0.0, neginf=0.0)
+
+
 def nearest_centres(vectors: Tensor, centres: Tensor) -> Tensor:
     """Return [N] int64, of each vector [N, D] the nearest of centres [k, D]."""
     from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
 
-    cloud = torch.nan_to_num(vectors.detach().cpu().double(), nan=0.0, posinf=0.0, neginf=0.0).numpy()
+    cloud = _finite(vectors.detach().cpu().double()).numpy()
     tree = cKDTree(centres.cpu().double().numpy())
     return torch.from_numpy(tree.query(cloud, workers=torch.get_num_threads())[1]).long().to(vectors.device)
 
@@ -206,17 +211,18 @@ def lloyd(vectors: Tensor, centres: Tensor, steps: int = LLOYD_STEPS) -> tuple[T
     A centre that no vector is nearest to becomes 0, as in the source. scikit-learn's k-means would move it elsewhere,
     and adds up in an order that depends on the threads.
     """
+    vectors = _finite(vectors)
     for _ in range(steps):
         ids = nearest_centres(vectors, centres)
         counts = torch.bincount(ids, minlength=len(centres)).clamp_min(1)
-        centres = grouped_sums(torch.nan_to_num(vectors), ids, len(centres)) / counts[:, None]
+        centres = grouped_sums(vectors, ids, len(centres)) / counts[:, None]
     return centres, nearest_centres(vectors, centres)
 
 
 def first_centres(vectors: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Return [count, D], vectors [N, D] drawn without replacement, and zeros where there are fewer."""
     chosen = torch.randperm(len(vectors), generator=generator)[:count].to(vectors.device)
-    return pad(vectors[chosen], (0, 0, 0, count - len(chosen)))
+    return pad(_finite(vectors[chosen]), (0, 0, 0, count - len(chosen)))
 
 
 def fine_clusters(drawn: Tensor, silhouette: Tensor, masks: MaskedPixels, labels: PseudoMasks, most: int = 10) -> int:
@@ -259,7 +265,7 @@ def inliers(points: Tensor, factor: float = 1.0) -> Tensor:
 
     if len(points) < 2:
         return torch.ones(len(points), dtype=torch.bool, device=points.device)
-    cloud = torch.nan_to_num(points.detach().cpu().double(), nan=0.0, posinf=0.0, neginf=0.0).numpy()
+    cloud = _finite(points.detach().cpu().double()).numpy()
     wanted = list(range(1, int(len(cloud) ** 0.5) + 1))
     squares = cKDTree(cloud).query(cloud, k=wanted, workers=torch.get_num_threads())[0] ** 2
     inside = squares.mean(axis=1) <= squares.mean() + factor * squares.std()

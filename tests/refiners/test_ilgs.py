@@ -83,6 +83,12 @@ def test_outliers_stay_where_no_four_would_be_left():
     assert 9 not in hull([*CORNERS, [10.0, 0.0, 0.0], [4.0, 0.1, 0.1]], 9)
 
 
+@pytest.mark.parametrize("broken", [math.nan, math.inf])
+def test_broken_centres_have_no_part_in_a_hull(broken):
+    assert hull([[broken, 0.0, 0.0], *CORNERS, [0.5, 0.5, 0.5], [2.0, 2.0, 2.0]], 9) == list(range(1, 10))
+    assert hull([[broken] * 3, *CORNERS[:3], [0.1, 0.1, 0.1]], 4) == [], "three are too few"
+
+
 def trained(steps: int = 0, masked: bool = True, **options) -> IlgsTraining:
     training = IlgsTraining(trained_scene(steps=max(steps, 1_000)), IlgsRefiner(**options))
     adam = torch.optim.Adam(list(vars(training.scene.surfels()).values()), lr=0.005)

@@ -91,6 +91,12 @@ def test_lloyd_moves_centres_and_empties_become_zero():
     centres, ids = parts.lloyd(vectors, torch.tensor([[1.0, 1.0], [9.0, 9.0], [90.0, 90.0]]), steps=1)
     assert centres.tolist() == [[0.0, 4.0], [5.5, 10.0], [0.0, 0.0]]  # NaN counts as 0
     assert ids.tolist() == [0, 0, 2, 1]
+    broken = vectors.masked_fill(vectors.isnan(), float("inf"))
+    assert torch.equal(parts.lloyd(broken, torch.tensor([[1.0, 1.0], [9.0, 9.0], [90.0, 90.0]]), steps=1)[0], centres)
+    for each in (vectors, broken):
+        first = parts.first_centres(each, 6, torch.Generator().manual_seed(0))
+        assert sorted(first.tolist()) == sorted([*torch.nan_to_num(vectors).tolist(), [0.0, 0.0], [0.0, 0.0]])
+        assert torch.isfinite(parts.lloyd(each, first)[0]).all()
     again = parts.lloyd(vectors, centres, steps=0)
     assert torch.equal(again[0], centres) and torch.equal(again[1], ids)
 
