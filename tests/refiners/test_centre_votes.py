@@ -8,13 +8,16 @@ from dataclasses import replace
 import pytest
 import torch
 from drawn_discs import camera, discs
+from trained_scenes import trained_scene
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.lifting import project, project_directions
 from beags_plugin.core.rotations import quat_product, rotation_from_quat
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.refiners import centre_votes
 from beags_plugin.refiners.centre_votes import decompose, members
+from beags_plugin.refiners.sagd import Decomposition, SagdRefiner
 
 SIZE = 41
 
@@ -180,6 +183,27 @@ def test_members_of_several_objects_at_once_and_one_by_one():
         alone, _ = decompose(part, ids[index : index + 1], camera(SIZE), labels)
         assert torch.equal(alone.means[0], after.means[index])
         assert torch.equal(alone.log_scales[0], after.log_scales[index])
+
+
+@pytest.mark.parametrize(("interval", "views"), [(1, [0, 1, 2, 3, 5, 6, 7, 8]), (3, [0, 3, 7]), (20, [0]), (-1, [])])
+def test_every_so_many_views_with_masks_decompose(interval, views, monkeypatch):
+    """The members of a view are those that the views before it left."""
+    scene, asked, left = trained_scene(), [], []
+    scene.labels[4][:] = IGNORE
+
+    def spied(surfels, class_ids, camera, labels):
+        asked.append(next(place for place, each in enumerate(scene.labels) if each is labels))
+        assert not left or surfels is left[-1]
+        after, changed = decompose(surfels, class_ids, camera, labels)
+        left.append(after)
+        return after, changed
+
+    monkeypatch.setattr(centre_votes, "decompose", spied)
+    edit = Decomposition(scene, SagdRefiner(gd_interval=interval)).last_edit()
+    assert asked == views and (edit is None) == (not views)
+    if edit is not None:
+        assert edit.edited is not None and edit.edited.surfels is left[-1]
+        assert not torch.equal(left[-1].means, scene.surfels().means)
 
 
 @pytest.mark.parametrize("threads", [2, 3])

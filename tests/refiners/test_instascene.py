@@ -11,7 +11,7 @@ from trained_scenes import FAR_APART, trained_scene
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.preparation.own_training import TrainedScene
-from beags_plugin.refiners import make_refiner
+from beags_plugin.refiners import make_refiner, mask_tracking
 from beags_plugin.refiners import prototypes as parts
 from beags_plugin.refiners.instascene import ContrastTraining, InstaSceneRefiner
 from beags_plugin.system.errors import UserError
@@ -113,6 +113,53 @@ def test_terms_and_their_turns():
     several = [training._several(10 * step) for step in range(30)]
     assert all(each == list(range(each[0], each[0] + 5)) for each in several)
     assert {each[0] for each in several} == {0, 1, 2, 3, 4}
+
+
+def test_what_options_change_in_the_terms(monkeypatch):
+    """The classes that each term contrasts in several steps, and whether its prototypes are fixed."""
+    asked, loss = [], parts.prototype_loss
+
+    def spied(features, classes, prototypes=None):
+        asked.append((set(classes.tolist()), prototypes is not None))
+        return loss(features, classes, prototypes)
+
+    monkeypatch.setattr(parts, "prototype_loss", spied)
+
+    def terms(**options) -> tuple[ContrastTraining, dict[str, tuple[set[int], bool]]]:
+        training, found = trained(trained_scene(), 0, **options), {}
+        training.before_step(0)
+        for step in range(0, 90, 10):
+            asked.clear()
+            names = list(training.terms(None, step, dict))  # pyright: ignore[reportArgumentType]
+            for name, (classes, fixed) in zip(names, asked, strict=True):
+                found[name] = (found.get(name, (set(),))[0] | classes, fixed)
+        return training, found
+
+    every, objects = {0, 1, 2}, {1, 2}
+    plain, found = terms()
+    assert found == {"single": (every, False), "multi": (objects, False), "space": (objects, False)}
+    assert terms(consider_negative=False)[1] == {**found, "single": (objects, False)}
+    training, found = terms(gram_feat=True)
+    whole = {"single": (every, False), "unfiltered": (every, False)}
+    assert found == {**whole, "multi": (objects, True), "space": (objects, True)}
+    seeds = training.seed_classes.nonzero()[:, 0]
+    assert training.fixed is not None and len(seeds) > 20
+    assert torch.equal(training.features[seeds], training.fixed[training.seed_classes[seeds]])
+    rest = training.seed_classes == 0
+    assert torch.equal(training.features[rest], plain.features[rest])
+
+
+def test_the_ground_votes_if_it_is_asked_to(monkeypatch):
+    asked, tracked_masks = [], mask_tracking.tracked_masks
+
+    def spied(views, count, num_classes, min_gaussians, ground_votes, progress):
+        asked.append((min_gaussians, ground_votes))
+        return tracked_masks(views, count, num_classes, min_gaussians, ground_votes, progress)
+
+    monkeypatch.setattr(mask_tracking, "tracked_masks", spied)
+    for options in ({}, {"ground_votes": True, "min_gaussians": 7}):
+        trained(trained_scene(), 1, **options)
+    assert asked == [(5, False), (7, True)]
 
 
 def test_few_views_and_views_without_masks():

@@ -15,6 +15,7 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.preparation.own_training import TrainedScene
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
+from beags_plugin.refiners import instance_features as parts
 from beags_plugin.refiners import make_refiner
 from beags_plugin.refiners.opengaussian import CodebookTraining, OpenGaussianRefiner
 from beags_plugin.system.errors import UserError
@@ -95,6 +96,28 @@ def test_stages_follow_the_shares_of_the_source():
     assert rates == pytest.approx([1e-3, 1e-4, 1e-4, 1e-2, 1e-3, 1e-3])
     assert [short.stage(step) for step in (99, 100, 199, 200)] == [0, 1, 1, 2]
     assert short._turn(200) == (0, 0) and short._turn(205) == (2, 1) and short._turn(200 + 64 * 3) == (0, 0)
+
+
+def test_terms_of_the_stages(monkeypatch):
+    """Cohesion has a weight, and separation drops its lighter pairs in the second half of the first stage."""
+    scene, late = replace(trained_scene(steps=32), labels=solid_scene(32).labels), []
+    separation = parts.separation
+    monkeypatch.setattr(parts, "separation", lambda means, now: late.append(now) or separation(means, now))
+
+    def terms(step: int, **options) -> dict[str, float]:
+        training = CodebookTraining(scene, OpenGaussianRefiner(coarse=2, fine=2, **NO_LIMITS, **options))
+        training.before_step(step)
+        found = training.terms(None, step, dict)  # pyright: ignore[reportArgumentType]
+        return {name: value.item() for name, value in found.items()}
+
+    one, two = terms(0), terms(0, cohesion_weight=0.2)
+    assert set(one) == {"cohesion", "separation"} and one["separation"] == two["separation"]
+    assert two["cohesion"] == pytest.approx(2 * one["cohesion"]) and one["cohesion"] > 0
+    late.clear()
+    for step in range(8):
+        terms(step)
+    assert late == [False] * 4 + [True] * 4
+    assert set(terms(8)) == {"clusters"}
 
 
 def test_sizes_shrink_in_half_of_the_steps():
