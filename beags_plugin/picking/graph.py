@@ -75,7 +75,8 @@ def surface_graph(surfels: Surfels, seen: np.ndarray, normals: np.ndarray) -> Su
         vectors = np.zeros((0, 3))
         return SurfaceGraph(nodes, np.zeros(len(means), np.int64), nothing, nothing, np.zeros(0), vectors, vectors, 1.0)
     tree = cKDTree(centres)
-    near = tree.query(centres, k=np.arange(1, min(NEIGHBOURS + 1, count) + 1))[1]
+    threads = torch.get_num_threads()
+    near = tree.query(centres, k=np.arange(1, min(NEIGHBOURS + 1, count) + 1), workers=threads)[1]
     own = np.arange(count)[:, None]
     low, high = np.minimum(near, own), np.maximum(near, own)
     keys = np.unique((low * count + high)[near != own])
@@ -86,7 +87,7 @@ def surface_graph(surfels: Surfels, seen: np.ndarray, normals: np.ndarray) -> Su
     nearest = np.empty(len(means), np.int64)
     nearest[nodes] = np.arange(count)
     others = np.setdiff1d(np.arange(len(means)), nodes)
-    nearest[others] = tree.query(means[others])[1]
+    nearest[others] = tree.query(means[others], workers=threads)[1]
     lengths = np.sqrt(((centres[second] - centres[first]) ** 2).sum(axis=1))
     spacing = max(float(np.median(lengths)) if len(lengths) else 1.0, 1e-30)
     weights = link_weights(centres / spacing, smooth, colors.clamp(0.0, 1.0).numpy()[nodes], first, second)

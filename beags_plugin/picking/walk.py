@@ -16,6 +16,11 @@ MOST_ITERATIONS = 2_000
 LEAST_LEVEL, HIGHEST_LEVEL = 0.1, 0.98  # of a border
 
 
+def dot(one: np.ndarray, other: np.ndarray) -> float:
+    """Return the sum of the products of two [M] float64, added up in one order whatever the number of threads."""
+    return float(np.einsum("i,i->", one, other))
+
+
 class Walker:
     """The walks of one graph. Determinism: no product here is one that a library splits over threads."""
 
@@ -23,8 +28,8 @@ class Walker:
         from scipy.sparse import csr_array
 
         count = len(graph.nodes)
-        rows = np.concatenate([graph.first, graph.second])
-        columns = np.concatenate([graph.second, graph.first])
+        first, second = graph.first.astype(np.int32), graph.second.astype(np.int32)  # a product is a third quicker
+        rows, columns = np.concatenate([first, second]), np.concatenate([second, first])
         values = np.concatenate([graph.weights, graph.weights])
         self._graph = graph
         self._links = csr_array((values, (rows, columns)), shape=(count, count))
@@ -43,18 +48,18 @@ class Walker:
         degree = self._degree - self._links @ excluded.astype(np.float64) + MORE_LEAK * leaking
         p = inside.astype(np.float64)
         residual = np.where(free, self._links @ p, 0.0)
-        goal = TOLERANCE**2 * (residual**2).sum()
+        goal = TOLERANCE**2 * dot(residual, residual)
         scaled = residual / degree
-        direction, rho = scaled, (residual * scaled).sum()
+        direction, rho = scaled, dot(residual, scaled)
         for _ in range(MOST_ITERATIONS):
-            if not (residual**2).sum() > goal:
+            if not dot(residual, residual) > goal:
                 break
             image = np.where(free, degree * direction - self._links @ direction, 0.0)
-            step = rho / (direction * image).sum()
+            step = rho / dot(direction, image)
             p += step * direction
-            residual = residual - step * image
+            residual -= step * image
             scaled = residual / degree
-            rho, former = (residual * scaled).sum(), rho
+            rho, former = dot(residual, scaled), rho
             direction = scaled + (rho / former) * direction
         return p.clip(0.0, 1.0)
 
