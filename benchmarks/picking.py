@@ -182,25 +182,29 @@ def overlaps(run, surfels, members: Sequence[Tensor], objects: Sequence[int]) ->
 
 
 def speed(gaussians: int) -> None:
-    """Print wall and processor time of the parts of a cut, one thread."""
+    """Print wall and processor time of the parts of a cut, with one thread and with two."""
+    import scipy.sparse.csgraph
+    import scipy.spatial  # noqa: F401  (a second of reading files, once a process)
+
     from beags_plugin.picking.cutter import Cutter
     from beags_plugin.rasterizers import make_rasterizer
     from benchmarks.clock import Seconds
     from benchmarks.scaling_scene import SETTINGS, Sizes, make_scene
 
-    torch.set_num_threads(1)
     rasterizer = make_rasterizer("native")
     scene = make_scene(Sizes(classes=8, views=24, gaussians=gaussians, pixels=76_800), rasterizer)
-    began = Seconds.now()
-    cutter = Cutter(scene.surfels, scene.cameras, rasterizer, replace(SETTINGS, geometry=False))
-    print(f"{len(scene.surfels)} Gaussians: made once {report(Seconds.now() - began)}")
     ids = scene.labels[0].numpy()
     objects, counts = np.unique(ids[(ids != 0) & (ids != 65535)], return_counts=True)
     on, beside = placed(ids, int(objects[np.argmax(counts)]))
-    for name, points in (("first cut", beside[:1]), ("after another point", beside)):
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
         began = Seconds.now()
-        members = cutter.solve([marked(scene.cameras[0], on, points)])
-        print(f"  {name} {report(Seconds.now() - began)}, {int(members.sum())} Gaussians")
+        cutter = Cutter(scene.surfels, scene.cameras, rasterizer, replace(SETTINGS, geometry=False))
+        print(f"{len(scene.surfels)} Gaussians, {threads} threads: made once {report(Seconds.now() - began)}")
+        for name, points in (("first cut", beside[:1]), ("after another point", beside)):
+            began = Seconds.now()
+            members = cutter.solve([marked(scene.cameras[0], on, points)])
+            print(f"  {name} {report(Seconds.now() - began)}, {int(members.sum())} Gaussians")
 
 
 def report(seconds) -> str:

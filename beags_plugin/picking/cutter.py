@@ -17,6 +17,7 @@ those on it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -109,9 +110,11 @@ class Cutter:
         barred = outside[nodes]
         inside, beside, ground = self._bound(marks, barred, name)
         behind = self._graph.on_plane_of(ground) & ~self._graph.on_plane_of(inside)
-        p = self._walker.potential(inside, beside, barred, behind)
-        if beside.any():
-            p[self._walker.potential(beside, inside, barred, np.zeros_like(behind)) > p] = 0.0
+        with ThreadPoolExecutor() as threads:  # both walks at once: their products hold no lock
+            walk = threads.submit(self._walker.potential, inside, beside, barred, behind)
+            nearer = self._walker.potential(beside, inside, barred, np.zeros_like(behind)) if beside.any() else 0.0
+            p = walk.result()
+        p[nearer > p] = 0.0
         ends = self._graph.first, self._graph.second
         weights = np.where(barred[ends[0]] | barred[ends[1]], 0.0, self._graph.weights)
         level = self._walker.border_level(p, weights, part)
