@@ -149,17 +149,19 @@ def test_what_options_change_in_the_terms(monkeypatch):
     assert torch.equal(training.features[rest], plain.features[rest])
 
 
-def test_the_ground_votes_if_it_is_asked_to(monkeypatch):
-    asked, tracked_masks = [], mask_tracking.tracked_masks
+def test_what_options_change_in_the_tracking(monkeypatch):
+    asked, scene, tracked_masks = [], trained_scene(), mask_tracking.tracked_masks
 
     def spied(views, count, num_classes, min_gaussians, ground_votes, progress):
-        asked.append((min_gaussians, ground_votes))
+        asked.append((min_gaussians, ground_votes, sum(len(view.members) for view in views)))
         return tracked_masks(views, count, num_classes, min_gaussians, ground_votes, progress)
 
     monkeypatch.setattr(mask_tracking, "tracked_masks", spied)
-    for options in ({}, {"ground_votes": True, "min_gaussians": 7}):
-        trained(trained_scene(), 1, **options)
-    assert asked == [(5, False), (7, True)]
+    for options in ({}, {"ground_votes": True, "min_gaussians": 7}, {"min_weight": 0.1}, {"min_weight": 0.5}):
+        trained(scene, 1, **options)
+    traced = asked[0][2]
+    assert asked[:3] == [(5, False, traced), (7, True, traced), (5, False, traced)]
+    assert 0 < asked[3][2] < 0.8 * traced, "few weigh more than half at a pixel"
 
 
 def test_few_views_and_views_without_masks():
@@ -208,6 +210,7 @@ def test_threads_change_nothing():
         ({"cosine": 1.2}, "cosine is 1.2: give one above 0, up to 1"),
         ({"min_gaussians": 0}, "min_gaussians is 0: give a number, 1 or more"),
         ({"samples": 0}, "samples is 0"),
+        ({"min_weight": 1.0}, "min_weight is 1: give a blending weight, from 0 to below 1"),
     ],
 )
 def test_options_that_cannot_work(options, sentence):
