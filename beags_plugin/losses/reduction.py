@@ -81,9 +81,10 @@ class _RowProduct(torch.autograd.Function):
         return _times(rows, matrix.T)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         rows, matrix = ctx.saved_tensors
-        return _times(grad, matrix), ordered_outer_sum(grad, rows)
+        of_rows, of_matrix = ctx.needs_input_grad
+        return _times(grad, matrix) if of_rows else None, ordered_outer_sum(grad, rows) if of_matrix else None
 
 
 def _times(rows: Tensor, matrix: Tensor) -> Tensor:
@@ -94,5 +95,6 @@ def _times(rows: Tensor, matrix: Tensor) -> Tensor:
 
 def _blocks(rows: Tensor) -> Tensor:
     """Return [P, A] as [blocks, 64, A], more of them than there are threads, filled up with zeros."""
-    missing = max(-len(rows) % _BLOCK, _BLOCK * _BLOCKS - len(rows))
-    return torch.nn.functional.pad(rows, (0, 0, 0, missing)).view(-1, _BLOCK, rows.shape[1])
+    if missing := max(-len(rows) % _BLOCK, _BLOCK * _BLOCKS - len(rows)):
+        rows = torch.nn.functional.pad(rows, (0, 0, 0, missing))  # a copy, even where nothing is missing
+    return rows.reshape(-1, _BLOCK, rows.shape[1])
