@@ -30,8 +30,9 @@ def ordered_mean(values: Tensor) -> Tensor:
 
 
 def grouped_sums(rows: Tensor, groups: Tensor, count: int) -> Tensor:
-    """Return [count, C], the sums of the rows of each group, in their order and in float64; differentiable.
+    """Return [count, C], the sums of the rows of each group, 0 of none; differentiable.
 
+    They are added in their order and in float64, whatever the number of threads, and are of the rows' dtype.
     rows: [P, C] float. groups: [P] int, below ``count``. Their gradient is a copy of that of their group.
     """
     channels = rows.shape[1]
@@ -59,17 +60,6 @@ def ordered_outer_sum(first: Tensor, second: Tensor) -> Tensor:
     parts = torch.bmm(_blocks(first).transpose(1, 2), _blocks(second))
     sums = parts.flatten(1).T.contiguous().sum(dim=1)  # a row for each entry, none of which is split
     return sums.view(first.shape[1], second.shape[1])
-
-
-def group_sums(values: Tensor, groups: Tensor, count: int) -> Tensor:
-    """Return the sums of the rows of each group, in order of the rows whatever the number of threads; differentiable.
-
-    values: [P, C] float. groups: [P] int64 below ``count``. Returns [count, C] float64, 0 for a group without rows.
-    """
-    width = values.shape[1]
-    places = (groups[:, None] * width + torch.arange(width, device=groups.device)).flatten()
-    zeros = torch.zeros(count * width, dtype=torch.float64, device=values.device)
-    return zeros.index_add(0, places, values.double().flatten()).view(count, width)
 
 
 class _RowProduct(torch.autograd.Function):
