@@ -115,6 +115,35 @@ def test_terms_and_their_turns():
     assert {each[0] for each in several} == {0, 1, 2, 3, 4}
 
 
+def test_weights_and_the_rate(monkeypatch):
+    monkeypatch.setattr(parts, "prototype_loss", lambda *_: torch.ones(()))
+    for gram_feat in (False, True):
+        training = trained(trained_scene(), 0, gram_feat=gram_feat)
+        training.before_step(0)
+        found = training.terms(None, 0, dict)  # pyright: ignore[reportArgumentType]
+        expected = {"single": 0.5e-6, "multi": 1e-6, "space": 2.5e-6, **({"unfiltered": 1e-6} if gram_feat else {})}
+        assert {name: value.item() for name, value in found.items()} == pytest.approx(expected)
+        assert [(group["lr"], group["eps"]) for group in training.adam.param_groups] == [(0.025, 1e-15)]
+
+
+def test_masks_that_are_left_out_are_background_in_the_term_of_their_view_alone(monkeypatch):
+    training, asked, loss = trained(trained_scene(), 0, gram_feat=True), [], parts.prototype_loss
+
+    def spied(features, classes, prototypes=None):
+        asked.append(set(classes.tolist()))
+        return loss(features, classes, prototypes)
+
+    monkeypatch.setattr(parts, "prototype_loss", spied)
+    training.before_step(0)
+    assert training.tracked is not None
+    every = frozenset((view, rank) for view in range(len(training.scene.cameras)) for rank in (1, 2))
+    training.tracked = mask_tracking.TrackedMasks(training.tracked.seeds, every)
+    names = list(training.terms(None, 0, dict))  # pyright: ignore[reportArgumentType]
+    classes = dict(zip(names, asked, strict=True))
+    assert classes["single"] == {0} and classes["unfiltered"] > {0}
+    assert classes["multi"] == classes["space"] == {1, 2}
+
+
 def test_what_options_change_in_the_terms(monkeypatch):
     """The classes that each term contrasts in several steps, and whether its prototypes are fixed."""
     asked, loss = [], parts.prototype_loss
