@@ -86,5 +86,5 @@ def _times(rows: Tensor, matrix: Tensor) -> Tensor:
 def _blocks(rows: Tensor) -> Tensor:
     """Return [P, A] as [blocks, 64, A], more of them than there are threads, filled up with zeros."""
     if missing := max(-len(rows) % _BLOCK, _BLOCK * _BLOCKS - len(rows)):
-        rows = torch.nn.functional.pad(rows, (0, 0, 0, missing))  # a copy, even where nothing is missing
+        rows = torch.nn.functional.pad(rows, (0, 0, 0, missing))  # which copies even where nothing is missing
     return rows.reshape(-1, _BLOCK, rows.shape[1])
