@@ -58,7 +58,7 @@ SHIPPED = {
     "outlines": "How far labels hold refinement back: outlines by votes alone, snapped to photos, and exact masks.",
     "tradeoff": "What time and memory buy: every choice moved alone, and the Pareto front of cost and quality.",
     "presets": "What the refinements of the presets cost and give, from one base.",
-    "compare": "Six other methods beside this one, from one base, on identical masks.",
+    "compare": "The paper's twelve other methods beside this one, from one base, on identical masks.",
     "compare-consistent": "The same with the consistent masks of this method for all.",
     "classes": "How time and memory of each method grow with the number of classes.",
     "improvements": "What each extension of ours gives, beside both losses alone.",

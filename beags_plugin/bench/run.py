@@ -37,8 +37,8 @@ QUICK_MOST = 30  # steps of variants that say how many
 def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
     """Run the trials of an experiment that are not done, print its tables and write its files; returns the rows.
 
-    With ``options.plan`` it prints the plan; no trial runs, and there are no rows. Raises ``UserError`` for a mistake
-    in the experiment or the options. A trial that fails is a row with the reason.
+    With ``options.plan`` it prints the plan: nothing is written, no trial runs, and there are no rows. Raises
+    ``UserError`` for a mistake in the experiment or the options. A trial that fails is a row with the reason.
     """
     from beags_plugin.bench.confidence import plot_confidence
     from beags_plugin.bench.front import plot_front
@@ -57,7 +57,7 @@ def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
             (scene.name, variant.name): made
             for scene in scenes
             for variant in experiment.variants
-            if (made := _other_masks(scene, variant, options.output / "scenes")) is not None
+            if (made := _other_masks(scene, variant, options.output / "scenes", not options.plan)) is not None
         }
         runs = plan(experiment, scenes, masks, code_digest())
         trials_folder = options.output / "trials"
@@ -117,11 +117,11 @@ def _wide() -> Console:
     return Console(width=max(CONSOLE.width, TABLE_WIDTH), highlight=False, markup=False)
 
 
-def _other_masks(scene: TrialScene, variant: Variant, folder: Path) -> Path | None:
+def _other_masks(scene: TrialScene, variant: Variant, folder: Path, write: bool) -> Path | None:
     """Return the folder of the masks that a variant has in place of the scene's; None for those."""
     if variant.classes is not None:
-        return class_masks(scene, variant.classes, folder)
-    return None if variant.damage is None else damaged_masks(scene, variant.damage, folder)
+        return class_masks(scene, variant.classes, folder, write)
+    return None if variant.damage is None else damaged_masks(scene, variant.damage, folder, write)
 
 
 def adapted(experiment: Experiment, options: ExperimentOptions) -> Experiment:
@@ -164,6 +164,7 @@ def _thinned(variants: Sequence[Variant]) -> list[Variant]:
 def scenes_of(experiment: Experiment, options: ExperimentOptions) -> list[TrialScene]:
     """Return the experiment's samples (none by default if the user gives data) and the user's folders.
 
+    A plan writes no sample.
     Raises ``UserError`` if there are none at all, or fewer samples than asked for.
     """
     given = given_scenes(options.data, options.downscale)
@@ -171,7 +172,9 @@ def scenes_of(experiment: Experiment, options: ExperimentOptions) -> list[TrialS
     if not 0 <= count <= len(experiment.samples):
         raise UserError(f"--scenes is {count}, but {experiment.name} names {len(experiment.samples)} sample scenes.")
     folder = options.output / "scenes"
-    samples = [sample_scene(folder, *which, experiment.sample) for which in experiment.samples[:count]]
+    samples = [
+        sample_scene(folder, *which, experiment.sample, not options.plan) for which in experiment.samples[:count]
+    ]
     if not samples and not given:
         raise UserError("there is no scene to train on: name a folder with --data, or give --scenes 1 or more.")
     return samples + given

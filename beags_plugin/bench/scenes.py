@@ -22,6 +22,7 @@ from beags_plugin.system.whole_files import write_text_atomically
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+    from beags_plugin.sample.writer import SampleConfig
 
 SEEDS = {"choosing": (0, 1, 2), "reporting": (100, 101, 102, 103, 104)}
 """Seeds of generated scenes. No choice is made by a result on those for reporting."""
@@ -32,7 +33,7 @@ class TrialScene:
     """A scene to train on.
 
     digest: changes with the content of ``data``. seed: of the damage to its masks. options: of ``beags-data``, by name,
-    as plain values.
+    as plain values. sample: what a generated one is made of, which a plan does not write.
     """
 
     name: str
@@ -41,6 +42,12 @@ class TrialScene:
     digest: str
     seed: int = 0
     options: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    sample: SampleConfig | None = field(default=None, compare=False)
+
+    @property
+    def unwritten(self) -> SampleConfig | None:
+        """Return what the scene would be made of, if it is not there."""
+        return None if self.data.exists() else self.sample
 
     def parser(self) -> BeagsDataParserConfig:
         """Return the data parser's config, without ``downscale``."""
@@ -58,7 +65,9 @@ class SceneSize:
 
 
 def scene_size(scene: TrialScene) -> SceneSize:
-    """Read the size of a scene that is on disk; raises ``UserError`` for data that cannot be read."""
+    """Return the size of a scene, read from the disk if it is there; raises ``UserError`` for what cannot be read."""
+    if (sample := scene.unwritten) is not None:
+        return SceneSize(sample.num_train, sample.num_train * sample.width * sample.height)
     parser = scene.parser()
     parser.downscale_factor = scene.downscale
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
@@ -72,17 +81,18 @@ def parser_options(plain: Mapping[str, Any]) -> dict[str, Any]:
     return {name: Path(value) if name.endswith("_path") else value for name, value in plain.items()}
 
 
-def sample_scene(folder: Path, family: str, seed: int, options: Mapping[str, Any]) -> TrialScene:
+def sample_scene(folder: Path, family: str, seed: int, options: Mapping[str, Any], write: bool = True) -> TrialScene:
     """Return the generated scene of that family and seed; write it into ``folder`` unless it is there."""
     from beags_plugin.sample.writer import SampleConfig, is_sample, write_sample
 
     config = SampleConfig(**{**options, "family": family, "seed": seed})
     digest = value_digest(config.as_dict())
     target = folder / f"{family}-{seed}-{digest[:8]}"
-    if not is_sample(target, config):
+    config.check()
+    if write and not is_sample(target, config):
         with progress_bar(f"Tracing {family} {seed}") as progress:
             write_sample(target, config, progress)
-    return TrialScene(f"{family} {seed}", target, 1.0, digest, seed)
+    return TrialScene(f"{family} {seed}", target, 1.0, digest, seed, sample=config)
 
 
 def given_scenes(folders: Sequence[Path], downscale: float | None) -> list[TrialScene]:
@@ -103,19 +113,19 @@ def given_scenes(folders: Sequence[Path], downscale: float | None) -> list[Trial
     return scenes
 
 
-def damaged_masks(scene: TrialScene, degree: float, folder: Path) -> Path:
+def damaged_masks(scene: TrialScene, degree: float, folder: Path, write: bool = True) -> Path:
     """Return a folder with the scene's masks, those of the training views damaged to ``degree`` (1 is mild, 2 strong).
 
     Exact masks (``ground_truth/masks``) are damaged where the scene has them, else its own masks. The scene's seed and
     the view's name decide the damage. At degree 1 a sample gets its default masks. Masks of held-out views stay as
-    they are. An existing folder of the same damage is used again.
+    they are. An existing folder of the same damage is used again. Without ``write`` the folder is only named.
     """
     from beags_plugin.sample import degrade
 
     degradation = degrade.degradation_of_degree(degree)
     code = [Path(str(file)).read_text("utf8") for file in (degrade.__file__, __file__)]
     target = folder / f"masks-{value_digest([scene.digest, scene.seed, degree, code])[:12]}"
-    if _is_whole(target):
+    if not write or _is_whole(target):
         return target
     parser = scene.parser().setup()
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
@@ -141,11 +151,11 @@ def damaged_masks(scene: TrialScene, degree: float, folder: Path) -> Path:
     return target
 
 
-def class_masks(scene: TrialScene, count: int, folder: Path) -> Path:
+def class_masks(scene: TrialScene, count: int, folder: Path, write: bool = True) -> Path:
     """Return a folder with masks of ``count`` objects for the training views, to measure what classes cost.
 
     The objects are cells around seed points: each pixel has that of the nearest point in the picture, whatever hides
-    it. Held-out views have none, so that no quality is scored.
+    it. Held-out views have none, so that no quality is scored. Without ``write`` the folder is only named.
     """
     import torch
     from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
@@ -156,7 +166,7 @@ def class_masks(scene: TrialScene, count: int, folder: Path) -> Path:
 
     code = Path(__file__).read_text("utf8")
     target = folder / f"classes-{value_digest([scene.digest, count, code])[:12]}"
-    if _is_whole(target):
+    if not write or _is_whole(target):
         return target
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
         outputs = scene.parser().setup().get_dataparser_outputs("train")

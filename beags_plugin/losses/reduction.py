@@ -30,8 +30,9 @@ def ordered_mean(values: Tensor) -> Tensor:
 
 
 def grouped_sums(rows: Tensor, groups: Tensor, count: int) -> Tensor:
-    """Return [count, C], the sums of the rows of each group, in their order and in float64; differentiable.
+    """Return [count, C], the sums of the rows of each group, 0 of none; differentiable.
 
+    They are added in their order and in float64, whatever the number of threads, and are of the rows' dtype.
     rows: [P, C] float. groups: [P] int, below ``count``. Their gradient is a copy of that of their group.
     """
     channels = rows.shape[1]
@@ -61,17 +62,6 @@ def ordered_outer_sum(first: Tensor, second: Tensor) -> Tensor:
     return sums.view(first.shape[1], second.shape[1])
 
 
-def group_sums(values: Tensor, groups: Tensor, count: int) -> Tensor:
-    """Return the sums of the rows of each group, in order of the rows whatever the number of threads; differentiable.
-
-    values: [P, C] float. groups: [P] int64 below ``count``. Returns [count, C] float64, 0 for a group without rows.
-    """
-    width = values.shape[1]
-    places = (groups[:, None] * width + torch.arange(width, device=groups.device)).flatten()
-    zeros = torch.zeros(count * width, dtype=torch.float64, device=values.device)
-    return zeros.index_add(0, places, values.double().flatten()).view(count, width)
-
-
 class _RowProduct(torch.autograd.Function):
     """rows @ matrix.T by many small products, each of which a thread takes as a whole; a large one would be split."""
 
@@ -81,9 +71,10 @@ class _RowProduct(torch.autograd.Function):
         return _times(rows, matrix.T)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         rows, matrix = ctx.saved_tensors
-        return _times(grad, matrix), ordered_outer_sum(grad, rows)
+        of_rows, of_matrix = ctx.needs_input_grad
+        return _times(grad, matrix) if of_rows else None, ordered_outer_sum(grad, rows) if of_matrix else None
 
 
 def _times(rows: Tensor, matrix: Tensor) -> Tensor:
@@ -94,5 +85,6 @@ def _times(rows: Tensor, matrix: Tensor) -> Tensor:
 
 def _blocks(rows: Tensor) -> Tensor:
     """Return [P, A] as [blocks, 64, A], more of them than there are threads, filled up with zeros."""
-    missing = max(-len(rows) % _BLOCK, _BLOCK * _BLOCKS - len(rows))
-    return torch.nn.functional.pad(rows, (0, 0, 0, missing)).view(-1, _BLOCK, rows.shape[1])
+    if missing := max(-len(rows) % _BLOCK, _BLOCK * _BLOCKS - len(rows)):
+        rows = torch.nn.functional.pad(rows, (0, 0, 0, missing))  # which copies even where nothing is missing
+    return rows.reshape(-1, _BLOCK, rows.shape[1])

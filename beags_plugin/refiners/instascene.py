@@ -40,20 +40,23 @@ class InstaSceneRefiner(Refiner):
     """Takes the objects out of the base by learned features; they may overlap and leave Gaussians to nobody.
 
     consider_negative: whether background pixels are sampled too, as a class. gram_feat: whether prototypes are fixed
-    and orthogonal, with which seeds begin. ground_votes, min_gaussians: see ``mask_tracking``. cosine: see
-    ``prototypes.members``. samples: of each term.
+    and orthogonal, with which seeds begin. ground_votes, min_gaussians: see ``mask_tracking``. min_weight: w that a
+    traced Gaussian exceeds at a pixel. cosine: see ``prototypes.members``. samples: of each term.
     """
 
     consider_negative: bool = True
     gram_feat: bool = False
     ground_votes: bool = False
     min_gaussians: int = mask_tracking.MIN_GAUSSIANS
+    min_weight: float = mask_tracking.MIN_WEIGHT
     cosine: float = prototypes.COSINE
     samples: int = SAMPLES
 
     def __post_init__(self) -> None:
         if not 0.0 < self.cosine <= 1.0:
             raise UserError(f"cosine is {self.cosine:g}: give one above 0, up to 1.")
+        if not 0.0 <= self.min_weight < 1.0:
+            raise UserError(f"min_weight is {self.min_weight:g}: give a blending weight, from 0 to below 1.")
         for name in ("min_gaussians", "samples"):
             if (value := getattr(self, name)) < 1:
                 raise UserError(f"{name} is {value}: give a number, 1 or more.")
@@ -169,7 +172,7 @@ class ContrastTraining(OwnTraining):
         def trace(view: int) -> mask_tracking.TracedView:
             camera = scene.cameras[view]
             labels = self._ranks(view).view(camera.height, camera.width)
-            what = (inputs, camera, scene.settings, labels, count, mask_tracking.MIN_WEIGHT)
+            what = (inputs, camera, scene.settings, labels, count, self.options.min_weight)
             return mask_tracking.TracedView.of_counts(*scene.rasterizer.sparse_class_pixel_counts(*what), count)
 
         with scene.stage("Tracing Gaussians") as progress:

@@ -27,7 +27,7 @@ from torch.nn.functional import cross_entropy, embedding
 from torch.utils.checkpoint import checkpoint
 
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.losses.reduction import group_sums, ordered_linear, ordered_mean, ordered_outer_sum, ordered_sum
+from beags_plugin.losses.reduction import grouped_sums, ordered_linear, ordered_mean, ordered_outer_sum, ordered_sum
 from beags_plugin.refiners.identity_codes import NORMALISER, THRESHOLD, Classify, probabilities
 
 SAMPLES = 32_768  # pixels of L_con, drawn with replacement
@@ -98,10 +98,10 @@ def own_shares(drawn: Tensor, group: Tensor, count: int) -> Tensor:
 def _prototypes(x: Tensor, group: Tensor, count: int, factor: float, least: float) -> tuple[Tensor, Tensor]:
     """Return u [count, C], with gradient, and f [count], without."""
     numbers = torch.bincount(group, minlength=count).clamp(min=1)
-    means = (group_sums(x, group, count) / numbers[:, None]).to(x)
+    means = (grouped_sums(x.double(), group, count) / numbers[:, None]).to(x)
     with torch.no_grad():
         distances = (x - means[group]).norm(dim=1, keepdim=True)
-        spread = group_sums(distances, group, count)[:, 0] / (numbers * (numbers + 10.0).log())
+        spread = grouped_sums(distances.double(), group, count)[:, 0] / (numbers * (numbers + 10.0).log())
         temperatures = (factor * spread).clamp(least, 1.0).to(x)
     return means, temperatures
 

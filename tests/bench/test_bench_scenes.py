@@ -15,8 +15,16 @@ from experiment_files import GOOD, masks_of, scene, written
 
 from beags_plugin.bench.experiment import load_experiment
 from beags_plugin.bench.options import ExperimentOptions
+from beags_plugin.bench.per_object import object_names
 from beags_plugin.bench.run import adapted, scenes_of
-from beags_plugin.bench.scenes import TrialScene, class_masks, damaged_masks, given_scenes
+from beags_plugin.bench.scenes import (
+    TrialScene,
+    class_masks,
+    damaged_masks,
+    given_scenes,
+    sample_scene,
+    scene_size,
+)
 from beags_plugin.bench.trials import MODEL, plan, steps_of
 from beags_plugin.bench.worker import trial_config
 from beags_plugin.labels.classes import read_id_mask
@@ -36,6 +44,18 @@ SMALL = {"width": 48, "height": 36, "num_train": 8, "num_test": 2, "num_points":
 def sample(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene") / "sample"
     return TrialScene("tabletop 5", write_sample(folder, SampleConfig(seed=5, **SMALL)), 1.0, "digest", seed=5)
+
+
+@pytest.mark.parametrize("family", ["tabletop", "room"])
+def test_a_plan_knows_of_an_unwritten_sample_what_is_read_of_a_written_one(family, tmp_path):
+    planned, written = (sample_scene(tmp_path, family, 5, SMALL, write=write) for write in (False, True))
+    assert planned == written and planned.data.is_dir() and planned.unwritten is None
+    masks = tmp_path / "masks"
+    named = [damaged_masks(planned, 1.0, masks, write=False), class_masks(planned, 3, masks, write=False)]
+    elsewhere = sample_scene(tmp_path / "absent", family, 5, SMALL, write=False)
+    assert elsewhere.unwritten is not None and not (tmp_path / "absent").exists() and not masks.exists()
+    assert (scene_size(elsewhere), object_names(elsewhere)) == (scene_size(written), object_names(written))
+    assert named == [damaged_masks(written, 1.0, masks), class_masks(written, 3, masks)]
 
 
 def read_all(folder: Path) -> dict[str, np.ndarray]:

@@ -17,7 +17,7 @@ from beags_plugin.losses.boundary import BoundaryLoss
 from beags_plugin.losses.distortion import DistortionLoss
 from beags_plugin.losses.normal import NormalConsistencyLoss, depth_normals
 from beags_plugin.losses.photometric import PhotometricLoss, blur, ssim, ssim_map
-from beags_plugin.losses.reduction import group_sums, ordered_mean, ordered_outer_sum, ordered_sum
+from beags_plugin.losses.reduction import grouped_sums, ordered_linear, ordered_mean, ordered_outer_sum, ordered_sum
 from beags_plugin.system.errors import UserError
 
 
@@ -130,10 +130,23 @@ def test_sums_of_groups_and_of_outer_products():
     values, others = _random(5_000).view(-1, 4), _random(3_750, seed=1).view(-1, 3)
     groups = torch.arange(1_250) % 7
     one_hot = torch.nn.functional.one_hot(groups, 9).to(values)
-    torch.testing.assert_close(group_sums(values, groups, 9), one_hot.T @ values)  # two groups without rows
+    torch.testing.assert_close(grouped_sums(values, groups, 9), one_hot.T @ values)  # two groups without rows
     torch.testing.assert_close(ordered_outer_sum(values, others), values.T @ others)
-    assert torch.autograd.gradcheck(lambda x: group_sums(x**2, groups, 9), values.requires_grad_(), fast_mode=True)
-    assert group_sums(torch.zeros(0, 2), groups[:0], 3).tolist() == [[0.0, 0.0]] * 3
+    assert torch.autograd.gradcheck(lambda x: grouped_sums(x**2, groups, 9), values.requires_grad_(), fast_mode=True)
+    assert grouped_sums(torch.zeros(0, 2), groups[:0], 3).tolist() == [[0.0, 0.0]] * 3
+
+
+@pytest.mark.parametrize("count", [3, 64 * 64, 5_000])
+def test_linear_products_and_the_gradients_that_are_asked_for(count):
+    rows, weight, bias = _random(count, 5), _random(7, 5, seed=1), _random(7, seed=2)
+    torch.testing.assert_close(ordered_linear(rows, weight, bias), rows @ weight.T + bias)
+    expected = (rows.T @ _random(count, 7, seed=3)).T
+    for with_rows in (False, True):
+        x, w = rows.clone().requires_grad_(with_rows), weight.clone().requires_grad_()
+        ordered_linear(x, w, bias).backward(_random(count, 7, seed=3))
+        torch.testing.assert_close(w.grad, expected)
+        assert (x.grad is not None) is with_rows
+    torch.testing.assert_close(x.grad, _random(count, 7, seed=3) @ weight)
 
 
 def test_photometric_does_not_depend_on_threads():

@@ -14,6 +14,7 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.rasterizers.rendering import draw_features
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
+from beags_plugin.refiners import ilgs
 from beags_plugin.refiners.ilgs import IlgsRefiner, IlgsTraining, inside_hull, trusted_mean
 from beags_plugin.refiners.object_codebook import code_entropy
 from beags_plugin.system.errors import UserError
@@ -117,6 +118,16 @@ def test_the_masks_reach_codes_classifier_and_geometry():
     assert training.learned.classifier.weight.shape == (256, 16)
     twice = IlgsTraining(training.scene, IlgsRefiner(weight=2.0)).terms(loss_inputs(training.scene), 0, dict)
     assert twice["identities"].item() == pytest.approx(2 * found["identities"].item())
+
+
+def test_the_bound_follows_the_steps(monkeypatch):
+    """It is the mean in the last step."""
+    training, shares = trained(), []
+    assert training.scene.steps == 1_000
+    monkeypatch.setattr(ilgs, "trusted_mean", lambda each, labelled, share: shares.append(share) or each.sum())
+    for step in (0, 499, 999):
+        training.terms(loss_inputs(training.scene), step, dict)
+    assert shares == [0.001, 0.5, 1.0]
 
 
 def test_without_weight_or_mask_the_base_just_trains_on():

@@ -115,6 +115,35 @@ def test_terms_and_their_turns():
     assert {each[0] for each in several} == {0, 1, 2, 3, 4}
 
 
+def test_weights_and_the_rate(monkeypatch):
+    monkeypatch.setattr(parts, "prototype_loss", lambda *_: torch.ones(()))
+    for gram_feat in (False, True):
+        training = trained(trained_scene(), 0, gram_feat=gram_feat)
+        training.before_step(0)
+        found = training.terms(None, 0, dict)  # pyright: ignore[reportArgumentType]
+        expected = {"single": 0.5e-6, "multi": 1e-6, "space": 2.5e-6, **({"unfiltered": 1e-6} if gram_feat else {})}
+        assert {name: value.item() for name, value in found.items()} == pytest.approx(expected)
+        assert [(group["lr"], group["eps"]) for group in training.adam.param_groups] == [(0.025, 1e-15)]
+
+
+def test_masks_that_are_left_out_are_background_in_the_term_of_their_view_alone(monkeypatch):
+    training, asked, loss = trained(trained_scene(), 0, gram_feat=True), [], parts.prototype_loss
+
+    def spied(features, classes, prototypes=None):
+        asked.append(set(classes.tolist()))
+        return loss(features, classes, prototypes)
+
+    monkeypatch.setattr(parts, "prototype_loss", spied)
+    training.before_step(0)
+    assert training.tracked is not None
+    every = frozenset((view, rank) for view in range(len(training.scene.cameras)) for rank in (1, 2))
+    training.tracked = mask_tracking.TrackedMasks(training.tracked.seeds, every)
+    names = list(training.terms(None, 0, dict))  # pyright: ignore[reportArgumentType]
+    classes = dict(zip(names, asked, strict=True))
+    assert classes["single"] == {0} and classes["unfiltered"] > {0}
+    assert classes["multi"] == classes["space"] == {1, 2}
+
+
 def test_what_options_change_in_the_terms(monkeypatch):
     """The classes that each term contrasts in several steps, and whether its prototypes are fixed."""
     asked, loss = [], parts.prototype_loss
@@ -149,17 +178,19 @@ def test_what_options_change_in_the_terms(monkeypatch):
     assert torch.equal(training.features[rest], plain.features[rest])
 
 
-def test_the_ground_votes_if_it_is_asked_to(monkeypatch):
-    asked, tracked_masks = [], mask_tracking.tracked_masks
+def test_what_options_change_in_the_tracking(monkeypatch):
+    asked, scene, tracked_masks = [], trained_scene(), mask_tracking.tracked_masks
 
     def spied(views, count, num_classes, min_gaussians, ground_votes, progress):
-        asked.append((min_gaussians, ground_votes))
+        asked.append((min_gaussians, ground_votes, sum(len(view.members) for view in views)))
         return tracked_masks(views, count, num_classes, min_gaussians, ground_votes, progress)
 
     monkeypatch.setattr(mask_tracking, "tracked_masks", spied)
-    for options in ({}, {"ground_votes": True, "min_gaussians": 7}):
-        trained(trained_scene(), 1, **options)
-    assert asked == [(5, False), (7, True)]
+    for options in ({}, {"ground_votes": True, "min_gaussians": 7}, {"min_weight": 0.1}, {"min_weight": 0.5}):
+        trained(scene, 1, **options)
+    traced = asked[0][2]
+    assert asked[:3] == [(5, False, traced), (7, True, traced), (5, False, traced)]
+    assert 0 < asked[3][2] < 0.8 * traced, "few weigh more than half at a pixel"
 
 
 def test_few_views_and_views_without_masks():
@@ -208,6 +239,7 @@ def test_threads_change_nothing():
         ({"cosine": 1.2}, "cosine is 1.2: give one above 0, up to 1"),
         ({"min_gaussians": 0}, "min_gaussians is 0: give a number, 1 or more"),
         ({"samples": 0}, "samples is 0"),
+        ({"min_weight": 1.0}, "min_weight is 1: give a blending weight, from 0 to below 1"),
     ],
 )
 def test_options_that_cannot_work(options, sentence):

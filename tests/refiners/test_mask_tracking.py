@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
-from raster_scenes import facing
+from raster_scenes import FLOATS, facing
 
+from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
-from beags_plugin.refiners.mask_tracking import MIN_WEIGHT, TracedView, TrackedMasks, tracked_masks
+from beags_plugin.refiners.mask_tracking import MIN_GAUSSIANS, MIN_WEIGHT, TracedView, TrackedMasks, tracked_masks
 
 
 def view_of(classes: dict[int, int]) -> TracedView:
@@ -124,3 +127,72 @@ def test_three_of_four_layers_are_traced(rasterizer):
     labels, settings = torch.ones(1, 1, dtype=torch.int32), RasterSettings(0.1, 100.0, geometry=False)
     found = rasterizer.sparse_class_pixel_counts(inputs, camera, settings, labels, 3, MIN_WEIGHT)
     assert TracedView.of_counts(*found, 3).traced.tolist() == [0, 1, 2]
+
+
+class Wall:
+    """Gaussians of 1.5 pixels, two apart, with a round object of some radius in pixels among those of another one."""
+
+    def __init__(self, radius: int) -> None:
+        size, generator = 2 * (radius + 8), torch.Generator().manual_seed(0)
+        grid = torch.arange(1.0, size, 2.0)
+        xy = torch.cartesian_prod(grid, grid)
+        xy = (xy + 2.0 * torch.rand(xy.shape, generator=generator) - 1.0)[torch.randperm(len(xy), generator=generator)]
+        self.inputs, self.camera = facing(size, size, [(x, y, 1.5, 0.9) for x, y in xy.tolist()], torch.float32)
+        pixels = torch.arange(size) + 0.5 - size / 2
+        self.inside = (pixels[:, None].square() + pixels.square()).sqrt() < radius
+        self.labels = torch.where(self.inside, 1, 2).int()
+        self.rasterizer, self.settings = make_rasterizer("auto"), RasterSettings(0.1, 100.0, geometry=False)
+
+    def __len__(self) -> int:
+        return len(self.inputs.means)
+
+    def views(self, min_weight: float) -> list[TracedView]:
+        what = (self.inputs, self.camera, self.settings, self.labels, 3, min_weight)
+        return [TracedView.of_counts(*self.rasterizer.sparse_class_pixel_counts(*what), 3)] * 3
+
+    def seeds(self, min_weight: float, min_gaussians: int = 5) -> torch.Tensor:
+        return tracked_masks(self.views(min_weight), len(self), 3, min_gaussians).seeds[1]
+
+    def assigned(self) -> torch.Tensor:
+        shares = self.rasterizer.class_contributions(self.inputs, self.camera, self.settings, self.labels, 3)
+        return (shares.argmax(dim=1) == 1).nonzero()[:, 0]
+
+    def excess(self, members: torch.Tensor) -> tuple[float, float]:
+        """By how many pixels the radius of the members, drawn alone, is too large; and their IoU."""
+        alone = replace(self.inputs, **{name: getattr(self.inputs, name)[members] for name in FLOATS})
+        alpha = self.rasterizer.rasterize(alone, self.camera, self.settings, torch.zeros(3)).alpha
+        drawn = alpha.view(self.inside.shape) > 0.5
+        iou = (drawn & self.inside).sum() / (drawn | self.inside).sum()
+        return float((drawn.sum() / torch.pi).sqrt() - (self.inside.sum() / torch.pi).sqrt()), float(iou)
+
+
+def test_seeds_reach_as_far_beyond_a_small_object_as_beyond_a_large_one():
+    """By nearly twice a Gaussian's size, assignment by less: what that costs falls as the object grows."""
+    by_seeds, by_assignment = [], []
+    for wall in (Wall(20), Wall(40)):
+        by_seeds.append(wall.excess(wall.seeds(MIN_WEIGHT, MIN_GAUSSIANS)))
+        by_assignment.append(wall.excess(wall.assigned()))
+    assert all(2.3 < excess < 3.0 for excess, _ in by_seeds), by_seeds
+    assert all(1.0 < excess < 1.5 for excess, _ in by_assignment), by_assignment
+    small, large = (mine - seeds for (_, mine), (_, seeds) in zip(by_assignment, by_seeds, strict=True))
+    assert small > 0.1 and large < 0.6 * small
+
+
+def test_with_a_higher_weight_seeds_keep_to_the_object():
+    wall = Wall(20)
+    excess = [wall.excess(wall.seeds(weight))[0] for weight in (0.1, 0.2, 0.3)]
+    assert excess == sorted(excess, reverse=True) and excess[0] - excess[2] > 1.0
+    assert excess[2] == pytest.approx(wall.excess(wall.assigned())[0], abs=0.5)
+
+
+@pytest.mark.parametrize(("radius", "min_weight", "left_out"), [(12, 0.1, True), (24, 0.1, False), (12, 0.3, False)])
+def test_a_small_object_that_touches_another_loses_its_masks(radius, min_weight, left_out):
+    """A fifth of the Gaussians of its mask at its rim are of the other, in every view: under-segmented everywhere."""
+    wall = Wall(radius)
+    views = wall.views(min_weight)
+    own = views[0].members[views[0].classes == 1].long()
+    alike = (views[0].strongest(len(wall))[own] == 1).float().mean()
+    found = tracked_masks(views, len(wall), 3)
+    assert bool(alike < 0.8) is left_out and len(own) > MIN_GAUSSIANS
+    assert ({(view, 1) for view in range(3)} <= found.suspect) is left_out
+    assert bool(len(found.seeds[1]) == 0) is left_out

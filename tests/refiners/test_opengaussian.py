@@ -120,6 +120,46 @@ def test_terms_of_the_stages(monkeypatch):
     assert set(terms(8)) == {"clusters"}
 
 
+def test_lengths_are_those_of_the_input_poses(monkeypatch):
+    """Positions beside features, and the size of Gaussians by which a cluster shows."""
+    monkeypatch.setattr(parts, "fine_clusters", lambda *_: 1)
+    for scale in (1.0, 4.0):
+        scene = replace(solid_scene(8), scale=scale)
+        largest = float(scene.surfels().log_scales.exp().max())
+        training = CodebookTraining(scene, OpenGaussianRefiner(coarse=1, min_gaussians=1, max_scale=largest / 2))
+        positions = training._vectors()[:, parts.CHANNELS :]
+        torch.testing.assert_close(positions, 0.5 / scale * scene.surfels().means.detach())
+        training._begin_leaves(scene.generator(0))
+        assert bool(training.book.occurs.any()) is (scale > 1.0)
+
+
+def test_a_cluster_gets_one_leaf_more_than_masks_that_it_shows(monkeypatch):
+    for shown, used in ((0, 2), (1, 2), (3, 4), (7, 5)):
+        monkeypatch.setattr(parts, "fine_clusters", lambda *_, shown=shown: shown)
+        training = CodebookTraining(dots(8), OpenGaussianRefiner(coarse=1, fine=5, **NO_LIMITS))
+        training._begin_leaves(training.scene.generator(0))
+        assert training.book.used.tolist() == [used]
+        assert bool(training.book.occurs[:3].all()) is bool(training.book.occurs.any()) is (shown > 0)
+
+
+def test_a_cluster_that_hardly_shows_takes_no_step(monkeypatch):
+    """Shrunk, or seen from afar, its largest alpha may be 0.8 or less."""
+    scene = dots(64)
+    training = CodebookTraining(scene, OpenGaussianRefiner(coarse=1, fine=2, **NO_LIMITS))
+    stepped(training, range(33))
+    training.book.occurs[:] = True
+    draw, found = training.drawing.draw, []
+    for factor in (0.79, 0.82):  # of 0.99
+
+        def fainter(*what, factor=factor):
+            drawn, alpha = draw(*what)
+            return drawn, factor / alpha.max() * alpha
+
+        monkeypatch.setattr(training.drawing, "draw", fainter)
+        found.append(set(training.terms(None, 40, dict)))  # pyright: ignore[reportArgumentType]
+    assert found == [set(), {"leaves"}]
+
+
 def test_sizes_shrink_in_half_of_the_steps():
     training = CodebookTraining(dots(8), OpenGaussianRefiner())
     sizes = torch.tensor([training._size(step) for step in range(2_000)])

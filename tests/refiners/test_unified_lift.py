@@ -63,13 +63,17 @@ def test_matched_pixels_reach_the_codebook_alone(name):
     assert int(of_codebook.any(dim=1).sum()) == (256 if name == "classes" else 3)
 
 
-def test_weights_and_rates():
+def test_weights_and_rates(monkeypatch):
     training = trained()
-    drawn = training.learned.drawn(training.scene.surfels().detach(), training.scene.cameras[0]).flatten(0, 1)
     found = training.terms(loss_inputs(training.scene), 0, lambda: pytest.fail("nothing of the scene is trained"))
+    monkeypatch.setattr(object_codebook, "WEIGHTS", dict.fromkeys(object_codebook.WEIGHTS, 1.0))
+    plain = training.terms(loss_inputs(training.scene), 0, dict)
+    weights = {name: float(value.detach() / plain[name].detach()) for name, value in found.items()}
+    expected = {"contrast": 1e-6, "norms": 1e-6, "classes": 1e-4, "concentration": 1.0}
+    assert weights == pytest.approx(expected, rel=1e-4)
+    drawn = training.learned.drawn(training.scene.surfels().detach(), training.scene.cameras[0]).flatten(0, 1)
     every = torch.ones(len(drawn), dtype=torch.bool)
-    assert float(found["norms"].detach() / object_codebook.norms(drawn, every).detach()) == pytest.approx(1e-6)
-    assert set(found) == {"contrast", "norms", "classes", "concentration"} == set(object_codebook.WEIGHTS)
+    assert float(object_codebook.norms(drawn, every).detach()) == pytest.approx(float(plain["norms"].detach()))
     assert [(group["lr"], group["eps"]) for group in training.learned.adam.param_groups] == [
         (pytest.approx(0.025), 1e-15),
         (pytest.approx(0.005), 1e-8),
@@ -90,6 +94,31 @@ def test_a_view_that_is_right_has_no_term_of_classes():
     other = replace(training.scene, labels=[training.scene.labels[0].clone()])
     other.labels[0][0, 0] = 7  # a stray pixel
     assert "classes" in training.terms(loss_inputs(other), 0, dict)
+
+
+def test_pixels_that_are_not_reliable_teach_no_code(monkeypatch):
+    """What they would be worth changes no term of the codebook; those of codes take all."""
+    training, counted = trained(), torch.zeros(0, dtype=torch.bool)
+
+    def terms(chosen: slice) -> dict[str, float]:
+        def some(drawn, group, count):
+            nonlocal counted
+            counted = torch.zeros(len(drawn), dtype=torch.bool)
+            counted[chosen] = True
+            return counted
+
+        monkeypatch.setattr(object_codebook, "reliable", some)
+        found = training.terms(loss_inputs(training.scene), 0, dict)
+        return {name: value.item() for name, value in found.items()}
+
+    nothing, half, every = terms(slice(0, 0)), terms(slice(0, None, 2)), terms(slice(0, None))
+    assert set(nothing) == {"contrast", "norms"} and int(counted.sum()) == len(counted) > 100
+    for name in ("contrast", "norms"):
+        assert nothing[name] == half[name] == every[name]
+    asked, selection = [], object_codebook.selection
+    monkeypatch.setattr(object_codebook, "selection", lambda *what: asked.append(len(what[1])) or selection(*what))
+    assert terms(slice(0, None, 2)) == half and asked == [(len(counted) + 1) // 2]
+    assert half["concentration"] != every["concentration"]
 
 
 def test_a_step_without_mask_leaves_all_as_it_is():
