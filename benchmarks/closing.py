@@ -2,8 +2,9 @@
 
 For each object (all, if none is named) of runs of generated scenes, as splats and as a mesh, open and closed: the IoU
 of its whole silhouettes in the held-out views; the same from below, from eyes mirrored in the level plane through its
-middle; and chamfer, the mean of the two mean distances between its surface and the exact one, the underside too, in per
-cent of its longest side. Splats are where their median depth is, seen from all around.
+middle; chamfer, the mean of the two mean distances between its surface and the exact one, the underside too, in per
+cent of its longest side; and, of meshes, whether they are watertight. Splats are where their median depth is, seen from
+all around.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import torch
 from beags_plugin.export import EXPORTERS
 from beags_plugin.export.base import ExportItem
 from beags_plugin.export.mesh import GlbExporter, MadeMesh
-from benchmarks.meshes import Drawn, chamfer, exact_points, read_glb
+from benchmarks.meshes import Drawn, chamfer, exact_points, is_closed, read_glb
 
 ALL_AROUND = 14  # views of the depth of splats
 PIXELS = 160  # of these, along a side
@@ -50,7 +51,7 @@ class ClosedMesh(GlbExporter):
 
 
 def measure(config_path: Path, objects: Sequence[str]) -> dict[str, np.ndarray]:
-    """Print a row for each object of a run, all if none is named; return their figures [objects, 3] by what they are
+    """Print a row for each object of a run, all if none is named; return their figures [objects, 4] by what they are
     of."""
     from beags_plugin.export.frames import Frame
     from beags_plugin.export.mesh_options import MeshOptions
@@ -96,10 +97,11 @@ def measure(config_path: Path, objects: Sequence[str]) -> dict[str, np.ndarray]:
         for what, part in (("splats", surfels[own]), ("splats, closed", surfels)):
             covers = partial(painter.covers, part)
             distance = apart(painter.points(part, around), exact)
-            rows[what] = [mean_iou(held_out, covers), mean_iou(below, covers), distance]
+            rows[what] = [mean_iou(held_out, covers), mean_iou(below, covers), distance, np.nan]
         for what, mesh in zip(("mesh", "mesh, closed"), meshes, strict=True):
             covers = partial(covered, mesh)
-            rows[what] = [mean_iou(held_out, covers), mean_iou(below, covers), chamfer(mesh, exact)]
+            ious = mean_iou(held_out, covers), mean_iou(below, covers)
+            rows[what] = [*ious, chamfer(mesh, exact), 100.0 * is_closed(mesh)]
         for what, row in rows.items():
             found.setdefault(what, []).append(row)
             print(f"| {run.name} {name} | {what} | {formatted(row)} |", flush=True)
@@ -217,7 +219,8 @@ def main() -> None:
         sys.exit(__doc__)
     EXPORTERS.register("glb-open", "benchmarks.closing:OpenMesh")
     EXPORTERS.register("glb-closed", "benchmarks.closing:ClosedMesh")
-    print("| scene, object | as | IoU % | IoU from below % | chamfer % |\n| --- | --- | --- | --- | --- |", flush=True)
+    print("| scene, object | as | IoU % | IoU from below % | chamfer % | watertight % |")
+    print("| --- | --- | --- | --- | --- | --- |", flush=True)
     every: dict[str, list[np.ndarray]] = {}
     runs = [path for path in map(Path, sys.argv[1:]) if path.exists()]
     objects = [name for name in sys.argv[1:] if not Path(name).exists()]
