@@ -213,13 +213,15 @@ def scored(run, part, view, class_id: int) -> Scored:
     """Return what a held-out view tells of an object; part: its Gaussians."""
     from scipy.ndimage import binary_erosion
 
+    from beags_plugin.labels.class_ids import resize_nearest
     from beags_plugin.rasterizers.rendering import surfel_inputs
 
     inputs = surfel_inputs(part.detach(), view.camera)
     drawn = run.rasterizer.rasterize(inputs, view.camera, run.settings, torch.zeros(3))
     alpha = drawn.alpha.numpy()
     color = np.clip(drawn.color.numpy() / np.maximum(alpha, 1e-3)[..., None], 0, 1)
-    inside = binary_erosion((view.visible == class_id).numpy(), np.ones((3, 3)))
+    own = resize_nearest((view.visible == class_id).numpy(), view.camera.height, view.camera.width)
+    inside = binary_erosion(own, np.ones((3, 3)))
     return Scored(view.camera, view.image.numpy(), inside, color, alpha > 0.5)
 
 
