@@ -38,6 +38,7 @@ class Change:
 def measure(config_path: Path) -> list[Change]:
     """Return what cleaning changes for each object of a run that the held-out views show."""
     from beags_plugin.core.membership import Membership
+    from beags_plugin.evaluation.metrics import MaskMetrics
     from beags_plugin.evaluation.run_metrics import evaluate_scene
     from beags_plugin.extraction.select import select_class
     from beags_plugin.plugin.objects.clean import cleaner_of
@@ -61,8 +62,9 @@ def measure(config_path: Path) -> list[Change]:
         ).masks
         scores: dict[int, list[tuple[float, float]]] = {}
         for record in metrics:
-            if record.kind == "extracted" and record.metrics.biou is not None:
-                scores.setdefault(record.class_id, []).append((record.metrics.iou, record.metrics.biou))
+            of_mask = record.metrics
+            if record.kind == "extracted" and isinstance(of_mask, MaskMetrics) and of_mask.iou is not None:
+                scores.setdefault(record.class_id, []).append((of_mask.iou, of_mask.biou or 0.0))
         found.append({c: 100 * np.array(rows) for c, rows in scores.items()})
     before, after = found
     return [

@@ -20,9 +20,7 @@ MOST_CELLS = 128
 """Along the longest side of the grid: its Fourier transform of twice as many takes about 1 GB."""
 _MARGIN = 4  # cells around the surface; beyond them lies the outside
 _NEAR = 1.5  # cells: what is nearer to the given surface is put onto it, what is farther off was invented
-_ONTO = (
-    0.95  # of the way: all of it would put several corners into one place of an edge, and files forget which is which
-)
+_ONTO = 0.95  # of the way: all of it puts several corners into one place of a rim, and files forget which is which
 _LEVEL = 0.5
 _KEPT = 0.5  # share of the given surface that the closed one keeps at least; less, and it encloses crumbs alone
 

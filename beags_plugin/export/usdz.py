@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -54,8 +55,7 @@ def usdz_bytes(mesh: Mesh, name: str, texture: Texture | None = None, invented: 
 
     invented: [V] bool; with it vertices have the primvar ``invented``, 1 where nothing but closing put them.
     """
-    from pxr import Sdf, UsdUtils
-
+    Sdf, UsdUtils = _modules("Sdf", "UsdUtils")
     with tempfile.TemporaryDirectory() as folder:
         layer, package = Path(folder) / "mesh.usdc", Path(folder) / "mesh.usdz"
         if texture is not None:
@@ -66,9 +66,13 @@ def usdz_bytes(mesh: Mesh, name: str, texture: Texture | None = None, invented: 
         return package.read_bytes()
 
 
-def _write_layer(path: Path, mesh: Mesh, name: str, texture: Texture | None, invented: np.ndarray | None) -> None:
-    from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+def _modules(*names: str) -> list[Any]:
+    """Return modules of Pixar's library, which tells no types."""
+    return [import_module(f"pxr.{name}") for name in names]
 
+
+def _write_layer(path: Path, mesh: Mesh, name: str, texture: Texture | None, invented: np.ndarray | None) -> None:
+    Gf, Sdf, Usd, UsdGeom, Vt = _modules("Gf", "Sdf", "Usd", "UsdGeom", "Vt")
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -105,8 +109,7 @@ def _write_layer(path: Path, mesh: Mesh, name: str, texture: Texture | None, inv
 
 def _bind_material(stage: Any, shape: Any, textured: bool) -> None:
     """Give a mesh a material that emits its texture, or without one the colours of its vertices."""
-    from pxr import Gf, Sdf, UsdShade
-
+    Gf, Sdf, UsdShade = _modules("Gf", "Sdf", "UsdShade")
     kinds = Sdf.ValueTypeNames
     material = UsdShade.Material.Define(stage, "/Object/Material")
 
