@@ -1,9 +1,10 @@
-"""What closing objects gains, against exact shapes: python -m benchmarks.closing RUN [RUN ...].
+"""What closing objects gains, against exact shapes: python -m benchmarks.closing RUN [RUN ...] [OBJECT ...].
 
-For each object of runs of generated scenes, as splats and as a mesh, open and closed: the IoU of its whole silhouettes
-in the held-out views; the same from below, from eyes mirrored in the level plane through its middle; and chamfer, the
-mean of the two mean distances between its surface and the exact one, the underside too, in per cent of its longest
-side. Splats are where their median depth is, seen from all around.
+For each object (all, if none is named) of runs of generated scenes, as splats and as a mesh, open and closed: the IoU
+of its whole silhouettes in the held-out views; the same from below, from eyes mirrored in the level plane through its
+middle; chamfer, the mean of the two mean distances between its surface and the exact one, the underside too, in per
+cent of its longest side; and, of meshes, whether they are watertight. Splats are where their median depth is, seen from
+all around.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import torch
 from beags_plugin.export import EXPORTERS
 from beags_plugin.export.base import ExportItem
 from beags_plugin.export.mesh import GlbExporter, MadeMesh
-from benchmarks.meshes import Drawn, chamfer, exact_points, read_glb
+from benchmarks.meshes import Drawn, chamfer, exact_points, is_closed, read_glb
 
 ALL_AROUND = 14  # views of the depth of splats
 PIXELS = 160  # of these, along a side
@@ -49,8 +50,9 @@ class ClosedMesh(GlbExporter):
     texture: Any = "none"
 
 
-def measure(config_path: Path) -> dict[str, np.ndarray]:
-    """Print a row for each object of a run; return their figures [objects, 3] by what they are of."""
+def measure(config_path: Path, objects: Sequence[str]) -> dict[str, np.ndarray]:
+    """Print a row for each object of a run, all if none is named; return their figures [objects, 4] by what they are
+    of."""
     from beags_plugin.export.frames import Frame
     from beags_plugin.export.mesh_options import MeshOptions
     from beags_plugin.extraction.ply import read_ply
@@ -62,7 +64,7 @@ def measure(config_path: Path) -> dict[str, np.ndarray]:
     run = EvaluatedRun(config_path)
     sample = json.loads((run.stages["after"].config.data_path / "sample.json").read_text())
     things = {thing.name: thing for thing in FAMILIES[sample["family"]].scene(sample["seed"]).things}
-    ids = {name: class_id for class_id, name in run.classes.items() if class_id}
+    ids = {name: c for c, name in run.classes.items() if c and (not objects or name in objects)}
     found: dict[str, list[list[float]]] = {}
     for name, class_id in ids.items():
         with tempfile.TemporaryDirectory() as folder:
@@ -95,10 +97,11 @@ def measure(config_path: Path) -> dict[str, np.ndarray]:
         for what, part in (("splats", surfels[own]), ("splats, closed", surfels)):
             covers = partial(painter.covers, part)
             distance = apart(painter.points(part, around), exact)
-            rows[what] = [mean_iou(held_out, covers), mean_iou(below, covers), distance]
+            rows[what] = [mean_iou(held_out, covers), mean_iou(below, covers), distance, np.nan]
         for what, mesh in zip(("mesh", "mesh, closed"), meshes, strict=True):
             covers = partial(covered, mesh)
-            rows[what] = [mean_iou(held_out, covers), mean_iou(below, covers), chamfer(mesh, exact)]
+            ious = mean_iou(held_out, covers), mean_iou(below, covers)
+            rows[what] = [*ious, chamfer(mesh, exact), 100.0 * is_closed(mesh)]
         for what, row in rows.items():
             found.setdefault(what, []).append(row)
             print(f"| {run.name} {name} | {what} | {formatted(row)} |", flush=True)
@@ -216,10 +219,13 @@ def main() -> None:
         sys.exit(__doc__)
     EXPORTERS.register("glb-open", "benchmarks.closing:OpenMesh")
     EXPORTERS.register("glb-closed", "benchmarks.closing:ClosedMesh")
-    print("| scene, object | as | IoU % | IoU from below % | chamfer % |\n| --- | --- | --- | --- | --- |", flush=True)
+    print("| scene, object | as | IoU % | IoU from below % | chamfer % | watertight % |")
+    print("| --- | --- | --- | --- | --- | --- |", flush=True)
     every: dict[str, list[np.ndarray]] = {}
-    for path in map(Path, sys.argv[1:]):
-        for what, rows in measure(path if path.is_file() else path / "config.yml").items():
+    runs = [path for path in map(Path, sys.argv[1:]) if path.exists()]
+    objects = [name for name in sys.argv[1:] if not Path(name).exists()]
+    for path in runs:
+        for what, rows in measure(path if path.is_file() else path / "config.yml", objects).items():
             every.setdefault(what, []).append(rows)
     for what, parts in every.items():
         print(f"| mean of {sum(map(len, parts))} objects | {what} | {formatted(np.concatenate(parts).mean(axis=0))} |")

@@ -1,10 +1,10 @@
 """Meshes of trained runs against photos and exact shapes: python -m benchmarks.meshes RUN [OBJECT ...].
 
-For each object (all, if none is named) of a run of a generated scene: its mesh with a texture, with colours of
-vertices, and closed; drawn by four rays a pixel into the held-out views. PSNR is over the pixels well inside the
-object's exact masks that mesh and splats both cover, its mean over views; covered is the share of the masks' pixels
+For each object (all, if none is named) of a run: its mesh with a texture, with colours of vertices, and closed; drawn
+by four rays a pixel into the held-out views. PSNR is over the pixels well inside the object's masks (of generated
+scenes, which are exact) that mesh and splats both cover, its mean over views; covered is the share of the masks' pixels
 that the mesh covers. Chamfer is the mean of the two mean distances between mesh and exact surface, the underside too,
-in per cent of the object's longest side.
+in per cent of the object's longest side; it is not a number for captures, whose shapes nobody knows.
 """
 
 from __future__ import annotations
@@ -174,14 +174,16 @@ def measure(config_path: Path, objects: Sequence[str]) -> None:
     EXPORTERS.register("glb-closed", "benchmarks.meshes:Closed")
     run = EvaluatedRun(config_path)
     scene = run.stages["after"]
-    sample = json.loads((scene.config.data_path / "sample.json").read_text())
-    things = {thing.name: thing for thing in FAMILIES[sample["family"]].scene(sample["seed"]).things}
+    things = {}
+    if (described := scene.config.data_path / "sample.json").exists():
+        sample = json.loads(described.read_text())
+        things = {thing.name: thing for thing in FAMILIES[sample["family"]].scene(sample["seed"]).things}
     ids = {name: class_id for class_id, name in run.classes.items() if class_id}
     found: dict[str, list[list[float]]] = {label: [] for label in VARIANTS}
     for name in objects or ids:
         part, _ = select_class(scene.surfels(), scene.members, ids[name])
         views = [scored(run, part, view, ids[name]) for view in run.views]
-        exact = exact_points(things[name])
+        exact = exact_points(things[name]) if things else None
         with tempfile.TemporaryDirectory() as folder:
             (exported,) = export_run(config_path, [name], formats=tuple(VARIANTS), output=Path(folder))
             for file in exported.files:
@@ -211,18 +213,20 @@ def scored(run, part, view, class_id: int) -> Scored:
     """Return what a held-out view tells of an object; part: its Gaussians."""
     from scipy.ndimage import binary_erosion
 
+    from beags_plugin.labels.class_ids import resize_nearest
     from beags_plugin.rasterizers.rendering import surfel_inputs
 
     inputs = surfel_inputs(part.detach(), view.camera)
     drawn = run.rasterizer.rasterize(inputs, view.camera, run.settings, torch.zeros(3))
     alpha = drawn.alpha.numpy()
     color = np.clip(drawn.color.numpy() / np.maximum(alpha, 1e-3)[..., None], 0, 1)
-    inside = binary_erosion((view.visible == class_id).numpy(), np.ones((3, 3)))
+    own = resize_nearest((view.visible == class_id).numpy(), view.camera.height, view.camera.width)
+    inside = binary_erosion(own, np.ones((3, 3)))
     return Scored(view.camera, view.image.numpy(), inside, color, alpha > 0.5)
 
 
-def figures(mesh: Drawn, to_run: np.ndarray, views: Sequence[Scored], exact: np.ndarray) -> list[float]:
-    """Return a mesh's row but for the size of its file."""
+def figures(mesh: Drawn, to_run: np.ndarray, views: Sequence[Scored], exact: np.ndarray | None) -> list[float]:
+    """Return a mesh's row but for the size of its file; exact: points of the true surface, None if it is unknown."""
     mine, theirs, covered, of = [], [], 0, 0
     for view in views:
         picture, there = mesh.seen_by(view.camera, to_run)
@@ -233,7 +237,8 @@ def figures(mesh: Drawn, to_run: np.ndarray, views: Sequence[Scored], exact: np.
             theirs.append(psnr(view.splats[both], view.photo[both]))
     closed = 100.0 * is_closed(mesh)
     means = float(np.mean(theirs)), float(np.mean(mine))
-    return [*means, 100 * covered / max(of, 1), chamfer(mesh, exact), closed, len(mesh.faces)]
+    distance = np.nan if exact is None else chamfer(mesh, exact)
+    return [*means, 100 * covered / max(of, 1), distance, closed, len(mesh.faces)]
 
 
 def is_closed(mesh: Drawn) -> bool:

@@ -156,7 +156,7 @@ class Export:
     """The whole scene in one file; without --object and --all it needs no classes."""
     format: tuple[str, ...] = ("ply",)
     """ply (viewers of 3D Gaussians), ply-2dgs (the official 2DGS code), spz, compressed-ply, sog (all small), html (a
-    page to send), glb, obj (meshes), stl, 3mf (to print), or your own."""
+    page to send), glb, usdz, obj (meshes), stl, 3mf (to print), or your own."""
     frame: str = "world"
     """world, that of the input poses; or object, the same with the middle of the object's box as origin."""
     output: Path | None = None
@@ -177,7 +177,7 @@ class Export:
     def run(self) -> None:
         with starting(self):
             from beags_plugin.plugin.objects.export import export_run
-        options = {name: asdict(self.mesh) for name in ("glb", "obj", "stl", "3mf")}
+        options = {name: asdict(self.mesh) for name in ("glb", "usdz", "obj", "stl", "3mf")}
         with progress_bar("exporting") as progress:
             exported = export_run(
                 self.load_config, self.object, self.all, self.format, self.frame, self.output, options, progress,

@@ -13,6 +13,7 @@ EXPORTERS = Registry(
         "spz": "beags_plugin.export.spz:SpzExporter",
         "html": "beags_plugin.export.web_page:WebPageExporter",
         "glb": "beags_plugin.export.mesh:GlbExporter",
+        "usdz": "beags_plugin.export.usdz:UsdzExporter",
         "obj": "beags_plugin.export.mesh:ObjExporter",
         "stl": "beags_plugin.export.printing:StlExporter",
         "3mf": "beags_plugin.export.printing:ThreeMfExporter",

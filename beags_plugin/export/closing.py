@@ -20,6 +20,7 @@ MOST_CELLS = 128
 """Along the longest side of the grid: its Fourier transform of twice as many takes about 1 GB."""
 _MARGIN = 4  # cells around the surface; beyond them lies the outside
 _NEAR = 1.5  # cells: what is nearer to the given surface is put onto it, what is farther off was invented
+_ONTO = 0.95  # of the way: all of it puts several corners into one place of a rim, and files forget which is which
 _LEVEL = 0.5
 _KEPT = 0.5  # share of the given surface that the closed one keeps at least; less, and it encloses crumbs alone
 
@@ -59,7 +60,7 @@ def closed(mesh: Mesh) -> Closed | None:
     places = low + (vertices.astype(np.float64) - 1.0) * cell
     nearest, colors = _nearest(mesh, places, mesh.colors)
     near = np.linalg.norm(nearest - places, axis=1) < _NEAR * cell
-    places[near] = nearest[near]
+    places[near] += _ONTO * (nearest[near] - places[near])
     faces = faces.astype(np.int64)
     there, _ = _nearest(Mesh(places, faces, colors, mesh.voxel), mesh.vertices, colors)
     if (np.linalg.norm(there - mesh.vertices, axis=1) < _NEAR * cell).mean() < _KEPT:

@@ -24,6 +24,7 @@ _SIGMA = 0.75  # standard deviation over the distance between neighbours: three 
 _INWARD = 0.5  # distance between neighbours over that from the rim
 _FINEST = 1.5  # distance between neighbours over that between the surface's corners
 _HALF = 1.2  # standard deviations from its middle at which an opaque Gaussian is half transparent
+_CLEAR = 2.4  # and at which it adds so little to the object's own edge that its outline stays
 _ON_SCREEN = 0.71  # pixels: the standard deviation that a Gaussian is drawn with at least (2DGS's low-pass filter)
 _LARGEST = 1 / 12  # distance between neighbours over the closed surface's longest side
 _SAME_SIDE = 0.5  # least cosine between the normals of places of one side
@@ -81,7 +82,7 @@ def _within(more: Surfels, own: Surfels, views: Viewpoints, pixel: float) -> Ten
     from scipy.ndimage import binary_fill_holes
 
     axes = rotation_from_quat(more.quats)[:, :, :2].mT.double()
-    reach = _HALF * more.log_scales[:, :1].double().exp().clamp(min=_ON_SCREEN * pixel)[..., None]
+    reach = _CLEAR * more.log_scales[:, :1].double().exp().clamp(min=_ON_SCREEN * pixel)[..., None]
     around = torch.cat([reach * axes, -reach * axes], dim=1)
     points = torch.cat([more.means[:, None].double(), more.means[:, None].double() + around], dim=1)
     inside = torch.ones(len(more), dtype=torch.bool)

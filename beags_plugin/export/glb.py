@@ -35,11 +35,11 @@ def glb_bytes(mesh: Mesh, name: str, texture: Texture | None = None, invented: n
     parts = _Parts()
     source = np.arange(len(mesh.vertices)) if texture is None else texture.atlas.source
     faces = mesh.faces if texture is None else texture.atlas.faces
-    positions = _y_up(mesh.vertices)[source].astype("<f4")
+    positions = y_up(mesh.vertices)[source].astype("<f4")
     bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
     attributes = {
         "POSITION": parts.accessor(positions, _FLOAT, "VEC3", **bounds),
-        "NORMAL": parts.accessor(_y_up(vertex_normals(mesh))[source].astype("<f4"), _FLOAT, "VEC3"),
+        "NORMAL": parts.accessor(y_up(vertex_normals(mesh))[source].astype("<f4"), _FLOAT, "VEC3"),
     }
     material: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
     pictures: dict[str, Any] = {}
@@ -54,7 +54,7 @@ def glb_bytes(mesh: Mesh, name: str, texture: Texture | None = None, invented: n
         pictures = {
             "textures": [{"sampler": 0, "source": 0}],
             "samplers": [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP_LINEAR, **clamp}],
-            "images": [{"bufferView": parts.view(_png(texture.image)), "mimeType": "image/png"}],
+            "images": [{"bufferView": parts.view(png_bytes(texture.image)), "mimeType": "image/png"}],
         }
     if invented is not None:
         # floats, as every reader takes them; names of an application's own begin with an underscore
@@ -101,12 +101,13 @@ class _Parts:
         return len(self.accessors) - 1
 
 
-def _y_up(vectors: np.ndarray) -> np.ndarray:
+def y_up(vectors: np.ndarray) -> np.ndarray:
     """Return vectors [V, 3] of a frame with z up in one with y up; z of ours is its y, and y its -z."""
     return vectors[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
 
 
-def _png(image: np.ndarray) -> bytes:
+def png_bytes(image: np.ndarray) -> bytes:
+    """Return a picture [H, W, 3] uint8 as a .png."""
     from PIL import Image
 
     file = io.BytesIO()

@@ -1,4 +1,4 @@
-"""Meshes of single objects: textured or vertex-coloured as .glb, vertex-coloured as .obj."""
+"""Meshes of single objects: textured or vertex-coloured as .glb and .usdz, vertex-coloured as .obj."""
 
 from __future__ import annotations
 
@@ -140,19 +140,10 @@ def open3d_missing() -> str | None:
 
 
 @dataclass(frozen=True)
-class GlbExporter(MeshExporter):
-    """Binary glTF 2.0: Blender, three.js, game engines."""
+class TexturedExporter(MeshExporter):
+    """File types that have a texture; those of one item share it."""
 
-    suffix: ClassVar[str] = "glb"
-
-    def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
-        made = self.made(item)
-        texture, facts = self._texture(made.mesh, item)
-        with whole_file(path) as part:
-            part.write_bytes(glb_bytes(made.mesh, item.name, texture, made.invented))
-        return made.facts() | {"texture": facts}
-
-    def _texture(self, mesh: Mesh, item: ExportItem) -> tuple[Texture | None, dict[str, Any] | str]:
+    def texture_of(self, mesh: Mesh, item: ExportItem) -> tuple[Texture | None, dict[str, Any] | str]:
         """Return the texture and the manifest's entry about it, or None and why there is none."""
         if self.texture == "none":
             return None, "none"
@@ -168,6 +159,20 @@ class GlbExporter(MeshExporter):
             "from_photos": round(texture.from_photos, 4),
             "exposures": [round(float(spread.min()), 4), round(float(spread.max()), 4)],
         }
+
+
+@dataclass(frozen=True)
+class GlbExporter(TexturedExporter):
+    """Binary glTF 2.0: Blender, three.js, game engines."""
+
+    suffix: ClassVar[str] = "glb"
+
+    def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
+        made = self.made(item)
+        texture, facts = self.texture_of(made.mesh, item)
+        with whole_file(path) as part:
+            part.write_bytes(glb_bytes(made.mesh, item.name, texture, made.invented))
+        return made.facts() | {"texture": facts}
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels, opacities
 from beags_plugin.export.base import ExportItem, NothingToExport, Viewpoints, make_exporter
 from beags_plugin.export.closing import Closed, closed
-from beags_plugin.export.closing_surfels import closing_surfels, with_closing
+from beags_plugin.export.closing_surfels import _within, closing_surfels, with_closing
 from beags_plugin.export.fusion import Mesh, decimated
 from beags_plugin.export.glb import glb_bytes
 from beags_plugin.export.mesh import MadeMesh
@@ -92,6 +92,24 @@ def test_a_box_without_bottom_is_closed_flat_and_keeps_its_sides():
     assert np.array_equal(found.invented_at(found.mesh.vertices), found.invented)
 
 
+def test_a_closed_mesh_stays_so_where_readers_join_vertices_of_one_place(monkeypatch):
+    """As those of .stl must: the ragged rim of a hole draws several corners towards one place."""
+    ragged = a_box(bottom=False)
+    chips = np.random.default_rng(0).random(len(ragged.faces)) < 0.1
+    ragged = replace(ragged, faces=ragged.faces[~(chips & (ragged.vertices[ragged.faces][:, :, 2] < 0.3).all(axis=1))])
+
+    def watertight() -> bool:
+        found = closed(ragged)
+        assert found is not None
+        as_read = found.mesh.vertices[found.mesh.faces].reshape(-1, 3).astype(np.float32)
+        joined = trimesh.Trimesh(as_read, np.arange(len(as_read)).reshape(-1, 3), process=True)
+        return joined.is_watertight
+
+    assert watertight()
+    monkeypatch.setattr("beags_plugin.export.closing._ONTO", 1.0)
+    assert not watertight()
+
+
 def test_a_closed_hole_has_the_colours_of_its_rim():
     """Red on one side, blue on the other, and between them no edge."""
     found = closed_box()
@@ -129,6 +147,19 @@ def test_gaussians_close_the_hole_and_are_its_only_new_ones():
     assert ((depth(surfels) - whole)[there].abs() > 0.1).float().mean() > 0.4  # it shows its inside
     assert ((depth(both) - whole)[there].abs() > 0.05).float().mean() < 0.02
     assert ((depth(both) > 0) != there).float().sum() < 0.06 * there.sum()  # and reaches hardly beyond
+
+
+def test_gaussians_that_close_keep_clear_of_the_outline():
+    """By more than where they are half transparent: there they would lift the object's own faint edge above 1/2."""
+    own, sigma = discs_on(a_box(bottom=True)), 0.12
+    x = HALF - sigma * torch.tensor([-1.0, 1.5, 4.0])
+    means = torch.stack([x, torch.zeros(3), torch.full((3,), HALF)], dim=1)
+    more = Surfels.of(
+        means, torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 3), torch.full((3, 2), float(np.log(sigma))),
+        torch.full((3,), 6.0), torch.zeros(3, 4, 3),
+    )  # fmt: skip
+    views = Viewpoints([camera_at((0.01, 0.0, 3.0))], make_rasterizer("auto"), SETTINGS)
+    assert _within(more, own, views, 0.0).tolist() == [False, False, True]
 
 
 def test_an_item_is_closed_and_says_which_gaussians_are_invented():

@@ -1,0 +1,143 @@
+"""A mesh as .usdz, for Apple's devices and programs that read USD; Pixar's library writes it.
+
+The content is that of a .glb: y up, normals, a texture or colours of the vertices, and no light of its own: what the
+photos show is emitted (UsdPreviewSurface has no unlit material).
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from beags_plugin.export.base import ExportItem
+from beags_plugin.export.color import linear_from_srgb
+from beags_plugin.export.fusion import Mesh
+from beags_plugin.export.glb import png_bytes, y_up
+from beags_plugin.export.mesh import TexturedExporter
+from beags_plugin.export.surface import vertex_normals
+from beags_plugin.export.texture import Texture
+from beags_plugin.extraction.files import whole_file
+
+_PICTURE = "colors.png"
+
+
+@dataclass(frozen=True)
+class UsdzExporter(TexturedExporter):
+    """A package of USD: Quick Look on iPhone, iPad and Mac, and programs that read USD."""
+
+    suffix: ClassVar[str] = "usdz"
+
+    @classmethod
+    def unavailable(cls) -> str | None:
+        try:
+            import pxr.UsdShade
+            import pxr.UsdUtils  # noqa: F401
+        except ImportError as error:
+            return f"Pixar's USD library cannot be loaded ({error}); pip install usd-core."
+        return super().unavailable()
+
+    def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
+        made = self.made(item)
+        texture, facts = self.texture_of(made.mesh, item)
+        content = usdz_bytes(made.mesh, item.name, texture, made.invented)
+        with whole_file(path) as part:
+            part.write_bytes(content)
+        return made.facts() | {"texture": facts}
+
+
+def usdz_bytes(mesh: Mesh, name: str, texture: Texture | None = None, invented: np.ndarray | None = None) -> bytes:
+    """Return the file's content; the mesh has z up and the file y. Its unit is the metre.
+
+    invented: [V] bool; with it vertices have the primvar ``invented``, 1 where nothing but closing put them.
+    """
+    Sdf, UsdUtils = _modules("Sdf", "UsdUtils")
+    with tempfile.TemporaryDirectory() as folder:
+        layer, package = Path(folder) / "mesh.usdc", Path(folder) / "mesh.usdz"
+        if texture is not None:
+            (layer.parent / _PICTURE).write_bytes(png_bytes(texture.image))
+        _write_layer(layer, mesh, name, texture, invented)
+        if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(layer)), str(package)):
+            raise RuntimeError("Pixar's USD library packed nothing")
+        return package.read_bytes()
+
+
+def _modules(*names: str) -> list[Any]:
+    """Return modules of Pixar's library, which tells no types."""
+    return [import_module(f"pxr.{name}") for name in names]
+
+
+def _write_layer(path: Path, mesh: Mesh, name: str, texture: Texture | None, invented: np.ndarray | None) -> None:
+    Gf, Sdf, Usd, UsdGeom, Vt = _modules("Gf", "Sdf", "Usd", "UsdGeom", "Vt")
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    root = UsdGeom.Xform.Define(stage, "/Object")
+    root.GetPrim().SetDisplayName(name)
+    stage.SetDefaultPrim(root.GetPrim())
+    shape = UsdGeom.Mesh.Define(stage, "/Object/Mesh")
+    source = np.arange(len(mesh.vertices)) if texture is None else texture.atlas.source
+    faces = mesh.faces if texture is None else texture.atlas.faces
+    places = y_up(mesh.vertices)[source].astype(np.float32)
+    shape.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(places))
+    shape.CreateExtentAttr([Gf.Vec3f(*map(float, bound)) for bound in (places.min(axis=0), places.max(axis=0))])
+    shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
+    shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.reshape(-1).astype(np.int32)))
+    shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    shape.CreateDoubleSidedAttr(True)
+    shape.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(y_up(vertex_normals(mesh))[source].astype(np.float32)))
+    shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    primvars, of_vertex = UsdGeom.PrimvarsAPI(shape), UsdGeom.Tokens.vertex
+    if texture is None:
+        colors = linear_from_srgb(mesh.colors).astype(np.float32)
+        primvars.CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, of_vertex).Set(
+            Vt.Vec3fArray.FromNumpy(colors)
+        )
+    else:
+        uv = (texture.atlas.uv * [1.0, -1.0] + [0.0, 1.0]).astype(np.float32)  # from the bottom
+        primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, of_vertex).Set(Vt.Vec2fArray.FromNumpy(uv))
+    if invented is not None:
+        marks = Vt.FloatArray.FromNumpy(invented[source].astype(np.float32))
+        primvars.CreatePrimvar("invented", Sdf.ValueTypeNames.FloatArray, of_vertex).Set(marks)
+    _bind_material(stage, shape, texture is not None)
+    stage.GetRootLayer().Save()
+
+
+def _bind_material(stage: Any, shape: Any, textured: bool) -> None:
+    """Give a mesh a material that emits its texture, or without one the colours of its vertices."""
+    Gf, Sdf, UsdShade = _modules("Gf", "Sdf", "UsdShade")
+    kinds = Sdf.ValueTypeNames
+    material = UsdShade.Material.Define(stage, "/Object/Material")
+
+    def shader(name: str, of: str) -> Any:
+        made = UsdShade.Shader.Define(stage, f"/Object/Material/{name}")
+        made.CreateIdAttr(of)
+        return made
+
+    surface = shader("Surface", "UsdPreviewSurface")
+    surface.CreateInput("diffuseColor", kinds.Color3f).Set(Gf.Vec3f(0.0))
+    surface.CreateInput("useSpecularWorkflow", kinds.Int).Set(1)  # else it would shine at its rims
+    surface.CreateInput("specularColor", kinds.Color3f).Set(Gf.Vec3f(0.0))
+    surface.CreateInput("roughness", kinds.Float).Set(1.0)
+    if textured:
+        reader = shader("Places", "UsdPrimvarReader_float2")
+        reader.CreateInput("varname", kinds.String).Set("st")
+        colors = shader("Colors", "UsdUVTexture")
+        colors.CreateInput("file", kinds.Asset).Set(_PICTURE)
+        colors.CreateInput("sourceColorSpace", kinds.Token).Set("sRGB")
+        for side in ("wrapS", "wrapT"):
+            colors.CreateInput(side, kinds.Token).Set("clamp")
+        places = reader.CreateOutput("result", kinds.Float2)
+        colors.CreateInput("st", kinds.Float2).ConnectToSource(places)
+        emitted = colors.CreateOutput("rgb", kinds.Float3)
+    else:
+        reader = shader("Colors", "UsdPrimvarReader_float3")
+        reader.CreateInput("varname", kinds.String).Set("displayColor")
+        emitted = reader.CreateOutput("result", kinds.Float3)
+    surface.CreateInput("emissiveColor", kinds.Color3f).ConnectToSource(emitted)
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", kinds.Token))
+    UsdShade.MaterialBindingAPI.Apply(shape.GetPrim()).Bind(material)
