@@ -35,8 +35,8 @@ class UsdzExporter(TexturedExporter):
     @classmethod
     def unavailable(cls) -> str | None:
         try:
-            import pxr.UsdShade
-            import pxr.UsdUtils  # noqa: F401
+            import pxr.UsdShade  # pyright: ignore[reportMissingImports]  (an extra)
+            import pxr.UsdUtils  # noqa: F401  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             return f"Pixar's USD library cannot be loaded ({error}); pip install usd-core."
         return super().unavailable()
