@@ -34,6 +34,7 @@ from beags_plugin.system.errors import UserError
 
 MANIFEST = "manifest.json"
 WHOLE = "whole scene"  # the name of the file that holds all Gaussians
+WHOLE_ID = -1  # of no class
 
 
 def export_run(
@@ -92,7 +93,8 @@ def export_run(
         raise UserError(f"objects cannot be closed here: {reason}")
     if closing is not None or any(exporter.needs_views for exporter in exporters.values()):
         views = training_viewpoints(scene.config, raster_settings(scene), config_path)
-    names, titles = list(present) if everything else list(dict.fromkeys(objects)), folder_names(scene.classes)
+    names = list(present) if everything else list(dict.fromkeys(objects))
+    titles = folder_names({**scene.classes, WHOLE_ID: WHOLE})  # an object may be called so too
     metres = None
     if (length := pose.length()) is not None:
         metres = metres_per_unit(length, scene, config_path, frame)
@@ -103,7 +105,7 @@ def export_run(
     )
     items: list[tuple[str, int | None, str]] = [(name, present[name], titles[present[name]]) for name in names]
     if whole:
-        items.append((WHOLE, None, "whole_scene"))
+        items.append((WHOLE, None, file_name(WHOLE)))
     steps = Steps(job.steps(), len(items), progress or (lambda done, total: None))
     exported = [job.export(name, class_id, folder / title, steps) for name, class_id, title in items]
     if everything:

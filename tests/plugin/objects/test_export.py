@@ -26,6 +26,7 @@ from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.ply import read_ply
 from beags_plugin.extraction.select import select_class
+from beags_plugin.plugin.objects import export
 from beags_plugin.plugin.objects.export import export_run
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.system.reading.ply import read_vertices
@@ -281,6 +282,13 @@ def test_extract_and_export_write_the_same_ply(trained, tmp_path):
     main(["extract", "--load-config", str(trained), "--object", "cup", "--output", str(tmp_path / "runs")])
     main(["export", "--load-config", str(trained), "--object", "cup", "--output", str(tmp_path)])
     assert (tmp_path / "cup.ply").read_bytes() == (tmp_path / "runs/cup/cup.ply").read_bytes()
+
+
+def test_an_object_called_as_the_whole_scene_has_a_file_of_its_own(trained, tmp_path, monkeypatch):
+    monkeypatch.setattr(export, "WHOLE", "Cup")
+    main(["export", "--load-config", str(trained), "--object", "cup", "--whole", "--output", str(tmp_path)])
+    counts = {path.name: len(read_vertices(path)) for path in tmp_path.glob("*.ply")}
+    assert counts.keys() == {"Cup.ply", "cup_1.ply"} and counts["Cup.ply"] > counts["cup_1.ply"] > 0
 
 
 def test_mistakes_leave_no_files(trained, tmp_path, capsys):
