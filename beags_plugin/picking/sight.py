@@ -17,6 +17,11 @@ from beags_plugin.rasterizers.rendering import geometry_inputs
 MOST_VIEWS = 64  # more add little: they are for sides and visibility, not for shape
 
 
+def row_dots(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the dot products [M] of the rows of two [M, 3] float64, in one order whatever the number of threads."""
+    return np.einsum("ij,ij->i", one, other)
+
+
 def spread(cameras: Sequence[Camera]) -> Sequence[Camera]:
     """Return at most ``MOST_VIEWS`` of the cameras, evenly spread over their order."""
     return cameras[:: max(1, -(-len(cameras) // MOST_VIEWS))]
@@ -46,7 +51,7 @@ def seen_from(
             keys, values = rasterizer.sparse_class_contributions(inputs, camera, settings, everywhere, 1)
         index, weight = keys.cpu().numpy(), values.double().cpu().numpy()
         towards = camera.host.center.double().cpu().numpy() - means[index]
-        cosine = (towards * normals[index]).sum(axis=1) / np.sqrt((towards**2).sum(axis=1)).clip(1e-12)
+        cosine = row_dots(towards, normals[index]) / np.sqrt(row_dots(towards, towards)).clip(1e-12)
         weights[index] += weight
         sides[index] += weight * cosine
         if progress is not None:
