@@ -51,8 +51,7 @@ class ClosedMesh(GlbExporter):
 
 
 def measure(config_path: Path, objects: Sequence[str]) -> dict[str, np.ndarray]:
-    """Print a row for each object of a run, all if none is named; return their figures [objects, 4] by what they are
-    of."""
+    """Print a row for each object of a run (all, if none is named); return their figures [objects, 4], by kind."""
     from beags_plugin.export.frames import Frame
     from beags_plugin.export.mesh_options import MeshOptions
     from beags_plugin.extraction.ply import read_ply
@@ -65,6 +64,8 @@ def measure(config_path: Path, objects: Sequence[str]) -> dict[str, np.ndarray]:
     sample = json.loads((run.stages["after"].config.data_path / "sample.json").read_text())
     things = {thing.name: thing for thing in FAMILIES[sample["family"]].scene(sample["seed"]).things}
     ids = {name: c for c, name in run.classes.items() if c and (not objects or name in objects)}
+    if not ids:
+        sys.exit(f"{run.name} has no object {' or '.join(objects)}: name one of {', '.join(run.classes.values())}.")
     found: dict[str, list[list[float]]] = {}
     for name, class_id in ids.items():
         with tempfile.TemporaryDirectory() as folder:
@@ -224,6 +225,8 @@ def main() -> None:
     every: dict[str, list[np.ndarray]] = {}
     runs = [path for path in map(Path, sys.argv[1:]) if path.exists()]
     objects = [name for name in sys.argv[1:] if not Path(name).exists()]
+    if not runs:
+        sys.exit(f"there is no run {objects[0]!r}: name its folder or its config.yml.")
     for path in runs:
         for what, rows in measure(path if path.is_file() else path / "config.yml", objects).items():
             every.setdefault(what, []).append(rows)

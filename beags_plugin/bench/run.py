@@ -164,8 +164,7 @@ def _thinned(variants: Sequence[Variant]) -> list[Variant]:
 def scenes_of(experiment: Experiment, options: ExperimentOptions) -> list[TrialScene]:
     """Return the experiment's samples (none by default if the user gives data) and the user's folders.
 
-    A plan writes no sample.
-    Raises ``UserError`` if there are none at all, or fewer samples than asked for.
+    A plan writes no sample. Raises ``UserError`` if there are none at all, or fewer samples than asked for.
     """
     given = given_scenes(options.data, options.downscale)
     count = options.scenes if options.scenes is not None else (0 if given else len(experiment.samples))

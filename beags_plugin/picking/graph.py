@@ -21,7 +21,7 @@ import torch
 
 from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.picking.sight import row_dots
+from beags_plugin.picking.dots import dots
 
 NEIGHBOURS = 10
 LEAST_WEIGHT = 0.3  # pixels over all views: less than this is no part of a surface that anybody sees
@@ -58,9 +58,9 @@ class SurfaceGraph:
         found = chosen.copy()
         for centre, normal in zip(self.centres[chosen], self.normals[chosen], strict=True):
             between = self.centres - centre
-            height = np.abs(row_dots(between, np.broadcast_to(normal, between.shape)))
-            limit = PLANE_HEIGHT * self.spacing + PLANE_SLOPE * np.sqrt(row_dots(between, between))
-            found |= (height < limit) & (row_dots(self.normals, np.broadcast_to(normal, between.shape)) > PLANE_COSINE)
+            height = np.abs(dots(between, normal))
+            limit = PLANE_HEIGHT * self.spacing + PLANE_SLOPE * np.sqrt(dots(between, between))
+            found |= (height < limit) & (dots(self.normals, normal) > PLANE_COSINE)
         return found
 
 
@@ -90,7 +90,7 @@ def surface_graph(surfels: Surfels, seen: np.ndarray, normals: np.ndarray) -> Su
     others = np.setdiff1d(np.arange(len(means)), nodes)
     nearest[others] = tree.query(means[others], workers=threads)[1]
     apart = centres[second] - centres[first]
-    lengths = np.sqrt(row_dots(apart, apart))
+    lengths = np.sqrt(dots(apart, apart))
     spacing = max(float(np.median(lengths)) if len(lengths) else 1.0, 1e-30)
     weights = link_weights(centres / spacing, smooth, colors.clamp(0.0, 1.0).numpy()[nodes], first, second)
     return SurfaceGraph(nodes, nearest, first, second, weights, centres, smooth, spacing)
@@ -104,10 +104,10 @@ def smoothed(normals: np.ndarray, seen: np.ndarray, first: np.ndarray, second: n
     rows = np.concatenate([first, second, np.arange(count)])
     columns = np.concatenate([second, first, np.arange(count)])
     for _ in range(SMOOTHING_ROUNDS):
-        alike = row_dots(normals[first], normals[second]).clip(0.0, 1.0) ** SMOOTHING_POWER
+        alike = dots(normals[first], normals[second]).clip(0.0, 1.0) ** SMOOTHING_POWER
         values = np.concatenate([alike * say[second], alike * say[first], say])
         mixed = np.asarray(csr_array((values, (rows, columns)), shape=(count, count)) @ normals)
-        normals = mixed / np.sqrt(row_dots(mixed, mixed))[:, None].clip(1e-12)
+        normals = mixed / np.sqrt(dots(mixed, mixed))[:, None].clip(1e-12)
     return normals
 
 
@@ -116,11 +116,11 @@ def link_weights(
 ) -> np.ndarray:
     """Return w_ij [P] of links between M Gaussians; centres in units of s, unit normals, colors (0..1): [M, 3]."""
     between = centres[second] - centres[first]
-    lengths = np.sqrt(row_dots(between, between))
+    lengths = np.sqrt(dots(between, between))
     direction = between / lengths.clip(1e-12)[:, None]
-    one, other = (row_dots(normals[each], direction) for each in (first, second))
+    one, other = (dots(normals[each], direction) for each in (first, second))
     change = colors[first] - colors[second]
-    change = row_dots(change, change)
+    change = dots(change, change)
     cost = (
         CONCAVE * (one - other).clip(0) ** 2 + CONVEX * (other - one).clip(0) ** 2 + STEP * (0.5 * (one + other)) ** 2
     )

@@ -11,15 +11,11 @@ import torch
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.picking.dots import dots
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs
 
 MOST_VIEWS = 64  # more add little: they are for sides and visibility, not for shape
-
-
-def row_dots(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the dot products [M] of the rows of two [M, 3] float64, in one order whatever the number of threads."""
-    return np.einsum("ij,ij->i", one, other)
 
 
 def spread(cameras: Sequence[Camera]) -> Sequence[Camera]:
@@ -51,7 +47,7 @@ def seen_from(
             keys, values = rasterizer.sparse_class_contributions(inputs, camera, settings, everywhere, 1)
         index, weight = keys.cpu().numpy(), values.double().cpu().numpy()
         towards = camera.host.center.double().cpu().numpy() - means[index]
-        cosine = row_dots(towards, normals[index]) / np.sqrt(row_dots(towards, towards)).clip(1e-12)
+        cosine = dots(towards, normals[index]) / np.sqrt(dots(towards, towards)).clip(1e-12)
         weights[index] += weight
         sides[index] += weight * cosine
         if progress is not None:

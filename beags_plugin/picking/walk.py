@@ -8,17 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from beags_plugin.picking.dots import dots
 from beags_plugin.picking.graph import FLOOR, SurfaceGraph
 
 LEAK, MORE_LEAK = 2e-3, 5e-2  # beside a link's weight, at most 1; the second on planes of what is beside the object
 TOLERANCE = 1e-4  # of the residual's norm
 MOST_ITERATIONS = 2_000
 LEAST_LEVEL, HIGHEST_LEVEL = 0.1, 0.98  # of a border
-
-
-def dot(one: np.ndarray, other: np.ndarray) -> float:
-    """Return the sum of the products of two [M] float64, added up in one order whatever the number of threads."""
-    return float(np.einsum("i,i->", one, other))
 
 
 class Walker:
@@ -48,18 +44,18 @@ class Walker:
         degree = self._degree - self._links @ excluded.astype(np.float64) + MORE_LEAK * leaking
         p = inside.astype(np.float64)
         residual = np.where(free, self._links @ p, 0.0)
-        goal = TOLERANCE**2 * dot(residual, residual)
+        goal = TOLERANCE**2 * dots(residual, residual)
         scaled = residual / degree
-        direction, rho = scaled, dot(residual, scaled)
+        direction, rho = scaled, dots(residual, scaled)
         for _ in range(MOST_ITERATIONS):
-            if not dot(residual, residual) > goal:
+            if not dots(residual, residual) > goal:
                 break
             image = np.where(free, degree * direction - self._links @ direction, 0.0)
-            step = rho / dot(direction, image)
+            step = rho / dots(direction, image)
             p += step * direction
             residual -= step * image
             scaled = residual / degree
-            rho, former = dot(residual, scaled), rho
+            rho, former = dots(residual, scaled), rho
             direction = scaled + (rho / former) * direction
         return p.clip(0.0, 1.0)
 

@@ -10,32 +10,18 @@ import numpy as np
 import pytest
 
 pytest.importorskip("open3d")
-trimesh = pytest.importorskip("trimesh")
+pytest.importorskip("trimesh")
 pytest.importorskip("pxr", reason="usd-core is not installed (pip install beags[usdz])")
 
 from PIL import Image
 from pxr import Usd, UsdGeom, UsdShade, UsdValidation
+from textured_balls import a_ball, texture_of
 
-from beags_plugin.export.atlas import unwrapped
 from beags_plugin.export.base import make_exporter
 from beags_plugin.export.color import linear_from_srgb
-from beags_plugin.export.fusion import Mesh
 from beags_plugin.export.surface import vertex_normals
-from beags_plugin.export.texture import Texture
 from beags_plugin.export.usdz import usdz_bytes
 from beags_plugin.system.errors import UserError
-
-
-def a_ball() -> Mesh:
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.3)
-    places = np.array(ball.vertices) + [1.0, 2.0, 3.0]
-    colors = np.random.default_rng(0).random((len(places), 3)).astype(np.float32)
-    return Mesh(places, np.array(ball.faces), colors, 0.01)
-
-
-def texture_of(mesh: Mesh) -> Texture:
-    image = np.random.default_rng(0).integers(0, 256, (128, 128, 3), dtype=np.uint8)
-    return Texture(unwrapped(mesh, 128), image, 1.0, np.ones((1, 3)))
 
 
 @pytest.mark.parametrize("textured", [False, True])

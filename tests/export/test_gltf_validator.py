@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 pytest.importorskip("open3d")
-trimesh = pytest.importorskip("trimesh")
+pytest.importorskip("trimesh")
 
-from beags_plugin.export.atlas import unwrapped
+from textured_balls import a_ball, texture_of
+
 from beags_plugin.export.fusion import Mesh
 from beags_plugin.export.glb import glb_bytes
-from beags_plugin.export.texture import Texture
 
 _PROGRAM = """
 const validator = require(process.argv[1]);
@@ -30,7 +30,7 @@ validator.validateBytes(new Uint8Array(require("fs").readFileSync(process.argv[2
 
 @cache
 def validator() -> Path | None:
-    """The folder of Khronos' package: that of GLTF_VALIDATOR, or one that npm has installed for all."""
+    """Return the folder of Khronos' package: that of GLTF_VALIDATOR, or one that npm has installed for all."""
     if named := os.environ.get("GLTF_VALIDATOR"):
         return Path(named).absolute()
     npm = shutil.which("npm")
@@ -48,22 +48,15 @@ VALIDATED = pytest.mark.skipif(
 
 
 def report(path: Path) -> dict:
-    """What the validator says of a file."""
+    """Return what the validator says of a file."""
     command = ["node", "-e", _PROGRAM, str(validator()), str(path)]
     result = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout)
 
 
-def a_ball() -> Mesh:
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.3)
-    places = np.array(ball.vertices) + [1.0, 2.0, 3.0]
-    colors = np.random.default_rng(0).random((len(places), 3)).astype(np.float32)
-    return Mesh(places, np.array(ball.faces), colors, 0.01)
-
-
 def with_slivers(mesh: Mesh) -> Mesh:
-    """The mesh with faces of no area, as decimation may leave them; their vertices have no normal of their own."""
+    """Return the mesh with a face of no area, as decimation may leave one; its vertices have no normal of their own."""
     count = len(mesh.vertices)
     line = np.array([[2.0, 0.0, 0.0], [3.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
     return replace(
@@ -72,11 +65,6 @@ def with_slivers(mesh: Mesh) -> Mesh:
         faces=np.concatenate([mesh.faces, [[count, count + 1, count + 2]]]),
         colors=np.concatenate([mesh.colors, np.zeros((3, 3), np.float32)]),
     )
-
-
-def texture_of(mesh: Mesh) -> Texture:
-    image = np.random.default_rng(0).integers(0, 256, (128, 128, 3), dtype=np.uint8)
-    return Texture(unwrapped(mesh, 128), image, 1.0, np.ones((1, 3)))
 
 
 @VALIDATED
