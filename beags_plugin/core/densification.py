@@ -38,7 +38,7 @@ class DensifyConfig:
     stop: int = 15_000
     """They end before this step."""
     prune_scale_after: int = 3_000
-    """Gaussians larger than a tenth of the scene's extent go after this step."""
+    """Gaussians larger than a tenth of the scene's extent go after this step; 0 keeps them."""
     reset_every: int = 3_000
     """Steps between resets of all opacities to at most 0.01; 0 never."""
     far_limits: bool = False
@@ -66,7 +66,7 @@ class DensifyConfig:
             every=max(steps(self.every, LEAST_EVERY), 1),
             start=steps(self.start),
             stop=steps(self.stop),
-            prune_scale_after=steps(self.prune_scale_after),
+            prune_scale_after=steps(self.prune_scale_after, 1),
             reset_every=steps(self.reset_every, LEAST_RESET_EVERY),
             prune_unseen_every=max(steps(self.prune_unseen_every, LEAST_EVERY), 1),
         )
@@ -165,7 +165,7 @@ def densify(
 
     grown, source = edited.surfels, edited.source
     keep = opacities(grown.opacity_logits) >= PRUNE_OPACITY
-    if step > config.prune_scale_after:
+    if 0 < config.prune_scale_after < step:
         keep &= grown.log_scales.exp().amax(dim=-1) <= PRUNE_SCALE * units[source]
     return edited.only(keep)
 

@@ -111,6 +111,8 @@ def test_faint_surfels_go_at_once_and_huge_ones_after_the_given_step():
     surfels = scene([SMALL, HUGE, MIDDLE], [0.04, 0.5, 0.5])
     assert run(surfels, [LOW] * 3, step=CONFIG.prune_scale_after).source.tolist() == [1, 2]
     assert run(surfels, [LOW] * 3, step=CONFIG.prune_scale_after + 1).source.tolist() == [2]
+    never = replace(CONFIG, prune_scale_after=0)
+    assert run(surfels, [LOW] * 3, config=never, step=CONFIG.prune_scale_after + 1).source.tolist() == [1, 2]
 
 
 def test_far_surfels_are_measured_by_the_distance_of_the_nearest_camera():

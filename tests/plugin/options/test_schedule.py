@@ -97,8 +97,10 @@ def test_a_shorter_run_has_the_same_proportions_but_no_shorter_intervals_than_it
         1000,
         300,
     )
-    never = DensifyConfig(reset_every=0, every=30).scaled(0.1)
-    assert (never.reset_every, never.every) == (0, 30)  # what is stated shorter than the bound stays as stated
+    never = DensifyConfig(reset_every=0, prune_scale_after=0, every=30).scaled(0.1)
+    # what is stated shorter than the bound stays as stated
+    assert (never.reset_every, never.prune_scale_after, never.every) == (0, 0, 30)
+    assert DensifyConfig(prune_scale_after=3).scaled(0.1).prune_scale_after == 1  # 0 would be never
 
 
 def test_stated_steps_are_scaled_with_the_length_of_the_base():
