@@ -24,6 +24,9 @@ from beags_plugin.system.errors import UserError
 TAU = 0.02
 """The object is hidden where its depth z and the scene's D have z > (1 + TAU) D; as in reprojection (E5)."""
 
+EDGE = 3
+"""Voxels of the 27 around a point that a plane fills which ends one voxel before it; up to its edge it fills 6."""
+
 SLACK = 0.4
 """Of a pixel next to another class, which may be covered in part; as in the boundary loss of our presets."""
 
@@ -39,7 +42,8 @@ class SilhouetteLoss(Loss):
         a render of its Gaussians.
     seen: near a contact the object below goes on behind the other one, too close for TAU. Pixels of other objects do
         not count where the rendered surface lies behind what the scene shows and D_occ >= seen there (method, section
-        5): that many of the 27 voxels around it were seen as this object's. A plane fills 9. 0: they all count.
+        5): that many of the 27 voxels around it were seen as this object's. A plane fills 9. Nor where there are
+        ``EDGE`` of them and no more of the other object's. 0: they all count.
     """
 
     needs: ClassVar[frozenset[str]] = frozenset({"geometry"})
@@ -89,18 +93,20 @@ class SilhouetteLoss(Loss):
         outside = known & ~inside & ~hidden
         if self.seen > 0:
             of_others = outside & (inputs.labels != 0) & (alone.alpha.detach() > 0) & (depth > shown)
-            outside &= ~self._seen_from_elsewhere(of_others, depth, class_id, inputs)
+            outside &= ~self._own_surface(of_others, depth, class_id, inputs)
         wrong = torch.where(inside, 1.0 - alone.alpha, torch.where(outside, alone.alpha, 0.0))
         return ordered_sum(beyond_slack(wrong, inputs.labels, SLACK))
 
-    def _seen_from_elsewhere(self, asked: Tensor, depth: Tensor, class_id: int, inputs: LossInputs) -> Tensor:
-        """Return the pixels of ``asked`` at whose ``depth`` [H, W] some view saw the object, both [H, W] bool."""
-        if inputs.grid is None:
-            raise ValueError("the silhouette loss needs a visibility grid where seen > 0")
+    def _own_surface(self, asked: Tensor, depth: Tensor, class_id: int, inputs: LossInputs) -> Tensor:
+        """Return the pixels of ``asked`` at whose ``depth`` [H, W] the object's surface goes on, both [H, W] bool."""
+        if inputs.grid is None or inputs.labels is None:
+            raise ValueError("the silhouette loss needs labels and a visibility grid where seen > 0")
         points = lift(depth, inputs.camera).reshape(-1, 3)
         # All pixels, as a GPU would have to say how many are chosen; of those that are not, no voxel is read.
         ids = torch.where(asked, class_id, IGNORE).int().reshape(-1)
-        return (inputs.grid.count(points, ids) >= self.seen).view_as(asked)
+        others = torch.where(asked, inputs.labels, IGNORE).int().reshape(-1)
+        own, other = inputs.grid.count(points, ids), inputs.grid.count(points, others)
+        return ((own >= self.seen) | (own >= other.clamp_min(EDGE))).view_as(asked)
 
 
 def _chosen(count: int, wanted: int, seed: int, step: int) -> list[int]:

@@ -30,8 +30,8 @@ class LossSpec:
     options: dict[str, bool | int | float] = field(default_factory=dict)
     """Of the loss itself. boundary: slack, how much of another class costs nothing at pixels next to it, 0 as in the
     paper. occupancy: samples, points per Gaussian and step (Z); background, the share of the weight on
-    the background's Gaussians, 1 as in the paper. silhouette: objects, how many are rendered each step; seen, how many
-    of the 27 voxels around what another object covers must have been seen for that pixel to count, 0 for every pixel.
+    the background's Gaussians, 1 as in the paper. silhouette: objects, how many are rendered each step; seen, of the 27
+    voxels around what another object covers how many seen as the object's own make that pixel not count, 0 for never.
     """
 
     def build(self, name: str, schedule: PhaseSchedule) -> Loss:
