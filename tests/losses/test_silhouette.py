@@ -116,6 +116,31 @@ def test_surface_that_was_seen_as_the_objects_does_not_count_where_another_objec
         SilhouetteLoss(seen=3).value(replace(inputs, grid=None))
 
 
+def test_surface_does_not_count_either_where_more_was_seen_of_it_than_of_what_covers_it():
+    surfels, labels = scene([3.0, 2.98]), columns((1, 8), (2, 6), (0, 10))
+    alone = draw(surfel_inputs(surfels[torch.tensor([0])], CAMERA), CAMERA)
+    points = lift(alone.depth, CAMERA)
+    shown = alone.alpha > 0
+    beside = points[:, 10:12][shown[:, 10:12]]
+    layers = [beside + torch.tensor([x, y, z]) for x in (-0.05, 0.05) for y in (-0.05, 0.05) for z in (-0.1, 0.1)]
+    clouds = [(points[shown], 1.0), (torch.cat(layers), 2.0)]  # more of the second in a part
+    together = [(torch.cat([c for c, _ in clouds]), torch.cat([torch.full((len(c),), i) for c, i in clouds]))]
+    grid = VisibilityGrid.from_points(together, 0.1, torch.full((3,), 0.05), 3)
+    inputs = replace(inputs_of(surfels, [1, 2], labels), grid=grid)
+    own, other = (
+        grid.count(points.view(-1, 3), torch.full((SIZE * SIZE,), i, dtype=torch.int32)).view(SIZE, SIZE)
+        for i in (1, 2)
+    )
+    depth = torch.where(alone.median_depth > 0, alone.median_depth, alone.depth)
+    asked = (labels == 2) & shown & (depth > inputs.render.median_depth)
+    free = asked & (own >= silhouette.EDGE) & (own >= other)
+    assert bool(free.any()) and bool((asked & (own >= silhouette.EDGE) & (own < other)).any())
+    second = counted(draw(surfel_inputs(surfels[torch.tensor([1])], CAMERA), CAMERA).alpha, labels, 2).sum()
+    found = SilhouetteLoss(objects=2, seen=27).value(inputs)  # never by the object's own voxels alone
+    expected = counted(alone.alpha, labels, 1)[~free].sum() + second
+    assert float(found) == pytest.approx(float(expected) / SIZE**2, rel=1e-5)
+
+
 def test_gradients_reach_the_shape_and_the_object_alone():
     surfels = scene([3.0, 3.2])
     names = ("means", "quats", "log_scales", "opacity_logits")
