@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from beags_plugin.system.errors import UserError
@@ -11,7 +12,9 @@ from beags_plugin.system.errors import UserError
 METRES = {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254, "ft": 0.3048}
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _POINT = rf"(?:[^\s:][^:]*:{_NUMBER},{_NUMBER}|{_NUMBER},{_NUMBER},{_NUMBER})"
-_SCALE = re.compile(rf"\s*({_POINT})\s+({_POINT})\s+({_NUMBER})\s*({'|'.join(METRES)})\s*")
+_LENGTH = rf"({_NUMBER})\s*({'|'.join(METRES)})"
+_SCALE = re.compile(rf"\s*({_POINT})\s+({_POINT})\s+{_LENGTH}\s*")
+_DIGITS = 4  # after the first one of the distance between two points, of their coordinates
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,26 @@ class PoseOptions:
         if not 0 < metres < math.inf:
             raise UserError(f"scale_by is {self.scale_by!r}: the length must be above 0.")
         return KnownLength(_point(first), _point(second), metres)
+
+
+def check_length(text: str) -> tuple[str, str]:
+    """Return number and unit of a text such as 12 cm; raises ``UserError`` for another one."""
+    match = re.fullmatch(rf"\s*{_LENGTH}\s*", text)
+    if match is None or not 0 < float(match[1]) * METRES[match[2]] < math.inf:
+        *some, last = METRES
+        raise UserError(f"{text.strip()!r} is no length: give one such as 12 cm, in {', '.join(some)} or {last}.")
+    return match[1], match[2]
+
+
+def scale_by_text(first: Sequence[float], second: Sequence[float], length: str) -> str:
+    """Return the text of ``scale_by`` for two places [3] of the input's world that are apart.
+
+    length: such as 12 cm. Raises ``UserError`` for another text.
+    """
+    number, unit = check_length(length)
+    digits = max(0, _DIGITS - math.floor(math.log10(math.dist(first, second))))
+    a, b = (",".join(f"{round(x, digits) + 0.0:.{digits}f}" for x in point) for point in (first, second))
+    return f"{a} {b} {number} {unit}"
 
 
 def _point(text: str) -> Point:

@@ -20,7 +20,8 @@ from beags_plugin.losses.photometric import psnr, ssim
 from beags_plugin.plugin.options.model_options import fixed_background
 from beags_plugin.plugin.training.callbacks import training_callbacks
 from beags_plugin.plugin.training.scene_model import LastRender, SceneModel
-from beags_plugin.plugin.viewer.panel import ObjectPanel, ViewerLink
+from beags_plugin.plugin.viewer.link import ViewerLink
+from beags_plugin.plugin.viewer.panel import ObjectPanel
 from beags_plugin.plugin.viewer.viewing import Viewing, asked_by_viewer, scene_outputs
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.objects_alone import of_objects, where_known

@@ -9,7 +9,7 @@ import torch
 from random_surfels import a_rotation
 
 from beags_plugin.export.frames import Frame
-from beags_plugin.export.pose_options import KnownLength, PhotoPoint, PoseOptions
+from beags_plugin.export.pose_options import KnownLength, PhotoPoint, PoseOptions, scale_by_text
 from beags_plugin.export.standing import standing_plane, turn_to_z
 from beags_plugin.system.errors import UserError
 
@@ -22,6 +22,17 @@ def test_lengths_are_read():
     assert found.metres == pytest.approx(3.5 * 0.0254)
     assert PoseOptions().length() is None and PoseOptions(up="0, 0,-1").direction() == (0, 0, -1)
     assert PoseOptions(up="plane").direction() is None
+
+
+@pytest.mark.parametrize("origin", [0.0, 512_345.678])
+@pytest.mark.parametrize("size", [0.003, 1.0, 40.0])
+def test_the_text_of_two_places_is_read_as_they_are(origin, size):
+    first, second = (origin, -1e-9 * size, 0.2), (origin + 0.6 * size, 0.8 * size, 0.2)
+    text = scale_by_text(first, second, " 12cm ")
+    assert "-0.0" not in text and text.endswith(" 12 cm")
+    found = PoseOptions(scale_by=text).length()
+    assert found is not None and found.metres == pytest.approx(0.12)
+    assert math.dist(found.first, found.second) == pytest.approx(size, rel=2e-4)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

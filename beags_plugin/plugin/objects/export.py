@@ -11,7 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.export.base import ExportItem, make_exporter
+from beags_plugin.export.base import Exporter, ExportItem, make_exporter
 from beags_plugin.export.frames import Frame, check_placement
 from beags_plugin.export.mesh import open3d_missing
 from beags_plugin.export.mesh_options import MeshOptions
@@ -81,11 +81,7 @@ def export_run(
             f"nothing to export is named: use --all, --whole, or --object with one of {', '.join(present)}."
         )
     for name, exporter in exporters.items():
-        if exporter.needs_metres and not pose.scale_by:
-            raise UserError(
-                f"a .{name} file is in millimetres, but the size of the scene is not known: give a length with "
-                '--scale-by, such as "frame_0012:340,215 frame_0012:512,220 12 cm".'
-            )
+        _check_size(name, exporter, pose, 'with --scale-by, such as "frame_0012:340,215 frame_0012:512,220 12 cm".')
     transform = read_transform(run)
     frame = Frame.of_run() if transform is None else Frame(*transform)
     views = None
@@ -97,7 +93,7 @@ def export_run(
     titles = folder_names({**scene.classes, WHOLE_ID: WHOLE})  # an object may be called so too
     metres = None
     if (length := pose.length()) is not None:
-        metres = metres_per_unit(length, scene, config_path, frame)
+        metres = metres_per_unit(length, config_path, frame, scene)
     shown = Shown(scene, config_path)
     cleaner = None if keep_all or not any(map(present.get, names)) else shown.cleaner()
     job = ExportJob(
@@ -130,27 +126,42 @@ def export_shown(
     format_name: str,
     settings: RasterSettings,
     progress: Progress = lambda done, total: None,
+    scale_by: str = "",
 ) -> Path:
     """Write Gaussians that a viewer shows into ``exports/`` of the run, without replacing a file; return the path.
 
     config_path: config.yml of the run. surfels: M of its frame. class_ids: [M] int32. title: file name before the
-    suffix. settings: depth range of the scene. progress: receives (done, total) rendered views of a mesh. Raises
-    ``UserError`` if nothing is shown, for an unknown format, or a file that cannot be written.
+    suffix. settings: depth range of the scene. progress: receives (done, total) rendered views of a mesh. scale_by: see
+    ``PoseOptions``. Raises ``UserError`` if nothing is shown, for an unknown format, one whose files have a size where
+    that is not known, or a file that cannot be written.
     """
-    exporter = make_exporter(format_name)
+    exporter, pose = make_exporter(format_name), PoseOptions(scale_by=scale_by)
+    _check_size(format_name, exporter, pose, "in the tab Size.")
     if len(surfels) == 0:
         raise UserError("nothing is shown, so there is nothing to export: show an object, or lower the least opacity.")
     transform = read_transform(config_path.parent)
     frame = Frame.of_run() if transform is None else Frame(*transform)
+    if (length := pose.length()) is not None:
+        frame = frame.scaled(metres_per_unit(length, config_path, frame))
     views = None
     if exporter.needs_views:
         views = frame.views(training_viewpoints(open_run(config_path), settings, config_path))
     path = _free_path(config_path.parent / "exports", title, exporter.suffix)
     total = 0 if views is None else len(views.cameras)
-    exporter.write(
-        path, ExportItem(title, frame.surfels(surfels), class_ids, views, on_render=lambda done: progress(done, total))
-    )
+    item = ExportItem(
+        title, frame.surfels(surfels), class_ids, views, on_render=lambda done: progress(done, total),
+        in_metres=bool(scale_by),
+    )  # fmt: skip
+    exporter.write(path, item)
     return path
+
+
+def _check_size(name: str, exporter: Exporter, pose: PoseOptions, how: str) -> None:
+    """Raise ``UserError`` if a format's files have a size and the scene has none; how: a length is given."""
+    if exporter.needs_metres and not pose.scale_by:
+        raise UserError(
+            f"a .{name} file is in millimetres, but the size of the scene is not known: give a length {how}"
+        )
 
 
 def _free_path(folder: Path, title: str, suffix: str) -> Path:

@@ -17,7 +17,7 @@ from beags_plugin.export.pose_options import KnownLength, PhotoPoint, Point
 from beags_plugin.export.standing import Plane, standing_plane
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.plugin.objects.shown import ShownScene
-from beags_plugin.plugin.runs.read import SavedScene, data_of_run, raster_settings
+from beags_plugin.plugin.runs.read import SavedScene, data_of_run, raster_settings, read_run
 from beags_plugin.plugin.views.datamanager import BeagsDataManager, Split
 from beags_plugin.plugin.views.dataset import BeagsDataset
 from beags_plugin.plugin.views.views import unique_names
@@ -57,13 +57,15 @@ def plane_under(name: str, part: Surfels, class_id: int, shown: ShownScene, fram
     return plane
 
 
-def metres_per_unit(length: KnownLength, scene: SavedScene, config_path: Path, world: Frame) -> float:
+def metres_per_unit(length: KnownLength, config_path: Path, world: Frame, scene: SavedScene | None = None) -> float:
     """Return how many metres a unit of ``world`` is, by a known length in it.
 
-    Raises ``UserError`` for a photo or pixel that is not there, or points that coincide.
+    scene: of the run, which is read if photos need it and it is None. Raises ``UserError`` for a photo or pixel that is
+    not there, or points that coincide.
     """
     manager = None
     if any(isinstance(point, PhotoPoint) for point in (length.first, length.second)):
+        scene = scene or read_run(config_path)
         manager = data_of_run(scene.config, config_path, split="test")
     first, second = (_place(point, scene, manager, world) for point in (length.first, length.second))
     apart = float((first - second).norm())
@@ -72,11 +74,11 @@ def metres_per_unit(length: KnownLength, scene: SavedScene, config_path: Path, w
     return length.metres / apart
 
 
-def _place(point: Point, scene: SavedScene, manager: BeagsDataManager | None, world: Frame) -> Tensor:
+def _place(point: Point, scene: SavedScene | None, manager: BeagsDataManager | None, world: Frame) -> Tensor:
     """Return the place [3] float64 of a point in ``world``."""
     if not isinstance(point, PhotoPoint):
         return torch.tensor(point, dtype=torch.float64)
-    assert manager is not None
+    assert scene is not None and manager is not None
     camera, x, y = _pixel(point, manager)
     surfels = scene.surfels().detach()
     render = make_rasterizer(scene.config.model_config.rasterizer).rasterize(

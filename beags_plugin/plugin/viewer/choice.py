@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -60,6 +61,13 @@ class Choice:
         if class_id in self.removed or class_id in self.hidden:
             return False
         return self.isolated is None or self.isolated == class_id
+
+    def title(self, names: Mapping[int, str]) -> str:
+        """Return the shown part in a few words, for a file's name; names: of the classes that have Gaussians."""
+        if self.isolated is not None:
+            return f"shown_{names.get(self.isolated, f'class_{self.isolated}')}"
+        away = [name for class_id, name in names.items() if not self.in_full(class_id)]
+        return f"shown_without_{'_'.join(away[:3])}" if away else "shown_scene"
 
     @property
     def of_classes(self) -> bool:

@@ -17,7 +17,8 @@ class ShownFiles:
     """Writer of the part that ``viewing`` shows, in a thread of its own, one file at a time.
 
     title, format_name: return the file's name and its format. report: receives sentences on the progress. part: returns
-    the Gaussians of the file; what is shown in full, if None.
+    the Gaussians of the file; what is shown in full, if None. scale_by: returns what gives it a size: see
+    ``PoseOptions``.
     """
 
     def __init__(
@@ -27,11 +28,13 @@ class ShownFiles:
         format_name: Callable[[], str],
         report: Callable[[str], None],
         part: Callable[[], Visible] | None = None,
+        scale_by: Callable[[], str] = str,
     ) -> None:
         self._viewing = viewing
         self._part = part or (lambda: viewing.copy(rest=False))
         self._title = title
         self._format_name = format_name
+        self._scale_by = scale_by
         self._report = report
         self._busy = threading.Lock()
 
@@ -45,7 +48,8 @@ class ShownFiles:
 
     def _write_and_report(self) -> None:
         try:
-            message = f"Exported to {self.write()}"
+            scale_by = self._scale_by()
+            message = f"Exported to {self.write(scale_by)}{', to scale.' if scale_by else ''}"
         except UserError as error:
             message = f"Not exported: {error}"
         except Exception as error:  # nobody else sees an exception of a thread
@@ -54,8 +58,8 @@ class ShownFiles:
             self._busy.release()
         self._report(message)
 
-    def write(self) -> Path:
-        """Write the part; return the file. Raises ``UserError``."""
+    def write(self, scale_by: str = "") -> Path:
+        """Write the part, in the size that ``scale_by`` gives it; return the file. Raises ``UserError``."""
         from beags_plugin.plugin.objects.export import export_shown
 
         viewing = self._viewing
@@ -66,7 +70,7 @@ class ShownFiles:
         with torch.no_grad():
             return export_shown(
                 config_path, scene.surfels, scene.class_ids, self._title(), self._format_name(),
-                viewing.model.settings(), self.report_views,
+                viewing.model.settings(), self.report_views, scale_by,
             )  # fmt: skip
 
     def report_views(self, done: int, total: int) -> None:

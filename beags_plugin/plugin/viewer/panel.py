@@ -20,15 +20,19 @@ from nerfstudio.viewer.viewer_elements import (
 )
 
 from beags_plugin.export import EXPORTERS
+from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.plugin.viewer.aim import frame_of, look, look_as, side_of_photos
+from beags_plugin.plugin.viewer.clicks import SceneClicks
 from beags_plugin.plugin.viewer.export import ShownFiles
 from beags_plugin.plugin.viewer.legend import LegendRow, escaped, legend, unique_labels
 from beags_plugin.plugin.viewer.pick_tab import PickTab
 from beags_plugin.plugin.viewer.pick_work import take_picked
-from beags_plugin.plugin.viewer.picking import pick
+from beags_plugin.plugin.viewer.picking import under_cursor
 from beags_plugin.plugin.viewer.serving import end_when_interrupted, first_folder, offer_whole_pictures, set_pace
+from beags_plugin.plugin.viewer.size_tab import SizeTab
 from beags_plugin.plugin.viewer.viewed_run import ViewedRun
 from beags_plugin.plugin.viewer.viewing import NO_CLASSES, Viewing
+from beags_plugin.system.errors import UserError
 
 if TYPE_CHECKING:
     from nerfstudio.data.scene_box import OrientedBox
@@ -37,19 +41,6 @@ if TYPE_CHECKING:
 
 NONE = "none yet"  # the drop-down's entry while no Gaussian has a class: it must have one
 REFRESH_SECONDS = 0.3  # how often the panel follows what the scene and the render threads have changed
-
-
-class ViewerLink(ViewerControl):
-    """Passes nerfstudio's viewer, once there is one, and clicks on the picture to the panel."""
-
-    viewer: Viewer | None = None
-
-    def __init__(self, panel: ObjectPanel) -> None:
-        self.panel = panel
-
-    def _setup(self, viewer: Viewer) -> None:
-        super()._setup(viewer)
-        self.panel.attach(viewer, self)
 
 
 class ObjectPanel(ViewerElement[None]):
@@ -66,10 +57,12 @@ class ObjectPanel(ViewerElement[None]):
         self.counts: dict[int, int] = {}
         self.notes: dict[str, str] = {}
         self.viewer: Viewer | None = None
-        self._link: ViewerLink | None = None
+        self._link: ViewerControl | None = None
         self._listening = False
         self._server: ViserServer | None = None
+        self.clicks: SceneClicks | None = None
         self.pick_tab: PickTab | None = None
+        self.size_tab: SizeTab | None = None
         self._legend: Any = None
         self._status: Any = None
         self._counted: tuple | None = None
@@ -88,7 +81,10 @@ class ObjectPanel(ViewerElement[None]):
             hint="Weaker Gaussians are left out",
         )  # fmt: skip
         self.next_click = ViewerButton("Pick with the next click", lambda _: self.listen(not self._listening))
-        self.files = ShownFiles(viewing, self.title, lambda: self.format.value, lambda text: self.note("export", text))
+        self.files = ShownFiles(
+            viewing, self.title, lambda: self.format.value, lambda text: self.note("export", text),
+            scale_by=self._scale_by,
+        )  # fmt: skip
         formats = EXPORTERS.names()
         self.format = ViewerDropdown("Format", "ply" if "ply" in formats else formats[0], formats)
         self.export = ViewerButton("Export what is shown", lambda _: self.files.start())
@@ -115,7 +111,7 @@ class ObjectPanel(ViewerElement[None]):
     def _create_gui_handle(self, viser_server: ViserServer) -> None:
         raise NotImplementedError("this element has no handle of its own")
 
-    def attach(self, viewer: Viewer, link: ViewerLink) -> None:
+    def attach(self, viewer: Viewer, link: ViewerControl) -> None:
         """Begin work with a viewer that has installed the panel."""
         self.viewer, self._link = viewer, link
         run = ViewedRun(Path(viewer.log_filename).parent.absolute(), viewer.pipeline.datamanager)  # type: ignore[arg-type]
@@ -123,8 +119,11 @@ class ObjectPanel(ViewerElement[None]):
             self.note("picked", damaged)
         self.viewing.attach(run, viewer.trainer is not None, viewer.train_lock)
         self.viewing.wanted, self.viewing.crop_box = self._wanted, self._crop_box
-        if viewer.trainer is None and self._server is not None:  # Gaussians that are trained have no fixed numbers
-            self.pick_tab = PickTab(self._server, self.viewing, self._listed, self._redraw)
+        if self._server is not None:
+            self.clicks = clicks = SceneClicks(self._server)
+            if viewer.trainer is None:  # Gaussians that are trained have no fixed numbers
+                self.pick_tab = PickTab(self._server, self.viewing, self._listed, self._redraw, clicks, self._scale_by)
+            self.size_tab = SizeTab(self._server, self.viewing, clicks)
         if run.note is not None:
             self.note("run", run.note)
         offer_whole_pictures(viewer.control_panel)
@@ -203,40 +202,22 @@ class ObjectPanel(ViewerElement[None]):
     def clicked(self, click: ViewerClick) -> None:
         """Choose the object under the cursor, and listen no longer."""
         self.listen(False)
-        self.note("object", self._pick(click))
-
-    def _pick(self, click: ViewerClick) -> str:
-        viewing, model = self.viewing, self.viewing.model
-        if not viewing.lock.acquire(timeout=5.0):
-            return "The scene is busy: click again."
         try:
-            scene = viewing.shown()
-            found = pick(model.rasterizer, scene.surfels, model.settings(), click.origin, click.direction)
-            if found is None:
-                return "Nothing is shown there."
-            index = found if scene.index is None else int(scene.index[found])
-            picked = int(scene.class_ids[found])
-            margin = float(model.class_margin[index])
-        finally:
-            viewing.lock.release()
-        if not bool(model.assigned):
-            return f"Gaussian {index}; {NO_CLASSES}"
-        label = next((label for label, class_id in self.labels.items() if class_id == picked), None)
-        if label is None:
-            return f"Gaussian {index} of class {picked}, which has no name."
-        if picked != 0:
+            found = under_cursor(self.viewing, click.origin, click.direction)
+        except UserError as error:
+            self.note("object", f"{str(error)[:1].upper()}{str(error)[1:]}")
+            return
+        label = next((label for label, class_id in self.labels.items() if class_id == found.class_id), None)
+        if label is not None and found.class_id != BACKGROUND:
             self.object.value = label
-        what = "background: nothing chosen" if picked == 0 else f"Picked: {label}"
-        return f"{what} (Gaussian {index}, {margin:.0%} of its weight)."
+        self.note("object", found.sentence(label))
+
+    def _scale_by(self) -> str:
+        return "" if self.size_tab is None else self.size_tab.scale_by()
 
     def title(self) -> str:
         """Return the shown part in a few words, for a file's name."""
-        names = {class_id: label for label, class_id in self.labels.items()}
-        choice = self.viewing.choice
-        if choice.isolated is not None:
-            return f"shown_{names.get(choice.isolated, f'class_{choice.isolated}')}"
-        away = [name for class_id, name in names.items() if not choice.in_full(class_id)]
-        return f"shown_without_{'_'.join(away[:3])}" if away else "shown_scene"
+        return self.viewing.choice.title({class_id: label for label, class_id in self.labels.items()})
 
     # -- following the scene -------------------------------------------------------------------------------------------
 

@@ -6,47 +6,40 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from beags_plugin.export import EXPORTERS
 from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.picking.cutter import ViewMarks
+from beags_plugin.plugin.viewer.clicks import SceneClicks
 from beags_plugin.plugin.viewer.export import ShownFiles
 from beags_plugin.plugin.viewer.legend import LegendRow, escaped, legend, unique_labels
 from beags_plugin.plugin.viewer.pick_work import FIRST_COLOR, PickWork
 from beags_plugin.plugin.viewer.pointing import box_mark, click_mark, page_camera
-from beags_plugin.plugin.viewer.serving import another_tab
+from beags_plugin.plugin.viewer.serving import another_tab, by_user
 from beags_plugin.plugin.viewer.viewing import Viewing
 
 if TYPE_CHECKING:
     from viser import SceneNodePointerEvent, ScenePointerEvent, ViserServer
 
-_AROUND = "/beags_picking"  # name of the box around the scene that takes clicks
-_FAR = 1e4  # viser's units: half of its side, beyond what a page draws
 _OF_RUN = "{} (of the run)"  # an object that can be corrected
-_INSIDES = [
-    (0, 3, 1), (0, 2, 3), (4, 5, 7), (4, 7, 6), (0, 1, 5), (0, 5, 4),
-    (2, 7, 3), (2, 6, 7), (0, 6, 2), (0, 4, 6), (1, 3, 7), (1, 7, 5),
-]  # fmt: skip
-"""Triangles of a cube whose corners are in binary order, seen from inside: an outline for the mouse shows nothing."""
 _HELP = "Tick Click to pick, and click on an object; the mouse still turns the camera."
 
 
 class PickTab:
     """Controls that say what the next click on the picture means, and what becomes of what has been picked.
 
-    labels: returns the run's objects that have Gaussians, label to class id. redraw: asks for new pictures.
+    labels: returns the run's objects that have Gaussians, label to class id. redraw: asks for new pictures. clicks: on
+    the picture. scale_by: of exported files: see ``PoseOptions``.
     """
 
     def __init__(
-        self, server: ViserServer, viewing: Viewing, labels: Callable[[], dict[str, int]], redraw: Callable[[], None]
-    ) -> None:
+        self, server: ViserServer, viewing: Viewing, labels: Callable[[], dict[str, int]], redraw: Callable[[], None],
+        clicks: SceneClicks, scale_by: Callable[[], str],
+    ) -> None:  # fmt: skip
         self.server = server
         self.viewing = viewing
         self.note = _HELP
         self._labels = labels
         self._redraw = redraw
-        self._around: Any = None
         self._boxing = False
         self._entries: dict[str, tuple[str, int]] = {}
         self._text = ""
@@ -68,37 +61,24 @@ class PickTab:
             self.export = gui.add_button("Export the picked object")
             self.masks = gui.add_button("Save as masks", hint="Of all objects, for the training views")
             self.keep = gui.add_button("Keep in the run", hint="As its objects, for every command")
-        self.files = ShownFiles(viewing, self._title, lambda: self.format.value, self.report, self.work.part)
+        self.files = ShownFiles(viewing, self._title, lambda: self.format.value, self.report, self.work.part, scale_by)
+        clicks.offer(self.clicks, self.clicked)
         self._listen()
         self.refresh()
 
     def _listen(self) -> None:
-        self.picked.on_update(_by_user(lambda: self._choose(self.picked.value)))
-        self.name.on_update(_by_user(lambda: self._rename(self.name.value)))
+        self.picked.on_update(by_user(lambda: self._choose(self.picked.value)))
+        self.name.on_update(by_user(lambda: self._rename(self.name.value)))
         self.new.on_click(lambda _: self.work.change(lambda picks: picks.another()))
-        self.clicks.on_update(lambda _: self.take_clicks(self.clicks.value))
         self.box.on_click(lambda _: self.take_box(not self._boxing))
         self.size.on_click(lambda event: self._grow({"Grow": 1, "Shrink": -1}[event.target.value]))
         self.undo.on_click(lambda _: self.work.undo())
-        self.alone.on_update(_by_user(lambda: self.work.show_alone(self.alone.value)))
+        self.alone.on_update(by_user(lambda: self.work.show_alone(self.alone.value)))
         self.export.on_click(lambda _: self.files.start())
         self.masks.on_click(lambda _: self.work.save_masks())
         self.keep.on_click(lambda _: self.work.keep())
 
     # -- pointing ----------------------------------------------------------------------------------------------------
-
-    def take_clicks(self, wanted: bool) -> None:
-        """Begin or end to take clicks on the picture: a box around the scene does, seen from inside by nobody."""
-        if wanted == (self._around is not None):
-            return
-        if not wanted:
-            self._around.remove()
-            self._around = None
-            return
-        corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
-        faces = np.array(_INSIDES, np.uint32)
-        self._around = self.server.scene.add_mesh_simple(_AROUND, _FAR * corners, faces, opacity=0.0)
-        self._around.on_click(self.clicked)
 
     def clicked(self, event: SceneNodePointerEvent) -> None:
         """Mark what is under the cursor."""
@@ -199,13 +179,3 @@ class PickTab:
             with suppress(KeyError):
                 self._status.content = text
             self._text = text
-
-
-def _by_user(listener: Callable[[], None]) -> Callable[[Any], None]:
-    """Return a listener that leaves alone what the program itself has written to a control."""
-
-    def heard(event: Any) -> None:
-        if event.client_id is not None:
-            listener()
-
-    return heard

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.class_ids import BACKGROUND
+from beags_plugin.plugin.viewer.viewing import NO_CLASSES, Viewing
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs
+from beags_plugin.system.errors import UserError
 
+PATIENCE = 5.0  # seconds that a click waits for the scene
+BUSY = "the scene is busy: click again."
 _FOCAL = 1000.0  # of the one rendered pixel: about that of a full-screen view, so that it is as sharp
 
 
@@ -47,3 +53,40 @@ def pick(
     camera = camera_along(origin, direction).to(surfels.means.device)
     index = int(rasterizer.dominant_gaussian(geometry_inputs(surfels), camera, settings)[0, 0])
     return None if index < 0 else index
+
+
+@dataclass(frozen=True)
+class UnderCursor:
+    """A Gaussian under the cursor: its index in the scene, its class, None before the scene has any, and the margin by
+    which it has it.
+    """
+
+    index: int
+    class_id: int | None
+    margin: float
+
+    def sentence(self, label: str | None) -> str:
+        """Return what a panel says of it; label: of its class, None without a name."""
+        if self.class_id is None:
+            return f"Gaussian {self.index}; {NO_CLASSES}"
+        if label is None:
+            return f"Gaussian {self.index} of class {self.class_id}, which has no name."
+        what = "background: nothing chosen" if self.class_id == BACKGROUND else f"Picked: {label}"
+        return f"{what} (Gaussian {self.index}, {self.margin:.0%} of its weight)."
+
+
+def under_cursor(viewing: Viewing, origin: Sequence[float], direction: Sequence[float]) -> UnderCursor:
+    """Return what a viewer shows along a ray; raises ``UserError`` if that is nothing, or the scene is busy."""
+    model = viewing.model
+    if not viewing.lock.acquire(timeout=PATIENCE):
+        raise UserError(BUSY)
+    try:
+        scene = viewing.shown()
+        found = pick(model.rasterizer, scene.surfels, model.settings(), origin, direction)
+        if found is None:
+            raise UserError("nothing is shown there.")
+        index = found if scene.index is None else int(scene.index[found])
+        class_id = int(scene.class_ids[found]) if bool(model.assigned) else None
+        return UnderCursor(index, class_id, float(model.class_margin[index]))
+    finally:
+        viewing.lock.release()

@@ -26,14 +26,19 @@ _DIAGONAL = 1000.0  # pixels of a page, whatever its size: marks are as large as
 _LEAST_SIDE = 0.01  # of the page: a smaller box was no box, but a click
 
 
+def along(position: Sequence[float], page: Camera) -> Tensor:
+    """Return the direction [3] float64, world, of what a page shows at ``position``: see ``click_mark``."""
+    pixel = torch.tensor([position[0] * page.width, position[1] * page.height, 1.0], dtype=torch.float64)
+    return page.rotation.double().T @ torch.linalg.solve(page.K.double(), pixel)
+
+
 def click_mark(position: Sequence[float], page: Camera, inside: bool, drawn: Tensor | None) -> ViewMarks:
     """Return the mark of a click on the object, or beside it.
 
     position: (x, y) in 0..1 of the page; the ray that viser 0.2.7 sends with a click on a node is another. page: see
     ``page_camera``. drawn: see ``ViewMarks``.
     """
-    pixel = torch.tensor([position[0] * page.width, position[1] * page.height, 1.0], dtype=torch.float64)
-    direction = page.rotation.double().T @ torch.linalg.solve(page.K.double(), pixel)
+    direction = along(position, page)
     pixels = 2 * round(MARK * _DIAGONAL) + 1
     view = camera_along(page.center.tolist(), direction.tolist(), pixels, float(page.K[1, 1]))
     return ViewMarks(_NAME, view, torch.zeros(pixels, pixels, dtype=torch.int32), (inside,), drawn=drawn)

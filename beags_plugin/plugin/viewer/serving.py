@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -40,6 +40,16 @@ def another_tab(gui: GuiApi, label: str) -> GuiTabHandle:
     folders: Any = gui._container_handle_from_id
     tab = next(handle for handle in folders.values() if isinstance(handle, GuiTabHandle))
     return tab._parent.add_tab(label)
+
+
+def by_user(listener: Callable[[], None]) -> Callable[[Any], None]:
+    """Return a listener that leaves alone what the program itself has written to a control."""
+
+    def heard(event: Any) -> None:
+        if event.client_id is not None:
+            listener()
+
+    return heard
 
 
 def set_pace(viewer: Viewer, client_id: int, pace: Pace) -> None:

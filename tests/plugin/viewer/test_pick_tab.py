@@ -14,8 +14,8 @@ from touching_solids import SETTINGS, solids, views
 
 pytest.importorskip("nerfstudio")
 
+from clicked_pages import VIEW, click_on, page, position
 from viewer_windows import Window
-from viser.transforms import SO3
 
 from beags_plugin.extraction.ply import read_ply
 from beags_plugin.labels.classes import read_id_mask
@@ -23,12 +23,10 @@ from beags_plugin.plugin.objects.export import export_run
 from beags_plugin.plugin.objects.extract import extract_objects
 from beags_plugin.plugin.runs.picked import PICKED_FILE
 from beags_plugin.plugin.runs.read import read_run
-from beags_plugin.plugin.viewer.pointing import WORLD, page_camera
+from beags_plugin.plugin.viewer.pointing import page_camera
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.system.errors import UserError
-
-VIEW = views()[3]
 
 
 @pytest.fixture
@@ -47,13 +45,6 @@ def opened(tmp_path):
         window.close()
 
 
-def page(view=VIEW):
-    """Return the camera of a page that looks as a view does."""
-    wxyz = SO3.from_matrix(view.rotation.double().T.numpy()).wxyz
-    fov = 2 * np.arctan(view.height / 2 / float(view.K[1, 1]))
-    return SimpleNamespace(wxyz=wxyz, position=WORLD * view.center.double().numpy(), fov=fov, aspect=1.0)
-
-
 def done(tab, text: str, seconds: float = 120.0) -> str:
     """Return the panel's sentence, once it holds ``text``."""
     end = time.monotonic() + seconds
@@ -63,17 +54,10 @@ def done(tab, text: str, seconds: float = 120.0) -> str:
     return tab.note
 
 
-def position(point) -> tuple[float, float]:
-    """Return where the page shows a point of the world, (x, y) in 0..1."""
-    camera = page_camera(page())
-    x, y, z = (camera.K @ (camera.rotation @ torch.tensor(point) + camera.translation)).tolist()
-    return x / z / camera.width, y / z / camera.height
-
-
 def click(tab, point, text: str, exclude: bool = False) -> str:
     """Click on a point of the world, and wait for what the panel says."""
     tab.excludes.value, tab.note = exclude, ""
-    tab.clicked(SimpleNamespace(screen_pos=position(point), client=SimpleNamespace(camera=page())))
+    tab.clicked(click_on(point))
     return done(tab, text)
 
 
@@ -154,15 +138,27 @@ def test_a_box_limits_the_object_and_excludes(opened):
     assert tab.server.scene._scene_pointer_cb is None  # the page turns again
 
 
-def test_the_box_around_the_scene_is_seen_from_inside_and_taken_away(opened):
-    tab, _ = opened()
-    tab.take_clicks(True)
-    tab.take_clicks(True)
-    assert tab._around is not None and len(tab._around._impl.click_cb) == 1
-    tab.take_clicks(False)
-    assert tab._around is None
-    from beags_plugin.plugin.viewer.pick_tab import _INSIDES
+def heard_by(panel, tab, seconds: float = 60.0) -> None:
+    """Wait until clicks go to this tab alone, or (None) to nobody."""
+    wanted, end = [] if tab is None else [tab.clicked], time.monotonic() + seconds
+    while ([] if (box := panel.clicks._around) is None else box._impl.click_cb) != wanted:
+        assert time.monotonic() < end, wanted
+        time.sleep(0.02)
 
+
+def test_the_box_around_the_scene_is_seen_from_inside_and_taken_away(opened):
+    from beags_plugin.plugin.viewer.clicks import _INSIDES
+
+    tab, _ = opened()
+    panel = tab.viewing.model.viewer_panel
+    for _ in range(2):
+        tab.clicks.value = True
+        heard_by(panel, tab)
+    panel.size_tab.clicks.value = True
+    heard_by(panel, panel.size_tab)
+    assert not tab.clicks.value
+    panel.size_tab.clicks.value = False
+    heard_by(panel, None)
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
     for a, b, c in corners[np.array(_INSIDES)]:
         assert np.cross(b - a, c - a) @ a < 0

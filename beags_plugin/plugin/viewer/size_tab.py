@@ -1,0 +1,127 @@
+"""The tab Size of a viewer: two clicks and the length between them give exported files a size."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from beags_plugin.export.frames import Frame
+from beags_plugin.export.pose_options import PoseOptions
+from beags_plugin.plugin.objects.pose import metres_per_unit
+from beags_plugin.plugin.runs.read import read_transform
+from beags_plugin.plugin.viewer.clicks import SceneClicks
+from beags_plugin.plugin.viewer.legend import escaped
+from beags_plugin.plugin.viewer.measure import Measure, place_under
+from beags_plugin.plugin.viewer.pointing import WORLD, page_camera
+from beags_plugin.plugin.viewer.serving import another_tab, by_user
+from beags_plugin.plugin.viewer.viewing import Viewing
+from beags_plugin.system.errors import UserError
+
+if TYPE_CHECKING:
+    from viser import SceneNodePointerEvent, ViserServer
+
+_MARK = "/beags_size"  # of the points, their names and the line
+_COLOR = (255, 0, 200)  # one that few things have
+_RADIUS = 5.0  # of a point, pixels of the page that clicked it
+_HELP = "Tick Click two points, and click on two whose distance you know; the mouse still turns the camera."
+
+
+class SizeTab:
+    """Controls of the length by which all that the viewer exports gets a size.
+
+    clicks: on the picture.
+    """
+
+    def __init__(self, server: ViserServer, viewing: Viewing, clicks: SceneClicks) -> None:
+        self.server = server
+        self.viewing = viewing
+        self.measure = Measure()
+        self.note = ""
+        self._marks: list[Any] = []
+        self._changing = threading.Lock()  # each control is heard in a thread of its own
+        gui = server.gui
+        with another_tab(gui, "Size"):
+            self.clicks = gui.add_checkbox("Click two points", False, hint="A drag turns the camera all the same")
+            self.length = gui.add_text("Length", "", hint="From A to B, such as 12 cm; in mm, cm, m, in or ft")
+            self.clear = gui.add_button("Without a size", hint="Takes points and length away")
+            self._status = gui.add_markdown("")
+        clicks.offer(self.clicks, self.clicked)
+        self.length.on_update(by_user(lambda: self.typed(self.length.value)))
+        self.clear.on_click(lambda _: self.forget())
+        self._write()
+
+    def clicked(self, event: SceneNodePointerEvent) -> None:
+        """Measure from or to what is under the cursor."""
+        position, page = event.screen_pos, page_camera(event.client.camera)
+        self._change(lambda: self.measure.clicked(place_under(self.viewing, position, page)))
+
+    def typed(self, length: str) -> None:
+        """Take another text for the length."""
+        self._change(lambda: replace(self.measure, length=length))
+
+    def forget(self) -> None:
+        """Give files no size."""
+        self.length.value = ""
+        self._change(Measure)
+
+    def scale_by(self) -> str:
+        """Return the text of ``--scale-by``; empty without a size. Raises ``UserError`` for half a measure."""
+        return self.measure.scale_by(self._world())
+
+    def _world(self) -> Frame:
+        assert self.viewing.run is not None
+        transform = read_transform(self.viewing.run.folder)
+        return Frame.of_run() if transform is None else Frame(*transform)
+
+    # -- what the tab shows ------------------------------------------------------------------------------------------
+
+    def _change(self, change: Callable[[], Measure]) -> None:
+        """Measure otherwise; a mistake changes nothing, and is told."""
+        with self._changing:
+            try:
+                former, self.measure, self.note = self.measure, change(), ""
+            except UserError as error:
+                self.note = str(error)
+            else:
+                if former.places is not self.measure.places:
+                    self._draw()
+                if len(self.measure.places) == 2 > len(former.places):
+                    self.clicks.value = False
+            self._write()
+
+    def _draw(self) -> None:
+        """Show the points and the line between them in the scene."""
+        for mark in self._marks:
+            mark.remove()
+        scene, self._marks = self.server.scene, []
+        points = [tuple((WORLD * place.point).tolist()) for place in self.measure.places]
+        for name, point, place in zip("AB", points, self.measure.places, strict=False):
+            radius = _RADIUS * WORLD * place.pixel
+            self._marks.append(scene.add_icosphere(f"{_MARK}/{name}", radius, _COLOR, 2, position=point))
+            self._marks.append(scene.add_label(f"{_MARK}/name_{name}", name, position=point))
+        if len(points) == 2:
+            line = scene.add_spline_catmull_rom(f"{_MARK}/line", tuple(points), line_width=3.0, color=_COLOR)
+            self._marks.append(line)
+
+    def _text(self) -> str:
+        """Return Markdown: a mistake or what is missing, or the size and how the command line is told of it."""
+        if self.note:
+            return escaped(f"{self.note[:1].upper()}{self.note[1:]}")
+        if not self.measure.places and not self.measure.length.strip():
+            return escaped(_HELP)
+        try:
+            text = self.scale_by()
+            length = PoseOptions(scale_by=text).length()
+            assert length is not None and self.viewing.run is not None
+            metres = metres_per_unit(length, self.viewing.run.folder / "config.yml", self._world())
+        except UserError as error:
+            return escaped(f"{str(error)[:1].upper()}{str(error)[1:]}")
+        said = f"A unit of the input is {metres:.4g} m. What is exported here is in metres, stl and 3mf in millimetres."
+        return f'{escaped(said)}\n\nThe same for beags export:\n\n`--scale-by "{text}"`'
+
+    def _write(self) -> None:
+        with suppress(KeyError):  # the viewer is being closed
+            self._status.content = self._text()
