@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _MARK = "/beags_size"  # of the points, their names and the line
 _COLOR = (255, 0, 200)  # one that few things have
-_RADIUS = 5.0  # of a point, pixels of the page that clicked it
+_RADIUS = 8.0  # of a point, pixels of the page that clicked it
 _HELP = "Tick Click two points, and click on two whose distance you know; the mouse still turns the camera."
 
 

@@ -62,6 +62,49 @@ def overlap(found: torch.Tensor, exact: torch.Tensor) -> float:
     return float((found & exact).sum() / (found | exact).sum())
 
 
+def marked(seen: np.ndarray) -> float:
+    """Return the share of the pixels that are about as pink as the tab Size's points and line."""
+    return float((np.minimum(seen[..., 0], seen[..., 2]) - seen[..., 1] > 60).mean())
+
+
+def test_a_length_between_two_clicks_gives_the_export_its_size(served):
+    config, _, page = served
+    page.open_tab("Size")
+    page.tick("Click two points")
+    page.click(*middle_of(page, RED))
+    page.wait_for_text("B is missing")
+    first = awaited(page, lambda now: marked(now) > 0.0001)
+    page.drag((100, 200), (130, 210))  # turns the camera, and measures nothing
+    turned = awaited(page, lambda now: differing(now, first) > 0.01)
+    page.drag((130, 210), (100, 200))
+    awaited(page, lambda now: differing(now, turned) > 0.01)
+    page.click(*middle_of(page, BLUE))
+    page.wait_for_text("The length from A to B is missing")
+    page.write("Length", "12 parsecs")
+    page.wait_for_text("is no length")
+    page.write("Length", "12 cm")
+    page.wait_for_text("--scale-by")
+    places = re.search(r'--scale-by "(\S+) (\S+) 12 cm"', page.text())
+    assert places is not None
+    points = np.array([[float(x) for x in place.split(",")] for place in places.groups()])
+    surfels, owner = solids(dict.fromkeys(range(3), (0.5,) * 3))
+    for point, block in zip(points, (1, 2), strict=True):
+        assert np.linalg.norm(surfels.means[owner == block].numpy() - point, axis=1).min() < 0.05
+    awaited(page, lambda now: marked(now) > 1.5 * marked(first))
+    page.open_tab("Control")
+    page.press("Export what is shown")
+    page.wait_for_text("to scale.")
+    (file,) = (config.parent / "exports").glob("shown_*.ply")
+    size = 0.12 / np.linalg.norm(points[0] - points[1])
+    assert torch.allclose(read_ply(file)[0].means, size * surfels.means, rtol=1e-3, atol=1e-4)
+    page.open_tab("Size")
+    page.press("Without a size")
+    page.wait_for_text("Tick Click two points")
+    awaited(page, lambda now: marked(now) == 0)
+    page.open_tab("Pick")
+    page.tick("Click to pick")  # as it was
+
+
 def test_objects_are_picked_saved_refined_and_kept(served):
     config, owner, page = served
     run, lab = config.parent, config.parent.parent / "lab"
