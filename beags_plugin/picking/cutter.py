@@ -10,8 +10,8 @@ minimises
 
 where g is how much it shall grow, and a Gaussian that a mark shows, or that is excluded, is bound to its side. Walks
 end more often on the tangent planes of what marks show beside the object (a floor goes on in a ring's hole, which no
-walk reaches), unless these lie on other objects, and p is 0 where a walk meets marks beside the object more surely than
-those on it.
+walk reaches), and p is 0 where a walk meets marks beside the object more surely than those on it. Neither holds for
+marks on other objects, at which walks end and no more: what such marks meet more surely may still be this object.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class Cutter:
         behind = self._graph.on_plane_of(ground) & ~self._graph.on_plane_of(inside)
         with ThreadPoolExecutor() as threads:  # both walks at once: their products hold no lock
             walk = threads.submit(self._walker.potential, inside, beside, barred, behind)
-            nearer = self._walker.potential(beside, inside, barred, np.zeros_like(behind)) if beside.any() else 0.0
+            nearer = self._walker.potential(ground, inside, barred, np.zeros_like(behind)) if ground.any() else 0.0
             p = walk.result()
         p[nearer > p] = 0.0
         ends = self._graph.first, self._graph.second

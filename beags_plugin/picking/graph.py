@@ -10,6 +10,10 @@ u = (mu_j - mu_i) / |mu_j - mu_i|. The link weighs
 
 with a concave crease, a convex one, a step (0 on a round surface, whose mean normal is square to each chord), the
 colours, and the distance in units of s, the median one.
+
+Gaussians are smaller where there is more to see, as at contacts. If they lie half as far apart, twice as many links
+cross a border and four times as many Gaussians lie within; so a cut link stands for sqrt(l_i l_j) of a border's length,
+and a Gaussian for l_i^2 of the area, where l_i is the mean length of its links in s.
 """
 
 from __future__ import annotations
@@ -28,6 +32,7 @@ LEAST_WEIGHT = 0.3  # pixels over all views: less than this is no part of a surf
 CONCAVE, CONVEX, STEP, COLOR, DISTANCE = 30.0, 0.5, 30.0, 2.0, 0.2
 PLANE_HEIGHT, PLANE_SLOPE, PLANE_COSINE = 0.5, 0.02, 0.95  # in s, per unit of distance, of the angle of normals
 FLOOR = 1e-5  # so that no seed's reach ends at a noisy normal
+SHORTEST, LONGEST = 0.1, 3.0  # of l: neither twins nor a Gaussian far from all others shall decide
 SMOOTHING_ROUNDS, SMOOTHING_POWER = 2, 8  # neighbours turned by more than 30 degrees have a third of the say or less
 
 
@@ -37,7 +42,8 @@ class SurfaceGraph:
 
     nodes: [M] int64, the Gaussians that cameras see, ascending. nearest: [N] int64, of each Gaussian the node that is
     nearest to it, itself if it is one. first, second: [P] int64, nodes that are linked, each pair once.
-    weights: [P] float64, w_ij. centres, normals: [M, 3] float64, of the nodes, in the scene's units and unit vectors.
+    weights, lengths: [P] float64, w_ij and sqrt(l_i l_j). areas: [M] float64, l_i^2. centres, normals: [M, 3] float64,
+    of the nodes, in the scene's units and unit vectors.
     spacing: s, scene units.
     """
 
@@ -46,6 +52,8 @@ class SurfaceGraph:
     first: np.ndarray
     second: np.ndarray
     weights: np.ndarray
+    lengths: np.ndarray
+    areas: np.ndarray
     centres: np.ndarray
     normals: np.ndarray
     spacing: float
@@ -72,9 +80,9 @@ def surface_graph(surfels: Surfels, seen: np.ndarray, normals: np.ndarray) -> Su
     means = torch.nan_to_num(surfels.means.detach().double().cpu(), posinf=0.0, neginf=0.0).numpy()
     centres, count = means[nodes], len(nodes)
     if count == 0:
-        nothing = np.zeros(0, np.int64)
-        vectors = np.zeros((0, 3))
-        return SurfaceGraph(nodes, np.zeros(len(means), np.int64), nothing, nothing, np.zeros(0), vectors, vectors, 1.0)
+        nothing, values, vectors = np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3))
+        nearest = np.zeros(len(means), np.int64)
+        return SurfaceGraph(nodes, nearest, nothing, nothing, values, values, values, vectors, vectors, 1.0)
     tree = cKDTree(centres)
     threads = torch.get_num_threads()
     near = tree.query(centres, k=np.arange(1, min(NEIGHBOURS + 1, count) + 1), workers=threads)[1]
@@ -93,7 +101,16 @@ def surface_graph(surfels: Surfels, seen: np.ndarray, normals: np.ndarray) -> Su
     lengths = np.sqrt(dots(apart, apart))
     spacing = max(float(np.median(lengths)) if len(lengths) else 1.0, 1e-30)
     weights = link_weights(centres / spacing, smooth, colors.clamp(0.0, 1.0).numpy()[nodes], first, second)
-    return SurfaceGraph(nodes, nearest, first, second, weights, centres, smooth, spacing)
+    own = mean_lengths(lengths / spacing, first, second, count)
+    stand_for = np.sqrt(own[first] * own[second])
+    return SurfaceGraph(nodes, nearest, first, second, weights, stand_for, own**2, centres, smooth, spacing)
+
+
+def mean_lengths(lengths: np.ndarray, first: np.ndarray, second: np.ndarray, count: int) -> np.ndarray:
+    """Return l_i [M] of M nodes, between ``SHORTEST`` and ``LONGEST``; lengths: [P] of the links, in s."""
+    sums = np.bincount(first, lengths, count) + np.bincount(second, lengths, count)
+    links = np.bincount(first, minlength=count) + np.bincount(second, minlength=count)
+    return (sums / links.clip(1)).clip(SHORTEST, LONGEST)
 
 
 def smoothed(normals: np.ndarray, seen: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:

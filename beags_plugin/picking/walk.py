@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from beags_plugin.picking.dots import dots
-from beags_plugin.picking.graph import FLOOR, SurfaceGraph
+from beags_plugin.picking.graph import FLOOR, SHORTEST, SurfaceGraph
 
 LEAK, MORE_LEAK = 2e-3, 5e-2  # beside a link's weight, at most 1; the second on planes of what is beside the object
 TOLERANCE = 1e-4  # of the residual's norm
@@ -60,11 +60,12 @@ class Walker:
         return p.clip(0.0, 1.0)
 
     def border_level(self, p: np.ndarray, weights: np.ndarray, part: bool = False) -> float:
-        """Return the level t of which {p >= t} has the least border for its size, cut / sqrt(number of Gaussians).
+        """Return the level t of which {p >= t} has the least border for its size, length / sqrt(area).
 
         weights: [P] float64, of the graph's links, 0 to what is excluded. part: whether there must be a border, so that
         it is no level that reaches all.
 
+        The length is a sum over cut links of their weight times what each stands for (``graph``).
         The border of a piece of surface grows like the root of its area, so that this prefers no size. 0.5 if no p
         lies between ``LEAST_LEVEL`` and ``HIGHEST_LEVEL``.
         """
@@ -73,11 +74,12 @@ class Walker:
         rank = np.empty(count, np.int64)
         rank[order] = np.arange(count)
         ends = rank[self._graph.first], rank[self._graph.second]
-        opened = np.bincount(np.minimum(*ends), weights, count)
-        closed = np.bincount(np.maximum(*ends), weights, count)
+        lengths = weights * self._graph.lengths
+        opened = np.bincount(np.minimum(*ends), lengths, count)
+        closed = np.bincount(np.maximum(*ends), lengths, count)
         border = np.cumsum(opened - closed)
-        quotient = border / np.sqrt(np.arange(1, count + 1))
-        there = border > 0.5 * FLOOR if part else np.ones(count, dtype=bool)  # the weakest link weighs more
+        quotient = border / np.sqrt(np.cumsum(self._graph.areas[order]))
+        there = border > 0.5 * SHORTEST * FLOOR if part else np.ones(count, dtype=bool)  # the weakest link weighs more
         allowed = np.flatnonzero((p[order] >= LEAST_LEVEL) & (p[order] <= HIGHEST_LEVEL) & there)
         if len(allowed) == 0:
             return 0.5

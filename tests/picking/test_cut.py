@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -60,6 +61,18 @@ def test_a_second_cut_after_a_point_beside_takes_the_other_solid_away(grey):
     assert overlap(less, owner == 1) > 0.97
     again = cutter.solve([marks(camera, [LOW_TOP, HIGH_TOP], [FLOOR])])
     assert torch.equal(both, again), "a cut depends on those before"
+
+
+def test_marks_on_other_objects_take_nothing_but_what_they_show(grey):
+    """A sticker's mark on the high block; one beside the block takes the half of it that is nearer."""
+    cutter, owner = grey
+    camera = views()[3]
+    sticker = marks(camera, [], [(0.15, 0.28, 0.5)])
+    own = marks(camera, [(0.15, -0.28, 0.5)], [LOW_TOP, FLOOR])
+    beside = cutter.solve([own, sticker])
+    other = cutter.solve([own, replace(sticker, of_others=True)])
+    assert overlap(beside, owner == 2) < 0.8
+    assert overlap(other, owner == 2) > 0.9
 
 
 def test_marks_of_several_views_act_together(coloured):
