@@ -11,7 +11,8 @@ minimises
 where g is how much it shall grow, and a Gaussian that a mark shows, or that is excluded, is bound to its side. Walks
 end more often on the tangent planes of what marks show beside the object (a floor goes on in a ring's hole, which no
 walk reaches), and p is 0 where a walk meets marks beside the object more surely than those on it. Neither holds for
-marks on other objects, at which walks end and no more: what such marks meet more surely may still be this object.
+marks on other objects: the object's walks end there, those from marks beside it pass, as what marks on other objects
+meet more surely may still be this object.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ def test_rows_named_after_presets_refine_as_these_do():
         )
         if row.name == "beags-paper":
             preset = replace(preset, prepare=replace(preset.prepare, k_pixels=own.prepare.k_pixels))
-        base = {"base_steps", "densify"}
+        base = {"base_steps", "base_lr_factor", "densify"}
         assert {key for key, value in vars(own).items() if value != getattr(preset, key)} <= base, row.name
 
 
