@@ -44,6 +44,12 @@ def shortened(name: str) -> str:
     return line if len(line) <= _LONGEST else f"{line[: _LONGEST - 1]}…"
 
 
+def capitalised(message: object) -> str:
+    """Return a message, such as that of an error, as a sentence that stands alone."""
+    text = str(message)
+    return f"{text[:1].upper()}{text[1:]}"
+
+
 def escaped(text: str) -> str:
     """Return text for Markdown, which viser reads as MDX: braces and angle brackets would be taken for a program."""
     plain = set(" .,:;%…")

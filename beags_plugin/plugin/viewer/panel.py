@@ -24,7 +24,7 @@ from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.plugin.viewer.aim import frame_of, look, look_as, side_of_photos
 from beags_plugin.plugin.viewer.clicks import SceneClicks
 from beags_plugin.plugin.viewer.export import ShownFiles
-from beags_plugin.plugin.viewer.legend import LegendRow, escaped, legend, unique_labels
+from beags_plugin.plugin.viewer.legend import LegendRow, capitalised, escaped, legend, unique_labels
 from beags_plugin.plugin.viewer.pick_tab import PickTab
 from beags_plugin.plugin.viewer.pick_work import take_picked
 from beags_plugin.plugin.viewer.picking import under_cursor
@@ -205,7 +205,7 @@ class ObjectPanel(ViewerElement[None]):
         try:
             found = under_cursor(self.viewing, click.origin, click.direction)
         except UserError as error:
-            self.note("object", f"{str(error)[:1].upper()}{str(error)[1:]}")
+            self.note("object", capitalised(error))
             return
         label = next((label for label, class_id in self.labels.items() if class_id == found.class_id), None)
         if label is not None and found.class_id != BACKGROUND:

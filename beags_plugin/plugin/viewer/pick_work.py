@@ -21,6 +21,7 @@ from beags_plugin.plugin.objects.picked_masks import save_masks
 from beags_plugin.plugin.runs.picked import with_picked, write_picked
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.viewer.choice import Visible
+from beags_plugin.plugin.viewer.legend import capitalised
 from beags_plugin.plugin.viewer.viewing import Paint, Viewing
 from beags_plugin.system.errors import UserError
 
@@ -180,7 +181,7 @@ class PickWork:
             try:
                 message = step()
             except UserError as error:
-                message = f"{str(error)[:1].upper()}{str(error)[1:]} Nothing has been changed."
+                message = f"{capitalised(error)} Nothing has been changed."
             except Exception as error:  # nobody else sees an exception of a thread
                 message = f"Nothing has been changed ({type(error).__name__}: {error})."
             self._viewing.paint = self._paint()

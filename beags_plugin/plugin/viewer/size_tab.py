@@ -13,7 +13,7 @@ from beags_plugin.export.pose_options import PoseOptions
 from beags_plugin.plugin.objects.pose import metres_per_unit
 from beags_plugin.plugin.runs.read import read_transform
 from beags_plugin.plugin.viewer.clicks import SceneClicks
-from beags_plugin.plugin.viewer.legend import escaped
+from beags_plugin.plugin.viewer.legend import capitalised, escaped
 from beags_plugin.plugin.viewer.measure import Measure, place_under
 from beags_plugin.plugin.viewer.pointing import WORLD, page_camera
 from beags_plugin.plugin.viewer.serving import another_tab, by_user
@@ -109,7 +109,7 @@ class SizeTab:
     def _text(self) -> str:
         """Return Markdown: a mistake or what is missing, or the size and how the command line is told of it."""
         if self.note:
-            return escaped(f"{self.note[:1].upper()}{self.note[1:]}")
+            return escaped(capitalised(self.note))
         if not self.measure.places and not self.measure.length.strip():
             return escaped(_HELP)
         try:
@@ -118,7 +118,7 @@ class SizeTab:
             assert length is not None and self.viewing.run is not None
             metres = metres_per_unit(length, self.viewing.run.folder / "config.yml", self._world())
         except UserError as error:
-            return escaped(f"{str(error)[:1].upper()}{str(error)[1:]}")
+            return escaped(capitalised(error))
         said = f"A unit of the input is {metres:.4g} m. What is exported here is in metres, stl and 3mf in millimetres."
         return f'{escaped(said)}\n\nThe same for beags export:\n\n`--scale-by "{text}"`'
 
