@@ -42,7 +42,7 @@ def test_rows_named_after_presets_refine_as_these_do():
     """In the experiment of presets, all from one base; k of the paper's is scaled to the pixels."""
     experiment = load_experiment("presets")
     rows = [variant for variant in experiment.variants if variant.name in preset_names()]
-    assert len(rows) == 4
+    assert len(rows) == 3
     for row in rows:
         own, preset = (
             preset_config(name, overrides, Path()).model_config

@@ -20,7 +20,7 @@ pytest.importorskip("nerfstudio")
 from beags_plugin.commands import cli, masks
 
 RUN = "{tmp}/run/config.yml"
-PRESETS = "beags, beags-accurate, beags-base, beags-fast, beags-paper, beags-refine, beags-tiny"
+PRESETS = "beags, beags-base, beags-fast, beags-paper, beags-refine, beags-tiny"
 NO_FILE = "{tmp}/absent.yml cannot be read (No such file or directory): name the config.yml of a run."
 NO_DATA = "the data folder {tmp}/nowhere does not exist: give --data the folder that holds the scene."
 SENTENCES = {

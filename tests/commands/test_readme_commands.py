@@ -45,7 +45,7 @@ RUN = {  # in this order; the command in README.md: flags that are appended
     "beags doctor [--data X]": "--data my_scene",
     "beags masks make --data X --source NAME": "--options folder=masks --output made",
     "beags masks check --data X": "",
-    "ns-train beags-tiny --data my_scene": SHORT.replace("base-steps 60", "base-steps 200"),  # killed on its way
+    "ns-train beags-fast --data my_scene": SHORT.replace("base-steps 60", "base-steps 200"),  # killed on its way
     "beags resume RUN": "",  # and so goes on
     f"beags export {CONFIG} --all --format ply glb": "--resolution 24 --output exported",
     "ns-train beags-refine --data my_scene --pipeline.model.start-from scene.ply": SHORT,
@@ -195,7 +195,7 @@ def test_the_commands_run_in_order(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), *sys.path[1:]]))
     reader = Reader(tmp_path)
     for line, more in RUN.items():
-        if line.startswith("ns-train beags-tiny"):
+        if line.startswith("ns-train beags-fast"):
             reader.trains_and_is_killed(line, more)
             assert not (reader.run / "training.json").exists()
         elif line.startswith("ns-viewer"):
@@ -207,7 +207,7 @@ def test_the_commands_run_in_order(tmp_path, monkeypatch):
                 assert len(plys) > 3
             reader.does(line, more)
     first, second = sorted(tmp_path.glob("outputs/my_scene/beags-*/*/training.json"), key=_changed)
-    assert first.parents[1].name == "beags-tiny" and second.parents[1].name == "beags-refine"
+    assert first.parents[1].name == "beags-fast" and second.parents[1].name == "beags-refine"
     run = reader.run
     for name in (
         "worst.png", "made/masks", "made/classes.json", "exported/manifest.json", "outputs/my_scene/summary.json",

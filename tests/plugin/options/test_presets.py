@@ -25,7 +25,7 @@ def write(folder, text):
 
 
 def test_the_documented_presets_exist():
-    documented = {"beags", "beags-accurate", "beags-base", "beags-fast", "beags-paper", "beags-refine", "beags-tiny"}
+    documented = {"beags", "beags-base", "beags-fast", "beags-paper", "beags-refine", "beags-tiny"}
     assert documented <= set(preset_names())
 
 
@@ -74,7 +74,19 @@ def test_every_preset_loads_and_names_itself(name):
 
 def test_entry_points_give_the_presets():
     assert methods.beags_tiny.config.method_name == "beags-tiny"
-    assert methods.beags.config.pipeline.model.base_steps == 30_000
+    assert methods.beags.config.pipeline.model.base_steps == 7_500
+
+
+def test_the_presets_of_one_phase_are_that_phase_of_beags():
+    """Who trains beags-base and then beags-refine gets what beags gives."""
+
+    def overrides(name):
+        kept = read_toml(preset_folder() / f"{name}.toml", "preset")["overrides"]
+        return {key.removeprefix("pipeline.model."): value for key, value in kept.items()}
+
+    whole, base, refine = map(overrides, ("beags", "beags-base", "beags-refine"))
+    assert base["refine_steps"] == 0 and refine["base_steps"] == 0
+    assert {**refine, **base, "refine_steps": refine["refine_steps"]} == whole
 
 
 def test_presets_do_not_share_state():
