@@ -110,9 +110,18 @@ def test_without_gradients_nothing_is_kept_for_a_backward():
     assert rasterizer.differentiable == [False, False, True]
 
 
+def across_many_tiles():
+    """Surfels wider than the 64 groups of pixels that binning takes at a time."""
+    scene = make_scene(count=60, width=1300, height=37, seed=3, size=-0.5)
+    K = torch.tensor([[1200.0, 0, 600.3], [0, 43.0, 16.2], [0, 0, 1.0]], dtype=torch.float64)
+    return replace(scene, camera=replace(scene.camera, K=K))
+
+
 @needs_native
-def test_work_is_counted():
-    scene = make_scene(count=120, width=71, height=51, seed=3, size=-1.8)
+@pytest.mark.parametrize(
+    "scene", [make_scene(count=120, width=71, height=51, seed=3, size=-1.8), across_many_tiles()], ids=["small", "wide"]
+)
+def test_work_is_counted(scene):
     counts = native.work_counts(scene.inputs, scene.camera, scene.settings)
     reference = TorchRasterizer()
     projected = project(scene.inputs, scene.camera, scene.settings)

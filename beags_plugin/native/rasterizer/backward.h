@@ -34,6 +34,20 @@ BEAGS_INLINE void load_saved(const Job<T>& job, int tile, PixelGradients<T>* pix
   }
 }
 
+template <Parts kWanted, class T>
+BEAGS_INLINE void prefetch_gradients(const Job<T>& job, int tile) {
+  const Images<const T>& g = job.gradients;
+  prefetch_image<3>(job, tile, g.color);
+  prefetch_image<1>(job, tile, g.alpha);
+  if (kWanted & kGeometry) {
+    prefetch_image<1>(job, tile, g.depth);
+    prefetch_image<1>(job, tile, g.median_depth);
+    prefetch_image<3>(job, tile, g.normal);
+  }
+  if (kWanted & kDistortion) prefetch_image<1>(job, tile, g.distortion);
+  if (kWanted & kBoundary) prefetch_image<1>(job, tile, g.boundary);
+}
+
 // Reads the gradients by the images. Returns the label of the whole tile, see load_labels.
 template <Parts kWanted, class T>
 BEAGS_INLINE int32_t read_gradients(const Job<T>& job, int tile, PixelGradients<T>* pixels) {
@@ -66,6 +80,7 @@ BEAGS_INLINE int32_t read_gradients(const Job<T>& job, int tile, PixelGradients<
 // at the end, which every Gaussian changes. Returns the label of the whole tile.
 template <Parts kWanted, class T>
 BEAGS_INLINE int32_t load_gradients(const Job<T>& job, int tile, PixelGradients<T>* pixels) {
+  prefetch_gradients<kWanted>(job, tile);
   load_saved<kWanted>(job, tile, pixels);
   const int32_t everywhere = read_gradients<kWanted>(job, tile, pixels);
   Vector<T> background[4] = {};

@@ -31,7 +31,7 @@ void sort_by_depth(const T* depths, std::vector<int32_t>& indices) {
   constexpr int kDigit = 11;
   constexpr int kPasses = (8 * sizeof(Bits) + kDigit - 1) / kDigit;
   const size_t n = indices.size();
-  std::vector<Item> items(n), other(n);
+  Scratch<Item> items(n), other(n);
   std::vector<uint32_t> counts(static_cast<size_t>(kPasses) << kDigit);
   for (size_t i = 0; i < n; ++i) {
     std::memcpy(&items[i].key, depths + indices[i], sizeof(Bits));
@@ -48,11 +48,19 @@ void sort_by_depth(const T* depths, std::vector<int32_t>& indices) {
       count[digit] = sum;
       sum += here;
     }
-    for (const Item& item : items) other[count[(item.key >> (pass * kDigit)) & ((1u << kDigit) - 1)]++] = item;
-    items.swap(other);
+    for (size_t i = 0; i < n; ++i) {
+      const Item item = items[i];
+      other[count[(item.key >> (pass * kDigit)) & ((1u << kDigit) - 1)]++] = item;
+    }
+    std::swap(items, other);
   }
   for (size_t i = 0; i < n; ++i) indices[i] = items[i].index;
 }
+
+constexpr int kWordGroups = 64;  // groups of a row that one word holds, a bit each
+
+// Returns the bits from .. to, 0 <= from <= to < 64.
+uint64_t bits(int from, int to) { return (~uint64_t{0} >> (63 - to)) & (~uint64_t{0} << from); }
 
 }  // namespace
 
@@ -69,15 +77,22 @@ bool find_tiles(const View& view, const Splat<T>& splat, std::vector<Reach>& out
       first = std::min(first, bands.first[row]);
       last = std::max(last, bands.last[row]);
     }
-    for (int tile_x = first / kGroup; tile_x * kGroup <= last; ++tile_x) {
-      unsigned mask = 0;
+    for (int origin = first / kGroup * kGroup; origin <= last; origin += kWordGroups) {
+      uint64_t rows[kGroup];  // of each row of groups, those from `origin` on that are reached
       for (int row = 0; row < kGroup; ++row) {
-        const int from = std::max(bands.first[row] - tile_x * kGroup, 0);
-        const int to = std::min(bands.last[row] - tile_x * kGroup, kGroup - 1);
-        const unsigned bits = from > to ? 0 : (2u << to) - (1u << from);
-        mask |= bits << (kGroup * row);
+        const int from = std::max(bands.first[row] - origin, 0);
+        const int to = std::min(bands.last[row] - origin, kWordGroups - 1);
+        rows[row] = from > to ? 0 : bits(from, to);
       }
-      if (mask) out.push_back({tile_y * tiles_x + tile_x, static_cast<uint16_t>(mask)});
+      const int end = std::min(last + 1, origin + kWordGroups);
+      for (int group = origin; group < end; group += kGroup) {
+        unsigned mask = 0;
+        for (int row = 0; row < kGroup; ++row) {
+          mask |= static_cast<unsigned>(rows[row] & 15) << (kGroup * row);
+          rows[row] >>= kGroup;
+        }
+        if (mask) out.push_back({tile_y * tiles_x + group / kGroup, static_cast<uint16_t>(mask)});
+      }
     }
   }
   return extent.on_screen();

@@ -65,6 +65,23 @@ BEAGS_INLINE void write_image(const Job<T>& job, int tile, T* image, Lanes lanes
   });
 }
 
+// Fetches the tile's part of an image, [height, width, kChannels]; null: none. Reads then wait for the memory of all
+// rows at once, not of one after the other.
+template <int kChannels, class T>
+BEAGS_INLINE void prefetch_image(const Job<T>& job, int tile, const T* image) {
+  if (!image) return;
+  const int x0 = tile % job.tiles_x * kTile, y0 = tile / job.tiles_x * kTile;
+  const int columns = job.width - x0 < kTile ? job.width - x0 : kTile;
+  const int rows = job.height - y0 < kTile ? job.height - y0 : kTile;
+  const int bytes = columns * kChannels * static_cast<int>(sizeof(T));
+  for (int row = 0; row < rows; ++row) {
+    const T* first = image + (static_cast<int64_t>(y0 + row) * job.width + x0) * kChannels;
+    const char* at = reinterpret_cast<const char*>(first);
+    for (int byte = 0; byte < bytes; byte += 64) __builtin_prefetch(at + byte);
+    __builtin_prefetch(at + bytes - 1);
+  }
+}
+
 // Returns the place of a pack's values among the 256 of a tile.
 template <class T>
 BEAGS_INLINE int64_t saved_at(int tile, int pack) {

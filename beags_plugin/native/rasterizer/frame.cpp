@@ -15,7 +15,7 @@ Frame<T>::Frame(const View& view, const Inputs<T>& inputs, bool* visible, int th
   const int64_t n = inputs.count, chunks = (n + kChunk - 1) / kChunk;
   std::vector<std::vector<Reach>> reached(chunks);
   std::vector<int64_t> record_start(n + 1, 0), nonfinite(chunks, 0);
-  std::vector<T> depths(n);
+  const Scratch<T> depths(n);
   const int team = n < kTeamSurfels ? 1 : threads;
   // Determinism: chunks have a fixed size and share nothing.
 #pragma omp parallel for num_threads(team) schedule(dynamic, 1)
@@ -32,7 +32,7 @@ Frame<T>::Frame(const View& view, const Inputs<T>& inputs, bool* visible, int th
   }
   for (int64_t i = 0; i < n; ++i) record_start[i + 1] += record_start[i];
   for (const int64_t count : nonfinite) num_nonfinite_ += count;
-  bins_ = bin(view_, reached, std::move(record_start), depths.data());
+  bins_ = bin(view_, reached, std::move(record_start), depths.get());
 }
 
 template <class T>

@@ -9,7 +9,7 @@
 namespace beags {
 namespace {
 
-constexpr size_t kMostKept = 64 << 20;
+constexpr size_t kMostKept = 128 << 20;
 constexpr size_t kLeast = 4096;  // of a block: small ones fit each other, so that few are kept and looked through
 constexpr std::align_val_t kAlignment{64};
 

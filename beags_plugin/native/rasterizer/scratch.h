@@ -10,7 +10,7 @@ namespace beags {
 
 // Returns a block of at least `bytes`, aligned to cache lines; `bytes` becomes its size. Throws std::bad_alloc.
 void* take_scratch(size_t& bytes);
-// Takes a block back. At most 64 MiB of unused blocks are kept.
+// Takes a block back. At most 128 MiB of unused blocks are kept.
 void give_scratch(void* block, size_t bytes);
 
 // `count` numbers or plain structures, uninitialised.
