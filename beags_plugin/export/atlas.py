@@ -10,6 +10,7 @@ import numpy as np
 from beags_plugin.export.fusion import Mesh
 
 GAP = 2  # texels between charts; what is between them is filled with the colours of the nearest
+SMALLEST = 128  # side of a picture that is as large as it needs to be
 _ROWS = 256  # of texels that are looked up at a time
 
 
@@ -44,20 +45,30 @@ class Texels:
         return np.einsum("tc,tcd->td", self.weights, values[self.corners])
 
 
-def unwrapped(mesh: Mesh, size: int) -> Atlas:
-    """Cut a mesh of at least one face into charts and pack them into a picture of ``size`` x ``size`` texels."""
+def unwrapped(mesh: Mesh, size: int, density: float = 0.0) -> Atlas:
+    """Cut a mesh of at least one face into charts and pack them into a picture of at most ``size`` x ``size`` texels.
+
+    density: texels along a side of the mesh's unit, in a picture that is as large as this takes; 0 fills the picture.
+    With many small charts most of a picture is gaps between them, so that its size alone says little of its texels.
+    """
     import xatlas
 
     atlas = xatlas.Atlas()
     places = (mesh.vertices - mesh.vertices.mean(axis=0)) / mesh.voxel
     atlas.add_mesh(places.astype(np.float32), mesh.faces.astype(np.uint32))
     pack = xatlas.PackOptions()
-    pack.resolution, pack.padding, pack.bilinear, pack.create_image = size, GAP, True, False
+    pack.padding, pack.bilinear, pack.create_image = GAP, True, False
+    pack.resolution, pack.texels_per_unit = (0, density * mesh.voxel) if density else (size, 0.0)
     atlas.generate(xatlas.ChartOptions(), pack)
     source, faces, uv = atlas[0]
     side = max(atlas.width, atlas.height)  # xatlas may take a little more than it was asked to
+    if density and side > size:
+        return unwrapped(mesh, size)
     uv = uv.astype(np.float64) * [atlas.width / side, atlas.height / side]
-    return Atlas(source.astype(np.int64), faces.astype(np.int64), uv, size)
+    if not density:
+        return Atlas(source.astype(np.int64), faces.astype(np.int64), uv, size)
+    whole = max(SMALLEST, side + -side % 4)  # what graphics cards compress comes in blocks of 4 x 4 texels
+    return Atlas(source.astype(np.int64), faces.astype(np.int64), uv * side / whole, whole)
 
 
 def texels(atlas: Atlas) -> Texels:

@@ -18,7 +18,7 @@ from beags_plugin.export.surface import in_voxels, surface_of
 
 HIDES = 0.02  # what is nearer than a place by more than this share of its depth hides it (as in E5)
 _OFF = 1.0  # voxels above the surface, where rays to the camera start
-_FLATTEST = 0.2  # least cosine between normal and ray: flatter views smear
+FLATTEST = 0.2  # least cosine between normal and ray: flatter views smear
 _SHARPEN = 3  # the power of a view's weight: more follow the best view, fewer blur what views place differently
 _PRIOR = 1e-6  # weight of the splats' colour, beside 1 of a photo that looks straight on at a pixel for a texel
 _SAMPLES = 8000  # places that exposures are compared at
@@ -84,18 +84,18 @@ def places_seen(places: Places, mesh: Mesh, caster: Any, photo: Photo) -> tuple[
     cosine = np.einsum("pd,pd->p", towards, places.normals) / np.maximum(distance, 1e-300)
     with np.errstate(invalid="ignore"):
         framed = ((xy >= 0.5) & (xy <= [camera.width - 0.5, camera.height - 0.5])).all(axis=1)
-    index = np.flatnonzero(framed & (z > 0) & (cosine > _FLATTEST))
+    index = np.flatnonzero(framed & (z > 0) & (cosine > FLATTEST))
     column, row = np.floor(xy[index]).astype(np.int64).T
     column, row = np.minimum(column, camera.width - 1), np.minimum(row, camera.height - 1)
     depth = photo.depth().numpy()[row, column]
-    index = index[_well_inside(photo.own())[row, column] & ~((depth > 0) & (depth < (1.0 - HIDES) * z[index]))]
+    index = index[well_inside(photo.own())[row, column] & ~((depth > 0) & (depth < (1.0 - HIDES) * z[index]))]
     index = index[~_hidden(caster, mesh, places[index], camera.center.double().numpy())]
     light = linear_from_srgb(interpolated(photo.image(), xy[index]))
     pixels = cosine[index] * (camera.focal * places.spacing / z[index]) ** 2  # for the area of a place
     return index, light, np.minimum(pixels, 4.0) ** _SHARPEN
 
 
-def _well_inside(mask: Tensor) -> np.ndarray:
+def well_inside(mask: Tensor) -> np.ndarray:
     """Return [H, W] bool, the pixels of a mask whose eight neighbours are in it: others mix with what is behind."""
     around = torch.nn.functional.pad((~mask).float()[None, None], (1, 1, 1, 1))
     return (torch.nn.functional.max_pool2d(around, 3, stride=1)[0, 0] == 0).numpy()

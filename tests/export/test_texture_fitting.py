@@ -1,0 +1,112 @@
+"""Textures fitted to photos: a box with a print that is finer than the mean of its photos shows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+open3d = pytest.importorskip("open3d")
+pytest.importorskip("xatlas")
+
+from photographed_box import EXPOSURES, EYES, a_box, camera_from, photo_of
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.export.atlas import picture, texels, unwrapped
+from beags_plugin.export.base import Photo
+from beags_plugin.export.fitting import fitted
+from beags_plugin.export.fusion import Mesh
+from beags_plugin.export.surface import area_vectors, vertex_normals
+from beags_plugin.export.texture import suitable_density, textured
+from benchmarks.meshes import Drawn
+
+FINE = 75.0  # radians a unit: about six pixels a period
+
+
+def print_at(points: np.ndarray) -> np.ndarray:
+    """Return light of each place, between 0.1 and 0.7."""
+    return 0.4 + 0.3 * np.sin(FINE * points[:, [1, 2, 0]]) * np.sin(FINE * points[:, [2, 0, 1]] + 1.0)
+
+
+@pytest.fixture(scope="module")
+def box() -> Mesh:
+    return a_box()
+
+
+@pytest.fixture(scope="module")
+def photos(box) -> list[Photo]:
+    return [photo_of(box, camera_from(eye), light=print_at, rays=3) for eye in EYES]
+
+
+def mean_picture(mesh: Mesh, photos: list[Photo]):
+    """Return an atlas and the picture before it is fitted."""
+    atlas = unwrapped(mesh, 4096, suitable_density(mesh, photos))
+    at = texels(atlas)
+    from beags_plugin.export.baking import Places, baked
+
+    normals = at.of(vertex_normals(mesh))
+    spacing = np.sqrt(np.linalg.norm(area_vectors(mesh), axis=1).sum() / len(at.rows))
+    found = baked(Places(at.of(mesh.vertices), normals, spacing), mesh, photos, at.of(mesh.colors))
+    return atlas, picture(atlas, at, found.colors)
+
+
+def error(mesh: Mesh, atlas, image: np.ndarray, camera: Camera) -> float:
+    """Return the root mean square difference to a photo that nobody was given, well inside its outline."""
+    photo = photo_of(mesh, camera, light=print_at, rays=3)
+    drawn = Drawn(mesh.vertices[atlas.source], atlas.faces, None, atlas.uv, image / 255.0)
+    shown, there = drawn.seen_by(camera, np.eye(4))
+    inside = photo.own().numpy() & there
+    inside &= np.roll(inside, 2, 0) & np.roll(inside, -2, 0) & np.roll(inside, 2, 1) & np.roll(inside, -2, 1)
+    return float(np.sqrt(((shown - photo.image().numpy())[inside] ** 2).mean()))
+
+
+def test_a_fitted_texture_is_nearer_to_photos_that_it_was_not_given(box, photos):
+    atlas, mean = mean_picture(box, photos)
+    sharp = fitted(mean, atlas, box, photos, np.ones((len(photos), 3)))
+    other = camera_from((1.9, -0.4, 1.4))
+    before, after = error(box, atlas, mean, other), error(box, atlas, sharp, other)
+    assert before > 0.02 and after < 0.6 * before
+    assert np.array_equal(sharp, fitted(mean, atlas, box, photos, np.ones((len(photos), 3))))
+
+
+def test_exposures_are_divided_out(box, photos):
+    """The same texture comes of photos that are brighter and darker, once it is known by how much."""
+    atlas, mean = mean_picture(box, photos)
+    uneven = [
+        photo_of(box, camera_from(eye), exposure, light=print_at, rays=3)
+        for eye, exposure in zip(EYES, EXPOSURES, strict=True)
+    ]
+    even = fitted(mean, atlas, box, photos, np.ones((len(EYES), 3))).astype(int)
+    found = fitted(mean, atlas, box, uneven, np.repeat(EXPOSURES[:, None], 3, axis=1)).astype(int)
+    assert np.abs(found - even).mean() < 0.5
+    wrong = fitted(mean, atlas, box, uneven, np.ones((len(EYES), 3))).astype(int)
+    assert np.abs(wrong - even).mean() > max(1.0, 4.0 * np.abs(found - even).mean())
+
+
+def test_what_no_photo_shows_and_what_stands_before_the_object_change_nothing(box, photos):
+    atlas, mean = mean_picture(box, photos)
+    grey = np.full_like(mean, 128)
+    at = texels(atlas)
+    below = at.of(box.vertices)[:, 2] < -0.39
+    screened = [photo_of(box, camera_from(eye), light=print_at, rays=3, screen=True) for eye in EYES]
+    found = fitted(grey, atlas, box, screened, np.ones((len(EYES), 3)))
+    assert (found[at.rows[below], at.columns[below]] == 128).all()
+    assert (found != 128).any(axis=2).mean() > 0.1
+    red = (found[..., 0] > 215) & (found[..., 1] < 50) & (found[..., 2] < 50)
+    assert not red.any()
+    unseen = [replace(photo, own=lambda: torch.zeros(160, 160, dtype=torch.bool)) for photo in photos]
+    assert fitted(mean, atlas, box, unseen, np.ones((len(EYES), 3))) is mean
+
+
+def test_a_picture_is_as_large_as_its_density_takes(box, photos):
+    density = suitable_density(box, photos)
+    atlas = unwrapped(box, 4096, density)
+    area = np.linalg.norm(area_vectors(box), axis=1).sum()
+    assert len(texels(atlas).rows) == pytest.approx(density**2 * area, rel=0.15)
+    assert atlas.size % 4 == 0 and 128 <= atlas.size < 1024
+    assert unwrapped(box, 256, density).size == 256  # no larger than it may be
+    assert unwrapped(box, 4096, density / 100).size == 128
+    texture = textured(box, photos, 0)
+    assert texture.atlas.size == atlas.size and texture.image.shape == (atlas.size, atlas.size, 3)
