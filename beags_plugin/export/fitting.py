@@ -19,7 +19,7 @@ from beags_plugin.export.baking import FLATTEST, HIDES, well_inside
 from beags_plugin.export.base import Photo
 from beags_plugin.export.color import linear_from_srgb, srgb_from_linear
 from beags_plugin.export.fusion import Mesh
-from beags_plugin.export.surface import in_voxels, surface_of
+from beags_plugin.export.surface import rays_through, surface_of
 
 _RAYS = 0.25 * np.array([[1.0, 1.0], [3.0, 1.0], [1.0, 3.0], [3.0, 3.0]])  # in a pixel
 _MOST = 1_000_000  # pixels of all photos that are looked at, 128 bytes each
@@ -77,20 +77,13 @@ def _pixels(
     Pixels well inside the item's mask, before which nothing of the scene stands, and that see the outside of the mesh,
     not too flat, with all their rays; at most ``most`` of them, chosen at random. Texels count row by row.
     """
-    import open3d
-
-    camera = photo.camera
     rows, cols = np.nonzero(well_inside(photo.own()))
     if len(rows) > most:
         chosen = np.sort(np.random.default_rng(0).choice(len(rows), most, replace=False))
         rows, cols = rows[chosen], cols[chosen]
     xy = (np.stack([cols, rows], axis=1)[:, None] + _RAYS).reshape(-1, 2)
-    K = camera.K.double().numpy()
-    ways = np.concatenate([(xy - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones((len(xy), 1))], axis=1)
-    ways = ways @ camera.rotation.double().numpy()
-    start = in_voxels(mesh, camera.center.double().numpy()[None]).numpy()
-    rays = np.concatenate([np.broadcast_to(start, ways.shape), ways / mesh.voxel], axis=1)  # t is the depth along z
-    hit = caster.cast_rays(open3d.core.Tensor(rays.astype(np.float32)))
+    rays, ways = rays_through(mesh, photo.camera, xy)
+    hit = caster.cast_rays(rays)
     depth, normals = hit["t_hit"].numpy(), hit["primitive_normals"].numpy()
     cosine = -np.einsum("pd,pd->p", normals, ways) / np.linalg.norm(ways, axis=1)
     scene = np.repeat(photo.depth().numpy()[rows, cols], len(_RAYS))

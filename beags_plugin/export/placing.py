@@ -2,7 +2,9 @@
 
 The depth of trained splats lies behind what they show, by up to a pixel: their pictures are right in each view, and a
 splat drawn at least a pixel wide keeps its outline where its middle lies further in. Where a surface lies, the photos
-that see a place have one colour for it; a pixel in front or behind they differ, wherever the surface has a texture.
+that see a place have one colour for it; a pixel in front or behind they differ, wherever the surface has a texture. But
+highlights of something glossy lie behind its surface, as seen in a mirror: so a surface is only moved where its outline
+still fits the masks.
 """
 
 from __future__ import annotations
@@ -15,11 +17,11 @@ import numpy as np
 import torch
 
 from beags_plugin.core.lifting import project
-from beags_plugin.export.baking import Places, exposures_of, interpolated, places_seen
+from beags_plugin.export.baking import HIDES, Places, exposures_of, interpolated, places_seen
 from beags_plugin.export.base import Photo
 from beags_plugin.export.color import linear_from_srgb
 from beags_plugin.export.fusion import Mesh
-from beags_plugin.export.surface import surface_of, vertex_normals
+from beags_plugin.export.surface import rays_through, surface_of, vertex_normals
 
 _SAMPLES = 4000  # vertices that are looked at
 _STEP = 0.25  # pixels
@@ -29,6 +31,8 @@ _FEWEST = 3  # photos that must see a place
 _NEIGHBOURS = 24  # places that are moved alike
 _REACH = 10.0  # voxels apart, or normals 60 degrees apart, is far for neighbours
 _PULL = 0.1  # of all places' mean agreement, beside a place's own
+_LOST = 0.002  # IoU with the masks that moving may cost
+_PIXELS = 50_000  # of a photo that outlines are compared at, about
 _NOISE = 1e-5  # disagreement a squared pixel, that places of one colour stay where they are
 
 
@@ -45,17 +49,38 @@ def placed(
 ) -> Placed:
     """Return a mesh of at least one face, moved to where photos agree; as it is where too few of them see it.
 
-    progress: receives (done, total) photos, each of which is looked at twice in a round.
+    A round that takes its outline away from the photos' masks does not count. progress: receives (done, total) photos,
+    each of which is looked at twice in a round.
     """
     moved, total = 0.0, 2 * _ROUNDS * len(photos)
+    least = outline_iou(mesh, photos) - _LOST
     for turn in range(_ROUNDS):
         first = 2 * turn * len(photos)
         found = _moved(mesh, photos, lambda done, first=first: progress(first + done, total))
-        if found is None:
+        if found is None or outline_iou(found[0], photos) < least:
             break
         mesh, pixels = found
         moved += pixels
     return Placed(mesh, moved)
+
+
+def outline_iou(mesh: Mesh, photos: Sequence[Photo]) -> float:
+    """Return the IoU of a mesh's outline with the masks of photos, over all of them; what hides the mesh is left out.
+
+    1 where neither shows anything.
+    """
+    caster, both, either = surface_of(mesh), 0, 0
+    for photo in photos:
+        camera, own, depth = photo.camera, photo.own().numpy(), photo.depth().numpy()
+        step = max(1, round((camera.height * camera.width / _PIXELS) ** 0.5))
+        rows, columns = (each.reshape(-1) for each in np.mgrid[: camera.height : step, : camera.width : step])
+        rays, _ = rays_through(mesh, camera, np.stack([columns, rows], axis=1) + 0.5)
+        hit = caster.cast_rays(rays)["t_hit"].numpy()
+        mine, scene = own[rows, columns], depth[rows, columns]
+        hidden = ~mine & (scene > 0) & (scene < (1.0 - HIDES) * hit)
+        shown = np.isfinite(hit) & ~hidden
+        both, either = both + int((shown & mine).sum()), either + int((shown | mine).sum())
+    return both / either if either else 1.0
 
 
 def _moved(mesh: Mesh, photos: Sequence[Photo], progress: Callable[[int], None]) -> tuple[Mesh, float] | None:

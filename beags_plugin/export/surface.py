@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from beags_plugin.core.cameras import Camera
 from beags_plugin.export.fusion import Mesh
 
 
@@ -40,3 +41,19 @@ def in_voxels(mesh: Mesh, points: np.ndarray) -> Any:
     import open3d
 
     return open3d.core.Tensor(((points - mesh.vertices[0]) / mesh.voxel).astype(np.float32))
+
+
+def rays_through(mesh: Mesh, camera: Camera, xy: np.ndarray) -> tuple[Any, np.ndarray]:
+    """Return Open3D's tensor of rays [P, 6] through pixel coordinates [P, 2], in the frame of ``surface_of``.
+
+    Their parameter is the depth along the camera's z, in the mesh's unit. The second are their ways [P, 3] in a unit of
+    depth.
+    """
+    import open3d
+
+    K = camera.K.double().numpy()
+    ways = np.concatenate([(xy - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones((len(xy), 1))], axis=1)
+    ways = ways @ camera.rotation.double().numpy()
+    start = in_voxels(mesh, camera.center.double().numpy()[None]).numpy()
+    rays = np.concatenate([np.broadcast_to(start, ways.shape), ways / mesh.voxel], axis=1)
+    return open3d.core.Tensor(rays.astype(np.float32)), ways

@@ -20,7 +20,7 @@ from beags_plugin.export.base import Photo
 from beags_plugin.export.color import linear_from_srgb, srgb_from_linear
 from beags_plugin.export.fusion import Mesh, decimated
 from beags_plugin.export.glb import glb_bytes
-from beags_plugin.export.placing import placed
+from beags_plugin.export.placing import _moved, outline_iou, placed
 from beags_plugin.export.surface import area_vectors, vertex_normals
 from beags_plugin.export.texture import textured
 
@@ -142,6 +142,28 @@ def test_photos_place_a_surface_that_lies_a_pixel_off(box, inwards):
     assert before.min() > 0.9 and np.median(after) < 0.25 and np.quantile(after, 0.9) < 0.5
     again = placed(off, photos_of(box))
     assert np.array_equal(again.mesh.vertices, found.mesh.vertices)
+
+
+def test_a_reflection_behind_a_surface_does_not_draw_it_in(box):
+    """Photos agree about what lies behind it, as highlights of glossy things do, but their masks show its outline."""
+    outside = photos_of(box)
+    behind = replace(box, vertices=box.vertices * (1 - 1.2 * PIXEL / 0.4))
+    glossy = [replace(photo, image=inner.image) for photo, inner in zip(outside, photos_of(behind), strict=True)]
+    drawn_in, pixels = _moved(box, glossy, lambda done: None)
+    assert pixels < -0.6 and outline_iou(drawn_in, outside) < outline_iou(box, outside) - 0.01
+    found = placed(box, glossy)
+    assert found.mesh is box and found.pixels == 0.0
+
+
+def test_an_outline_is_compared_with_masks_where_nothing_hides_it(box):
+    seen, screened = photos_of(box), photos_of(box, screen=True)
+    assert outline_iou(box, seen) > 0.97
+    half = [replace(photo, own=lambda own=photo.own: own() & (torch.arange(160) >= 80)) for photo in seen]
+    assert outline_iou(box, half) == pytest.approx(0.5, abs=0.05)
+    hidden = [replace(photo, depth=screen.depth) for photo, screen in zip(half, screened, strict=True)]
+    assert outline_iou(box, hidden) > 0.96
+    nothing = [replace(photo, own=lambda: torch.zeros(160, 160, dtype=torch.bool)) for photo in seen]
+    assert outline_iou(box, nothing) == 0.0
 
 
 def test_a_surface_of_one_colour_or_of_two_photos_stays(box):
