@@ -5,6 +5,9 @@ by four rays a pixel into the held-out views. PSNR is over the pixels well insid
 scenes, which are exact) that mesh and splats both cover, its mean over views; covered is the share of the masks' pixels
 that the mesh covers. Chamfer is the mean of the two mean distances between mesh and exact surface, the underside too,
 in per cent of the object's longest side; it is not a number for captures, whose shapes nobody knows.
+
+With ``--one-colour`` before RUN: PSNR of the splats alone, as they are and with one colour from all sides, which is
+what any texture can be compared with where the photos' colours change with the view.
 """
 
 from __future__ import annotations
@@ -197,6 +200,29 @@ def measure(config_path: Path, objects: Sequence[str]) -> None:
         print(f"| {run.name}, mean | {VARIANTS[label]} | {formatted(np.mean(rows, axis=0))} |", flush=True)
 
 
+def measure_one_colour(config_path: Path, objects: Sequence[str]) -> None:
+    """Print PSNR of objects' splats in held-out views, as they are and with one colour each."""
+    from beags_plugin.export.page_colors import seen_colors
+    from beags_plugin.extraction.select import select_class
+    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
+    from beags_plugin.plugin.runs.read import raster_settings, training_viewpoints
+
+    run = EvaluatedRun(config_path)
+    scene = run.stages["after"]
+    training = training_viewpoints(scene.config, raster_settings(scene), config_path)
+    ids = {name: class_id for class_id, name in run.classes.items() if class_id}
+    for name in objects or ids:
+        part, _ = select_class(scene.surfels(), scene.members, ids[name])
+        kinds = part, seen_colors(part, training, lambda done: None).surfels
+        rows = []
+        for view in run.views:
+            drawn = [scored(run, kind, view, ids[name]) for kind in kinds]
+            both = drawn[0].inside & drawn[0].solid
+            if both.sum() >= FEWEST:
+                rows.append([psnr(each.splats[both], each.photo[both]) for each in drawn])
+        print("| {} {} | {:.2f} | {:.2f} |".format(run.name, name, *np.mean(rows, axis=0)), flush=True)
+
+
 @dataclass(frozen=True)
 class Scored:
     """A held-out view: its photo [H, W, 3], the pixels well inside an object's exact mask [H, W], and the object's
@@ -256,12 +282,19 @@ def formatted(row) -> str:
 
 def main() -> None:
     """Measure objects of the run that is named."""
-    if len(sys.argv) < 2:
+    arguments = sys.argv[1:]
+    if one_colour := arguments[:1] == ["--one-colour"]:
+        del arguments[0]
+    if not arguments:
         sys.exit(__doc__)
+    path = Path(arguments[0])
+    path = path if path.is_file() else path / "config.yml"
+    if one_colour:
+        print("| scene, object | splats' PSNR | with one colour from all sides |\n| --- | --- | --- |", flush=True)
+        return measure_one_colour(path, arguments[1:])
     print("| scene, object | mesh | splats' PSNR | its PSNR | covered % | chamfer % | closed % | triangles | MB |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |", flush=True)
-    path = Path(sys.argv[1])
-    measure(path if path.is_file() else path / "config.yml", sys.argv[2:])
+    measure(path, arguments[1:])
 
 
 if __name__ == "__main__":

@@ -149,7 +149,9 @@ def test_a_reflection_behind_a_surface_does_not_draw_it_in(box):
     outside = photos_of(box)
     behind = replace(box, vertices=box.vertices * (1 - 1.2 * PIXEL / 0.4))
     glossy = [replace(photo, image=inner.image) for photo, inner in zip(outside, photos_of(behind), strict=True)]
-    drawn_in, pixels = _moved(box, glossy, lambda done: None)
+    moved = _moved(box, glossy, lambda done: None)
+    assert moved is not None
+    drawn_in, pixels = moved
     assert pixels < -0.6 and outline_iou(drawn_in, outside) < outline_iou(box, outside) - 0.01
     found = placed(box, glossy)
     assert found.mesh is box and found.pixels == 0.0
