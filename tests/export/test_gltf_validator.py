@@ -16,10 +16,12 @@ import pytest
 pytest.importorskip("open3d")
 pytest.importorskip("trimesh")
 
+from photographed_box import EYES, a_box, camera_from, photo_of
 from textured_balls import a_ball, texture_of
 
 from beags_plugin.export.fusion import Mesh
 from beags_plugin.export.glb import glb_bytes
+from beags_plugin.export.texture import textured
 
 _PROGRAM = """
 const validator = require(process.argv[1]);
@@ -78,6 +80,15 @@ def test_the_validator_finds_nothing(tmp_path, textured, closed):
     found = report(path)
     assert found["issues"]["messages"] == [], found["issues"]
     assert found["info"]["totalTriangleCount"] == len(mesh.faces) and found["info"]["hasTextures"] == textured
+
+
+@VALIDATED
+def test_the_validator_finds_nothing_in_a_texture_as_large_as_photos_need(tmp_path):
+    box = a_box()
+    texture = textured(box, [photo_of(box, camera_from(eye)) for eye in EYES], 0)
+    (tmp_path / "box.glb").write_bytes(glb_bytes(box, "box", texture))
+    found = report(tmp_path / "box.glb")
+    assert found["issues"]["messages"] == [], found["issues"]
 
 
 @VALIDATED
