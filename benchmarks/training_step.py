@@ -40,7 +40,7 @@ class Training:
 
 
 class TrainingStep(Training):
-    """The step of the preset ``beags`` on one scene: L1 + SSIM and normal losses; in refinement two more.
+    """The step of the preset ``beags-paper`` on one scene: L1 + SSIM and normal losses; in refinement two more.
 
     samples: Z of the occupancy loss, in a refinement step with boundary and occupancy losses; None: a base step.
     rasterizer: None for the best one here.

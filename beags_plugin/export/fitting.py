@@ -43,9 +43,13 @@ def fitted(
     from scipy.sparse import csr_array
     from scipy.sparse.linalg import lsmr
 
+    if not photos:
+        return image
     caster, columns, shares, colors = surface_of(mesh), [], [], []
+    inside = [int(well_inside(photo.own()).sum()) for photo in photos]
+    part = min(1.0, _MOST / max(sum(inside), 1))
     for done, (photo, exposure) in enumerate(zip(photos, exposures, strict=True), start=1):
-        found = _pixels(photo, atlas, mesh, caster, max(1, _MOST // len(photos)))
+        found = _pixels(photo, atlas, mesh, caster, math.ceil(part * inside[done - 1]))
         columns.append(found[0])
         shares.append(found[1])
         colors.append(srgb_from_linear(linear_from_srgb(found[2]) / exposure))

@@ -50,27 +50,34 @@ def placed(
     """Return a mesh of at least one face, moved to where photos agree; as it is where too few of them see it.
 
     A round that takes its outline away from the photos' masks does not count. progress: receives (done, total) photos,
-    each of which is looked at twice in a round.
+    each of which is looked at once, and then three times in a round.
     """
-    moved, total = 0.0, 2 * _ROUNDS * len(photos)
-    least = outline_iou(mesh, photos) - _LOST
+    count = len(photos)
+    if count < _FEWEST:
+        return Placed(mesh, 0.0)
+    moved, total = 0.0, (1 + 3 * _ROUNDS) * count
+
+    def passed(before: int) -> Callable[[int], None]:
+        return lambda done: progress(before + done, total)
+
+    least = outline_iou(mesh, photos, passed(0)) - _LOST
     for turn in range(_ROUNDS):
-        first = 2 * turn * len(photos)
-        found = _moved(mesh, photos, lambda done, first=first: progress(first + done, total))
-        if found is None or outline_iou(found[0], photos) < least:
+        first = (1 + 3 * turn) * count
+        found = _moved(mesh, photos, passed(first))
+        if found is None or outline_iou(found[0], photos, passed(first + 2 * count)) < least:
             break
         mesh, pixels = found
         moved += pixels
     return Placed(mesh, moved)
 
 
-def outline_iou(mesh: Mesh, photos: Sequence[Photo]) -> float:
+def outline_iou(mesh: Mesh, photos: Sequence[Photo], progress: Callable[[int], None] = lambda done: None) -> float:
     """Return the IoU of a mesh's outline with the masks of photos, over all of them; what hides the mesh is left out.
 
-    1 where neither shows anything.
+    1 where neither shows anything. progress: receives how many photos are done.
     """
     caster, both, either = surface_of(mesh), 0, 0
-    for photo in photos:
+    for done, photo in enumerate(photos, start=1):
         camera, own, depth = photo.camera, photo.own().numpy(), photo.depth().numpy()
         step = max(1, round((camera.height * camera.width / _PIXELS) ** 0.5))
         rows, columns = (each.reshape(-1) for each in np.mgrid[: camera.height : step, : camera.width : step])
@@ -80,6 +87,7 @@ def outline_iou(mesh: Mesh, photos: Sequence[Photo]) -> float:
         hidden = ~mine & (scene > 0) & (scene < (1.0 - HIDES) * hit)
         shown = np.isfinite(hit) & ~hidden
         both, either = both + int((shown & mine).sum()), either + int((shown | mine).sum())
+        progress(done)
     return both / either if either else 1.0
 
 

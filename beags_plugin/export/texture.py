@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from beags_plugin.core.lifting import project
-from beags_plugin.export.atlas import Atlas, picture, texels, unwrapped
+from beags_plugin.export.atlas import SMALLEST, Atlas, picture, texels, unwrapped
 from beags_plugin.export.baking import Places, baked
 from beags_plugin.export.base import Photo
 from beags_plugin.export.fitting import fitted
@@ -39,7 +39,8 @@ class Texture:
 
 def textured(mesh: Mesh, photos: Sequence[Photo], size: int) -> Texture:
     """Return the texture of a mesh of at least one face; size: its side in texels, 0 for one that suits the photos."""
-    atlas = unwrapped(mesh, size) if size else unwrapped(mesh, LARGEST, suitable_density(mesh, photos))
+    density = 0.0 if size else suitable_density(mesh, photos)
+    atlas = unwrapped(mesh, LARGEST, density) if density else unwrapped(mesh, size or SMALLEST)
     at = texels(atlas)
     normals = at.of(vertex_normals(mesh))
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
@@ -56,11 +57,12 @@ def textured(mesh: Mesh, photos: Sequence[Photo], size: int) -> Texture:
 def suitable_density(mesh: Mesh, photos: Sequence[Photo]) -> float:
     """Return how many texels along a side of the mesh's unit are a bit finer than a pixel of the nearer photos.
 
-    0 without photos that have the mesh before them.
+    Photos count that have the mesh before them; 0 without any.
     """
     middle = torch.from_numpy((mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2)
     finest = []
     for photo in photos:
         _, z = project(middle[None], photo.camera.to(torch.float64))
-        finest.append(photo.camera.focal / float(z[0]) if float(z[0]) > 0 else 0.0)
+        if float(z[0]) > 0:
+            finest.append(photo.camera.focal / float(z[0]))
     return _FINE * float(np.quantile(finest, _NEAREST)) if finest else 0.0

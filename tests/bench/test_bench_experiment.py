@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from places import ROOT
 
 pytest.importorskip("nerfstudio")
 
@@ -38,11 +39,14 @@ def test_scenes_for_choosing_and_for_reporting_are_kept_apart(name):
     assert not set(SEEDS["choosing"]) & set(SEEDS["reporting"]) and experiment.variants
 
 
-def test_rows_named_after_presets_refine_as_these_do():
-    """In the experiment of presets, all from one base; k of the paper's is scaled to the pixels."""
-    experiment = load_experiment("presets")
+@pytest.mark.parametrize(
+    ("name", "count"), [("presets", 3), ("compare", 2), (str(ROOT / "benchmarks/presets-captures.toml"), 2)]
+)
+def test_rows_named_after_presets_refine_as_these_do(name, count):
+    """All from one base; k of the paper's is scaled to the pixels."""
+    experiment = load_experiment(name)
     rows = [variant for variant in experiment.variants if variant.name in preset_names()]
-    assert len(rows) == 3
+    assert len(rows) == count
     for row in rows:
         own, preset = (
             preset_config(name, overrides, Path()).model_config

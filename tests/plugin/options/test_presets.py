@@ -78,7 +78,7 @@ def test_entry_points_give_the_presets():
 
 
 def test_the_presets_of_one_phase_are_that_phase_of_beags():
-    """Who trains beags-base and then beags-refine gets what beags gives."""
+    """The options of beags-base and beags-refine together are those of beags."""
 
     def overrides(name):
         kept = read_toml(preset_folder() / f"{name}.toml", "preset")["overrides"]
