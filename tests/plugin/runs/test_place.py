@@ -87,6 +87,8 @@ def test_data_elsewhere_are_named_by_an_option(tmp_path):
     (tmp_path / "lab").rename(tmp_path / "disk")
     for words in ("eval", "export --object cup --format obj --resolution 8", "masks reproject", "masks check"):
         called("beags", *words.split(), "--load-config", config, "--data", tmp_path / "disk")
+        assert words == "masks check" or (config.parent / COMMANDS[words]).exists()
+    assert not (tmp_path / "lab").exists()
 
 
 # -- nerfstudio's commands -------------------------------------------------------------------------------------------
