@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from itertools import count
@@ -101,18 +101,42 @@ def sharp(page: Page) -> bool:
     return found is not None and max(int(found[1]), int(found[2])) == MAX_RESOLUTION
 
 
-def awaited(page: Page, true, press: str | None = None) -> np.ndarray:
+STILL = 1.0  # seconds that a picture must stay as it is: the page names its size before it has decoded it
+
+
+def awaited(page: Page, true: Callable[[np.ndarray], bool], act: str | Callable[[], object] | None = None) -> np.ndarray:
     """Return the picture, once it is as asked for and stays so.
 
-    press: the button that makes it so; pressed again after a while, as a panel that is put together anew hears nothing.
+    act: the button that makes it so, or a function; done again after a while, as a panel that is put together anew
+    hears nothing.
     """
-    found, looks = [picture(page)], count()
+    found, looks, since = [picture(page)], count(), time.monotonic()
 
     def holds() -> bool:
-        if press is not None and next(looks) % 40 == 0:
-            page.press(press)
-        found.append(picture(page))
-        return differing(*found[-2:]) == 0.0 and true(found[-1]) and sharp(page)
+        nonlocal since
+        if act is not None and next(looks) % 40 == 0:
+            page.press(act) if isinstance(act, str) else act()
+        found[:] = [found[-1], picture(page)]
+        if differing(*found) > 0.0 or not true(found[-1]):
+            since = time.monotonic()
+        return time.monotonic() - since > STILL and sharp(page)
 
-    page.wait(holds)
+    try:
+        page.wait(holds)
+    except AssertionError as error:
+        described = f"the picture varies by {varied(found[-1]):.2f}, mean {found[-1].mean():.1f}"
+        raise AssertionError(f"{described}; {error}") from None
     return found[-1]
+
+
+def slid(page: Page, label: str, value: float, true: Callable[[np.ndarray], bool]) -> np.ndarray:
+    """Move a slider until the picture is as asked for; see ``awaited``."""
+    moves = count()
+
+    def move() -> None:
+        if next(moves):  # a field that has the value already tells nobody
+            page.slide(label, value + 0.01)
+            time.sleep(1.0)
+        page.slide(label, value)
+
+    return awaited(page, true, move)

@@ -9,7 +9,7 @@ from run_folders import CLASSES, write_prepared, write_scene, write_trained
 pytest.importorskip("nerfstudio")
 
 from browser import NEEDED, Page
-from viewer_pages import COLORS, HEIGHT, WIDTH, awaited, differing, painted, varied, viewed
+from viewer_pages import COLORS, HEIGHT, WIDTH, awaited, differing, painted, slid, varied, viewed
 
 from beags_plugin.extraction.ply import read_ply
 
@@ -78,8 +78,7 @@ def test_objects_are_isolated_hidden_faded_and_removed(page):
     page.wait(lambda: struck(page) == "background,box")
     awaited(page, lambda now: painted(now, "box") > 0.01, "Show all objects")
     awaited(page, lambda now: painted(now, "cup") < 0.001 and painted(now, "box") > 0.01, "Hide")
-    page.slide("Rest", 0.5)
-    awaited(page, lambda now: painted(now, "cup") > 0.01)
+    slid(page, "Rest", 0.5, lambda now: painted(now, "cup") > 0.01)
     awaited(page, lambda now: painted(now, "cup") < 0.001 and painted(now, "box") > 0.01, "Remove")
     page.wait(lambda: struck(page) == "cup")
 
@@ -90,14 +89,11 @@ def test_the_sliders_fade_and_thin_out(page):
     classes = awaited(page, lambda now: painted(now, "cup") > 0.01 < painted(now, "box"))
     page.choose("Output type", "accumulation")
     whole = awaited(page, lambda now: differing(now, classes) > 0.01 and varied(now) > 2)  # not what was there before
-    page.slide("Least opacity", 0.97)
-    awaited(page, lambda now: varied(now) < 1)
-    page.slide("Least opacity", 0.9)
-    awaited(page, lambda now: differing(now, whole) < 0.002)
+    empty = slid(page, "Least opacity", 0.97, lambda now: varied(now) < 1)
+    slid(page, "Least opacity", 0.9, lambda now: differing(now, whole) < 0.1 * differing(empty, whole))
     page.choose("Object", "box")
     alone = awaited(page, lambda now: differing(now, whole) > 0.01, "Isolate")
-    page.slide("Rest", 0.2)
-    awaited(page, lambda now: differing(now, whole) > 0.01 < differing(now, alone))
+    slid(page, "Rest", 0.2, lambda now: differing(now, whole) > 0.01 < differing(now, alone))
 
 
 def middle_of(seen: np.ndarray, name: str) -> tuple[float, float]:
