@@ -104,7 +104,7 @@ def sharp(page: Page) -> bool:
 STILL = 1.0  # seconds that a picture must stay as it is: the page names its size before it has decoded it
 
 
-def awaited(page: Page, true: Callable[[np.ndarray], bool], act: str | Callable[[], object] | None = None) -> np.ndarray:
+def awaited(page: Page, true: Callable[[np.ndarray], bool], act: str | Callable[[], None] | None = None) -> np.ndarray:
     """Return the picture, once it is as asked for and stays so.
 
     act: the button that makes it so, or a function; done again after a while, as a panel that is put together anew
