@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,22 +18,29 @@ _CURVES = (
     ("extracted_iou_after", "extracted IoU, %", 100.0),
     ("extracted_biou_after", "extracted BIoU, %", 100.0),
     ("psnr_after", "PSNR, dB", 1.0),
-    ("seconds refinement", "refinement, s", 1.0),
+    ("cpu_seconds", "CPU after the base, s", 1.0),
     ("peak_memory_mb", "peak memory, MB", 1.0),
 )
 _PAPER_MARKS = "ovs^Dp*X"
 _WIDTH, _HEIGHT = 4.4, 3.6  # of one diagram, inches
 _BAR_HEIGHT = 0.22  # so that the names of many bars do not touch
 _LOGARITHMIC = 20.0  # an axis that spans more than this factor is logarithmic
+_FEW = 4  # lines of a sweep, with their dashes, that a legend within a diagram has room for
+_COLORS, _MARKS = 10, "osD^"
 
 
 def plot_experiment(path: Path, experiment: Experiment, rows: Sequence[ResultRow]) -> None:
-    """Plot a row of bars for the variants and a row of curves per sweep; the suffix of ``path`` gives the format."""
+    """Plot a row of bars for the variants and a row of curves per sweep; the suffix of ``path`` gives the format.
+
+    A diagram without any figure is left out of a picture of sweeps alone.
+    """
     variants = [row for row in rows if not row.variant.sweep]
+    known = [curve for curve in _CURVES if any(row.figures[curve[0]] is not None for row in rows)]
+    curves = _CURVES if variants or not known else tuple(known)
     height = 1 if variants else 0
     names = len({row.variant.name for row in variants})
     inches = max(_HEIGHT, _BAR_HEIGHT * names) if not experiment.sweeps else _HEIGHT
-    figure, axes = new_figure(len(_CURVES), height + len(experiment.sweeps), size=(_WIDTH, inches))
+    figure, axes = new_figure(len(curves), height + len(experiment.sweeps), size=(_WIDTH, inches))
     if variants:
         for column, (metric, title) in enumerate(_BARS):
             _bars(axes[0, column], experiment, variants, metric, title, column, labels=column == 0)
@@ -41,8 +48,9 @@ def plot_experiment(path: Path, experiment: Experiment, rows: Sequence[ResultRow
         for column, (metric, title) in enumerate((_CURVES[3][:2], _CURVES[4][:2]), start=3):
             _bars(axes[0, column], experiment, variants, metric, title, None, labels=False)
     for line, sweep in enumerate(experiment.sweeps, start=height):
-        for column, curve in enumerate(_CURVES):
+        for column, curve in enumerate(curves):
             _curves(axes[line, column], [row for row in rows if row.variant.sweep == sweep], sweep, *curve)
+        _legend(axes[line])
     figure.suptitle(experiment.description)
     save_figure(path, figure)
 
@@ -83,27 +91,41 @@ def _curves(axes: Axes, rows: Sequence[ResultRow], sweep: str, metric: str, titl
     """Plot means as thick lines, assignment alone dashed, scenes thin, with a colour per line of the sweep."""
     lines = list(dict.fromkeys(row.variant.line for row in rows))
     for index, line in enumerate(lines):
-        color = f"C{index % 10}"
+        color, mark = f"C{index % _COLORS}", _MARKS[index // _COLORS % len(_MARKS)]
         of_line = [row for row in rows if row.variant.line == line]
         for scene, seed in dict.fromkeys((row.scene, row.seed) for row in of_line):
             points = _points([row for row in of_line if (row.scene, row.seed) == (scene, seed)], metric, factor)
             axes.plot(*points, lw=0.6, alpha=0.6, color=color)
         averaged = means(of_line)
-        axes.plot(*_points(averaged, metric, factor), "o-", lw=2, ms=4, color=color, label=line or "refined")
-        if metric.endswith("_after"):
-            before = _points(averaged, metric.replace("_after", "_before"), factor)
+        axes.plot(*_points(averaged, metric, factor), f"{mark}-", lw=2, ms=4, color=color, label=line or "refined")
+        before = _points(averaged, metric.replace("_after", "_before"), factor)
+        if metric.endswith("_after") and len(lines) <= _FEW:
             label = ", ".join(filter(None, [line, "assignment alone"]))
             axes.plot(*before, "--", lw=1.2, color=color, label=label)
-    values = [row.variant.x for row in rows if row.variant.x is not None]
-    if min(values) > 0 and max(values) / min(values) > _LOGARITHMIC:
-        axes.set_xscale("log")
+    _scale(axes.set_xscale, [row.variant.x for row in rows])
+    if title.startswith("CPU"):
+        _scale(axes.set_yscale, [row.figures[metric] for row in rows])
     if title.startswith("peak"):
         axes.set_ylim(bottom=0)
-    if title.startswith("extracted IoU"):
-        axes.legend(fontsize="x-small")
-    axes.ticklabel_format(axis="y", useOffset=False)
+    if axes.get_yscale() == "linear":
+        axes.ticklabel_format(axis="y", useOffset=False)
     axes.set_xlabel(sweep)
     axes.set_title(title)
+
+
+def _scale(set_scale: Callable[[str], None], values: Sequence[float | None]) -> None:
+    """Make an axis logarithmic where the values span a large factor."""
+    known = [value for value in values if value is not None]
+    if known and min(known) > 0 and max(known) / min(known) > _LOGARITHMIC:
+        set_scale("log")
+
+
+def _legend(axes: Sequence[Axes]) -> None:
+    """Name the lines of a row of diagrams: within the first one, or beside the last where they are many."""
+    if len(axes[0].get_legend_handles_labels()[0]) <= 2 * _FEW:
+        axes[0].legend(fontsize="x-small")
+    else:
+        axes[-1].legend(fontsize="x-small", loc="center left", bbox_to_anchor=(1.02, 0.5))
 
 
 def _points(rows: Sequence[ResultRow], metric: str, factor: float) -> tuple[list[float], list[float]]:

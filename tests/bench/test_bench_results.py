@@ -171,6 +171,18 @@ def test_the_plot_has_failures_or_none(rows, tmp_path):
             assert image.width > 1000 and len(image.convert("L").getcolors()) > 20
 
 
+def test_the_plot_of_many_lines_has_no_empty_diagrams(tmp_path):
+    """Masks of made-up objects have no quality: of five diagrams three are left, with the names beside them."""
+    from PIL import Image
+
+    experiment = load_experiment("classes")
+    given = {"psnr_after": 30.0, "cpu_seconds": 9.0, "peak_memory_mb": 700.0}
+    rows = [ResultRow(v, "a", 0, dict.fromkeys(FIGURES) | given, {}) for v in experiment.variants]
+    plot_experiment(tmp_path / "p.png", experiment, rows)
+    with Image.open(tmp_path / "p.png") as image:
+        assert image.width == 3 * 484
+
+
 def test_rows_come_from_outcomes_in_order(experiment):
     variant = experiment.variants[0]
     trial = plan(experiment, [scene()], masks_of(scene()), "code")[0].trial
