@@ -18,6 +18,8 @@ from beags_plugin.system.errors import UserError
 from benchmarks import readme_table
 
 RESULTS = ROOT / "docs" / "results"
+COSTS = {"rendered_iou_after": 0.75, "steps": 200, "cpu_seconds": 40.5, "cpu_seconds total": 90.25,
+         "own_memory_mb": 300.5, "peak_memory_mb": 900.5}  # fmt: skip
 
 
 def cells(text: str) -> list[list[str]]:
@@ -57,7 +59,7 @@ def clone(tmp_path):
     shutil.copy(ROOT / "README.md", tmp_path)
     experiment = load_experiment(written(tmp_path, GOOD))
     figures = {**dict.fromkeys(FIGURES), "extracted_iou_after": 0.91234567, "extracted_biou_after": 0.8,
-               "worst_biou_after": 0.5, "psnr_after": 30.126, "psnr_shown_after": 31.0}  # fmt: skip
+               "worst_biou_after": 0.5, "psnr_after": 30.126, "psnr_shown_after": 31.0, **COSTS}  # fmt: skip
     rows = [
         ResultRow(Variant("neither loss"), scene, 1, figures, {"cup": figures})
         for scene in ("tabletop 1", "tabletop 2", "room 1")
@@ -75,6 +77,8 @@ def test_one_command_makes_the_table_from_a_result(clone):
     assert [row["scene"] for row in kept["rows"]] == ["tabletop 1", "tabletop 2", "room 1", "tabletop 1"]
     assert kept["rows"][3]["failed"] == "no memory"
     assert kept["means"][0]["extracted_iou_after"] == 0.912346
+    assert COSTS.items() <= kept["rows"][0].items() and COSTS.items() <= kept["means"][0].items()
+    assert not COSTS.keys() & kept["rows"][3].keys()  # failed
     text = (clone / "README.md").read_text()
     head, line, control, failed, *_ = cells(text.partition(readme_table.BEGIN)[2])
     assert head[2:] == ["extracted IoU, BIoU", "worst object's BIoU", "PSNR", "PSNR shown", "removal PSNR, shown"]
