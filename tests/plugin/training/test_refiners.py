@@ -33,8 +33,11 @@ from beags_plugin.plugin.objects.extract import extract_objects
 from beags_plugin.plugin.runs.read import read_run
 from beags_plugin.plugin.training import densifier
 from beags_plugin.plugin.training.scene_edits import edit_scene
+from beags_plugin.refiners import REFINERS
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.ply import read_vertices
 
+TRAINED = {"bea": {}}
 UNTRAINED = {
     "none": {},
     "flashsplat": {"gamma": -0.9},
@@ -43,22 +46,25 @@ UNTRAINED = {
 }
 OWN: dict[str, dict] = {
     "cob-gs": {"epochs": 6, "tau": 0.4, "threshold": 0.2},  # both objects claim some Gaussians
-    "trace3d": {"min_pixels": 2},
+    "cob-gs: box": {"object": "box", "epochs": 6, "tau": 0.4, "threshold": 0.2},
+    "trace3d": {"min_pixels": 2, "max_ambiguous": 0.7, "member_share": 0.5},
     "gaussian-grouping": {"threshold": 0.25},
     "objectgs": {"labels": "nonzero"},
-    "opengaussian": {"coarse": 2, "fine": 2, "min_gaussians": 1, "min_leaf": 1, "max_scale": 9.0, "min_views": 1},
+    "opengaussian": {"coarse": 8, "fine": 4, "min_gaussians": 1, "min_leaf": 1, "max_scale": 9.0, "min_views": 1},
     "instascene": {"min_gaussians": 2, "samples": 500, "cosine": 0.8},
     "ilgs": {"threshold": 0.02},
     "unified-lift": {"codes": 200, "threshold": 0.02},  # many random codes, some of which are of an object
 }
 EDITING = {"sagd": {"threshold": 0.3, "gd_interval": 2}}
+RUNS = {**TRAINED, **UNTRAINED, **OWN, **EDITING}
+"""Options by the name of a refiner, perhaps with a remark after a colon."""
 PLACES = ["/gauss_params.means", "/gauss_params.scales"]
 BASE_STEPS = STEPS[0]
 
 
 def overrides(refiner: str, **options) -> dict:
     return {
-        "pipeline.model.refiner": refiner,
+        "pipeline.model.refiner": refiner.partition(":")[0],
         "pipeline.model.refiner_options": options,
         "pipeline.model.refine_rounds": 1,
         "pipeline.model.prepare.reprojection": "none",
@@ -81,9 +87,8 @@ def refined(data, tmp_path_factory):
 
     def run(name: str) -> Path:
         if name not in made:
-            options = {**UNTRAINED, **OWN, **EDITING}[name]
-            run_to_end(short_config(data, folder / name, **overrides(name, **options)))
-            made[name] = folder / name
+            made[name] = folder / name.replace(": ", "-")
+            run_to_end(short_config(data, made[name], **overrides(name, **RUNS[name])))
         return made[name]
 
     return run
@@ -106,6 +111,31 @@ def test_a_refiner_that_learns_features_keeps_the_base_bit_for_bit(refined, name
     assert not differences(parameters(base.state), parameters(after.state))
     own = checkpoint_of(run)["beags"]["parts"]["refinement"]["own"]
     assert own["adam"]["state"], "it has made steps"
+
+
+def test_every_refiner_has_a_run_here():
+    assert {name.partition(":")[0] for name in RUNS} == set(REFINERS.names())
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_objects_of_every_refiner_are_extracted_and_exported(refined, tmp_path, name):
+    """Each with the Gaussians that the run holds for it, and with all their values."""
+    config = refined(name) / "config.yml"
+    scene = read_run(config)
+    members, whole = scene.members, parameters(scene.state)
+    expected = {scene.classes[c]: members.of(c) for c in members.present()}
+    assert CLASSES[0] in expected and len(expected) > 1, "some Gaussians are of an object"
+    extracted = extract_objects(config, keep_all=True, output=tmp_path / "extracted")
+    assert {item.name for item in extracted} == expected.keys() - {CLASSES[0]}
+    for item in extracted:
+        part = read_run(item.config)
+        assert [part.classes[c] for c in part.members.present()] == [item.name]
+        assert not differences(parameters(part.state), {k: v[expected[item.name]] for k, v in whole.items()})
+        assert len(read_vertices(item.ply)) == item.gaussians == int(expected[item.name].sum())
+    exported = export_run(config, everything=True, keep_all=True, output=tmp_path / "exports")
+    assert {item.name: item.gaussians for item in exported} == {k: int(v.sum()) for k, v in expected.items()}
+    vertices = {path.stem: len(read_vertices(path)) for path in (tmp_path / "exports").glob("*.ply")}
+    assert vertices == {item.name: item.gaussians for item in exported}
 
 
 def test_objects_that_overlap_go_through_evaluation_extraction_and_export(refined):
@@ -228,7 +258,7 @@ def test_a_joint_base_grows_with_the_classes_of_its_seeds(data, tmp_path, monkey
 )
 def test_a_killed_run_ends_as_the_whole_one(refined, data, tmp_path, monkeypatch, name, step):
     run = tmp_path / "run"
-    changes = overrides(name, **{**OWN, **EDITING}[name])
+    changes = overrides(name, **RUNS[name])
     interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, BASE_STEPS + step), **changes)
     resume_to_end(run)
     found = differences(without_clocks(checkpoint_of(run)), without_clocks(checkpoint_of(refined(name))))
