@@ -16,6 +16,7 @@ pytest.importorskip("nerfstudio")
 from nerfstudio.viewer.viewer_elements import ViewerClick
 from viewer_windows import ALWAYS, Window, write_finished
 
+from beags_plugin.core.membership import Membership
 from beags_plugin.extraction.ply import read_ply
 from beags_plugin.labels.colors import colorize
 from beags_plugin.plugin.viewer.choice import Choice
@@ -84,6 +85,43 @@ def test_the_split_screen_shows_two_outputs_as_soon_as_it_is_opened(window):
         assert "gl_z_buf_depth" not in (*controls._output_render.options, *controls._split_output_render.options)
     finally:
         controls._split.value, controls._max_res.value = False, size
+
+
+@pytest.mark.parametrize("class_id", [0, 1, 2])
+def test_objects_that_overlap_are_drawn_as_each_would_be_alone(window, class_id):
+    """Isolated, hidden and removed; the cup has Gaussians of the box, and some of its own belong to nobody."""
+    panel, model = window.panel, window.model
+    plain, phi = model.members(), model.class_ids.clone()
+    masks = {1: (phi == 1) | (phi == 2) & (torch.arange(len(phi)) % 3 == 0), 2: phi == 2}
+    masks[1][(phi == 1).nonzero()[::4]] = False
+    members = Membership.of_masks(masks, phi)
+    shared = masks[1] & masks[2]
+    assert bool(shared.any()) and not bool((members.of(0) == (phi == 0)).all())
+    # one object against all else, which is told by another class
+    alone = Membership(torch.where(members.of(class_id), class_id, 1 if class_id != 1 else 0).int())
+    choices = [Choice().isolate(class_id), Choice().hide(class_id), Choice(faded_opacity=0.5).remove(class_id)]
+    try:
+        for choice in choices:
+            looks = []
+            for each in (members, alone):
+                model.take_members(each)
+                panel.choose(choice)
+                looks.append({**window.look("class_map"), **window.look("class_confidence")})
+                index = model.viewing.copy().index
+                expected = members.of(class_id) if choice is choices[0] else ~members.of(class_id)
+                assert torch.equal(index, expected.nonzero()[:, 0])
+            overlapping, exclusive = looks
+            for name in ALWAYS:
+                assert torch.equal(overlapping[name], exclusive[name]), (choice, name)
+            if choice is choices[0]:  # shared Gaussians are in the object's colour
+                assert torch.equal(overlapping["class_map"], exclusive["class_map"])
+                assert torch.equal(overlapping["class_confidence"], exclusive["class_confidence"])
+        model.take_members(members)
+        panel.follow()
+        assert panel.counts == {c: int(members.of(c).sum()) for c in (0, 1, 2)}
+        assert sum(panel.counts.values()) == len(phi) + int(shared.sum())
+    finally:
+        model.take_members(plain)
 
 
 def test_what_is_hidden_in_the_viewer_changes_no_figure(window):
