@@ -56,6 +56,16 @@ def test_counts_are_those_counted_by_hand(case, dtype, rasterizer):
         assert found.tolist() == pytest.approx(sums, rel=1e-4)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("layers", "pixels", "weight"), [(0, 540, 80.054), (1, 540, 2.5651), (2, 458, 0.09988)])
+def test_counts_see_through_what_hides_a_surfel(layers, pixels, weight, dtype, rasterizer):
+    """Even two opaque layers, 60 px wide, let about a thousandth of its weight through, in most of its pixels."""
+    inputs, camera = facing(64, 64, [(32, 32, 60, 0.999)] * layers + [(46, 32, 4, 0.8)], dtype)
+    assert counts(rasterizer, inputs, camera, HALVES, 2)[-1].tolist() == [0, pixels]
+    found = rasterizer.class_contributions(inputs, camera, SETTINGS, HALVES, 2)[-1]
+    assert found.tolist() == pytest.approx([0.0, weight], rel=1e-4)
+
+
 def test_unlabelled_pixels_and_ids_of_no_class_are_not_counted(rasterizer):
     inputs, camera = facing(6, 5, [(3, 2, WIDE, 0.9)])
     labels = EVERYWHERE * 300

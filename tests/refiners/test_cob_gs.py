@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
+from drawn_discs import camera, discs
 from owned_scenes import OwnedScene
 from run_folders import drawn_labels, ring_cameras
 
 from beags_plugin.assignment.contributions import contributions
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.refiners import flashsplat, make_refiner
 from beags_plugin.refiners.cob_gs import CobGsRefiner, CobGsTraining
@@ -54,6 +59,42 @@ def test_objects_take_turns_in_one_scene():
     assert members is not None and len(members) == before and members.present() == [0, 1, 2]
     for class_id, x in ((1, -0.5), (2, 0.5)):
         assert float(held.surfels.means[members.of(class_id), 0].mean()) == pytest.approx(x, abs=0.1)
+
+
+def held_row(extent: float) -> OwnedScene:
+    """The specification's five discs of sigma 4 px in 24 views that are alike: across the border of the mask, which is
+    right of column 32, near it, inside, and behind the camera. They overlap, which changes no count.
+    """
+    inputs, view = discs(64, [(x, 32) for x in (32, 36, 38, 46, 46)], 4.0, 0.8), camera(64)
+    inputs.means[4, 2] = -1.0
+    values = (inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits, torch.zeros(5, 4, 3))
+    labels = (torch.arange(64) >= 32).int().repeat(64, 1)
+    held = OwnedScene(24, [labels] * 24, surfels=Surfels.of(*(each.float() for each in values)))
+    held.cameras[:] = [Camera(view.viewmat.float(), view.K.float(), 64, 64)] * 24
+    held.scene = replace(held.scene, extent=extent)
+    return held
+
+
+@pytest.mark.parametrize(("extent", "splits"), [(3.9, True), (4.1, False)])
+def test_a_phase_splits_what_is_mixed_and_large_and_the_last_removes_it(extent, splits):
+    """A disc is 0.04 wide; what must exceed 0.01 of the extent for a split may be of any size for removal."""
+    for tau, mixed in ((0.5, [0, 1]), (0.8, [0, 1, 2])):
+        held = held_row(extent)
+        split = CobGsRefiner(object="cup", tau=tau).own_training(held.scene).before_step(0)
+        assert split is not None and split.edited is not None
+        kept = [i for i in range(5) if i not in mixed]
+        children = [i for i in mixed for _ in range(2)]
+        assert sorted(split.edited.source.tolist()) == (sorted(kept + children) if splits else [0, 1, 2, 3, 4])
+        assert sorted(split.edited.source[split.edited.fresh].tolist()) == (children if splits else [])
+
+        own = CobGsRefiner(object="cup", tau=tau).own_training(held.scene)  # a run of one phase, which is the last
+        held.take(own.last_edit())
+        (removal,) = held.edits
+        assert removal.edited is not None and removal.edited.source.tolist() == kept
+        assert not removal.edited.fresh.any()
+        members = own.finish()
+        assert members is not None and members.of(1).tolist() == [True] * (len(kept) - 1) + [False]
+        assert own.state()["logits"]["logits"][-1] == 0.0, "what no view shows stays where it began"
 
 
 def test_an_object_of_its_own_keeps_adam_and_has_the_steps_of_one():
