@@ -9,6 +9,11 @@ Gaussian's weights over the labelled pixels of the object, and r that over all o
 
 Objects are cut out one by one against the rest: with gamma >= 0 a Gaussian joins at most one and perhaps none, with
 gamma < 0 perhaps several.
+
+Where the port differs: sums are of float64 and in a fixed order, where the source adds float32 in any; the second line
+above replaces the first, which the source computes; all views vote, as in its scripts (its code takes ten unless told
+otherwise); pixels without a label, which it does not know, enter no sum; gamma is by default that of one of its
+scripts, not 0 as in its code. It draws no masks of objects: they are drawn here as those of all refiners.
 """
 
 from __future__ import annotations
