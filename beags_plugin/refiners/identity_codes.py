@@ -36,7 +36,6 @@ WEIGHT_3D = 2.0
 LARGEST_SAMPLE = 200_000
 ANCHORS = 1_000
 THRESHOLD = 0.3  # of an object in space
-THRESHOLD_2D = 0.2  # of an object's picture
 HULL = True
 IQR_FACTOR = 1.0
 LEAST_INLIERS = 5  # of a hull
@@ -120,11 +119,6 @@ def neighbour_loss(classifier: Classify, codes: Tensor, groups: Tensor, weight: 
 def right_pixels(logits: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
     """Return how many labelled pixels have their class as the largest logit, and how many are labelled."""
     return (logits.argmax(dim=-1) == labels).sum(), (labels < logits.shape[-1]).sum()
-
-
-def masks_in_picture(classifier: Classify, drawn: Tensor, threshold: float = THRESHOLD_2D) -> Tensor:
-    """Return [H, W, K] bool, the authors' masks of all classes: the softmax of a drawn code [H, W, C] above a bound."""
-    return classifier(drawn).softmax(dim=-1) > threshold
 
 
 def members(
