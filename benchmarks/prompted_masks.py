@@ -1,15 +1,19 @@
-"""Masks by the same few clicks from each source: python -m benchmarks.prompted_masks [--refine] OUTPUT RUN [RUN ...].
+"""Masks by the same few clicks from each source.
+
+python -m benchmarks.prompted_masks [--refine] [--preset NAME] [--sources NAME,...] OUTPUT RUN [RUN ...]
 
 Each RUN is a base (config.yml) trained on a generated scene, which has exact masks. For every object three points on
 it and two beside it are placed in the training view that shows most of it (``picking.placed``). The cut takes these
 alone; GrabCut, which asks for boxes and for all objects of a view, also gets the box of every object in each of these
 views; ``salient`` gets nothing and is scored on all objects as one. Printed, in per cent: the mean over objects of the
-mean IoU over the training views without a prompt. With --refine, ``beags-fast`` refines the base with these masks and
-with the exact ones, and the extracted BIoU of held-out views follows, the mean and that of the worst object.
+mean IoU over the training views without a prompt. With --refine, the preset (``beags-fast``) refines the base with
+these masks and with the exact ones, and the extracted BIoU of held-out views follows, the mean and the worst object's.
+OUTPUT keeps a run for each scene, source and preset; one that is there is scored as it is.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -19,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from beags_plugin.labels.classes import read_classes, read_id_mask
+from beags_plugin.system.shipped import shipped_names
 from benchmarks.picking import placed
 
 IGNORED = 65535
@@ -64,15 +69,19 @@ def overlap(
     return float(np.mean([np.mean(values) for values in by_object.values() if values]))
 
 
-def refined(base: Path, data: Path, masks: Path, run: Path) -> str:
-    """Refine the base with other masks; return the extracted BIoU, the mean and the worst object's, as text."""
+def refined(base: Path, data: Path, masks: Path, folder: Path, preset: str) -> str:
+    """Refine the base with other masks by a preset; return the extracted BIoU, mean and worst object's, as text.
+
+    folder: of the runs with these masks; each preset has its own below it.
+    """
     from beags_plugin.plugin.objects.evaluate import evaluate_run
     from beags_plugin.plugin.presets import preset_config
     from beags_plugin.plugin.runs.launch import train
     from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 
+    run = folder / preset
     if not (run / "config.yml").exists():
-        config = preset_config("beags-fast", {"pipeline.model.base_steps": 0}, Path("benchmarks"))
+        config = preset_config(preset, {"pipeline.model.base_steps": 0}, Path("benchmarks"))
         config.run_dir, config.vis, config.load_dir = run, "tensorboard", base / "nerfstudio_models"
         config.steps_per_eval_image = 0
         config.data_config.dataparser = BeagsDataParserConfig(data=data, masks_path=masks)
@@ -82,8 +91,8 @@ def refined(base: Path, data: Path, masks: Path, run: Path) -> str:
     return f"{100 * found['mean']['extracted']['after']['biou']:.1f}, {100 * worst:.1f}"
 
 
-def compare(config_path: Path, output: Path, refine: bool) -> None:
-    """Print the rows of one base."""
+def compare(config_path: Path, output: Path, sources: Sequence[str], preset: str | None) -> None:
+    """Print the rows of one base; preset: refines with the masks of each source and the exact ones; None: nothing."""
     from beags_plugin.plugin.objects.make_masks import configured_source, make_masks
     from beags_plugin.plugin.runs.place import open_run
     from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
@@ -98,7 +107,7 @@ def compare(config_path: Path, output: Path, refine: bool) -> None:
     names = read_classes(data / "classes.json")
     prompts, prompted = prompts_of(exact, names, boxes=False)
     objects = [entry["id"] for entry in prompts["objects"]]
-    for source in (*SOURCES, "exact"):
+    for source in (*sources, "exact"):
         folder = output / data.name / source
         folder.mkdir(parents=True, exist_ok=True)
         masks, quality = folder / "masks", "100"
@@ -116,14 +125,34 @@ def compare(config_path: Path, output: Path, refine: bool) -> None:
                 print(f"{data.name}: {source}: {error}", file=sys.stderr)
                 continue
             quality = f"{overlap(folder, exact, objects, prompted, source == 'salient'):.1f}"
-        after = refined(config_path.parent, data, masks, folder / "run") if refine and source != "salient" else "-"
+        after = "-"
+        if preset is not None and source != "salient":
+            after = refined(config_path.parent, data, masks, folder, preset)
         print(f"| {data.name} | {source} | {quality} | {after} |", flush=True)
 
 
+def source_list(text: str) -> list[str]:
+    """Return the sources of a list with commas; raises ``ArgumentTypeError`` for a name that is none."""
+    names = text.split(",")
+    if unknown := [name for name in names if name not in SOURCES]:
+        raise argparse.ArgumentTypeError(f"no source {', '.join(map(repr, unknown))}: choose from {', '.join(SOURCES)}")
+    return names
+
+
+def main(given: Sequence[str] | None = None) -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--refine", action="store_true", help="refine with the masks of each source")
+    parser.add_argument("--preset", default="beags-fast", choices=shipped_names("method_configs"), metavar="NAME")
+    parser.add_argument("--sources", type=source_list, default=list(SOURCES), metavar="NAME,...")
+    parser.add_argument("output", type=Path)
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="config.yml of a base")
+    options = parser.parse_args(given)
+    after = f"worst after {options.preset}" if options.refine else "worst after refinement"
+    print(f"| scene | source | IoU of training masks | extracted BIoU, {after} |\n|---|---|---|---|")
+    for config in options.runs:
+        compare(config, options.output, options.sources, options.preset if options.refine else None)
+
+
 if __name__ == "__main__":
-    given = [argument for argument in sys.argv[1:] if argument != "--refine"]
-    if len(given) < 2:
-        sys.exit(__doc__)
-    print("| scene | source | IoU of training masks | extracted BIoU, worst after refinement |\n|---|---|---|---|")
-    for config in given[1:]:
-        compare(Path(config), Path(given[0]), "--refine" in sys.argv)
+    main()

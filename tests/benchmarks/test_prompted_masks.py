@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.prompted_masks import IGNORED, overlap, prompts_of
+from benchmarks import prompted_masks
+from benchmarks.prompted_masks import IGNORED, main, overlap, prompts_of, refined
 
 
 def views() -> dict[str, np.ndarray]:
@@ -40,3 +44,43 @@ def test_masks_are_scored_in_views_without_a_prompt_and_where_the_truth_is_known
     Image.fromarray(1 - drawn).save(tmp_path / "masks/a.png")  # prompted: does not count
     assert overlap(tmp_path, truth, [1, 2], {"a"}, as_one=False) == pytest.approx(100 * (3 / 4 + 1 / 2) / 2)
     assert overlap(tmp_path, truth, [1, 2], {"a"}, as_one=True) == pytest.approx(100 * 4 / 6)
+
+
+def test_the_command_line_chooses_preset_and_sources(monkeypatch, capsys):
+    asked = []
+    monkeypatch.setattr(prompted_masks, "compare", lambda *given: asked.append(given))
+    main(["--refine", "--preset", "beags-refine", "--sources", "cut", "out", "a/config.yml", "b/config.yml"])
+    assert [(str(run), str(output), sources, preset) for run, output, sources, preset in asked] == [
+        ("a/config.yml", "out", ["cut"], "beags-refine"),
+        ("b/config.yml", "out", ["cut"], "beags-refine"),
+    ]
+    asked.clear()
+    main(["out", "a/config.yml"])
+    assert asked[0][2:] == (["cut", "grabcut", "salient"], None)
+    main(["--refine", "out", "a/config.yml"])
+    assert asked[1][3] == "beags-fast"
+    for wrong in (["--sources", "cut,sam9"], ["--preset", "beags-slow"]):
+        with pytest.raises(SystemExit):
+            main([*wrong, "out", "a/config.yml"])
+        assert wrong[1].split(",")[-1] in capsys.readouterr().err
+
+
+def test_runs_of_different_presets_are_kept_apart_and_not_trained_again(monkeypatch, tmp_path):
+    trained = []
+
+    def train(config):
+        trained.append((config.method_name, config.run_dir, config.pipeline.model.base_steps))
+        config.run_dir.mkdir(parents=True)
+        (config.run_dir / "config.yml").touch()
+
+    def score(path: Path):
+        biou = {"beags-fast": 0.5, "beags-refine": 0.75}[path.parent.name]
+        extracted = {"extracted": {"after": {"biou": biou}}}
+        return SimpleNamespace(to_json=lambda: {"mean": extracted, "worst": "cup", "objects": {"cup": extracted}})
+
+    monkeypatch.setattr("beags_plugin.plugin.runs.launch.train", train)
+    monkeypatch.setattr("beags_plugin.plugin.objects.evaluate.evaluate_run", score)
+    for _ in range(2):
+        for preset, text in (("beags-fast", "50.0, 50.0"), ("beags-refine", "75.0, 75.0")):
+            assert refined(tmp_path, tmp_path, tmp_path, tmp_path / "cut", preset) == text
+    assert trained == [(name, tmp_path / "cut" / name, 0) for name in ("beags-fast", "beags-refine")]
