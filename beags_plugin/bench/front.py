@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beags_plugin.bench.experiment import Experiment
+from beags_plugin.bench.point_labels import Point, label_points
 from beags_plugin.bench.report import new_figure, save_figure
 from beags_plugin.bench.results import ResultRow, means
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-COSTS = (("cpu_seconds total", "CPU seconds, base and refinement"), ("peak_memory_mb", "peak memory, MB"))
+TOTAL = ("cpu_seconds total", "CPU seconds, base and refinement")
+REFINEMENT = ("cpu_seconds", "CPU seconds after the base, which all share")
+MEMORY = ("peak_memory_mb", "peak memory, MB")
 QUALITIES = (("extracted_biou_after", "extracted BIoU, %", 100.0), ("psnr_after", "PSNR, dB", 1.0))
+LOGARITHMIC = 20.0  # an axis that spans more than this factor is logarithmic
+FRONT, BEATEN = "#d94801", "#2171b5"
 
 
 def pareto_front(rows: Sequence[ResultRow], cost: str, quality: str) -> list[ResultRow]:
@@ -32,34 +38,69 @@ def pareto_front(rows: Sequence[ResultRow], cost: str, quality: str) -> list[Res
     return [row for row, _, _ in front]
 
 
+def costs(rows: Sequence[ResultRow]) -> tuple[tuple[str, str], ...]:
+    """Return the costs to plot, each with its title: seconds and memory.
+
+    The seconds of a base that all variants share would hide the differences between them, and move no front.
+    """
+    shared = all(row.variant.base == rows[0].variant.base for row in rows)
+    return (REFINEMENT if shared else TOTAL, MEMORY)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A drawn panel: its front, its points with their numbers, the front's first, and the corners of its line."""
+
+    axes: Axes
+    front: list[ResultRow]
+    points: list[Point]
+    corners: list[tuple[float, float]]
+
+
 def plot_front(path: Path, experiment: Experiment, rows: Sequence[ResultRow]) -> None:
     """Plot the mean of every variant: a panel for every pair of a cost and a quality.
 
-    Points bear numbers, with a list of the variants beside them: names would cover each other.
+    Points bear numbers, with a list of the variants beside them: names would cover each other. Those on the first
+    panel's front are in its colour there too.
     """
-    figure, axes = new_figure(len(COSTS), len(QUALITIES), size=(6.5, 5.0))
     averaged = [row for row in means(rows) if not row.failed]
+    figure, axes = new_figure(2, len(QUALITIES), size=(6.5, 5.0))
+    panels = []
     for line, (quality, quality_title, factor) in enumerate(QUALITIES):
-        for column, (cost, cost_title) in enumerate(COSTS):
-            panel: Axes = axes[line, column]
-            _panel(panel, averaged, cost, quality, factor)
-            panel.set_xlabel(cost_title)
-            panel.set_ylabel(quality_title)
+        for column, (cost, cost_title) in enumerate(costs(averaged)):
+            panels.append(_panel(axes[line, column], averaged, cost, quality, factor))
+            axes[line, column].set_xlabel(cost_title)
+            axes[line, column].set_ylabel(quality_title)
     names = [f"{number}  {row.variant.name}" for number, row in enumerate(averaged, start=1)]
     handles = [axes[0, 0].plot([], [], " ")[0] for _ in names]
-    figure.legend(handles, names, loc="outside right upper", handlelength=0, handletextpad=0, fontsize="small")
-    figure.suptitle(f"{experiment.description} Line: the Pareto front.")
+    colors = [FRONT if row in panels[0].front else "black" for row in averaged]
+    figure.legend(
+        handles, names, loc="outside right upper", handlelength=0, handletextpad=0, fontsize="small", labelcolor=colors
+    )
+    figure.suptitle(f"{experiment.description} Orange: the Pareto front.")
+    figure.canvas.draw()  # the layout, in which labels have their places
+    figure.set_layout_engine("none")
+    for panel in panels:
+        label_points(panel.axes, panel.points, panel.corners)
     save_figure(path, figure)
 
 
-def _panel(axes: Axes, rows: Sequence[ResultRow], cost: str, quality: str, factor: float) -> None:
+def _panel(axes: Axes, rows: Sequence[ResultRow], cost: str, quality: str, factor: float) -> Panel:
     front = pareto_front(rows, cost, quality)
+    points, corners = [], []
     for number, row in enumerate(rows, start=1):
         x, y = row.figures[cost], row.figures[quality]
         if x is not None and y is not None:
-            color = "#d94801" if row in front else "#6baed6"
-            axes.plot(x, factor * y, "o", ms=4, color=color, zorder=2)
-            axes.annotate(str(number), (x, factor * y), (3, 3), textcoords="offset points", fontsize="x-small")
-    x = [row.figures[cost] or 0.0 for row in front]
-    y = [factor * (row.figures[quality] or 0.0) for row in front]
-    axes.step(x, y, where="post", color="#d94801", lw=1, zorder=1)
+            color = FRONT if row in front else BEATEN
+            axes.plot(x, factor * y, "o", ms=4, color=color, zorder=2 + (row in front))
+            points.append((x, factor * y, str(number), color))
+    for row in front:
+        x, y = row.figures[cost] or 0.0, factor * (row.figures[quality] or 0.0)
+        corners += [(x, corners[-1][1])] if corners else []
+        corners.append((x, y))
+    axes.plot([x for x, _ in corners], [y for _, y in corners], color=FRONT, lw=1, zorder=1)
+    if points and max(points)[0] > LOGARITHMIC * min(points)[0] > 0:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter("{x:g}")
+    axes.margins(0.08)
+    return Panel(axes, front, sorted(points, key=lambda point: point[3] != FRONT), corners)
