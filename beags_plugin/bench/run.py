@@ -79,8 +79,8 @@ def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
         files["confidence"] = picture.with_stem(f"{picture.stem}-confidence")
         plot_confidence(files["confidence"], runs, outcomes)
     if experiment.objects:
-        files["objects"] = picture.with_stem(f"{picture.stem}-objects")
-        plot_objects(files["objects"], runs, outcomes)
+        paths = plot_objects(picture.with_stem(f"{picture.stem}-objects"), runs, outcomes)
+        files |= {f"objects {place}" if place > 1 else "objects": path for place, path in enumerate(paths, start=1)}
     if experiment.front:
         files["front"] = picture.with_stem(f"{picture.stem}-front")
         plot_front(files["front"], experiment, rows)

@@ -10,6 +10,7 @@ import numpy as np
 from beags_plugin.system.errors import UserError, writing
 
 CAPTION = 18  # pixels of text above each cell
+FURTHER_LINE = 12  # pixels of each line of text after the first
 GAP = 4  # pixels between cells
 MARGIN = 0.15  # of the crop, around the object: its boundary may spread
 
@@ -40,15 +41,21 @@ def crop(image: np.ndarray, square: Square, fill: int = 0) -> np.ndarray:
 
 
 def cell(image: np.ndarray, size: tuple[int, int], caption: str) -> np.ndarray:
-    """Return [height + CAPTION, width, 3] uint8: the image resized to (width, height) under its caption."""
+    """Return [height + CAPTION, width, 3] uint8: the image resized to (width, height) under its caption.
+
+    A caption of several lines takes ``FURTHER_LINE`` more for each.
+    """
     from PIL import Image, ImageDraw
 
     width, height = size
     enlarged = image.shape[1] < width  # enlarged pixels stay sharp, so that boundaries can be judged
     resample = Image.Resampling.NEAREST if enlarged else Image.Resampling.BOX
-    picture = Image.new("RGB", (width, height + CAPTION), "white")
-    picture.paste(Image.fromarray(image).resize(size, resample), (0, CAPTION))
-    ImageDraw.Draw(picture).text((2, 3), printable(caption), fill="black")
+    lines = printable(caption).split("\n")
+    above = CAPTION + FURTHER_LINE * (len(lines) - 1)
+    picture = Image.new("RGB", (width, height + above), "white")
+    picture.paste(Image.fromarray(image).resize(size, resample), (0, above))
+    for place, line in enumerate(lines):
+        ImageDraw.Draw(picture).text((2, 3 + FURTHER_LINE * place), line, fill="black")
     return np.asarray(picture)
 
 
