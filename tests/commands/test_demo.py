@@ -16,7 +16,6 @@ from beags_plugin.commands import demo
 from beags_plugin.commands.cli import main
 from beags_plugin.commands.demo import STAMP, _trained, check_preset
 from beags_plugin.data.quick import quick_downscale
-from beags_plugin.plugin.objects.extract import folder_names
 from beags_plugin.plugin.options.config import base_config
 from beags_plugin.system.errors import UserError
 
@@ -161,11 +160,6 @@ def test_brackets_in_a_path_are_no_markup(tmp_path, capsys):
         main(["demo", "--data", str(tmp_path / "x[/y]")])
     assert end.value.code == 2
     assert "x[/y] does not exist" in capsys.readouterr().out.replace("\n", "")
-
-
-def test_objects_never_share_a_folder():
-    assert folder_names({1: "cup 1", 2: "cup_1", 3: "Box"}) == {1: "cup_1_1", 2: "cup_1_2", 3: "Box"}
-    assert folder_names({1: "cup", 2: "Cup"}) == {1: "cup_1", 2: "Cup_2"}
 
 
 def test_a_saved_run_names_its_folder_absolutely(tmp_path, monkeypatch):

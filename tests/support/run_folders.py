@@ -104,6 +104,15 @@ def write_trained(
     return write_run(config, folder, state_of(*discs(), assigned=assigned, scale=scale), 199)
 
 
+def rename_classes(config_path: Path, classes: dict[int, str]) -> None:
+    """Give a run's classes other names, and more of them, which then have no Gaussians."""
+    from beags_plugin.plugin.runs.place import open_run
+    from beags_plugin.plugin.runs.write import write_run
+
+    state = state_of(*discs()) | {"_extra_state": {"classes": classes}}
+    write_run(open_run(config_path), config_path.parent, state, 299)
+
+
 def write_camera_path(path: Path) -> Path:
     """Write a file such as the viewer's tab Render saves: five cameras of the ring."""
     cameras = [{"camera_to_world": pose.flatten().tolist(), "fov": 40.0, "aspect": 4 / 3} for pose in ring(5)]

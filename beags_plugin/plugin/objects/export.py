@@ -34,7 +34,6 @@ from beags_plugin.system.errors import UserError
 
 MANIFEST = "manifest.json"
 WHOLE = "whole scene"  # the name of the file that holds all Gaussians
-WHOLE_ID = -1  # of no class
 
 
 def export_run(
@@ -90,7 +89,8 @@ def export_run(
     if closing is not None or any(exporter.needs_views for exporter in exporters.values()):
         views = training_viewpoints(scene.config, raster_settings(scene), config_path)
     names = list(present) if everything else list(dict.fromkeys(objects))
-    titles = folder_names({**scene.classes, WHOLE_ID: WHOLE})  # an object may be called so too
+    whole_title = file_name(WHOLE)
+    titles = folder_names(scene.classes, [whole_title])  # an object may be called so too
     metres = None
     if (length := pose.length()) is not None:
         metres = metres_per_unit(length, config_path, frame, scene)
@@ -101,7 +101,7 @@ def export_run(
     )
     items: list[tuple[str, int | None, str]] = [(name, present[name], titles[present[name]]) for name in names]
     if whole:
-        items.append((WHOLE, None, file_name(WHOLE)))
+        items.append((WHOLE, None, whole_title))
     steps = Steps(job.steps(), len(items), progress or (lambda done, total: None))
     exported = [job.export(name, class_id, folder / title, steps) for name, class_id, title in items]
     if everything:

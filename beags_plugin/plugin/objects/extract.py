@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -113,13 +114,26 @@ def _rows(state: dict[str, Any], index: Tensor, members: Membership) -> dict[str
     return {**rows, "class_ids": members.class_ids, "_extra_state": extra}
 
 
-def folder_names(classes: dict[int, str]) -> dict[int, str]:
-    """Return class id to the name of its folder, with the id appended where two would get the same one."""
+def folder_names(classes: dict[int, str], taken: Collection[str] = ()) -> dict[int, str]:
+    """Return class id to the name of its folder or files, no two the same, also where case is ignored.
+
+    Names that would be shared, or are ``taken``, get the id appended, and a number if that is another's name.
+    """
     plain = {index: file_name(name) for index, name in classes.items()}
-    shared = Counter(name.lower() for name in plain.values())  # some file systems ignore case
-    return {index: name if shared[name.lower()] == 1 else f"{name}_{index}" for index, name in plain.items()}
+    shared = Counter(name.casefold() for name in (*plain.values(), *taken))  # some file systems ignore case
+    found, used = {}, set(shared)
+    for index, name in plain.items():
+        if shared[name.casefold()] > 1:
+            longer = chain([f"{name}_{index}"], (f"{name}_{index}_{number}" for number in count(2)))
+            name = next(each for each in longer if each.casefold() not in used)
+            used.add(name.casefold())
+        found[index] = name
+    return found
 
 
 def file_name(name: str) -> str:
-    """Return a class name as part of a path: anything unusual becomes an underscore."""
-    return re.sub(r"[^\w.-]+", "_", name).strip("._") or "object"
+    """Return a class name as part of a path: anything unusual becomes an underscore, dots too, as suffixes have some.
+
+    So ``cup.compressed`` and ``cup`` cannot share a file where one suffix ends with another.
+    """
+    return re.sub(r"[^\w-]+", "_", name).strip("_") or "object"
