@@ -128,10 +128,11 @@ class Extract:
     def run(self) -> None:
         with starting(self):
             from beags_plugin.plugin.objects.extract import extract_objects
+        sentences: list[str] = []
         with progress_bar("extracting") as progress:
             extracted = extract_objects(
                 self.load_config, self.object, self.remove, self.output, progress, keep_all=self.keep_all,
-                data=self.data,
+                data=self.data, say=sentences.append,
             )  # fmt: skip
         write_json(self.json, [asdict(done) for done in extracted])
         for done in extracted:
@@ -140,6 +141,8 @@ class Extract:
                 f"  ns-viewer --load-config {done.config}",
                 markup=False,
             )
+        for sentence in sentences:
+            CONSOLE.print(sentence, markup=False)
 
 
 @dataclass
@@ -178,17 +181,20 @@ class Export:
         with starting(self):
             from beags_plugin.plugin.objects.export import export_run
         options = {name: asdict(self.mesh) for name in ("glb", "usdz", "obj", "stl", "3mf")}
+        sentences: list[str] = []
         with progress_bar("exporting") as progress:
             exported = export_run(
                 self.load_config, self.object, self.all, self.format, self.frame, self.output, options, progress,
                 whole=self.whole, data=self.data, keep_all=self.keep_all, pose=self.pose,
-                closing=self.mesh if self.close else None,
+                closing=self.mesh if self.close else None, say=sentences.append,
             )  # fmt: skip
         write_json(self.json, [asdict(one) for one in exported])
         for one in exported:
             CONSOLE.print(str(one), markup=False)
             for file in one.files:
                 CONSOLE.print(f"  {file}", markup=False)
+        for sentence in sentences:
+            CONSOLE.print(sentence, markup=False)
 
 
 @dataclass

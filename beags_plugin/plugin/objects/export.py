@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,13 @@ from beags_plugin.export.pose_options import PoseOptions
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.plugin.objects.export_job import ExportJob, Progress, Shown, Steps
 from beags_plugin.plugin.objects.exported import Exported
-from beags_plugin.plugin.objects.extract import file_name, folder_names, objects_with_gaussians
+from beags_plugin.plugin.objects.extract import (
+    empty_objects,
+    file_name,
+    folder_names,
+    objects_with_gaussians,
+    said_of_empty,
+)
 from beags_plugin.plugin.objects.pose import metres_per_unit
 from beags_plugin.plugin.runs.place import open_run
 from beags_plugin.plugin.runs.read import (
@@ -50,6 +56,7 @@ def export_run(
     keep_all: bool = False,
     pose: PoseOptions | None = None,
     closing: MeshOptions | None = None,
+    say: Callable[[str], None] = lambda sentence: None,
 ) -> list[Exported]:
     """Write files of objects of a run.
 
@@ -61,7 +68,8 @@ def export_run(
     among them. data: if not where they were. keep_all: keep Gaussians too that do not belong to their object
     (``cleaning.clean``); the background and the whole scene are kept as they are. pose: where objects stand and how
     large they are. closing: close objects where no photo shows them, by the surface that these options lead to; the
-    background and the whole scene are not closed. Raises ``UserError`` for a mistake, before anything is written.
+    background and the whole scene are not closed. say: receives a sentence on objects without Gaussians, if everything
+    is asked for. Raises ``UserError`` for a mistake, before anything is written.
     """
     run, folder, pose = config_path.parent, output or config_path.parent / "exports", pose or PoseOptions()
     check_placement(placement)
@@ -105,6 +113,7 @@ def export_run(
     steps = Steps(job.steps(), len(items), progress or (lambda done, total: None))
     exported = [job.export(name, class_id, folder / title, steps) for name, class_id, title in items]
     if everything:
+        empty = empty_objects(scene, run)
         world = "run" if transform is None else "input"
         content = {
             "run": str(config_path.absolute()),
@@ -112,9 +121,12 @@ def export_run(
             "world": world,
             **({} if metres is None else {"unit": "metre", "metres_per_world_unit": metres}),
             "objects": [one.to_json(folder) for one in exported],
+            "empty": [{"name": name, "class_id": class_id} for name, class_id in empty.items()],
         }
         with whole_file(folder / MANIFEST) as part:
             part.write_text(json.dumps(content, indent=2), "utf8")
+        if empty:
+            say(said_of_empty(empty, "exported"))
     return exported
 
 

@@ -50,14 +50,16 @@ def extract_objects(
     *,
     keep_all: bool = False,
     data: Path | None = None,
+    say: Callable[[str], None] = lambda sentence: None,
 ) -> list[Extracted]:
     """Write a run and a .ply per object.
 
     config_path: config.yml of a refined (or assigned) run. objects: names; all that have Gaussians but the background
     if empty. remove: keep all but the object instead. output: folder for the runs; ``extracted/`` in the run by
     default. progress: receives (done, total) objects. keep_all: keep Gaussians too that do not belong to their object
-    (``cleaning.clean``); with ``remove`` they go with it in any case. data: of the run, if not where they were. Raises
-    ``UserError`` for an unknown name, before anything is written.
+    (``cleaning.clean``); with ``remove`` they go with it in any case. data: of the run, if not where they were. say:
+    receives a sentence on objects without Gaussians, if all are asked for. Raises ``UserError`` for an unknown name,
+    before anything is written.
     """
     scene = read_assigned_run(config_path, data)
     run, members = config_path.parent, scene.members
@@ -89,6 +91,8 @@ def extract_objects(
         written.append(Extracted(title, config, ply, len(surfels), left_out))
         if progress is not None:
             progress(len(written), len(names))
+    if not objects and (empty := {name: index for name, index in empty_objects(scene, run).items() if index != 0}):
+        say(said_of_empty(empty, "extracted"))
     return written
 
 
@@ -102,6 +106,20 @@ def objects_with_gaussians(scene: SavedScene, objects: Sequence[str], run: Path)
     if absent := [name for name in objects if name not in present]:
         raise UserError(f"no Gaussian belongs to {absent[0]!r}: its masks cover too little of the scene.")
     return present
+
+
+def empty_objects(scene: SavedScene, run: Path) -> dict[str, int]:
+    """Return name to class id of all classes without Gaussians; of an extracted run, which is to lack some, none."""
+    if (run / EXTRACTION_FILE).exists():
+        return {}
+    there = set(scene.members.present())
+    return {name: index for index, name in scene.classes.items() if index not in there}
+
+
+def said_of_empty(empty: Collection[str], done: str) -> str:
+    """Return a sentence that names objects without Gaussians; done: what would have been done with them."""
+    names = ", ".join(map(repr, empty))
+    return f"no Gaussian belongs to {names}: nothing is {done} of {'it' if len(empty) == 1 else 'them'}."
 
 
 def _rows(state: dict[str, Any], index: Tensor, members: Membership) -> dict[str, Any]:
