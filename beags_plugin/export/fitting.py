@@ -4,6 +4,8 @@ The mean of photos is blurred: each of its texels lies between the pixels of eac
 between texels once more. Pixels are linear in texels, so the texels that give the photos back are a sparse least
 squares problem, with the mean as what it starts from and is held to (in the manner of Goldluecke and Cremers,
 "Superresolution texture maps for multiview reconstruction", 2009).
+
+Determinism: the solver runs on one thread of BLAS, whose sums depend on how many it has.
 """
 
 from __future__ import annotations
@@ -42,6 +44,7 @@ def fitted(
     """
     from scipy.sparse import csr_array
     from scipy.sparse.linalg import lsmr
+    from threadpoolctl import threadpool_limits
 
     if not photos:
         return image
@@ -67,9 +70,10 @@ def fitted(
     )
     matrix.sum_duplicates()
     texels = image.reshape(-1, 3)[used] / 255.0
-    for channel in range(3):
-        missing = target[:, channel] - matrix @ texels[:, channel]
-        texels[:, channel] += lsmr(matrix, missing, damp=math.sqrt(_HOLD), atol=0, btol=0, maxiter=_STEPS)[0]
+    with threadpool_limits(1, "blas"):
+        for channel in range(3):
+            missing = target[:, channel] - matrix @ texels[:, channel]
+            texels[:, channel] += lsmr(matrix, missing, damp=math.sqrt(_HOLD), atol=0, btol=0, maxiter=_STEPS)[0]
     new = image.reshape(-1, 3).copy()
     new[used] = np.round(255.0 * np.clip(texels, 0.0, 1.0))
     return new.reshape(image.shape)

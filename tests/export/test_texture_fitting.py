@@ -12,6 +12,8 @@ open3d = pytest.importorskip("open3d")
 pytest.importorskip("xatlas")
 
 from photographed_box import EXPOSURES, EYES, a_box, camera_from, photo_of
+from scipy.sparse.linalg import lsmr
+from threadpoolctl import threadpool_limits
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.export.atlas import picture, texels, unwrapped
@@ -68,6 +70,24 @@ def test_a_fitted_texture_is_nearer_to_photos_that_it_was_not_given(box, photos)
     before, after = error(box, atlas, mean, other), error(box, atlas, sharp, other)
     assert before > 0.02 and after < 0.6 * before
     assert np.array_equal(sharp, fitted(mean, atlas, box, photos, np.ones((len(photos), 3))))
+
+
+def test_textures_do_not_depend_on_the_number_of_threads(box, photos, monkeypatch):
+    """Nor do the solver's numbers before they are rounded, which tell more."""
+    atlas, mean = mean_picture(box, photos)
+    found: dict[int, list[np.ndarray]] = {1: [], 2: []}
+    for threads, kept in found.items():
+
+        def solve(*arguments, kept=kept, **options):
+            answer = lsmr(*arguments, **options)
+            kept.append(answer[0])
+            return answer
+
+        monkeypatch.setattr("scipy.sparse.linalg.lsmr", solve)
+        with threadpool_limits(threads, "blas"):
+            kept.append(fitted(mean, atlas, box, photos, np.ones((len(photos), 3))))
+    assert len(found[1]) == 4 and len(found[1][0]) > 20_000  # of fewer numbers BLAS makes no parts
+    assert all(np.array_equal(one, two) for one, two in zip(found[1], found[2], strict=True))
 
 
 def test_exposures_are_divided_out(box, photos):
