@@ -16,8 +16,8 @@ from beags_plugin.bench.report import new_figure
 from beags_plugin.bench.results import FIGURES, ResultRow
 
 
-def row(name: str, base: dict | None = None, **figures) -> ResultRow:
-    return ResultRow(Variant(name, base or {}), "a", 0, {**dict.fromkeys(FIGURES), **figures}, {})
+def row(name: str, figures: dict[str, float] | None = None, base: dict | None = None) -> ResultRow:
+    return ResultRow(Variant(name, base or {}), "a", 0, {**dict.fromkeys(FIGURES), **(figures or {})}, {})
 
 
 def test_the_seconds_of_a_base_that_all_share_are_left_out():
@@ -26,7 +26,7 @@ def test_the_seconds_of_a_base_that_all_share_are_left_out():
     assert costs([*shared, row("c", base={"pipeline.model.base_steps": 700})]) == (TOTAL, MEMORY)
     seconds, biou = (30.0, 3.0, 45.0, 40.0, 3.0), (0.8, 0.5, 0.9, 0.79, 0.4)
     rows = [
-        row(str(i), cpu_seconds=x, extracted_biou_after=y, **{"cpu_seconds total": x + 500.0})
+        row(str(i), {"cpu_seconds": x, "extracted_biou_after": y, "cpu_seconds total": x + 500.0})
         for i, (x, y) in enumerate(zip(seconds, biou, strict=True))
     ]
     fronts = [pareto_front(rows, cost, "extracted_biou_after") for cost, _ in (REFINEMENT, TOTAL)]
@@ -60,6 +60,6 @@ def test_labels_of_many_points_cover_neither_each_other_nor_points(seed):
     middles = np.array([((left + right) / 2, (bottom + top) / 2) for left, bottom, right, top in labels])
     away = np.abs(middles - pixels).max(axis=1)
     assert away.max() < 150 and np.median(away) < 30
-    written = [text.get_window_extent(figure.canvas.get_renderer()).extents for text in axes[0, 0].texts]
+    written = [text.get_window_extent().extents for text in axes[0, 0].texts]
     assert all(covers(one, other) == (i == j) for i, one in enumerate(written) for j, other in enumerate(labels))
     pyplot.close(figure)
