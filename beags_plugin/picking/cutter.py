@@ -194,9 +194,10 @@ class Cutter:
         if view.drawn is not None:  # what cannot be seen stops no light
             unseen = ~view.drawn.to(inputs.means.device)
             inputs = replace(inputs, opacity_logits=inputs.opacity_logits.masked_fill(unseen, NOTHING))
+        numbers = view.numbers.to(inputs.means.device)  # marks are made on the CPU
         with torch.no_grad():
             keys, weights = self._rasterizer.sparse_class_contributions(
-                inputs, view.camera, self._settings, view.numbers, count
+                inputs, view.camera, self._settings, numbers, count
             )
         pixels = torch.bincount(view.numbers[view.numbers != IGNORE].long(), minlength=count).double().cpu().numpy()
         found = np.zeros((count, len(self._inputs.means)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -16,6 +16,7 @@ from beags_plugin.core.regions import Ball, Block, HalfSpace
 from beags_plugin.picking.cutter import Cutter
 from beags_plugin.picking.walk import Walker
 from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.interface import FLOATS
 from beags_plugin.system.errors import UserError
 
 GREY = (0.5, 0.5, 0.5)
@@ -79,6 +80,33 @@ def test_marks_of_several_views_act_together(coloured):
     cutter, owner = coloured
     found = cutter.solve([marks(views()[3], [LOW_TOP]), marks(views()[5], [], [HIGH_TOP, FLOOR])])
     assert overlap(found, owner == 1) > 0.97
+
+
+class OtherDevice:
+    """A rasterizer on a device without memory: it refuses tensors from elsewhere, and answers as one on the CPU."""
+
+    def __init__(self, inputs, labels: torch.Tensor) -> None:
+        self.inputs, self.labels = inputs, labels
+
+    def sparse_class_contributions(self, inputs, camera, settings, labels, num_classes):
+        given = [getattr(inputs, field.name) for field in fields(inputs)]
+        devices = {tensor.device.type for tensor in (*given, labels) if isinstance(tensor, torch.Tensor)}
+        assert devices == {"meta"}, devices
+        return make_rasterizer("auto").sparse_class_contributions(
+            self.inputs, camera, settings, self.labels, num_classes
+        )
+
+
+def test_marks_go_to_the_device_of_the_gaussians():
+    cutter, _ = cutter_of(COLOURED)
+    mark = marks(views()[3], [LOW_TOP], [HIGH_TOP, FLOOR])
+    expected = cutter.solve([mark])
+    floats = {name: getattr(cutter._inputs, name).to("meta") for name in FLOATS}
+    cutter._rasterizer = OtherDevice(cutter._inputs, mark.numbers)
+    cutter._inputs = replace(cutter._inputs, **floats)
+    assert torch.equal(cutter.solve([mark]), expected)
+    everything = torch.ones(len(expected), dtype=torch.bool)
+    assert torch.equal(cutter.solve([replace(mark, drawn=everything)]), expected)
 
 
 def test_what_lies_outside_a_box_is_excluded(coloured):
