@@ -94,8 +94,8 @@ class Picks:
         """Return the classes of N Gaussians once all is picked, and their names.
 
         members, names: as before. New objects get new ids, or that of a class of their name without Gaussians. What
-        several of the picked ones hold is the last one's, and what was taken from an object is the background's. Raises
-        ``UserError`` if nothing was picked, and for a name that is empty or another object's.
+        several of the picked ones hold is the smallest one's (``_smallest_last``), and what was taken from an object is
+        the background's. Raises ``UserError`` if nothing was picked, and for a name that is empty or another object's.
         """
         changed = self.changed()
         if not changed:
@@ -113,15 +113,18 @@ class Picks:
             if name in (other for each, other in given.items() if each != class_id):
                 raise UserError(f"there are two objects called {name!r}: name one of them otherwise.")
             given[class_id] = name
-            masks = {each: mask & ~one.members for each, mask in masks.items()} | {class_id: one.members}
+            masks[class_id] = one.members
+        taken = torch.zeros(len(members), dtype=torch.bool)
+        for class_id in reversed(_smallest_last(masks)):
+            masks[class_id], taken = masks[class_id] & ~taken, taken | masks[class_id]
         return _with_masks(members, masks), given
 
     def owners(self, count: int) -> Tensor:
-        """Return [count] int64, the place of the object that holds each Gaussian, the last one if several; -1: none."""
+        """Return [count] int64, the place of the smallest object that holds each Gaussian; -1: none."""
         found = torch.full((count,), -1, dtype=torch.int64)
-        for place, one in enumerate(self.objects):
-            if one.members is not None:
-                found[one.members] = place
+        masks = {place: one.members for place, one in enumerate(self.objects) if one.members is not None}
+        for place in _smallest_last(masks):
+            found[masks[place]] = place
         return found
 
     def _with(self, one: Picked) -> Picks:
@@ -136,6 +139,11 @@ class Picks:
         ]
         cut = _cut_new if one.start is None else _corrected
         return self._with(replace(one, members=cut(cutter, one, [mark for mark in others if mark.inside])))
+
+
+def _smallest_last(masks: Mapping[int, Tensor]) -> list[int]:
+    """Return the keys of masks [N] bool by falling size, those of one size in their order: the last one wins."""
+    return sorted(masks, key=lambda each: -int(masks[each].sum()))
 
 
 def _cut_new(cutter: Cutter, one: Picked, others: Sequence[ViewMarks]) -> Tensor:

@@ -12,9 +12,10 @@ from data_folders import write_image
 from source_scenes import make
 from touching_solids import SETTINGS, pixel_of, solids, views
 
+from beags_plugin.core.membership import Membership
 from beags_plugin.masks.sources.base import Photo, SourceScene
 from beags_plugin.masks.sources.prompts import read_prompts
-from beags_plugin.picking.source import CutSource
+from beags_plugin.picking.source import CutSource, DrawnSource
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.system.errors import UserError
@@ -93,6 +94,24 @@ def test_objects_are_drawn_into_all_training_views_behind_what_hides_them(run, t
             found, truth = labels == class_id, exact == number
             if truth.sum() > 50:
                 assert (found & truth).sum() / (found | truth).sum() > 0.9
+
+
+@pytest.mark.parametrize("class_ids", [(1, 2), (2, 1)])
+def test_of_objects_that_share_gaussians_the_smaller_is_drawn(run, tmp_path, class_ids):
+    """The cut of both solids took the low block too, as a table's takes what stands on it."""
+    both, block = run.owner >= 1, run.owner == 1
+    large, small = class_ids
+    members = Membership.of_masks({large: both, small: block}, torch.zeros(len(both), dtype=torch.int32))
+    source = DrawnSource(members, {0: "background", large: "both", small: "low"})
+    _, maps = make(source, SourceScene(tmp_path, run.photos, run))
+    alone = Membership.of_masks({5: both}, torch.zeros(len(both), dtype=torch.int32))
+    _, outlines = make(DrawnSource(alone, {5: "both"}), SourceScene(tmp_path, run.photos, run))
+    assert sum((run.exact(view) == 1).sum() for view in range(len(maps))) > 500
+    for view, (labels, outline) in enumerate(zip(maps, outlines, strict=True)):
+        exact = run.exact(view) == 1
+        found = labels == small
+        assert (found & exact).sum() >= 0.95 * (found | exact).sum()
+        assert ((labels != 0) == (outline != 0)).all(), "no gap between the two"
 
 
 def test_a_stroke_is_points_along_it(run, tmp_path):

@@ -110,16 +110,37 @@ def test_a_correction_that_leaves_nothing_is_refused(scene):
         Picks().correcting("low", 5, owner == 1).marked(cutter, beside(LOW))
 
 
-def test_the_last_object_has_what_two_hold_and_shared_gaussians_are_known(scene):
+@pytest.mark.parametrize("reverse", [False, True])
+def test_the_smallest_object_has_what_several_hold(scene, reverse):
+    """A block within all solids, which lie within the whole scene, in whatever order they were picked."""
     _, owner = scene
-    first, last = owner <= 1, owner >= 1
+    nested = [("all", owner >= 0), ("solids", owner >= 1), ("low", owner == 1)]
+    objects = tuple(
+        replace(Picks().chosen, name=n, marks=(on(LOW),), members=m) for n, m in (nested[::-1] if reverse else nested)
+    )
+    picks = Picks(objects)
+    members, names = picks.applied(Membership(torch.zeros(len(owner), dtype=torch.int32)), {0: "background"})
+    ids = {name: class_id for class_id, name in names.items()}
+    wanted = {"all": owner == 0, "solids": owner == 2, "low": owner == 1}
+    for place, one in enumerate(objects):
+        assert torch.equal(members.of(ids[one.name]), wanted[one.name])
+        assert torch.equal(picks.owners(len(owner)) == place, wanted[one.name])
+
+
+def test_the_last_of_two_as_large_has_what_both_hold_and_shared_gaussians_are_known(scene):
+    _, owner = scene
+    low, size = (owner == 1).nonzero()[:, 0], int(min((owner == 0).sum(), (owner == 2).sum()))
+    first, last = (torch.zeros(len(owner), dtype=torch.bool) for _ in range(2))
+    for members, number in ((first, 0), (last, 2)):
+        members[(owner == number).nonzero()[:size, 0]] = True
+        members[low] = True
     mark = on(LOW)
     objects = tuple(replace(Picks().chosen, name=n, marks=(mark,), members=m) for n, m in (("a", first), ("b", last)))
     shared = Membership(torch.zeros(len(owner), dtype=torch.int32), {7: torch.arange(len(owner))})
     members, names = Picks(objects).applied(shared, {0: "background", 7: "all"})
     assert names == {0: "background", 7: "all", 8: "a", 9: "b"}
-    assert torch.equal(members.of(8), owner == 0) and torch.equal(members.of(9), last)
-    assert not members.of(7).any()
+    assert torch.equal(members.of(8), first & ~last) and torch.equal(members.of(9), last)
+    assert torch.equal(members.of(7), ~(first | last))
 
 
 def test_an_object_gets_the_id_that_the_masks_of_the_data_give_to_its_name(scene):
