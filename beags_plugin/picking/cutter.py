@@ -43,7 +43,16 @@ LEAST_OWN = 0.5  # of that light from Gaussians which no mark of the other kind 
 BELIEF = 0.3  # of the logit of p, beside links of at most 1
 BOUND = 1e3  # more than all links of a Gaussian can be worth
 NOTHING = -30.0  # logit of an opacity that no picture shows
+MUCH = 0.5  # of the scene: a cut that takes more may be right, but is said
 LIMIT = 1e-6  # of p, so that its logit is finite
+
+
+def takes_much(members: Tensor) -> str | None:
+    """Return what to say of a cut, [N] bool, that takes more than half of a scene, or None."""
+    share = float(members.double().mean())
+    if share <= MUCH:
+        return None
+    return f"more than half of the scene ({share:.0%}): if that is too much, mark what is beside it or draw a box"
 
 
 @dataclass(frozen=True)
@@ -100,7 +109,7 @@ class Cutter:
         excluded: [N] bool, Gaussians that do not, or None. name: of the object, for errors. growth: g; a larger one
         takes the same Gaussians and more, a negative one fewer. part: whether the object is not all of what is neither
         excluded nor outside of a box. Raises ``UserError`` if no mark lies on the object or
-        on a Gaussian, if marks contradict one another, or if all Gaussians belong to it.
+        on a Gaussian, if marks contradict one another, or if no Gaussian belongs to it, or all do.
         """
         if not any(inside for view in marks for inside in view.inside):
             raise UserError(f"no point lies on {name}: give at least one in a view that shows it.")
@@ -123,6 +132,8 @@ class Cutter:
         if found.all():
             raise UserError(f"the cut of {name} takes the whole scene: mark points beside it, or draw a box about it.")
         members = found[self._graph.nearest] & ~outside
+        if not members.any():
+            raise UserError(f"the cut of {name} takes nothing: mark points on it that no box or limit leaves out.")
         return torch.from_numpy(members)
 
     def outside(self, marks: Sequence[ViewMarks]) -> Tensor:

@@ -17,7 +17,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.masks.sources.base import Geometry, MadeMasks, MaskSource, Progress, SourceScene
 from beags_plugin.masks.sources.prompts import Prompt, PromptedObject, read_prompts
-from beags_plugin.picking.cutter import Cutter, ViewMarks
+from beags_plugin.picking.cutter import Cutter, ViewMarks, takes_much
 from beags_plugin.picking.sight import spread
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import draw_features, geometry_inputs
@@ -66,19 +66,21 @@ class CutSource(MaskSource):
         seen, total = len(cameras), len(cameras) + len(objects) + len(trained)
         cutter = Cutter(surfels, cameras, geometry.rasterizer, geometry.settings, lambda done, _: progress(done, total))
         means = geometry.input_means()
-        members = []
+        members, notes = [], []
         for done, one in enumerate(objects, start=1):
             excluded = torch.zeros(len(surfels), dtype=torch.bool)
             for region in one.space:
                 excluded |= ~region.contains(means).cpu()
             views = [view_marks(geometry, index, scene, prompts, one) for index, prompts in marked.items()]
             members.append(cutter.solve([marks for each in views for marks in each], excluded, one.name))
+            if much := takes_much(members[-1]):
+                notes.append(f"The cut of {one.name} takes {much}.")
             progress(seen + done, total)
         left = iter(range(seen + len(objects) + 1, total + 1))
         names = {0: "background", **{one.class_id: one.name for one in objects}}
         ids = [one.class_id for one in objects]
         maps = _drawn(scene, geometry, ids, torch.stack(members, dim=1), lambda: progress(next(left), total))
-        return MadeMasks(names, maps, [])
+        return MadeMasks(names, maps, notes)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import torch
 from touching_solids import SETTINGS, marks, pixel_of, solids, views
 
 from beags_plugin.core.regions import Ball, Block, HalfSpace
-from beags_plugin.picking.cutter import Cutter
+from beags_plugin.picking.cutter import Cutter, takes_much
 from beags_plugin.picking.walk import Walker
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import FLOATS
@@ -149,6 +149,24 @@ def test_bad_marks_end_with_a_sentence(coloured):
     nowhere = torch.zeros(camera.height, camera.width, dtype=torch.bool)
     with pytest.raises(UserError, match="lies outside a box or another limit"):
         cutter.solve([marks(camera, [LOW_TOP], within=nowhere)])
+
+
+def test_a_cut_that_a_limit_leaves_nothing_of_is_refused(coloured, monkeypatch):
+    """Of two Gaussians that the point on the object shows, a limit leaves out one, the point beside has the other."""
+    cutter, owner = coloured
+    shares = np.zeros((2, len(cutter._graph.nodes)))
+    shares[0, :2], shares[1, 1] = (0.6, 0.4), 0.9
+    monkeypatch.setattr(cutter, "_shares", lambda view: shares)
+    excluded = torch.zeros(len(owner), dtype=torch.bool)
+    excluded[cutter._graph.nodes[0]] = True
+    with pytest.raises(UserError, match="the cut of the cup takes nothing: mark points on it"):
+        cutter.solve([marks(views()[3], [LOW_TOP], [FLOOR])], excluded, "the cup")
+
+
+@pytest.mark.parametrize("count", [50, 51])
+def test_a_cut_of_more_than_half_of_the_scene_is_said(count):
+    said = takes_much(torch.arange(100) < count)
+    assert said is None if count == 50 else said is not None and "more than half of the scene (51%)" in said
 
 
 def test_a_cut_of_the_whole_scene_is_refused():

@@ -137,6 +137,14 @@ def test_space_is_that_of_the_input_poses(run, tmp_path):
     assert labels[row, column] == 1
 
 
+def test_a_cut_of_more_than_half_of_the_scene_is_said_and_no_other(run, tmp_path):
+    floor = {"name": "floor", "prompts": [{"view": "v3", "points": [run.pixel(3, "floor")]}]}
+    made = CutSource().make(scene_with(run, tmp_path, [low(run), floor]), lambda done, total: None)
+    assert (run.owner == 0).double().mean() > 0.5
+    (note,) = made.notes
+    assert note.startswith("The cut of floor takes more than half of the scene (") and note.endswith("draw a box.")
+
+
 BAD = {
     "no point on the object": (lambda run: low(run, points=[], box=[0, 0, 90, 80]), "gives no point on low"),
     "a view that does not exist": (lambda run: {**low(run), "prompts": [{"view": "v99", "points": [[1, 1]]}]}, "'v99'"),

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from beags_plugin.core.membership import Membership
 from beags_plugin.labels.colors import colorize
-from beags_plugin.picking.cutter import Cutter
+from beags_plugin.picking.cutter import Cutter, takes_much
 from beags_plugin.picking.picks import Picks
 from beags_plugin.plugin.objects.picked_masks import save_masks
 from beags_plugin.plugin.runs.picked import with_picked, write_picked
@@ -27,7 +27,6 @@ from beags_plugin.system.errors import UserError
 
 _CHOSEN, _OTHERS = 0.65, 0.4  # of the colour, over what has been picked
 FIRST_COLOR = 3  # of ``colorize``: one that few things have
-_MOST = 0.5  # of the scene: a cut that takes more is doubtful
 Step = Callable[[Picks], Picks]
 
 
@@ -169,9 +168,9 @@ class PickWork:
             else f", {int((one.members & ~former).sum()):,} more and "
             + (f"{int((former & ~one.members).sum()):,} fewer than before")
         )
-        much = ", more than half of the scene: exclude what is beside it" if count > _MOST * len(one.members) else ""
         took = "" if seconds is None else f" ({seconds:.1f} s)"
-        return f"{one.name}: {count:,} Gaussians{more}{much}{took}."
+        much = takes_much(one.members)
+        return f"{one.name}: {count:,} Gaussians{more}{took}." + (f" This is {much}." if much else "")
 
     # -- the thread --------------------------------------------------------------------------------------------------
 

@@ -95,6 +95,13 @@ def test_clicks_paint_the_object_and_are_undone(opened):
     assert viewing.paint is None
 
 
+def test_a_cut_of_more_than_half_of_the_scene_is_said(opened):
+    tab, _ = opened()
+    assert "half of the scene" not in click(tab, POINTS["low"], "Gaussians")
+    tab.work.change(lambda picks: picks.another())
+    assert "This is more than half of the scene (" in click(tab, POINTS["floor"], "Gaussians")
+
+
 def test_only_what_is_picked_is_shown_and_exported(opened):
     tab, config = opened()
     assert "click on it first" in press(tab, tab.files.start, "Not exported")
