@@ -126,6 +126,44 @@ def test_a_stroke_is_points_along_it(run, tmp_path):
     assert (found & truth).sum() / (found | truth).sum() > 0.9
 
 
+def test_a_stroke_beside_the_object_keeps_off_what_it_crosses(run, tmp_path):
+    row, column = pixel_of(run.cameras[3], (0.15, 0.25, 0.5))
+    both = {"view": "v3", "strokes": [[run.pixel(3, "low"), run.pixel(3, "high")]]}
+    _, wide = make(CutSource(), scene_with(run, tmp_path, [{"name": "one", "prompts": [both]}]))
+    one = {"view": "v3", "strokes": [[run.pixel(3, "low")]]}  # of a single place, as a click
+    one["outside_strokes"] = [[run.pixel(3, "high"), [column, row]], [run.pixel(3, "floor")]]
+    _, maps = make(CutSource(), scene_with(run, tmp_path, [{"name": "one", "prompts": [one]}]))
+    (prompted,) = read_prompts(tmp_path / "prompts.json")
+    assert sum(prompted.prompts["v3"].inside) == 1 < len(prompted.prompts["v3"].inside) - 2
+    exact = run.exact(3)
+    found, truth = maps[3] == 1, exact == 1
+    assert (found & truth).sum() / (found | truth).sum() > 0.9
+    high = exact == 2
+    assert (wide[3][high] == 1).mean() > 0.9 and (maps[3][high] == 1).mean() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("stroke", "message"),
+    [
+        ({"strokes": [[[20, 20], [500, 20]]]}, r"\[9\d, 20\] of one in v3 lies outside"),
+        ({"strokes": [[[20, 20], [float("inf"), 20]]]}, "object 1 of the prompts .* is wrong"),
+        ({"strokes": [[20, 20], [30, 30]]}, "object 1 of the prompts .* is wrong"),
+        ({"strokes": [[]]}, "object 1 of the prompts .* is wrong"),
+        ({"outside_strokes": [[[20, 20], [30, 20]]]}, "gives no point on one"),
+    ],
+)
+def test_bad_strokes_end_with_a_sentence(run, tmp_path, stroke, message):
+    with pytest.raises(UserError, match=message):
+        make(CutSource(), scene_with(run, tmp_path, [{"name": "one", "prompts": [{"view": "v3", **stroke}]}]))
+
+
+def test_a_stroke_on_the_object_that_crosses_one_beside_it_contradicts(run, tmp_path):
+    one = {"view": "v3", "strokes": [[run.pixel(3, "low"), run.pixel(3, "high")]]}
+    one["outside_strokes"] = [[run.pixel(3, "high"), run.pixel(3, "floor")]]
+    with pytest.raises(UserError, match="is both on one and beside it: remove one"):
+        make(CutSource(), scene_with(run, tmp_path, [{"name": "one", "prompts": [one]}]))
+
+
 def test_space_is_that_of_the_input_poses(run, tmp_path):
     both = {"name": "both", "prompts": [{"view": "v3", "points": [run.pixel(3, "low"), run.pixel(3, "high")]}]}
     both["space"] = [{"plane": [0, 0, 1, 0.06]}]
