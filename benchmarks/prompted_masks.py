@@ -1,6 +1,6 @@
 """Masks by the same few clicks from each source.
 
-python -m benchmarks.prompted_masks [--refine] [--preset NAME] [--sources NAME,...] OUTPUT RUN [RUN ...]
+python -m benchmarks.prompted_masks [--refine] [--preset NAME] [--sources NAME,...] [--snap RADIUS] OUTPUT RUN [RUN ...]
 
 Each RUN is a base (config.yml) trained on a generated scene, which has exact masks. For every object three points on
 it and two beside it are placed in the training view that shows most of it (``picking.placed``). The cut takes these
@@ -8,7 +8,8 @@ alone; GrabCut, which asks for boxes and for all objects of a view, also gets th
 views; ``salient`` gets nothing and is scored on all objects as one. Printed, in per cent: the mean over objects of the
 mean IoU over the training views without a prompt. With --refine, the preset (``beags-fast``) refines the base with
 these masks and with the exact ones, and the extracted BIoU of held-out views follows, the mean and the worst object's.
-OUTPUT keeps a run for each scene, source and preset; one that is there is scored as it is.
+--snap: the outlines of masks that sources make snap to the photos, as by ``beags masks make --snap RADIUS``. OUTPUT
+keeps a run for each scene, source, radius and preset; one that is there is scored as it is.
 """
 
 from __future__ import annotations
@@ -91,8 +92,11 @@ def refined(base: Path, data: Path, masks: Path, folder: Path, preset: str) -> s
     return f"{100 * found['mean']['extracted']['after']['biou']:.1f}, {100 * worst:.1f}"
 
 
-def compare(config_path: Path, output: Path, sources: Sequence[str], preset: str | None) -> None:
-    """Print the rows of one base; preset: refines with the masks of each source and the exact ones; None: nothing."""
+def compare(config_path: Path, output: Path, sources: Sequence[str], preset: str | None, snap: int = 0) -> None:
+    """Print the rows of one base; preset: refines with the masks of each source and the exact ones; None: nothing.
+
+    snap: pixels; see ``make_masks``.
+    """
     from beags_plugin.plugin.objects.make_masks import configured_source, make_masks
     from beags_plugin.plugin.runs.place import open_run
     from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
@@ -108,7 +112,8 @@ def compare(config_path: Path, output: Path, sources: Sequence[str], preset: str
     prompts, prompted = prompts_of(exact, names, boxes=False)
     objects = [entry["id"] for entry in prompts["objects"]]
     for source in (*sources, "exact"):
-        folder = output / data.name / source
+        name = f"{source}, snap {snap}" if snap and source != "exact" else source
+        folder = output / data.name / name.replace(", snap ", "-snap-")
         folder.mkdir(parents=True, exist_ok=True)
         masks, quality = folder / "masks", "100"
         if source == "exact":
@@ -120,7 +125,7 @@ def compare(config_path: Path, output: Path, sources: Sequence[str], preset: str
                 file.write_text(json.dumps(prompts_of(exact, names, boxes=source == "grabcut")[0]))
                 options = [f"prompts={file.absolute()}"]
             try:
-                make_masks(parser, configured_source(source, options), config_path, folder, overwrite=True)
+                make_masks(parser, configured_source(source, options), config_path, folder, overwrite=True, snap=snap)
             except UserError as error:
                 print(f"{data.name}: {source}: {error}", file=sys.stderr)
                 continue
@@ -128,7 +133,7 @@ def compare(config_path: Path, output: Path, sources: Sequence[str], preset: str
         after = "-"
         if preset is not None and source != "salient":
             after = refined(config_path.parent, data, masks, folder, preset)
-        print(f"| {data.name} | {source} | {quality} | {after} |", flush=True)
+        print(f"| {data.name} | {name} | {quality} | {after} |", flush=True)
 
 
 def source_list(text: str) -> list[str]:
@@ -145,13 +150,14 @@ def main(given: Sequence[str] | None = None) -> None:
     parser.add_argument("--refine", action="store_true", help="refine with the masks of each source")
     parser.add_argument("--preset", default="beags-fast", choices=shipped_names("method_configs"), metavar="NAME")
     parser.add_argument("--sources", type=source_list, default=list(SOURCES), metavar="NAME,...")
+    parser.add_argument("--snap", type=int, default=0, metavar="RADIUS", help="pixels, of the sources' outlines")
     parser.add_argument("output", type=Path)
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="config.yml of a base")
     options = parser.parse_args(given)
     after = f"worst after {options.preset}" if options.refine else "worst after refinement"
     print(f"| scene | source | IoU of training masks | extracted BIoU, {after} |\n|---|---|---|---|")
     for config in options.runs:
-        compare(config, options.output, options.sources, options.preset if options.refine else None)
+        compare(config, options.output, options.sources, options.preset if options.refine else None, options.snap)
 
 
 if __name__ == "__main__":

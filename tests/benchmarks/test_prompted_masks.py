@@ -49,14 +49,15 @@ def test_masks_are_scored_in_views_without_a_prompt_and_where_the_truth_is_known
 def test_the_command_line_chooses_preset_and_sources(monkeypatch, capsys):
     asked = []
     monkeypatch.setattr(prompted_masks, "compare", lambda *given: asked.append(given))
-    main(["--refine", "--preset", "beags-refine", "--sources", "cut", "out", "a/config.yml", "b/config.yml"])
-    assert [(str(run), str(output), sources, preset) for run, output, sources, preset in asked] == [
-        ("a/config.yml", "out", ["cut"], "beags-refine"),
-        ("b/config.yml", "out", ["cut"], "beags-refine"),
+    options = ["--refine", "--preset", "beags-refine", "--sources", "cut", "--snap", "2"]
+    main([*options, "out", "a/config.yml", "b/config.yml"])
+    assert [(str(run), str(output), *others) for run, output, *others in asked] == [
+        ("a/config.yml", "out", ["cut"], "beags-refine", 2),
+        ("b/config.yml", "out", ["cut"], "beags-refine", 2),
     ]
     asked.clear()
     main(["out", "a/config.yml"])
-    assert asked[0][2:] == (["cut", "grabcut", "salient"], None)
+    assert asked[0][2:] == (["cut", "grabcut", "salient"], None, 0)
     main(["--refine", "out", "a/config.yml"])
     assert asked[1][3] == "beags-fast"
     for wrong in (["--sources", "cut,sam9"], ["--preset", "beags-slow"]):
