@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,12 +18,12 @@ pytest.importorskip("nerfstudio")
 from clicked_pages import VIEW, click_on, page, position
 from viewer_windows import Window
 
-from beags_plugin.extraction.ply import read_ply
+from beags_plugin.extraction.ply import read_ply, write_ply
 from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.plugin.objects.export import export_run
 from beags_plugin.plugin.objects.extract import extract_objects
 from beags_plugin.plugin.runs.picked import PICKED_FILE
-from beags_plugin.plugin.runs.read import read_run
+from beags_plugin.plugin.runs.read import read_run, read_transform
 from beags_plugin.plugin.viewer.pointing import page_camera
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import geometry_inputs
@@ -246,23 +247,94 @@ def _options(tab, wanted: str) -> tuple[str, ...]:
     return tab.picked.options
 
 
+def _correct(tab, label: str, class_id: int) -> None:
+    """Choose an object of the run, and wait until clicks are about it."""
+    _options(tab, label)
+    tab._choose(label)
+    end = time.monotonic() + 60
+    while tab.work.picks.chosen.class_id != class_id:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
 def test_an_object_of_the_run_is_corrected_and_the_run_remembers(opened):
     """The low block has floor about it: a click takes that away."""
     tab, config = opened(assigned=True)
     before = read_run(config).members
     assert overlap(before.of(1), OWNER == 1) < 0.9
-    _options(tab, "low (of the run)")
-    tab._choose("low (of the run)")
-    end = time.monotonic() + 60
-    while tab.work.picks.chosen.class_id != 1:
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    _correct(tab, "low (of the run)", 1)
     click(tab, (-0.7, 0.3, 0.0), "Gaussians", exclude=True)
     press(tab, tab.work.keep, "Kept in")
     after = read_run(config)
     assert overlap(after.members.of(1), OWNER == 1) > 0.95 and after.classes == {0: "background", 1: "low", 2: "high"}
     assert torch.equal(after.members.of(2), before.of(2))
     assert torch.equal(tab.viewing.model.members().class_ids, after.members.class_ids)
+
+
+def test_an_extracted_run_is_corrected_and_drawn_and_the_run_that_it_is_from_stays(opened, tmp_path):
+    """The object has floor about it. A click on it alone takes all that there is, so that nothing is picked anew."""
+    config, _ = write_solids_run(tmp_path / "run", write_solids(tmp_path / "lab"), assigned=True)
+    (extracted,) = extract_objects(config, ["low"], keep_all=True)
+    tab, _ = opened(config=extracted.config)
+    before = read_run(config).members
+    owner = OWNER[before.of(1)]
+    assert "draw a box about it" in click(tab, POINTS["low"], "takes the whole scene")
+    _correct(tab, "low (of the run)", 1)
+    click(tab, (-0.7, 0.3, 0.0), "Gaussians", exclude=True)
+    block = tab.work.picks.chosen.members
+    assert len(block) == len(owner) and overlap(block, owner == 1) > 0.95 > (owner == 1).double().mean()
+    press(tab, tab.work.keep, "Kept in")
+    assert torch.equal(read_run(extracted.config).members.of(1), block)
+    assert torch.equal(read_run(config).members.class_ids, before.class_ids)
+    (again,) = extract_objects(extracted.config, ["low"], output=tmp_path / "out", keep_all=True)
+    assert again.gaussians == int(block.sum())
+    assert "beags-refine" in press(tab, tab.work.save_masks, "Saved")
+    assert any((read_id_mask(file) == 1).any() for file in (tmp_path / "lab/masks").glob("*.png"))
+
+
+def test_objects_of_another_programs_scene_are_picked(opened, tmp_path):
+    """A .ply of 3D Gaussians in no order of ours, of which ``beags-base`` made a run."""
+    from beags_plugin.plugin.presets import preset_config
+    from beags_plugin.plugin.runs.launch import train
+
+    lab, ply, run = write_solids(tmp_path / "lab"), tmp_path / "scene.ply", tmp_path / "run"
+    surfels, order = solids(COLOURED)[0], torch.randperm(len(OWNER), generator=torch.Generator().manual_seed(0))
+    write_ply(ply, surfels[order], layout="3dgs")
+    options = {"vis": "tensorboard", "pipeline.model.base_steps": 1, "pipeline.model.start_from": ply}
+    config = preset_config("beags-base", options, run)
+    config.data_config.data, config.run_dir = lab, run
+    train(config)
+    tab, _ = opened(config=run / "config.yml")
+    scene = read_run(run / "config.yml")
+    assert not scene.assigned and len(scene.surfels()) == len(order)
+    transform, scale = read_transform(run)
+    moved = not torch.allclose(transform, torch.eye(4, dtype=torch.float64)[:3])
+    assert scale != 1.0 or moved, "the run has a frame of its own"
+    view = replace(VIEW, viewmat=in_run(VIEW.viewmat, transform, scale))
+    for name, number in (("low", 1), ("high", 2)):
+        tab.note = ""
+        tab.clicked(SimpleNamespace(screen_pos=position(POINTS[name]), client=SimpleNamespace(camera=page(view))))
+        done(tab, "Gaussians")
+        assert overlap(tab.work.picks.chosen.members, OWNER[order] == number) > 0.95
+        tab.work.change(lambda picks, name=name: picks.named(name).another())
+    press(tab, tab.work.keep, "Kept in")
+    assert sorted(read_run(run / "config.yml").classes.values()) == ["background", "high", "low"]
+    (exported,) = export_run(run / "config.yml", ["low"], keep_all=True)
+    (file,) = exported.files
+    assert file.path is not None
+    found, _ = read_ply(file.path)
+    nearest = torch.cdist(found.means.double(), surfels.means.double()).min(dim=1)
+    assert float(nearest.values.max()) < 0.02, "in the frame of the file"
+    assert overlap(torch.isin(torch.arange(len(OWNER)), nearest.indices), OWNER == 1) > 0.95
+
+
+def in_run(viewmat: torch.Tensor, transform: torch.Tensor, scale: float) -> torch.Tensor:
+    """Return a view of the input frame as one of the run's, for which x' = scale (R x + t)."""
+    turn, shift = transform[:, :3].double(), transform[:, 3].double()
+    moved = viewmat.double().clone()
+    moved[:3, :3] = viewmat[:3, :3].double() @ turn.T
+    moved[:3, 3] = scale * (viewmat[:3, 3].double() - moved[:3, :3] @ shift)
+    return moved.float()
 
 
 def test_a_training_has_no_tab(tmp_path):
