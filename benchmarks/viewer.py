@@ -158,11 +158,15 @@ def measure(viewer: Any, port: int, middle: list[float], seconds: float, ours: b
 
 
 def cut_on(viewing: Any, seconds: list[float]) -> None:
-    """Cut an object out of the shown scene again and again, in a thread; seconds: receives how long each cut took."""
+    """Cut an object out of the shown scene again and again, in a thread, and show it in colour as the tab Pick does.
+
+    A mark lies on it, another beside it. seconds: receives how long each cut took.
+    """
     import torch
 
     from beags_plugin.picking.cutter import Cutter, ViewMarks
     from beags_plugin.plugin.viewer.picking import camera_along
+    from beags_plugin.plugin.viewer.viewing import Paint
 
     model, surfels = viewing.model, viewing.whole()[0]
     middle = surfels.means.median(dim=0).values
@@ -170,13 +174,25 @@ def cut_on(viewing: Any, seconds: list[float]) -> None:
     began = time.perf_counter()
     cutter = Cutter(surfels, views, model.rasterizer, model.settings())
     print(f"made once in {time.perf_counter() - began:.1f} s")
-    view = camera_along([0.0, 0.0, 0.0], middle.tolist(), 7, 600.0)
-    mark = ViewMarks("view", view, torch.zeros(7, 7, dtype=torch.int32), (True,))
+    far = surfels.means[(surfels.means - middle).norm(dim=1).argmax()]
+    places = ((middle, True), (far, False))
+    numbers = torch.zeros(7, 7, dtype=torch.int32)
+    marks = [
+        ViewMarks("view", camera_along([0.0, 0.0, 0.0], place.tolist(), 7, 600.0), numbers, (inside,))
+        for place, inside in places
+    ]
+    colors = surfels.means.new_tensor([1.0, 0.5, 0.0]).expand(len(surfels), 3)
+
+    def cut() -> None:
+        members = cutter.solve(marks).to(colors.device)
+        viewing.paint = Paint(colors, 0.65 * members.float(), None)
+
+    cut()  # here, so that an error is seen
 
     def work() -> None:
         while True:
             began = time.perf_counter()
-            cutter.solve([mark])
+            cut()
             seconds.append(time.perf_counter() - began)
 
     threading.Thread(target=work, daemon=True).start()
