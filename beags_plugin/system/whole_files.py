@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -51,11 +52,17 @@ def put_in_place(part: Path, path: Path) -> None:
     _sync_folder(path.parent)
 
 
-def remove_unfinished(folder: Path) -> list[Path]:
-    """Remove what a killed program left half written in ``folder`` and below; returns the files."""
-    found = sorted(path for path in folder.rglob(f".*{PART}") if path.is_file())
-    for path in found:
-        path.unlink()
+def remove_unfinished(folder: Path, below: bool = True, older: float = 0.0) -> list[Path]:
+    """Remove what a killed program left half written in ``folder`` and ``below``; returns the files.
+
+    older: seconds since something was written to them, where another process may be writing some too.
+    """
+    latest, found = time.time() - older, []
+    for path in sorted((folder.rglob if below else folder.glob)(f".*{PART}")):
+        with suppress(FileNotFoundError):  # another process has put it in its place
+            if path.is_file() and (not older or path.stat().st_mtime <= latest):
+                path.unlink()
+                found.append(path)
     return found
 
 

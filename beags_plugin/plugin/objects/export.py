@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -36,9 +36,12 @@ from beags_plugin.plugin.runs.read import (
     training_viewpoints,
 )
 from beags_plugin.rasterizers.interface import RasterSettings
-from beags_plugin.system.errors import UserError
+from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.reading.text import load_json
+from beags_plugin.system.whole_files import remove_unfinished
 
 MANIFEST = "manifest.json"
+_LEFT = 10.0  # seconds after which nobody writes to an unfinished file any more; another export may to a younger one
 WHOLE = "whole scene"  # the name of the file that holds all Gaussians
 
 
@@ -110,6 +113,8 @@ def export_run(
     items: list[tuple[str, int | None, str]] = [(name, present[name], titles[present[name]]) for name in names]
     if whole:
         items.append((WHOLE, None, whole_title))
+    suffixes = [exporter.suffix for exporter in exporters.values()]
+    _clear_up(folder, None if everything else {f"{title}.{suffix}" for *_, title in items for suffix in suffixes})
     steps = Steps(job.steps(), len(items), progress or (lambda done, total: None))
     exported = [job.export(name, class_id, folder / title, steps) for name, class_id, title in items]
     if everything:
@@ -128,6 +133,26 @@ def export_run(
         if empty:
             say(said_of_empty(empty, "exported"))
     return exported
+
+
+def _clear_up(folder: Path, names: Set[str] | None) -> None:
+    """Remove what a killed export left half written in a folder, and a manifest that is about to be wrong.
+
+    names: of the files that will be written; None: those of all objects.
+    """
+    manifest = folder / MANIFEST
+    with writing(folder):
+        remove_unfinished(folder, below=False, older=_LEFT)
+        if names is None or names & _listed(manifest):
+            manifest.unlink(missing_ok=True)
+
+
+def _listed(manifest: Path) -> set[str]:
+    """Return the files that a manifest lists; none if it is not there, or not ours."""
+    try:
+        return {file["path"] for one in load_json(manifest)["objects"] for file in one["files"]}
+    except (OSError, ValueError, KeyError, TypeError):
+        return set()
 
 
 def export_shown(
