@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import gzip
 import json
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from run_folders import rename_classes, write_scene, write_trained
+import torch
+from run_folders import discs, rename_classes, state_of, write_scene, write_trained
 
 pytest.importorskip("nerfstudio")
 
 from beags_plugin.commands.cli import main
+from beags_plugin.export.base import make_exporter
+from beags_plugin.extraction.ply import read_ply
+from beags_plugin.plugin.runs.place import open_run
+from beags_plugin.plugin.runs.write import write_run
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.ply import read_vertices
 
 
 def manifest_in(folder: Path) -> dict:
@@ -55,3 +66,75 @@ def test_one_object_without_gaussians_is_named(tmp_path, capsys):
     rename_classes(config, {0: "background", 1: "cup", 2: "box", 3: "lid"})
     main(["export", "--load-config", str(config), "--all", "--output", str(tmp_path / "files")])
     assert last_line(capsys) == "no Gaussian belongs to 'lid': nothing is exported of it."
+
+
+def opened_mesh(path: Path) -> bool:
+    import trimesh
+
+    mesh = trimesh.load(path, process=False)
+    mesh = mesh.to_mesh() if hasattr(mesh, "to_mesh") else mesh
+    return len(mesh.faces) > 3 and bool((mesh.extents > 0).all())
+
+
+def opened_package(path: Path) -> bool:
+    stage = pytest.importorskip("pxr.Usd").Stage.Open(str(path))
+    return bool(stage.GetDefaultPrim())
+
+
+OPENED: dict[str, Callable[[Path], bool]] = {
+    "ply": lambda path: len(read_ply(path)[0]) == 10,
+    "ply-2dgs": lambda path: len(read_vertices(path)) == 10,
+    "compressed-ply": lambda path: (
+        path.read_bytes().startswith(b"ply\n") and b"element vertex 10\n" in path.read_bytes()
+    ),
+    "spz": lambda path: gzip.decompress(path.read_bytes())[8:12] == (10).to_bytes(4, "little"),
+    "sog": lambda path: json.loads(zipfile.ZipFile(path).read("meta.json"))["count"] == 10,
+    "html": lambda path: path.read_text("utf8").startswith("<!doctype html>"),
+    "glb": opened_mesh,
+    "obj": opened_mesh,
+    "stl": opened_mesh,
+    "3mf": opened_mesh,
+    "usdz": opened_package,
+}  # each says whether a file of the ten Gaussians can be opened, by another project's reader where there is one
+
+
+def can_write(name: str) -> bool:
+    try:
+        make_exporter(name)
+    except UserError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize("kind", ["a clump", "far apart", "faint"])
+@pytest.mark.parametrize("close", [(), ("--close",)])
+def test_an_object_of_ten_gaussians_is_a_file_that_opens_or_a_sentence(tmp_path, capsys, kind, close):
+    pytest.importorskip("open3d")
+    pytest.importorskip("trimesh")
+    config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"))
+    surfels, ids = discs()
+    few = surfels[ids == 1][:10]
+    if kind == "far apart":
+        few = replace(few, means=4.0 * few.means, log_scales=few.log_scales - 2.0)
+    elif kind == "faint":
+        few = replace(few, opacity_logits=torch.full((10,), -3.0))
+    write_run(open_run(config), config.parent, state_of(few, torch.ones(10, dtype=torch.int32)), 299)
+    formats = [name for name in OPENED if can_write(name)]
+    assert {"ply", "glb", "3mf", "html"} <= set(formats)
+    arguments = ["--all", "--format", *formats, "--scale-by", "0,0,0 1,0,0 1 m", "--resolution", "32", *close]
+    main(["export", "--load-config", str(config), "--output", str(tmp_path / "files"), *arguments])
+    said = " ".join(capsys.readouterr().out.split())
+    (one,) = manifest_in(tmp_path / "files")["objects"]
+    written = {file["format"]: tmp_path / "files" / file["path"] for file in one["files"]}
+    refused = {each["format"]: each["reason"] for each in one["left_out"]}
+    assert written.keys() | refused.keys() == set(formats) and not written.keys() & refused.keys()
+    assert one["closing_gaussians"]["gaussians"] == 0 if close else "closing_gaussians" not in one
+    for name, path in written.items():
+        assert OPENED[name](path), name
+    for name, reason in refused.items():
+        assert name in ("glb", "usdz", "obj", "stl", "3mf") and f"no {name}: {reason}" in said
+        assert "'cup'" in reason and reason.endswith(".") and ("is seen in 3" in reason or "encloses nothing" in reason)
+    if kind == "a clump":
+        assert {"glb", "3mf"} <= written.keys()
+    if kind == "faint":
+        assert {"glb", "3mf"} <= refused.keys()
