@@ -51,7 +51,7 @@ build() {
 tests() { # everything that draws or uses an op on the GPU; nothing here imports nerfstudio
   "$python" -m pytest -q -p no:cacheprovider tests/ops/test_{cuda_ops,cuda_votes,image_ops}.py \
     tests/rasterizers/test_{cuda_rasterizer,cuda_gpu,rasterizer_reference,rasterizer_robustness}.py \
-    tests/rasterizers/test_{screen_shift,extremes,invariances,sparse_class_ids}.py \
+    tests/rasterizers/test_{screen_shift,extremes,invariances,sparse_class_ids}.py tests/picking/test_cut.py \
     -k "cuda and not emulated"
 }
 

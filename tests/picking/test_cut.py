@@ -212,3 +212,13 @@ def test_bits_are_the_same_for_one_and_for_three_threads():
         )
         digests.add(done.stdout)
     assert len(digests) == 1
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+def test_a_scene_on_cuda_is_cut_by_marks_on_the_host(coloured):
+    """As pages and files give them; the same Gaussians as on the CPU."""
+    surfels, _ = solids(COLOURED)
+    moved = type(surfels)(**{field.name: getattr(surfels, field.name).cuda() for field in fields(surfels)})
+    cutter = Cutter(moved, views(), make_rasterizer("auto"), SETTINGS)
+    given = [marks(views()[3], [LOW_TOP], [HIGH_TOP, FLOOR])]
+    assert overlap(cutter.solve(given), coloured[0].solve(given)) > 0.99
