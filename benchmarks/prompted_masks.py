@@ -7,9 +7,10 @@ it and two beside it are placed in the training view that shows most of it (``pi
 alone; GrabCut, which asks for boxes and for all objects of a view, also gets the box of every object in each of these
 views; ``salient`` gets nothing and is scored on all objects as one. Printed, in per cent: the mean over objects of the
 mean IoU over the training views without a prompt. With --refine, the preset (``beags-fast``) refines the base with
-these masks and with the exact ones, and the extracted BIoU of held-out views follows, the mean and the worst object's.
---snap: the outlines of masks that sources make snap to the photos, as by ``beags masks make --snap RADIUS``. OUTPUT
-keeps a run for each scene, source, radius and preset; one that is there is scored as it is.
+these masks (but ``salient``'s) and with the exact ones, and the extracted BIoU of held-out views follows, the mean and
+the worst object's. --snap: the outlines of masks that sources make snap to the photos, as by ``beags masks make --snap
+RADIUS``. OUTPUT keeps a run for each scene, source, radius and preset; one that is there is scored as it is, even if
+the masks, which are made anew, differ: name another OUTPUT after a change of the code.
 """
 
 from __future__ import annotations

@@ -64,8 +64,8 @@ class Experiment:
     samples, sample: family and seed of the generated scenes, and other options of ``SampleConfig``. seeds: of the
     training.
     reference: the variant that the others' errors are compared with. confidence, front, objects: also plot the masks'
-    confidence, the Pareto front, or the objects by each variant. relative_to_pixels: sweeps whose axis is also given
-    per million training pixels.
+    confidence, the Pareto front, or the largest objects by each variant. relative_to_pixels: sweeps whose axis is also
+    given per million training pixels.
     """
 
     name: str

@@ -17,6 +17,7 @@ meet more surely may still be this object.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -52,7 +53,8 @@ def takes_much(members: Tensor) -> str | None:
     share = float(members.double().mean())
     if share <= MUCH:
         return None
-    return f"more than half of the scene ({share:.0%}): if that is too much, mark what is beside it or draw a box"
+    percent = math.ceil(100.0 * share - 1e-9)
+    return f"more than half of the scene ({percent}%): if that is too much, mark what is beside it or draw a box"
 
 
 @dataclass(frozen=True)
@@ -108,8 +110,8 @@ class Cutter:
 
         excluded: [N] bool, Gaussians that do not, or None. name: of the object, for errors. growth: g; a larger one
         takes the same Gaussians and more, a negative one fewer. part: whether the object is not all of what is neither
-        excluded nor outside of a box. Raises ``UserError`` if no mark lies on the object or
-        on a Gaussian, if marks contradict one another, or if no Gaussian belongs to it, or all do.
+        excluded nor outside of a box. Raises ``UserError`` if no mark lies on the object or on a Gaussian, if marks
+        contradict one another, or if no Gaussian belongs to it, or all do.
         """
         if not any(inside for view in marks for inside in view.inside):
             raise UserError(f"no point lies on {name}: give at least one in a view that shows it.")

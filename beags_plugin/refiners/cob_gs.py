@@ -4,8 +4,8 @@ Where the port differs from the source: a mask phase is played from sums over ea
 fewer than 24 views it is longer, as no logit could get far enough; pixels without a label count neither as inside nor
 as outside, and a view without any trains texture alone; halves of a split lie in the plane of their disc; texture
 phases keep the base's loss of normals, and have none of depths, which the source adds where depth maps are given; an
-object that no Gaussian is sure of is empty, where the source falls back to the whole scene. All objects in one scene is
-the way of a fork of it, whose clean-up by voxels, off there too, is left out.
+object that no Gaussian is sure of is empty, where the source falls back to the whole scene. To cut all objects
+in one scene is the way of a fork of the source; the fork's clean-up by voxels, off by default there, is left out.
 """
 
 from __future__ import annotations

@@ -52,15 +52,19 @@ def put_in_place(part: Path, path: Path) -> None:
     _sync_folder(path.parent)
 
 
-def remove_unfinished(folder: Path, below: bool = True, older: float = 0.0) -> list[Path]:
-    """Remove what a killed program left half written in ``folder`` and ``below``; returns the files.
+def remove_unfinished(
+    folder: Path, below: bool = True, older: float = 0.0, ends: tuple[str, ...] = ("",)
+) -> list[Path]:
+    """Remove what a killed program left half written in ``folder``, and with ``below`` in the folders below it.
 
-    older: seconds since something was written to them, where another process may be writing some too.
+    older: only files to which nothing was written for so many seconds, where another process may be writing; 0: all.
+    ends: how the names of the whole files end, where other programs may write too. Returns the files.
     """
     latest, found = time.time() - older, []
     for path in sorted((folder.rglob if below else folder.glob)(f".*{PART}")):
         with suppress(FileNotFoundError):  # another process has put it in its place
-            if path.is_file() and (not older or path.stat().st_mtime <= latest):
+            named = path.name.removesuffix(PART).endswith(ends)
+            if named and path.is_file() and (not older or path.stat().st_mtime <= latest):
                 path.unlink()
                 found.append(path)
     return found

@@ -167,6 +167,7 @@ def test_a_cut_that_a_limit_leaves_nothing_of_is_refused(coloured, monkeypatch):
 def test_a_cut_of_more_than_half_of_the_scene_is_said(count):
     said = takes_much(torch.arange(100) < count)
     assert said is None if count == 50 else said is not None and "more than half of the scene (51%)" in said
+    assert "(51%)" in str(takes_much(torch.arange(1000) < 501))
 
 
 def test_a_cut_of_the_whole_scene_is_refused():

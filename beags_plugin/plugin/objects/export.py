@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence, Set
+from contextlib import suppress
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 from torch import Tensor
 
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.export import EXPORTERS
 from beags_plugin.export.base import Exporter, ExportItem, make_exporter
 from beags_plugin.export.frames import Frame, check_placement
 from beags_plugin.export.mesh import open3d_missing
@@ -41,7 +43,7 @@ from beags_plugin.system.reading.text import load_json
 from beags_plugin.system.whole_files import remove_unfinished
 
 MANIFEST = "manifest.json"
-_LEFT = 10.0  # seconds after which nobody writes to an unfinished file any more; another export may to a younger one
+_LEFT = 10.0  # seconds without a write after which an unfinished file is left over, not another export's
 WHOLE = "whole scene"  # the name of the file that holds all Gaussians
 
 
@@ -142,9 +144,18 @@ def _clear_up(folder: Path, names: Set[str] | None) -> None:
     """
     manifest = folder / MANIFEST
     with writing(folder):
-        remove_unfinished(folder, below=False, older=_LEFT)
+        remove_unfinished(folder, below=False, older=_LEFT, ends=(f".{MANIFEST}", *_ends()))
         if names is None or names & _listed(manifest):
             manifest.unlink(missing_ok=True)
+
+
+def _ends() -> list[str]:
+    """Return how the names of all formats end, but those of other packages that cannot be loaded."""
+    found = []
+    for name in EXPORTERS.names():
+        with suppress(UserError):
+            found.append(f".{EXPORTERS.get(name).suffix}")
+    return found
 
 
 def _listed(manifest: Path) -> set[str]:

@@ -80,15 +80,15 @@ def test_a_killed_export_leaves_whole_files_and_no_manifest_in_any_format(traine
 
 
 def test_unfinished_files_of_other_formats_go_but_not_those_that_are_being_written(trained, tmp_path):
-    for name in (".cup.glb.part", ".manifest.json.part", ".now.spz.part"):
+    for name in (".cup.glb.part", ".manifest.json.part", ".now.spz.part", ".film.mkv.part"):
         (tmp_path / name).write_bytes(b"half")
     age(tmp_path, 60.0)
-    (tmp_path / ".now.spz.part").touch()
+    os.utime(tmp_path / ".now.spz.part", (time.time() + 3600.0,) * 2)
     (tmp_path / "deeper").mkdir()
     (tmp_path / "deeper/.cup.glb.part").write_bytes(b"half")
     age(tmp_path / "deeper", 60.0)
     (tmp_path / "cup.part").write_bytes(b"of somebody else")
-    age_of_all = {"cup.part", ".now.spz.part", "deeper"}
+    age_of_all = {"cup.part", ".now.spz.part", ".film.mkv.part", "deeper"}
     main(["export", "--load-config", str(trained), "--object", "cup", "--output", str(tmp_path)])
     assert {path.name for path in tmp_path.iterdir()} == age_of_all | {"cup.ply"}
     assert (tmp_path / "deeper/.cup.glb.part").exists()
