@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from beags_plugin.bench.experiment import Experiment
 from beags_plugin.bench.point_labels import Point, label_points
-from beags_plugin.bench.report import new_figure, save_figure
+from beags_plugin.bench.report import new_figure, save_figure, scale_axis
 from beags_plugin.bench.results import ResultRow, means
 
 if TYPE_CHECKING:
@@ -19,7 +19,6 @@ TOTAL = ("cpu_seconds total", "CPU seconds, base and refinement")
 REFINEMENT = ("cpu_seconds", "CPU seconds after the base, which all share")
 MEMORY = ("peak_memory_mb", "peak memory, MB")
 QUALITIES = (("extracted_biou_after", "extracted BIoU, %", 100.0), ("psnr_after", "PSNR, dB", 1.0))
-LOGARITHMIC = 20.0  # an axis that spans more than this factor is logarithmic
 FRONT, BEATEN = "#d94801", "#2171b5"
 
 
@@ -60,8 +59,8 @@ class Panel:
 def plot_front(path: Path, experiment: Experiment, rows: Sequence[ResultRow]) -> None:
     """Plot the mean of every variant: a panel for every pair of a cost and a quality.
 
-    Points bear numbers, with a list of the variants beside them: names would cover each other. Those on the first
-    panel's front are in its colour there too.
+    Points bear numbers, with a list of the variants beside them: names would cover each other. In that list,
+    names on the first panel's front have its colour.
     """
     averaged = [row for row in means(rows) if not row.failed]
     figure, axes = new_figure(2, len(QUALITIES), size=(6.5, 5.0))
@@ -99,8 +98,8 @@ def _panel(axes: Axes, rows: Sequence[ResultRow], cost: str, quality: str, facto
         corners += [(x, corners[-1][1])] if corners else []
         corners.append((x, y))
     axes.plot([x for x, _ in corners], [y for _, y in corners], color=FRONT, lw=1, zorder=1)
-    if points and max(points)[0] > LOGARITHMIC * min(points)[0] > 0:
-        axes.set_xscale("log")
+    scale_axis(axes.set_xscale, [x for x, *_ in points])
+    if axes.get_xscale() == "log":
         axes.xaxis.set_major_formatter("{x:g}")
     axes.margins(0.08)
     return Panel(axes, front, sorted(points, key=lambda point: point[3] != FRONT), corners)

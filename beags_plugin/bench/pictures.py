@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beags_plugin.bench.experiment import Experiment
-from beags_plugin.bench.report import new_figure, save_figure
+from beags_plugin.bench.report import new_figure, save_figure, scale_axis
 from beags_plugin.bench.results import ResultRow, means
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ _CURVES = (
 _PAPER_MARKS = "ovs^Dp*X"
 _WIDTH, _HEIGHT = 4.4, 3.6  # of one diagram, inches
 _BAR_HEIGHT = 0.22  # so that the names of many bars do not touch
-_LOGARITHMIC = 20.0  # an axis that spans more than this factor is logarithmic
 _FEW = 4  # lines of a sweep, with their dashes, that a legend within a diagram has room for
 _COLORS, _MARKS = 10, "osD^"
 
@@ -102,22 +101,15 @@ def _curves(axes: Axes, rows: Sequence[ResultRow], sweep: str, metric: str, titl
         if metric.endswith("_after") and len(lines) <= _FEW:
             label = ", ".join(filter(None, [line, "assignment alone"]))
             axes.plot(*before, "--", lw=1.2, color=color, label=label)
-    _scale(axes.set_xscale, [row.variant.x for row in rows])
+    scale_axis(axes.set_xscale, [row.variant.x for row in rows])
     if title.startswith("CPU"):
-        _scale(axes.set_yscale, [row.figures[metric] for row in rows])
+        scale_axis(axes.set_yscale, [row.figures[metric] for row in rows])
     if title.startswith("peak"):
         axes.set_ylim(bottom=0)
     if axes.get_yscale() == "linear":
         axes.ticklabel_format(axis="y", useOffset=False)
     axes.set_xlabel(sweep)
     axes.set_title(title)
-
-
-def _scale(set_scale: Callable[[str], None], values: Sequence[float | None]) -> None:
-    """Make an axis logarithmic where the values span a large factor."""
-    known = [value for value in values if value is not None]
-    if known and min(known) > 0 and max(known) / min(known) > _LOGARITHMIC:
-        set_scale("log")
 
 
 def _legend(axes: Sequence[Axes]) -> None:

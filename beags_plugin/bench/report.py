@@ -6,7 +6,7 @@ import csv
 import json
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,8 @@ from beags_plugin.system.whole_files import write_text_atomically
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.table import Table
+
+_LOGARITHMIC = 20.0  # above it, a linear axis would crowd small values at one end
 
 
 def provenance() -> dict[str, Any]:
@@ -83,6 +85,13 @@ def new_figure(columns: int, rows: int = 1, size: tuple[float, float] = (4.4, 3.
     return pyplot.subplots(
         rows, columns, figsize=(size[0] * columns, size[1] * rows), squeeze=False, layout="constrained"
     )
+
+
+def scale_axis(set_scale: Callable[[str], None], values: Sequence[float | None]) -> None:
+    """Make an axis logarithmic where the values span more than the factor ``_LOGARITHMIC``; None: no value."""
+    known = [value for value in values if value is not None]
+    if known and min(known) > 0 and max(known) / min(known) > _LOGARITHMIC:
+        set_scale("log")
 
 
 def save_figure(path: Path, figure: Figure) -> None:
