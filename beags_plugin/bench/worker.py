@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 def serve() -> None:
     """Read folders from standard input until it ends."""
+    # Libraries ask on import whether there is a GPU. Asked through CUDA, no process forked later could use it.
+    os.environ["PYTORCH_NVML_BASED_CUDA_CHECK"] = "1"
     _import_everything()
     for line in sys.stdin:
         child = os.fork()

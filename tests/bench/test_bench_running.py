@@ -163,3 +163,20 @@ def _runs(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+_ASKING = """
+import os, sys, torch
+torch.cuda._device_count_nvml = lambda: 1
+torch._C._cuda_getDeviceCount = lambda: print("CUDA was asked") or 1
+sys.stdin = open(os.devnull)
+from beags_plugin.bench.worker import serve
+serve()
+print(torch.cuda.is_available())
+"""
+
+
+def test_a_worker_asks_for_gpus_without_starting_cuda():
+    """A process that is forked after a call of CUDA cannot use it."""
+    done = subprocess.run([sys.executable, "-c", _ASKING], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "True" and "CUDA was asked" not in done.stdout

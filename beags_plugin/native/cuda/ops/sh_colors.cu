@@ -9,6 +9,8 @@ namespace {
 using namespace ops;
 using namespace ops::BEAGS_ISA;
 
+constexpr int kThreads = 128;
+
 template <int kDegree, class T>
 __global__ void colors_kernel(ColorJob<T> job, int64_t count) {
   constexpr int kBases = (kDegree + 1) * (kDegree + 1);
@@ -35,37 +37,52 @@ BEAGS_DEVICE void add(DirectionGradient<T>& sum, const DirectionGradient<T>& mor
   sum.z += more.z;
 }
 
+// A block's coefficients of `rest` pass through shared memory, and so do their gradients, in the same place: rows are
+// long, and threads that read or wrote a row each would touch as many lines of memory at a time.
 template <int kDegree, class T>
 __global__ void colors_backward_kernel(ColorJob<T> job, int64_t count) {
-  constexpr int kBases = (kDegree + 1) * (kDegree + 1);
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
-  if (i >= count) return;
-  const Direction<T> d = direction(job, i);
-  T b[kBases], g[3];
-  basis<kDegree>(d, [&](int k, T value) { b[k] = value; });
-  for (int c = 0; c < 3; ++c) g[c] = job.clamped[i] >> c & 1 ? T(0) : job.g_colors[3 * i + c];
-  if (job.g_dc) {
-    for (int c = 0; c < 3; ++c) job.g_dc[3 * i + c] = b[0] * g[c];
+  constexpr int kBases = (kDegree + 1) * (kDegree + 1), kUsed = 3 * (kBases - 1);
+  constexpr int kStride = kUsed | 1;  // odd: a column lies in all banks
+  __shared__ T rows[kThreads * kStride];
+  const int row = 3 * job.num_rest, threads = static_cast<int>(blockDim.x), me = static_cast<int>(threadIdx.x);
+  const int64_t first = static_cast<int64_t>(blockIdx.x) * threads, i = first + me;
+  const int all = static_cast<int>(least<int64_t>(threads, count - first)) * row;
+  const bool moves = kDegree > 0 && job.g_means;
+  if (moves) {
+    for (int k = me; k < all; k += threads) {
+      if (k % row < kUsed) rows[k / row * kStride + k % row] = job.rest[first * row + k];
+    }
+    __syncthreads();
   }
-  if (job.g_rest) {
-    T* to = job.g_rest + i * job.num_rest * 3;
+  if (i < count) {
+    const Direction<T> d = direction(job, i);
+    T b[kBases], g[3];
+    T* mine = rows + me * kStride;
+    basis<kDegree>(d, [&](int k, T value) { b[k] = value; });
+    for (int c = 0; c < 3; ++c) g[c] = job.clamped[i] >> c & 1 ? T(0) : job.g_colors[3 * i + c];
+    if (job.g_dc) {
+      for (int c = 0; c < 3; ++c) job.g_dc[3 * i + c] = b[0] * g[c];
+    }
+    if (moves) {
+      T g_basis[16] = {};
+      for (int k = 1; k < kBases; ++k) {  // the first function is constant
+        const T* sh = mine + 3 * (k - 1);
+        g_basis[k] = g[0] * sh[0] + g[1] * sh[1] + g[2] * sh[2];
+      }
+      const auto g_of = [&](int k) { return g_basis[k]; };
+      DirectionGradient<T> sum = basis_backward<1>(d, g_of);
+      if constexpr (kDegree >= 2) add(sum, basis_backward<2>(d, g_of));
+      if constexpr (kDegree >= 3) add(sum, basis_backward<3>(d, g_of));
+      to_mean(d, sum, job.g_means + 3 * i);
+    }
     for (int k = 1; k < kBases; ++k) {
-      for (int c = 0; c < 3; ++c) to[3 * (k - 1) + c] = b[k] * g[c];
+      for (int c = 0; c < 3; ++c) mine[3 * (k - 1) + c] = b[k] * g[c];
     }
-    for (int k = 3 * (kBases - 1); k < 3 * job.num_rest; ++k) to[k] = 0;
   }
-  if (kDegree > 0 && job.g_means) {
-    const T* rest = job.rest + i * job.num_rest * 3;
-    T g_basis[16] = {};
-    for (int k = 1; k < kBases; ++k) {  // the first function is constant
-      const T* sh = rest + 3 * (k - 1);
-      g_basis[k] = g[0] * sh[0] + g[1] * sh[1] + g[2] * sh[2];
-    }
-    const auto g_of = [&](int k) { return g_basis[k]; };
-    DirectionGradient<T> sum = basis_backward<1>(d, g_of);
-    if constexpr (kDegree >= 2) add(sum, basis_backward<2>(d, g_of));
-    if constexpr (kDegree >= 3) add(sum, basis_backward<3>(d, g_of));
-    to_mean(d, sum, job.g_means + 3 * i);
+  if (!job.g_rest) return;
+  __syncthreads();
+  for (int k = me; k < all; k += threads) {
+    job.g_rest[first * row + k] = k % row < kUsed ? rows[k / row * kStride + k % row] : T(0);
   }
 }
 
@@ -77,7 +94,7 @@ void sh_colors(const ColorJob<T>& job, int64_t count, Stream stream) {
   if (job.degree == 1) kernel = colors_kernel<1, T>;
   if (job.degree == 2) kernel = colors_kernel<2, T>;
   if (job.degree == 3) kernel = colors_kernel<3, T>;
-  BEAGS_LAUNCH(kernel, blocks_for(count, 128), 128, stream, job, count);
+  BEAGS_LAUNCH(kernel, blocks_for(count, kThreads), kThreads, stream, job, count);
 }
 
 template <class T>
@@ -86,7 +103,7 @@ void sh_colors_backward(const ColorJob<T>& job, int64_t count, Stream stream) {
   if (job.degree == 1) kernel = colors_backward_kernel<1, T>;
   if (job.degree == 2) kernel = colors_backward_kernel<2, T>;
   if (job.degree == 3) kernel = colors_backward_kernel<3, T>;
-  BEAGS_LAUNCH(kernel, blocks_for(count, 128), 128, stream, job, count);
+  BEAGS_LAUNCH(kernel, blocks_for(count, kThreads), kThreads, stream, job, count);
 }
 
 #define BEAGS_INSTANTIATE(T)                                    \
