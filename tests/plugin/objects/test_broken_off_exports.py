@@ -12,15 +12,13 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from export_formats import formats_here
 from killed_exports import export
 from run_folders import write_scene, write_trained
 
 pytest.importorskip("nerfstudio")
 
 from beags_plugin.commands.cli import main
-from beags_plugin.export import EXPORTERS
-from beags_plugin.export.base import make_exporter
-from beags_plugin.system.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -29,18 +27,6 @@ ROOT = Path(__file__).resolve().parents[3]
 def trained(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("lab")
     return write_trained(root / "run", write_scene(root / "lab"))
-
-
-def formats_here() -> list[str]:
-    """Return the formats that can be written here."""
-    found = []
-    for name in EXPORTERS.names():
-        try:
-            make_exporter(name)
-        except UserError:
-            continue
-        found.append(name)
-    return found
 
 
 def age(folder: Path, seconds: float) -> None:
