@@ -100,7 +100,7 @@ class Rendering:
 
 
 class GsplatRendering(Rendering):
-    """gsplat's ``rasterization_2dgs``: colour with expected depth, alpha, normal; always also the depth's normals."""
+    """gsplat's ``rasterization_2dgs``: colour with expected depth, alpha, normal, and normals of that depth."""
 
     mode = "RGB+ED"
 

@@ -4,7 +4,8 @@ A line says how far to run a trial ("trained" or "scored") and names its folder,
 trains into FOLDER/run and writes FOLDER/trained.json, measures and writes FOLDER/result.json, or FOLDER/failed.json
 with the reason in a sentence. What an interrupted attempt has saved there, it does not do again. The output goes to
 FOLDER/log.txt. For each folder the program prints the exit code of the process that it forked: imports, which take
-longer than a short trial, are done once.
+longer than a short trial, are done once. Where there may be a GPU, each process does its own: imports start CUDA, which
+cannot be used after a fork.
 """
 
 from __future__ import annotations
@@ -27,16 +28,25 @@ if TYPE_CHECKING:
     from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 
 
+GPU_FILES = ("/dev/nvidiactl", "/dev/dxg")
+"""Made by the drivers of Linux, and of Linux under Windows."""
+
+
 def serve() -> None:
     """Read folders from standard input until it ends."""
-    # Libraries ask on import whether there is a GPU. Asked through CUDA, no process forked later could use it.
-    os.environ["PYTORCH_NVML_BASED_CUDA_CHECK"] = "1"
-    _import_everything()
+    with_gpu = any(os.path.exists(path) for path in GPU_FILES)
+    if not with_gpu:
+        _import_everything()
     for line in sys.stdin:
+        until, _, folder = line.rstrip("\n").partition(" ")
         child = os.fork()
         if child == 0:
-            until, _, folder = line.rstrip("\n").partition(" ")
-            os._exit(_in_child(Path(folder), until))
+            try:
+                if with_gpu:
+                    os.execv(sys.executable, [sys.executable, "-m", "beags_plugin.bench.worker", until, folder])
+                os._exit(_in_child(Path(folder), until))
+            finally:
+                os._exit(1)
         _, status = os.waitpid(child, 0)
         print(os.waitstatus_to_exitcode(status), flush=True)
 
@@ -187,4 +197,6 @@ def trial_config(request: dict[str, Any], run_folder: Path) -> BeagsTrainerConfi
 
 
 if __name__ == "__main__":
+    if sys.argv[1:]:
+        sys.exit(_in_child(Path(sys.argv[2]), sys.argv[1]))
     serve()

@@ -25,8 +25,7 @@ def disagreement(depths: Sequence[Tensor], cameras: Sequence[Camera], tau: float
     pairs = [(i, j) for i, j in enumerate(_neighbours(cameras)) if j is not None]
     pairs = [pairs[n * len(pairs) // _VIEWS] for n in range(_VIEWS)] if len(pairs) > _VIEWS else pairs
     step = max(1, sum(cameras[i].height * cameras[i].width for i, _ in pairs) // _SAMPLES)
-    # On the CPU, so that every device finds the same bits.
-    apart = [_apart(depths[i].cpu(), depths[j].cpu(), cameras[i], cameras[j], tau, step) for i, j in pairs]
+    apart = [_apart(depths[i], depths[j], cameras[i], cameras[j], tau, step) for i, j in pairs]
     found = torch.cat(apart) if apart else torch.zeros(0)
     return float(found.quantile(share)) if len(found) else None
 
@@ -48,7 +47,9 @@ def _neighbours(cameras: Sequence[Camera]) -> list[int | None]:
 def _apart(depth: Tensor, shown: Tensor, camera: Camera, other: Camera, tau: float, step: int) -> Tensor:
     """Return [P] float64, for each ``step``-th pixel of a view whose point the other view sees."""
     pixel = torch.arange(0, depth.numel(), step)
-    x, y, d = pixel % camera.width + 0.5, pixel // camera.width + 0.5, depth.reshape(-1)[pixel]
+    # On the CPU, so that every device finds the same bits.
+    d, shown = depth.reshape(-1)[::step].cpu(), shown.cpu()
+    x, y = pixel % camera.width + 0.5, pixel // camera.width + 0.5
     A, b = (values[0] for values in PixelMaps([camera, other]).towards(1))
     _, there, z = landing(x, y, d, (A, b), (other.width, other.height), d > 0)
     error = (z - shown.reshape(-1)[there]).abs()

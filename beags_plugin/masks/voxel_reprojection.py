@@ -135,7 +135,7 @@ def _survey(depths, cameras, labels, num_classes: int) -> tuple[float, bool]:
     thinned, labelled, kinds = [], [], set()
     for index, (depth, camera, mask) in enumerate(zip(depths, cameras, labels, strict=True)):
         check_view(index, depth, camera, mask, num_classes)
-        # On the CPU: a GPU multiplies by the rounded 1 / focal length, and voxels of another size get other votes.
+        # On the CPU: torch multiplies by the rounded 1 / focal length on a GPU; voxels of another size get other votes.
         thinned.append((depth.reshape(-1)[::step].cpu() / camera.focal).double())
         label = torch.zeros(len(thinned[-1]), dtype=torch.int32) if mask is None else mask.reshape(-1)[::step].cpu()
         labelled.append(label.clone())  # a slice would keep the view's whole map in memory

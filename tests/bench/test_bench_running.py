@@ -165,18 +165,19 @@ def _runs(pid: int) -> bool:
         return False
 
 
-_ASKING = """
-import os, sys, torch
-torch.cuda._device_count_nvml = lambda: 1
-torch._C._cuda_getDeviceCount = lambda: print("CUDA was asked") or 1
-sys.stdin = open(os.devnull)
-from beags_plugin.bench.worker import serve
-serve()
-print(torch.cuda.is_available())
+_WITH_A_GPU = """
+from beags_plugin.bench import worker
+worker.GPU_FILES = ("/",)
+worker._in_child = lambda *_: 9  # in a process that is only forked
+worker.serve()
 """
 
 
-def test_a_worker_asks_for_gpus_without_starting_cuda():
-    """A process that is forked after a call of CUDA cannot use it."""
-    done = subprocess.run([sys.executable, "-c", _ASKING], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "True" and "CUDA was asked" not in done.stdout
+def test_where_there_is_a_gpu_a_trial_imports_for_itself(tmp_path):
+    """Imports start CUDA there, and a process that is forked after that cannot use it."""
+    (tmp_path / "trial.json").write_text("{")
+    done = subprocess.run(
+        [sys.executable, "-c", _WITH_A_GPU], input=f"scored {tmp_path}\n", capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "1\n"
+    assert "JSONDecodeError" in (tmp_path / "log.txt").read_text()

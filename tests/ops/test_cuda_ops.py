@@ -14,6 +14,7 @@ from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.occupancy import OccupancyLoss
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.ops import cuda_extension, extension
+from beags_plugin.ops.sh_colors import sh_colors
 
 pytestmark = pytest.mark.skipif(extension.load() is None, reason="beags_plugin._native was not built")
 device = pytest.fixture(params=["cuda", "cuda emulated"])(cuda_device)
@@ -47,6 +48,25 @@ def test_colors_are_the_torch_versions(degree, bases, dtype, device, torch_versi
     tolerance = 1e-11 if dtype == torch.float64 else 2e-5
     for a, b in zip(found, expected, strict=True):
         torch.testing.assert_close(a.cpu(), b, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize(("degree", "bases"), [(0, 4), (2, 16), (3, 16)])
+@pytest.mark.parametrize("wanted", [(0,), (1,), (2,), (0, 1), (0, 2), (1, 2)])
+def test_gradients_of_some_inputs_are_those_of_all(wanted, degree, bases, device):
+    coefficients, means, center, weight = (value.detach().to(device) for value in test_sh_colors.scene(333, bases))
+
+    def gradients(*chosen: int) -> list[torch.Tensor | None]:
+        leaves = [coefficients[:, 0].clone(), coefficients[:, 1:].clone(), means.clone()]
+        for each in chosen:
+            leaves[each].requires_grad_()
+        sh_colors(*leaves, center, degree).backward(weight)
+        return [leaf.grad for leaf in leaves]
+
+    for each, (found, expected) in enumerate(zip(gradients(*wanted), gradients(0, 1, 2), strict=True)):
+        if each in wanted and expected is not None:
+            assert found is not None and torch.equal(found, expected)
+        else:  # colours of degree 0 do not depend on means
+            assert found is None
 
 
 def test_a_surfel_at_the_camera_has_finite_gradients(device, torch_version):

@@ -1,4 +1,4 @@
-"""The trial of the CUDA backend before it serves unasked, with backends that fail in every way. Not run on a GPU."""
+"""The trial of the CUDA backend before it serves unasked, with backends that fail in every way."""
 
 from __future__ import annotations
 

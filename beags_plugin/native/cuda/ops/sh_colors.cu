@@ -37,13 +37,14 @@ BEAGS_DEVICE void add(DirectionGradient<T>& sum, const DirectionGradient<T>& mor
   sum.z += more.z;
 }
 
-// A block's coefficients of `rest` pass through shared memory, and so do their gradients, in the same place: rows are
-// long, and threads that read or wrote a row each would touch as many lines of memory at a time.
+// A block's coefficients of `rest` pass through shared memory, and then their gradients, in the same place. A Gaussian's
+// row is long: if each thread read or wrote its own, a warp would touch 32 lines of memory at once.
 template <int kDegree, class T>
 __global__ void colors_backward_kernel(ColorJob<T> job, int64_t count) {
   constexpr int kBases = (kDegree + 1) * (kDegree + 1), kUsed = 3 * (kBases - 1);
   constexpr int kStride = kUsed | 1;  // odd: a column lies in all banks
   __shared__ T rows[kThreads * kStride];
+  static_assert(sizeof(rows) <= 48 << 10, "no more can be had without asking");
   const int row = 3 * job.num_rest, threads = static_cast<int>(blockDim.x), me = static_cast<int>(threadIdx.x);
   const int64_t first = static_cast<int64_t>(blockIdx.x) * threads, i = first + me;
   const int all = static_cast<int>(least<int64_t>(threads, count - first)) * row;
