@@ -18,7 +18,7 @@ from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.boundary import beyond_slack
 from beags_plugin.losses.class_members import ClassMembers
 from beags_plugin.losses.reduction import ordered_sum
-from beags_plugin.rasterizers.rendering import surfel_inputs
+from beags_plugin.rasterizers.rendering import shape_inputs
 from beags_plugin.system.errors import UserError
 
 TAU = 0.02
@@ -82,8 +82,7 @@ class SilhouetteLoss(Loss):
         if len(members) == 0:
             return inputs.render.color.new_zeros(())
         inside = inputs.labels == class_id
-        part = inputs.surfels[members]
-        alone = inputs.draw(surfel_inputs(part, inputs.camera, 0), inputs.camera)
+        alone = inputs.draw(shape_inputs(inputs.surfels, members), inputs.camera)
         assert alone.depth is not None and alone.median_depth is not None
         assert inputs.render.median_depth is not None
         # thin parts have no median: their expected depth shows where they are

@@ -37,6 +37,16 @@ def geometry_inputs(surfels: Surfels, class_ids: Tensor | None = None) -> Surfel
     return SurfelInputs(bare.means, bare.quats, bare.log_scales, bare.opacity_logits, colors, class_ids)
 
 
+def shape_inputs(surfels: Surfels, members: Tensor) -> SurfelInputs:
+    """Return some Gaussians without colours: for their alpha and depth, differentiable.
+
+    surfels: N surfels. members: [M] int64, each at most once, so that every device adds the gradients alike.
+    """
+    values = (surfels.means, surfels.quats, surfels.log_scales, surfels.opacity_logits)
+    means, quats, log_scales, logits = (value.index_select(0, members) for value in values)
+    return SurfelInputs(means, quats, log_scales, logits, torch.zeros_like(means))
+
+
 def render_class_map(
     rasterizer: Rasterizer, surfels: Surfels, class_ids: Tensor, camera: Camera, settings: RasterSettings
 ) -> tuple[Tensor, Tensor]:
