@@ -37,8 +37,8 @@ BEAGS_DEVICE void add(DirectionGradient<T>& sum, const DirectionGradient<T>& mor
   sum.z += more.z;
 }
 
-// A block's coefficients of `rest` pass through shared memory, and then their gradients, in the same place. A Gaussian's
-// row is long: if each thread read or wrote its own, a warp would touch 32 lines of memory at once.
+// A block's coefficients of `rest` pass through shared memory, and then their gradients, in the same place. A
+// Gaussian's row is long: if each thread read or wrote its own, a warp would touch 32 lines of memory at once.
 template <int kDegree, class T>
 __global__ void colors_backward_kernel(ColorJob<T> job, int64_t count) {
   constexpr int kBases = (kDegree + 1) * (kDegree + 1), kUsed = 3 * (kBases - 1);
