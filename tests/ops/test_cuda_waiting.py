@@ -67,9 +67,8 @@ def gpu(monkeypatch):
     on_gpu = lambda *tensors: module if tensors[0].device.type == "cuda" else None  # noqa: E731
     monkeypatch.setattr(cuda_extension, "module_for", on_gpu)
     monkeypatch.setattr(cuda_extension, "call", lambda *_: None)
-    # What the host draws at random, and what it reads of a camera on the host, would have no data either.
+    # What the host draws at random would have no data either.
     monkeypatch.setattr(silhouette, "_chosen", lambda count, wanted, *_: list(range(count))[:wanted])
-    monkeypatch.setattr(silhouette, "surfel_inputs", lambda surfels, camera, degree: surfels)
     with FakeTensorMode(), Fetches() as fetches:
         yield fetches
 
