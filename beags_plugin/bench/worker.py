@@ -3,15 +3,16 @@
 A line says how far to run a trial ("trained" or "scored") and names its folder, which holds trial.json. The worker
 trains into FOLDER/run and writes FOLDER/trained.json, measures and writes FOLDER/result.json, or FOLDER/failed.json
 with the reason in a sentence. What an interrupted attempt has saved there, it does not do again. The output goes to
-FOLDER/log.txt. For each folder the program prints the exit code of the process that it forked: imports, which take
-longer than a short trial, are done once. Where there may be a GPU, each process does its own: imports start CUDA, which
-cannot be used after a fork.
+FOLDER/log.txt. For each folder the program prints the exit code of the trial's process, which it forks: imports, which
+take longer than a short trial, are done once. Where there may be a GPU, each process is this program anew ("UNTIL
+FOLDER" as arguments): imports start CUDA, which cannot be used after a fork.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import subprocess
 import sys
 import time
 import traceback
@@ -39,16 +40,22 @@ def serve() -> None:
         _import_everything()
     for line in sys.stdin:
         until, _, folder = line.rstrip("\n").partition(" ")
-        child = os.fork()
-        if child == 0:
-            try:
-                if with_gpu:
-                    os.execv(sys.executable, [sys.executable, "-m", "beags_plugin.bench.worker", until, folder])
-                os._exit(_in_child(Path(folder), until))
-            finally:
-                os._exit(1)
-        _, status = os.waitpid(child, 0)
-        print(os.waitstatus_to_exitcode(status), flush=True)
+        print(_in_program(folder, until) if with_gpu else _forked(folder, until), flush=True)
+
+
+def _in_program(folder: str, until: str) -> int:
+    """Run the trial in ``folder`` by this program anew; returns the exit code, negative for a signal."""
+    command = [sys.executable, "-m", "beags_plugin.bench.worker", until, folder]
+    return subprocess.Popen(command, stdin=subprocess.DEVNULL).wait()
+
+
+def _forked(folder: str, until: str) -> int:
+    """Run the trial in ``folder`` in a fork of this process; returns the exit code, negative for a signal."""
+    child = os.fork()
+    if child == 0:
+        os._exit(_in_child(Path(folder), until))
+    _, status = os.waitpid(child, 0)
+    return os.waitstatus_to_exitcode(status)
 
 
 def _import_everything() -> None:
