@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
+import re
+import uuid
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -37,9 +42,14 @@ class PrintExporter(MeshExporter):
         solid = trimesh.Trimesh(MILLIMETRES * made.mesh.vertices, made.mesh.faces, process=False)
         content: Any = trimesh.Scene({item.name: solid}).export(file_type=self.suffix)
         with whole_file(path) as part:
-            part.write_bytes(content)
+            part.write_bytes(self.repeatable(content))
         sides = solid.extents.round(2).tolist()
         return made.facts() | {"unit": "millimetre", "sides": sides, "watertight": bool(solid.is_watertight)}
+
+    @classmethod
+    def repeatable(cls, content: bytes) -> bytes:
+        """Return the file's content without what trimesh draws by chance."""
+        return content
 
 
 @dataclass(frozen=True)
@@ -54,3 +64,20 @@ class ThreeMfExporter(PrintExporter):
     """3D Manufacturing Format, which states its unit."""
 
     suffix: ClassVar[str] = "3mf"
+
+    @classmethod
+    def repeatable(cls, content: bytes) -> bytes:
+        """Return the archive with UUIDs that follow from its content, in place of trimesh's random ones."""
+        made = io.BytesIO()
+        with zipfile.ZipFile(io.BytesIO(content)) as read, zipfile.ZipFile(made, "w") as written:
+            for entry in read.infolist():
+                written.writestr(entry, _with_own_uuids(read.read(entry)))
+        return made.getvalue()
+
+
+def _with_own_uuids(text: bytes) -> bytes:
+    """Return XML whose n-th UUID is made of the rest of the text and n."""
+    first, *others = re.split(rb'(?<=:UUID=")[0-9a-f-]{36}(?=")', text)
+    rest = hashlib.sha256(b"".join([first, *others])).hexdigest()
+    own = (str(uuid.uuid5(uuid.NAMESPACE_OID, f"{rest} {order}")).encode() for order in range(len(others)))
+    return first + b"".join(mine + other for mine, other in zip(own, others, strict=True))

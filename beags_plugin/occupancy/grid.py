@@ -247,8 +247,11 @@ def _count(keys: Tensor, voxels: Tensor) -> Tensor:
 
 
 def _scaled(points: Tensor, origin: Tensor, size: float) -> Tensor:
-    """Return voxel indices as whole floats. Each step is monotonic, as ``disc_inside`` requires."""
-    return torch.floor((points - origin.to(points)) / size)
+    """Return voxel indices as whole floats. Each step is monotonic, as ``disc_inside`` requires.
+
+    The divisor lies beside the points: by a number a GPU multiplies with the inverse, which ends in other bits.
+    """
+    return torch.floor((points - origin.to(points)) / points.new_full((), size))
 
 
 def _voxels(points: Tensor, origin: Tensor, size: float) -> Tensor:

@@ -37,7 +37,7 @@ def wall(depth: float = 4.0) -> Shown:
 def discs(*means: tuple[float, float, float], scales: tuple[float, float] = (0.05, 0.05)) -> Surfels:
     count = len(means)
     return Surfels.of(
-        torch.tensor(means), torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        torch.tensor(means, dtype=torch.float32), torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
         torch.tensor([scales]).log().repeat(count, 1), torch.zeros(count), torch.zeros(count, 1, 3),
     )  # fmt: skip
 

@@ -43,8 +43,7 @@ OPTIONS = {
     "pipeline.model.densify.max_surfels": 2500, "pipeline.model.prepare.k": 200, "steps_per_save": 5,
     "steps_per_held_out": 40, "vis": "tensorboard",
 }  # fmt: skip
-FORMATS = ("ply", "ply-2dgs", "compressed-ply", "sog", "spz", "html", "glb", "obj", "stl")  # not usdz, an extra; a .3mf
-# has other numbers each time, by which its parts are called
+FORMATS = ("ply", "ply-2dgs", "compressed-ply", "sog", "spz", "html", "glb", "obj", "stl", "3mf")  # not usdz, an extra
 EXPORT = ("--all", "--format", *FORMATS, "--scale-by", "0,0,0 1,0,0 1 m", "--resolution", "32", "--min-views", "1")
 EXPORTS = ANY_TIME, IN_A_FILE = "export", "exported file"
 KINDS = ("step", "checkpoint", "anywhere", ANY_TIME, "step", "preparation", "anywhere", IN_A_FILE)  # in turn

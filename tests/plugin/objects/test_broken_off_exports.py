@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import subprocess
 import sys
 import time
-import zipfile
 from pathlib import Path
 
 import pytest
@@ -59,10 +57,7 @@ def test_a_killed_export_leaves_whole_files_and_no_manifest_in_any_format(traine
         objects = json.loads((folder / "manifest.json").read_text())["objects"]
         assert there == {file["path"] for one in objects for file in one["files"]} | {"manifest.json"}
         for each, content in whole.items():
-            if name == "3mf":  # which has other numbers each time
-                assert zipfile.ZipFile(io.BytesIO(content)).testzip() is None
-            else:
-                assert (folder / each).read_bytes() == content
+            assert (folder / each).read_bytes() == content
 
 
 def test_unfinished_files_of_other_formats_go_but_not_those_that_are_being_written(trained, tmp_path):

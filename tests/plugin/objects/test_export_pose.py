@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -153,4 +154,11 @@ def test_prints_are_closed_and_as_large_as_was_said(trained, tmp_path):
     import zipfile
 
     with zipfile.ZipFile(tmp_path / "cup.3mf") as archive:
-        assert b'unit="millimeter"' in archive.read("3D/3dmodel.model")
+        model = archive.read("3D/3dmodel.model")
+    assert b'unit="millimeter"' in model
+    uuids = re.findall(rb'UUID="([^"]*)"', model)
+    assert len(set(uuids)) == len(uuids) >= 2
+    first = (tmp_path / "cup.3mf").read_bytes()
+    export(trained, "--object", "cup", "--format", "3mf", "--scale-by", "0,0,0 1,0,0 20 cm",
+           "--resolution", "64", "--output", str(tmp_path))  # fmt: skip
+    assert (tmp_path / "cup.3mf").read_bytes() == first
