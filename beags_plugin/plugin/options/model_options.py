@@ -23,6 +23,8 @@ from beags_plugin.refiners import make_refiner
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.registry import load
 
+MOST_DECAY = 100.0  # of colours by the view: an eightieth a step at the official rate
+
 
 @dataclass
 class BeagsModelConfig(ModelConfig):
@@ -80,6 +82,10 @@ class BeagsModelConfig(ModelConfig):
     base_lr_factor: float = 1.0
     """Factor of all learning rates of the base but that of opacities, for a base that is shorter than the official one;
     a base that polishes takes none."""
+    sh_decay: float = 0.0
+    """Weight decay of colours that depend on the view (AdamW's, of the coefficients of degrees 1 and up): each step
+    takes this times their learning rate of them away. With 0, as in the official code, they learn by heart what photos
+    differ in by chance."""
     refine_position_lr_factor: float = 1.0
     """Factor of the positions' learning rate while refining; 1, as in the paper, is the end of the base schedule."""
     near: Suppress[float] = 0.01
@@ -103,6 +109,8 @@ class BeagsModelConfig(ModelConfig):
             raise UserError(f"position_lr is {self.position_lr}: give two learning rates above 0.")
         if not 0 < self.base_lr_factor < math.inf:
             raise UserError(f"base_lr_factor is {self.base_lr_factor}: give a factor above 0.")
+        if not 0 <= self.sh_decay <= MOST_DECAY:
+            raise UserError(f"sh_decay is {self.sh_decay}: give a number from 0 (no decay) to {MOST_DECAY}.")
         if not 0 <= self.refine_position_lr_factor < math.inf:
             raise UserError(f"refine_position_lr_factor is {self.refine_position_lr_factor}: give 0 or more.")
         self.pyramid.check()

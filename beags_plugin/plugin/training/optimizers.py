@@ -16,7 +16,10 @@ SCENE = "scene"  # name of the one optimizer, for nerfstudio and in checkpoints
 
 
 class SceneOptimizer(Optimizers):
-    """One Adam for all parameters of the scene; its ``param_groups`` carry the names and rates of the config."""
+    """One Adam for all parameters of the scene; its ``param_groups`` carry the names and rates of the config.
+
+    ``weight_decay`` is AdamW's, which never enters the moments.
+    """
 
     def __init__(
         self, config: dict[str, Any], param_groups: dict[str, list[Parameter]], clock: StepClock | None = None
@@ -28,7 +31,7 @@ class SceneOptimizer(Optimizers):
             groups[-1] |= {"weight_decay": options.weight_decay, "fused": options.fused}
         self.config = config
         self.clock = clock or StepClock()
-        self.adam = torch.optim.Adam(groups)
+        self.adam = torch.optim.AdamW(groups)
         self.optimizers = {SCENE: self.adam}
         self.schedulers = {}
         self.parameters = {SCENE: [value for parameters in param_groups.values() for value in parameters]}

@@ -158,6 +158,12 @@ def test_official_learning_rates(model):
     model.schedule = PhaseSchedule(30_000, 3_000, 30_000)
     assert rates(30_000) == pytest.approx({"means": 2.5 * 1.6e-4 * 100**-0.9 * 10, **constant})
 
+    model.config.sh_decay = 1.5  # of both phases
+    for step in (0, 30_000):
+        rates(step)
+        assert {group["name"]: group["weight_decay"] for group in adam.param_groups if group["weight_decay"]} == {
+            "features_rest": 1.5
+        }
     refined = rates(30_000)
     model.config.base_lr_factor = 4.0
     assert rates(30_000) == refined  # the base's alone, and not that of opacities

@@ -74,3 +74,22 @@ def test_its_state_goes_through_a_file(configs, tmp_path):
         give_gradients(groups, 2)
         optimizer.optimizer_scaler_step_some(GradScaler(enabled=False), [SCENE])
     assert all(torch.equal(first[name][0], second[name][0]) for name in SHAPES)
+
+
+def test_decay_takes_a_share_of_values_away_whatever_their_gradients_were(configs):
+    decay = 1.2
+    groups, plain = parameters(), parameters()
+    decaying, other = SceneOptimizer(configs, groups), SceneOptimizer(configs, plain)
+    (group,) = (each for each in decaying.adam.param_groups if each["name"] == "features_rest")
+    group["weight_decay"] = decay
+    for step in (0, 2):
+        for values, optimizer in ((groups, decaying), (plain, other)):
+            give_gradients(values, step)
+            before = {name: value.detach().clone() for name, (value,) in values.items()}
+            optimizer.optimizer_scaler_step_some(GradScaler(enabled=False), [SCENE])
+            moved = {name: value.detach() - before[name] for name, (value,) in values.items()}
+            if optimizer is decaying:
+                with_decay, start = moved, before["features_rest"]
+        assert all(torch.equal(with_decay[name], moved[name]) for name in SHAPES if name != "features_rest")
+        taken = moved["features_rest"] - with_decay["features_rest"]
+        torch.testing.assert_close(taken, group["lr"] * decay * start, atol=2e-7, rtol=1e-3)

@@ -18,6 +18,7 @@ SHORT = {
     "pipeline.model.pyramid.until": 0.8,
     "pipeline.model.pyramid.levels": 3,
     "pipeline.model.base_lr_factor": 3.0,
+    "pipeline.model.sh_decay": 1.2,
     "pipeline.model.densify.prune_unseen": 0.1,
     "pipeline.model.densify.prune_unseen_every": 12,
 }
