@@ -96,11 +96,12 @@ def own_learning_rates(model: SceneModel, adam: Adam, step: int) -> None:
 def set_learning_rates(model: SceneModel, adam: Adam, configs: dict[str, Any], step: int) -> None:
     """Set every group's learning rate for this step, and how fast view-dependent colours decay."""
     progress, refining = model.schedule.progress(step), model.schedule.refining(step)
-    faster = 1.0 if refining or model.schedule.warm else model.config.base_lr_factor
+    from_seeds = not (refining or model.schedule.warm)
+    faster = model.config.base_lr_factor if from_seeds else 1.0
     for group in adam.param_groups:
         rate = configs[group["name"]]["optimizer"].lr
         if group["name"] == "features_rest":
-            group["weight_decay"] = model.config.sh_decay
+            group["weight_decay"] = model.config.sh_decay if from_seeds else 0.0
         if group["name"] == "means":
             rate = log_linear(*model.config.position_lr, progress) * model.extent_on_host()
             rate *= model.config.refine_position_lr_factor if refining and model.own_training is None else 1.0

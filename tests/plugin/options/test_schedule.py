@@ -158,19 +158,19 @@ def test_official_learning_rates(model):
     model.schedule = PhaseSchedule(30_000, 3_000, 30_000)
     assert rates(30_000) == pytest.approx({"means": 2.5 * 1.6e-4 * 100**-0.9 * 10, **constant})
 
-    model.config.sh_decay = 1.5  # of both phases
-    for step in (0, 30_000):
+    def decays(step):
         rates(step)
-        assert {group["name"]: group["weight_decay"] for group in adam.param_groups if group["weight_decay"]} == {
-            "features_rest": 1.5
-        }
+        return {group["name"]: group["weight_decay"] for group in adam.param_groups if group["weight_decay"]}
+
+    model.config.sh_decay = 1.5
+    assert decays(0) == decays(29_999) == {"features_rest": 1.5} and decays(30_000) == {}
     refined = rates(30_000)
     model.config.base_lr_factor = 4.0
     assert rates(30_000) == refined  # the base's alone, and not that of opacities
     found, official = rates(15_000), {"means": 2.5 * 1.6e-5, **constant}
     assert found == pytest.approx({name: rate * (1 if name == "opacities" else 4) for name, rate in official.items()})
     model.schedule = PhaseSchedule(30_000, 3_000, 30_000, warm=True)
-    assert rates(0)["scales"] == pytest.approx(0.005)  # polishing learns little
+    assert rates(0)["scales"] == pytest.approx(0.005) and decays(0) == {}  # polishing learns little
 
 
 def test_only_steps_of_growth_gather_gradients(model):
