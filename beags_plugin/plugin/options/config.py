@@ -39,7 +39,7 @@ def _adam_fuses_on_cpus() -> bool:
 
 @dataclass
 class FusedAdamConfig(AdamOptimizerConfig):
-    """Options of one group of parameters in the scene's Adam, which goes over each parameter in one pass."""
+    """Options of one group of parameters in the scene's AdamW, which goes over each parameter in one pass."""
 
     fused: Suppress[bool] = field(default_factory=_adam_fuses_on_cpus)
 

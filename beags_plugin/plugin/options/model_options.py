@@ -85,7 +85,7 @@ class BeagsModelConfig(ModelConfig):
     sh_decay: float = 0.0
     """Weight decay of colours that depend on the view (AdamW's, of the coefficients of degrees 1 and up) in the base:
     each step takes this times their learning rate of them away. With 0, as in the official code, they learn by heart
-    what photos differ in by chance. A base that polishes takes none."""
+    what photos differ in by chance. A base that polishes takes none. It is added to the group's own weight decay."""
     refine_position_lr_factor: float = 1.0
     """Factor of the positions' learning rate while refining; 1, as in the paper, is the end of the base schedule."""
     near: Suppress[float] = 0.01

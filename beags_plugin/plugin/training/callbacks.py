@@ -99,9 +99,10 @@ def set_learning_rates(model: SceneModel, adam: Adam, configs: dict[str, Any], s
     from_seeds = not (refining or model.schedule.warm)
     faster = model.config.base_lr_factor if from_seeds else 1.0
     for group in adam.param_groups:
-        rate = configs[group["name"]]["optimizer"].lr
-        if group["name"] == "features_rest":
-            group["weight_decay"] = model.config.sh_decay if from_seeds else 0.0
+        options = configs[group["name"]]["optimizer"]
+        rate, group["weight_decay"] = options.lr, options.weight_decay
+        if group["name"] == "features_rest" and from_seeds:
+            group["weight_decay"] += model.config.sh_decay
         if group["name"] == "means":
             rate = log_linear(*model.config.position_lr, progress) * model.extent_on_host()
             rate *= model.config.refine_position_lr_factor if refining and model.own_training is None else 1.0

@@ -164,6 +164,12 @@ def test_official_learning_rates(model):
 
     model.config.sh_decay = 1.5
     assert decays(0) == decays(29_999) == {"features_rest": 1.5} and decays(30_000) == {}
+    for name, own in (("features_rest", 0.5), ("scales", 0.25)):  # of the group itself, in all steps
+        configs[name]["optimizer"].weight_decay = own
+    assert decays(0) == {"features_rest": 2.0, "scales": 0.25}
+    assert decays(30_000) == {"features_rest": 0.5, "scales": 0.25}
+    for name in ("features_rest", "scales"):
+        configs[name]["optimizer"].weight_decay = 0
     refined = rates(30_000)
     model.config.base_lr_factor = 4.0
     assert rates(30_000) == refined  # the base's alone, and not that of opacities
