@@ -58,6 +58,26 @@ def test_rows_named_after_presets_refine_as_these_do(name, count):
         assert {key for key, value in vars(own).items() if value != getattr(preset, key)} <= base, row.name
 
 
+@pytest.mark.parametrize(
+    ("file", "rows"),
+    [
+        ("experiments/time-to-quality.toml", {"beags": "beags", "beags-fast": "beags-fast"}),
+        ("benchmarks/official-base.toml", {f"base of {name}, refined": name for name in ("beags", "beags-fast")}),
+        ("benchmarks/shorter-bases.toml", {"7,500 steps, colours decay": "beags", "rates x 2": "beags-fast"}),
+    ],
+)
+def test_rows_of_the_bases_of_presets_train_these(file, rows):
+    experiment = load_experiment(str(ROOT / file))
+    variants = {variant.name: variant.base for variant in experiment.variants}
+    for row, name in rows.items():
+        own, preset = (
+            preset_config(name, overrides, Path()).model_config
+            for name, overrides in ((experiment.preset, variants[row]), (name, {}))
+        )
+        refinement = {"refine_steps", "refine_position_lr_factor", "losses"}
+        assert {key for key, value in vars(own).items() if value != getattr(preset, key)} <= refinement, row
+
+
 @pytest.mark.parametrize("name", [name for name in WITH_QUALITY if name not in BASES])
 def test_every_length_of_refinement_has_its_control(name):
     """A gain in PSNR is one over as many steps with no loss of masks; where figures are reported, at equal rates."""
