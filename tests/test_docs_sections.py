@@ -30,6 +30,20 @@ def cited(text: str) -> Iterator[str]:
         yield from (number for number in re.findall(r"\d+(?:\.\d+)*", match[1]) if "." not in number)
 
 
+def test_the_documents_have_each_heading_that_comments_name():
+    """A file of docs/, a comma, then headings in quotes; a comment may break them over two lines."""
+    lost, count = [], 0
+    for path in [*sources(), *sorted((ROOT / "benchmarks").rglob("*.md"))]:
+        joined = re.sub(r"\s*\n\s*(?:#|//|\*)?\s*", " ", path.read_text("utf-8"))
+        for name, titles in re.findall(r'(docs/[\w-]+\.md),((?:,? (?:and )?"[^"]+")+)', joined):
+            for title in re.findall(r'"([^"]+)"', titles):
+                count += 1
+                if f"# {title}\n" not in (ROOT / name).read_text("utf-8"):
+                    lost.append(f"{path.relative_to(ROOT)}: {name}, {title!r}")
+    assert count > 5, "the pattern no longer finds the headings"
+    assert not lost
+
+
 def without_code(markdown: str) -> str:
     return re.sub(r"^(```|~~~).*?^\1", "", markdown, flags=re.MULTILINE | re.DOTALL)
 
