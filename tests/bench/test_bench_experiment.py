@@ -40,10 +40,16 @@ def test_scenes_for_choosing_and_for_reporting_are_kept_apart(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "count"), [("presets", 3), ("compare", 2), (str(ROOT / "benchmarks/presets-captures.toml"), 2)]
+    ("name", "count"),
+    [
+        ("presets", 3),
+        ("compare", 2),
+        (str(ROOT / "benchmarks/presets-captures.toml"), 2),
+        (str(ROOT / "benchmarks/presets-whole.toml"), 1),
+    ],
 )
 def test_rows_named_after_presets_refine_as_these_do(name, count):
-    """All from one base; k of the paper's is scaled to the pixels."""
+    """All of a file from one base; k of the paper's is scaled to the pixels."""
     experiment = load_experiment(name)
     rows = [variant for variant in experiment.variants if variant.name in preset_names()]
     assert len(rows) == count
@@ -63,6 +69,7 @@ def test_rows_named_after_presets_refine_as_these_do(name, count):
     [
         ("experiments/time-to-quality.toml", {"beags": "beags", "beags-fast": "beags-fast"}),
         ("benchmarks/official-base.toml", {f"base of {name}, refined": name for name in ("beags", "beags-fast")}),
+        ("benchmarks/presets-whole.toml", {"beags": "beags"}),
         ("benchmarks/shorter-bases.toml", {"7,500 steps, colours decay": "beags", "rates x 2": "beags-fast"}),
     ],
 )
