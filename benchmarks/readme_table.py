@@ -24,12 +24,14 @@ FAST = ("assignment alone", "as long as beags-fast, neither loss", "beags-fast")
 LONGER = ("as long as beags, neither loss", "beags")
 PAPER = ("as long as beags-paper, neither loss", "beags-paper")
 GROUPS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
-    ("five generated tabletops, base of `beags-fast`", "presets", "tabletop", ()),
-    ("the same, as in the paper", "presets-paper", "tabletop", PAPER),
-    ("five generated rooms, base of `beags-fast`", "presets", "room", ()),
-    ("the same, as in the paper", "presets-paper", "room", PAPER),
-    ("fruit, a real capture", "presets-captures", "fruit", (*FAST, *LONGER)),
-    ("a skull, a real capture", "presets-captures", "dtu_skull", (*FAST, *LONGER)),
+    ("five generated tabletops, base of `beags-fast`", "presets", "tabletop", FAST),
+    ("four of them, base of `beags`", "presets-whole", "tabletop", ()),
+    ("all five, as in the paper", "presets-paper", "tabletop", PAPER),
+    ("five generated rooms, base of `beags-fast`", "presets", "room", FAST),
+    ("four of them, base of `beags`", "presets-whole", "room", ()),
+    ("all five, as in the paper", "presets-paper", "room", PAPER),
+    ("fruit, a real capture, base of `beags-fast`", "presets-captures", "fruit", (*FAST, *LONGER)),
+    ("a skull, a real capture, base of `beags-fast`", "presets-captures", "dtu_skull", (*FAST, *LONGER)),
 )
 """What a group of rows is called, its file in docs/results, the scene or the family of generated scenes there, and its
 variants (or all)."""

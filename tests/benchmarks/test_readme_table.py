@@ -33,16 +33,21 @@ def test_readme_has_the_figures_of_the_committed_files():
     shown = text.partition(readme_table.BEGIN)[2].partition(readme_table.END)[0]
     assert shown.strip() == readme_table.table(RESULTS).strip()
     places = (
-        ("presets", "tabletop"),
-        ("presets", "room"),
-        ("presets-captures", "fruit"),
-        ("presets-captures", "dtu_skull"),
+        ("presets", "beags-fast", "tabletop"),
+        ("presets-whole", "beags", "tabletop"),
+        ("presets", "beags-fast", "room"),
+        ("presets-whole", "beags", "room"),
+        ("presets-captures", "beags-fast", "fruit"),
+        ("presets-captures", "beags", "fruit"),
+        ("presets-captures", "beags-fast", "dtu_skull"),
+        ("presets-captures", "beags", "dtu_skull"),
     )
-    for (name, scene), row in zip(places, (row for row in cells(shown) if row[1] == "`beags-fast`"), strict=True):
+    of_presets = (row for row in cells(shown) if row[1] in ("`beags-fast`", "`beags`"))
+    for (name, preset, scene), row in zip(places, of_presets, strict=True):
         rows = json.loads((RESULTS / f"{name}.json").read_text())["rows"]
-        fast = [row for row in rows if row["variant"] == "beags-fast" and row["scene"].startswith(scene)]
+        own = [row for row in rows if row["variant"] == preset and row["scene"].startswith(scene)]
         iou, biou, psnr = (
-            sum(row[name] for row in fast) / len(fast)
+            sum(row[name] for row in own) / len(own)
             for name in ("extracted_iou_after", "extracted_biou_after", "psnr_after")
         )
         assert row[2] == f"{100 * iou:.1f}, {100 * biou:.1f}"
@@ -61,10 +66,12 @@ def clone(tmp_path):
     figures = {**dict.fromkeys(FIGURES), "extracted_iou_after": 0.91234567, "extracted_biou_after": 0.8,
                "worst_biou_after": 0.5, "psnr_after": 30.126, "psnr_shown_after": 31.0, **COSTS}  # fmt: skip
     rows = [
-        ResultRow(Variant("neither loss"), scene, 1, figures, {"cup": figures})
+        ResultRow(Variant(name), scene, 1, figures, {"cup": figures})
         for scene in ("tabletop 1", "tabletop 2", "room 1")
+        for name in readme_table.FAST[:2]
     ]
-    rows.append(ResultRow(Variant("beags-fast"), "tabletop 1", 1, dict.fromkeys(FIGURES), {}, "no memory"))
+    for scene in ("tabletop 1", "room 1"):
+        rows.append(ResultRow(Variant("beags-fast"), scene, 1, dict.fromkeys(FIGURES), {}, "no memory"))
     source = {"command": "beags bench presets", "commit": "abc", "machine": {"cpu": "x"}, "torch": "2", "quick": False}
     (tmp_path / "presets.json").write_text(json.dumps(report_json(experiment, rows, source)))
     return tmp_path
@@ -74,15 +81,17 @@ def test_one_command_makes_the_table_from_a_result(clone):
     readme_table.main([str(clone / "presets.json")], clone)
     kept = json.loads((clone / "docs/results/presets.json").read_text())
     assert kept["command"] == "beags bench presets" and kept["commit"] == "abc" and kept["machine"] == {"cpu": "x"}
-    assert [row["scene"] for row in kept["rows"]] == ["tabletop 1", "tabletop 2", "room 1", "tabletop 1"]
-    assert kept["rows"][3]["failed"] == "no memory"
+    scenes = ["tabletop 1"] * 2 + ["tabletop 2"] * 2 + ["room 1"] * 2 + ["tabletop 1", "room 1"]
+    assert [row["scene"] for row in kept["rows"]] == scenes
+    assert kept["rows"][6]["failed"] == "no memory"
     assert kept["means"][0]["extracted_iou_after"] == 0.912346
     assert COSTS.items() <= kept["rows"][0].items() and COSTS.items() <= kept["means"][0].items()
-    assert not COSTS.keys() & kept["rows"][3].keys()  # failed
+    assert not COSTS.keys() & kept["rows"][6].keys()  # failed
     text = (clone / "README.md").read_text()
-    head, line, control, failed, *_ = cells(text.partition(readme_table.BEGIN)[2])
+    head, line, alone, control, failed, *_ = cells(text.partition(readme_table.BEGIN)[2])
     assert head[2:] == ["extracted IoU, BIoU", "worst object's BIoU", "PSNR", "PSNR shown", "removal PSNR, shown"]
-    assert control[1:] == ["neither loss", "91.2, 80.0", "50.0", "30.13", "31.00", "–, –"]
+    assert alone[1:] == ["assignment alone", "91.2, 80.0", "50.0", "30.13", "31.00", "–, –"]
+    assert control[1:] == ["as long as beags-fast, neither loss", *alone[2:]]
     assert failed[1:] == ["`beags-fast`", "–, –", "–", "–", "–", "–, –"] and line[0] == "---"
     readme_table.main([], clone)
     assert (clone / "README.md").read_text() == text and text.startswith("# beags")
