@@ -8,6 +8,7 @@ PATH="$(cd "${1:?$usage}/bin" && pwd):$PATH" # auditwheel calls patchelf
 output="${2:?$usage}"
 
 rm -rf build/raw
+mkdir -p build
 # Objects stay in build/wheel, so that the next build takes seconds.
 python -m build --no-isolation --sdist --wheel --outdir build/raw \
   -C build-dir=build/wheel -C cmake.define.BEAGS_CUDA=OFF . >build/wheel.log 2>&1 || { cat build/wheel.log >&2; exit 1; }
