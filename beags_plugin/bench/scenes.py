@@ -15,7 +15,7 @@ import numpy as np
 
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import read_mask, write_mask
-from beags_plugin.system.digests import folder_digest, value_digest
+from beags_plugin.system.digests import folder_content_digest, value_digest
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
@@ -109,7 +109,8 @@ def given_scenes(folders: Sequence[Path], downscale: float | None) -> list[Trial
         name = folder.resolve().name
         if any(scene.name == name for scene in scenes):
             raise UserError(f"two of the given folders are called {name}: rename one of them.")
-        scenes.append(TrialScene(name, folder.resolve(), downscale or quick_downscale(folder), folder_digest(folder)))
+        digest = folder_content_digest(folder)
+        scenes.append(TrialScene(name, folder.resolve(), downscale or quick_downscale(folder), digest))
     return scenes
 
 
