@@ -38,9 +38,9 @@ def test_readme_has_the_figures_of_the_committed_files():
         ("presets", "beags-fast", "room"),
         ("presets-whole", "beags", "room"),
         ("presets-captures", "beags-fast", "fruit"),
-        ("presets-captures", "beags", "fruit"),
+        ("presets-whole-captures", "beags", "fruit"),
         ("presets-captures", "beags-fast", "dtu_skull"),
-        ("presets-captures", "beags", "dtu_skull"),
+        ("presets-whole-captures", "beags", "dtu_skull"),
     )
     of_presets = (row for row in cells(shown) if row[1] in ("`beags-fast`", "`beags`"))
     for (name, preset, scene), row in zip(places, of_presets, strict=True):
