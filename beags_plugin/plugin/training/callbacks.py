@@ -94,13 +94,13 @@ def own_learning_rates(model: SceneModel, adam: Adam, step: int) -> None:
 
 
 def set_learning_rates(model: SceneModel, adam: Adam, configs: dict[str, Any], step: int) -> None:
-    """Set every group's learning rate for this step, and how fast view-dependent colours decay."""
+    """Set every group's options of Adam for this step, whatever a checkpoint of the base says of them."""
     progress, refining = model.schedule.progress(step), model.schedule.refining(step)
     from_seeds = not (refining or model.schedule.warm)
     faster = model.config.base_lr_factor if from_seeds else 1.0
     for group in adam.param_groups:
         options = configs[group["name"]]["optimizer"]
-        rate, group["weight_decay"] = options.lr, options.weight_decay
+        rate, group["weight_decay"], group["eps"] = options.lr, options.weight_decay, options.eps
         if group["name"] == "features_rest" and from_seeds:
             group["weight_decay"] += model.config.sh_decay
         if group["name"] == "means":

@@ -152,7 +152,10 @@ def test_official_learning_rates(model):
     assert rates(0) == pytest.approx({"means": 2.5 * 1.6e-4, **constant})
     assert rates(15_000) == pytest.approx({"means": 2.5 * 1.6e-5, **constant})
     assert rates(29_999) == pytest.approx({"means": 2.5 * 1.6e-6, **constant}, rel=1e-3)
-    assert all(configs[name]["optimizer"].eps == 1e-15 for name in configs)
+    assert all(group["eps"] == 1e-15 for group in adam.param_groups)
+    configs["scales"]["optimizer"].eps = 1e-6  # not what Adam was made or loaded with
+    rates(0)
+    assert [group["name"] for group in adam.param_groups if group["eps"] != 1e-15] == ["scales"]
     model.config.refine_position_lr_factor = 10.0  # of refinement alone
     assert rates(29_999)["means"] == pytest.approx(2.5 * 1.6e-6, rel=1e-3)
     model.schedule = PhaseSchedule(30_000, 3_000, 30_000)
