@@ -15,7 +15,7 @@ import numpy as np
 
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import read_mask, write_mask
-from beags_plugin.system.digests import folder_content_digest, value_digest
+from beags_plugin.system.digests import folder_digest, value_digest
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
@@ -32,8 +32,9 @@ SEEDS = {"choosing": (0, 1, 2), "reporting": (100, 101, 102, 103, 104)}
 class TrialScene:
     """A scene to train on.
 
-    digest: changes with the content of ``data``. seed: of the damage to its masks. options: of ``beags-data``, by name,
-    as plain values. sample: what a generated one is made of, which a plan does not write.
+    digest: changes with what ``data`` is made from; of given data it has their place, and files' sizes and times. seed:
+    of the damage to its masks. options: of ``beags-data``, by name, as plain values. sample: what a generated one is
+    made of, which a plan does not write.
     """
 
     name: str
@@ -109,8 +110,7 @@ def given_scenes(folders: Sequence[Path], downscale: float | None) -> list[Trial
         name = folder.resolve().name
         if any(scene.name == name for scene in scenes):
             raise UserError(f"two of the given folders are called {name}: rename one of them.")
-        digest = folder_content_digest(folder)
-        scenes.append(TrialScene(name, folder.resolve(), downscale or quick_downscale(folder), digest))
+        scenes.append(TrialScene(name, folder.resolve(), downscale or quick_downscale(folder), folder_digest(folder)))
     return scenes
 
 

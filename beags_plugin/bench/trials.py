@@ -35,7 +35,7 @@ class Trial:
 
     @cached_property
     def digest(self) -> str:
-        """Return a digest that trials share if their results are equal, wherever the data lie."""
+        """Return a digest that trials share if their results are equal; given data that were moved count as others."""
         from beags_plugin.plugin.presets import preset_folder
 
         return value_digest(

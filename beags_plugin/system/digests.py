@@ -36,17 +36,6 @@ def folder_digest(folder: Path, without: Path | None = None) -> str:
     return digest.hexdigest()
 
 
-def folder_content_digest(folder: Path) -> str:
-    """Digest relative path and content of every file of ``folder`` whose name begins with no dot: copies share it."""
-    digest = hashlib.sha256()
-    for path in sorted(path for path in folder.rglob("[!.]*") if path.is_file()):
-        digest.update(f"{path.relative_to(folder).as_posix()} {path.stat().st_size} ".encode())
-        with path.open("rb") as file:
-            while piece := file.read(1 << 20):
-                digest.update(piece)
-    return digest.hexdigest()
-
-
 def content_digest(files: Iterable[Path]) -> str:
     """Digest name and content of every file."""
     digest = hashlib.sha256()

@@ -94,7 +94,7 @@ def own_learning_rates(model: SceneModel, adam: Adam, step: int) -> None:
 
 
 def set_learning_rates(model: SceneModel, adam: Adam, configs: dict[str, Any], step: int) -> None:
-    """Set every group's options of Adam for this step, whatever a checkpoint of the base says of them."""
+    """Set every group's rate, decay and eps for this step; a checkpoint of the base may hold others."""
     progress, refining = model.schedule.progress(step), model.schedule.refining(step)
     from_seeds = not (refining or model.schedule.warm)
     faster = model.config.base_lr_factor if from_seeds else 1.0
