@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import platform
+import shlex
 import subprocess
+import sys
 from pathlib import Path
 
 _PACKAGE = Path(__file__).resolve().parents[1]  # where git is asked
@@ -45,6 +47,15 @@ def _cpu_name() -> str:
     except OSError:
         pass
     return platform.processor() or platform.machine()
+
+
+def command() -> str:
+    """Return the command line of this process: of ``beags``, or of another package's module that ``python -m`` runs."""
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    program = ["beags"]
+    if spec is not None and not spec.name.startswith(f"{_PACKAGE.name}."):
+        program = ["python", "-m", spec.name.removesuffix(".__main__")]
+    return shlex.join([*program, *sys.argv[1:]])
 
 
 def commit() -> str:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
-import shlex
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from beags_plugin.bench.provenance import commit, describe_machine
+from beags_plugin.bench.provenance import command, commit, describe_machine
 from beags_plugin.system.errors import writing
 from beags_plugin.system.whole_files import write_text_atomically
 
@@ -27,7 +25,7 @@ def provenance() -> dict[str, Any]:
     import torch
 
     return {
-        "command": shlex.join(["beags", *sys.argv[1:]]),
+        "command": command(),
         "commit": commit(),
         "machine": describe_machine(),
         "torch": torch.__version__,
