@@ -113,9 +113,9 @@ def _curves(axes: Axes, rows: Sequence[ResultRow], sweep: str, metric: str, titl
 
 
 def _legend(axes: Sequence[Axes]) -> None:
-    """Name the lines of a row of diagrams: within the first one, or beside the last where they are many."""
+    """Name the lines of a row of diagrams: in the last, whose memory leaves most room, or beside it if they are many."""
     if len(axes[0].get_legend_handles_labels()[0]) <= 2 * _FEW:
-        axes[0].legend(fontsize="x-small")
+        axes[-1].legend(*axes[0].get_legend_handles_labels(), fontsize="x-small")
     else:
         axes[-1].legend(fontsize="x-small", loc="center left", bbox_to_anchor=(1.02, 0.5))
 
