@@ -113,7 +113,7 @@ def _curves(axes: Axes, rows: Sequence[ResultRow], sweep: str, metric: str, titl
 
 
 def _legend(axes: Sequence[Axes]) -> None:
-    """Name the lines of a row of diagrams: in the last, whose memory leaves most room, or beside it if they are many."""
+    """Name the lines of a row of diagrams: in the last one, of memory, which has room, or beside it if many."""
     if len(axes[0].get_legend_handles_labels()[0]) <= 2 * _FEW:
         axes[-1].legend(*axes[0].get_legend_handles_labels(), fontsize="x-small")
     else:

@@ -23,6 +23,7 @@ INITIAL_OPACITY = 0.1
 # Ours, for runs that are shorter than the official ones: ``DensifyConfig.scaled`` makes no interval shorter than these.
 LEAST_EVERY = 50  # an interval must show the surfels to many views
 LEAST_RESET_EVERY = 1_000  # opacities need time to recover
+UNPRUNED = 0.05  # the share of the base, at its end, without pruning by views: what is left must fill the place
 SH_C0 = 0.28209479177387814  # value of the constant basis function
 COINCIDENT = 1e-7  # smallest initial scale relative to the cloud's size: coincident points have no neighbour distance
 
@@ -49,11 +50,11 @@ class DensifyConfig:
     pixels_per_surfel: float = 0.0
     """Training pixels that each Gaussian needs at least, against overfitting of few images; 0, as officially, sets no
     bound."""
-    prune_unseen: float = 0.0
-    """Gaussians whose weights over all pixels of all training views add up to less than this go, in pixels; 0 keeps
-    them."""
-    prune_unseen_every: int = 1_500
-    """Steps between two such prunings, from ``start`` to ``stop``."""
+    least_views: int = 0
+    """Gaussians that fewer training views than this show go, against overfitting: what one view alone shows may stand
+    anywhere on its rays; 0 keeps them."""
+    least_views_every: int = 3_000
+    """Steps between two such prunings, from ``start`` to the last twentieth of the base."""
 
     def scaled(self, factor: float) -> DensifyConfig:
         """Return the same for a run ``factor`` times as long: its steps are scaled, within the smallest intervals."""
@@ -68,7 +69,7 @@ class DensifyConfig:
             stop=steps(self.stop),
             prune_scale_after=steps(self.prune_scale_after, 1),
             reset_every=steps(self.reset_every, LEAST_RESET_EVERY),
-            prune_unseen_every=max(steps(self.prune_unseen_every, LEAST_EVERY), 1),
+            least_views_every=max(steps(self.least_views_every, LEAST_EVERY), 1),
         )
 
     def bounded(self, pixels: int) -> DensifyConfig:
@@ -82,10 +83,10 @@ class DensifyConfig:
         """Return whether the scene is densified after ``done`` steps."""
         return self.start < done < self.stop and done % self.every == 0
 
-    def prunes_unseen_at(self, done: int) -> bool:
-        """Return whether Gaussians that no view shows go after ``done`` steps."""
-        wanted = self.prune_unseen > 0 and self.start < done < self.stop
-        return wanted and done % self.prune_unseen_every == 0
+    def prunes_by_views_at(self, done: int, base_steps: int) -> bool:
+        """Return whether Gaussians that too few views show go after ``done`` steps of a base of ``base_steps``."""
+        wanted = self.least_views > 0 and self.start < done <= (1.0 - UNPRUNED) * base_steps
+        return wanted and done % self.least_views_every == 0
 
     def resets_at(self, done: int) -> bool:
         """Return whether opacities are reset after ``done`` steps."""

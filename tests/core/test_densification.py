@@ -205,10 +205,10 @@ def test_the_bound_by_pixels():
     assert replace(config, max_surfels=90).bounded(1000).max_surfels == 20
 
 
-def test_the_unseen_are_pruned_between_start_and_stop_in_scaled_intervals():
-    config = replace(CONFIG, prune_unseen=0.5)
-    steps = [done for done in range(1, 20_000) if config.prunes_unseen_at(done)]
-    assert steps == list(range(1_500, 15_000, 1_500))
+def test_what_too_few_views_show_is_pruned_from_start_to_near_the_end_in_scaled_intervals():
+    config = replace(CONFIG, least_views=2)
+    steps = [done for done in range(1, 40_000) if config.prunes_by_views_at(done, 30_000)]
+    assert steps == list(range(3_000, 28_501, 3_000))
     tenth = config.scaled(0.1)
-    assert [done for done in range(1, 2_000) if tenth.prunes_unseen_at(done)] == list(range(150, 1_500, 150))
-    assert not any(CONFIG.prunes_unseen_at(done) for done in steps)
+    assert [done for done in range(1, 4_000) if tenth.prunes_by_views_at(done, 3_000)] == list(range(300, 2_851, 300))
+    assert not any(CONFIG.prunes_by_views_at(done, 30_000) for done in steps)

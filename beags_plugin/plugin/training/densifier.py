@@ -10,7 +10,7 @@ from torch.optim import Adam
 from beags_plugin.core.densification import Densified, GradientStatistics, densify, length_units, reset_opacity
 from beags_plugin.plugin.training.scene_edits import edit_scene, move_adam_state
 from beags_plugin.plugin.training.scene_model import SceneModel
-from beags_plugin.plugin.training.shown_weights import shown_weights
+from beags_plugin.plugin.training.showing_views import showing_views
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system import processes
 
@@ -45,19 +45,22 @@ class Densifier:
         self.model.growing = not schedule.warm and step + 1 < min(self.config.stop, schedule.base_steps)
 
     def after_step(self, step: int) -> None:
-        """Gather statistics; densify and reset opacities when their step has come."""
-        config, last = self.config, self.model.last_render
-        done = step + 1
-        if not self.model.growing or last is None:
-            return
-        if last.screen_shift is not None and last.screen_shift.grad is not None:
-            self.statistics.add(last.screen_shift.grad.norm(dim=-1), last.render.visible)
-        if config.grows_at(done):
-            self._densify(done)
-        if config.prunes_unseen_at(done):
-            self._prune_unseen(done)
-        if config.resets_at(done):
+        """Gather statistics; densify, prune by views and reset opacities when their step has come."""
+        config, schedule, done = self.config, self.model.schedule, step + 1
+        growing = self.model.growing and self.model.last_render is not None
+        if growing:
+            self._gather()
+            if config.grows_at(done):
+                self._densify(done)
+        if not schedule.warm and config.prunes_by_views_at(done, schedule.base_steps):
+            self._prune_by_views(step)
+        if growing and config.resets_at(done):
             self._reset_opacity()
+
+    def _gather(self) -> None:
+        last = self.model.last_render
+        if last is not None and last.screen_shift is not None and last.screen_shift.grad is not None:
+            self.statistics.add(last.screen_shift.grad.norm(dim=-1), last.render.visible)
 
     def _densify(self, step: int) -> None:
         model = self.model
@@ -66,11 +69,10 @@ class Densifier:
         units = length_units(surfels.means, self.camera_centers, float(model.extent), self.config)
         self._edit(densify(surfels, self.statistics.mean(), units, self.config, step, model.generator(step)))
 
-    def _prune_unseen(self, step: int) -> None:
-        """Remove the Gaussians that hardly show in any training view."""
-        shown = shown_weights(self.model, self.datamanager, step)
-        scene = Densified.unchanged(self.model.surfels().detach())
-        self._edit(scene.only(shown >= self.config.prune_unseen))
+    def _prune_by_views(self, step: int) -> None:
+        """Remove the Gaussians that too few training views show."""
+        views = showing_views(self.model, self.datamanager, step)
+        self._edit(Densified.unchanged(self.model.surfels().detach()).only(views >= self.config.least_views))
 
     def _edit(self, edited: Densified) -> None:
         model = self.model

@@ -1,4 +1,4 @@
-"""What shortens a base: small photos first, faster rates, pruning of what no view shows."""
+"""What shortens a base: small photos first, faster rates, pruning of what too few views show."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ SHORT = {
     "pipeline.model.pyramid.levels": 3,
     "pipeline.model.base_lr_factor": 3.0,
     "pipeline.model.sh_decay": 1.2,
-    "pipeline.model.densify.prune_unseen": 0.1,
-    "pipeline.model.densify.prune_unseen_every": 12,
+    "pipeline.model.densify.least_views": 2,
+    "pipeline.model.densify.least_views_every": 6,
 }
 
 
@@ -63,22 +63,23 @@ def test_a_base_of_all_means_is_resumed_bit_for_bit(data, tmp_path, monkeypatch)
     assert_same_run(killed, whole)
 
 
-def test_what_no_view_shows_goes_and_what_shows_stays(data, tmp_path, monkeypatch):
-    """Before the pruning some Gaussians are moved behind all cameras: these go, and no others."""
-    calls, shown = [], densifier.shown_weights
+@pytest.mark.parametrize("stop", [31, 11])  # the scene still grows then, or no more
+def test_what_too_few_views_show_goes_and_what_shows_stays(data, tmp_path, monkeypatch, stop):
+    """Before the pruning some Gaussians are moved behind all cameras: these go, with what one view alone shows."""
+    calls, showing = [], densifier.showing_views
 
     def hidden(model, datamanager, step):
         model.gauss_params["means"].data[::4] = 1e4
-        calls.append(shown(model, datamanager, step))
-        assert (calls[-1][::4] == 0).all()
-        return calls[-1]
+        calls.append((showing(model, datamanager, step), len(datamanager.train_dataset)))
+        return calls[-1][0]
 
-    monkeypatch.setattr(densifier, "shown_weights", hidden)
-    options = {"pipeline.model.densify.prune_unseen": 1e-3, "pipeline.model.densify.prune_unseen_every": 12,
-               "pipeline.model.densify.stop": 13, "pipeline.model.densify.start": 11,
+    monkeypatch.setattr(densifier, "showing_views", hidden)
+    options = {"pipeline.model.densify.least_views": 2, "pipeline.model.densify.least_views_every": 30,
+               "pipeline.model.densify.stop": stop, "pipeline.model.densify.start": 10,
                "pipeline.model.refine_steps": 0}  # fmt: skip
     run_to_end(usual_config(data, tmp_path / "run", **options))
-    (weights,) = calls
+    ((views, all_views),) = calls
+    assert (views[::4] == 0).all() and int(views.max()) <= all_views
     means = checkpoint_of(tmp_path / "run")["pipeline"]["_model.gauss_params.means"]
-    assert len(means) == int((weights >= 1e-3).sum()) < len(weights) and means.abs().max() < 1e3
+    assert len(means) == int((views >= 2).sum()) < len(views) and means.abs().max() < 1e3
     assert torch.isfinite(means).all()
