@@ -210,5 +210,5 @@ def test_only_steps_of_growth_gather_gradients(model):
     assert float(densifier.statistics.views.max()) == 1
     assert gathered(14_997) > 0 and model.last_render.screen_shift is not None
     assert gathered(15_000) == 0 and model.last_render.screen_shift is None
-    densifier.config = SimpleNamespace(stop=10**9)
+    densifier.config = DensifyConfig(stop=10**9)
     assert gathered(29_999) == 0  # the last step of the base prepares for what follows
