@@ -2,6 +2,12 @@
 
 The source learns them with the scene, from scratch. Here they join a trained base, whose number of Gaussians stays, at
 the refinement's rates: those of the base, for positions those of its last tenth.
+
+Where the port differs besides: rates of codes and classifier are multiplied by 30,000 / steps, at most 10; the
+classifier has an output for each class that there is, while 256 stays in both normalisers; pixels without a label,
+which the source does not know, enter no mean; the other terms are the base's, whose loss of normals the source's 3D
+Gaussians do not have; the hull is left out where fewer than five inliers in general position remain, where the source
+fails. Its masks of pictures, from the classifier of drawn codes, are left out: objects are drawn as with all refiners.
 """
 
 from __future__ import annotations

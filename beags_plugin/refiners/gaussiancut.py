@@ -1,4 +1,10 @@
-"""GaussianCut as a refiner: a minimum cut of the Gaussians' graph for each object (``graph_cut``)."""
+"""GaussianCut as a refiner: a minimum cut of the Gaussians' graph for each object (``graph_cut``).
+
+Where the port differs from the source: the masks are those of the data in all training views, so that clicks, scribbles
+and the tracking of masks over the views are left out; they are not resized here, bilinearly with all above 0 as in the
+source (files of another size than the photos were read by the nearest pixel); pixels without a label, which the source
+does not know, enter no share. Of several objects each is cut out against all else. For the cut see ``graph_cut``.
+"""
 
 from __future__ import annotations
 

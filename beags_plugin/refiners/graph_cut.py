@@ -11,6 +11,11 @@ w_i the share of its blending weight that falls on the object's pixels, 0 if nev
 F being the Gaussians with w >= ``foreground_threshold``, R all others, and m the five k-means centres of S.
 Distances are in the units of the centres; the result depends on them, so that they should be the input's.
 Small, thin or embedded objects lose to the rest, as in the source: their links cost more than their shares are worth.
+
+Where the port differs: the solver is scipy's, whose capacities are int32, here multiples of 2^-16, and of a node's two
+terminals only the difference enters, which changes no cut; ties go to the object; a set of fewer than five Gaussians
+has as many clusters as Gaussians, where the source fails; an object without F is empty; Gaussians that are not finite
+stand at the origin.
 """
 
 from __future__ import annotations

@@ -3,6 +3,16 @@
 The source trains anchors and their networks from scratch, with the classes of seed points. Here the Gaussians of a
 trained base get theirs (``object_labels``), and train on in the same number at the refinement's rates, as those of the
 base's start would tear it up; or, ``joint``, a base grows with the classes of its seed points.
+
+What is lost without anchors: opacity, shape and colour that networks make for each view, so that a leak may be hidden
+in some of them; the bound on how far a Gaussian lies from its anchor, of whose class it is; networks that all objects
+share; growth and pruning of the Gaussians of an anchor together, to the end. A ``joint`` base grows as any other, and
+new Gaussians have the class of the one they come from, where the source's new anchors have the highest id of several.
+
+Where the port differs besides: classes are those of blending weights in all views, or of projected centres, where the
+source has seed points vote, by their tracks unless told otherwise; what it leaves out as its id 0, "unlabelled", is
+IGNORE here, and the background is one more object; the term of sizes is of areas, there of volumes; the weight of the
+cross-entropy is the same for all data, there chosen by data set.
 """
 
 from __future__ import annotations
