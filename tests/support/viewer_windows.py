@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import torch
@@ -38,7 +39,9 @@ class Window:
         config.viewer.websocket_port = None
         self.lock = threading.Lock()
         log = config.get_base_dir() / "viewer.log"
-        self.viewer = Viewer(config.viewer, log, pipeline.datamanager.get_datapath(), pipeline, trainer, self.lock)
+        # viser would look through all processes for yarn, and fail if one ends meanwhile
+        with mock.patch("viser._client_autobuild._check_viser_yarn_running", return_value=False):
+            self.viewer = Viewer(config.viewer, log, pipeline.datamanager.get_datapath(), pipeline, trainer, self.lock)
         self.model = pipeline.model
         self.panel = pipeline.model.viewer_panel
         self.sent: list[np.ndarray] = []

@@ -26,6 +26,7 @@ from resumed_runs import (
     without_clocks,
 )
 from run_folders import CLASSES, write_scene
+from viewer_windows import Window
 
 from beags_plugin.plugin.objects.evaluate import evaluate_run
 from beags_plugin.plugin.objects.export import export_run
@@ -33,6 +34,7 @@ from beags_plugin.plugin.objects.extract import extract_objects
 from beags_plugin.plugin.runs.read import read_run
 from beags_plugin.plugin.training import densifier
 from beags_plugin.plugin.training.scene_edits import edit_scene
+from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.refiners import REFINERS
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.ply import read_vertices
@@ -136,6 +138,33 @@ def test_objects_of_every_refiner_are_extracted_and_exported(refined, tmp_path, 
     assert {item.name: item.gaussians for item in exported} == {k: int(v.sum()) for k, v in expected.items()}
     vertices = {path.stem: len(read_vertices(path)) for path in (tmp_path / "exports").glob("*.ply")}
     assert vertices == {item.name: item.gaussians for item in exported}
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_the_viewer_shows_the_objects_of_every_refiner(refined, name, monkeypatch):
+    """Each isolated: the Gaussians that the run holds for it, drawn as if there were no others."""
+    config = refined(name) / "config.yml"
+    scene = read_run(config)
+    members, surfels, cameras = scene.members, scene.surfels(), []
+    window = Window(config)
+    try:
+        panel, model, viewing = window.panel, window.model, window.model.viewing
+        window.viewer.control_panel._max_res.value = 64
+        outputs = viewing.outputs
+        monkeypatch.setattr(viewing, "outputs", lambda camera: cameras.append(camera) or outputs(camera))
+        whole = window.look_as_it_opens()["rgb"]
+        assert panel.counts == {c: int(members.of(c).sum()) for c in members.present()}
+        for class_id in members.present():
+            panel.object.value = scene.classes[class_id]
+            panel.act("Isolate")
+            shown = window.look_as_it_opens()["rgb"]
+            assert torch.equal(viewing.shown().index, members.of(class_id).nonzero()[:, 0])
+            inputs = surfel_inputs(surfels[members.of(class_id)], cameras[-1], model.active_sh_degree())
+            alone = model.rasterizer.rasterize(inputs, cameras[-1], model.settings(), viewing.background)
+            assert torch.equal(shown, alone.color.clamp(0.0, 1.0))
+            assert not torch.equal(shown, whole)
+    finally:
+        window.close()
 
 
 def test_objects_that_overlap_go_through_evaluation_extraction_and_export(refined):
