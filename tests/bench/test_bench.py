@@ -18,6 +18,7 @@ from beags_plugin.bench.experiment import load_experiment
 from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.results import STAGES
 from beags_plugin.bench.run import run_experiment
+from beags_plugin.commands.cli import main
 
 MINIATURE = """
 description = "a miniature"
@@ -97,6 +98,16 @@ def test_the_plan_runs_nothing_and_knows_what_is_done(miniature, tmp_path, monke
     assert run_experiment(path, ExperimentOptions(output=options.output, plan=True)) == []
     text = " ".join(capsys.readouterr().out.split())
     assert "tabletop 5 5 4 8" in text and "5 trials, 1 of them not done." in text and "disk of broken are" in text
+
+
+def test_methods_of_the_comparison_are_its_variants(tmp_path, capsys):
+    printed = []
+    for words in (["--methods", "flashsplat"], ["--variants", "flashsplat"], []):
+        main(["bench", "compare", *words, "--scenes", "1", "--plan", "--output", str(tmp_path / "out")])
+        printed.append(" ".join(capsys.readouterr().out.split()))
+    assert printed[0] == printed[1] and "4 trials, 4 of them not done." in printed[0]
+    assert "of base, assignment alone, flashsplat, flashsplat, gamma 0 are known" in printed[0]
+    assert "4 trials" not in printed[2], "without the option all of them"
 
 
 def test_a_second_call_trains_only_what_failed(miniature, monkeypatch):
