@@ -23,8 +23,10 @@ _WORST, _LOST = "worst_biou_after", "lost_biou"
 _OBJECTS = (_WORST, _LOST)  # extracted BIoU of the worst object; the most that an object loses against before
 _MASKS = ("mask_error_given", "mask_error_used")
 _SCALE = ("voxel_size", "training_pixels")
+_OWN = ("labelled_share",)  # of refiners that learn codes: of the labelled training pixels those that got their class
 _TOTAL = "cpu_seconds total"  # of the base and the refinement
-FIGURES = (*_QUALITY, *_OBJECTS, *(f"seconds {stage}" for stage in STAGES), _TOTAL, *_COSTS, *_MASKS, *_SCALE)
+_STAGES = tuple(f"seconds {stage}" for stage in STAGES)
+FIGURES = (*_QUALITY, *_OBJECTS, *_STAGES, _TOTAL, *_COSTS, *_MASKS, *_SCALE, *_OWN)
 COLUMNS = (*_PLACE, *FIGURES)
 
 
@@ -59,7 +61,7 @@ def make_row(
     figures |= {f"{metric}_{m}": evaluation[metric][m] for metric in IMAGE_FIGURES for m in MOMENTS}
     seconds = {**result["seconds"], "base training": base["seconds"]["base training"]}
     figures |= {f"seconds {stage}": seconds.get(stage) for stage in STAGES}
-    figures |= {name: result[name] for name in (*_COSTS, *_MASKS, *_SCALE)}
+    figures |= {name: result[name] for name in (*_COSTS, *_MASKS, *_SCALE)} | {name: result.get(name) for name in _OWN}
     parts = (base["cpu_seconds"], result["cpu_seconds"])  # None: it was interrupted
     figures[_TOTAL] = None if None in parts else sum(parts)
     objects = {name: _masks(found) for name, found in evaluation["objects"].items()}

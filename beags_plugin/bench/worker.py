@@ -126,7 +126,8 @@ def train_trial(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
 
     Returns {"steps", "gaussians", "seconds": {stage: s}, "cpu_seconds", "peak_memory_mb", "own_memory_mb" (the peak
     without the loaded program), "processor"}. cpu_seconds is None after an interruption: what was killed has not said
-    how much it took. A refinement adds "summary" (a line per stage), "voxel_size" and "training_pixels".
+    how much it took. A refinement adds "summary" (a line per stage), "voxel_size" and "training_pixels", and some
+    refiners a figure of their own, as "labelled_share".
     """
     from beags_plugin.data.files import image_size
     from beags_plugin.plugin.runs.checkpoint_file import read_checkpoint

@@ -315,5 +315,7 @@ class BeagsTrainer(Trainer):
         super()._after_train()
 
     def _write_report(self) -> None:
-        report = {"seconds": self.seconds.total(), "peak_memory_mb": peak_memory_mb()}
+        own = self._model.own_training
+        figures = {} if own is None else own.figures()
+        report = {"seconds": self.seconds.total(), "peak_memory_mb": peak_memory_mb(), **figures}
         write_text_atomically(json.dumps(report, indent=2), self.base_dir / REPORT_FILE)

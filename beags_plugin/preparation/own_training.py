@@ -97,6 +97,10 @@ class OwnTraining(ABC):
     def finish(self) -> Membership | None:
         """Return the objects, after ``last_edit``; None: phi, as it is, says which they are."""
 
+    def figures(self) -> Mapping[str, float]:
+        """Return what the run's report says of this training besides, by name; known once it has finished."""
+        return {}
+
     def state(self) -> dict[str, Any]:
         """Return what decides how it goes on: tensors and plain values."""
         return {}

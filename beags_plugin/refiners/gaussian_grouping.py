@@ -12,7 +12,7 @@ fails. Its masks of pictures, from the classifier of drawn codes, are left out: 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -90,6 +90,9 @@ class IdentityTraining(OwnTraining):
             if class_id != 0
         }
         return Membership.of_masks(masks, self.scene.class_ids())
+
+    def figures(self) -> Mapping[str, float]:
+        return self.identities.figures
 
     def state(self) -> dict[str, Any]:
         return self.identities.state()

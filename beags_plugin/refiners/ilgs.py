@@ -12,7 +12,7 @@ which reaches codes, classifier and, through the blending weights, the geometry.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -118,6 +118,9 @@ class IlgsTraining(OwnTraining):
                 say(f"  no hull, for want of Gaussians or as all lie in a plane: {', '.join(without)}")
             found = {rank: chosen | hulls[rank] for rank, chosen in found.items()}
         return Membership.of_masks({ids[rank]: chosen for rank, chosen in found.items()}, self.scene.class_ids())
+
+    def figures(self) -> Mapping[str, float]:
+        return self.learned.figures
 
     def state(self) -> dict[str, Any]:
         return self.learned.state()

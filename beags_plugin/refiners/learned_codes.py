@@ -23,7 +23,8 @@ CODES, CLASSIFIER = 1, 2  # purposes of random numbers; 0 is for the refiner's o
 class LearnedCodes:
     """A code of each Gaussian [N, 16], a classifier with some number of outputs, and an Adam for both.
 
-    Short runs learn faster: see ``identity_codes.rate_factor``. ``scene`` must keep its number of Gaussians.
+    Short runs learn faster: see ``identity_codes.rate_factor``. ``scene`` must keep its number of Gaussians. figures:
+    for the run's report; "labelled_share" once ``say_right_pixels`` has found it.
     """
 
     def __init__(self, scene: TrainedScene, outputs: int, bias: bool = True) -> None:
@@ -34,6 +35,7 @@ class LearnedCodes:
         generator = scene.generator(0, CLASSIFIER)
         self.classifier = identity_codes.initial_classifier(outputs, generator, bias).to(means.device)
         self.learned = [self.codes, *self.classifier.parameters()]
+        self.figures: dict[str, float] = {}
         factor = identity_codes.rate_factor(scene.steps)
         self.adam = torch.optim.Adam(
             [
@@ -56,7 +58,7 @@ class LearnedCodes:
             self.adam.step()
 
     def say_right_pixels(self, surfels: Surfels, ranks: ClassRanks) -> None:
-        """Print the share of labelled pixels of all training views whose drawn code gets their class."""
+        """Print and keep the share of labelled pixels of all training views whose drawn code gets their class."""
         found, scene = torch.zeros(2, dtype=torch.int64), self.scene
         with torch.no_grad(), scene.stage("Checking identities") as progress:
             for index, camera in enumerate(scene.cameras):
@@ -65,7 +67,7 @@ class LearnedCodes:
                     labels = ranks.ranked_labels(labels.to(logits.device))
                     found += torch.stack(identity_codes.right_pixels(logits, labels)).cpu()
                 progress(index + 1, len(scene.cameras))
-        right = int(found[0]) / max(int(found[1]), 1)
+        right = self.figures["labelled_share"] = int(found[0]) / max(int(found[1]), 1)
         lesson = "" if right >= LEAST_RIGHT else f", below {LEAST_RIGHT:.0%}: train longer (refine_steps)"
         say(f"  codes: {right:.1%} of the labelled pixels of training views get their class{lesson}")
 

@@ -71,7 +71,7 @@ def rows():
     none, every = Variant("none"), Variant("k = 8", sweep="k", x=8.0)
     return [
         make_row(none, "a", 0, BASE, result(0.5), None),
-        make_row(every, "a", 0, BASE, result(0.8), None),
+        make_row(every, "a", 0, BASE, {**result(0.8), "labelled_share": 0.875}, None),
         make_row(none, "b", 0, BASE, result(0.3, psnr=None), None),
         make_row(every, "b", 0, BASE, None, "k is 0."),
     ]
@@ -87,6 +87,7 @@ def test_means_are_over_the_scenes_that_finished(rows):
     assert none.figures["seconds base training"] == 60.0
     assert none.figures["cpu_seconds total"] == 70.0
     assert none.figures["psnr_after"] == 30.0 and none.figures["mask_error_used"] is None
+    assert none.figures["labelled_share"] is None and every.figures["labelled_share"] == 0.875
     assert every.figures["rendered_iou_after"] == pytest.approx(0.9)
     left = error_left(every, none)
     assert left == pytest.approx((1 - 0.9) / (1 - 0.5))

@@ -80,8 +80,10 @@ def test_short_runs_learn_faster():
 
 def test_codes_learn_the_masks_and_leave_objects_that_overlap(capsys):
     training = trained(200, hull=False)
+    assert training.figures() == {}
     found, scene = training.finish(), training.scene
-    assert "labelled pixels of training views get their class\n" in capsys.readouterr().out
+    printed = f"codes: {training.figures()['labelled_share']:.1%} of the labelled pixels of training views get their"
+    assert f"{printed} class\n" in capsys.readouterr().out and 0.97 <= training.figures()["labelled_share"] <= 1.0
     assert sorted(found.objects) == list(FAR_APART[1:])
     for class_id in FAR_APART[1:]:
         own = scene.class_ids() == class_id

@@ -12,7 +12,7 @@ from beags_plugin.system.reading.text import load_json, reason
 BASE_SNAPSHOT = "base"  # folder with the scene as refinement started from it
 PREPARED = "prepared"  # folder with the masks and grids of refinement
 EXTRACTION_FILE = "extraction.json"  # in a run that holds a part of another: which one, and which part
-REPORT_FILE = "training.json"  # seconds and memory of a run that is complete
+REPORT_FILE = "training.json"  # seconds, memory and a refiner's own figures of a run that is complete
 TRANSFORM_FILE = "dataparser_transforms.json"  # nerfstudio's name for the normalisation of the poses
 
 

@@ -120,6 +120,13 @@ def test_every_refiner_has_a_run_here():
 
 
 @pytest.mark.parametrize("name", RUNS)
+def test_the_report_of_a_run_keeps_how_many_pixels_the_codes_got_right(refined, name):
+    report = json.loads((refined(name) / "training.json").read_text())
+    assert ("labelled_share" in report) == (name in ("gaussian-grouping", "ilgs"))
+    assert 0.0 < report.get("labelled_share", 0.5) < 1.0
+
+
+@pytest.mark.parametrize("name", RUNS)
 def test_objects_of_every_refiner_are_extracted_and_exported(refined, tmp_path, name):
     """Each with the Gaussians that the run holds for it, and with all their values."""
     config = refined(name) / "config.yml"
