@@ -52,7 +52,8 @@ class DensifyConfig:
     bound."""
     least_views: int = 0
     """Gaussians that fewer training views than this show go, against overfitting: what one view alone shows may stand
-    anywhere on its rays; 0 keeps them."""
+    anywhere on its rays. Those in the frames of more views than this stay, hidden: they fill things. 0 keeps all, as
+    does a scene of at most twice as many views."""
     least_views_every: int = 3_000
     """Steps between two such prunings, from ``start`` to the last twentieth of the base."""
 

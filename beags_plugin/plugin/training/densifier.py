@@ -70,9 +70,12 @@ class Densifier:
         self._edit(densify(surfels, self.statistics.mean(), units, self.config, step, model.generator(step)))
 
     def _prune_by_views(self, step: int) -> None:
-        """Remove the Gaussians that too few training views show."""
-        views = showing_views(self.model, self.datamanager, step)
-        self._edit(Densified.unchanged(self.model.surfels().detach()).only(views >= self.config.least_views))
+        """Remove the Gaussians that too few training views show, but for what is hidden in more of them."""
+        least = self.config.least_views
+        if len(self.datamanager.train_dataset) <= 2 * least:
+            return
+        showing, framing = showing_views(self.model, self.datamanager, step)
+        self._edit(Densified.unchanged(self.model.surfels().detach()).only((showing >= least) | (framing > least)))
 
     def _edit(self, edited: Densified) -> None:
         model = self.model

@@ -1,4 +1,4 @@
-"""How many training views show each Gaussian, while the base trains."""
+"""How many training views show each Gaussian and have it in their frame, while the base trains."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from beags_plugin.core.lifting import pixels_under
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.rasterizers.rendering import geometry_inputs
@@ -15,12 +16,18 @@ SHOWN = 1.0  # a view shows a Gaussian whose w_i over its pixels add up to so ma
 
 
 @torch.no_grad()
-def showing_views(model: SceneModel, datamanager: BeagsDataManager, step: int) -> Tensor:
-    """Return [N] int64, how many training views show each Gaussian; all are rendered, as ``step`` sees them."""
-    inputs, settings = geometry_inputs(model.surfels()), replace(model.settings(), geometry=False)
-    views = torch.zeros(model.num_points, dtype=torch.int64, device=model.device)
+def showing_views(model: SceneModel, datamanager: BeagsDataManager, step: int) -> tuple[Tensor, Tensor]:
+    """Return how many training views show each Gaussian and how many have its centre in their frame, [N] int64 each.
+
+    A Gaussian that others hide, such as the inside of a thing, is in frames that do not show it. All views are
+    rendered, as ``step`` sees them.
+    """
+    surfels = model.surfels()
+    inputs, settings = geometry_inputs(surfels), replace(model.settings(), geometry=False)
+    showing, framing = torch.zeros(2, model.num_points, dtype=torch.int64, device=model.device)
     for index in range(len(datamanager.train_dataset)):
         camera = datamanager.training_camera(index, step)
         everywhere = torch.zeros(camera.height, camera.width, dtype=torch.int32, device=model.device)
-        views += model.rasterizer.class_contributions(inputs, camera, settings, everywhere, 1)[:, 0] >= SHOWN
-    return views
+        showing += model.rasterizer.class_contributions(inputs, camera, settings, everywhere, 1)[:, 0] >= SHOWN
+        framing[pixels_under(surfels.means, camera)[0]] += 1
+    return showing, framing

@@ -64,22 +64,33 @@ def test_a_base_of_all_means_is_resumed_bit_for_bit(data, tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("stop", [31, 11])  # the scene still grows then, or no more
-def test_what_too_few_views_show_goes_and_what_shows_stays(data, tmp_path, monkeypatch, stop):
-    """Before the pruning some Gaussians are moved behind all cameras: these go, with what one view alone shows."""
-    calls, showing = [], densifier.showing_views
+def test_what_too_few_views_show_goes_but_for_what_is_hidden(data, tmp_path, monkeypatch, stop):
+    """Before the pruning some Gaussians are moved behind all cameras, which go, and some are hidden, which stay."""
+    calls, showing_views = [], densifier.showing_views
 
-    def hidden(model, datamanager, step):
-        model.gauss_params["means"].data[::4] = 1e4
-        calls.append((showing(model, datamanager, step), len(datamanager.train_dataset)))
-        return calls[-1][0]
+    def moved(model, datamanager, step):
+        means = model.gauss_params["means"].data
+        means[::4] = 1e4
+        means[1::4] = means[2]
+        model.gauss_params["scales"].data[1::4] = -20.0  # they cover no pixel
+        calls.append((*showing_views(model, datamanager, step), len(datamanager.train_dataset)))
+        return calls[-1][:2]
 
-    monkeypatch.setattr(densifier, "showing_views", hidden)
+    monkeypatch.setattr(densifier, "showing_views", moved)
     options = {"pipeline.model.densify.least_views": 2, "pipeline.model.densify.least_views_every": 30,
                "pipeline.model.densify.stop": stop, "pipeline.model.densify.start": 10,
                "pipeline.model.refine_steps": 0}  # fmt: skip
     run_to_end(usual_config(data, tmp_path / "run", **options))
-    ((views, all_views),) = calls
-    assert (views[::4] == 0).all() and int(views.max()) <= all_views
+    ((showing, framing, views),) = calls
+    assert (framing[::4] == 0).all() and (showing[::4] == 0).all() and int(framing.max()) <= views
+    assert (showing[1::4] < 2).all() and (framing[1::4] > 2).all()
+    stays = (showing >= 2) | (framing > 2)
     means = checkpoint_of(tmp_path / "run")["pipeline"]["_model.gauss_params.means"]
-    assert len(means) == int((views >= 2).sum()) < len(views) and means.abs().max() < 1e3
+    assert len(means) == int(stays.sum()) < len(showing) and means.abs().max() < 1e3
     assert torch.isfinite(means).all()
+
+
+def test_few_views_say_nothing_about_what_they_show(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(densifier, "showing_views", lambda *of: pytest.fail("all should stay"))
+    least = "pipeline.model.densify.least_views"
+    run_to_end(usual_config(data, tmp_path / "run", **{least: 4, f"{least}_every": 6}))
