@@ -27,6 +27,7 @@ from beags_plugin.evaluation.records import (
     ViewRecord,
 )
 from beags_plugin.evaluation.removal import removal_metrics
+from beags_plugin.evaluation.shown import TAU
 from beags_plugin.extraction.select import remove_class, select_class
 from beags_plugin.labels.borders import at_border
 from beags_plugin.labels.class_ids import IGNORE, resize_nearest
@@ -181,26 +182,27 @@ class MaskRenderer:
         for class_id in objects:
             truth = extracted_truth(self.view, class_id) if kind == "extracted" else seen_truth(self.view, class_id)
             if truth is not None:
-                mask, hidden = self._extracted(class_id, truth.others)
+                mask, hidden = self._extracted(self.members, class_id, truth.others)
                 left_out = [pixels for pixels in (truth.unknown, hidden) if pixels is not None]
                 ignore = torch.stack(left_out).any(dim=0) if left_out else None
                 found[class_id] = RenderedMask(mask, truth.mask, ignore, truth.source)
         return found
 
-    def _extracted(self, class_id: int, others: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    def _extracted(self, members: Membership, class_id: int, others: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """Return [H, W] bool, alpha of the object alone above the threshold; and which of ``others`` may hide it.
 
-        A pixel of another object tells nothing about what lies behind it; what is drawn before it is wrong.
+        A pixel of another object tells nothing about what lies behind it, by more than ``TAU`` of the depth; what is
+        drawn before it, in it, or by the whole scene instead of it is wrong.
         """
         if class_id not in self._alone:
-            assert self.members is not None
-            part = select_class(self.surfels, self.members, class_id)[0]
+            part = select_class(self.surfels, members, class_id)[0]
             camera, hidden = self.view.camera, None
             if len(part) == 0:
                 return torch.zeros(camera.height, camera.width, dtype=torch.bool), None
             render = self._render(part, depth=others is not None)
             if others is not None:
-                nearer = self._scene_depth < surface_depth(render, "median")
+                nearer = self._scene_depth < (1.0 - TAU) * surface_depth(render, "median")
+                nearer &= ~self._rendered(members, [class_id])[class_id]
                 hidden = others & torch.from_numpy(resize_nearest(nearer.cpu().numpy(), *others.shape))
             self._alone[class_id] = render.alpha > self.protocol.threshold, hidden
         return self._alone[class_id]

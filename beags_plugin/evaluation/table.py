@@ -118,7 +118,7 @@ def protocol_line(runs: Sequence[RunMetrics]) -> str:
     return (
         f"Protocol: extracted masks against {truth}; above {protocol.threshold:g}; boundary band "
         f"{100 * protocol.band_share:g} % of the diagonal; the {protocol.resize} is resized; masks empty in truth and "
-        f"prediction are left out; means over {protocol.scene_average}, then {scenes}.{removal}{shown}"
+        f"prediction are left out, IoU and BIoU of those empty in truth alone are 0; means over {protocol.scene_average}, then {scenes}.{removal}{shown}"
     )
 
 

@@ -17,6 +17,7 @@ from rich.console import Console
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.rotations import rotation_from_quat
+from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import MaskMetrics
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import EvalView, ObjectMetrics, SceneMetrics
@@ -32,6 +33,7 @@ from beags_plugin.pictures.contact_sheet import (
     interpolate_cameras,
     novel_camera,
 )
+from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 from beags_plugin.system.errors import UserError
 
 STRAY = (20.0, 20.0, 2.0)
@@ -89,6 +91,28 @@ def test_what_is_drawn_before_another_object_counts_as_wrong():
     """The box is drawn whole before the cup, though the cup hides its left half."""
     box = evaluated([BOX, CUP, FLOOR], [2, 1, 0], EvalView(camera(), None, truth())).objects[2]
     assert box.extracted is not None and box.extracted.iou == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("gap", [0.003, 0.1])
+def test_layers_of_the_object_itself_hide_nothing(gap):
+    """A haze of the box lies before two layers of the cup, which the whole scene draws where the truth says box.
+
+    In the whole scene the surface is the cup's first layer, of the cup alone the second: nearer, but not hidden.
+    """
+    depths, opacities = torch.tensor([1.0 - gap, 1.0, 1.0 + gap, 2.0]), torch.tensor([0.2, 0.45, 0.45, 0.99])
+    surfels = Surfels.of(
+        means=torch.stack([torch.zeros(4), torch.zeros(4), depths], dim=-1),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(4, 1),
+        log_scales=torch.full((4, 2), 3.0),
+        opacity_logits=torch.logit(opacities),
+        sh=torch.zeros(4, 1, 3),
+    )
+    ids = Membership(torch.tensor([2, 1, 1, 2], dtype=torch.int32))
+    view = EvalView(camera(), None, torch.full((SIZE, SIZE), 2, dtype=torch.int32))
+    metrics = evaluate_scene(surfels, ids, TorchRasterizer(), SETTINGS, [view], CLASSES)
+    cup = metrics.objects[1]
+    assert cup.rendered is not None and cup.rendered.acc == 0.0  # the whole scene draws it everywhere
+    assert cup.extracted is not None and cup.extracted.acc == 0.0
 
 
 def test_ignored_pixels_do_not_count():
