@@ -70,10 +70,7 @@ def test_rows_named_after_presets_refine_as_these_do(name, count):
         ("experiments/time-to-quality.toml", {"beags": "beags", "beags-fast": "beags-fast"}),
         ("benchmarks/official-base.toml", {f"base of {name}, refined": name for name in ("beags", "beags-fast")}),
         ("benchmarks/presets-whole.toml", {"beags": "beags"}),
-        (
-            "benchmarks/shorter-bases.toml",
-            {"7,500 steps, colours decay, what one view alone shows goes": "beags", "rates x 2": "beags-fast"},
-        ),
+        ("benchmarks/shorter-bases.toml", {"7,500 steps, colours decay": "beags", "rates x 2": "beags-fast"}),
     ],
 )
 def test_rows_of_the_bases_of_presets_train_these(file, rows):
