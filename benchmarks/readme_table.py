@@ -47,7 +47,7 @@ COLUMNS: tuple[tuple[str, tuple[str, ...], int, float], ...] = (
     ("removal PSNR, shown", ("removal_psnr_after", "removal_psnr_shown_after"), 2, 1.0),
 )
 """Head, figures, digits, factor; a column without figures is left out."""
-_SOURCE = ("experiment", "preset", "reference", "command", "commit", "machine", "torch", "busy", "quick")
+_SOURCE = ("experiment", "preset", "reference", "command", "commit", "machine", "torch", "busy", "quick", "protocol")
 _ROW = ("scene", "seed", "variant", "failed", "failures", "error_left", "lost_biou", "shown_after", "ssim_after",
         "rendered_iou_after", "rendered_biou_after", "removal_remains_after", "steps", "cpu_seconds",
         "cpu_seconds total", "own_memory_mb", "peak_memory_mb")  # fmt: skip

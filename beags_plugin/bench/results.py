@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from beags_plugin.bench.experiment import Experiment, Variant
+from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import FIGURES as METRICS
 from beags_plugin.evaluation.records import IMAGE_FIGURES
 from beags_plugin.evaluation.report import STAGES as MOMENTS
+from beags_plugin.evaluation.table import protocol_sentence
 
 STAGES = ("base training", "reprojection", "assignment", "border split", "voxel grids", "objects", "refinement")
 MEAN = "mean"  # in the column "object": over all masks of the scene
@@ -36,7 +38,8 @@ class ResultRow:
 
     figures: values by the names of ``FIGURES``, None where there is none; mask metrics in 0..1. objects: the same of
     each object. failed: the reason for missing figures, in a sentence. count: number of scenes and seeds in a mean;
-    failures: number of those that it lacks.
+    failures: number of those that it lacks. protocol, truth: of the evaluation of one trial, see
+    ``SceneMetrics.extracted_truth``; None in a mean or where it failed.
     """
 
     variant: Variant
@@ -47,6 +50,8 @@ class ResultRow:
     failed: str | None = None
     count: int = 1
     failures: int = 0
+    protocol: Protocol | None = None
+    truth: str | None = None
 
 
 def make_row(
@@ -70,7 +75,8 @@ def make_row(
     figures[_WORST] = min((end for _, end in pairs if end is not None), default=None)
     lost = (start - end for start, end in pairs if start is not None and end is not None)
     figures[_LOST] = max(lost, default=None)
-    return ResultRow(variant, scene, seed, figures, objects)
+    protocol = Protocol(**evaluation["protocol"])
+    return ResultRow(variant, scene, seed, figures, objects, protocol=protocol, truth=evaluation["extracted_truth"])
 
 
 def _masks(found: Mapping[str, Any]) -> dict[str, float | None]:
@@ -109,6 +115,22 @@ def _mean(values: Iterable[float | None]) -> float | None:
     return math.fsum(known) / len(known) if known else None
 
 
+def protocol_of(rows: Sequence[ResultRow]) -> str | None:
+    """Return the sentence of ``beags eval`` with all choices behind the figures of rows; None if all failed.
+
+    Trials of one bench have one protocol.
+    """
+    protocol = next((row.protocol for row in rows if row.protocol is not None), None)
+    if protocol is None:
+        return None
+    return protocol_sentence(
+        protocol,
+        [row.truth for row in rows],
+        removal=any(row.figures["removal_psnr_after"] is not None for row in rows),
+        shown=any(row.figures["shown_after"] is not None for row in rows),
+    )
+
+
 def error_left(row: ResultRow, reference: ResultRow | None) -> float | None:
     """Return (1 - extracted BIoU) of a row over that of the reference, or None if one is unknown."""
     metric = "extracted_biou_after"
@@ -141,9 +163,10 @@ def flat(row: ResultRow) -> list[dict[str, Any]]:
 
 
 def report_json(experiment: Experiment, rows: Sequence[ResultRow], provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """Return {"experiment", "description", "preset", "reference", provenance ..., "rows": [], "means": [], "paper"}.
+    """Return {"experiment", "description", "preset", "reference", provenance ..., "protocol", "rows", "means",
+    "paper"}.
 
-    Every row has ``COLUMNS``; "means" adds "count", "failures" and "error_left".
+    protocol: see ``protocol_of``. Every row has ``COLUMNS``; "means" adds "count", "failures" and "error_left".
     """
     averaged = means(rows)
     reference = find_reference(averaged, experiment, MEAN)
@@ -151,6 +174,7 @@ def report_json(experiment: Experiment, rows: Sequence[ResultRow], provenance: M
         **experiment.header(),
         "reference": experiment.reference,
         **provenance,
+        "protocol": protocol_of(rows),
         "rows": [line for row in rows for line in flat(row)],
         "means": [
             {**flat(row)[0], "count": row.count, "failures": row.failures, "error_left": error_left(row, reference)}

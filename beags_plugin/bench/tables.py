@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from beags_plugin.bench.experiment import Experiment, PaperFigures
 from beags_plugin.bench.report import new_table, number, plain_table
-from beags_plugin.bench.results import STAGES, ResultRow, error_left, find_reference, means
+from beags_plugin.bench.results import STAGES, ResultRow, error_left, find_reference, means, protocol_of
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -26,7 +26,7 @@ _COLUMNS = (  # head, figure, digits, factor
     ("\nafter", "psnr_after", 2, 1.0),
     ("shown, dB\nbefore", "psnr_shown_before", 2, 1.0),
     ("\nafter", "psnr_shown_after", 2, 1.0),
-    ("\npixels", "shown_after", 1, 100.0),
+    ("\n%", "shown_after", 1, 100.0),
     ("objects, dB\nbefore", "psnr_objects_before", 2, 1.0),
     ("\nafter", "psnr_objects_after", 2, 1.0),
     ("SSIM\nafter", "ssim_after", 3, 1.0),
@@ -40,7 +40,7 @@ _COLUMNS = (  # head, figure, digits, factor
 
 
 def tables(experiment: Experiment, rows: Sequence[ResultRow]) -> list[Table | str]:
-    """Return what to print: the means, each scene, the paper's figures, and the failures."""
+    """Return what to print: the means, each scene, the paper's figures, the protocol, and the failures."""
     averaged = means(rows)
     scenes = list(dict.fromkeys(row.scene for row in rows))
     title = f"{experiment.name}, {experiment.preset}: mean over {', '.join(scenes)}"
@@ -50,9 +50,6 @@ def tables(experiment: Experiment, rows: Sequence[ResultRow]) -> list[Table | st
     if experiment.paper is not None:
         printed.append(paper_table(experiment.paper, experiment.reference))
     printed.append("Worst object: the lowest extracted BIoU; lost: the most that an object loses by refinement.")
-    if _any(rows, "removal_psnr_after"):
-        printed.append("Removal: the scene without an object, against the exact picture; remains: pixels that show it.")
-    printed.append("Shown: PSNR over the pixels (in %) whose surface some training view shows.")
     printed.append("Objects: PSNR over the pixels of objects, but those next to the background.")
     printed.append("Seconds of stages are wall time; CPU: of the whole trial after its base, all threads.")
     printed.append("Memory: the peak of the trial's process, and what of it the loaded program does not take.")
@@ -61,6 +58,8 @@ def tables(experiment: Experiment, rows: Sequence[ResultRow]) -> list[Table | st
     if experiment.reference is not None:
         printed.append(f"BIoU error left: (100 - extracted BIoU) as a share of that of {experiment.reference!r}.")
     printed += [line for sweep in experiment.sweeps if (line := memory_line(averaged, sweep)) is not None]
+    if (protocol := protocol_of(rows)) is not None:
+        printed.append(protocol)
     printed += [f"failed: {row.variant.name} on {row.scene}: {row.failed}" for row in rows if row.failed]
     return printed
 

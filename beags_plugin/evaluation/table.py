@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from beags_plugin.evaluation.metrics import METRICS
+from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import FIGURES, KINDS, MASK_KINDS, ObjectMetrics
 from beags_plugin.evaluation.removal import TELLING
 from beags_plugin.evaluation.report import DataSetMetrics, RunMetrics, Stage
@@ -98,19 +99,31 @@ def render_data_set(found: DataSetMetrics) -> RenderableType:
 
 def protocol_line(runs: Sequence[RunMetrics]) -> str:
     """Return a sentence with all choices behind the figures of runs of one protocol."""
-    protocol = runs[0].protocol
-    truths = {truth for run in runs if (truth := run.after.extracted_truth) is not None}
-    truth = _TRUTHS[truths.pop() if len(truths) == 1 else "both"] if truths else "no masks"
-    removal = ""
-    if any(run.after.mean.removal is not None for run in runs):
-        removal = (
+    return protocol_sentence(
+        runs[0].protocol,
+        [run.after.extracted_truth for run in runs],
+        removal=any(run.after.mean.removal is not None for run in runs),
+        shown=any(run.after.shown is not None for run in runs),
+    )
+
+
+def protocol_sentence(protocol: Protocol, truths: Iterable[str | None], *, removal: bool, shown: bool) -> str:
+    """Return a sentence with all choices behind figures.
+
+    truths: of each scene, as ``SceneMetrics.extracted_truth``. removal, shown: whether there are such figures.
+    """
+    known = {truth for truth in truths if truth is not None}
+    truth = _TRUTHS[known.pop() if len(known) == 1 else "both"] if known else "no masks"
+    of_removal = ""
+    if removal:
+        of_removal = (
             " Removal: the scene without the object's Gaussians against the exact picture without it, over the whole "
             "silhouette; shown: where the latter shows surface that some training view shows; remains: pixels nearer "
             f"to the photo, of those where the two differ by {TELLING:g} or more."
         )
-    shown = ""
-    if any(run.after.shown is not None for run in runs):
-        shown = (
+    of_shown = ""
+    if shown:
+        of_shown = (
             " PSNR shown: over the pixels whose surface (median depth before refinement, else of the run) some "
             f"training view shows within {100 * TAU:g} % of its depth."
         )
@@ -118,7 +131,8 @@ def protocol_line(runs: Sequence[RunMetrics]) -> str:
     return (
         f"Protocol: extracted masks against {truth}; above {protocol.threshold:g}; boundary band "
         f"{100 * protocol.band_share:g} % of the diagonal; the {protocol.resize} is resized; masks empty in truth and "
-        f"prediction are left out, IoU and BIoU of those empty in truth alone are 0; means over {protocol.scene_average}, then {scenes}.{removal}{shown}"
+        f"prediction are left out, IoU and BIoU of those empty in truth alone are 0; means over "
+        f"{protocol.scene_average}, then {scenes}.{of_removal}{of_shown}"
     )
 
 

@@ -79,6 +79,8 @@ def test_trials_are_trained_measured_and_reported(miniature):
     assert exact["mask_error_given"] == 0.0 < damaged["mask_error_given"]
     report = json.loads(options.json.read_text())
     assert report["commit"] and report["machine"]["cpu"] and report["experiment"] == "mine"
+    assert report["protocol"].startswith("Protocol: extracted masks against whole occlusion-free silhouettes; ")
+    assert " Removal: " in report["protocol"] and " PSNR shown: " in report["protocol"]
     assert [row["failed"] is None for row in report["means"]] == [True, False, True, True]
     assert options.csv.read_text().count("\n") == 1 + len(report["rows"]) + len(report["means"])
     for name in ("mine.png", "mine-confidence.png"):

@@ -20,11 +20,26 @@ from beags_plugin.bench.experiment import Variant, load_experiment
 from beags_plugin.bench.front import pareto_front, plot_front
 from beags_plugin.bench.pictures import plot_experiment
 from beags_plugin.bench.report import write_csv, write_json
-from beags_plugin.bench.results import COLUMNS, FIGURES, ResultRow, error_left, make_row, means, report_json, table_rows
+from beags_plugin.bench.results import (
+    COLUMNS,
+    FIGURES,
+    ResultRow,
+    error_left,
+    make_row,
+    means,
+    protocol_of,
+    report_json,
+    table_rows,
+)
 from beags_plugin.bench.run import rows_of
 from beags_plugin.bench.tables import memory_line, per_million_pixels, tables
 from beags_plugin.bench.trials import VariantTrial, plan
+from beags_plugin.evaluation.metrics import RemovalMetrics
+from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import FIGURES as METRICS
+from beags_plugin.evaluation.records import ObjectMetrics, SceneMetrics
+from beags_plugin.evaluation.report import RunMetrics
+from beags_plugin.evaluation.table import protocol_line
 
 
 @pytest.fixture
@@ -42,6 +57,8 @@ def masks(value: float) -> dict:
 def result(value: float, psnr: float | None = 30.0) -> dict:
     return {
         "evaluation": {
+            "protocol": Protocol(band_share=0.03).to_json(),
+            "extracted_truth": "silhouette",
             "mean": masks(value),
             "psnr": {"before": 29.0, "after": psnr},
             "psnr_shown": {"before": 31.0, "after": 31.25},
@@ -103,6 +120,7 @@ def test_json_and_csv_hold_every_row_and_the_same_figures(rows, tmp_path, experi
     write_csv(tmp_path / "deep/r.csv", table_rows(rows))
     read = json.loads((tmp_path / "deep/r.json").read_text())
     assert read["experiment"] == "mine" and read["commit"] == "abc" and read["paper"] is None
+    assert read["protocol"] == protocol_of(rows)
     assert all(set(row) == set(COLUMNS) for row in read["rows"])
     assert [(row["scene"], row["object"]) for row in read["rows"]] == [
         ("a", "mean"), ("a", "cup"), ("a", "box"), ("a", "mean"), ("a", "cup"), ("a", "box"),
@@ -119,6 +137,20 @@ def test_json_and_csv_hold_every_row_and_the_same_figures(rows, tmp_path, experi
             assert line[name] == ("" if row[name] is None else str(row[name]))
 
 
+def test_the_protocol_is_worded_as_by_beags_eval(rows):
+    removal = RemovalMetrics(20.0, None, None, 0.9, 0.1)
+    scene = SceneMetrics(ObjectMetrics(None, None, None, removal), {}, 30.0, "silhouette", shown=0.75)
+    run = RunMetrics("a", "c", Protocol(band_share=0.03), {}, None, scene)
+    assert protocol_of(rows) == protocol_line([run]) and "3 % of the diagonal" in protocol_line([run])
+    gone = dict.fromkeys((f"removal_{metric}_after" for metric in METRICS["removal"]), None)
+    plain = [dataclasses.replace(row, figures={**row.figures, "shown_after": None, **gone}) for row in rows]
+    bare = dataclasses.replace(scene, mean=ObjectMetrics(None, None), shown=None)
+    assert protocol_of(plain) == protocol_line([dataclasses.replace(run, after=bare)])
+    mixed = [dataclasses.replace(row, truth="visible" if row.scene == "b" else row.truth) for row in rows]
+    assert "against whole occlusion-free silhouettes, else visible masks" in protocol_of(mixed)
+    assert protocol_of(rows[3:]) is None  # it failed
+
+
 def test_tables_list_failures_and_mark_the_papers_figures(rows):
     from rich.console import Console
 
@@ -127,7 +159,7 @@ def test_tables_list_failures_and_mark_the_papers_figures(rows):
         console.print(table)
     text = console.file.getvalue()
     assert "failed: k = 8 on b: k is 0." in text and "k = 8 (1 of 2 scenes)" in text
-    assert "remains: pixels that show it" in text and "removal" in text
+    assert "removal" in text and protocol_of(rows) in " ".join(text.split())
     assert "29.00 30.00 31.00 31.25 75.0" in " ".join(text.split())  # PSNR, then shown, share
     of_removal = [f"removal_{metric}_after" for metric in METRICS["removal"]]
     real = [dataclasses.replace(r, figures={**r.figures, **dict.fromkeys(of_removal)}) for r in rows]  # fmt: skip

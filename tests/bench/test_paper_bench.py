@@ -56,6 +56,7 @@ def test_what_is_on_disk_is_run_and_scored(finished):
         assert 5 < row.figures["psnr_after"] < 50 and row.figures["steps"] == (3 if row.variant.name == "bea-gs" else 0)
     assert set(outcomes.truths.values()) == {"silhouette"}
     report = json.loads((options.output / "paper.json").read_text())
+    assert report["protocol"].startswith("Protocol: extracted masks against whole occlusion-free silhouettes; ")
     llff, ovs = report["data_sets"]["llff"], report["data_sets"]["3dovs"]
     assert llff["scenes"] == ["fern"] and llff["paper"]["extracted"]["bea-gs"] == [93.0, 80.7]
     ours = next(row for row in outcomes.rows if row.scene == "llff/fern" and row.variant.name == "bea-gs")
@@ -84,6 +85,7 @@ def test_truth_drawn_later_is_scored_without_training_again(finished, capsys):
     again = run_paper(options)
     text = printed(capsys)
     assert "2 trials are scored again, without training" in text and "silhouettes of fern belong in" in text
+    assert "Protocol: extracted masks against whole occlusion-free silhouettes, else visible masks" in text
     assert again.truths["llff/fern", "bea-gs"] == "visible" and again.truths["lerf/figurines", "bea-gs"] == "silhouette"
     ious = [[row.figures["extracted_iou_after"] for row in found.rows] for found in (before, again)]
     assert ious[0][:2] != ious[1][:2] and ious[0][2:] == ious[1][2:]

@@ -14,6 +14,7 @@ from experiment_files import GOOD, written
 
 from beags_plugin.bench.experiment import Variant, load_experiment
 from beags_plugin.bench.results import FIGURES, ResultRow, report_json
+from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.system.errors import UserError
 from benchmarks import readme_table
 
@@ -66,7 +67,7 @@ def clone(tmp_path):
     figures = {**dict.fromkeys(FIGURES), "extracted_iou_after": 0.91234567, "extracted_biou_after": 0.8,
                "worst_biou_after": 0.5, "psnr_after": 30.126, "psnr_shown_after": 31.0, **COSTS}  # fmt: skip
     rows = [
-        ResultRow(Variant(name), scene, 1, figures, {"cup": figures})
+        ResultRow(Variant(name), scene, 1, figures, {"cup": figures}, protocol=Protocol(), truth="visible")
         for scene in ("tabletop 1", "tabletop 2", "room 1")
         for name in readme_table.FAST[:2]
     ]
@@ -81,6 +82,7 @@ def test_one_command_makes_the_table_from_a_result(clone):
     readme_table.main([str(clone / "presets.json")], clone)
     kept = json.loads((clone / "docs/results/presets.json").read_text())
     assert kept["command"] == "beags bench presets" and kept["commit"] == "abc" and kept["machine"] == {"cpu": "x"}
+    assert kept["protocol"].startswith("Protocol: extracted masks against visible masks, less")
     scenes = ["tabletop 1"] * 2 + ["tabletop 2"] * 2 + ["room 1"] * 2 + ["tabletop 1", "room 1"]
     assert [row["scene"] for row in kept["rows"]] == scenes
     assert kept["rows"][6]["failed"] == "no memory"

@@ -29,7 +29,7 @@ from beags_plugin.bench.paper.tables import (
 )
 from beags_plugin.bench.provenance import busy_note
 from beags_plugin.bench.report import provenance, write_csv, write_json
-from beags_plugin.bench.results import report_json, table_rows
+from beags_plugin.bench.results import protocol_of, report_json, table_rows
 from beags_plugin.bench.run import TABLE_WIDTH, adapted, print_plan, processors, rows_of, trained
 from beags_plugin.bench.scenes import SceneSize
 from beags_plugin.bench.trials import VariantTrial, plan
@@ -152,8 +152,9 @@ def _truth(run: VariantTrial, outcomes: Mapping[str, Outcome]) -> str | None:
 
 
 def _lines(experiment: Experiment, options: PaperOptions, outcomes: Outcomes) -> list[str]:
-    """Return what readers of the tables must know, and the failures."""
-    lines = []
+    """Return what readers of the tables must know, the protocol too, and the failures."""
+    protocol = protocol_of(outcomes.rows)
+    lines = [] if protocol is None else [protocol]
     if options.quick or options.downscale != 1.0 or experiment.preset != "beags-paper":
         how = "in a trial run" if options.quick else f"with {experiment.preset}, sizes / {options.downscale:g}"
         lines.append(f"Trained {how}: ours are not figures of the paper's protocol.")
