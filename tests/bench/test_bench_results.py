@@ -127,6 +127,8 @@ def test_json_and_csv_hold_every_row_and_the_same_figures(rows, tmp_path, experi
         ("b", "mean"), ("b", "cup"), ("b", "box"), ("b", "mean"),
     ]  # fmt: skip
     assert read["rows"][1]["extracted_iou_after"] == pytest.approx(0.35)
+    assert read["rows"][0]["removal_ssim_after"] == pytest.approx(0.6)
+    assert read["means"][0]["removal_ssim_after"] == pytest.approx(0.5)
     assert read["rows"][-1]["failed"] == "k is 0."
     assert [mean["error_left"] for mean in read["means"]] == [1.0, pytest.approx(0.2)]
     with open(tmp_path / "deep/r.csv", newline="") as file:
