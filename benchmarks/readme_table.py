@@ -1,7 +1,8 @@
 """README's table of results: ``python -m benchmarks.readme_table [outputs/bench/presets.json ...]``.
 
-Each given result of ``beags bench`` is reduced to its means, command, commit and machine in docs/results. Then the
-lines between README's two markers are written anew from the files there, which are the only source of its figures.
+Each given result of ``beags bench`` is reduced to its means, the extracted BIoU of each object, protocol, command,
+commit and machine in docs/results. Then the lines between README's two markers are written anew from the files there,
+which are the only source of its figures.
 """
 
 from __future__ import annotations
@@ -50,11 +51,20 @@ COLUMNS: tuple[tuple[str, tuple[str, ...], int, float], ...] = (
 _SOURCE = ("experiment", "preset", "reference", "command", "commit", "machine", "torch", "busy", "quick", "protocol")
 _ROW = ("scene", "seed", "variant", "failed", "failures", "error_left", "lost_biou", "shown_after", "ssim_after",
         "rendered_iou_after", "rendered_biou_after", "removal_ssim_after", "removal_remains_after", "steps",
-        "cpu_seconds", "cpu_seconds total", "own_memory_mb", "peak_memory_mb")  # fmt: skip
+        "cpu_seconds", "cpu_seconds total", "own_memory_mb", "peak_memory_mb", "objects")  # fmt: skip
+_OF_OBJECTS = "extracted_biou_after"
 
 
 def reduced(report: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what is kept of a result of ``beags bench``: its source, means, and the means of each scene."""
+    """Return what is kept of a result of ``beags bench``: its source, means, and the means of each scene.
+
+    Each row of a scene has "objects", {name: extracted BIoU, or None}, where the result has rows of objects.
+    """
+    objects: dict[tuple[Any, ...], dict[str, float | None]] = {}
+    for line in report["rows"]:
+        if (name := line.get("object", MEAN)) != MEAN:
+            value = line[_OF_OBJECTS]
+            objects.setdefault(_place(line), {})[name] = None if value is None else round(value, 4)
     kept = (*_ROW, *(figure for _, figures, *_ in COLUMNS for figure in figures))
 
     def row(full: Mapping[str, Any]) -> dict[str, Any]:
@@ -64,8 +74,16 @@ def reduced(report: Mapping[str, Any]) -> dict[str, Any]:
     return {
         **{name: report[name] for name in _SOURCE if name in report},
         "means": [row(mean) for mean in report["means"]],
-        "rows": [row(line) for line in report["rows"] if line.get("object", MEAN) == MEAN],
+        "rows": [
+            row({"objects": objects.get(_place(line)), **line})
+            for line in report["rows"]
+            if line.get("object", MEAN) == MEAN
+        ],
     }
+
+
+def _place(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    return row["scene"], row.get("seed"), row["variant"]
 
 
 def table(folder: Path) -> str:

@@ -58,6 +58,14 @@ def test_readme_has_the_figures_of_the_committed_files():
         assert source["command"] and source["commit"] and source["machine"]["cpu"] and not source["quick"]
 
 
+def objects_of(place: int, figures: dict) -> dict[str, dict]:
+    """Return figures of two objects; of the second, masks are empty in truth and as rendered."""
+    return {
+        "cup": {**figures, "extracted_biou_after": 0.8 + 0.0123456 * place},
+        "box": {**figures, "extracted_biou_after": None},
+    }
+
+
 @pytest.fixture
 def clone(tmp_path):
     """A folder with README and results, and a fresh result of the presets, with objects and a failure."""
@@ -67,8 +75,8 @@ def clone(tmp_path):
     figures = {**dict.fromkeys(FIGURES), "extracted_iou_after": 0.91234567, "extracted_biou_after": 0.8,
                "worst_biou_after": 0.5, "psnr_after": 30.126, "psnr_shown_after": 31.0, **COSTS}  # fmt: skip
     rows = [
-        ResultRow(Variant(name), scene, 1, figures, {"cup": figures}, protocol=Protocol(), truth="visible")
-        for scene in ("tabletop 1", "tabletop 2", "room 1")
+        ResultRow(Variant(name), scene, 1, figures, objects_of(place, figures), protocol=Protocol(), truth="visible")
+        for place, scene in enumerate(("tabletop 1", "tabletop 2", "room 1"))
         for name in readme_table.FAST[:2]
     ]
     for scene in ("tabletop 1", "room 1"):
@@ -85,7 +93,10 @@ def test_one_command_makes_the_table_from_a_result(clone):
     assert kept["protocol"].startswith("Protocol: extracted masks against visible masks, less")
     scenes = ["tabletop 1"] * 2 + ["tabletop 2"] * 2 + ["room 1"] * 2 + ["tabletop 1", "room 1"]
     assert [row["scene"] for row in kept["rows"]] == scenes
-    assert kept["rows"][6]["failed"] == "no memory"
+    assert kept["rows"][6]["failed"] == "no memory" and "objects" not in kept["rows"][6]
+    bious = [{"cup": biou, "box": None} for biou in (0.8, 0.8, 0.8123, 0.8123, 0.8247, 0.8247)]
+    assert [row["objects"] for row in kept["rows"][:6]] == bious and "objects" not in kept["means"][0]
+    assert readme_table.reduced(kept) == kept
     assert kept["means"][0]["extracted_iou_after"] == 0.912346
     assert COSTS.items() <= kept["rows"][0].items() and COSTS.items() <= kept["means"][0].items()
     assert not COSTS.keys() & kept["rows"][6].keys()  # failed
