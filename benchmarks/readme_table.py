@@ -25,10 +25,10 @@ FAST = ("assignment alone", "as long as beags-fast, neither loss", "beags-fast")
 GROUPS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
     ("five generated tabletops, base of `beags-fast`", "presets", "tabletop", FAST),
     ("the same, base of `beags`", "presets-whole", "tabletop", ()),
-    ("the same, as in the paper, base of `beags-fast`", "presets-paper", "tabletop", ()),
+    ("the same, refined as `beags-paper`, base of `beags-fast`", "presets-paper", "tabletop", ()),
     ("five generated rooms, base of `beags-fast`", "presets", "room", FAST),
     ("the same, base of `beags`", "presets-whole", "room", ()),
-    ("the same, as in the paper, base of `beags-fast`", "presets-paper", "room", ()),
+    ("the same, refined as `beags-paper`, base of `beags-fast`", "presets-paper", "room", ()),
     ("fruit, a real capture, base of `beags-fast`", "presets-captures", "fruit", FAST),
     ("the same, base of `beags`", "presets-whole-captures", "fruit", ()),
     ("a skull, a real capture, base of `beags-fast`", "presets-captures", "dtu_skull", FAST),
