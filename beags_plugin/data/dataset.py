@@ -86,7 +86,7 @@ class Dataset:
     visible, silhouettes: object name to exact masks for evaluation: of its visible part, and occlusion-free.
     seed_points: .ply, or COLMAP's points3D.bin or .txt, in the frame of a ``PoseTable``; None: the poses bring them.
     downscale: factor by which the images' sides are divided by default, for the size that the data set's papers use.
-    notes: sentences for the user.
+    notes: sentences for the user. size_note: a sentence about the size of the images, where the layout chose it.
     """
 
     layout: str
@@ -103,3 +103,4 @@ class Dataset:
     seed_points: Path | None = None
     downscale: float = 1.0
     notes: tuple[str, ...] = ()
+    size_note: str = ""

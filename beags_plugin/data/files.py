@@ -74,15 +74,26 @@ def largest_images(root: Path, chosen: Path | None = None) -> tuple[Path, float]
     folders = [] if chosen is not None else image_folders(root)
     if not folders:
         return choose_images(root, chosen), 1.0
-    width = image_size(list_images(folders[0])[0])[0]
-    return folders[0], max(width / LARGEST_WIDTH, 1.0)
+    return folders[0], max(image_width(folders[0]) / LARGEST_WIDTH, 1.0)
 
 
-def size_note(folder: Path, downscale: float = 1.0) -> str:
-    """Return a sentence about the size of images that a layout has chosen."""
-    size = "as they are" if downscale == 1.0 else f"{LARGEST_WIDTH} pixels wide"
+def size_note(folder: Path, size: str = "as they are, as in the paper") -> str:
+    """Return a sentence about the size of images that a layout has chosen, which ``size`` compares with the paper's."""
     others = "others: beags-data --images-path FOLDER or --downscale-factor N"
-    return f"The images of {folder.name} are taken {size}, as in the paper ({others})."
+    return f"The images of {folder.name} are taken {size} ({others})."
+
+
+def width_note(folder: Path) -> str:
+    """Return that sentence for the images of ``largest_images``: smaller files than the paper's are not enlarged."""
+    width = image_width(folder)
+    if width < LARGEST_WIDTH:
+        return size_note(folder, f"as they are, {width} pixels wide, narrower than the paper's {LARGEST_WIDTH}")
+    return size_note(folder, f"{LARGEST_WIDTH} pixels wide, as in the paper")
+
+
+def image_width(folder: Path) -> int:
+    """Return the width in pixels of the first of the images in a folder."""
+    return image_size(list_images(folder)[0])[0]
 
 
 def image_size(path: Path, what: str = "the image") -> tuple[int, int]:

@@ -39,8 +39,18 @@ def test_llff_makes_the_largest_images_as_wide_as_papers_do(tmp_path, monkeypatc
     largest = max(image_size(path)[0] for path in root.rglob("*.*") if path.suffix.lower() in files.IMAGE_SUFFIXES)
     camera = camera_from_nerfstudio(parse(root).cameras, 0)
     assert camera.width == WIDTH - 4 < largest
-    assert f"{WIDTH - 4} pixels wide, as in the paper" in " ".join(capsys.readouterr().out.split())
+    assert f"are taken {WIDTH - 4} pixels wide, as in the paper (" in " ".join(capsys.readouterr().out.split())
     assert camera_from_nerfstudio(parse(root, downscale_factor=1.0).cameras, 0).width == largest
+    assert "in the paper" not in capsys.readouterr().out  # that is another size
+
+
+@pytest.mark.parametrize(("papers", "words"), [(WIDTH, "20 pixels wide, as in the paper"),
+    (WIDTH + 1, "as they are, 20 pixels wide, narrower than the paper's 21")])  # fmt: skip
+def test_images_of_llff_that_are_narrower_than_the_papers_are_said_to_be(tmp_path, monkeypatch, capsys, papers, words):
+    write_llff(tmp_path, originals=False)
+    monkeypatch.setattr(files, "LARGEST_WIDTH", papers)
+    assert camera_from_nerfstudio(parse(tmp_path).cameras, 0).width == WIDTH
+    assert f"The images of images_4 are taken {words} (others: " in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize("known_by", ["images", "names", "copies"])

@@ -29,7 +29,9 @@ def test_lerf_mask(tmp_path, capsys):
         "green apple": [folder / "0/green apple.png", folder / "1/green apple.png"],
         "old camera": [folder / "0/old camera.png", None],
     }
-    assert "Exact masks of 'green apple', 'old camera' do not count" in " ".join(capsys.readouterr().out.split())
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Exact masks of 'green apple', 'old camera' do not count" in said
+    assert "The images of images are taken as they are, as in the paper (others: " in said
     (tmp_path / "classes.json").write_text('{"37": "green apple", "4": "old camera"}')
     assert parse(tmp_path).metadata["classes"][37] == "green apple"
     assert "do not count" not in capsys.readouterr().out
@@ -71,11 +73,13 @@ def test_the_masks_of_dtu_train_and_evaluate(tmp_path):
     assert view.silhouettes is not None and (view.silhouettes[1].numpy() == (ids() > 0)).all()
 
 
-def test_3dovs(tmp_path):
+def test_3dovs(tmp_path, capsys):
     stems = write_3dovs(tmp_path)
     assert title(tmp_path) == "3D-OVS"
     test = parse(tmp_path, "test")
     assert names(test) == ["00", "04"] and names(parse(tmp_path)) == [stems[i] for i in (1, 2, 3, 5)]
+    said = " ".join(capsys.readouterr().out.split())
+    assert "The images of images are taken as they are, 20 pixels wide, narrower than the paper's 1600 (" in said
     assert test.metadata["classes"] == {0: "background", 1: "red bag", 2: "banana", 3: "white sheet"}
     assert test.metadata["ground_truth"]["visible"]["banana"] == [
         tmp_path / f"segmentations/{view}/banana.png" for view in ("00", "04")

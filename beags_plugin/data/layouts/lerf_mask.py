@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from beags_plugin.data.dataset import ColmapModel, Dataset, Split
-from beags_plugin.data.files import choose_images, list_images
+from beags_plugin.data.files import choose_images, list_images, size_note
 from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.colmap import checked_model, model_folder
 from beags_plugin.system.errors import UserError
@@ -14,7 +14,8 @@ from beags_plugin.system.errors import UserError
 class LerfMask(Layout):
     """images, images_train, object_mask/<stem>.png (ids), test_mask/<n>/<prompt>.png and sparse/0.
 
-    Test views are those of images/ that images_train/ lacks; <n> counts them from 0 in the order of their names.
+    By default the images are taken as they are, as in the paper. Test views are those of images/ that images_train/
+    lacks; <n> counts them from 0 in the order of their names.
     """
 
     title = "LERF-Mask"
@@ -37,6 +38,7 @@ class LerfMask(Layout):
             Split(tuple(test), every=False),
             masks=root / "object_mask",
             visible=_masks_by_prompt(root / "test_mask", test),
+            size_note="" if images else size_note(folder),
         )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from beags_plugin.data.dataset import ColmapModel, Dataset, PoseTable, Split
-from beags_plugin.data.files import image_folders, largest_images, list_images, size_note
+from beags_plugin.data.files import image_folders, largest_images, list_images, width_note
 from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.colmap import complete_model, points_file
 from beags_plugin.data.poses_bounds import FILE, read_poses_bounds
@@ -28,7 +28,7 @@ ORIGINAL_NAMES = "original_names.txt"
 class Llff(Layout):
     """images, and poses in a complete COLMAP model, else in poses_bounds.npy.
 
-    By default the largest images, 1600 pixels wide, as in the paper.
+    By default the largest images, 1600 pixels wide, as in the paper, or as wide as they are if that is less.
     """
 
     title = "LLFF"
@@ -44,8 +44,8 @@ class Llff(Layout):
     def read(self, root: Path, images: Path | None) -> Dataset:
         folder, downscale = largest_images(root, images)
         poses, points = model_or_bounds(root, folder)
-        split, notes = Split(nvos_target(root, folder)), () if images else (size_note(folder, downscale),)
-        return Dataset(self.title, root, poses, split, seed_points=points, downscale=downscale, notes=notes)
+        split, note = Split(nvos_target(root, folder)), "" if images else width_note(folder)
+        return Dataset(self.title, root, poses, split, seed_points=points, downscale=downscale, size_note=note)
 
 
 def lacks_poses(root: Path) -> str | None:

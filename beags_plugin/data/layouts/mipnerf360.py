@@ -5,17 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 
 from beags_plugin.data.dataset import ColmapModel, Dataset
-from beags_plugin.data.files import choose_images, image_folders, list_images, size_note
+from beags_plugin.data.files import choose_images, image_folders, image_width, list_images, size_note
 from beags_plugin.data.layouts.colmap import Colmap, checked_model
 
 SCENES = ("bicycle", "bonsai", "counter", "flowers", "garden", "kitchen", "room", "stump", "treehill")
+QUARTER = "images_4"
 FOLDERS = {"images", "images_2", "images_4", "images_8"}
 
 
 class MipNerf360(Colmap):
     """images, images_2, images_4, images_8 and sparse/0; every 8th view is for evaluation.
 
-    By default images are a quarter of the original, images_4, as in the paper.
+    By default images are a quarter of the original, images_4, as in the paper; without them those of ``choose_images``.
     """
 
     title = "Mip-NeRF 360"
@@ -29,8 +30,13 @@ class MipNerf360(Colmap):
         return folders >= FOLDERS or (root.name in SCENES and bool(folders))
 
     def read(self, root: Path, images: Path | None) -> Dataset:
-        quarter = root / "images_4"
-        default = images is None and bool(list_images(quarter))
-        folder = quarter if default else choose_images(root, images)
-        notes = (size_note(folder),) if default else ()
-        return Dataset(self.title, root, ColmapModel(checked_model(root), folder), notes=notes)
+        quarter = root / QUARTER
+        if images is not None:
+            folder, note = choose_images(root, images), ""
+        elif list_images(quarter):
+            folder, note = quarter, size_note(quarter)
+        else:
+            folder = choose_images(root)
+            width = f"{image_width(folder)} pixels wide, for lack of {QUARTER}, which the paper takes"
+            note = size_note(folder, f"as they are, {width}")
+        return Dataset(self.title, root, ColmapModel(checked_model(root), folder), size_note=note)

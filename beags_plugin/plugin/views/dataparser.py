@@ -254,6 +254,8 @@ class BeagsDataParser(DataParser):
             f"{views.images[0].parent.name} ({self._split_in_words(views, scene)}), "
             f"{sum(mask is not None for mask in masks) or 'no'} masks, {points} seed points."
         )
+        if scene.size_note and self.config.downscale_factor in (None, scene.downscale):
+            notes.append(scene.size_note)
         return [line, *notes, *scene.notes]
 
     def _split_in_words(self, views: PosedViews, scene: Dataset) -> str:
