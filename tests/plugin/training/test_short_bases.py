@@ -90,7 +90,19 @@ def test_what_too_few_views_show_goes_but_for_what_is_hidden(data, tmp_path, mon
     assert torch.isfinite(means).all()
 
 
-def test_few_views_say_nothing_about_what_they_show(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(densifier, "showing_views", lambda *of: pytest.fail("all should stay"))
-    least = "pipeline.model.densify.least_views"
-    run_to_end(usual_config(data, tmp_path / "run", **{least: 4, f"{least}_every": 6}))
+@pytest.mark.parametrize(("least", "enough"), [(1, True), (10, False)])
+def test_few_views_say_nothing_about_what_they_show(data, tmp_path, monkeypatch, least, enough):
+    """Views are counted where there are more than twice ``least_views``, and nowhere else, though pruning is due."""
+    views, counted = [], []
+    prune, showing_views = densifier.Densifier._prune_by_views, densifier.showing_views
+
+    def due(own, step):
+        views.append(len(own.datamanager.train_dataset))
+        prune(own, step)
+
+    monkeypatch.setattr(densifier.Densifier, "_prune_by_views", due)
+    monkeypatch.setattr(densifier, "showing_views", lambda *of: counted.append(of) or showing_views(*of))
+    option = "pipeline.model.densify.least_views"
+    run_to_end(usual_config(data, tmp_path / "run", **{option: least, f"{option}_every": 6}))
+    assert views and all((count > 2 * least) == enough for count in views)
+    assert len(counted) == (len(views) if enough else 0)
