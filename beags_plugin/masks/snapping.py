@@ -7,7 +7,9 @@ import numpy as np
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.system.errors import UserError
 
-EPSILON = 1e-2  # variance of colour (0..1) below which the guide counts as flat
+EPSILON = 1e-4  # variance of linear colour (0..1) below which the guide counts as flat
+GAMMA = 2.2  # of photos: a pixel across an edge is a mean of both sides in linear light
+_LINEAR = (255.0 * (np.arange(256) / 255.0) ** GAMMA).astype(np.float32)
 NO_FILTER = "this OpenCV has no guided filter: run beags doctor, which names the command that repairs it."
 
 
@@ -18,13 +20,21 @@ def can_snap() -> bool:
     return hasattr(getattr(cv2, "ximgproc", None), "guidedFilter")
 
 
-def snap_to_edges(labels: np.ndarray, photo: np.ndarray, radius: int, second: np.ndarray | None = None) -> np.ndarray:
+def snap_to_edges(
+    labels: np.ndarray,
+    photo: np.ndarray,
+    radius: int,
+    second: np.ndarray | None = None,
+    share: float = 0.5,
+    window: int | None = None,
+) -> np.ndarray:
     """Move outlines of labels [H, W] uint16 to edges of the photo [H, W, 3] uint8 RGB, by a guided filter.
 
-    radius: pixels of the filter's window, and the largest distance of a changed label from an outline. second: another
-    opinion of the labels, [H, W] uint16, which counts as much; wherever it differs, its ids must be near in ``labels``.
-    Each class's indicator is filtered with the photo as guide (He et al., "Guided image filtering"); near outlines the
-    class of the largest value is taken. IGNORE stays. Raises ``UserError`` where OpenCV lacks the filter.
+    radius: pixels, the largest distance of a changed label from an outline. second: another opinion of the labels,
+    [H, W] uint16, which counts ``share``, and ``labels`` the rest; wherever it differs, its ids must be near in
+    ``labels``. window: radius of the filter in pixels; ``radius`` if None. Each class's indicator is filtered with the
+    photo as guide, in linear light (He et al., "Guided image filtering"); near outlines the class of the largest value
+    is taken. IGNORE stays. Raises ``UserError`` where OpenCV lacks the filter.
     """
     import cv2
 
@@ -33,8 +43,10 @@ def snap_to_edges(labels: np.ndarray, photo: np.ndarray, radius: int, second: np
     ids = [int(i) for i in np.unique(labels) if i != IGNORE]
     if radius < 1 or len(ids) < 2:
         return labels
+    window = radius if window is None else window
     kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
-    guide = np.ascontiguousarray(photo, np.float32) / np.float32(255.0)
+    # 0..255: OpenCV takes the covariance of a guide in 0..1 as singular, and the filter as flat, without a word
+    guide = _LINEAR[photo]
     flat = labels.astype(np.float32)
     near = cv2.dilate(flat, kernel) != cv2.erode(flat, kernel)
     best = np.full(labels.shape, -np.inf, np.float32)
@@ -42,9 +54,11 @@ def snap_to_edges(labels: np.ndarray, photo: np.ndarray, radius: int, second: np
     for class_id in ids:
         indicator = (labels == class_id).astype(np.float32)
         if second is not None:
-            indicator = 0.5 * (indicator + (second == class_id))
-        part = _around(indicator, 4 * radius)
-        value = cv2.ximgproc.guidedFilter(np.ascontiguousarray(guide[part]), indicator[part], radius, EPSILON)
+            indicator = (1.0 - share) * indicator + share * (second == class_id)
+        part = _around(indicator, 4 * window)
+        value = cv2.ximgproc.guidedFilter(
+            np.ascontiguousarray(guide[part]), indicator[part].astype(np.float32), window, EPSILON * 255.0**2
+        )
         larger = value > best[part]
         found[part][larger], best[part][larger] = class_id, value[larger]
     return np.where(near & (labels != IGNORE), found, labels)

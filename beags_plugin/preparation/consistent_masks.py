@@ -26,6 +26,8 @@ AUTO = "auto"  # pairwise up to the two limits, else voxel
 PAIRWISE_PIXELS = 100_000_000  # in all views; pairwise holds 5 bytes for each: 0.5 GB
 PAIRWISE_PAIRS = 10_000_000_000  # of a voting pixel and a view: 7 to 9 ns each on one core at 256 x 192
 OUTLINE = 1  # pixels: outlines snap no farther
+WINDOW = 2  # pixels around that say what colour each class has there
+OWN = 0.4  # what the view's own mask counts at outlines; the votes count the rest
 
 Stage = Callable[[str], AbstractContextManager[Progress | None]]
 """Opens a named stage and returns its progress callback, such as a progress bar."""
@@ -95,7 +97,7 @@ def reprojected_masks(
     ranked, consistent, confidence = LabelMaps(), LabelMaps(), CompressedMaps()
     reproject = REPROJECTIONS.get(config.reprojection)
     for mask in reproject(depths, cameras, given, len(known), tau=config.tau, progress=progress):
-        labels = mask.labels
+        labels = with_own_parts(mask.labels, mask.confidence, given[len(ranked)], config.overrule)
         if config.snap:
             if photos is None:
                 raise ValueError("outlines cannot snap without photos")
@@ -113,6 +115,23 @@ def reprojected_masks(
     return ConsistentMasks(ranked, consistent, confidence)
 
 
+def with_own_parts(voted: Tensor, confidence: Tensor, own: Tensor | None, overrule: float) -> Tensor:
+    """Return voted labels, with those of the view's own mask where votes are too divided to overrule it.
+
+    Where the base puts a surface before the true one, as in dark gaps between things, many views vote for what stands
+    behind it. At outlines the own mask errs more than the votes: so parts thinner than two pixels stay as voted.
+
+    voted, own: [H, W] int; own is None in a view without a mask, and IGNORE names nothing. confidence: [H, W] float,
+    the winner's share of the votes. overrule: least share that overrules; 0 returns ``voted``.
+    """
+    if own is None or overrule == 0.0:
+        return voted
+    differs = (voted != own) & (own != IGNORE) & (confidence < overrule)
+    square = torch.nn.functional.avg_pool2d(differs[None, None].float(), 2, stride=1) == 1.0  # 2 x 2, all of them
+    thick = torch.nn.functional.max_pool2d(square.float(), 2, stride=1, padding=1)[0, 0] > 0
+    return torch.where(differs & thick, own, voted)
+
+
 def with_snapped_outlines(voted: Tensor, own: Tensor | None, photo: Tensor) -> Tensor:
     """Decide the pixels at outlines by the votes, the view's own mask and the edges of its photo (method, section 10).
 
@@ -125,7 +144,7 @@ def with_snapped_outlines(voted: Tensor, own: Tensor | None, photo: Tensor) -> T
     ids = _as_array(voted)
     second = None if own is None else own_outlines(ids, _as_array(own))
     pixels = (255.0 * photo + 0.5).to(torch.uint8).cpu().numpy()
-    return torch.from_numpy(snap_to_edges(ids, pixels, OUTLINE, second).astype(np.int32)).to(voted.device)
+    return torch.from_numpy(snap_to_edges(ids, pixels, OUTLINE, second, OWN, WINDOW).astype(np.int32)).to(voted.device)
 
 
 def _as_array(labels: Tensor) -> np.ndarray:

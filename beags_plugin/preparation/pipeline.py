@@ -56,6 +56,8 @@ class PreparationConfig:
     snap: bool = False
     """Whether the outlines of reprojected masks follow the view's own mask and the edges of its photo too, within a
     pixel. In the paper the votes decide alone."""
+    overrule: float = 0.0
+    """Least share of the votes that overrules a view's own mask, but at outlines; 0, as in the paper: any majority."""
     depth: str = "median"
     """Which depth is lifted: median or expected."""
     k: int = 2000
@@ -78,6 +80,8 @@ class PreparationConfig:
         if not 0.0 <= self.min_confidence <= 1.0:
             raise UserError(f"min_confidence is {self.min_confidence}: it must be a share of the votes, 0 to 1.")
         check_surface_depth(self.depth)
+        if not 0.0 <= self.overrule <= 1.0:
+            raise UserError(f"overrule is {self.overrule}: it must be a share of the votes, 0 to 1.")
         if not self.tau >= 0:
             raise UserError(f"tau is {self.tau}: it must be 0 or more (inf counts every vote).")
         if not self.k >= 1:

@@ -61,6 +61,13 @@ def test_without_an_edge_in_the_photo_votes_and_the_own_mask_share_the_error():
     np.testing.assert_array_equal(snap_to_edges(exact, flat, 1, exact), exact)
 
 
+def test_an_edge_of_little_contrast_counts_too():
+    photo, exact = scene(contrast=0.05)
+    smooth = cv2.GaussianBlur(photo, (0, 0), 1.0)  # little noise, as in a photo that was made smaller
+    noisy = ragged(exact, np.random.default_rng(1))
+    assert (snap_to_edges(noisy, smooth, 1, window=2) != exact).sum() < 0.5 * (noisy != exact).sum()
+
+
 def test_the_own_mask_counts_at_outlines_alone():
     voted = np.zeros((12, 12), np.uint16)
     voted[3:9, 3:9] = 1
@@ -112,6 +119,6 @@ def test_tensors_keep_their_type_and_a_view_may_have_no_mask():
     image = torch.from_numpy(photo).float() / 255.0
     alone = with_snapped_outlines(voted, None, image)
     assert alone.dtype == torch.int32
-    np.testing.assert_array_equal(alone.numpy(), snap_to_edges(grown(exact), photo, 1))
+    np.testing.assert_array_equal(alone.numpy(), snap_to_edges(grown(exact), photo, 1, window=2))
     own = torch.from_numpy(exact.astype(np.int32))
     assert 0 <= excess(with_snapped_outlines(voted, own, image).numpy(), exact) < excess(alone.numpy(), exact)
