@@ -4,12 +4,12 @@ For runs of generated scenes, which have exact masks of everything: the wrong pi
 held-out views, before refinement (if a run has kept that) and after. Each wrong pixel is of the first kind that fits:
 
     unseen    missing surface that no training photo shows
+    thin      missing from parts (and sharp corners) that an opening with a disc of 5 pixels takes away
     rim       within a pixel of the exact outline: too much or missing, where another object shows next to it
               ("rim, object") or not ("rim, ground")
     floater   a piece that hangs together with no pixel of the object
-    thin      missing from parts that an opening with 5 x 5 pixels takes away
-    contact   deeper than a pixel, where another object shows within two
-    else      deeper than a pixel, elsewhere: bulges and bites
+    contact   farther than a pixel from the outline, where another object shows within two pixels
+    else      farther than a pixel from the outline, elsewhere: bulges and bites
 
 Printed is each kind's share of the wrong pixels, and the points of BIoU that objects would win if its pixels were right
 and all others as they are (these gains do not add up to the whole error).
@@ -25,20 +25,21 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.system.errors import UserError, print_user_errors_plainly
 
 KINDS = (
     "unseen",
+    "thin",
     "rim, ground: too much",
     "rim, ground: missing",
     "rim, object: too much",
     "rim, object: missing",
     "floater",
-    "thin",
     "contact",
     "else",
 )
-_THREE, _FIVE = np.ones((3, 3), np.uint8), np.ones((5, 5), np.uint8)
+_THREE, _DISC = np.ones((3, 3), np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
 
 
 @dataclass(frozen=True)
@@ -66,8 +67,10 @@ def kinds_of(predicted: np.ndarray, exact: np.ndarray, seen: np.ndarray, others:
         left = left & ~pixels
 
     take("unseen", missing & ~seen)
+    take("thin", missing & (cv2.morphologyEx(exact.astype(np.uint8), cv2.MORPH_OPEN, _DISC) == 0))
     grown = _grown(exact)
-    rim = (extra & grown) | (missing & _grown(~exact))
+    inner = cv2.erode(exact.astype(np.uint8), _THREE, borderValue=(0,)) > 0  # outside the picture is no mask
+    rim = (extra & grown) | (missing & ~inner)
     next_to = _grown(others)
     take("rim, ground: too much", rim & extra & ~next_to)
     take("rim, ground: missing", rim & missing & ~next_to)
@@ -75,7 +78,6 @@ def kinds_of(predicted: np.ndarray, exact: np.ndarray, seen: np.ndarray, others:
     take("rim, object: missing", rim & missing)
     _, pieces = cv2.connectedComponents(predicted.astype(np.uint8), connectivity=8)
     take("floater", predicted & ~np.isin(pieces, np.unique(pieces[predicted & grown])))
-    take("thin", missing & (cv2.morphologyEx(exact.astype(np.uint8), cv2.MORPH_OPEN, _FIVE) == 0))
     take("contact", _grown(next_to))
     take("else", left)
     return found
@@ -95,12 +97,12 @@ def judged(
     if biou is None:
         return None
     kinds = kinds_of(predicted, exact, seen, others)
-    righted = {kind: mask_metrics(predicted ^ pixels, exact).biou or 0.0 for kind, pixels in kinds.items()}
+    righted = {kind: mask_metrics(predicted ^ pixels, exact).biou for kind, pixels in kinds.items()}
     return WrongMask(
         name,
         biou,
         {kind: int(pixels.sum()) for kind, pixels in kinds.items()},
-        {kind: value - biou for kind, value in righted.items()},
+        {kind: (1.0 if value is None else value) - biou for kind, value in righted.items()},  # None: both are empty
     )
 
 
@@ -126,7 +128,11 @@ def measure(config_path: Path) -> dict[str, list[WrongMask]]:
             with torch.no_grad():
                 masks = renderer.masks("extracted", [c for c in run.classes if c != 0])
             for class_id, mask in masks.items():
-                others = (view.visible != class_id) & (view.visible != 0)
+                if class_id not in view.silhouettes or class_id not in view.seen:
+                    raise UserError(f"{run.name} lacks masks of {run.classes[class_id]}: give a generated scene.")
+                if mask.prediction.shape != mask.truth.shape:
+                    raise UserError(f"{run.name} was trained on smaller photos: give a run of whole ones.")
+                others = (view.visible != class_id) & (view.visible != 0) & (view.visible != IGNORE)
                 judgement = judged(
                     run.classes[class_id],
                     mask.prediction.cpu().numpy(),

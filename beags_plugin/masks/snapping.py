@@ -45,7 +45,7 @@ def snap_to_edges(
         return labels
     window = radius if window is None else window
     kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
-    # 0..255: OpenCV takes the covariance of a guide in 0..1 as singular, and the filter as flat, without a word
+    # 0..255: with so small an epsilon, OpenCV takes many covariances of a guide in 0..1 as singular, without a word
     guide = _LINEAR[photo]
     flat = labels.astype(np.float32)
     near = cv2.dilate(flat, kernel) != cv2.erode(flat, kernel)

@@ -97,11 +97,12 @@ def reprojected_masks(
     ranked, consistent, confidence = LabelMaps(), LabelMaps(), CompressedMaps()
     reproject = REPROJECTIONS.get(config.reprojection)
     for mask in reproject(depths, cameras, given, len(known), tau=config.tau, progress=progress):
-        labels = with_own_parts(mask.labels, mask.confidence, given[len(ranked)], config.overrule)
+        own = given[len(ranked)]
+        labels = with_own_parts(mask.labels, mask.confidence, own, config.overrule)
         if config.snap:
             if photos is None:
                 raise ValueError("outlines cannot snap without photos")
-            labels = with_snapped_outlines(labels, given[len(ranked)], photos(len(ranked)))
+            labels = with_snapped_outlines(labels, own, photos(len(ranked)))
         ranked.append(labels)
         confidence.append((mask.confidence * 255.0 + 0.5).to(torch.uint8))
         if config.min_confidence > 0.0:
@@ -119,7 +120,8 @@ def with_own_parts(voted: Tensor, confidence: Tensor, own: Tensor | None, overru
     """Return voted labels, with those of the view's own mask where votes are too divided to overrule it.
 
     Where the base puts a surface before the true one, as in dark gaps between things, many views vote for what stands
-    behind it. At outlines the own mask errs more than the votes: so parts thinner than two pixels stay as voted.
+    behind it. At outlines the own mask errs more than the votes: so where less than 2 x 2 pixels are so divided, they
+    stay as voted.
 
     voted, own: [H, W] int; own is None in a view without a mask, and IGNORE names nothing. confidence: [H, W] float,
     the winner's share of the votes. overrule: least share that overrules; 0 returns ``voted``.

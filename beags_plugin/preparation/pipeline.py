@@ -57,7 +57,8 @@ class PreparationConfig:
     """Whether the outlines of reprojected masks follow the view's own mask and the edges of its photo too, within a
     pixel. In the paper the votes decide alone."""
     overrule: float = 0.0
-    """Least share of the votes that overrules a view's own mask, but at outlines; 0, as in the paper: any majority."""
+    """Least share of the votes that overrules a view's own mask, but in parts thinner than two pixels, where any
+    majority does; 0, as in the paper: everywhere."""
     depth: str = "median"
     """Which depth is lifted: median or expected."""
     k: int = 2000

@@ -41,7 +41,7 @@ def changed(exact, rows, columns, value):
         ((20, slice(25, 35)), False, "rim, ground: missing"),
         ((slice(25, 35), 19), True, "rim, object: too much"),
         ((slice(50, 54), slice(60, 64)), True, "floater"),
-        ((29, slice(48, 52)), False, "thin"),
+        ((slice(28, 31), slice(46, 52)), False, "thin"),
         ((slice(25, 35), slice(30, 34)), False, "else"),
     ],
 )

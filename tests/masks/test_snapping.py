@@ -9,7 +9,7 @@ cv2 = pytest.importorskip("cv2")
 from beags_plugin.labels.class_ids import IGNORE  # noqa: E402
 from beags_plugin.masks import snapping  # noqa: E402
 from beags_plugin.masks.snapping import own_outlines, snap_to_edges  # noqa: E402
-from beags_plugin.preparation.consistent_masks import with_snapped_outlines  # noqa: E402
+from beags_plugin.preparation.consistent_masks import OWN, WINDOW, with_snapped_outlines  # noqa: E402
 
 HEIGHT, WIDTH = 90, 120
 
@@ -42,7 +42,7 @@ def excess(found, exact):
 def test_an_outline_that_all_votes_put_too_far_out_comes_half_way_back_and_the_own_masks_noise_does_not_come_in():
     photo, exact = scene()
     own, voted = ragged(exact, np.random.default_rng(1)), grown(exact)
-    found = snap_to_edges(voted, photo, 1, own_outlines(voted, own))
+    found = snap_to_edges(voted, photo, 1, own_outlines(voted, own), OWN, WINDOW)
     assert abs(excess(found, exact)) < 0.5 * excess(voted, exact)
     assert (found != exact).sum() < 0.8 * (own != exact).sum() < 0.8 * (voted != exact).sum()
 
@@ -59,13 +59,16 @@ def test_without_an_edge_in_the_photo_votes_and_the_own_mask_share_the_error():
     both = snap_to_edges(grown(exact), flat, 1, exact)
     assert 0 <= excess(both, exact) < excess(grown(exact), exact)
     np.testing.assert_array_equal(snap_to_edges(exact, flat, 1, exact), exact)
+    as_in_presets = snap_to_edges(grown(exact), flat, 1, exact, OWN, WINDOW)
+    assert excess(both, exact) <= excess(as_in_presets, exact) < excess(grown(exact), exact)
 
 
 def test_an_edge_of_little_contrast_counts_too():
     photo, exact = scene(contrast=0.05)
     smooth = cv2.GaussianBlur(photo, (0, 0), 1.0)  # little noise, as in a photo that was made smaller
-    noisy = ragged(exact, np.random.default_rng(1))
-    assert (snap_to_edges(noisy, smooth, 1, window=2) != exact).sum() < 0.5 * (noisy != exact).sum()
+    flat = np.full_like(photo, 90)
+    wrong, without = ((snap_to_edges(grown(exact), guide, 1, window=2) != exact).sum() for guide in (smooth, flat))
+    assert wrong < 0.9 * without
 
 
 def test_the_own_mask_counts_at_outlines_alone():
@@ -93,9 +96,10 @@ def test_filtering_the_box_of_a_class_gives_what_the_whole_picture_gives(monkeyp
     labels = exact.copy()
     labels[2:6, 3:20] = 2
     labels[85:, 110:] = 3  # at a corner of the picture
-    small = snap_to_edges(labels, photo, 1, grown(labels))
+    small = [snap_to_edges(labels, photo, 1, grown(labels), OWN, window) for window in (1, WINDOW)]
     monkeypatch.setattr(snapping, "_around", lambda indicator, margin: (slice(None), slice(None)))
-    np.testing.assert_array_equal(small, snap_to_edges(labels, photo, 1, grown(labels)))
+    whole = [snap_to_edges(labels, photo, 1, grown(labels), OWN, window) for window in (1, WINDOW)]
+    np.testing.assert_array_equal(small, whole)
 
 
 def test_the_labels_are_the_same_for_any_number_of_threads():
@@ -106,7 +110,7 @@ def test_the_labels_are_the_same_for_any_number_of_threads():
         found = []
         for threads in (1, 2, 4):
             cv2.setNumThreads(threads)
-            found.append(snap_to_edges(grown(labels), photo, 1, labels))
+            found.append(snap_to_edges(grown(labels), photo, 1, labels, OWN, WINDOW))
     finally:
         cv2.setNumThreads(before)
     for other in found[1:]:
@@ -119,6 +123,6 @@ def test_tensors_keep_their_type_and_a_view_may_have_no_mask():
     image = torch.from_numpy(photo).float() / 255.0
     alone = with_snapped_outlines(voted, None, image)
     assert alone.dtype == torch.int32
-    np.testing.assert_array_equal(alone.numpy(), snap_to_edges(grown(exact), photo, 1, window=2))
+    np.testing.assert_array_equal(alone.numpy(), snap_to_edges(grown(exact), photo, 1, window=WINDOW))
     own = torch.from_numpy(exact.astype(np.int32))
     assert 0 <= excess(with_snapped_outlines(voted, own, image).numpy(), exact) < excess(alone.numpy(), exact)
