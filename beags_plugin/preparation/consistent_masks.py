@@ -27,7 +27,7 @@ PAIRWISE_PIXELS = 100_000_000  # in all views; pairwise holds 5 bytes for each: 
 PAIRWISE_PAIRS = 10_000_000_000  # of a voting pixel and a view: 7 to 9 ns each on one core at 256 x 192
 OUTLINE = 1  # pixels: outlines snap no farther
 WINDOW = 2  # pixels around that say what colour each class has there
-OWN = 0.4  # what the view's own mask counts at outlines; the votes count the rest
+OWN = 0.4  # what the view's own mask counts at outlines, the votes the rest: docs/results.md, "Outlines"
 
 Stage = Callable[[str], AbstractContextManager[Progress | None]]
 """Opens a named stage and returns its progress callback, such as a progress bar."""
