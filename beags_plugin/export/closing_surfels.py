@@ -46,25 +46,36 @@ class Added:
 
 def with_closing(item: ExportItem, options: MeshOptions) -> tuple[ExportItem, Added]:
     """Return an item with Gaussians where no photo shows it, by the closed surface that the options lead to."""
+    more, doubt = closing_gaussians(item, options)
     own = torch.zeros(len(item.surfels), dtype=torch.bool)
+    if not len(more):
+        return replace(item, invented=own), Added(0, doubt)
+    ids = torch.cat([item.class_ids, item.class_ids[:1].expand(len(more))])
+    invented = torch.cat([own, torch.ones(len(more), dtype=torch.bool)])
+    both = joined(item.surfels.detach(), more)
+    return replace(item, surfels=both, class_ids=ids, invented=invented), Added(len(more), doubt)
+
+
+def closing_gaussians(item: ExportItem, options: MeshOptions) -> tuple[Surfels, str]:
+    """Return the Gaussians that close an item where no photo shows it, and why there are none, or ""."""
+    none = item.surfels.detach()[:0]
     try:
         mesh = seen_surface(item, options)  # where the splats are; photos would place it elsewhere
         if not len(mesh.faces):
             raise NothingToExport(f"no surface of {item.name!r} is seen in {options.min_views} training views")
         solid = closed_surface(item, mesh)
     except NothingToExport as error:
-        return replace(item, invented=own), Added(0, str(error).partition(":")[0])
+        return none, str(error).partition(":")[0]
     assert item.views is not None  # the surface was seen from there
     pixel = _pixel(item.views, solid.mesh.vertices)
     wanted = closing_surfels(solid, item.surfels, pixel)
     more = wanted[_within(wanted, item.surfels, item.views, pixel)]
-    doubt = "all Gaussians there would leave its outline" if len(wanted) and not len(more) else ""
-    both = Surfels(
-        **{name: torch.cat([getattr(item.surfels, name).detach(), added]) for name, added in vars(more).items()}
-    )
-    ids = torch.cat([item.class_ids, item.class_ids[:1].expand(len(more))])
-    invented = torch.cat([own, torch.ones(len(more), dtype=torch.bool)])
-    return replace(item, surfels=both, class_ids=ids, invented=invented), Added(len(more), doubt)
+    return more, "all Gaussians there would leave its outline" if len(wanted) and not len(more) else ""
+
+
+def joined(*parts: Surfels) -> Surfels:
+    """Return all Gaussians of the parts, in their order."""
+    return Surfels(**{name: torch.cat([getattr(part, name) for part in parts]) for name in vars(parts[0])})
 
 
 def _pixel(views: Viewpoints, points: np.ndarray) -> float:

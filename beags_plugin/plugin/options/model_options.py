@@ -88,6 +88,9 @@ class BeagsModelConfig(ModelConfig):
     what photos differ in by chance. A base that polishes takes none. It is added to the group's own weight decay."""
     refine_position_lr_factor: float = 1.0
     """Factor of the positions' learning rate while refining; 1, as in the paper, is the end of the base schedule."""
+    close_contacts: bool = False
+    """After the last step of a refinement by losses: close objects, such as the lid of a box, where another object that
+    touches them hid them from every photo. It takes seconds for each object."""
     near: Suppress[float] = 0.01
     """Near plane in units of the scene's extent."""
     far: Suppress[float] = 100.0

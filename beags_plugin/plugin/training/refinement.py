@@ -14,11 +14,13 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.assignment.assignment import Assignment
 from beags_plugin.core.membership import Membership
+from beags_plugin.export.mesh import open3d_missing
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED, round_folder
 from beags_plugin.plugin.runs.prepared import prepared_labels, read_grid
 from beags_plugin.plugin.runs.write import write_run
+from beags_plugin.plugin.training.contacts import close_contacts
 from beags_plugin.plugin.training.contradiction import residuals
 from beags_plugin.plugin.training.prepared_files import bar, clear, save_prepared
 from beags_plugin.plugin.training.resumable import TrainingRun
@@ -76,6 +78,8 @@ class RefinementSwitch:
                 raise UserError(f"refine_rounds is {rounds}: the refiner {config.refiner} has 1 round.")
             config.prepare.check()
             config.split.check()
+            if config.close_contacts and (reason := open3d_missing()):
+                raise UserError(f"objects cannot be closed here: {reason} Or set close_contacts to False.")
         if config.refine_steps > 0 or self.refiner.joins_base:
             check_masks(view.labels for view in self.datamanager.views("train", original=True))
 
@@ -138,6 +142,8 @@ class RefinementSwitch:
                     "assignment, not yet its own.",
                     style="yellow", highlight=False, markup=False, soft_wrap=True,
                 )  # fmt: skip
+        if own is None and self.ready and self.refiner.trains and refined + 1 == self.model.schedule.refine_steps:
+            self._close_contacts()
         if self.wanted and not self.ready and step + 1 == self.model.schedule.base_steps:
             self._switching = True
             self._prepare(step)
@@ -155,6 +161,14 @@ class RefinementSwitch:
             members = own.finish()
         if members is not None:
             self.model.take_members(members)
+
+    def _close_contacts(self) -> None:
+        """Add the Gaussians that close objects where others hid them, if the options ask for them."""
+        if self.model.config.close_contacts:
+            with released(self.trainer.train_lock), bar("Closing what neighbours hide") as progress:
+                edit, line = close_contacts(self.model, self.datamanager, progress)
+            apply_edit(self.model, self.trainer.optimizers.adam, edit)
+            CONSOLE.print(f"  {line}", highlight=False, markup=False)
 
     def _round_starts(self) -> list[int]:
         return self.model.schedule.round_starts(self.model.config.refine_rounds)

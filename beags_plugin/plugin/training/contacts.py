@@ -1,0 +1,67 @@
+"""The last change of a refinement: objects are closed where others hid them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.densification import Densified
+from beags_plugin.core.membership import Membership
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.export.base import Viewpoints
+from beags_plugin.export.closing_surfels import joined
+from beags_plugin.export.contact_faces import contact_faces
+from beags_plugin.export.mesh_options import MeshOptions
+from beags_plugin.plugin.training.scene_model import SceneModel
+from beags_plugin.plugin.views.datamanager import BeagsDataManager
+from beags_plugin.plugin.views.views import View
+from beags_plugin.preparation.own_training import Edit
+from beags_plugin.rasterizers import make_rasterizer
+
+MOST_VIEWS = 30  # that are rendered for each object, at even distances
+RESOLUTION = 96  # voxels along an object's longest side
+
+
+@torch.no_grad()
+def close_contacts(
+    model: SceneModel, datamanager: BeagsDataManager, progress: Callable[[int, int], None]
+) -> tuple[Edit, str]:
+    """Return the edit that adds the Gaussians of ``export.contact_faces``, and a line that counts them.
+
+    All of it runs on the CPU, where meshes are made. progress: receives (done, total).
+    """
+    views = datamanager.views("train")
+    chosen = [views[index] for index in range(0, len(views), -(-len(views) // MOST_VIEWS))]
+    scene = Surfels(**{name: values.cpu() for name, values in vars(model.surfels().detach()).items()})
+    class_ids = model.class_ids.cpu()
+    rasterizer = model.rasterizer if model.device.type == "cpu" else make_rasterizer()
+    faces = contact_faces(
+        scene,
+        Membership(class_ids),
+        model.classes,
+        Viewpoints([view.camera.to("cpu") for view in chosen], rasterizer, model.settings()),
+        [_labels(view) for view in chosen],
+        MeshOptions(resolution=RESOLUTION),
+        progress,
+    )
+    added = [int((faces.class_ids == class_id).sum()) for class_id in model.classes]
+    counts = ", ".join(f"{count} of {name}" for count, name in zip(added, model.classes.values(), strict=True) if count)
+    line = f"closed where neighbours hide objects: {counts} Gaussians added" if counts else "no contact to close"
+    device, own = model.device, torch.arange(len(scene))
+    # a Gaussian of the same object lends its class
+    lenders = [int((class_ids == class_id).nonzero()[0]) for class_id in faces.class_ids.tolist()]
+    source = torch.cat([own, torch.tensor(lenders, dtype=torch.int64)])
+    both = joined(scene, faces.surfels)
+    edited = Densified(
+        Surfels(**{name: values.to(device) for name, values in vars(both).items()}),
+        source.to(device),
+        (torch.arange(len(source)) >= len(own)).to(device),
+    )
+    return Edit(edited=edited) if len(faces.surfels) else Edit(), line
+
+
+def _labels(view: View) -> Tensor:
+    assert view.labels is not None  # refinement has replaced all of them
+    return view.labels.cpu()

@@ -1,0 +1,103 @@
+"""The end of a refinement that closes objects where they touch: what it adds, and how a resumed run ends."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+pytest.importorskip("nerfstudio")
+pytest.importorskip("open3d")
+
+from resumed_runs import (
+    STEPS,
+    assert_same_run,
+    checkpoint_of,
+    interrupted,
+    kill_at,
+    resume_to_end,
+    run_to_end,
+    short_config,
+)
+from run_folders import CLASSES, write_scene
+
+from beags_plugin.export import mesh
+from beags_plugin.export.contact_faces import ContactFaces
+from beags_plugin.plugin.objects.evaluate import evaluate_run
+from beags_plugin.plugin.runs.read import read_run
+from beags_plugin.plugin.training import contacts, refinement
+from beags_plugin.system.errors import UserError
+
+CLOSE = {"pipeline.model.close_contacts": True}
+
+
+@pytest.fixture
+def data(tmp_path):
+    write_scene(tmp_path / "data")
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def three_faces(monkeypatch):
+    """Let contacts ask for three Gaussians, two of the last object and one of the one before; returns the calls."""
+    calls = []
+
+    def faces(surfels, members, names, views, labels, options, progress):
+        calls.append((names, views, labels))
+        last, before = sorted(names)[-1], sorted(names)[-2]
+        return ContactFaces(surfels[:3], torch.tensor([last, before, last], dtype=torch.int32))
+
+    monkeypatch.setattr(contacts, "contact_faces", faces)
+    return calls
+
+
+def test_the_last_step_adds_the_faces_and_changes_nothing_else(data, tmp_path, three_faces, capsys):
+    run_to_end(short_config(data, tmp_path / "without"))
+    run_to_end(short_config(data, tmp_path / "with", **CLOSE))
+    assert "closed where neighbours hide objects: 1 of " in capsys.readouterr().out
+    (call,) = three_faces
+    names, views, labels = call
+    assert names == CLASSES and len(views.cameras) == len(labels)
+    assert all(
+        tuple(each.shape) == (camera.height, camera.width) for each, camera in zip(labels, views.cameras, strict=True)
+    )
+    without, with_ = (read_run(tmp_path / name / "config.yml") for name in ("without", "with"))
+    count = len(without.members)
+    assert len(with_.members) == count + 3
+    assert with_.surfels()[:count].means.equal(without.surfels().means)
+    assert with_.surfels()[count:].means.equal(without.surfels()[:3].means)
+    assert with_.members.class_ids[:count].equal(without.members.class_ids)
+    last, before = sorted(CLASSES)[-1], sorted(CLASSES)[-2]
+    assert with_.members.class_ids[count:].tolist() == [last, before, last]
+    assert evaluate_run(tmp_path / "with/config.yml").after.objects[last].extracted is not None
+
+
+@pytest.mark.parametrize("after", [False, True])
+def test_a_run_that_was_killed_in_its_last_step_ends_the_same(data, tmp_path, three_faces, monkeypatch, after):
+    run_to_end(short_config(data, tmp_path / "whole", **CLOSE))
+
+    def kill(patch):
+        kill_at(patch, sum(STEPS) - 1, after)
+
+    interrupted(data, tmp_path / "killed", monkeypatch, kill, **CLOSE)
+    resume_to_end(tmp_path / "killed")
+    assert_same_run(tmp_path / "whole", tmp_path / "killed")
+
+
+def test_a_scene_of_noise_is_closed_or_says_that_there_is_nothing_to_close(data, tmp_path, capsys):
+    run_to_end(short_config(data, tmp_path / "run", **CLOSE))
+    said = capsys.readouterr().out
+    assert ("no contact to close" in said) != ("closed where neighbours hide objects" in said)
+    assert checkpoint_of(tmp_path / "run")
+
+
+def test_a_refiner_that_trains_nothing_closes_nothing(data, tmp_path, three_faces):
+    run_to_end(short_config(data, tmp_path / "run", **CLOSE, **{"pipeline.model.refiner": "none",
+                            "pipeline.model.refine_steps": 1, "pipeline.model.refine_rounds": 1}))  # fmt: skip
+    assert not three_faces
+
+
+def test_without_open3d_it_is_refused_before_training(data, tmp_path, monkeypatch):
+    assert refinement.open3d_missing is mesh.open3d_missing
+    monkeypatch.setattr(refinement, "open3d_missing", lambda: "Open3D cannot be loaded (libX11); pip install open3d.")
+    with pytest.raises(UserError, match=r"^objects cannot be closed here: Open3D .* Or set close_contacts to False\.$"):
+        run_to_end(short_config(data, tmp_path / "run", **CLOSE))
