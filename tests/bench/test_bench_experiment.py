@@ -81,7 +81,7 @@ def test_rows_of_the_bases_of_presets_train_these(file, rows):
             preset_config(name, overrides, Path()).model_config
             for name, overrides in ((experiment.preset, variants[row]), (name, {}))
         )
-        refinement = {"refine_steps", "refine_position_lr_factor", "losses"}
+        refinement = {"refine_steps", "refine_position_lr_factor", "losses", "close_contacts"}
         assert {key for key, value in vars(own).items() if value != getattr(preset, key)} <= refinement, row
 
 
