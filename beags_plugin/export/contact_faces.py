@@ -24,7 +24,7 @@ from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
 
 LEAST_VIEWS = 2  # in which another object hides a place from its front
-TAU = 0.02  # of a depth: what is nearer than that is before it
+TAU = 0.02  # of a depth, by which depths may err
 _FACING = 0.1  # least cosine between a place's normal and the way to a camera that looks at its front
 
 
@@ -39,8 +39,8 @@ class ContactFaces:
 class Witnesses:
     """How many views look at the front of each of M places, by what they show there; all [M] int64.
 
-    hidden: another object, at the place or before it. open: the background before it, or anything behind it. Views that
-    show the own object there, and pixels without a label, say nothing.
+    hidden: another object before the place. open: the background before it, or anything behind it, by more than ``TAU``
+    of the depth. Views that show the own object there, and pixels without a label, say nothing.
     """
 
     def __init__(self, places: Surfels, class_ids: Tensor) -> None:
@@ -62,7 +62,7 @@ class Witnesses:
         at = torch.where(at > 0, at, torch.inf)
         other = (shown != self._class_ids) & (shown != IGNORE)
         is_object = other & (shown != BACKGROUND)
-        self.hidden += looks & is_object & (at < (1.0 + TAU) * z)
+        self.hidden += looks & is_object & (at < z)
         self.open += looks & other & ((at >= (1.0 + TAU) * z) | (~is_object & (at < (1.0 - TAU) * z)))
 
     def in_contact(self) -> Tensor:
@@ -76,26 +76,27 @@ def contact_faces(
     members: Membership,
     names: Mapping[int, str],
     views: Viewpoints,
-    labels: Sequence[Tensor],
+    labels: Sequence[Tensor | None],
     options: MeshOptions,
     progress: Callable[[int, int], None],
 ) -> ContactFaces:
     """Return the Gaussians that close the objects of a scene where other objects hid them.
 
-    surfels: N Gaussians, on the CPU. names: of the classes by id. views: training views; labels: [H, W] each. options:
-    of the surfaces that tell what is open. progress: receives (done, total) objects and views.
+    surfels: N Gaussians, on the CPU. names: of the classes by id. views: training views; labels: [H, W] each, None
+    where a view has none. options: of the surfaces that tell what is open. progress: receives (done, total) objects
+    and views.
     """
     found: list[ContactFaces] = []
-    objects = [class_id for class_id in names if class_id != BACKGROUND]
+    objects = [class_id for class_id in names if class_id != BACKGROUND and bool(members.of(class_id).any())]
+    if len(objects) < 2:  # nothing touches
+        objects = []
     total = len(objects) + len(views.cameras)
     for done, class_id in enumerate(objects):
         progress(done, total)
         part = select_class(surfels, members, class_id)[0]
-        if len(part):
-            ids = torch.full((len(part),), class_id, dtype=torch.int32)
-            item = ExportItem(names[class_id], part, ids, views)
-            more = closing_gaussians(item, options)[0]
-            found.append(ContactFaces(more, torch.full((len(more),), class_id, dtype=torch.int32)))
+        ids = torch.full((len(part),), class_id, dtype=torch.int32)
+        more = closing_gaussians(ExportItem(names[class_id], part, ids, views), options)[0]
+        found.append(ContactFaces(more, torch.full((len(more),), class_id, dtype=torch.int32)))
     candidates = ContactFaces(
         joined(surfels[:0], *(each.surfels for each in found)),
         torch.cat([torch.zeros(0, dtype=torch.int32), *(each.class_ids for each in found)]),
@@ -104,9 +105,9 @@ def contact_faces(
     inputs, settings = geometry_inputs(surfels), replace(views.settings, geometry=True, distortion=False)
     for index, (camera, of_view) in enumerate(zip(views.cameras, labels, strict=True)):
         progress(len(objects) + index, total)
-        if len(candidates.surfels):
+        if len(candidates.surfels) and of_view is not None:
             render = views.rasterizer.rasterize(inputs, camera, settings, surfels.means.new_zeros(3))
-            witnesses.add(camera, of_view, surface_depth(render, "median"))
+            witnesses.add(camera, of_view.cpu(), surface_depth(render, "median"))
     progress(total, total)
     kept = witnesses.in_contact()
     return ContactFaces(candidates.surfels[kept], candidates.class_ids[kept])

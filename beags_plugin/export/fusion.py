@@ -82,6 +82,8 @@ def fuse(
     mesh, maybe of no face, whose order does not depend on the number of threads.
     """
     low, high = bounding_box(surfels)
+    if not bool((high > low).any()):
+        return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32), 0.0)
     voxel = voxel_size(low, high, resolution, truncation, memory_mb)
     nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32), voxel)
     grid, seen = _new_grid(), False
@@ -89,8 +91,7 @@ def fuse(
         close = close_up(camera, low, high, views.settings.near, PIXELS_PER_VOXEL * resolution)
         depth, color = _draw(surfels, close, views, low - truncation * voxel, high + truncation * voxel)
         if bool((depth > 0).any()):
-            _integrate(grid, depth / voxel, color, _in_voxels(close, low, voxel), truncation)
-            seen = True
+            seen |= _integrate(grid, depth / voxel, color, _in_voxels(close, low, voxel), truncation)
         on_render(done)
     if not seen:  # Open3D ends with an error
         return nothing
@@ -142,17 +143,20 @@ def _in_voxels(camera: Camera, low: Tensor, voxel: float) -> tuple[np.ndarray, n
     return K, viewmat
 
 
-def _integrate(grid: Any, depth: Tensor, color: Tensor, pose: tuple[np.ndarray, np.ndarray], truncation: float) -> None:
+def _integrate(grid: Any, depth: Tensor, color: Tensor, pose: tuple[np.ndarray, np.ndarray], truncation: float) -> bool:
+    """Add a view to the grid; return whether that changed it."""
     import open3d
 
     K, viewmat = (open3d.core.Tensor(matrix) for matrix in pose)
     depth_image = open3d.t.geometry.Image(open3d.core.Tensor(depth.float().contiguous().numpy()))
     color_image = open3d.t.geometry.Image(open3d.core.Tensor(color.float().contiguous().numpy()))
     limit = float(depth.max()) + 1.0
-    if not bool((depth[::_STRIDE, ::_STRIDE] > 0).any()):
-        return  # a few pixels between those at which Open3D looks for blocks: it would end with an error
+    rows, columns = (_STRIDE * (side // _STRIDE) for side in depth.shape)  # Open3D looks at no pixel beyond
+    if not bool((depth[:rows:_STRIDE, :columns:_STRIDE] > 0).any()):
+        return False  # a few pixels between those at which Open3D looks for blocks: it would end with an error
     blocks = grid.compute_unique_block_coordinates(depth_image, K, viewmat, 1.0, limit, float(truncation))
     grid.integrate(blocks, depth_image, color_image, K, viewmat, 1.0, limit, float(truncation))
+    return True
 
 
 def sorted_mesh(mesh: Mesh) -> Mesh:

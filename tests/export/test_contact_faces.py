@@ -11,6 +11,7 @@ trimesh = pytest.importorskip("trimesh")
 
 from disc_meshes import discs_on
 from random_surfels import SETTINGS, camera_at
+from scipy.ndimage import binary_fill_holes
 
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
@@ -96,27 +97,51 @@ def test_the_lid_below_a_block_is_closed_and_no_underside(monkeypatch):
 
 
 def test_a_hole_that_lies_open_stays_open(monkeypatch):
-    """Without the block every view looks into the hole."""
+    """With the block far below the scene every view looks into the hole."""
     surfels, ids, _ = stacked()
     labels = [torch.where(label == BLOCK, 0, label) for label in shown_classes(surfels, ids, VIEWS)]
-    found = closed_scene(monkeypatch, surfels[ids == BOX], ids[ids == BOX], labels)
+    surfels.means[ids == BLOCK] -= 30.0
+    found = closed_scene(monkeypatch, surfels, ids, labels)
     assert len(found.surfels) == len(found.class_ids) == 0
 
 
-def test_a_block_that_nothing_touches_gets_no_face():
-    """Nothing is patched: what closes it is its underside, at which nobody looks."""
+def test_the_surface_of_the_box_closes_much_of_what_one_sees_through():
+    """With nothing patched: the box has no underside either, so that its surface bends into the hole."""
+    surfels, ids, _ = stacked()
+    views = Viewpoints([camera_at(eye, pixels=192) for eye in EYES], make_rasterizer("auto"), SETTINGS)
+    options = MeshOptions(resolution=96, min_views=1)
+    labels = shown_classes(surfels, ids, views)
+    found = contact_faces(surfels, Membership(ids), NAMES, views, labels, options, lambda done, total: None)
+    assert found.class_ids.unique().tolist() == [BOX]
+    assert float(found.surfels.means.abs().max()) < 0.4, "inside the box"
+    above = camera_at((0.3, 0.2, 3.0), pixels=192)
+
+    def pierced(box: Surfels) -> int:
+        alpha = VIEWS.rasterizer.rasterize(geometry_inputs(box), above, SETTINGS, torch.zeros(3)).alpha > 0.5
+        return int((binary_fill_holes(alpha.numpy()) & ~alpha.numpy()).sum())
+
+    box = surfels[ids == BOX]
+    assert pierced(joined(box, found.surfels)) < 0.6 * pierced(box)
+
+
+def test_an_object_alone_touches_nothing_and_no_surface_is_made(monkeypatch):
     surfels, ids, _ = stacked()
     labels = shown_classes(surfels, ids, VIEWS)
-    options = MeshOptions(resolution=32, min_views=1)
-    found = contact_faces(surfels[ids == BLOCK], Membership(ids[ids == BLOCK]), NAMES, VIEWS, labels, options, print)
-    assert len(found.surfels) == 0
+    monkeypatch.setattr("beags_plugin.export.contact_faces.closing_gaussians", lambda *_: 1 / 0)
+    alone = surfels[ids == BLOCK], Membership(ids[ids == BLOCK])
+    assert not len(contact_faces(*alone, NAMES, VIEWS, labels, MeshOptions(), print).surfels)
+
+
+def test_views_without_labels_say_nothing(monkeypatch):
+    surfels, ids, _ = stacked()
+    assert not len(closed_scene(monkeypatch, surfels, ids, [None] * len(EYES)).surfels)
 
 
 @pytest.mark.parametrize(
     ("shown", "depth", "hidden", "open_"),
     [
         (BLOCK, 1.9, 1, 0),  # the neighbour, before the place
-        (BLOCK, 2.0, 1, 0),  # or at it
+        (BLOCK, 2.02, 0, 0),  # or just behind it, as far as depths may err
         (BLOCK, 2.2, 0, 1),  # or behind it: one looks through
         (0, 1.9, 0, 1),  # the background before it
         (0, 2.0, 0, 0),  # or at it: no one knows

@@ -279,3 +279,25 @@ def test_without_open3d_a_user_error_explains_it(monkeypatch):
 def test_wrong_options(options, sentence):
     with pytest.raises(UserError, match=sentence):
         MeshOptions(**options)
+
+
+def test_a_depth_at_the_last_rows_alone_is_no_surface():
+    """Open3D looks at no pixel of a last, smaller strip of rows, and ends with an error if there is none elsewhere."""
+    grid, camera = fusion._new_grid(), cameras(1)[0]
+    depth = torch.zeros(103, 64)
+    depth[100, 8] = 40.0
+    pose = fusion._in_voxels(camera, torch.zeros(3, dtype=torch.float64), 0.05)
+    assert not fusion._integrate(grid, depth, torch.zeros(103, 64, 3), pose, 6.0)
+
+
+def test_what_no_view_adds_to_has_no_surface(item, monkeypatch):
+    monkeypatch.setattr(fusion, "_integrate", lambda *_: False)
+    assert len(fusion.fuse(item.surfels, item.views, 16, 6.0, 500.0, 3).faces) == 0
+
+
+def test_what_has_no_extent_has_no_surface(item):
+    nothing = item.surfels[:3].clone()
+    nothing.log_scales[:] = -torch.inf
+    nothing.means[:] = nothing.means[:1].clone()
+    for surfels in (nothing, replace(nothing, means=torch.full_like(nothing.means, torch.nan))):
+        assert len(fusion.fuse(surfels, item.views, 16, 6.0, 500.0, 3).faces) == 0

@@ -112,7 +112,7 @@ def _open3d() -> Check:
     except Exception as error:
         absent = isinstance(error, ModuleNotFoundError)
         repair = "pip install open3d==0.19.0" if absent else "apt install libx11-6 libgl1"
-        return Check("open3d", False, f"{first_line(error)}; exported meshes need it", False, repair)
+        return Check("open3d", False, f"{first_line(error)}; exported meshes and close_contacts need it", False, repair)
     return Check("open3d", True, open3d.__version__, False)
 
 

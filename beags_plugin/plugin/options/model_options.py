@@ -89,8 +89,8 @@ class BeagsModelConfig(ModelConfig):
     refine_position_lr_factor: float = 1.0
     """Factor of the positions' learning rate while refining; 1, as in the paper, is the end of the base schedule."""
     close_contacts: bool = False
-    """After the last step of a refinement by losses: close objects, such as the lid of a box, where another object that
-    touches them hid them from every photo. It takes seconds for each object."""
+    """After the last step of a refinement by losses: close objects, such as the lid of a box, where other objects hid
+    them from every photo. It takes a second or more for each object."""
     near: Suppress[float] = 0.01
     """Near plane in units of the scene's extent."""
     far: Suppress[float] = 100.0

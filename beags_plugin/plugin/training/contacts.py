@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from torch import Tensor
 
 from beags_plugin.core.densification import Densified
 from beags_plugin.core.membership import Membership
@@ -14,9 +13,9 @@ from beags_plugin.export.base import Viewpoints
 from beags_plugin.export.closing_surfels import joined
 from beags_plugin.export.contact_faces import contact_faces
 from beags_plugin.export.mesh_options import MeshOptions
+from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
-from beags_plugin.plugin.views.views import View
 from beags_plugin.preparation.own_training import Edit
 from beags_plugin.rasterizers import make_rasterizer
 
@@ -42,7 +41,7 @@ def close_contacts(
         Membership(class_ids),
         model.classes,
         Viewpoints([view.camera.to("cpu") for view in chosen], rasterizer, model.settings()),
-        [_labels(view) for view in chosen],
+        LabelMaps(view.labels for view in chosen),
         MeshOptions(resolution=RESOLUTION),
         progress,
     )
@@ -51,8 +50,8 @@ def close_contacts(
     line = f"closed where neighbours hide objects: {counts} Gaussians added" if counts else "no contact to close"
     device, own = model.device, torch.arange(len(scene))
     # a Gaussian of the same object lends its class
-    lenders = [int((class_ids == class_id).nonzero()[0]) for class_id in faces.class_ids.tolist()]
-    source = torch.cat([own, torch.tensor(lenders, dtype=torch.int64)])
+    lenders = {class_id: int((class_ids == class_id).int().argmax()) for class_id in faces.class_ids.unique().tolist()}
+    source = torch.cat([own, torch.tensor([lenders[each] for each in faces.class_ids.tolist()], dtype=torch.int64)])
     both = joined(scene, faces.surfels)
     edited = Densified(
         Surfels(**{name: values.to(device) for name, values in vars(both).items()}),
@@ -60,8 +59,3 @@ def close_contacts(
         (torch.arange(len(source)) >= len(own)).to(device),
     )
     return Edit(edited=edited) if len(faces.surfels) else Edit(), line
-
-
-def _labels(view: View) -> Tensor:
-    assert view.labels is not None  # refinement has replaced all of them
-    return view.labels.cpu()

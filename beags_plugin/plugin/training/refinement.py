@@ -14,7 +14,6 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.assignment.assignment import Assignment
 from beags_plugin.core.membership import Membership
-from beags_plugin.export.mesh import open3d_missing
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED, round_folder
@@ -32,6 +31,8 @@ from beags_plugin.preparation.pipeline import check_masks, prepare
 from beags_plugin.refiners import make_refiner
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import counted
+
+NOTHING_TO_SAVE = -1  # instead of a step
 
 
 class RefinementSwitch:
@@ -78,8 +79,6 @@ class RefinementSwitch:
                 raise UserError(f"refine_rounds is {rounds}: the refiner {config.refiner} has 1 round.")
             config.prepare.check()
             config.split.check()
-            if config.close_contacts and (reason := open3d_missing()):
-                raise UserError(f"objects cannot be closed here: {reason} Or set close_contacts to False.")
         if config.refine_steps > 0 or self.refiner.joins_base:
             check_masks(view.labels for view in self.datamanager.views("train", original=True))
 
@@ -124,6 +123,9 @@ class RefinementSwitch:
         if self._evaluation_due:
             self.trainer.eval_iteration(step - 1)
             self._evaluation_due = False
+        if self._closes_after(step):  # which may take minutes: what was trained before is on disk by then
+            with self.trainer.long_stage(step - 1):
+                pass
         model.refined_steps += 1
         self._done += 1
         if (own := model.own_training) is not None:
@@ -142,7 +144,7 @@ class RefinementSwitch:
                     "assignment, not yet its own.",
                     style="yellow", highlight=False, markup=False, soft_wrap=True,
                 )  # fmt: skip
-        if own is None and self.ready and self.refiner.trains and refined + 1 == self.model.schedule.refine_steps:
+        if self._closes_after(step):
             self._close_contacts()
         if self.wanted and not self.ready and step + 1 == self.model.schedule.base_steps:
             self._switching = True
@@ -162,13 +164,29 @@ class RefinementSwitch:
         if members is not None:
             self.model.take_members(members)
 
+    def _closes_after(self, step: int) -> bool:
+        model, last = self.model, self.model.schedule.base_steps + self.model.schedule.refine_steps - 1
+        by_losses = self.ready and self.refiner.trains and model.own_training is None and model.objects is None
+        return model.config.close_contacts and by_losses and step == last
+
     def _close_contacts(self) -> None:
-        """Add the Gaussians that close objects where others hid them, if the options ask for them."""
-        if self.model.config.close_contacts:
-            with released(self.trainer.train_lock), bar("Closing what neighbours hide") as progress:
+        """Add the Gaussians that close objects where others hid them; without them if that fails."""
+        try:
+            with (
+                self.trainer.long_stage(NOTHING_TO_SAVE),
+                released(self.trainer.train_lock),
+                bar("Closing what neighbours hide") as progress,
+            ):
                 edit, line = close_contacts(self.model, self.datamanager, progress)
             apply_edit(self.model, self.trainer.optimizers.adam, edit)
             CONSOLE.print(f"  {line}", highlight=False, markup=False)
+        except Exception as error:  # of meshes, say: the scene is trained, and whole without these Gaussians
+            reason = str(error).partition("\n")[0]
+            CONSOLE.print(
+                f"Objects stay open where others hide them, as closing them failed ({reason}): "
+                "beags export has --close.",
+                style="yellow", highlight=False, markup=False, soft_wrap=True,
+            )  # fmt: skip
 
     def _round_starts(self) -> list[int]:
         return self.model.schedule.round_starts(self.model.config.refine_rounds)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import pytest
 import torch
 
@@ -12,20 +14,20 @@ from resumed_runs import (
     STEPS,
     assert_same_run,
     checkpoint_of,
+    differences,
     interrupted,
     kill_at,
+    killed,
     resume_to_end,
     run_to_end,
     short_config,
 )
 from run_folders import CLASSES, write_scene
 
-from beags_plugin.export import mesh
 from beags_plugin.export.contact_faces import ContactFaces
 from beags_plugin.plugin.objects.evaluate import evaluate_run
 from beags_plugin.plugin.runs.read import read_run
-from beags_plugin.plugin.training import contacts, refinement
-from beags_plugin.system.errors import UserError
+from beags_plugin.plugin.training import contacts
 
 CLOSE = {"pipeline.model.close_contacts": True}
 
@@ -96,8 +98,21 @@ def test_a_refiner_that_trains_nothing_closes_nothing(data, tmp_path, three_face
     assert not three_faces
 
 
-def test_without_open3d_it_is_refused_before_training(data, tmp_path, monkeypatch):
-    assert refinement.open3d_missing is mesh.open3d_missing
-    monkeypatch.setattr(refinement, "open3d_missing", lambda: "Open3D cannot be loaded (libX11); pip install open3d.")
-    with pytest.raises(UserError, match=r"^objects cannot be closed here: Open3D .* Or set close_contacts to False\.$"):
-        run_to_end(short_config(data, tmp_path / "run", **CLOSE))
+def test_a_run_that_was_killed_while_it_closed_contacts_ends_the_same(data, tmp_path, three_faces, monkeypatch):
+    run_to_end(short_config(data, tmp_path / "whole", **CLOSE))
+    interrupted(
+        data, tmp_path / "killed", monkeypatch, lambda patch: patch.setattr(contacts, "contact_faces", killed), **CLOSE
+    )
+    assert checkpoint_of(tmp_path / "killed")["step"] == sum(STEPS) - 2, "all but one step is on disk"
+    resume_to_end(tmp_path / "killed")
+    assert_same_run(tmp_path / "whole", tmp_path / "killed")
+
+
+def test_a_run_that_cannot_be_closed_is_kept_as_it_was_trained(data, tmp_path, monkeypatch, capsys):
+    run_to_end(short_config(data, tmp_path / "without"))
+    monkeypatch.setitem(sys.modules, "open3d", None)  # an import of it fails
+    run_to_end(short_config(data, tmp_path / "with", **CLOSE))
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Objects stay open where others hide them, as closing them failed (import of open3d" in said
+    without, with_ = (checkpoint_of(tmp_path / name)["pipeline"] for name in ("without", "with"))
+    assert not differences(without, with_)
