@@ -71,8 +71,11 @@ def reduced(report: Mapping[str, Any]) -> dict[str, Any]:
         found = {name: full[name] for name in kept if full.get(name) is not None}
         return {name: round(value, 6) if isinstance(value, float) else value for name, value in found.items()}
 
+    source = {name: report[name] for name in _SOURCE if name in report}
+    if "command" in source:
+        source["command"] = _without_places(source["command"])
     return {
-        **{name: report[name] for name in _SOURCE if name in report},
+        **source,
         "means": [row(mean) for mean in report["means"]],
         "rows": [
             row({"objects": objects.get(_place(line)), **line})
@@ -80,6 +83,11 @@ def reduced(report: Mapping[str, Any]) -> dict[str, Any]:
             if line.get("object", MEAN) == MEAN
         ],
     }
+
+
+def _without_places(command: str) -> str:
+    """Return a command without ``--output`` and the folders of its data, which are the machine's own."""
+    return re.sub(r"(?<=\s)/\S*/(?=[^/\s])", "", re.sub(r"\s--output\s+\S+", "", command))
 
 
 def _place(row: Mapping[str, Any]) -> tuple[Any, ...]:

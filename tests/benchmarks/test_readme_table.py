@@ -81,7 +81,8 @@ def clone(tmp_path):
     ]
     for scene in ("tabletop 1", "room 1"):
         rows.append(ResultRow(Variant("beags-fast"), scene, 1, dict.fromkeys(FIGURES), {}, "no memory"))
-    source = {"command": "beags bench presets", "commit": "abc", "machine": {"cpu": "x"}, "torch": "2", "quick": False}
+    command = "beags bench presets --data /data/fruit tin --output /tmp/bench --scenes 1"
+    source = {"command": command, "commit": "abc", "machine": {"cpu": "x"}, "torch": "2", "quick": False}
     (tmp_path / "presets.json").write_text(json.dumps(report_json(experiment, rows, source)))
     return tmp_path
 
@@ -89,7 +90,8 @@ def clone(tmp_path):
 def test_one_command_makes_the_table_from_a_result(clone):
     readme_table.main([str(clone / "presets.json")], clone)
     kept = json.loads((clone / "docs/results/presets.json").read_text())
-    assert kept["command"] == "beags bench presets" and kept["commit"] == "abc" and kept["machine"] == {"cpu": "x"}
+    assert kept["command"] == "beags bench presets --data fruit tin --scenes 1"
+    assert kept["commit"] == "abc" and kept["machine"] == {"cpu": "x"}
     assert kept["protocol"].startswith("Protocol: extracted masks against visible masks, less")
     scenes = ["tabletop 1"] * 2 + ["tabletop 2"] * 2 + ["room 1"] * 2 + ["tabletop 1", "room 1"]
     assert [row["scene"] for row in kept["rows"]] == scenes
