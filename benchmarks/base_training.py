@@ -185,8 +185,8 @@ def _minutes(seconds: float | None) -> float | None:
 class Arguments(ExperimentOptions):
     """Measure how well bases render held-out views, over steps and number of Gaussians."""
 
-    file: tyro.conf.Positional[str] = "base"
-    """base (bases of different lengths), or a TOML file."""
+    file: tyro.conf.Positional[str] = "benchmarks/base.toml"
+    """A TOML file; by default bases of different lengths."""
 
     def run(self) -> None:
         """Train and report."""

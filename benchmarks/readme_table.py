@@ -22,13 +22,14 @@ from beags_plugin.system.whole_files import write_text_atomically
 ROOT = Path(__file__).resolve().parents[1]
 BEGIN, END = "<!-- made by python -m benchmarks.readme_table -->\n", "<!-- end of the table -->\n"
 FAST = ("assignment alone", "as long as beags-fast, neither loss", "beags-fast")
+PAPER = ("as long as beags-paper, neither loss", "beags-paper")  # assignment alone is that of FAST, from the same base
 GROUPS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
     ("five generated tabletops, base of `beags-fast`", "presets", "tabletop", FAST),
-    ("the same, base of `beags`", "presets-whole", "tabletop", ()),
-    ("the same, refined as `beags-paper`, base of `beags-fast`", "presets-paper", "tabletop", ()),
+    ("the same scenes and base", "presets-paper", "tabletop", PAPER),
+    ("the same scenes, base of `beags`", "presets-whole", "tabletop", ()),
     ("five generated rooms, base of `beags-fast`", "presets", "room", FAST),
-    ("the same, base of `beags`", "presets-whole", "room", ()),
-    ("the same, refined as `beags-paper`, base of `beags-fast`", "presets-paper", "room", ()),
+    ("the same scenes and base", "presets-paper", "room", PAPER),
+    ("the same scenes, base of `beags`", "presets-whole", "room", ()),
     ("fruit, a real capture, base of `beags-fast`", "presets-captures", "fruit", FAST),
     ("the same, base of `beags`", "presets-whole-captures", "fruit", ()),
     ("a skull, a real capture, base of `beags-fast`", "presets-captures", "dtu_skull", FAST),

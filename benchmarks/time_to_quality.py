@@ -33,7 +33,7 @@ MEAN = "mean"  # in the column "scene"
 def run(name: str, options: ExperimentOptions) -> list[dict[str, Any]]:
     """Train the bases that are not done, print a table and write its files; returns the table's lines.
 
-    name: of an experiment, or a TOML file; it must name a reference variant. Raises ``UserError`` for a mistake in it
+    name: of a TOML file, or an experiment; it must name a reference variant. Raises ``UserError`` for a mistake in it
     or in the options.
     """
     experiment = adapted(load_experiment(name), options)
@@ -167,8 +167,8 @@ def plot(path: Path, rows: Sequence[CurveRow], reference: str) -> None:
 class Arguments(ExperimentOptions):
     """Measure the CPU seconds that bases take to the quality of a reference's end."""
 
-    file: tyro.conf.Positional[str] = "time-to-quality"
-    """time-to-quality (the official schedule, beags-fast and its means), or a TOML file with a reference."""
+    file: tyro.conf.Positional[str] = "benchmarks/time-to-quality.toml"
+    """A TOML file with a reference; by default the official schedule, beags-fast and its means."""
 
     def run(self) -> None:
         """Train and report."""

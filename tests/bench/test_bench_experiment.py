@@ -26,8 +26,11 @@ def experiment(tmp_path):
 
 WITH_QUALITY = [name for name in experiment_names() if name != "classes"]  # which measures cost alone
 # experiments whose figures are reported; by all others something is chosen
-REPORTING = {"presets", "compare", "compare-consistent", "time-to-quality"}
-BASES = {"base", "time-to-quality"}  # that refine nothing
+REPORTING = {"presets", "compare", "compare-consistent"}
+BENCHMARKS = {path.stem: path for path in sorted((ROOT / "benchmarks").glob("*.toml"))}
+REPORTING_BENCHMARKS = {
+    "comparison-more", "official-base", "photo-size", "presets-rooms", "presets-whole", "time-to-quality",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", WITH_QUALITY)
@@ -39,6 +42,13 @@ def test_scenes_for_choosing_and_for_reporting_are_kept_apart(name):
     assert not set(SEEDS["choosing"]) & set(SEEDS["reporting"]) and experiment.variants
 
 
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_files_of_benchmarks_keep_them_apart_too(name):
+    experiment = load_experiment(str(BENCHMARKS[name]))
+    seeds = {seed for _, seed in experiment.samples}
+    assert seeds and seeds <= set(SEEDS["reporting" if name in REPORTING_BENCHMARKS else "choosing"])
+
+
 @pytest.mark.parametrize(
     ("name", "count"),
     [
@@ -46,6 +56,7 @@ def test_scenes_for_choosing_and_for_reporting_are_kept_apart(name):
         ("compare", 2),
         (str(ROOT / "benchmarks/presets-captures.toml"), 2),
         (str(ROOT / "benchmarks/presets-whole.toml"), 1),
+        (str(ROOT / "benchmarks/photo-size.toml"), 1),
     ],
 )
 def test_rows_named_after_presets_refine_as_these_do(name, count):
@@ -67,9 +78,10 @@ def test_rows_named_after_presets_refine_as_these_do(name, count):
 @pytest.mark.parametrize(
     ("file", "rows"),
     [
-        ("experiments/time-to-quality.toml", {"beags": "beags", "beags-fast": "beags-fast"}),
+        ("benchmarks/time-to-quality.toml", {"beags": "beags", "beags-fast": "beags-fast"}),
         ("benchmarks/official-base.toml", {f"base of {name}, refined": name for name in ("beags", "beags-fast")}),
         ("benchmarks/presets-whole.toml", {"beags": "beags"}),
+        ("benchmarks/photo-size.toml", {"beags": "beags"}),
         ("benchmarks/shorter-bases.toml", {"7,500 steps, colours decay": "beags", "rates x 2": "beags-fast"}),
     ],
 )
@@ -85,7 +97,7 @@ def test_rows_of_the_bases_of_presets_train_these(file, rows):
         assert {key for key, value in vars(own).items() if value != getattr(preset, key)} <= refinement, row
 
 
-@pytest.mark.parametrize("name", [name for name in WITH_QUALITY if name not in BASES])
+@pytest.mark.parametrize("name", WITH_QUALITY)
 def test_every_length_of_refinement_has_its_control(name):
     """A gain in PSNR is one over as many steps with no loss of masks; where figures are reported, at equal rates."""
     lengths: dict[bool, set[tuple[int, float]]] = {True: set(), False: set()}
