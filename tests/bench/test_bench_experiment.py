@@ -29,7 +29,8 @@ WITH_QUALITY = [name for name in experiment_names() if name != "classes"]  # whi
 REPORTING = {"presets", "compare", "compare-consistent"}
 BENCHMARKS = {path.stem: path for path in sorted((ROOT / "benchmarks").glob("*.toml"))}
 REPORTING_BENCHMARKS = {
-    "comparison-more", "official-base", "photo-size", "presets-rooms", "presets-whole", "time-to-quality",
+    "comparison-more", "official-base", "photo-size", "presets-rooms", "presets-tiny", "presets-whole",
+    "time-to-quality",
 }  # fmt: skip
 
 
@@ -57,6 +58,7 @@ def test_files_of_benchmarks_keep_them_apart_too(name):
         (str(ROOT / "benchmarks/presets-captures.toml"), 2),
         (str(ROOT / "benchmarks/presets-whole.toml"), 1),
         (str(ROOT / "benchmarks/photo-size.toml"), 1),
+        (str(ROOT / "benchmarks/presets-tiny.toml"), 1),
     ],
 )
 def test_rows_named_after_presets_refine_as_these_do(name, count):
@@ -82,6 +84,7 @@ def test_rows_named_after_presets_refine_as_these_do(name, count):
         ("benchmarks/official-base.toml", {f"base of {name}, refined": name for name in ("beags", "beags-fast")}),
         ("benchmarks/presets-whole.toml", {"beags": "beags"}),
         ("benchmarks/photo-size.toml", {"beags": "beags"}),
+        ("benchmarks/presets-tiny.toml", {"beags-tiny": "beags-tiny"}),
         ("benchmarks/shorter-bases.toml", {"7,500 steps, colours decay": "beags", "rates x 2": "beags-fast"}),
     ],
 )
