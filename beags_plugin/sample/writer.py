@@ -100,7 +100,7 @@ def write_sample(
     the config.
 
     All is written into a temporary folder beside it and renamed at the end: an interrupted run leaves no ``folder``.
-    A folder that holds another sample is replaced.
+    A folder that holds another sample is replaced; one that another program has made of ``config`` meanwhile is kept.
     progress: called as ``progress(done, total)`` after each view.
     Raises ``UserError`` for a bad config, or if ``folder`` holds something that is no sample.
     """
@@ -121,9 +121,10 @@ def write_sample(
         built = partial / "new"
         with writing(target):
             _build(built, config, progress)
-            if old:
-                target.rename(partial / "old")
-            built.rename(target)
+            if not is_sample(target, config):  # by now
+                if old:
+                    target.rename(partial / "old")
+                built.rename(target)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return target

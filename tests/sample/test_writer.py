@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -123,6 +124,19 @@ def test_another_config_replaces_a_sample(tmp_path):
     write_sample(tmp_path / "s", second)
     assert is_sample(tmp_path / "s", second) and not is_sample(tmp_path / "s", first)
     assert [p.name for p in tmp_path.iterdir()] == ["s"]
+
+
+def test_the_same_sample_by_another_program_meanwhile_is_kept(folder, config, tmp_path):
+    target = tmp_path / "s"
+
+    def other(done, total):
+        if done == total:
+            shutil.copytree(folder, target)
+            (target / "theirs").touch()
+
+    assert write_sample(target, config, progress=other) == target
+    assert (target / "theirs").exists() and is_sample(target, config)
+    assert list(tmp_path.iterdir()) == [target]
 
 
 def test_an_interrupted_run_leaves_nothing_that_looks_complete(tmp_path):
