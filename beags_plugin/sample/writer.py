@@ -109,8 +109,7 @@ def write_sample(
     target = Path(folder).absolute()
     if is_sample(target, config):
         return target
-    old = target.exists()
-    if old and (not target.is_dir() or (any(target.iterdir()) and not (target / SAMPLE_FILE).is_file())):
+    if target.exists() and (not target.is_dir() or (any(target.iterdir()) and not (target / SAMPLE_FILE).is_file())):
         raise UserError(f"{target} exists and is no sample scene: choose another folder or empty it.")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -121,10 +120,15 @@ def write_sample(
         built = partial / "new"
         with writing(target):
             _build(built, config, progress)
-            if not is_sample(target, config):  # by now
-                if old:
+            try:
+                if is_sample(target, config):  # by now
+                    return target
+                if (target / SAMPLE_FILE).is_file():
                     target.rename(partial / "old")
                 built.rename(target)
+            except OSError:
+                if not is_sample(target, config):
+                    raise
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return target

@@ -48,6 +48,8 @@ def test_files_of_benchmarks_keep_them_apart_too(name):
     experiment = load_experiment(str(BENCHMARKS[name]))
     seeds = {seed for _, seed in experiment.samples}
     assert seeds and seeds <= set(SEEDS["reporting" if name in REPORTING_BENCHMARKS else "choosing"])
+    if name in {"base", "photo-size", "presets-tiny", "presets-whole", "time-to-quality"}:
+        assert {family for family, _ in experiment.samples} == {"tabletop", "room"}
 
 
 @pytest.mark.parametrize(
@@ -100,7 +102,10 @@ def test_rows_of_the_bases_of_presets_train_these(file, rows):
         assert {key for key, value in vars(own).items() if value != getattr(preset, key)} <= refinement, row
 
 
-@pytest.mark.parametrize("name", WITH_QUALITY)
+WITH_CONTROLS = [str(BENCHMARKS[name]) for name in ("background", "photo-size", "presets-tiny", "presets-whole")]
+
+
+@pytest.mark.parametrize("name", [*WITH_QUALITY, *WITH_CONTROLS])
 def test_every_length_of_refinement_has_its_control(name):
     """A gain in PSNR is one over as many steps with no loss of masks; where figures are reported, at equal rates."""
     lengths: dict[bool, set[tuple[int, float]]] = {True: set(), False: set()}
@@ -112,7 +117,7 @@ def test_every_length_of_refinement_has_its_control(name):
         if model.refiner == "bea":
             lengths[control].add((model.refine_steps, model.refine_position_lr_factor))
     assert {steps for steps, _ in lengths[False]} == {steps for steps, _ in lengths[True]}
-    if name in REPORTING:
+    if name in REPORTING or name in WITH_CONTROLS:
         assert lengths[False] == lengths[True]
 
 

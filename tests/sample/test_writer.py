@@ -126,17 +126,34 @@ def test_another_config_replaces_a_sample(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["s"]
 
 
-def test_the_same_sample_by_another_program_meanwhile_is_kept(folder, config, tmp_path):
+@pytest.mark.parametrize("former", [False, True])
+def test_the_same_sample_by_another_program_meanwhile_is_kept(folder, config, tmp_path, former):
     target = tmp_path / "s"
+    if former:  # another sample is there, which both are to replace
+        target.mkdir()
+        (target / writer.SAMPLE_FILE).write_text("{}")
 
     def other(done, total):
         if done == total:
+            shutil.rmtree(target, ignore_errors=True)
             shutil.copytree(folder, target)
             (target / "theirs").touch()
 
     assert write_sample(target, config, progress=other) == target
     assert (target / "theirs").exists() and is_sample(target, config)
     assert list(tmp_path.iterdir()) == [target]
+
+
+def test_what_a_user_puts_there_meanwhile_is_kept(tmp_path):
+    target = tmp_path / "s"
+
+    def user(done, total):
+        target.mkdir(exist_ok=True)
+        (target / "thesis.txt").write_text("mine")
+
+    with pytest.raises(UserError, match="cannot be written"):
+        write_sample(target, TINY, progress=user)
+    assert (target / "thesis.txt").read_text() == "mine" and list(tmp_path.iterdir()) == [target]
 
 
 def test_an_interrupted_run_leaves_nothing_that_looks_complete(tmp_path):
