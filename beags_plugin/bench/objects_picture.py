@@ -104,7 +104,7 @@ def captioned(names: Sequence[str], letters: int = _LETTERS) -> list[str]:
 
 def _largest(run: EvaluatedRun, most: int) -> dict[int, tuple[EvalView, np.ndarray]]:
     """Return the ids of the objects of which a held-out view shows most pixels, the view, and its mask [H, W] bool."""
-    from beags_plugin.evaluation.run_metrics import extracted_truth
+    from beags_plugin.evaluation.truths import extracted_truth
 
     found: list[tuple[int, int, EvalView, np.ndarray]] = []
     for class_id in sorted(run.classes):

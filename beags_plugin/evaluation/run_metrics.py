@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -28,9 +28,9 @@ from beags_plugin.evaluation.records import (
 )
 from beags_plugin.evaluation.removal import removal_metrics
 from beags_plugin.evaluation.shown import TAU
+from beags_plugin.evaluation.truths import extracted_truth, object_pixels, removals, rendered_truth, seen_truth
 from beags_plugin.extraction.select import remove_class, select_class
-from beags_plugin.labels.borders import at_border
-from beags_plugin.labels.class_ids import IGNORE, resize_nearest
+from beags_plugin.labels.class_ids import resize_nearest
 from beags_plugin.losses.photometric import ssim
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth, surfel_inputs
@@ -123,20 +123,6 @@ def pooled_average(scenes: Mapping[Hashable, Iterable[MaskRecord]], kind: Kind, 
                 key = {"masks": 0, "objects": (scene, record.class_id), "views": (scene, record.view)}
                 groups.setdefault(key[protocol.scene_average], []).append(record.metrics)
     return mean_metrics(mean_metrics(group) for group in groups.values())
-
-
-@dataclass(frozen=True)
-class Truth:
-    """The mask of an object in a view, [h, w] bool, and pixels of that size that may not count.
-
-    source: "silhouette" or "visible". unknown: pixels that count nowhere, or None. others: pixels of other objects,
-    which count unless their object hides this one, or None.
-    """
-
-    source: str
-    mask: Tensor
-    unknown: Tensor | None = None
-    others: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -233,70 +219,3 @@ class MaskRenderer:
             value = self.rasterizer.rasterize(colored, self.view.camera, self.settings, black).color
             masks |= {c: value[..., channel] > self.protocol.threshold for channel, c in enumerate(triple)}
         return masks
-
-
-def rendered_truth(view: EvalView, class_id: int) -> Truth | None:
-    """Return an object's visible mask; None if the view has no mask of it."""
-    if view.visible_objects is not None:
-        mask = view.visible_objects.get(class_id)
-        return None if mask is None else Truth("visible", mask)
-    return None if view.visible is None else Truth("visible", view.visible == class_id, view.visible == IGNORE)
-
-
-def extracted_truth(view: EvalView, class_id: int) -> Truth | None:
-    """Return the silhouette of an object in a view, else its visible mask; None if the view has no mask of it."""
-    if view.silhouettes is not None and class_id in view.silhouettes:
-        return Truth("silhouette", view.silhouettes[class_id])
-    visible = rendered_truth(view, class_id)
-    if visible is None:
-        return None
-    if view.visible_objects is not None:
-        return replace(visible, others=_of_others(view.visible_objects, class_id) & ~visible.mask)
-    assert view.visible is not None
-    return replace(visible, others=(view.visible != class_id) & (view.visible != 0) & (view.visible != IGNORE))
-
-
-def seen_truth(view: EvalView, class_id: int) -> Truth | None:
-    """Return an object's silhouette, where training photos show it; None unless the data says where."""
-    known = None if view.seen is None else view.seen.get(class_id)
-    if known is None or view.silhouettes is None or class_id not in view.silhouettes:
-        return None
-    return Truth("silhouette", view.silhouettes[class_id], view.silhouettes[class_id] & ~known)
-
-
-def removals(view: EvalView, objects: Sequence[int]) -> Iterator[tuple[int, Tensor, Tensor, Tensor | None]]:
-    """Yield the objects whose removal can be scored: id, exact picture [H, W, 3], silhouette and known part [H, W]."""
-    for class_id, exact in (view.removed or {}).items():
-        found = (None if masks is None else masks.get(class_id) for masks in (view.silhouettes, view.removed_shown))
-        silhouette, shown = (
-            None if mask is None else torch.from_numpy(resize_nearest(mask.cpu().numpy(), *exact.shape[:2]))
-            for mask in found
-        )
-        if class_id in objects and silhouette is not None:
-            yield class_id, exact, silhouette, shown
-
-
-def object_pixels(view: EvalView) -> Tensor | None:
-    """Return [H, W] bool, the pixels of the photograph inside the objects; None without a mask that says.
-
-    Those next to the background, which the photograph shows too, are left out.
-    """
-    if view.visible_objects is not None:
-        masks = list(view.visible_objects.values())
-    else:
-        masks = [] if view.visible is None else [(view.visible != 0) & (view.visible != IGNORE)]
-    size = view.camera.height, view.camera.width
-    found = [torch.from_numpy(resize_nearest(mask.cpu().numpy(), *size)) for mask in masks]
-    if not found:
-        return None
-    inside = torch.stack(found).any(dim=0)
-    return inside & ~at_border(inside.int())
-
-
-def _of_others(masks: Mapping[int, Tensor], class_id: int) -> Tensor:
-    """Return [h, w] bool: pixels of the masks of other objects that have the size of this one's."""
-    others = torch.zeros_like(masks[class_id])
-    for other, mask in masks.items():
-        if other != class_id and mask.shape == others.shape:
-            others |= mask
-    return others

@@ -8,7 +8,7 @@ import torch
 from beags_plugin.core.cameras import Camera
 from beags_plugin.evaluation.metrics import mask_metrics
 from beags_plugin.evaluation.records import EvalView
-from beags_plugin.evaluation.run_metrics import seen_truth
+from beags_plugin.evaluation.truths import seen_truth
 from beags_plugin.sample.seen import PATCH, seen_part, well_seen
 from beags_plugin.sample.views import View
 
