@@ -15,6 +15,8 @@ from beags_plugin.system.reading.text import load_json, reason
 
 NO_TRUTH = "no_truth.json"
 """In a folder of masks: a program drew those of all views, so that held-out ones are no truth to evaluate with."""
+UNTOLD = 128
+"""Grey value in the mask of one object of a pixel that cannot be told to be inside or outside."""
 SHADES = slice(32, 224)  # values of 8 bits that are neither black nor white
 MOST_SHADED, LEAST_SHADES = 0.25, 64  # share of a mask's pixels with shades, and number of shades: more is a picture
 _ID_MODES = {"1", "L", "P", "I", "I;16", "I;16L", "I;16B"}  # Pillow's names of images with one integer per pixel
@@ -41,23 +43,36 @@ def read_id_mask(path: Path | str, ignore_ids: Iterable[int] = ()) -> np.ndarray
     return labels
 
 
-def read_binary_mask(path: Path | str) -> np.ndarray:
-    """Read the mask of one object, [H, W] bool.
+def read_object_mask(path: Path | str) -> np.ndarray:
+    """Read the mask of one object, [H, W] uint16: 1 inside, 0 outside, IGNORE where that cannot be told.
 
-    In 8-bit grey or colour images that reach 128, pixels are inside from 128 on, as outlines may be blended. In other
-    images, such as labels 0 and 1, all but 0 and IGNORE is inside. Alpha is ignored.
+    In 8-bit grey or colour images that reach 128, pixels are inside from 128 on, as outlines may be blended. But in an
+    image of no other values than 0, 128 and 255, with 255 in it, grey 128 is ``UNTOLD``: a blended outline has more
+    shades. In other images, such as labels 0 and 1, all but 0 and IGNORE is inside. Alpha is ignored.
     Raises ``UserError`` for any other file, a photo among them.
     """
     mode, values = _read_pixels(path)
     if mode in _COLOR_MODES:
-        values = values[..., : 1 if mode == "LA" else 3].max(axis=2)
-    elif mode not in _ID_MODES or values.ndim != 2:
+        channels = values[..., : 1 if mode == "LA" else 3]
+    elif mode in _ID_MODES and values.ndim == 2:
+        channels = values[..., None]
+    else:
         raise UserError(f"the mask {path} is of mode {mode}: save it as grey PNG.")
-    if mode in {"L", *_COLOR_MODES} and values.max(initial=0) >= 128:
-        if _is_picture(values):
+    brightest = channels.max(axis=2)
+    if mode in {"L", *_COLOR_MODES} and brightest.max(initial=0) >= UNTOLD:
+        if _is_picture(brightest):
             raise UserError(f"the mask {path} is a picture: fill the object white on black, without the photo below.")
-        return values >= 128
-    return (values != 0) & (values != IGNORE)
+        shades = set(np.unique(channels).tolist())
+        inside, untold = brightest >= UNTOLD, (channels == UNTOLD).all(axis=2)
+        untold &= 255 in shades and shades <= {0, UNTOLD, 255}
+    else:
+        inside, untold = brightest != 0, brightest == IGNORE
+    return np.where(untold, IGNORE, inside).astype(np.uint16)
+
+
+def read_binary_mask(path: Path | str) -> np.ndarray:
+    """Read the pixels that surely lie inside one object, [H, W] bool; see ``read_object_mask``."""
+    return read_object_mask(path) == 1
 
 
 def _is_picture(values: np.ndarray) -> bool:
@@ -67,8 +82,8 @@ def _is_picture(values: np.ndarray) -> bool:
 
 
 def read_mask(path: Path | str, kind: str, ignore_ids: Iterable[int] = ()) -> np.ndarray:
-    """Read [H, W] uint16: the class ids of an id image ("ids"), or 1 inside and 0 outside of a "binary" mask."""
-    return read_binary_mask(path).astype(np.uint16) if kind == "binary" else read_id_mask(path, ignore_ids)
+    """Read [H, W] uint16: the class ids of an id image ("ids"), or of a "binary" mask 1 inside, 0 outside, or IGNORE."""
+    return read_object_mask(path) if kind == "binary" else read_id_mask(path, ignore_ids)
 
 
 def _read_pixels(path: Path | str) -> tuple[str, np.ndarray]:

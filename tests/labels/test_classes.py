@@ -8,7 +8,15 @@ from PIL import Image
 
 from beags_plugin.data.files import image_size
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.labels.classes import check_names, read_binary_mask, read_classes, read_id_mask, read_mask, write_mask
+from beags_plugin.labels.classes import (
+    check_names,
+    read_binary_mask,
+    read_classes,
+    read_id_mask,
+    read_mask,
+    read_object_mask,
+    write_mask,
+)
 from beags_plugin.labels.colors import colorize
 from beags_plugin.system.errors import UserError
 
@@ -63,7 +71,34 @@ def test_binary_masks_of_all_kinds(tmp_path, array, inside):
     mask = read_binary_mask(tmp_path / "a.png")
     assert mask.dtype == bool and np.array_equal(mask, inside)
     ones = read_mask(tmp_path / "a.png", "binary")
+    ones[ones == IGNORE] = 0  # of 16 bits
     assert ones.dtype == np.uint16 and np.array_equal(ones, np.asarray(inside, int))
+
+
+TOLD = np.array([[0, 128, 255], [128, 0, 255]], dtype=np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("array", "untold"),
+    [
+        (TOLD, TOLD == 128),
+        (TOLD[..., None].repeat(3, axis=2), TOLD == 128),
+        (np.stack([TOLD, 255 - TOLD], axis=2), TOLD == 128),  # alpha says nothing
+        (np.maximum(TOLD, 128), TOLD != 255),  # no pixel is surely outside
+        (np.array([[0, IGNORE, 1]], dtype=np.uint16), [[False, True, False]]),
+        (np.minimum(TOLD, 128), TOLD < 0),  # an object in grey
+        (np.where(TOLD == 0, np.uint8(1), TOLD), TOLD < 0),  # a blended outline has more shades
+        (np.append(TOLD, [[64], [0]], axis=1).astype(np.uint8), np.zeros((2, 4), bool)),
+        (np.stack([TOLD, 0 * TOLD, 0 * TOLD], axis=2), TOLD < 0),  # half red is no grey
+    ],
+)
+def test_grey_beside_black_and_white_alone_cannot_be_told(tmp_path, array, untold):
+    Image.fromarray(array).save(tmp_path / "a.png")
+    ids = read_object_mask(tmp_path / "a.png")
+    assert ids.dtype == np.uint16 and set(ids.ravel().tolist()) <= {0, 1, IGNORE}
+    assert np.array_equal(ids == IGNORE, untold)
+    assert np.array_equal(read_binary_mask(tmp_path / "a.png"), ids == 1)
+    assert np.array_equal(read_mask(tmp_path / "a.png", "binary"), ids)
 
 
 def test_a_picture_is_no_binary_mask(tmp_path):
