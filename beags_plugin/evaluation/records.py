@@ -35,7 +35,9 @@ class EvalView:
     photo shows; metrics of the kind "seen" leave out the rest. visible_objects: object id to [h, w] bool, the visible
     part where single objects were labelled and nothing is known of the others; scored instead of ``visible``. removed:
     object id to [H, W, 3] float in 0..1, the exact picture without it. removed_shown: object id to [h, w] bool, the
-    part of the silhouette where that picture shows surface which some training photo shows.
+    part of the silhouette where that picture shows surface which some training photo shows. unknown_silhouettes,
+    unknown_visible: object id to [h, w] bool, the pixels of which cannot be told whether its silhouette, or its mask in
+    ``visible_objects``, holds them; they are in neither and count nowhere.
     """
 
     camera: Camera
@@ -53,6 +55,8 @@ class EvalView:
 class ObjectMetrics:
     """The metrics of each kind; None where there was nothing to compare with."""
 
+    unknown_silhouettes: Mapping[int, Tensor] | None = None
+    unknown_visible: Mapping[int, Tensor] | None = None
     extracted: MaskMetrics | None
     rendered: MaskMetrics | None
     seen: MaskMetrics | None = None

@@ -127,9 +127,9 @@ def pooled_average(scenes: Mapping[Hashable, Iterable[MaskRecord]], kind: Kind, 
 
 @dataclass(frozen=True)
 class RenderedMask:
-    """A predicted mask [H, W] bool and its truth [h, w] bool. ignore: [h, w] bool, pixels that do not count, or None.
+    """A predicted mask [H, W] bool and its truth [h, w] bool, as ``Truth.compared`` gives it.
 
-    source: as of ``Truth``.
+    ignore: [h, w] bool, pixels that do not count, or None. source: as of ``Truth``.
     """
 
     prediction: Tensor
@@ -163,7 +163,9 @@ class MaskRenderer:
         if kind == "rendered":
             known = {c: truth for c in objects if (truth := rendered_truth(self.view, c)) is not None}
             rendered = self._rendered(self.members, list(known))
-            return {c: RenderedMask(mask, known[c].mask, known[c].unknown, "visible") for c, mask in rendered.items()}
+            return {
+                c: RenderedMask(mask, known[c].compared(), known[c].unknown, "visible") for c, mask in rendered.items()
+            }
         found = {}
         for class_id in objects:
             truth = extracted_truth(self.view, class_id) if kind == "extracted" else seen_truth(self.view, class_id)
@@ -171,7 +173,7 @@ class MaskRenderer:
                 mask, hidden = self._extracted(self.members, class_id, truth.others)
                 left_out = [pixels for pixels in (truth.unknown, hidden) if pixels is not None]
                 ignore = torch.stack(left_out).any(dim=0) if left_out else None
-                found[class_id] = RenderedMask(mask, truth.mask, ignore, truth.source)
+                found[class_id] = RenderedMask(mask, truth.compared(), ignore, truth.source)
         return found
 
     def _extracted(self, members: Membership, class_id: int, others: Tensor | None) -> tuple[Tensor, Tensor | None]:

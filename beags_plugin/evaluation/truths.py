@@ -17,8 +17,8 @@ from beags_plugin.labels.class_ids import IGNORE, resize_nearest
 class Truth:
     """The mask of an object in a view, [h, w] bool, and pixels of that size that may not count.
 
-    source: "silhouette" or "visible". unknown: pixels that count nowhere, or None. others: pixels of other objects,
-    which count unless their object hides this one, or None.
+    source: "silhouette" or "visible". unknown: pixels that count nowhere, or None. others: pixels that are or may be
+    other objects', which count unless their object hides this one, or None.
     """
 
     source: str
@@ -26,40 +26,45 @@ class Truth:
     unknown: Tensor | None = None
     others: Tensor | None = None
 
+    def compared(self) -> Tensor:
+        """Return [h, w] bool, the mask with the unknown pixels in it, so that they make no boundary."""
+        return self.mask if self.unknown is None else self.mask | self.unknown
+
 
 def rendered_truth(view: EvalView, class_id: int) -> Truth | None:
     """Return an object's visible mask; None if the view has no mask of it."""
     if view.visible_objects is not None:
         mask = view.visible_objects.get(class_id)
-        return None if mask is None else Truth("visible", mask)
+        return None if mask is None else Truth("visible", mask, _of(view.unknown_visible, class_id))
     return None if view.visible is None else Truth("visible", view.visible == class_id, view.visible == IGNORE)
 
 
 def extracted_truth(view: EvalView, class_id: int) -> Truth | None:
     """Return the silhouette of an object in a view, else its visible mask; None if the view has no mask of it."""
     if view.silhouettes is not None and class_id in view.silhouettes:
-        return Truth("silhouette", view.silhouettes[class_id])
+        return Truth("silhouette", view.silhouettes[class_id], _of(view.unknown_silhouettes, class_id))
     visible = rendered_truth(view, class_id)
     if visible is None:
         return None
     if view.visible_objects is not None:
-        return replace(visible, others=_of_others(view.visible_objects, class_id) & ~visible.mask)
+        return replace(visible, others=_of_others(view, class_id) & ~visible.mask)
     assert view.visible is not None
     return replace(visible, others=(view.visible != class_id) & (view.visible != 0) & (view.visible != IGNORE))
 
 
 def seen_truth(view: EvalView, class_id: int) -> Truth | None:
     """Return an object's silhouette, where training photos show it; None unless the data says where."""
-    known = None if view.seen is None else view.seen.get(class_id)
+    known = _of(view.seen, class_id)
     if known is None or view.silhouettes is None or class_id not in view.silhouettes:
         return None
-    return Truth("silhouette", view.silhouettes[class_id], view.silhouettes[class_id] & ~known)
+    unseen, unknown = view.silhouettes[class_id] & ~known, _of(view.unknown_silhouettes, class_id)
+    return Truth("silhouette", view.silhouettes[class_id], unseen if unknown is None else unseen | unknown)
 
 
 def removals(view: EvalView, objects: Sequence[int]) -> Iterator[tuple[int, Tensor, Tensor, Tensor | None]]:
     """Yield the objects whose removal can be scored: id, exact picture [H, W, 3], silhouette and known part [H, W]."""
     for class_id, exact in (view.removed or {}).items():
-        found = (None if masks is None else masks.get(class_id) for masks in (view.silhouettes, view.removed_shown))
+        found = (_of(masks, class_id) for masks in (view.silhouettes, view.removed_shown))
         silhouette, shown = (
             None if mask is None else torch.from_numpy(resize_nearest(mask.cpu().numpy(), *exact.shape[:2]))
             for mask in found
@@ -85,10 +90,16 @@ def object_pixels(view: EvalView) -> Tensor | None:
     return inside & ~at_border(inside.int())
 
 
-def _of_others(masks: Mapping[int, Tensor], class_id: int) -> Tensor:
-    """Return [h, w] bool: pixels of the masks of other objects that have the size of this one's."""
-    others = torch.zeros_like(masks[class_id])
-    for other, mask in masks.items():
-        if other != class_id and mask.shape == others.shape:
-            others |= mask
+def _of_others(view: EvalView, class_id: int) -> Tensor:
+    """Return [h, w] bool: pixels that are or may be other objects', by masks that have the size of this one's."""
+    assert view.visible_objects is not None
+    others = torch.zeros_like(view.visible_objects[class_id])
+    for masks in (view.visible_objects, view.unknown_visible or {}):
+        for other, mask in masks.items():
+            if other != class_id and mask.shape == others.shape:
+                others |= mask
     return others
+
+
+def _of(masks: Mapping[int, Tensor] | None, class_id: int) -> Tensor | None:
+    return None if masks is None else masks.get(class_id)

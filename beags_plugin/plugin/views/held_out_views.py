@@ -15,7 +15,7 @@ from beags_plugin.data.files import image_size, same_proportions
 from beags_plugin.data.ground_truth import GroundTruth
 from beags_plugin.evaluation.records import EvalView
 from beags_plugin.labels.class_ids import IGNORE, resize_nearest
-from beags_plugin.labels.classes import read_binary_mask, read_mask
+from beags_plugin.labels.classes import read_mask, read_object_mask
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system.errors import UserError
@@ -82,8 +82,9 @@ class HeldOutViews(Sequence[EvalView]):
         if file is not None:
             ids = read_mask(file, kind, self._metadata["ignore_ids"])
             visible = torch.from_numpy(self._straight(file, ids, index).astype(np.int32))
-        silhouettes = self._per_object(truth["silhouettes"], index)
-        seen = self._per_object(truth["seen"], index)
+        silhouettes, unknown_silhouettes = self._per_object(truth["silhouettes"], index)
+        visible_objects, unknown_visible = self._per_object(truth["visible"], index)
+        seen, _ = self._per_object(truth["seen"], index)
         seen = {c: _of_size(mask, silhouettes[c]) for c, mask in seen.items() if c in silhouettes}
         return EvalView(
             view.camera,
@@ -92,18 +93,24 @@ class HeldOutViews(Sequence[EvalView]):
             silhouettes or None,
             view.name,
             seen or None,
-            self._per_object(truth["visible"], index) or None,
+            visible_objects or None,
             {c: self._picture(file, index) for c, file in self._files(truth["removed"], index).items()} or None,
-            self._per_object(truth["removed_shown"], index) or None,
+            self._per_object(truth["removed_shown"], index)[0] or None,
+            unknown_silhouettes or None,
+            unknown_visible or None,
         )
 
-    def _per_object(self, files: Mapping[str, Sequence[Path | None]], view: int) -> dict[int, Tensor]:
-        """Read the [h, w] bool masks of a view by object id."""
-        masks = {}
+    def _per_object(
+        self, files: Mapping[str, Sequence[Path | None]], view: int
+    ) -> tuple[dict[int, Tensor], dict[int, Tensor]]:
+        """Read the [h, w] bool masks of a view by object id, and what of them cannot be told, if anything."""
+        masks, unknown = {}, {}
         for class_id, file in self._files(files, view).items():
-            ids = self._straight(file, read_binary_mask(file).astype(np.uint16), view)
-            masks[class_id] = torch.from_numpy((ids != 0) & (ids != IGNORE))  # outside the lens is IGNORE
-        return masks
+            ids = self._straight(file, read_object_mask(file), view)
+            masks[class_id] = torch.from_numpy(ids == 1)
+            if (untold := ids == IGNORE).any():  # outside the lens too
+                unknown[class_id] = torch.from_numpy(untold)
+        return masks, unknown
 
     def _files(self, files: Mapping[str, Sequence[Path | None]], view: int) -> dict[int, Path]:
         """Return object id to its file of a view, for those that have one."""
