@@ -51,7 +51,8 @@ COLUMNS: tuple[tuple[str, tuple[str, ...], int, float], ...] = (
 """Head, figures, digits, factor; a column without figures is left out."""
 _SOURCE = ("experiment", "preset", "reference", "command", "commit", "machine", "torch", "busy", "quick", "protocol")
 _ROW = ("scene", "seed", "variant", "failed", "failures", "error_left", "lost_biou", "shown_after", "ssim_after",
-        "rendered_iou_after", "rendered_biou_after", "removal_ssim_after", "removal_remains_after", "steps",
+        "rendered_iou_after", "rendered_biou_after", "extracted_spill_before", "extracted_spill_after",
+        "psnr_fit_before", "psnr_fit_after", "removal_ssim_after", "removal_remains_after", "steps",
         "cpu_seconds", "cpu_seconds total", "own_memory_mb", "peak_memory_mb", "objects")  # fmt: skip
 _OF_OBJECTS = "extracted_biou_after"
 

@@ -26,7 +26,7 @@ from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.progress import progress_bar
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
-TABLE_WIDTH = 220  # a narrow terminal breaks the lines, which is better than cells that are cut short
+TABLE_WIDTH = 256  # a narrow terminal breaks the lines, which is better than cells that are cut short
 QUICK_SAMPLE = {"width": 96, "height": 72, "num_train": 16, "num_test": 3}
 QUICK_BASE = {"base_steps": 220, "schedule_steps": 0, "densify.start": 50, "densify.stop": 180}
 QUICK_REFINE = {"refine_steps": 10}

@@ -17,6 +17,8 @@ _COLUMNS = (  # head, figure, digits, factor
     ("\nBIoU", "extracted_biou_after", 1, 100.0),
     ("worst object\nBIoU", "worst_biou_after", 1, 100.0),
     ("\nlost", "lost_biou", 1, 100.0),
+    ("spill, %\nbefore", "extracted_spill_before", 1, 100.0),
+    ("\nafter", "extracted_spill_after", 1, 100.0),
     ("rendered\nIoU", "rendered_iou_after", 1, 100.0),
     ("\nBIoU", "rendered_biou_after", 1, 100.0),
     ("removal\nPSNR", "removal_psnr_after", 2, 1.0),
@@ -24,6 +26,8 @@ _COLUMNS = (  # head, figure, digits, factor
     ("\nremains", "removal_remains_after", 1, 100.0),
     ("PSNR, dB\nbefore", "psnr_before", 2, 1.0),
     ("\nafter", "psnr_after", 2, 1.0),
+    ("fit, dB\nbefore", "psnr_fit_before", 2, 1.0),
+    ("\nafter", "psnr_fit_after", 2, 1.0),
     ("shown, dB\nbefore", "psnr_shown_before", 2, 1.0),
     ("\nafter", "psnr_shown_after", 2, 1.0),
     ("\n%", "shown_after", 1, 100.0),
@@ -50,6 +54,8 @@ def tables(experiment: Experiment, rows: Sequence[ResultRow]) -> list[Table | st
     if experiment.paper is not None:
         printed.append(paper_table(experiment.paper, experiment.reference))
     printed.append("Worst object: the lowest extracted BIoU; lost: the most that an object loses by refinement.")
+    printed.append("Spill: what an object drawn alone covers beyond a margin around its truth, in % of the truth.")
+    printed.append("Fit: PSNR after the affine map of colours that fits each photo best.")
     printed.append("Objects: PSNR over the pixels of objects, but those next to the background.")
     printed.append("Seconds of stages are wall time; CPU: of the whole trial after its base, all threads.")
     printed.append("Memory: the peak of the trial's process, and what of it the loaded program does not take.")

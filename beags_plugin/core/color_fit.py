@@ -38,6 +38,6 @@ def affine_color_fit(rendered: Tensor, photo: Tensor, where: Tensor | None = Non
 
 
 def apply_affine(colors: Tensor, affine: Tensor) -> Tensor:
-    """Return the colours [..., 3] under an affine map [3, 4], in the colours' dtype and on their device; not clamped."""
+    """Return the colours [..., 3] under an affine map [3, 4], in the colours' dtype, not clamped."""
     affine = affine.to(colors)
     return colors @ affine[:, :3].T + affine[:, 3]

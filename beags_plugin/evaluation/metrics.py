@@ -13,21 +13,24 @@ import numpy as np
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.labels.class_ids import resize_nearest
 
-METRICS = ("acc", "iou", "biou")
+AGREEMENT = ("acc", "iou", "biou")
+METRICS = (*AGREEMENT, "spill")
 REMOVAL_METRICS = ("psnr", "psnr_shown", "shown", "ssim", "remains")
 
 
 @dataclass(frozen=True)
 class MaskMetrics:
-    """Agreement of one predicted mask with its truth, or a mean of it; each in 0..1, higher is better.
+    """Agreement of one predicted mask with its truth, or a mean of it.
 
-    acc: pixel accuracy. iou: intersection over union. biou: IoU of the inner boundary bands. None: nothing to compare,
-    as where both masks are empty; it is left out of means.
+    acc: pixel accuracy. iou: intersection over union. biou: IoU of the inner boundary bands. Each is in 0..1, higher is
+    better. spill: see ``spill``; 0 or more, lower is better. None: nothing to compare, as where both masks are empty;
+    it is left out of means.
     """
 
     acc: float | None
     iou: float | None
     biou: float | None
+    spill: float | None = None
 
 
 @dataclass(frozen=True)
@@ -86,10 +89,10 @@ def compared_masks(
 
 
 def mask_metrics(prediction: Any, truth: Any, ignore: Any = None, protocol: Protocol | None = None) -> MaskMetrics:
-    """Return Acc, IoU and BIoU of a mask (method, section 8).
+    """Return Acc, IoU, BIoU and spill of a mask (method, section 8).
 
     prediction: [H', W'] bool array or tensor. truth: [H, W] bool. ignore: [H, W] bool or None; True pixels count
-    nowhere. A mask that is empty in truth and prediction is not scored: all three are None. Raises ``ValueError`` for
+    nowhere. A mask that is empty in truth and prediction is not scored: all are None. Raises ``ValueError`` for
     masks that are not two-dimensional and for an ``ignore`` of another size than the truth.
     """
     protocol = protocol or Protocol()
@@ -100,13 +103,28 @@ def mask_metrics(prediction: Any, truth: Any, ignore: Any = None, protocol: Prot
         return np.count_nonzero(a & b & counted) / union if union else None
 
     if not ((predicted | true) & counted).any():
-        return MaskMetrics(None, None, None)
+        return MaskMetrics(None, None, None, None)
     d = band_width(true.shape[0], true.shape[1], protocol.band_share)
     return MaskMetrics(
         acc=np.count_nonzero((predicted == true) & counted) / np.count_nonzero(counted),
         iou=iou(predicted, true),
         biou=iou(boundary_band(predicted, d), boundary_band(true, d)),
+        spill=spill(predicted, true, counted, d),
     )
+
+
+def spill(predicted: np.ndarray, true: np.ndarray, counted: np.ndarray, margin: float) -> float | None:
+    """Return the area of a mask that lies far outside of the truth, as a share of the truth's area; None without truth.
+
+    predicted, true, counted: [H, W] bool, as ``compared_masks`` returns them. margin: pixels; what lies at most so far
+    from a pixel of ``true``, centre to centre, is no spill. Only counted pixels enter both areas.
+    """
+    area = np.count_nonzero(true & counted)
+    if area == 0:
+        return None
+    distance = cv2.distanceTransform((~true).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    squared = np.rint(np.square(distance, dtype=np.float64))  # whole numbers, but for OpenCV's rounding of the root
+    return np.count_nonzero(predicted & counted & (squared > margin**2)) / area
 
 
 def psnr(a: Any, b: Any) -> float:

@@ -22,7 +22,8 @@ class Protocol:
     data_set_average: Literal["scenes", "pooled"] = "scenes"
     """Mean of several scenes: over the means of the scenes; or as if all views were of one scene."""
     band_share: float = 0.02
-    """Width of the boundary band, as a share of the image diagonal; at least one pixel."""
+    """Width of the boundary band, and margin outside of a mask before an object spills, as a share of the image
+    diagonal; at least one pixel."""
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that cannot be used."""

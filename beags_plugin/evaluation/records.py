@@ -9,19 +9,25 @@ from typing import Literal
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.evaluation.metrics import METRICS, REMOVAL_METRICS, MaskMetrics, RemovalMetrics
+from beags_plugin.evaluation.metrics import AGREEMENT, METRICS, REMOVAL_METRICS, MaskMetrics, RemovalMetrics
 
 MaskKind = Literal["extracted", "seen", "rendered"]
 MASK_KINDS: tuple[MaskKind, ...] = ("extracted", "seen", "rendered")
 """extracted: the object rendered alone. seen: the same over the parts that training photos show, where the data says
 which. rendered: the object's share of the whole scene."""
 Kind = MaskKind | Literal["removal"]
-FIGURES: dict[Kind, tuple[str, ...]] = {**dict.fromkeys(MASK_KINDS, METRICS), "removal": REMOVAL_METRICS}
-"""The names of the figures of each kind. removal: the scene rendered without the object, where the data has an exact
-picture of that."""
+FIGURES: dict[Kind, tuple[str, ...]] = {
+    "extracted": METRICS,
+    "seen": METRICS,
+    "rendered": AGREEMENT,
+    "removal": REMOVAL_METRICS,
+}
+"""The names of the figures of each kind. Spill is of objects drawn alone. removal: the scene rendered without the
+object, where the data has an exact picture of that."""
 KINDS = tuple(FIGURES)
-IMAGE_FIGURES = ("psnr", "psnr_shown", "shown", "psnr_objects", "ssim")
-"""Of whole images. psnr_shown: over the pixels whose surface some training photo shows; shown: their share.
+IMAGE_FIGURES = ("psnr", "psnr_fit", "psnr_shown", "shown", "psnr_objects", "ssim")
+"""Of whole images. psnr_fit: after the affine map of colours that fits the photo best, one a photo, clamped to 0..1.
+psnr_shown: over the pixels whose surface some training photo shows; shown: their share.
 psnr_objects: over the pixels of any object but those next to the background."""
 
 
@@ -49,14 +55,14 @@ class EvalView:
     visible_objects: Mapping[int, Tensor] | None = None
     removed: Mapping[int, Tensor] | None = None
     removed_shown: Mapping[int, Tensor] | None = None
+    unknown_silhouettes: Mapping[int, Tensor] | None = None
+    unknown_visible: Mapping[int, Tensor] | None = None
 
 
 @dataclass(frozen=True)
 class ObjectMetrics:
     """The metrics of each kind; None where there was nothing to compare with."""
 
-    unknown_silhouettes: Mapping[int, Tensor] | None = None
-    unknown_visible: Mapping[int, Tensor] | None = None
     extracted: MaskMetrics | None
     rendered: MaskMetrics | None
     seen: MaskMetrics | None = None
@@ -90,6 +96,7 @@ class ViewRecord:
     psnr_shown: float | None = None
     shown: float | None = None
     psnr_objects: float | None = None
+    psnr_fit: float | None = None
 
 
 @dataclass(frozen=True)
@@ -112,3 +119,4 @@ class SceneMetrics:
     psnr_shown: float | None = None
     shown: float | None = None
     psnr_objects: float | None = None
+    psnr_fit: float | None = None

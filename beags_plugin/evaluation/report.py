@@ -59,7 +59,7 @@ class RunMetrics:
         """Return the run as plain values for ``json.dump``; a figure that does not exist or is infinite is None.
 
         {"scene", "config", "protocol": {choice: value}, "extracted_truth", "notes": [sentence], "mean": {"extracted":
-        {"before": {"acc", "iou", "biou"}, "after": {...}}, "seen": {...}, "rendered": {...}, "removal": {"before":
+        {"before": {``FIGURES``}, "after": {...}}, "seen": {...}, "rendered": {...}, "removal": {"before":
         {``REMOVAL_METRICS``}, "after": {...}}}, "objects": {name: as mean}, "worst": name, "masks": [{"kind",
         "object", "view", "truth", "before": as in mean, "after": {...}}], "views": [{"view"}]}, and {"before", "after"}
         of every one of ``IMAGE_FIGURES`` in itself and in each view.
@@ -191,7 +191,7 @@ def _comparable(runs: Sequence[RunMetrics], has: Callable[[SceneMetrics], Any]) 
 
 
 def plain_metrics(kind: Kind, metrics: Any) -> dict[str, float | None]:
-    """Return the metrics of a kind by name, such as {"acc", "iou", "biou"}, each a float or None."""
+    """Return the metrics of a kind by name, such as {"acc", "iou", "biou", "spill"}, each a float or None."""
     return {name: None if metrics is None else finite(getattr(metrics, name)) for name in FIGURES[kind]}
 
 

@@ -10,11 +10,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from beags_plugin.core.color_fit import affine_color_fit, apply_affine
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import mask_metrics, mean, mean_metrics, psnr
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import (
+    FIGURES,
     IMAGE_FIGURES,
     KINDS,
     MASK_KINDS,
@@ -73,12 +75,15 @@ def evaluate_scene(
             for kind in MASK_KINDS if complete else ("extracted", "seen"):
                 for class_id, mask in renderer.masks(kind, objects).items():
                     metrics = mask_metrics(mask.prediction, mask.truth, mask.ignore, protocol)
+                    if "spill" not in FIGURES[kind]:
+                        metrics = replace(metrics, spill=None)
                     masks.append(MaskRecord(kind, class_id, index, mask.source, metrics))
             image = ViewRecord(view.name, None, None)
             if complete and view.image is not None:
                 color, photo = renderer.image(surfels, background), view.image.to(surfels.means)
                 if not objects_alone:
-                    image = ViewRecord(view.name, psnr(color, photo), float(ssim(color, photo)))
+                    plain, fitted = psnr(color, photo), psnr_after_fit(color, photo)
+                    image = ViewRecord(view.name, plain, float(ssim(color, photo)), psnr_fit=fitted)
                 if (of_objects := object_pixels(view)) is not None and of_objects.any():
                     image = replace(image, psnr_objects=psnr(color[of_objects], photo[of_objects]))
                 if shown is not None and not objects_alone:
@@ -107,6 +112,15 @@ def evaluate_scene(
         views=tuple(images),
         **{name: mean(getattr(image, name) for image in images) for name in IMAGE_FIGURES},
     )
+
+
+def psnr_after_fit(rendered: Tensor, photo: Tensor) -> float:
+    """Return the PSNR in dB of a rendering after its best affine colour fit to the photo, clamped to 0..1.
+
+    rendered, photo: [H, W, 3] float in 0..1. A difference of exposure or white balance alone costs nothing.
+    """
+    fitted = apply_affine(rendered.double(), affine_color_fit(rendered, photo))
+    return psnr(fitted.clamp(0, 1), photo)
 
 
 def average(masks: Iterable[MaskRecord], kind: Kind, protocol: Protocol, scene: Hashable = 0) -> Any:

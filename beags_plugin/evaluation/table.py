@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from beags_plugin.evaluation.metrics import METRICS
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import FIGURES, KINDS, MASK_KINDS, ObjectMetrics
 from beags_plugin.evaluation.removal import TELLING
@@ -16,8 +15,9 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 _HEADINGS = {"acc": "Acc", "iou": "IoU", "biou": "BIoU", "psnr": "PSNR", "ssim": "SSIM", "remains": "remains"}
-_HEADINGS |= {"psnr_shown": "shown", "shown": "pixels", "psnr_objects": "objects"}
-_IN_IMAGES = ("psnr", "psnr_shown", "psnr_objects", "ssim")
+_HEADINGS |= {"psnr_shown": "shown", "shown": "pixels", "spill": "spill"}
+_IN_IMAGES = {"psnr": "\nPSNR", "psnr_fit": "after\ncolour fit", "psnr_shown": "\nshown", "psnr_objects": "\nobjects"}
+_IN_IMAGES |= {"ssim": "\nSSIM"}
 _STAGE_NAMES = {"before": "assigned", "after": "refined"}  # in summary.json
 _Row = tuple[str, Mapping[str, Any], Mapping[str, Any] | None]
 """A row's name, its metrics {kind: {stage: {metric: value}}}, and its ``IMAGE_FIGURES`` or None."""
@@ -32,7 +32,7 @@ def summary_json(run: RunMetrics, seconds: Mapping[str, float], peak_memory_mb: 
     """Return the summary of one run as plain values for ``json.dump``; a missing or infinite figure is None.
 
     seconds: stage to wall time. peak_memory_mb: of the whole process, MB of 10^6 bytes. {"mean": {"extracted":
-    {"assigned": {"acc", "iou", "biou"}, "refined": {...}}, ...}, "objects": {name: as mean}, "psnr":
+    {"assigned": {"acc", "iou", "biou", "spill"}, "refined": {...}}, ...}, "objects": {name: as mean}, "psnr":
     {"before", "after"}, "seconds": {stage: s}, "peak_memory_mb": n}.
     """
     content = run.to_json()
@@ -68,7 +68,7 @@ def render_run(
     lines = []
     share = _cell("shown", run.after.shown)
     of_images = {
-        "psnr": "PSNR, dB", "psnr_shown": f"PSNR of the {share} % shown, dB",
+        "psnr": "PSNR, dB", "psnr_fit": "PSNR after colour fit, dB", "psnr_shown": f"PSNR of the {share} % shown, dB",
         "psnr_objects": "PSNR inside the objects, dB", "ssim": "SSIM",
     }  # fmt: skip
     for metric, title in of_images.items():
@@ -129,7 +129,7 @@ def protocol_sentence(protocol: Protocol, truths: Iterable[str | None], *, remov
         )
     scenes = "over scenes" if protocol.data_set_average == "scenes" else "of all scenes pooled"
     return (
-        f"Protocol: extracted masks against {truth}; above {protocol.threshold:g}; boundary band "
+        f"Protocol: extracted masks against {truth}; above {protocol.threshold:g}; boundary band and margin of spill "
         f"{100 * protocol.band_share:g} % of the diagonal; the {protocol.resize} is resized; masks empty in truth and "
         f"prediction are left out, IoU and BIoU of those empty in truth alone are 0; means over "
         f"{protocol.scene_average}, then {scenes}.{of_removal}{of_shown}"
@@ -148,8 +148,8 @@ def _meaning(stages: Sequence[Stage]) -> str:
 
 def _mask_table(what: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> RenderableType:
     """Return rows of all kinds of mask metrics per stage, with PSNR and SSIM if any row has images."""
-    columns = [(kind, metric) for kind in MASK_KINDS for metric in METRICS]
-    columns = [c for c in columns if c[0] != "seen" or (c[1] != "acc" and _known(rows, stages, *c))]
+    columns = [(kind, metric) for kind in MASK_KINDS for metric in FIGURES[kind]]
+    columns = [c for c in columns if c[0] != "seen" or (c[1] in ("iou", "biou") and _known(rows, stages, *c))]
     return _table(f"{what}: masks, %{_meaning(stages)}", first, rows, stages, columns)
 
 
@@ -181,8 +181,8 @@ def _table(
         new = index == 0 or columns[index - 1][0] != kind
         heading = _HEADINGS[metric]
         table.add_column(f"{kind if new else ''}\n{heading}", justify="right", min_width=len(kind) if new else 5)
-    for metric in _IN_IMAGES if any(images for *_, images in rows) else ():
-        table.add_column(f"\n{_HEADINGS[metric]}", justify="right")
+    for metric in _IN_IMAGES if any(images for *_, images in rows) else {}:
+        table.add_column(_IN_IMAGES[metric], justify="right")
     for name, row, images in rows:
         for stage in stages:
             cells = [_cell(metric, row[kind][stage][metric]) for kind, metric in columns]

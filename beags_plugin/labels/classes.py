@@ -82,7 +82,7 @@ def _is_picture(values: np.ndarray) -> bool:
 
 
 def read_mask(path: Path | str, kind: str, ignore_ids: Iterable[int] = ()) -> np.ndarray:
-    """Read [H, W] uint16: the class ids of an id image ("ids"), or of a "binary" mask 1 inside, 0 outside, or IGNORE."""
+    """Read [H, W] uint16: the class ids of an id image ("ids"), or 1, 0 or IGNORE of a "binary" mask."""
     return read_object_mask(path) if kind == "binary" else read_id_mask(path, ignore_ids)
 
 

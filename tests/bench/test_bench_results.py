@@ -31,7 +31,7 @@ from beags_plugin.bench.results import (
     report_json,
     table_rows,
 )
-from beags_plugin.bench.run import rows_of
+from beags_plugin.bench.run import TABLE_WIDTH, rows_of
 from beags_plugin.bench.tables import memory_line, per_million_pixels, tables
 from beags_plugin.bench.trials import VariantTrial, plan
 from beags_plugin.evaluation.metrics import RemovalMetrics
@@ -61,6 +61,7 @@ def result(value: float, psnr: float | None = 30.0) -> dict:
             "extracted_truth": "silhouette",
             "mean": masks(value),
             "psnr": {"before": 29.0, "after": psnr},
+            "psnr_fit": {"before": 29.5, "after": 30.25},
             "psnr_shown": {"before": 31.0, "after": 31.25},
             "psnr_objects": {"before": 29.0, "after": 30.5},
             "shown": {"before": 0.75, "after": 0.75},
@@ -156,13 +157,15 @@ def test_the_protocol_is_worded_as_by_beags_eval(rows):
 def test_tables_list_failures_and_mark_the_papers_figures(rows):
     from rich.console import Console
 
-    console = Console(width=200, file=io.StringIO())
+    console = Console(width=TABLE_WIDTH, file=io.StringIO())
     for table in tables(load_experiment("ablation"), rows):
         console.print(table)
     text = console.file.getvalue()
     assert "failed: k = 8 on b: k is 0." in text and "k = 8 (1 of 2 scenes)" in text
     assert "removal" in text and protocol_of(rows) in " ".join(text.split())
-    assert "29.00 30.00 31.00 31.25 75.0" in " ".join(text.split())  # PSNR, then shown, share
+    assert "29.00 30.00 29.50 30.25 31.00 31.25 75.0" in " ".join(text.split())  # PSNR, after the fit, shown, share
+    assert text.index("spill,") < text.index("rendered") and "…" not in text
+    assert " -10.0 40.0 50.0 50.0 50.0 0.50" in " ".join(text.split())  # lost, then spill before and after, rendered
     of_removal = [f"removal_{metric}_after" for metric in METRICS["removal"]]
     real = [dataclasses.replace(r, figures={**r.figures, **dict.fromkeys(of_removal)}) for r in rows]  # fmt: skip
     for table in tables(load_experiment("ablation"), real):

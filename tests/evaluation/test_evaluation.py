@@ -18,7 +18,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.evaluation.metrics import MaskMetrics
+from beags_plugin.evaluation.metrics import METRICS, MaskMetrics
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import EvalView, ObjectMetrics, SceneMetrics
 from beags_plugin.evaluation.report import RunMetrics
@@ -38,7 +38,8 @@ from beags_plugin.system.errors import UserError
 
 STRAY = (20.0, 20.0, 2.0)
 IDS = torch.tensor([1, 2, 0], dtype=torch.int32)  # of cup, box and floor
-PERFECT = MaskMetrics(1.0, 1.0, 1.0)
+RENDERED = MaskMetrics(1.0, 1.0, 1.0)
+PERFECT = ObjectMetrics(replace(RENDERED, spill=0.0), RENDERED)
 
 
 def evaluated(squares, ids, *views: EvalView, **options) -> SceneMetrics:
@@ -50,7 +51,7 @@ def test_a_perfect_scene_scores_one():
     silhouettes = {1: square_mask(*CUP), 2: square_mask(*BOX)}
     view = EvalView(camera(), torch.full((SIZE, SIZE, 3), 0.3), truth(), silhouettes)
     metrics = evaluated([CUP, BOX, FLOOR], IDS, view)
-    assert metrics.mean == metrics.objects[1] == metrics.objects[2] == ObjectMetrics(PERFECT, PERFECT)
+    assert metrics.mean == metrics.objects[1] == metrics.objects[2] == PERFECT
     assert metrics.extracted_truth == "silhouette"
     assert metrics.psnr is not None and metrics.psnr > 100
 
@@ -63,6 +64,7 @@ def test_a_stray_gaussian_costs_what_it_covers():
     assert cup.extracted is not None and cup.rendered is not None and metrics.mean.extracted is not None
     assert cup.extracted.iou == pytest.approx(64 / 80)
     assert cup.extracted.acc == pytest.approx(1 - 16 / SIZE**2)
+    assert cup.extracted.spill == 16 / 64 and cup.rendered.spill is None
     assert cup.rendered.iou == 1.0  # the floor lies before the stray one
     assert metrics.mean.extracted.iou == pytest.approx((64 / 80 + 1) / 2)
     assert metrics.psnr is None
@@ -73,7 +75,7 @@ def test_only_labelled_objects_are_scored():
     wrong = torch.full((SIZE, SIZE), 2, dtype=torch.int32)
     metrics = evaluated([CUP, BOX, FLOOR], IDS, EvalView(camera(), None, wrong, visible_objects={1: square_mask(*CUP)}))
     assert metrics.objects == {1: metrics.mean, 2: ObjectMetrics(None, None)}
-    assert metrics.mean == ObjectMetrics(PERFECT, PERFECT) and metrics.extracted_truth == "visible"
+    assert metrics.mean == PERFECT and metrics.extracted_truth == "visible"
 
 
 def test_pixels_of_other_objects_are_left_out_of_extracted_masks():
@@ -157,7 +159,7 @@ SECONDS = {"base": 12.345}
 
 def report(classes: dict[int, str] | None = None) -> RunMetrics:
     def stage(value: float, psnr: float) -> SceneMetrics:
-        one = ObjectMetrics(MaskMetrics(value, value - 0.1, value - 0.2), MaskMetrics(value, value, value))
+        one = ObjectMetrics(MaskMetrics(value, value - 0.1, value - 0.2, 1 - value), MaskMetrics(value, value, value))
         return SceneMetrics(one, {1: one, 2: ObjectMetrics(None, None)}, psnr, "silhouette")
 
     return RunMetrics("lab", "config.yml", Protocol(), classes or CLASSES, stage(0.8, 30.0), stage(0.9, math.inf))
@@ -169,9 +171,9 @@ def test_the_summary_has_the_documented_keys():
     assert set(summary["objects"]) == {"cup", "box"}
     for row in (summary["mean"], summary["objects"]["cup"]):
         assert set(row) == {"extracted", "seen", "rendered", "removal"}
-        assert row["extracted"]["assigned"] == pytest.approx({"acc": 0.8, "iou": 0.7, "biou": 0.6})
+        assert row["extracted"]["assigned"] == pytest.approx({"acc": 0.8, "iou": 0.7, "biou": 0.6, "spill": 0.2})
         assert row["rendered"]["refined"] == pytest.approx({"acc": 0.9, "iou": 0.9, "biou": 0.9})
-    assert summary["objects"]["box"]["extracted"]["refined"] == {"acc": None, "iou": None, "biou": None}
+    assert summary["objects"]["box"]["extracted"]["refined"] == dict.fromkeys(METRICS)
     assert summary["psnr"] == {"before": 30.0, "after": None}  # infinity is no JSON
     assert summary["seconds"] == {"base": 12.345} and summary["peak_memory_mb"] == 812.0
 
@@ -182,7 +184,7 @@ def test_equal_names_stay_apart():
 
 def test_a_run_without_a_former_state_has_no_before():
     content = replace(report(), before=None).to_json()
-    assert content["mean"]["extracted"]["before"] == {"acc": None, "iou": None, "biou": None}
+    assert content["mean"]["extracted"]["before"] == dict.fromkeys(METRICS)
     assert content["mean"]["extracted"]["after"]["acc"] == 0.9 and content["psnr"]["before"] is None
 
 
@@ -190,9 +192,9 @@ def test_the_table_shows_both_stages():
     out = io.StringIO()
     Console(file=out, width=80).print(render_run(report(), SECONDS, 812.0))
     cells = [line.split() for line in out.getvalue().splitlines()]
-    assert ["cup", "before", "80.0", "70.0", "60.0", "80.0", "80.0", "80.0"] in cells
-    assert ["after", "90.0", "80.0", "70.0", "90.0", "90.0", "90.0"] in cells
-    assert ["box", "before", *6 * ["–"]] in cells
+    assert ["cup", "before", "80.0", "70.0", "60.0", "20.0", "80.0", "80.0", "80.0"] in cells
+    assert ["after", "90.0", "80.0", "70.0", "10.0", "90.0", "90.0", "90.0"] in cells
+    assert ["box", "before", *7 * ["–"]] in cells
     assert "worst: cup" in out.getvalue()
     for part in (
         "PSNR, dB: 30.00 → –",

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from beags_plugin.evaluation.metrics import MaskMetrics, band_width, boundary_band, mask_metrics, psnr
+from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.labels.class_ids import resize_nearest
 
 
@@ -36,12 +37,13 @@ def test_hand_computed():
     predicted = mask("#####", "#####", "#####", "#####", ".....")
     # d = 1: the truth's band is all but the 3x3 middle (16 pixels), the prediction's all but a 2x3 one (20 - 6 = 14);
     # they share the top row (5), rows 1 and 2 at both ends (4) and row 3 at both ends (2): 11 of 16 + 14 - 11 = 19.
-    assert mask_metrics(predicted, truth) == MaskMetrics(acc=20 / 25, iou=20 / 25, biou=11 / 19)
+    assert mask_metrics(predicted, truth) == MaskMetrics(acc=20 / 25, iou=20 / 25, biou=11 / 19, spill=0.0)
     truth, predicted = mask("##..", "##..", "....", "...."), mask(".##.", ".##.", "....", "....")
-    empty, perfect = np.zeros_like(truth), MaskMetrics(1.0, 1.0, 1.0)
-    assert mask_metrics(predicted, truth) == MaskMetrics(acc=12 / 16, iou=2 / 6, biou=2 / 6)
+    empty, perfect = np.zeros_like(truth), MaskMetrics(1.0, 1.0, 1.0, 0.0)
+    assert mask_metrics(predicted, truth) == MaskMetrics(acc=12 / 16, iou=2 / 6, biou=2 / 6, spill=0.0)
     assert mask_metrics(torch.from_numpy(predicted), torch.from_numpy(truth)) == mask_metrics(predicted, truth)
-    assert mask_metrics(empty, truth) == mask_metrics(truth, empty) == MaskMetrics(acc=12 / 16, iou=0.0, biou=0.0)
+    assert mask_metrics(empty, truth) == MaskMetrics(acc=12 / 16, iou=0.0, biou=0.0, spill=0.0)
+    assert mask_metrics(truth, empty) == MaskMetrics(acc=12 / 16, iou=0.0, biou=0.0, spill=None)
     assert mask_metrics(truth, truth) == perfect
 
 
@@ -49,8 +51,30 @@ def test_ignored_pixels_leave_every_count():
     truth = mask("##..", "##..", "....", "....")
     predicted = mask("###.", "##..", "....", "...#")
     ignore = mask("..#.", "....", "....", "...#")
-    assert mask_metrics(predicted, truth, ignore) == MaskMetrics(1.0, 1.0, 1.0)
+    assert mask_metrics(predicted, truth, ignore) == MaskMetrics(1.0, 1.0, 1.0, 0.0)
     assert mask_metrics(predicted, truth).iou == 4 / 6
+    assert mask_metrics(predicted, truth).spill == 1 / 4  # the far corner; the pixel beside the mask is within d = 1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_spill_is_what_lies_beyond_the_margin(seed):
+    """By definition, pixel by pixel: further than d from every pixel of the truth, both of counted pixels only."""
+    generator = np.random.default_rng(seed)
+    truth, predicted = np.zeros((40, 60), bool), generator.random((40, 60)) < 0.3
+    truth[12:20, 20:33] = True
+    truth[30, 50] = True
+    ignore = generator.random((40, 60)) < 0.2
+    rows, columns = np.nonzero(truth)
+    y, x = np.mgrid[:40, :60]
+    nearest = np.hypot(y[..., None] - rows, x[..., None] - columns).min(axis=2)
+    for share in (0.02, 0.1):
+        d = max(1, round(share * math.hypot(40, 60)))
+        area = np.count_nonzero(truth & ~ignore)
+        expected = np.count_nonzero(predicted & ~ignore & (nearest > d)) / area
+        assert mask_metrics(predicted, truth, ignore, Protocol(band_share=share)).spill == expected > 0
+    assert mask_metrics(np.ones_like(truth), truth).spill > 5  # a share of the truth's area, not of the mask's
+    assert mask_metrics(~truth & (nearest <= 1.4), truth).spill == 0.0
+    assert mask_metrics(predicted, truth, truth).spill is None  # nothing is left to be a share of
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -75,7 +99,7 @@ def test_resize_is_nearest_and_to_the_truth():
     assert np.array_equal(resize_nearest(small, 4, 6), np.kron(small, np.ones((2, 3), bool)))
     assert np.array_equal(resize_nearest(np.kron(small, np.ones((2, 3), bool)), 2, 2), small)
     truth = np.kron(small, np.ones((5, 5), bool))
-    assert mask_metrics(small, truth) == MaskMetrics(1.0, 1.0, 1.0)
+    assert mask_metrics(small, truth) == MaskMetrics(1.0, 1.0, 1.0, 0.0)
     # Centres of 3 pixels over 5: 0.83, 2.5, 4.17.
     assert np.array_equal(resize_nearest(np.arange(5)[None], 1, 3), [[0, 2, 4]])
 

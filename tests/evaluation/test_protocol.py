@@ -126,9 +126,9 @@ def records(seed: int, views: int, objects: int) -> list[MaskRecord]:
         for class_id in range(1, objects + 1):
             for kind in ("extracted", "rendered"):
                 if presence.random() < 0.75:
-                    acc, iou, biou = generator.random(3).tolist()
+                    acc, iou, biou, spill = generator.random(4).tolist()
                     none = generator.random() < 0.2
-                    figures = MaskMetrics(acc, None if none else iou, biou)
+                    figures = MaskMetrics(acc, None if none else iou, biou, spill)
                     found.append(MaskRecord(kind, class_id, view, "visible", figures))
     return found
 
@@ -218,7 +218,7 @@ def test_a_former_state_that_some_scenes_lack_is_not_averaged():
     protocol = Protocol()
     found = data_set("two", [run(0, 3, 2, protocol), run(1, 3, 2, protocol, before=False)])
     assert set(found.means) == {"after"} and found.images["psnr"]["before"] is None
-    assert found.to_json()["mean"]["extracted"]["before"] == {"acc": None, "iou": None, "biou": None}
+    assert found.to_json()["mean"]["extracted"]["before"] == dict.fromkeys(METRICS)
     with pytest.raises(ValueError, match="one protocol"):
         data_set("two", [run(0, 3, 2, protocol), run(1, 3, 2, Protocol(threshold=0.3))])
 

@@ -234,6 +234,29 @@ def test_the_option_who_is_resized_reaches_the_files(trained):
     )
 
 
+def test_grey_of_traced_truth_counts_nowhere(tmp_path):
+    """Value 128 beside 0 and 255 alone, in silhouettes and in the masks of single objects."""
+    data = write_scene(tmp_path / "lab")
+    values = np.full((HEIGHT, WIDTH), 128, np.uint8)
+    values[:, : WIDTH // 2], values[4:9, 4:9] = 0, 255
+    for kind in ("silhouettes", "visible"):
+        write_image(data / f"ground_truth/{kind}/cup/v00.png", values)
+    config = write_trained(tmp_path / "run", data)
+    view = EvaluatedRun(config).views[0]
+    for masks, unknown in (
+        (view.silhouettes, view.unknown_silhouettes),
+        (view.visible_objects, view.unknown_visible),
+    ):
+        assert masks is not None and unknown is not None and list(masks) == list(unknown) == [1]
+        assert np.array_equal(masks[1], values == 255) and np.array_equal(unknown[1], values == 128)
+    alone = rendered(config, discs()[0][discs()[1] == 1], 0).alpha.numpy() > 0.5
+    told = values != 128
+    (mask,) = (m for m in evaluate_run(config).after.masks if m.kind == "extracted" and m.view == 0)
+    assert mask.metrics.iou == (alone & (values == 255)).sum() / ((alone | (values == 255)) & told).sum() > 0
+    view = EvaluatedRun(write_trained(tmp_path / "second", write_scene(tmp_path / "plain", truth_factor=2))).views[0]
+    assert view.silhouettes is not None and view.unknown_silhouettes is None and view.unknown_visible is None
+
+
 def test_data_that_has_gone_and_truth_of_other_proportions_are_refused(tmp_path):
     data = write_scene(tmp_path / "lab", truth_factor=2)
     write_image(data / "ground_truth/masks/v08.png", np.zeros((2 * HEIGHT, WIDTH), np.uint8))

@@ -1,0 +1,82 @@
+"""PSNR after the best affine colour fit: what exposure and white balance alone change costs nothing."""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from known_masks import BOX, CLASSES, CUP, FLOOR, SETTINGS, SIZE, Squares, camera, scene, square_mask
+from rich.console import Console
+
+from beags_plugin.core.membership import Membership
+from beags_plugin.evaluation.protocol import Protocol
+from beags_plugin.evaluation.records import EvalView, SceneMetrics
+from beags_plugin.evaluation.report import CSV_COLUMNS, RunMetrics, data_set
+from beags_plugin.evaluation.run_metrics import evaluate_scene, psnr_after_fit
+from beags_plugin.evaluation.table import render_data_set, render_run
+
+COLORS = torch.tensor([[0.9, 0.1, 0.4], [0.2, 0.7, 0.3], [0.5, 0.5, 0.8]])  # of cup, box and floor
+IDS = torch.tensor([1, 2, 0], dtype=torch.int32)
+
+
+def evaluated(photo: torch.Tensor) -> SceneMetrics:
+    surfels = scene([CUP, BOX, FLOOR])
+    surfels = replace(surfels, sh_dc=(COLORS - 0.5) / 0.28209479177387814)
+    return evaluate_scene(surfels, Membership(IDS), Squares(), SETTINGS, [EvalView(camera(), photo)], CLASSES)
+
+
+def warm_photo() -> torch.Tensor:
+    """Return what is drawn, darker and warmer."""
+    photo = torch.zeros(SIZE, SIZE, 3)
+    for square, color in zip((FLOOR, BOX, CUP), COLORS.flip(0), strict=True):
+        photo[square_mask(*square)] = color * torch.tensor([0.8, 0.6, 0.4]) + 0.05
+    return photo
+
+
+def test_exposure_and_white_balance_are_fitted_away_and_nothing_else():
+    photo = warm_photo()
+    metrics = evaluated(photo)
+    assert metrics.psnr < 15 and metrics.psnr_fit == metrics.views[0].psnr_fit > 100
+    photo[:2, :2, 0] += 0.4  # four pixels show something else
+    metrics, error = evaluated(photo), 4 * 0.4**2 / (3 * SIZE**2)
+    assert metrics.psnr < 15 and metrics.psnr_fit == pytest.approx(-10 * math.log10(error), abs=0.1)
+
+
+def test_a_rendering_of_one_colour_is_fitted_to_the_mean():
+    photo = torch.rand(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(0))
+    spread = float(photo.double().var(dim=(0, 1), correction=0).mean())
+    assert psnr_after_fit(torch.full_like(photo, 0.5), photo) == pytest.approx(-10 * math.log10(spread))
+
+
+def test_fitted_values_are_clamped():
+    """The line through three greys leaves 0..1, in which all photos lie."""
+    rendered, photo = np.array([0.2, 0.5, 0.8, 0.8]), np.array([0.0, 0.7, 1.0, 1.0])
+    line = np.polyval(np.polyfit(rendered, photo, 1), rendered)
+    assert line.max() > 1.01
+    error = np.mean((line.clip(0, 1) - photo) ** 2)
+    images = (torch.from_numpy(values)[:, None, None].expand(-1, 1, 3) for values in (rendered, photo))
+    assert psnr_after_fit(*images) == pytest.approx(-10 * np.log10(error), abs=1e-4)
+
+
+def test_tables_and_files_say_which_is_which():
+    before, after = evaluated(warm_photo().roll(6, 1)), evaluated(warm_photo().roll(3, 0))
+    run = RunMetrics("lab", "c", Protocol(), CLASSES, before, after)
+    found = data_set("labs", [run, run])
+    content = found.to_json()
+    assert content["psnr_fit"] == content["scenes"][0]["psnr_fit"] == content["scenes"][0]["views"][0]["psnr_fit"]
+    assert content["psnr_fit"] == {"before": before.psnr_fit, "after": after.psnr_fit} != content["psnr"]
+    assert found.csv_rows()[-1][CSV_COLUMNS.index("psnr_fit")] == after.psnr_fit
+    plain, fitted = ([f"{getattr(scene, name):.2f}" for scene in (before, after)] for name in ("psnr", "psnr_fit"))
+    out = io.StringIO()
+    Console(file=out, width=120).print(render_run(run), render_data_set(found))
+    lines = out.getvalue().splitlines()
+    assert f"PSNR after colour fit, dB: {fitted[0]} → {fitted[1]}" in lines
+    upper, lower = next(
+        pair for pair in zip(lines, lines[1:], strict=False) if "colour fit" in pair[1] and "IoU" in pair[1]
+    )
+    assert upper.split()[-1] == "after" and lower.split()[-6:-3] == ["PSNR", "colour", "fit"]
+    assert [line.split()[-5:-3] for line in lines if line.split()[1:2] == ["before"]][-1] == [plain[0], fitted[0]]
