@@ -10,6 +10,8 @@ from beags_plugin.data.dataset import Dataset, FilesOfObject
 from beags_plugin.data.files import files_of_views
 
 FilesPerView = list[Path | None]
+OF_OBJECTS = ("visible", "silhouettes", "seen", "removed", "removed_shown")
+"""Folders of exact masks and pictures with a folder for each object."""
 
 
 class GroundTruth(TypedDict):
@@ -44,7 +46,7 @@ def of_views(truth: GroundTruth, chosen: Sequence[int]) -> GroundTruth:
     )
 
 
-def find_ground_truth(folder: Path, dataset: Dataset, images: Sequence[Path], images_root: Path) -> GroundTruth | None:
+def find_ground_truth(dataset: Dataset, folder: Path, images: Sequence[Path], images_root: Path) -> GroundTruth | None:
     """Find the exact masks and pictures in ``folder`` and those of the layout; None without any.
 
     ``folder`` holds masks/<stem>.png, and <kind>/<object>/<stem>.png for the other kinds.
@@ -67,4 +69,25 @@ def find_ground_truth(folder: Path, dataset: Dataset, images: Sequence[Path], im
         seen=per_object("seen", {}),
         removed=per_object("removed", {}),
         removed_shown=per_object("removed_shown", {}),
+    )
+
+
+def stray_note(folder: Path, images: Sequence[Path], images_root: Path) -> str | None:
+    """Return a sentence about the files in ``folder`` that have the name of no image; None without such files.
+
+    images: those with a pose, by whose names ``files_of_views`` finds the files.
+    """
+    places = [folder / "masks", *(path for kind in OF_OBJECTS for path in (folder / kind).glob("*") if path.is_dir())]
+    present = {path for place in places for path in place.rglob("*.png")}
+    strays = sorted(present - {path for place in places for path in files_of_views(place, images, images_root)})
+    if not strays:
+        return None
+    if len(strays) == len(present):
+        return (
+            f"No exact mask in {folder} has the name of a photo here ({images[0].stem}.png, ...), so none counts: name "
+            f"them as their photos, or remove them if they are of another scene."
+        )
+    return (
+        f"{len(strays)} of the {len(present)} files in {folder} have the name of no photo that has a pose, and do not "
+        f"count, {strays[0].relative_to(folder)} among them: name them as their photos, or remove them."
     )

@@ -8,8 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-from data_folders import noise, write_image
+from data_folders import HEIGHT, noise, write_image
 
 from mistakes.table import SHORT, Place, beags_after, mistake, mistakes
 
@@ -251,6 +252,15 @@ mistakes(
     {
         "a held-out view that does not exist": replaced(f"{HELD_OUT}[]", f"{HELD_OUT}[nobody]", EVAL),
         "no held-out views": beags_after(hold_nothing_out, EVAL),
+        "a silhouette of other proportions": beags_after(
+            lambda at: write_image(
+                at.data / "ground_truth/silhouettes/cup/v00.png", np.zeros((HEIGHT, HEIGHT), np.uint8)
+            ),
+            EVAL,
+        ),
+        "a silhouette that is a photo": beags_after(
+            lambda at: write_image(at.data / "ground_truth/silhouettes/cup/v00.png", noise(0)), EVAL
+        ),
         "a picture of an unknown kind": lambda at: at.beags(f"{EVAL} --picture worst.txt"),
     },
 )

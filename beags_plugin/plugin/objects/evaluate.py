@@ -140,6 +140,8 @@ class EvaluatedRun:
             yield "This run was trained on the objects' pixels alone, so only these are scored."
         elif "before" not in self.stages:
             yield "This run has kept no state before refinement, so there is nothing to compare with."
+        if self.views.stray_truth is not None:
+            yield self.views.stray_truth
         if trained_on := self.views.trained_on():
             yield f"{trained_on} of these {len(self.views)} views were trained on, so the figures flatter the run."
 

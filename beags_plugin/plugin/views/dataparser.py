@@ -18,7 +18,7 @@ from tyro.conf import Suppress
 
 from beags_plugin.data.dataset import ColmapModel, Dataset, MaskKind, TransformsFile
 from beags_plugin.data.files import check_same_size, files_of_views, image_size
-from beags_plugin.data.ground_truth import find_ground_truth, of_views
+from beags_plugin.data.ground_truth import find_ground_truth, of_views, stray_note
 from beags_plugin.data.labels import read_class_names
 from beags_plugin.data.layout import read_dataset
 from beags_plugin.data.split import split_views
@@ -105,7 +105,8 @@ class BeagsDataParser(DataParser):
     Metadata of its outputs, per view of the split where it is a list: ``points3D_xyz`` [P, 3] float32 in the world
     of the cameras, ``points3D_rgb`` [P, 3] uint8, ``points3D_random`` bool, ``classes`` dict id -> name,
     ``mask_filenames`` list of Path or None, ``mask_kind`` (see ``data.dataset.MaskKind``), ``no_truth`` (the file that
-    says so of the masks) or None, ``ignore_ids``, ``ground_truth`` (see ``data.ground_truth.GroundTruth``) or None.
+    says so of the masks) or None, ``ignore_ids``, ``ground_truth`` (see ``data.ground_truth.GroundTruth``) or None,
+    ``stray_truth`` (a sentence about exact masks of no view) or None.
     """
 
     config: BeagsDataParserConfig
@@ -173,6 +174,7 @@ class BeagsDataParser(DataParser):
             )
         check_same_size(masks, sizes)
         present = [mask for mask in masks if mask is not None and kind == "ids"]
+        truth = (scene.root / config.ground_truth_path, views.images, _images_root(scene))
         classes_file = scene.root / config.classes_path
         self._check_named(folder, classes_file)
         known = (scene.class_names, scene.class_names_file)
@@ -183,9 +185,8 @@ class BeagsDataParser(DataParser):
             "mask_kind": kind,
             "no_truth": folder / NO_TRUTH if (folder / NO_TRUTH).exists() else None,
             "ignore_ids": tuple(config.ignore_ids),
-            "ground_truth": find_ground_truth(
-                scene.root / config.ground_truth_path, scene, views.images, _images_root(scene)
-            ),
+            "ground_truth": find_ground_truth(scene, *truth),
+            "stray_truth": stray_note(*truth),
         }
 
     def _check_named(self, masks: Path, classes: Path) -> None:
@@ -247,6 +248,8 @@ class BeagsDataParser(DataParser):
                 f"Exact masks of {', '.join(map(repr, unknown))} do not count, as no class is called so: "
                 f'name the classes in {scene.root / self.config.classes_path}, {{"id": "name"}}.'
             )
+        if (stray := self._metadata["stray_truth"]) is not None:
+            notes.append(stray)
         masks = self._metadata["mask_filenames"]
         points = "random" if self._metadata["points3D_random"] else len(self._metadata["points3D_xyz"])
         line = (

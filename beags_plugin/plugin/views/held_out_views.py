@@ -60,6 +60,11 @@ class HeldOutViews(Sequence[EvalView]):
         """Return the file that says that a program drew the data's own masks; None where they count as truth."""
         return self._metadata["no_truth"]
 
+    @property
+    def stray_truth(self) -> str | None:
+        """Return a sentence about exact masks that belong to no view of the data; None without any."""
+        return self._metadata["stray_truth"]
+
     def trained_on(self) -> int:
         """Return the number of these views that are training views too."""
         trained = set(self.manager.train_dataset.image_filenames)

@@ -151,6 +151,18 @@ def test_notes_name_missing_masks_and_views_that_were_trained_on(tmp_path):
     assert len(notes) == 2 and "no state before refinement" in notes[0] and "9 of these 9 views" in notes[1]
 
 
+def test_notes_name_truth_of_another_scene(tmp_path, capsys):
+    config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab", truth_factor=2))
+    folder = tmp_path / "lab/ground_truth/silhouettes/cup"
+    for path in sorted(folder.iterdir()):
+        path.rename(path.with_stem(f"other_{path.stem}"))
+    main(["eval", "--load-config", str(config)])
+    printed = " ".join(capsys.readouterr().out.split())
+    (note,) = evaluate_run(config).notes
+    assert note in printed and f"2 of the 4 files in {tmp_path}/lab/ground_truth have the name of no photo" in note
+    assert "silhouettes/cup/other_v00.png among them" in note
+
+
 def test_an_extracted_object_is_scored_alone(trained, tmp_path):
     whole = evaluate_run(trained)
     for removed, object_scored in ((False, 1), (True, 2)):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pytest
 import torch
 from run_folders import write_scene
@@ -22,3 +24,37 @@ def test_masks_that_a_program_made_of_all_photos_are_trained_on_but_are_no_truth
     views = HeldOutViews(manager, {0: "background", 1: "cup", 2: "box"}, torch.zeros(3))
     assert all((view.visible is not None) == given for view in views) and len(views) > 0
     assert all(view.labels is not None for view in manager.views("train"))
+
+
+def opened(data) -> HeldOutViews:
+    manager = BeagsDataManagerConfig(dataparser=BeagsDataParserConfig(data=data)).setup(device="cpu")
+    return HeldOutViews(manager, {0: "background", 1: "cup", 2: "box"}, torch.zeros(3))
+
+
+def test_truth_without_a_photo_is_named_and_the_rest_counts(tmp_path, capsys):
+    data = write_scene(tmp_path / "lab", truth_factor=2)
+    assert opened(data).stray_truth is None
+    truth = data / "ground_truth"
+    shutil.copy(truth / "silhouettes/cup/v00.png", truth / "silhouettes/cup/w05.png")
+    shutil.copy(truth / "silhouettes/cup/v00.png", truth / "silhouettes/cup/v01.png")  # a training photo has it
+    shutil.copytree(truth / "silhouettes/cup", truth / "visible/box/deep")  # at no photo's path
+    for name in ("v01", "w05"):
+        (truth / f"visible/box/deep/{name}.png").unlink()
+    capsys.readouterr()
+    views = opened(data)
+    note = f"3 of the 8 files in {truth} have the name of no photo that has a pose, and do not count, "
+    assert views.stray_truth == note + "silhouettes/cup/w05.png among them: name them as their photos, or remove them."
+    assert " ".join(views.stray_truth.split()) in " ".join(capsys.readouterr().out.split())  # while training, too
+    assert views[0].silhouettes is not None and list(views[0].silhouettes) == [1]
+
+
+def test_truth_of_another_scene_is_named_and_nothing_ends(tmp_path):
+    data = write_scene(tmp_path / "lab", truth_factor=2)
+    for path in sorted((data / "ground_truth").rglob("*.png")):
+        path.rename(path.with_stem(path.stem.replace("v", "frame_")))
+    views = opened(data)
+    assert views.stray_truth == (
+        f"No exact mask in {data}/ground_truth has the name of a photo here (v00.png, ...), so none counts: name them "
+        "as their photos, or remove them if they are of another scene."
+    )
+    assert views[0].silhouettes is None and views[0].visible is not None  # by the scene's own masks
