@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 MaskKind = Literal["ids", "binary"]
-"""Images of class ids, or binary masks of one object (``labels.classes.read_binary_mask``)."""
+"""Images of class ids, or binary masks of one object (``labels.classes.read_object_mask``)."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ from parsed_views import parse
 
 from beags_plugin.commands import cli
 from beags_plugin.data.downloads import POINTS, points_of, read_nvos
-from beags_plugin.labels.classes import read_binary_mask
+from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.labels.classes import read_binary_mask, read_object_mask
 from beags_plugin.masks.sources.prompts import read_prompts
 from beags_plugin.system.errors import UserError
 
@@ -84,6 +85,15 @@ def test_nvos_is_scored_in_its_view_and_prompts_in_its_reference(fern, nvos, cap
     assert prompted.name == "fern" and 0 < len(prompt.points) <= 2 * POINTS
     for (x, y), inside in zip(prompt.points, prompt.inside, strict=True):  # pixels of the photo, four times as many
         assert 24 <= x <= 60 and (16 <= y <= 28 if inside else 36 <= y <= 48)
+
+
+def test_what_cannot_be_told_is_kept(fern, nvos):
+    mask = 255 * ids(1, 4 * WIDTH, 4 * HEIGHT)
+    mask[:3] = 128
+    write_image(nvos / f"masks/fern/{TARGET}_mask.png", mask)
+    truth("--data", fern, "--nvos", nvos)
+    kept = read_object_mask(fern / f"ground_truth/visible/fern/{TARGET}.png")
+    assert ((kept == IGNORE) == (mask == 128)).all() and ((kept == 1) == (mask == 255)).all() and (mask == 255).any()
 
 
 def test_smaller_copies_are_found_by_the_order_of_the_cameras_names(fern, nvos):

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from beags_plugin.labels.classes import read_binary_mask
+from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.labels.classes import read_object_mask
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo, stacked
 from beags_plugin.masks.sources.matching import files_by_name
 from beags_plugin.system.errors import UserError
@@ -59,9 +60,12 @@ class ObjectImagesSource(MaskSource):
 
     @staticmethod
     def _stack(files: Sequence[tuple[int, Path]]) -> np.ndarray:
-        masks = [(class_id, read_binary_mask(path)) for class_id, path in files]
+        masks = [(class_id, read_object_mask(path)) for class_id, path in files]
         sizes = {mask.shape for _, mask in masks}
         if len(sizes) > 1:
             raise UserError(f"{files[0][1]} and the other objects' masks of this view differ in size: make them alike.")
         height, width = sizes.pop()
-        return stacked(masks, (height, width))
+        labels = stacked([(class_id, mask == 1) for class_id, mask in masks], (height, width))
+        untold = np.any([mask == IGNORE for _, mask in masks], axis=0)
+        labels[untold & (labels == 0)] = IGNORE
+        return labels

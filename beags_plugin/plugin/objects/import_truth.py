@@ -15,7 +15,8 @@ from beags_plugin.data.dataset import ColmapModel
 from beags_plugin.data.downloads import DownloadedObject, Scribbles
 from beags_plugin.data.files import image_size, same_proportions
 from beags_plugin.data.layouts.llff import camera_names
-from beags_plugin.labels.classes import read_binary_mask, write_mask
+from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.labels.classes import UNTOLD, read_object_mask, write_mask
 from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParserConfig
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.whole_files import write_text_atomically
@@ -52,7 +53,8 @@ def import_truth(
                 absent.append(camera)
                 continue
             _check_proportions(file, image_size(file, "the mask"), image)
-            masks[truth / each.name / f"{image.stem}.png"] = np.uint8(255) * read_binary_mask(file)
+            mask = read_object_mask(file)
+            masks[truth / each.name / f"{image.stem}.png"] = np.where(mask == IGNORE, UNTOLD, 255 * (mask == 1))
         if len(absent) == len(each.masks):
             raise UserError(
                 f"no photo of {scene.root} is called {absent[0]}, as a mask of {each.name} is: give --images-path the "

@@ -15,12 +15,12 @@ from parser_targets.target import SIDE, Target
 
 
 def _mask(path: Path) -> None:
-    from beags_plugin.labels.classes import read_binary_mask, read_id_mask
+    from beags_plugin.labels.classes import read_id_mask, read_object_mask
 
     try:
         read_id_mask(path, (255,))
     except UserError:
-        read_binary_mask(path)
+        read_object_mask(path)
 
 
 def _png_files() -> list[bytes]:
