@@ -18,6 +18,7 @@ from beags_plugin.sample.textures import (
     marble,
     sectors,
 )
+from beags_plugin.sample.tracing import hit_fixtures
 
 DOME_RADIUS = 5.0
 """World units; the ground is the disc z = 0 of this radius, closed by the half-dome above it."""
@@ -32,21 +33,24 @@ class Still(Scene):
     """The whole scene, on the ground under a dome.
 
     sun: [3] unit vector towards the light. noise: of the ground and the dome. palette: [4, 3] linear RGB of both.
+    fixtures: belong to the background; fixture i is its part -2 - i.
     """
 
     things: tuple[Thing[Solid], ...]
     sun: np.ndarray
     noise: Noise
     palette: np.ndarray
+    fixtures: tuple[Thing[Solid], ...] = ()
 
     def surround(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return hits of the ground or, beyond its edge, of the dome; the origin must lie inside."""
+        """Return hits of fixtures, the ground or, beyond its edge, the dome; the origin must lie inside."""
         a = dot(directions, directions)
         half_b = dot(directions, origin[None])
         t = (-half_b + np.sqrt(half_b * half_b - a * (origin @ origin - DOME_RADIUS**2))) / a
         with np.errstate(divide="ignore"):
             ground = np.where(directions[:, 2] < 0.0, -origin[2] / directions[:, 2], np.inf)
-        return np.minimum(t, ground), np.where(ground < t, GROUND, DOME).astype(np.int32)
+        part = np.where(ground < t, GROUND, DOME).astype(np.int32)
+        return hit_fixtures(self.fixtures, origin, directions, np.minimum(t, ground), part, DOME - 1)
 
 
 def turn_z(angle: float) -> np.ndarray:

@@ -6,13 +6,13 @@ Everything is decided by the seed and the view's name, so one view's mask does n
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
+from beags_plugin.sample.lots import lowest_lots, view_generator
 from beags_plugin.sample.textures import Noise
 from beags_plugin.system.errors import UserError, check_choice
 
@@ -78,16 +78,10 @@ def resolve_degradation(degradation: str | Degradation) -> Degradation:
     return degradation
 
 
-def _generator(seed: int, view: str, purpose: int) -> np.random.Generator:
-    # crc32, since Python's own string hash differs from run to run.
-    return np.random.default_rng([seed, purpose, zlib.crc32(view.encode())])
-
-
 def dropped_views(names: Sequence[str], seed: int, fraction: float) -> set[str]:
     """Return the ``round(fraction * len(names))`` names, but never all, whose lot (by seed and name) is lowest."""
     count = min(round(fraction * len(names)), len(names) - 1)
-    lots = sorted((float(_generator(seed, name, 3).random()), name) for name in names)
-    return {name for _, name in lots[: max(count, 0)]}
+    return lowest_lots(names, seed, max(count, 0), 3)
 
 
 def rim_amplitude(strength: float, height: int, width: int) -> float:
@@ -104,7 +98,7 @@ def roughen_rims(labels: np.ndarray, amplitude: float, seed: int, view: str) -> 
     if amplitude <= 0.0:
         return labels.copy()
     height, width = labels.shape
-    noise = Noise(_generator(seed, view, 4))
+    noise = Noise(view_generator(seed, view, 4))
     y, x = np.meshgrid(np.arange(height) + 0.5, np.arange(width) + 0.5, indexing="ij")
     cell = max(3.0 * amplitude, 4.0)  # pixels per lattice cell: at least 4, or the boundary turns to salt and pepper
     points = np.stack([x.ravel() / cell, y.ravel() / cell, np.zeros(x.size)], axis=1)
@@ -130,7 +124,7 @@ def swap_pieces(
 
     out = labels.copy()
     swaps = []
-    generator = _generator(seed, view, 5)
+    generator = view_generator(seed, view, 5)
     for class_id in range(1, num_classes):
         # Drawn for absent objects too, so that each object's fate does not depend on the others' presence.
         chance, angle, share, other = generator.random(4)

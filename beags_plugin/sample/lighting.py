@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from beags_plugin.sample.arrangement import DOME, DOME_RADIUS, GROUND, Still, turn_z
-from beags_plugin.sample.solids import dot, turned
+from beags_plugin.sample.scene import Thing
+from beags_plugin.sample.solids import Solid, dot, turned
 from beags_plugin.sample.tracing import seen_share
 
 SUN = np.array([1.22, 1.13, 1.0])
@@ -40,13 +41,14 @@ class Light:
 
     def __init__(self, still: Still, object_samples: int = 8, ground_samples: int = 24) -> None:
         self.still = still
+        self._blockers = (*still.things, *still.fixtures)
         self._suns = _sun_directions(still.sun, object_samples)
         axis = np.linspace(-MAP_EXTENT, MAP_EXTENT, MAP_CELLS)
         x, y = np.meshgrid(axis, axis, indexing="ij")
         points = np.stack([x.ravel(), y.ravel(), np.full(x.size, LIFT)], axis=1)
 
-        self._sun_map = seen_share(still.things, points, _sun_directions(still.sun, ground_samples)).reshape(x.shape)
-        self._sky_map = seen_share(still.things, points, _sky_directions(2 * ground_samples)).reshape(x.shape)
+        self._sun_map = seen_share(self._blockers, points, _sun_directions(still.sun, ground_samples)).reshape(x.shape)
+        self._sky_map = seen_share(self._blockers, points, _sky_directions(2 * ground_samples)).reshape(x.shape)
 
     def _read(self, table: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Read the baked map bilinearly; outside it, its border."""
@@ -100,15 +102,14 @@ class Light:
         colour = palette[2] + weight[:, None] * (palette[3] - palette[2])
         return colour * (0.62 + 0.4 * height + 0.2 * fold)[:, None]
 
-    def _object(self, class_id: int, points: np.ndarray) -> np.ndarray:
-        thing = self.still.things[class_id - 1]
+    def _thing(self, thing: Thing[Solid], points: np.ndarray) -> np.ndarray:
         local = thing.to_local(points)
         normals = turned(thing.solid.normals(local), thing.rotation.T)
         cosine = dot(normals, self.still.sun[None])
         sun = np.zeros(len(points))
         bright = np.flatnonzero(cosine > 0.0)
         lifted = points[bright] + LIFT * normals[bright]
-        sun[bright] = cosine[bright] * seen_share(self.still.things, lifted, self._suns)
+        sun[bright] = cosine[bright] * seen_share(self._blockers, lifted, self._suns)
         # Sky light by tilt, dimmed close to the ground: a cheap stand-in for ambient occlusion.
         sky = (0.62 + 0.38 * normals[:, 2]) * (0.55 + 0.45 * np.clip(points[:, 2] / 0.25, 0.0, 1.0))
         return self._lit(thing.texture(local), sun, sky)
@@ -125,7 +126,8 @@ class Light:
             elif which == GROUND:
                 colours[chosen] = self._ground(points[chosen], center)
             else:
-                colours[chosen] = self._object(int(which), points[chosen])
+                thing = self.still.things[which - 1] if which > 0 else self.still.fixtures[DOME - 1 - which]
+                colours[chosen] = self._thing(thing, points[chosen])
         return colours
 
 

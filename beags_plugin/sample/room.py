@@ -17,7 +17,7 @@ from beags_plugin.sample.room_things import Group, Stock, make_groups, superelli
 from beags_plugin.sample.scene import Contact, Scene, Thing
 from beags_plugin.sample.solids import turned
 from beags_plugin.sample.textures import Noise, linear_from_hsv
-from beags_plugin.sample.tracing import object_hits
+from beags_plugin.sample.tracing import hit_fixtures
 
 SHELL = 0
 SLOTS = ((-0.66, 0.34), (0.66, 0.36), (0.0, 0.0), (-0.58, -0.40), (0.58, -0.38))
@@ -61,12 +61,7 @@ class Room(Scene):
         with np.errstate(divide="ignore", invalid="ignore"):
             t = np.min(np.where(local == 0.0, np.inf, room / local), axis=1)
         part = np.full(len(t), SHELL, dtype=np.int32)
-        for i, fixture in enumerate(self.fixtures):
-            rays, distances = object_hits(fixture, origin, directions)
-            first = distances < t[rays]
-            t[rays[first]] = distances[first]
-            part[rays[first]] = -1 - i
-        return t, part
+        return hit_fixtures(self.fixtures, origin, directions, t, part, SHELL - 1)
 
 
 def make_room(seed: int) -> Room:

@@ -38,6 +38,23 @@ def object_hits(thing: Thing[Any], origin: np.ndarray, directions: np.ndarray) -
     return near[hit], t[hit]
 
 
+def hit_fixtures(
+    fixtures: Sequence[Thing[Any]],
+    origin: np.ndarray,
+    directions: np.ndarray,
+    t: np.ndarray,
+    part: np.ndarray,
+    first_part: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the background's ``t`` and ``part`` [N] with hits of its fixtures; fixture i is ``first_part`` - i."""
+    for i, fixture in enumerate(fixtures):
+        rays, distances = object_hits(fixture, origin, directions)
+        first = distances < t[rays]
+        t[rays[first]] = distances[first]
+        part[rays[first]] = first_part - i
+    return t, part
+
+
 def first_hits(
     scene: Scene, origin: np.ndarray, directions: np.ndarray, without: int | None = None
 ) -> tuple[Hits, list[np.ndarray]]:
