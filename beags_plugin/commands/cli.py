@@ -98,11 +98,20 @@ class Sample:
     family: str = "tabletop"
     """tabletop: plain solids that touch, seen from all sides. turntable: the same, but they turn and the room stands.
     room: a furnished room with textured objects that lean on and stand in one another, seen from one side."""
+    exposure: float = 0.0
+    """The largest difference of a photo's exposure from the mean, in stops (EV), at most 6."""
+    white_balance: float = 0.0
+    """The largest difference of a photo's red from the mean, and of its blue the other way, in stops, at most 6."""
+    moved: int = 0
+    """Views to train on that show something of the background which stands elsewhere in each, and in no other view."""
 
     def run(self) -> None:
         with starting(self):
             from beags_plugin.sample.writer import make_sample
-        make_sample(self.output, self.seed, self.width, self.height, self.degradation, self.views, self.family)
+        make_sample(
+            self.output, self.seed, self.width, self.height, self.degradation, self.views, family=self.family,
+            exposure=self.exposure, white_balance=self.white_balance, moved=self.moved,
+        )  # fmt: skip
         CONSOLE.print(f"sample: {self.output}", markup=False)
 
 

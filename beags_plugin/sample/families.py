@@ -17,15 +17,19 @@ from beags_plugin.sample.views import View, make_views
 
 @dataclass(frozen=True)
 class Family:
-    """scene: from the seed. light: of such a scene, or of one with objects left out. views: as ``make_views``."""
+    """scene: from the seed. light: of such a scene, or of one with objects left out. views: as ``make_views``.
+
+    turns: whether the background stands with the camera while the objects turn.
+    """
 
     scene: Callable[[int], Scene]
     light: Callable[[Any], Lighting]
     views: Callable[[int, int, int, int, int], list[View]]
+    turns: bool = False
 
 
 FAMILIES = {
     "tabletop": Family(make_still, Light, make_views),
-    "turntable": Family(make_still, TurntableLight, make_views),
+    "turntable": Family(make_still, TurntableLight, make_views, turns=True),
     "room": Family(make_room, RoomLight, room_views),
 }

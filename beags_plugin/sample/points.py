@@ -1,30 +1,69 @@
-"""Seed points such as structure from motion would give."""
+"""Seed points such as structure from motion would give, and the photos that show each."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
+from beags_plugin.sample.seen import Photo, shown_in
 from beags_plugin.sample.views import Picture, View
 
 
-def seed_points(view: View, picture: Picture, count: int, noise: float, generator: np.random.Generator) -> np.ndarray:
+@dataclass(frozen=True)
+class SeedPoints:
+    """Seed points of one photo.
+
+    records: [P] of x, y, z (float32, world) and red, green, blue, with noise. places: [P, 3] world, without noise.
+    pixels: [P] of the photo, row by row. on_objects: [P] bool.
+    """
+
+    records: np.ndarray
+    places: np.ndarray
+    pixels: np.ndarray
+    on_objects: np.ndarray
+
+    def paint(self, colours: np.ndarray) -> None:
+        """Give the points colours [P, 3] uint8."""
+        for channel, name in enumerate(("red", "green", "blue")):
+            self.records[name] = colours[:, channel]
+
+
+def seed_points(
+    view: View, picture: Picture, lasting: np.ndarray, count: int, noise: float, generator: np.random.Generator
+) -> SeedPoints:
     """Sample ``count`` visible surface points of a view with noise, half of them on objects, where there are any.
 
-    noise: standard deviation, world units. Returns [count] records of x, y, z (float32, world) and red, green, blue.
+    lasting: [H, W] bool, pixels to sample from. noise: standard deviation, world units.
     """
     labels = picture.labels.ravel()
-    objects, rest = np.flatnonzero(labels > 0), np.flatnonzero(labels == 0)
+    objects, rest = np.flatnonzero(labels > 0), np.flatnonzero((labels == 0) & lasting.ravel())
     on_objects = count // 2 if len(objects) else 0
     on_objects = on_objects if len(rest) else count
     pixels = np.concatenate(
         [generator.choice(pool, n) for pool, n in ((objects, on_objects), (rest, count - on_objects)) if n]
     )
     x, y = pixels % view.width + 0.5, pixels // view.width + 0.5
-    points = view.center + picture.depth.ravel()[pixels, None].astype(np.float64) * view.directions(x, y)
-    points = points + generator.normal(0.0, noise, points.shape)
+    places = view.center + picture.depth.ravel()[pixels, None].astype(np.float64) * view.directions(x, y)
+    points = places + generator.normal(0.0, noise, places.shape)
     records = np.empty(len(pixels), dtype=[(n, "<f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")])
     for axis, name in enumerate("xyz"):
         records[name] = points[:, axis]
-    for channel, name in enumerate(("red", "green", "blue")):
-        records[name] = picture.image.reshape(-1, 3)[pixels, channel]
-    return records
+    found = SeedPoints(records, places, pixels, labels[pixels] > 0)
+    found.paint(picture.image.reshape(-1, 3)[pixels])
+    return found
+
+
+def find_tracks(seeds: Sequence[SeedPoints], photos: Sequence[Photo], turns: bool) -> list[list[int]]:
+    """Return, for all points of ``seeds``, the indices of the photos that show each: its own, and others.
+
+    seeds: of each photo. turns: whether the background stands with the camera, so that points of it do not last.
+    """
+    places = np.concatenate([each.places for each in seeds])
+    own = np.repeat(np.arange(len(seeds)), [len(each.places) for each in seeds])
+    shown = np.stack([shown_in(photo, places) for photo in photos], axis=1)
+    if turns:
+        shown &= np.concatenate([each.on_objects for each in seeds])[:, None]
+    shown[np.arange(len(places)), own] = True  # rounding must not hide a point from the photo that it was sampled from
+    return [np.flatnonzero(row).tolist() for row in shown]

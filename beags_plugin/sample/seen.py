@@ -7,6 +7,7 @@ the silhouette out. Likewise what an object hid can only be put back where some 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
@@ -57,19 +58,41 @@ def seen_part(view: View, surface: np.ndarray, silhouette: np.ndarray) -> np.nda
     return ndimage.binary_closing(np.pad(hit, GAP), np.ones((3, 3)), GAP)[GAP:-GAP, GAP:-GAP] & silhouette
 
 
-def shown_points(scene: Scene, points: np.ndarray, photos: Sequence[tuple[View, np.ndarray]]) -> np.ndarray:
+@dataclass(frozen=True)
+class Photo:
+    """A photo of training: its camera, what stood before it, and its depth [H, W]."""
+
+    view: View
+    scene: Scene
+    depth: np.ndarray
+
+
+def shown_in(photo: Photo, points: np.ndarray) -> np.ndarray:
+    """Return [P] bool: which world points [P, 3] of the scene's surfaces a photo shows."""
+    shown = np.zeros(len(points), dtype=bool)
+    inside = _landing(photo.view, points)[0]
+    shown[inside] = _reached(photo, points[inside])
+    return shown
+
+
+def shown_points(points: np.ndarray, photos: Sequence[Photo]) -> np.ndarray:
     """Return [P] bool: which world points [P, 3] of the scene's surfaces some photo shows.
 
-    photos: each with its depth [H, W], which tells for most points that they are hidden; rays are cast at the others.
+    Depth tells for most points that they are hidden; rays are cast at the others.
     """
     shown = np.zeros(len(points), dtype=bool)
-    for view, surface in photos:
+    for photo in photos:
         rest = np.flatnonzero(~shown)
-        inside, rows, columns, depth = _landing(view, points[rest])
-        near = rest[inside[np.abs(depth - surface[rows, columns]) <= NEAR * depth]]
-        hits, _ = first_hits(scene, view.center, points[near] - view.center)
-        shown[near] = hits.t > 1.0 - SAME
+        inside, rows, columns, depth = _landing(photo.view, points[rest])
+        near = rest[inside[np.abs(depth - photo.depth[rows, columns]) <= NEAR * depth]]
+        shown[near] = _reached(photo, points[near])
     return shown
+
+
+def _reached(photo: Photo, points: np.ndarray) -> np.ndarray:
+    """Return [P] bool: which world points [P, 3] on surfaces nothing hides from the photo's camera."""
+    hits, _ = first_hits(photo.scene, photo.view.center, points - photo.view.center)
+    return hits.t > 1.0 - SAME
 
 
 def _landing(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

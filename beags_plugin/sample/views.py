@@ -121,10 +121,21 @@ def _grid(view: View, samples: int) -> tuple[np.ndarray, np.ndarray]:
     return tuple(a.reshape(shape).transpose(0, 2, 1, 3).reshape(-1) for a in (xx, yy))  # type: ignore[return-value]
 
 
+def pixel_directions(view: View) -> np.ndarray:
+    """Return [H W, 3] world directions through the pixel centres, row by row, of depth 1 along the optical axis."""
+    return view.directions(*_grid(view, 1))
+
+
 def render_image(scene: Scene, light: Lighting, view: View, samples: int) -> np.ndarray:
     """Render [H, W, 3] uint8 sRGB, the mean in linear light over samples x samples rays per pixel."""
     pixels = _pixels(scene, light, view, view.directions(*_grid(view, samples)), samples * samples)
     return pixels.reshape(view.height, view.width, 3)
+
+
+def render_pixels(scene: Scene, light: Lighting, view: View, pixels: np.ndarray, samples: int) -> np.ndarray:
+    """Render [P, 3] uint8 sRGB, the pixels [P] of ``render_image``, numbered row by row."""
+    directions = view.directions(*_grid(view, samples)).reshape(-1, samples * samples, 3)[pixels].reshape(-1, 3)
+    return _pixels(scene, light, view, directions, samples * samples)
 
 
 def render_removed(
@@ -171,9 +182,8 @@ def _pixels(
 
 def render_view(scene: Scene, light: Lighting, view: View, samples: int = 2) -> Picture:
     """Render the picture of a view, with ``samples`` x ``samples`` rays per pixel for the image."""
-    x, y = _grid(view, 1)
-    hits, silhouettes = first_hits(scene, view.center, view.directions(x, y))
-    masks = np.zeros((len(scene.things), len(x)), dtype=bool)
+    hits, silhouettes = first_hits(scene, view.center, pixel_directions(view))
+    masks = np.zeros((len(scene.things), len(hits.t)), dtype=bool)
     for mask, rays in zip(masks, silhouettes, strict=True):
         mask[rays] = True
     shape = (view.height, view.width)

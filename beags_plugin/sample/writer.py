@@ -14,21 +14,22 @@ from typing import Any
 import numpy as np
 
 from beags_plugin.sample.degrade import Degradation, degrade_mask, dropped_views, resolve_degradation
+from beags_plugin.sample.exposure import LARGEST_STOPS
 from beags_plugin.sample.families import FAMILIES
-from beags_plugin.sample.points import seed_points
-from beags_plugin.sample.scene import Scene
-from beags_plugin.sample.seen import seen_part, shown_points, visible_surface, well_seen
-from beags_plugin.sample.views import Picture, View, render_removed, render_view, surface_without
+from beags_plugin.sample.points import SeedPoints, find_tracks, seed_points
+from beags_plugin.sample.seen import Photo, seen_part, shown_points, visible_surface, well_seen
+from beags_plugin.sample.shots import Shot, plan_shots
+from beags_plugin.sample.views import Picture, View, render_pixels, render_removed, render_view, surface_without
 from beags_plugin.system.errors import UserError, check_choice, unwritable, writing
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.reading.ply import write_vertices
 
-VERSION = 10
+VERSION = 11
 """Raise it whenever the same config would give other files: older samples are then rebuilt."""
 LARGEST_SIDE = 8192  # pixels
 POINT_NOISE = 0.03
 """World units, two to three pixels at 256 x 192: as a hand-held capture gives."""
-SAMPLE_FILE = "sample.json"
+SAMPLE_FILE, TRACKS_FILE = "sample.json", "seed_tracks.json"
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,10 @@ class SampleConfig:
     width, height: pixels. num_train, num_test: views.
     degradation: of the train masks: "none", "mild", "strong", a degree as text ("1.5"), or a ``Degradation``.
     num_points: seed points. antialias: rays per pixel and direction for the images.
+    exposure, white_balance: stops, the largest differences of a photo from the mean (``exposure.photo_gains``); with 0
+        for both all photos are alike.
+    moved: training photos in which something of the background stands before the camera, elsewhere in each; no other
+        photo shows it.
     """
 
     seed: int = 0
@@ -52,16 +57,30 @@ class SampleConfig:
     num_points: int = 2000
     antialias: int = 2
     family: str = "tabletop"
+    exposure: float = 0.0
+    white_balance: float = 0.0
+    moved: int = 0
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that makes no scene."""
-        least = {"seed": 0, "width": 16, "height": 16, "num_train": 1, "num_test": 1, "num_points": 1, "antialias": 1}
+        least = {"seed": 0, "width": 16, "height": 16, "num_train": 1, "num_test": 1, "num_points": 1, "antialias": 1,
+                 "moved": 0}  # fmt: skip
         for name, low in least.items():
             if getattr(self, name) < low:
                 raise UserError(f"the sample's {name} is {getattr(self, name)}: give at least {low}.")
         for name in ("width", "height"):
             if getattr(self, name) > LARGEST_SIDE:
                 raise UserError(f"the sample's {name} is {getattr(self, name)}: give at most {LARGEST_SIDE}.")
+        for name in ("exposure", "white_balance"):
+            if not 0.0 <= getattr(self, name) <= LARGEST_STOPS:
+                raise UserError(
+                    f"the sample's {name} is {getattr(self, name)}: give the largest difference of a photo from the "
+                    f"mean in stops, from 0 to {LARGEST_STOPS:g}."
+                )
+        if self.moved > self.num_train:
+            raise UserError(
+                f"the sample's moved is {self.moved}: give at most {self.num_train}, the number of training photos."
+            )
         check_choice(self.family, FAMILIES, "family of scenes")
         resolve_degradation(self.degradation)
 
@@ -97,7 +116,9 @@ def write_sample(
     the object, removed/<object>/<stem>.png (the photo with the object cut out, in the light as it was) and
     removed_shown/<object>/<stem>.png (where in the silhouette this is surface that some training photo shows), and
     depth/<stem>.npy (float32, z along the optical axis); masks and depth are those of the pixel centres. sample.json is
-    the config.
+    the config. seed_tracks.json says which training photos show each seed point: ``photos``, their stems, and
+    ``points``, indices of photos for each point of seed_points.ply. Seed points have the colours of the mean exposure,
+    pictures without an object the exposure of their photo: a rendering must be brought to that before it is compared.
 
     All is written into a temporary folder beside it and renamed at the end: an interrupted run leaves no ``folder``.
     A folder that holds another sample is replaced; one that another program has made of ``config`` meanwhile is kept.
@@ -136,51 +157,56 @@ def write_sample(
 
 def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], None] | None) -> None:
     family = FAMILIES[config.family]
-    still = family.scene(config.seed)
-    light = family.light(still)
     views = family.views(config.seed, config.width, config.height, config.num_train, config.num_test)
+    shots = plan_shots(family, config.seed, views, config.exposure, config.white_balance, config.moved)
     degradation = resolve_degradation(config.degradation)
     train = [view.name for view in views if view.split == "train"]
     dropped = dropped_views(train, config.seed, degradation.dropped)
     ends = [config.num_points * i // len(train) for i in range(len(train) + 1)]
     shares = {name: end - first for name, first, end in zip(train, ends[:-1], ends[1:], strict=True)}
-    names = still.class_names
+    names = shots[0].still.class_names
     for sub in ("images", "masks", *_truth_folders(names)):
         (folder / sub).mkdir(parents=True)
-    points = []
-    surfaces: list[list[np.ndarray]] = [[] for _ in still.things]
-    photos: list[tuple[View, np.ndarray]] = []  # of training, with their depth
+    seeds: list[SeedPoints] = []
+    surfaces: list[list[np.ndarray]] = [[] for _ in shots[0].still.things]
+    photos: list[Photo] = []  # of training
     silhouettes: dict[str, np.ndarray] = {}
-    for done, view in enumerate(views, start=1):
-        picture = render_view(still, light, view, config.antialias)
+    for done, shot in enumerate(shots, start=1):
+        view, scene = shot.view, shot.scene
+        picture = render_view(scene, shot.exposed, view, config.antialias)
         _write_truth(folder, view, picture, names)
         _write_png(folder / "images" / f"{view.name}.png", picture.image)
         mask = picture.labels
         if view.split == "test":
             silhouettes[view.name] = picture.silhouettes
             for class_id in range(1, len(names)):
-                removed = render_removed(still, light, view, picture.image, class_id, config.antialias)
+                removed = render_removed(scene, shot.exposed, view, picture.image, class_id, config.antialias)
                 if removed is not None:
                     _write_png(folder / "ground_truth" / "removed" / names[class_id] / f"{view.name}.png", removed)
         else:
-            photos.append((view, picture.depth))
+            photos.append(Photo(view, scene, picture.depth))
             for surface, part in zip(surfaces, visible_surface(view, picture), strict=True):
                 surface.append(part)
             mask = degrade_mask(mask, len(names), degradation, config.seed, view.name)
             # One generator per view, so that no view's points depend on another's picture.
             generator = np.random.default_rng([config.seed, 6, done])
-            points.append(seed_points(view, picture, shares[view.name], POINT_NOISE, generator))
+            found = seed_points(view, picture, shot.lasting(picture), shares[view.name], POINT_NOISE, generator)
+            if shot.exposed is not shot.light:  # the points have the colours of the mean exposure
+                found.paint(render_pixels(scene, shot.light, view, found.pixels, config.antialias))
+            seeds.append(found)
         if view.name not in dropped:
             _write_png(folder / "masks" / f"{view.name}.png", mask)
         if progress is not None:
             progress(done, len(views))
     whole = [well_seen(surface) for surface in surfaces]
-    for view in views:
-        if view.name in silhouettes:
-            _write_seen(folder, view, whole, silhouettes[view.name], names)
-            _write_removed_shown(folder, still, view, photos, silhouettes[view.name])
+    for shot in shots:
+        if shot.view.name in silhouettes:
+            _write_seen(folder, shot.view, whole, silhouettes[shot.view.name], names)
+            _write_removed_shown(folder, shot, photos, silhouettes[shot.view.name])
     with open(folder / "seed_points.ply", "wb") as file:
-        write_vertices(file, np.concatenate(points))
+        write_vertices(file, np.concatenate([found.records for found in seeds]))
+    tracks = {"photos": train, "points": find_tracks(seeds, photos, family.turns)}
+    (folder / TRACKS_FILE).write_text(json.dumps(tracks) + "\n", encoding="utf-8")
     _write_json(folder / "classes.json", {str(i): name for i, name in names.items()})
     _write_json(folder / "transforms.json", transforms(views))
     _write_json(folder / SAMPLE_FILE, config.as_dict())
@@ -236,14 +262,13 @@ def _write_seen(
         _write_png(folder / "ground_truth" / "seen" / names[class_id] / f"{view.name}.png", seen)
 
 
-def _write_removed_shown(
-    folder: Path, scene: Scene, view: View, photos: list[tuple[View, np.ndarray]], silhouettes: np.ndarray
-) -> None:
+def _write_removed_shown(folder: Path, shot: Shot, photos: list[Photo], silhouettes: np.ndarray) -> None:
+    scene, view = shot.scene, shot.view
     for class_id, silhouette in enumerate(silhouettes, start=1):
         place = Path(scene.class_names[class_id]) / f"{view.name}.png"
         if (folder / "ground_truth/removed" / place).exists():
             shown = np.zeros(silhouette.shape, np.uint8)
-            shown[silhouette] = 255 * shown_points(scene, surface_without(scene, view, silhouette, class_id), photos)
+            shown[silhouette] = 255 * shown_points(surface_without(scene, view, silhouette, class_id), photos)
             _write_png(folder / "ground_truth/removed_shown" / place, shown)
 
 
@@ -259,9 +284,12 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 def make_sample(
-    folder: Path, seed: int, width: int, height: int, degradation: str, views: int = 60, family: str = "tabletop"
+    folder: Path, seed: int, width: int, height: int, degradation: str, views: int = 60, **options: Any
 ) -> None:
-    """Generate the sample with ``views`` training views in ``folder`` unless the same one lies there already."""
-    config = SampleConfig(seed, width, height, views, degradation=degradation, family=family)
+    """Generate the sample with ``views`` training views in ``folder`` unless the same one lies there already.
+
+    options: others of ``SampleConfig``.
+    """
+    config = SampleConfig(seed, width, height, views, degradation=degradation, **options)
     with progress_bar("Tracing the sample") as progress:
         write_sample(folder, config, progress)

@@ -166,6 +166,8 @@ mistakes(
 mistake("sample", "a family that does not exist")(beags("sample --family attic --output out"))
 mistake("sample", "no views")(beags("sample --views 0 --output out"))
 mistake("sample", "a negative seed")(beags("sample --seed -1 --output out"))
+mistake("sample", "a photo of no exposure")(beags("sample --exposure nan --output out"))
+mistake("sample", "more moved views than views")(beags("sample --views 3 --moved 4 --output out"))
 mistake("sample", "pixels that fill no memory")(beags("sample --width 10000000 --height 10000000 --output out"))
 mistake("demo", "an empty folder")(lambda at: at.beags("demo --data", (at.root / "empty").mkdir() or at.root / "empty"))
 mistake("demo", "a downscale factor of 0")(beags("demo --downscale 0 --data {data}"))

@@ -14,7 +14,7 @@ from beags_plugin.sample.arrangement import make_still, turn_z
 from beags_plugin.sample.families import FAMILIES
 from beags_plugin.sample.lighting import Light
 from beags_plugin.sample.room import Room
-from beags_plugin.sample.seen import shown_points
+from beags_plugin.sample.seen import Photo, shown_points
 from beags_plugin.sample.solids import Ball, Cone, Solid, Tube, slab
 from beags_plugin.sample.tracing import first_hits
 from beags_plugin.sample.views import make_views, render_removed, render_view, surface_without
@@ -202,20 +202,20 @@ def test_on_a_turntable_objects_look_the_same_and_the_room_stands():
 def test_what_photos_show_of_the_surface_behind_objects(scene):
     """Against rays cast from each photo to each point: the first thing that they meet is the point."""
     still, views, pictures = scene
-    photos = [(v, p.depth) for v, p in zip(views, pictures, strict=True) if v.split == "train"]
+    photos = [Photo(v, still, p.depth) for v, p in zip(views, pictures, strict=True) if v.split == "train"]
     wrong, all_shown = [], []
     for view, picture in zip(views, pictures, strict=True):
         for class_id in (1, 4, 7) if view.split == "test" else ():
             points = surface_without(still, view, picture.silhouettes[class_id - 1], class_id)
             expected = np.zeros(len(points), dtype=bool)
-            for photo, _ in photos:
+            for photo in (each.view for each in photos):
                 rays = points - photo.center
                 local = rays @ photo.camera_to_world[:3, :3]
                 x, y = (photo.focal * local[:, 0] / -local[:, 2], photo.focal * -local[:, 1] / -local[:, 2])
                 inside = (-photo.cx <= x) & (x < photo.width - photo.cx) & (np.abs(y + photo.cy - 36) < 36)
                 reached = np.abs(first_hits(still, photo.center, rays)[0].t - 1) < 1e-6
                 expected |= inside & (local[:, 2] < 0) & reached
-            found = shown_points(still, points, photos)
+            found = shown_points(points, photos)
             wrong += (found != expected).tolist()
             all_shown += expected.tolist()
     assert np.mean(wrong) < 0.005 and 0.2 < np.mean(all_shown) < 0.9
