@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from beags_plugin.evaluation.metrics import MaskMetrics, band_width, boundary_band, mask_metrics, psnr
+from beags_plugin.evaluation.metrics import MaskMetrics, band_width, boundary_band, mask_metrics, psnr, spill
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.labels.class_ids import resize_nearest
 
@@ -72,6 +72,7 @@ def test_spill_is_what_lies_beyond_the_margin(seed):
         area = np.count_nonzero(truth & ~ignore)
         expected = np.count_nonzero(predicted & ~ignore & (nearest > d)) / area
         assert mask_metrics(predicted, truth, ignore, Protocol(band_share=share)).spill == expected > 0
+        assert spill(predicted, truth, ~ignore, d) == expected
     assert mask_metrics(np.ones_like(truth), truth).spill > 5  # a share of the truth's area, not of the mask's
     assert mask_metrics(~truth & (nearest <= 1.4), truth).spill == 0.0
     assert mask_metrics(predicted, truth, truth).spill is None  # nothing is left to be a share of
