@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from beags_plugin.core.exposure import BRIGHT, DARK, even_exposures
 from beags_plugin.core.lifting import project
 from beags_plugin.export.base import Photo
 from beags_plugin.export.color import linear_from_srgb, srgb_from_linear
@@ -22,9 +23,7 @@ FLATTEST = 0.2  # least cosine between normal and ray: flatter views smear
 _SHARPEN = 3  # the power of a view's weight: more follow the best view, fewer blur what views place differently
 _PRIOR = 1e-6  # weight of the splats' colour, beside 1 of a photo that looks straight on at a pixel for a texel
 _SAMPLES = 8000  # places that exposures are compared at
-_DARK, _BRIGHT = 0.02, 0.95  # light: outside, noise and clipping tell nothing of exposure
 _ALIKE = 0.05  # standard deviation of log exposures below which they are not told from errors of the surface
-_RIDGE = 1e-3  # of all views' mean evidence, for views that share no place with others
 
 
 @dataclass(frozen=True)
@@ -128,31 +127,20 @@ def exposures_of(
 ) -> np.ndarray:
     """Return [V, 3], how many times as bright as the mean each photo shows places, by colour.
 
-    Least squares: log light of place p in photo v = log colour of p + log exposure of v, weighted. The colours are
-    solved for first, which leaves a Laplacian of the photos; rounded, so that no last bit of a solver tells.
+    By ``core.exposure.even_exposures``; rounded, so that no last bit of a solver tells.
     """
     count = len(photos)
     logs, weights = (np.zeros((len(places.points), count, 3)) for _ in range(2))
     for view, photo in enumerate(photos):
         index, light, weight = places_seen(places, mesh, caster, photo)
-        usable = (light > _DARK) & (light < _BRIGHT)
+        usable = (light > DARK) & (light < BRIGHT)
         logs[index, view] = np.log(np.where(usable, light, 1.0))
         weights[index, view] = usable * np.minimum(weight, 1.0)[:, None] ** (1 / _SHARPEN)
         progress(view + 1)
     found = np.zeros((count, 3))
     for channel in range(3):
-        found[:, channel] = _even(logs[..., channel], weights[..., channel])
+        place, view = np.nonzero(weights[..., channel])
+        seen = place, view, channel
+        found[:, channel] = even_exposures(place, view, logs[seen], weights[seen], count)[0]
     found -= found.mean(axis=0)
     return np.exp(np.round(np.where(found.std(axis=0) < _ALIKE, 0.0, found), 5))
-
-
-def _even(logs: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return [V] log exposures of log light [P, V] with weights [P, V]; their mean is about 0."""
-    of_place = np.maximum(weights.sum(axis=1), 1e-300)
-    shares = weights / of_place[:, None]
-    colors = np.einsum("pv,pv->p", shares, logs)
-    right = np.einsum("pv,pv->v", weights, logs - colors[:, None])
-    evidence = weights.sum(axis=0)
-    laplacian = np.diag(evidence) - np.einsum("pv,pw->vw", weights, shares)
-    ridge = _RIDGE * evidence.mean() + 1e-12
-    return np.linalg.solve(laplacian + ridge * np.eye(len(evidence)), right)

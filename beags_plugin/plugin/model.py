@@ -77,6 +77,8 @@ class BeagsModel(SceneModel):
         inputs = surfel_inputs(self.surfels(), camera, self.active_sh_degree(), class_ids)
         if self.growing:
             inputs = replace(inputs, screen_shift=torch.zeros_like(inputs.means[:, :2]).requires_grad_())
+        if self.photo_colors is not None:
+            inputs = replace(inputs, colors=self.photo_colors(inputs.colors, metadata["cam_idx"]))
         settings = self.settings(geometry="geometry" in needs, distortion="distortion" in needs)
         render = self.rasterizer.rasterize(inputs, camera, settings, background, against)
         self.last_render = LastRender(camera, render, inputs.screen_shift, labels)

@@ -21,19 +21,12 @@ from beags_plugin.masks.check.disagreement import views_against_others
 from beags_plugin.masks.check.files import FEW_VIEWS, MOST_IDS, Coverage, MaskFiles, check_files
 from beags_plugin.masks.check.issues import LEVELS, Issue, ordered, percent
 from beags_plugin.pictures.masks import Changed, Pointed, contradicted_picture, coverage_picture
-from beags_plugin.plugin.objects.compare_views import (
-    Tracks,
-    agreements,
-    features_of,
-    pointed,
-    points_in_space,
-    tracks_of,
-    turned,
-)
+from beags_plugin.plugin.objects.compare_views import agreements, pointed, points_in_space, tracks_of, turned
 from beags_plugin.plugin.objects.reproject_masks import ReprojectedRun, ReprojectionOptions, reproject_run
 from beags_plugin.plugin.runs.place import open_run
 from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParserConfig
 from beags_plugin.plugin.views.poses import PosedViews
+from beags_plugin.plugin.views.tracks import Tracks, features_of
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.progress import progress_bar
 

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from beags_plugin.data.dataset import Dataset
-from beags_plugin.data.layouts.colmap import complete_model
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.masks.check.consistency import Agreement, labels_around, labels_at, ranks_of
 from beags_plugin.masks.check.contradictions import LEAST_OTHERS
@@ -15,20 +14,17 @@ from beags_plugin.masks.check.files import Coverage, MaskFiles
 from beags_plugin.masks.check.issues import Issue, percent
 from beags_plugin.pictures.masks import Pointed
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
-from beags_plugin.plugin.views.colmap_files import read_features
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.plugin.views.lens import project_through_lens
 from beags_plugin.plugin.views.poses import PosedViews
 from beags_plugin.plugin.views.seed_points import random_points, starting_points
+from beags_plugin.plugin.views.tracks import Tracks
 from beags_plugin.posing.turned import seem_turned, shares_explained
 from beags_plugin.system.progress import progress_bar
 
 RANDOM_POINTS = 50_000  # beside the seed points: an object that has none of these has some of them in it
 MOST_SEED_POINTS = 100_000
 MOST_COUNTS = 30_000_000  # points times classes, or times views, that are held at a time
-
-Tracks = list[tuple[np.ndarray, np.ndarray]]
-"""Of each view the points of a COLMAP model that it saw: rows [N], and places [N, 2] in 0..1; empty without a model."""
 
 
 def points_in_space(scene: Dataset, views: PosedViews, config: BeagsDataParserConfig) -> np.ndarray:
@@ -39,26 +35,6 @@ def points_in_space(scene: Dataset, views: PosedViews, config: BeagsDataParserCo
     cameras = [camera_from_nerfstudio(views.cameras, index) for index in range(len(views.images))]
     random, _ = random_points(cameras, RANDOM_POINTS)
     return np.concatenate([seeds[::step], random.astype(np.float64)])
-
-
-def features_of(scene: Dataset, views: PosedViews) -> Tracks:
-    """Return the features of each view in the COLMAP model of a scene, which may lie beside poses in another file.
-
-    Each with the id of its point, -1 where it has none, and its place.
-    """
-    folder = complete_model(scene.root)
-    if folder is None:
-        return []
-    named: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
-    for name, features in read_features(folder).items():
-        for key in {name, name.rpartition("/")[2]}:
-            named.setdefault(key, []).append(features)
-    none = np.zeros(0, np.int64), np.zeros((0, 2))
-    found = []
-    for stems in views.stems:
-        alone = [named[stem][0] for stem in sorted(stems, key=len) if len(named.get(stem, ())) == 1]
-        found.append(alone[-1] if alone else none)
-    return found
 
 
 def tracks_of(features: Tracks, classes: int) -> Tracks:

@@ -19,7 +19,7 @@ from beags_plugin.core.membership import Membership
 from beags_plugin.extraction.ply import write_ply
 from beags_plugin.extraction.select import remove_class, select_class
 from beags_plugin.plugin.objects.clean import cleaner_of
-from beags_plugin.plugin.runs.checkpoint_file import extra_state
+from beags_plugin.plugin.runs.checkpoint_file import exposures_of, extra_state
 from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, prepared_digests
 from beags_plugin.plugin.runs.read import SavedScene, read_assigned_run, read_transform
 from beags_plugin.plugin.runs.write import write_run
@@ -128,7 +128,8 @@ def _rows(state: dict[str, Any], index: Tensor, members: Membership) -> dict[str
         name: value[index] if name == "class_margin" or name.startswith("gauss_params.") else value
         for name, value in state.items()
     }
-    extra = extra_state(state["_extra_state"]["classes"], members)
+    former = state["_extra_state"]
+    extra = extra_state(former["classes"], members, exposures_of(former))
     return {**rows, "class_ids": members.class_ids, "_extra_state": extra}
 
 

@@ -28,7 +28,9 @@ def photos_of(shown: ShownScene, class_id: int | None, frame: Frame) -> Sequence
 
 
 def _image(shown: ShownScene, view: int) -> Tensor:
-    return shown.photos[view].image.cpu()
+    """Return a photo [H, W, 3] in the exposure of the scene."""
+    image = shown.photos[view].image.cpu()
+    return image if shown.exposures is None else shown.exposures.evened(image, shown.names[view])
 
 
 def _own(shown: ShownScene, view: int, class_id: int | None) -> Tensor:

@@ -113,7 +113,8 @@ def _pixel(point: PhotoPoint, manager: BeagsDataManager) -> tuple[Camera, float,
     if not (-0.5 <= point.x < width - 0.5 and -0.5 <= point.y < height - 0.5):
         raise UserError(f"{point.view} has {width} x {height} pixels: {point.x:g},{point.y:g} is not one.")
     share = torch.tensor([(point.x + 0.5) / width, (point.y + 0.5) / height], dtype=torch.float64)
-    camera, (x, y) = manager.straightened(share.numpy(), index, split)
+    camera, straight = manager.straightened(share.numpy()[None], index, split)
+    x, y = straight[0].tolist()
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         raise UserError(
             f"{point.view}:{point.x:g},{point.y:g} lies outside of the photo without its lens distortion: "

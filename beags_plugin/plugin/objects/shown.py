@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 
 from beags_plugin.cleaning.silhouettes import MaskedViews
+from beags_plugin.core.exposure import Exposures
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, last_prepared, preparing_run
 from beags_plugin.plugin.runs.prepared import prepared_labels
@@ -32,13 +33,14 @@ class ShownScene:
     """Training views of a run: at most ``MOST_VIEWS``.
 
     names: of the views. views: their cameras, masks after reprojection and depth, in the frame of the run.
-    manager, chosen: where their photos are.
+    manager, chosen: where their photos are. exposures: of these; None where they have one.
     """
 
     names: list[str]
     views: MaskedViews
     manager: BeagsDataManager
     chosen: range
+    exposures: Exposures | None = None
 
     @cached_property
     def photos(self) -> list[View]:
@@ -80,4 +82,6 @@ def shown_scene(scene: SavedScene, config_path: Path) -> ShownScene:
     with progress_bar("Rendering depth", passing=True) as progress:
         surfels = scene.surfels().detach()
         depths = filed(render_depths(surfels, cameras, rasterizer, settings, "median", progress), surfels.means.device)
-    return ShownScene(names, MaskedViews(cameras, labels, depths, rasterizer, settings), manager, chosen)
+    return ShownScene(
+        names, MaskedViews(cameras, labels, depths, rasterizer, settings), manager, chosen, scene.exposures
+    )

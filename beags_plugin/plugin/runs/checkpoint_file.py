@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from beags_plugin.core.exposure import Exposures
 from beags_plugin.core.membership import Membership
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.tensors import load_tensors
@@ -35,12 +36,23 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     return checkpoint
 
 
-def extra_state(classes: Mapping[int, str], members: Membership) -> dict[str, Any]:
-    """Return what a model's state holds besides tensors by name: class names, and objects that classes do not tell."""
+def extra_state(classes: Mapping[int, str], members: Membership, exposures: Exposures | None = None) -> dict[str, Any]:
+    """Return what a model's state holds besides tensors by name: class names, and what classes do not tell.
+
+    That is, objects that share Gaussians or lack some, and the photos' exposures.
+    """
     state: dict[str, Any] = {"classes": dict(classes)}
     if members.objects is not None:
         state["objects"] = {class_id: index.cpu() for class_id, index in members.objects.items()}
+    if exposures is not None:
+        state["exposures"] = {"names": list(exposures.names), "affine": exposures.affine.detach().cpu().clone()}
     return state
+
+
+def exposures_of(extra: Mapping[str, Any]) -> Exposures | None:
+    """Return the photos' exposures in what ``extra_state`` returned; None where they have one."""
+    known = extra.get("exposures")
+    return None if known is None else Exposures(tuple(known["names"]), known["affine"])
 
 
 def scene_alone(checkpoint: dict[str, Any]) -> bool:
@@ -83,9 +95,20 @@ def _wrong(state: Mapping[str, Any]) -> str | None:
     objects = extra.get("objects", {})
     if not isinstance(objects, dict) or not all(_is_index(each, count) for each in objects.values()):
         return "the Gaussians of its objects are not among its own"
+    if (known := extra.get("exposures")) is not None and not _is_exposures(known):
+        return "the exposures of its photos are damaged"
     found = set(objects) | set(state["class_ids"].unique().tolist() if bool(state["assigned"]) else [])
     unnamed = sorted(found - set(names))
     return f"it gives Gaussians the class {unnamed[0]}, which has no name" if unnamed else None
+
+
+def _is_exposures(value: Any) -> bool:
+    """Return whether a value holds the names of V photos and their transforms [V, 3, 4] float."""
+    if not isinstance(value, dict) or not isinstance(value.get("names"), list):
+        return False
+    affine = value.get("affine")
+    right = isinstance(affine, Tensor) and affine.shape == (len(value["names"]), 3, 4) and affine.is_floating_point()
+    return right and bool(affine.isfinite().all())
 
 
 def _is_index(value: Any, count: int) -> bool:

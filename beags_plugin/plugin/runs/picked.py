@@ -42,7 +42,8 @@ def with_picked(state: dict[str, Any], run: Path) -> dict[str, Any]:
         if not isinstance(kept, dict):
             raise ValueError("it holds something else")
         fits = kept["gaussians"] == _digest(state["gauss_params.means"])
-        extra = {name: kept[name] for name in ("classes", "objects") if name in kept}
+        former = {name: value for name, value in state["_extra_state"].items() if name != "objects"}
+        extra = {**former, **{name: kept[name] for name in ("classes", "objects") if name in kept}}
         changed = {**state, "class_ids": kept["class_ids"], "assigned": torch.tensor(True), "_extra_state": extra}
     except (OSError, ValueError, KeyError) as error:
         raise UserError(f"{path}, what was picked in the viewer, is damaged ({error}): delete it.") from error

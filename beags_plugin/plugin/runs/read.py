@@ -12,11 +12,12 @@ from typing import Any, Literal, cast
 import torch
 from torch import Tensor
 
+from beags_plugin.core.exposure import Exposures
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import Viewpoints
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
-from beags_plugin.plugin.runs.checkpoint_file import model_state, read_checkpoint
+from beags_plugin.plugin.runs.checkpoint_file import exposures_of, model_state, read_checkpoint
 from beags_plugin.plugin.runs.layout import TRANSFORM_FILE, newest_checkpoint
 from beags_plugin.plugin.runs.picked import with_picked
 from beags_plugin.plugin.runs.place import check_data, open_run
@@ -56,6 +57,11 @@ class SavedScene:
     def members(self) -> Membership:
         """Which Gaussians belong to which class; all to the background before they have classes."""
         return Membership(self.state["class_ids"], self.state["_extra_state"].get("objects"))
+
+    @property
+    def exposures(self) -> Exposures | None:
+        """Exposures of the training photos; None where they have one."""
+        return exposures_of(self.state["_extra_state"])
 
 
 def read_run(config_path: Path, data: Path | None = None) -> SavedScene:

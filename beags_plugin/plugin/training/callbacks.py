@@ -11,6 +11,7 @@ from beags_plugin.core.cameras import camera_extent
 from beags_plugin.plugin.options.pyramid import small_size
 from beags_plugin.plugin.options.schedule import log_linear
 from beags_plugin.plugin.training.densifier import Densifier
+from beags_plugin.plugin.training.exposure import exposures_of_run
 from beags_plugin.plugin.training.monitor import Curves
 from beags_plugin.plugin.training.optimizers import SceneOptimizer
 from beags_plugin.plugin.training.refinement import RefinementSwitch
@@ -36,6 +37,9 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
     for name, part in {"views": datamanager, "densification": densifier, "refinement": switch}.items():
         trainer.keep(name, part)
 
+    model.photo_colors = exposure = exposures_of_run(model, datamanager)
+    if exposure is not None:
+        trainer.keep("exposure", exposure)
     curves = _curves(model, trainer, datamanager)
     if curves is not None:
         trainer.keep("curves", curves)
@@ -54,6 +58,8 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
         own_learning_rates(model, adam, step)
 
     def after(step: int) -> None:
+        if exposure is not None:
+            exposure.after_step(step)
         densifier.after_step(step)
         model.clock.mark("growth")
         switch.after_step(step)

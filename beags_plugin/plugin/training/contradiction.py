@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -51,6 +51,8 @@ def residuals(model: SceneModel, views: Sequence[View], labels: Sequence[Tensor 
         view, ids = views[index], labels[index]
         assert ids is not None
         inputs = surfel_inputs(model.surfels(), view.camera)
+        if model.photo_colors is not None:
+            inputs = replace(inputs, colors=model.photo_colors(inputs.colors, index))
         color = model.rasterizer.rasterize(inputs, view.camera, settings, background).color.clamp(0.0, 1.0)
         error = (color - view.image_on(background).to(color)).square().mean(-1).cpu()
         for side, part in enumerate(((ids != BACKGROUND) & (ids != IGNORE), ids == BACKGROUND)):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,12 +12,13 @@ from nerfstudio.models.splatfacto import SplatfactoModel
 from torch import Tensor, nn
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.exposure import Exposures
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.base import Loss
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.options.model_options import BeagsModelConfig, fixed_background
-from beags_plugin.plugin.runs.checkpoint_file import extra_state
+from beags_plugin.plugin.runs.checkpoint_file import exposures_of, extra_state
 from beags_plugin.plugin.training.timing import StepClock
 from beags_plugin.preparation.own_training import OwnTraining
 from beags_plugin.rasterizers import make_rasterizer
@@ -51,7 +52,9 @@ class SceneModel(SplatfactoModel):
     refinement. growing: whether this step gathers gradients for densification. frozen: whether the refiner leaves the
     scene as it is. own_training: of a refiner that makes its steps itself. last_render: of the last training step.
     measuring: whether anyone reads this step's metrics. prepared_rounds: rounds of refinement that this run has
-    prepared; None for a scene that is only looked at. crop_box: nerfstudio's.
+    prepared; None for a scene that is only looked at. exposures: of the training photos; None where they have one,
+    that of the scene. photo_colors: makes colours [N, 3] those that a training photo shows, by its index; None where
+    they are the scene's. crop_box: nerfstudio's.
     """
 
     config: BeagsModelConfig
@@ -73,6 +76,8 @@ class SceneModel(SplatfactoModel):
         self.register_buffer("refined_steps", torch.tensor(0))
         self.classes = dict(classes)
         self.objects: Mapping[int, Tensor] | None = None
+        self.exposures: Exposures | None = None
+        self.photo_colors: Callable[[Tensor, int], Tensor] | None = None
         self.schedule = self.config.schedule()
         self.losses: dict[str, Loss] = {
             name: spec.build(name, self.schedule)
@@ -192,13 +197,14 @@ class SceneModel(SplatfactoModel):
         return nn.Module.load_state_dict(self, state, **kwargs)  # type: ignore[arg-type]
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return the class names and objects, which a checkpoint keeps besides tensors by name."""
-        return extra_state(self.classes, self.members())
+        """Return what a checkpoint keeps besides tensors by name: class names, objects and exposures."""
+        return extra_state(self.classes, self.members(), self.exposures)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Take the class names and objects of a checkpoint."""
+        """Take the class names, objects and exposures of a checkpoint."""
         self.classes = {int(index): str(name) for index, name in state["classes"].items()}
         self.objects = state.get("objects")
+        self.exposures = exposures_of(state)
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return one optimizer group per kind of parameter."""

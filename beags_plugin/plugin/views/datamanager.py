@@ -146,14 +146,14 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         """Remove a view's lens distortion from labels [h, w] of any size."""
         return lens.undistort_labels(labels, *self._lens(split, index))
 
-    def straightened(self, place: np.ndarray, index: int, split: Split) -> tuple[Camera, list[float]]:
-        """Return a view's camera without lens, and where a place of its photo is in it, [x, y] (centres at + 0.5).
+    def straightened(self, places: np.ndarray, index: int, split: Split) -> tuple[Camera, np.ndarray]:
+        """Return a view's camera without lens, and where places of its photo are in it, [P, 2] (centres at + 0.5).
 
-        place: [2] float64, in shares of the photo's width and height.
+        places: [P, 2] float64, in shares of the photo's width and height.
         """
         distorted, straight, _ = self._lens(split, index)
-        point = place * [int(distorted.width[index]), int(distorted.height[index])]
-        return camera_from_nerfstudio(straight, index), lens.straight_point(point, distorted, straight, index).tolist()
+        points = places * [int(distorted.width[index]), int(distorted.height[index])]
+        return camera_from_nerfstudio(straight, index), lens.straight_points(points, distorted, straight, index)
 
     def picture(self, file: Path, index: int, split: Split = "train") -> Tensor:
         """Read another picture of a view as its photo [H, W, 3] float in 0..1, undistorted."""

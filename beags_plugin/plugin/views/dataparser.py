@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
@@ -29,6 +29,9 @@ from beags_plugin.plugin.views.poses import Normalization, PosedViews, read_pose
 from beags_plugin.plugin.views.seed_points import starting_points
 from beags_plugin.system.errors import UserError, print_user_errors_plainly
 from beags_plugin.system.progress import say
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.views.tracks import Tracks
 
 LEAST_PIXELS = 2  # of a side that was scaled down; fewer show nothing
 
@@ -144,6 +147,20 @@ class BeagsDataParser(DataParser):
         views = read_poses(scene.poses, scene.root, Normalization(**options))
         check_cameras(views.cameras, views.images)
         return scene, views
+
+    def tracks(self, split: str) -> Tracks:
+        """Return which points each view of a split shows, and where: of the COLMAP model, else seed points.
+
+        Empty where nothing says so. The outputs of a split must have been asked for before.
+        """
+        from beags_plugin.plugin.views.tracks import features_of, seeds_seen  # they import OpenCV
+
+        views = self._views
+        assert views is not None
+        found = features_of(self._scene, views)
+        if not found and not self._metadata["points3D_random"]:
+            found = seeds_seen(self._scene.root, self._metadata["points3D_xyz"].double().numpy(), views)
+        return [found[view] for view in self.views_of_split(views, split)] if found else []
 
     def mask_files(self, scene: Dataset, views: PosedViews) -> tuple[list[Path | None], Path, MaskKind]:
         """Return the mask file of each view or None, the folder of the masks, and their kind."""

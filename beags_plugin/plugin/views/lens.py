@@ -148,13 +148,13 @@ def _nearest(labels: np.ndarray, x: np.ndarray, y: np.ndarray, border: int) -> n
     return cv2.remap(labels, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=(border,))
 
 
-def straight_point(point: np.ndarray, distorted: Cameras, straight: Cameras, index: int) -> np.ndarray:
-    """Return where a pixel [2] (centres at + 0.5) of a distorted view is in the straight one, [2] float64."""
-    if not has_lens(distorted, index):
-        return point
+def straight_points(points: np.ndarray, distorted: Cameras, straight: Cameras, index: int) -> np.ndarray:
+    """Return where pixels [P, 2] (centres at + 0.5) of a distorted view are in the straight one, [P, 2] float64."""
+    if not has_lens(distorted, index) or len(points) == 0:
+        return points
     sizes = [(int(cameras.width[index]), int(cameras.height[index])) for cameras in (distorted, straight)]
     K, new_K = (_intrinsics(cameras, index, *size) for cameras, size in zip((distorted, straight), sizes, strict=True))
-    return _straight(point[None] - 0.5, distorted, index, K, new_K)[0] + 0.5
+    return _straight(points - 0.5, distorted, index, K, new_K) + 0.5
 
 
 def _straight(pixels: np.ndarray, distorted: Cameras, index: int, K: np.ndarray, new_K: np.ndarray) -> np.ndarray:

@@ -1,0 +1,131 @@
+"""Exposures of photos, learned with the scene: an affine colour transform for each, beside the mean photo's in all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.core.exposure import Exposures, Gains, gains, sightings
+from beags_plugin.export.baking import interpolated
+from beags_plugin.export.color import linear_from_srgb
+from beags_plugin.losses.reduction import ordered_linear
+from beags_plugin.plugin.options.schedule import log_linear
+from beags_plugin.plugin.training.prepared_files import bar
+from beags_plugin.plugin.training.scene_model import SceneModel
+from beags_plugin.plugin.views.datamanager import BeagsDataManager
+from beags_plugin.plugin.views.dataparser import BeagsDataParser
+from beags_plugin.system import processes
+from beags_plugin.system.progress import counted, say
+
+LEAST_SPREAD = 0.05  # EV; photos whose gains differ by less are taken to be of one exposure
+CERTAIN = 3.0  # times the noise of a gain, by which the photos' gains must differ to count as different
+RATES = 2e-3, 2e-4  # first and last learning rate of the transforms, log-linear
+TOWARDS_START = 0.05  # weight of the squared change of a photo's transform in its step
+GAMMA = 2.2  # photos' values are about the 2.2nd root of light, so that a gain multiplies them by its own root
+
+
+class PhotoExposures:
+    """The transforms of V photos while they are learned; their mean over the photos is the identity throughout.
+
+    Each step moves the transform of its photo by the training loss and by a pull towards where it began.
+    """
+
+    def __init__(self, model: SceneModel, exposures: Exposures) -> None:
+        self.model = model
+        self.affine = exposures.affine.to(model.device).clone().requires_grad_()
+        self.start = self.affine.detach().clone()
+        self.adam = torch.optim.Adam([self.affine], lr=RATES[0], eps=1e-15)
+        model.exposures = Exposures(exposures.names, self.affine.detach())  # which shares the memory
+        self._seen: int | None = None
+
+    def state(self) -> dict[str, Any]:
+        """Return where the transforms began, and Adam's moments; see ``Resumable``."""
+        return {"start": self.start.cpu(), "adam": self.adam.state_dict()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on with the moments of ``state``; the model has the transforms."""
+        self.start = state["start"].to(self.start)
+        self.adam.load_state_dict(state["adam"])
+
+    def __call__(self, colors: Tensor, photo: int) -> Tensor:
+        """Return colours [N, 3] as the photo shows them, with a gradient for its transform."""
+        self._seen = photo if torch.is_grad_enabled() else None
+        affine = self.affine[photo]
+        return ordered_linear(colors, affine[:, :3], affine[:, 3])
+
+    def after_step(self, step: int) -> None:
+        """Move the transforms by the gradients of this step."""
+        gradient = self.affine.grad
+        if self._seen is None or gradient is None:
+            return
+        with torch.no_grad():
+            gradient[self._seen] += 2.0 * TOWARDS_START * (self.affine[self._seen] - self.start[self._seen])
+            processes.average([gradient])
+            self.adam.param_groups[0]["lr"] = log_linear(*RATES, self.model.schedule.progress(step))
+            self.adam.step()
+            self.affine -= self.affine.mean(dim=0) - torch.eye(3, 4).to(self.affine)
+        self.affine.grad, self._seen = None, None
+
+
+def exposures_of_run(model: SceneModel, datamanager: BeagsDataManager) -> PhotoExposures | None:
+    """Return the photos' exposures to learn, those of a loaded scene where it has any; None where photos have one."""
+    wanted = model.config.exposure
+    if wanted == "off":
+        model.exposures = None
+        return None
+    names = tuple(view.name for view in datamanager.views("train"))
+    start = torch.eye(3, 4).repeat(len(names), 1, 1)
+    if (known := model.exposures) is not None:
+        of_name = dict(zip(known.names, known.affine.cpu(), strict=True))
+        of_photos = [of_name.get(name, identity) for name, identity in zip(names, start, strict=True)]
+        return PhotoExposures(model, Exposures(names, torch.stack(of_photos)))
+    found = photo_gains(datamanager)
+    if found is not None:
+        different = found.spread > max(LEAST_SPREAD, CERTAIN * float(np.median(found.noise)))
+        if wanted == "auto" and not different:
+            return None
+        for line in _lines(found, names):
+            say(line)
+        start[:, range(3), range(3)] = torch.from_numpy(_diagonals(found)).float()
+    return PhotoExposures(model, Exposures(names, start))
+
+
+def photo_gains(datamanager: BeagsDataManager) -> Gains | None:
+    """Return how bright the training photos show the points of the COLMAP model; None without one."""
+    tracks = cast(BeagsDataParser, datamanager.dataparser).tracks("train")
+    if not any((ids >= 0).any() for ids, _ in tracks):
+        return None
+    light = []
+    with bar("Comparing exposures", passing=True) as progress:
+        for index, view in enumerate(counted(datamanager.views("train"), len(tracks), progress)):
+            image = view.image.cpu()
+            xy = datamanager.straightened(tracks[index][1], index, "train")[1]
+            light.append(linear_from_srgb(interpolated(image, xy)))
+    return gains(sightings([ids for ids, _ in tracks], light), len(tracks))
+
+
+def _lines(found: Gains, names: Sequence[str]) -> Iterator[str]:
+    """Yield what the user should know about the photos' gains."""
+    means = found.stops.mean(axis=1)
+    tinted = found.spread_of_colors
+    balance = f", and their colours by {tinted:.2f} EV besides" if tinted > LEAST_SPREAD else ""
+    yield (
+        f"The photos differ in exposure by {found.spread:.2f} EV (standard deviation; {means.min():+.2f} to "
+        f"{means.max():+.2f}){balance}: each gets a colour transform of its own, and the scene has the mean photo's "
+        "exposure."
+    )
+    if blind := [name for name, noise in zip(names, found.noise, strict=True) if np.isinf(noise)]:
+        yield (
+            f"{len(blind)} photos, the first of them {blind[0]}, show no point that is neither black nor burnt out: "
+            "they begin with the mean exposure."
+        )
+
+
+def _diagonals(found: Gains) -> np.ndarray:
+    """Return [V, 3], the factors of the photos' values that gains make, each with a mean of 1 over the photos."""
+    factors = 2.0 ** (found.stops / GAMMA)
+    return factors / factors.mean(axis=0)
