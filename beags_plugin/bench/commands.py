@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Union
 
 import tyro
 
+from beags_plugin.bench.captures.options import CapturesOptions
 from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.paper.options import PaperOptions
 
@@ -47,6 +48,16 @@ class PaperBench(PaperOptions):
         run_paper(self)
 
 
+@dataclass
+class CapturesBench(CapturesOptions):
+    """Real captures, as far as they are on disk: the paper's losses and each preset, scored by traced silhouettes."""
+
+    def run(self) -> None:
+        from beags_plugin.bench.captures.run import run_captures
+
+        run_captures(self)
+
+
 SHIPPED = {
     "ablation": "What each part gives: assignment alone, without each of reprojection, boundary and occupancy loss, "
     "all.",
@@ -66,7 +77,7 @@ SHIPPED = {
 """Commands by experiment, with the sentence of their help."""
 
 if TYPE_CHECKING:
-    Measurement = ShippedExperiment | ExperimentFile | PaperBench
+    Measurement = ShippedExperiment | ExperimentFile | PaperBench | CapturesBench
 else:
     Measurement = Union[  # noqa: UP007  (of a tuple)
         tuple(
@@ -79,5 +90,6 @@ else:
         + (
             Annotated[ExperimentFile, tyro.conf.subcommand("file")],
             Annotated[PaperBench, tyro.conf.subcommand("paper")],
+            Annotated[CapturesBench, tyro.conf.subcommand("captures")],
         )
     ]

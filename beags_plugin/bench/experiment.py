@@ -18,7 +18,7 @@ _ENTRIES = {
     "description", "preset", "seeds", "sample", "variant", "sweep", "paper", "reference", "confidence", "front",
     "objects", *PHASES,
 }  # fmt: skip
-_VARIANT = {"name", DAMAGE, "per_object", *PHASES}
+_VARIANT = {"name", DAMAGE, "per_object", "preset", "control", *PHASES}
 _SWEEP = {"name", "key", "values", "phase", "lines", "relative_to_pixels"}
 
 
@@ -30,6 +30,8 @@ class Variant:
     classes: number of objects in masks that are made up, with which cost alone is measured.
     sweep, line, x: name of the sweep, its curve and the place on its axis, if the variant is a point of a sweep.
     per_object: a training for each object, whose name is the option "object" of the refiner.
+    preset: what its refinement starts from in place of the experiment's. control: the variant that its PSNR is compared
+    with.
     """
 
     name: str
@@ -41,6 +43,8 @@ class Variant:
     line: str = ""
     x: float | None = None
     per_object: bool = False
+    preset: str | None = None
+    control: str | None = None
 
     @property
     def has_other_masks(self) -> bool:
@@ -116,12 +120,13 @@ def check_keys(experiment: Experiment, source: Path) -> None:
     from beags_plugin.plugin.presets import preset_config, preset_names
 
     try:
-        check_choice(experiment.preset, preset_names(), "preset")
+        for name in (experiment.preset, *(variant.preset for variant in experiment.variants if variant.preset)):
+            check_choice(name, preset_names(), "preset")
     except UserError as error:
         raise UserError(f"{source}: {error}") from None
     for variant in experiment.variants:
-        for overrides in (variant.base, variant.refine):
-            preset_config(experiment.preset, overrides, source)
+        preset_config(experiment.preset, variant.base, source)
+        preset_config(variant.preset or experiment.preset, variant.refine, source)
 
 
 class _Reader:
@@ -153,9 +158,10 @@ class _Reader:
         if repeated := {name for name in names if names.count(name) > 1}:
             raise self.wrong(f"has two variants called {min(repeated)!r}: rename one of them.")
         reference = self.value(content, "reference", str, None)
-        if reference is not None and reference not in names:
-            near = meant(reference, names)
-            raise self.wrong(f"refers to {reference!r}, which is no variant{near}: name one of {', '.join(names)}.")
+        for named in (reference, *(variant.control for variant in variants)):
+            if named is not None and named not in names:
+                near = meant(named, names)
+                raise self.wrong(f"refers to {named!r}, which is no variant{near}: name one of {', '.join(names)}.")
         sample = dict(self.table(content, "sample", ""))
         return Experiment(
             name=self.path.stem,
@@ -180,7 +186,8 @@ class _Reader:
         damage = entry.get(DAMAGE)
         each = self.value(entry, "per_object", bool, False, f"variant {name!r}: ")
         degree = None if damage is None else self.degree(damage)
-        return Variant(name, *_by_phase(common, own), degree, per_object=each)
+        other = {key: self.value(entry, key, str, None, f"variant {name!r}: ") for key in ("preset", "control")}
+        return Variant(name, *_by_phase(common, own), degree, per_object=each, **other)
 
     def points(self, sweep: dict[str, Any], common: dict[str, dict[str, Any]]) -> list[Variant]:
         """Return the variants of a sweep: every value on every line."""

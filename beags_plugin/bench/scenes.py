@@ -34,7 +34,7 @@ class TrialScene:
 
     digest: changes with what ``data`` is made from; of given data it has their place, and files' sizes and times. seed:
     of the damage to its masks. options: of ``beags-data``, by name, as plain values. sample: what a generated one is
-    made of, which a plan does not write.
+    made of, which a plan does not write. photos: the scene that its base is trained on; None: itself.
     """
 
     name: str
@@ -44,6 +44,7 @@ class TrialScene:
     seed: int = 0
     options: Mapping[str, Any] = field(default_factory=dict, hash=False)
     sample: SampleConfig | None = field(default=None, compare=False)
+    photos: TrialScene | None = field(default=None, compare=False)
 
     @property
     def unwritten(self) -> SampleConfig | None:

@@ -89,16 +89,22 @@ def plan(
     for scene in scenes:
         for seed in experiment.seeds:
             for variant in experiment.variants:
-                # other masks do not change the base: it is trained from photos alone
-                base = Trial(scene, experiment.preset, {**variant.base, MODEL + "refine_steps": 0}, seed, code)
+                base = base_trial(experiment, variant, scene, seed, code)
                 other = masks[scene.name, variant.name] if variant.has_other_masks else None
                 refine = {**variant.refine, MODEL + "base_steps": 0}
                 objects = tuple(object_names(scene)) if variant.per_object else ()
                 options = refine.get(OPTIONS, {})
                 changes = [{**refine, OPTIONS: {**options, OBJECT: name}} for name in objects] or [refine]
-                trials = (Trial(scene, experiment.preset, each, seed, code, other, base) for each in changes)
+                preset = variant.preset or experiment.preset
+                trials = (Trial(scene, preset, each, seed, code, other, base) for each in changes)
                 planned.append(VariantTrial(variant, scene, seed, tuple(trials), objects))
     return planned
+
+
+def base_trial(experiment: Experiment, variant: Variant, scene: TrialScene, seed: int, code: str) -> Trial:
+    """Return the training of a variant's base. Masks do not change it: it is trained from photos alone."""
+    changes = {**variant.base, MODEL + "refine_steps": 0}
+    return Trial(scene.photos or scene, experiment.preset, changes, seed, code)
 
 
 def steps_of(trial: Trial) -> int:

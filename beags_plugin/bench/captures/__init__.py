@@ -1,0 +1,1 @@
+"""``beags bench captures``: refinement on real captures, scored by silhouettes traced by eye."""
