@@ -162,6 +162,8 @@ def test_a_file_describes_variants_and_sweeps(experiment):
         ("[0.0, 1.5]", "[-1.0]", "degree of mask degradation is -1"),
         ("[0.0, 1.5]", "[99.0]", "number from 0 to 1"),
         ('name = "noisy"', 'name = "noisy"\nextra = 1', "variant 'noisy': has an unknown entry 'extra'"),
+        ('name = "noisy"', 'name = "noisy"\npreset = "beags-fats"', "'beags-fats' (did you mean beags-fast?)"),
+        ('name = "noisy"', 'name = "noisy"\ncontrol = "nose"', "refers to 'nose', which is no variant"),
         ("[both]", "[sample]\nseeds = [-1]\n[both]", "sample.seeds must be"),
         ("[both]", '[sample]\nseeds = "untouched"\n[both]', "'untouched': choose one of choosing, reporting"),
         ("[both]", '[sample]\nfamilies = ["attic"]\n[both]', "list of tabletop, turntable, room"),

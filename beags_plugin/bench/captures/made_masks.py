@@ -104,7 +104,7 @@ def make_masks_once(found: FoundCapture, kind: str, folder: Path, run: Path | No
     with writing(folder):
         (folder / COMPLETE).touch()
     _remove_old(sorted(folder.parent.glob(f"{found.capture.name}-{kind}-*/{COMPLETE}")))
-    return [line for line in lines if not line.startswith("  ")]
+    return [line for line in lines if not line.startswith(" ")]
 
 
 def _remove_old(complete: Sequence[Path]) -> None:
