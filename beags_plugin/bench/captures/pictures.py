@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from beags_plugin.bench.engines.interface import Outcome
+from beags_plugin.bench.objects_picture import captioned
 from beags_plugin.bench.trials import VariantTrial
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 SIDE = 200  # pixels of a picture of an object, and height of one of the scene
 AROUND, ABOVE = 4, 20.0  # pictures on a circle, degrees above the horizon
 BENEATH, BELOW = 2, -35.0
+LETTER = 7  # pixels of one in a caption, at most
 
 
 def write_sheet(path: Path, runs: Sequence[VariantTrial], outcomes: Mapping[str, Outcome]) -> bool:
@@ -48,13 +50,15 @@ def write_sheet(path: Path, runs: Sequence[VariantTrial], outcomes: Mapping[str,
     stands = {class_id: _stand(class_id, first, scenes) for class_id in first.classes if class_id != 0}
     for name, scene in scenes.items():
         render = render_alone(scene.surfels(), view.camera, settings, first.rasterizer, "black")
-        cells = [cell(photo, size, view.name), cell(render, size, name)]
+        drawn, captions = [(photo, size), (render, size)], [view.name, name]
         for class_id, (cameras, orbit_settings) in stands.items():
             alone = _alone(scene, class_id)
-            drawn = [render_alone(alone, camera, orbit_settings, first.rasterizer, "checker") for camera in cameras]
-            captions = [first.classes[class_id], *[""] * (AROUND - 1), "from below", *[""] * (BENEATH - 1)]
-            cells += [cell(image, (SIDE, SIDE), text) for image, text in zip(drawn, captions, strict=True)]
-        lines.append(beside(cells))
+            for camera in cameras:
+                image = render_alone(alone, camera, orbit_settings, first.rasterizer, "checker")
+                drawn.append((image, (SIDE, SIDE)))
+            captions += [first.classes[class_id], *[""] * (AROUND - 1), "from below", *[""] * (BENEATH - 1)]
+        texts = captioned(captions, max(size[0] // LETTER, 1))
+        lines.append(beside([cell(image, of, text) for (image, of), text in zip(drawn, texts, strict=True)]))
     write_picture(path, below(lines))
     return True
 
