@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from data_folders import SCENES
 
 pytest.importorskip("nerfstudio")
@@ -15,14 +16,16 @@ pytest.importorskip("nerfstudio")
 from capture_trees import write_capture, write_prompts, write_truth
 from experiment_files import GOOD, written
 from PIL import Image
+from run_folders import discs
 
 from beags_plugin.bench import run as bench_run
 from beags_plugin.bench.captures import made_masks
 from beags_plugin.bench.captures.known import CAPTURES, PICKED, Capture, find_captures
 from beags_plugin.bench.captures.options import CapturesOptions
+from beags_plugin.bench.captures.pictures import _bulk
 from beags_plugin.bench.captures.run import run_captures
 from beags_plugin.bench.captures.scores import by_silhouettes_alone
-from beags_plugin.bench.captures.tables import groups, psnr_cost, tables
+from beags_plugin.bench.captures.tables import groups, mean_rows, psnr_cost, tables
 from beags_plugin.bench.engines import trial_folder
 from beags_plugin.bench.experiment import Variant, load_experiment
 from beags_plugin.bench.results import FIGURES, ResultRow
@@ -182,7 +185,7 @@ def test_without_the_network_its_scenes_are_left_out(again, monkeypatch, capsys)
         run_captures(replace(again, scenes=("bear",), masks=("salient",)))
 
 
-def test_the_command_plans_and_writes_nothing(tmp_path, monkeypatch, capsys):
+def test_the_command_plans_and_writes_nothing(tmp_path, capsys):
     write_capture(tmp_path / "data", "fruit")
     write_truth(tmp_path / "truth", "fruit", ("v00", "v03"))
     (tmp_path / "truth/fruit/banana/v00.png").unlink()
@@ -241,6 +244,15 @@ def test_photos_are_divided_to_the_wanted_size(tmp_path):
         assert found[0].size.pixels == 7 * round(80 / factor) * round(48 / factor)
 
 
+def test_strays_do_not_make_an_object_small_in_its_picture():
+    surfels, _ = discs()
+    means = torch.linspace(0.0, 1.0, len(surfels))[:, None].repeat(1, 3)
+    low, high = _bulk(replace(surfels, means=means))
+    means[-1] = 100.0
+    assert torch.equal(_bulk(replace(surfels, means=means))[0], low)
+    assert (_bulk(replace(surfels, means=means))[1] - high).abs().max() < 0.05 and (low < 0).all() and (high > 1).all()
+
+
 def test_scores_keep_what_no_silhouette_says():
     def mask(kind, view, truth, iou):
         figures = dict.fromkeys(("acc", "iou", "biou", "spill"), iou)
@@ -264,12 +276,10 @@ def row(scene: str, name: str, psnr: float | None, control: str | None = None) -
     return ResultRow(Variant(name, control=control), scene, 1, figures, {}, None if psnr else "it broke")
 
 
-def test_costs_are_beside_the_control_of_the_same_scenes(capsys):
+def test_costs_are_beside_the_control_of_the_same_scenes():
     rows = [row("bear, picked", "control", 20.0), row("bear, picked", "own", 19.5, "control")]
     assert [psnr_cost(each, rows) for each in rows] == [None, 0.5]
     rows += [row("fruit, given", "control", None), row("fruit, given", "own", 30.0, "control")]
-    from beags_plugin.bench.captures.tables import mean_rows
-
     averaged = mean_rows(rows, ["bear, picked", "fruit, given"])
     assert [psnr_cost(each, averaged) for each in averaged] == [None, None], "one scene beside two"
     assert groups(["bear, salient", "fern, picked", "fruit, given"]) == {
@@ -323,7 +333,7 @@ def test_the_committed_clicks_lie_in_training_photos(capture):
                 assert all(0 <= x < image.width and 0 <= y < image.height for x, y in prompt.points)
 
 
-def test_the_real_captures_are_planned_whole(capsys, tmp_path):
+def test_the_real_captures_are_planned_whole():
     truth = SCENES.parent / "truth"
     if not (SCENES.is_dir() and truth.is_dir()):
         pytest.skip(f"{SCENES} or {truth} is not here")

@@ -14,21 +14,27 @@ from beags_plugin.bench.objects_picture import captioned
 from beags_plugin.bench.trials import VariantTrial
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
+    from beags_plugin.core.cameras import Camera
     from beags_plugin.core.surfels import Surfels
     from beags_plugin.evaluation.records import EvalView
     from beags_plugin.plugin.objects.evaluate import EvaluatedRun
     from beags_plugin.plugin.runs.read import SavedScene
+    from beags_plugin.rasterizers.interface import RasterSettings
 
 SIDE = 200  # pixels of a picture of an object, and height of one of the scene
 AROUND, ABOVE = 4, 20.0  # pictures on a circle, degrees above the horizon
 BENEATH, BELOW = 2, -35.0
+STRAYS = 0.03  # of an object's Gaussians, at each end of each axis
+MARGIN = 0.1  # around the others, in sides of their box
 LETTER = 7  # pixels of one in a caption, at most
 
 
 def write_sheet(path: Path, runs: Sequence[VariantTrial], outcomes: Mapping[str, Outcome]) -> bool:
     """Write the sheet of one scene, a line for each row of its first seed; returns whether any row has a result.
 
-    All rows are seen by the same cameras, which stand around the median of the boxes of the rows' objects.
+    All rows are seen by the same cameras: an object's box is the median of those that it has in the rows.
     """
     from beags_plugin.pictures.cells import below, beside, cell, write_picture
     from beags_plugin.pictures.objects import render_alone
@@ -75,15 +81,24 @@ def _alone(scene: SavedScene, class_id: int) -> Surfels:
     return select_class(scene.surfels(), scene.members, class_id)[0]
 
 
-def _stand(class_id: int, first: EvaluatedRun, scenes: Mapping[str, SavedScene]):
+def _stand(class_id: int, first: EvaluatedRun, scenes: Mapping[str, SavedScene]) -> tuple[list[Camera], RasterSettings]:
     """Return the cameras around an object, from above the horizon and then from below, and their settings."""
-    from beags_plugin.export.frames import bounding_box
     from beags_plugin.pictures.orbit import orbit, orbit_frame, orbit_settings
 
-    boxes = [bounding_box(part) for scene in scenes.values() if len(part := _alone(scene, class_id))]
+    boxes = [_bulk(part) for scene in scenes.values() if len(part := _alone(scene, class_id))]
     if not boxes:
         boxes = [(torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))]
     low, high = (torch.stack(corners).median(dim=0).values for corners in zip(*boxes, strict=True))
     stand = orbit_frame(low, high, first.views.cameras("train"))
     cameras = [*orbit(stand, AROUND, SIDE, ABOVE), *orbit(stand, BENEATH, SIDE, BELOW)]
     return cameras, orbit_settings(stand)
+
+
+def _bulk(surfels: Surfels) -> tuple[Tensor, Tensor]:
+    """Return the corners, [3] float64 each, of a box around all but the outermost centres, and a margin.
+
+    What spreads further leaves the picture: a few strays would else make everything small.
+    """
+    shares = torch.tensor([STRAYS, 1.0 - STRAYS], dtype=torch.float64)
+    low, high = torch.quantile(surfels.means.detach().cpu().double(), shares, dim=0)
+    return low - MARGIN * (high - low), high + MARGIN * (high - low)
