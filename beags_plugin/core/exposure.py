@@ -17,6 +17,7 @@ _ROUNDS = 12  # rounds of reweighting, which turn least squares into least absol
 _LEAST_RESIDUAL = 0.02  # log2 units; a smaller residual counts no more than this one
 _NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 _MEDIAN_COST = 1.25  # standard error of a median over that of a mean
+_LEAST_GAIN = 0.02  # of a transform that can be inverted; a photo of less is black, and evening it out shows noise
 
 
 @dataclass(frozen=True)
@@ -30,12 +31,18 @@ class Exposures:
     affine: Tensor
 
     def evened(self, photo: Tensor, name: str) -> Tensor:
-        """Return a photo [H, W, 3] in 0..1 with the mean photo's exposure; as it is where its own is not known."""
+        """Return a photo [H, W, 3] in 0..1 with the mean photo's exposure.
+
+        It is returned as it is where its transform is not known, or cannot be inverted, as a black photo's.
+        """
         if name not in self.names:
             return photo
-        affine = self.affine[self.names.index(name)].to(photo)
+        affine = self.affine[self.names.index(name)].double()
+        if float(torch.linalg.svdvals(affine[:, :3])[-1]) < _LEAST_GAIN:
+            return photo
         matrix = torch.linalg.inv(affine[:, :3])
-        return apply_affine(photo - affine[:, 3], torch.cat([matrix, matrix.new_zeros(3, 1)], dim=1)).clamp(0.0, 1.0)
+        inverse = torch.cat([matrix, -(matrix @ affine[:, 3:])], dim=1)
+        return apply_affine(photo, inverse).clamp(0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -87,8 +94,7 @@ def gains(sightings: Sightings, count: int) -> Gains:
             stops[:, channel] = found - found.mean()
     seen = np.bincount(photo, minlength=count)
     spread = _NORMAL * float(np.median(np.abs(residuals))) if len(logs) else 0.0
-    with np.errstate(divide="ignore"):
-        noise = np.where(seen > 0, _MEDIAN_COST * spread / np.sqrt(seen), np.inf)
+    noise = np.where(seen > 0, _MEDIAN_COST * spread / np.sqrt(np.maximum(seen, 1)), np.inf)
     return Gains(np.round(stops, 5), noise)  # Rounded, so that no last bit of a solver tells.
 
 

@@ -84,14 +84,12 @@ def exposures_of_run(model: SceneModel, datamanager: BeagsDataManager) -> PhotoE
         of_photos = [of_name.get(name, identity) for name, identity in zip(names, start, strict=True)]
         return PhotoExposures(model, Exposures(names, torch.stack(of_photos)))
     found = photo_gains(datamanager)
+    learned = wanted == "on" or (found is not None and _differ(found))
     if found is not None:
-        different = found.spread > max(LEAST_SPREAD, CERTAIN * float(np.median(found.noise)))
-        if wanted == "auto" and not different:
-            return None
-        for line in _lines(found, names):
+        for line in _lines(found, names, learned):
             say(line)
         start[:, range(3), range(3)] = torch.from_numpy(_diagonals(found)).float()
-    return PhotoExposures(model, Exposures(names, start))
+    return PhotoExposures(model, Exposures(names, start)) if learned else None
 
 
 def photo_gains(datamanager: BeagsDataManager) -> Gains | None:
@@ -108,20 +106,29 @@ def photo_gains(datamanager: BeagsDataManager) -> Gains | None:
     return gains(sightings([ids for ids, _ in tracks], light), len(tracks))
 
 
-def _lines(found: Gains, names: Sequence[str]) -> Iterator[str]:
-    """Yield what the user should know about the photos' gains."""
-    means = found.stops.mean(axis=1)
-    tinted = found.spread_of_colors
-    balance = f", and their colours by {tinted:.2f} EV besides" if tinted > LEAST_SPREAD else ""
-    yield (
-        f"The photos differ in exposure by {found.spread:.2f} EV (standard deviation; {means.min():+.2f} to "
-        f"{means.max():+.2f}){balance}: each gets a colour transform of its own, and the scene has the mean photo's "
-        "exposure."
-    )
-    if blind := [name for name, noise in zip(names, found.noise, strict=True) if np.isinf(noise)]:
+def _differ(found: Gains) -> bool:
+    """Return whether photos differ in exposure or white balance by more than noise explains."""
+    spread = max(found.spread, found.spread_of_colors)
+    return spread > max(LEAST_SPREAD, CERTAIN * float(np.median(found.noise)))
+
+
+def _lines(found: Gains, names: Sequence[str], learned: bool) -> Iterator[str]:
+    """Yield what the user should know about the photos' gains. learned: whether photos get transforms of their own."""
+    if learned:
+        means = found.stops.mean(axis=1)
+        tinted = found.spread_of_colors
+        balance = f", and their colours by {tinted:.2f} EV besides" if tinted > LEAST_SPREAD else ""
         yield (
-            f"{len(blind)} photos, the first of them {blind[0]}, show no point that is neither black nor burnt out: "
-            "they begin with the mean exposure."
+            f"The photos differ in exposure by {found.spread:.2f} EV (standard deviation; {means.min():+.2f} to "
+            f"{means.max():+.2f}){balance}: each gets a colour transform of its own, and the scene has the mean "
+            "photo's exposure."
+        )
+    if blind := [name for name, noise in zip(names, found.noise, strict=True) if np.isinf(noise)]:
+        one = len(blind) == 1
+        which = f"The photo {blind[0]} shows" if one else f"{len(blind)} photos, the first of them {blind[0]}, show"
+        yield (
+            f"{which} no point of the scene that is neither black nor burnt out: take {'it' if one else 'them'} out of "
+            "the data if nothing can be seen there."
         )
 
 

@@ -33,6 +33,8 @@ def seeds_seen(root: Path, points: np.ndarray, views: PosedViews) -> Tracks:
         content = load_json(file)
         photos, seen = [str(stem) for stem in content["photos"]], content["points"]
         pairs = [(photos[photo], point) for point, shown in enumerate(seen) for photo in shown]
+        if any(photo < 0 for shown in seen for photo in shown):
+            raise ValueError("an index of a photo is negative")
     except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
         raise UserError(f"{file} cannot be read ({reason(error)}): write it anew, or delete it.") from error
     if len(seen) != len(points):
