@@ -104,10 +104,10 @@ def _wrong(state: Mapping[str, Any]) -> str | None:
 
 def _is_exposures(value: Any) -> bool:
     """Return whether a value holds the names of V photos and their transforms [V, 3, 4] float."""
-    if not isinstance(value, dict) or not isinstance(value.get("names"), list):
+    names, affine = (value.get(key) for key in ("names", "affine")) if isinstance(value, dict) else (None, None)
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         return False
-    affine = value.get("affine")
-    right = isinstance(affine, Tensor) and affine.shape == (len(value["names"]), 3, 4) and affine.is_floating_point()
+    right = isinstance(affine, Tensor) and affine.shape == (len(names), 3, 4) and affine.is_floating_point()
     return right and bool(affine.isfinite().all())
 
 

@@ -11,7 +11,9 @@ from beags_plugin.system.errors import UserError
 
 pytest.importorskip("nerfstudio")
 
-from beags_plugin.plugin.runs.checkpoint_file import validate
+from beags_plugin.core.exposure import Exposures
+from beags_plugin.core.membership import Membership
+from beags_plugin.plugin.runs.checkpoint_file import exposures_of, extra_state, validate
 
 
 def state(**changed) -> dict:
@@ -26,6 +28,38 @@ def state(**changed) -> dict:
 
 def test_a_whole_scene_passes():
     validate(state(), Path("a.ckpt"))
+
+
+def test_exposures_pass_and_are_read_as_they_were():
+    exposures = Exposures(("a", "b"), torch.rand(2, 3, 4))
+    members = Membership(torch.zeros(2, dtype=torch.int32))
+    extra = extra_state({0: "background"}, members, exposures)
+    validate(state(_extra_state=extra), Path("a.ckpt"))
+    found = exposures_of(extra)
+    assert found is not None and found.names == ("a", "b") and torch.equal(found.affine, exposures.affine)
+    exposures.affine.zero_()  # as training would go on
+    assert found.affine.any()
+    assert exposures_of({"classes": {}}) is None and "exposures" not in extra_state({}, members)
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        3,
+        {},
+        {"names": ["a"]},
+        {"names": "a", "affine": torch.zeros(1, 3, 4)},
+        {"names": [1], "affine": torch.zeros(1, 3, 4)},
+        {"names": ["a", "b"], "affine": torch.zeros(1, 3, 4)},
+        {"names": ["a"], "affine": torch.zeros(1, 3, 3)},
+        {"names": ["a"], "affine": torch.zeros(1, 3, 4, dtype=torch.int32)},
+        {"names": ["a"], "affine": torch.full((1, 3, 4), torch.inf)},
+    ],
+)
+def test_damaged_exposures_are_refused(damaged):
+    extra = {"classes": {0: "background"}, "exposures": damaged}
+    with pytest.raises(UserError, match=r"a.ckpt holds no scene of beags \(the exposures of its photos are damaged\)"):
+        validate(state(_extra_state=extra), Path("a.ckpt"))
 
 
 @pytest.mark.parametrize(
