@@ -39,7 +39,7 @@ class ResultRow:
     figures: values by the names of ``FIGURES``, None where there is none; mask metrics in 0..1. objects: the same of
     each object. failed: the reason for missing figures, in a sentence. count: number of scenes and seeds in a mean;
     failures: number of those that it lacks. protocol, truth: of the evaluation of one trial, see
-    ``SceneMetrics.extracted_truth``; None in a mean or where it failed.
+    ``SceneMetrics.extracted_truth``; None in a mean or where it failed. colors_fitted: see ``SceneMetrics`` too.
     """
 
     variant: Variant
@@ -52,6 +52,7 @@ class ResultRow:
     failures: int = 0
     protocol: Protocol | None = None
     truth: str | None = None
+    colors_fitted: bool = False
 
 
 def make_row(
@@ -76,7 +77,8 @@ def make_row(
     lost = (start - end for start, end in pairs if start is not None and end is not None)
     figures[_LOST] = max(lost, default=None)
     protocol = Protocol(**evaluation["protocol"])
-    return ResultRow(variant, scene, seed, figures, objects, protocol=protocol, truth=evaluation["extracted_truth"])
+    truth, fitted = evaluation["extracted_truth"], evaluation.get("colors_fitted", False)
+    return ResultRow(variant, scene, seed, figures, objects, protocol=protocol, truth=truth, colors_fitted=fitted)
 
 
 def _masks(found: Mapping[str, Any]) -> dict[str, float | None]:
@@ -128,6 +130,7 @@ def protocol_of(rows: Sequence[ResultRow]) -> str | None:
         [row.truth for row in rows],
         removal=any(row.figures["removal_psnr_after"] is not None for row in rows),
         shown=any(row.figures["shown_after"] is not None for row in rows),
+        fitted=any(row.colors_fitted for row in rows),
     )
 
 

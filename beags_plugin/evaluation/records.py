@@ -28,7 +28,8 @@ KINDS = tuple(FIGURES)
 IMAGE_FIGURES = ("psnr", "psnr_fit", "psnr_shown", "shown", "psnr_objects", "ssim")
 """Of whole images. psnr_fit: after the affine map of colours that fits the photo best, one a photo, clamped to 0..1.
 psnr_shown: over the pixels whose surface some training photo shows; shown: their share.
-psnr_objects: over the pixels of any object but those next to the background."""
+psnr_objects: over the pixels of any object but those next to the background. These two are taken after that map where
+``SceneMetrics.colors_fitted`` says so."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ class SceneMetrics:
     mean: over the scene, as the protocol says. objects: object id to the mean over its masks. psnr: dB, mean over the
     views with a photograph, infinite for equal images; None without any. Other ``IMAGE_FIGURES``: likewise.
     extracted_truth: "silhouette" (occlusion-free), "visible" (without the pixels where another object hides this one),
-    "both", or None. masks, views: the single figures behind these means.
+    "both", or None. masks, views: the single figures behind these means. colors_fitted: see ``evaluate_scene``.
     """
 
     mean: ObjectMetrics
@@ -120,3 +121,4 @@ class SceneMetrics:
     shown: float | None = None
     psnr_objects: float | None = None
     psnr_fit: float | None = None
+    colors_fitted: bool = False

@@ -58,11 +58,11 @@ class RunMetrics:
     def to_json(self) -> dict[str, Any]:
         """Return the run as plain values for ``json.dump``; a figure that does not exist or is infinite is None.
 
-        {"scene", "config", "protocol": {choice: value}, "extracted_truth", "notes": [sentence], "mean": {"extracted":
-        {"before": {``FIGURES``}, "after": {...}}, "seen": {...}, "rendered": {...}, "removal": {"before":
-        {``REMOVAL_METRICS``}, "after": {...}}}, "objects": {name: as mean}, "worst": name, "masks": [{"kind",
-        "object", "view", "truth", "before": as in mean, "after": {...}}], "views": [{"view"}]}, and {"before", "after"}
-        of every one of ``IMAGE_FIGURES`` in itself and in each view.
+        {"scene", "config", "protocol": {choice: value}, "extracted_truth", "colors_fitted", "notes": [sentence],
+        "mean": {"extracted": {"before": {``FIGURES``}, "after": {...}}, "seen": {...}, "rendered": {...}, "removal":
+        {"before": {``REMOVAL_METRICS``}, "after": {...}}}, "objects": {name: as mean}, "worst": name, "masks":
+        [{"kind", "object", "view", "truth", "before": as in mean, "after": {...}}], "views": [{"view"}]}, and
+        {"before", "after"} of every one of ``IMAGE_FIGURES`` in itself and in each view.
         """
         names, stages = self.names(), self.stages()
         view_names = [view.name for view in self.after.views]
@@ -86,6 +86,7 @@ class RunMetrics:
             "config": self.config,
             "protocol": self.protocol.to_json(),
             "extracted_truth": self.after.extracted_truth,
+            "colors_fitted": self.after.colors_fitted,
             "notes": list(self.notes),
             "mean": all_kinds(lambda scene: scene.mean),
             **images(lambda scene: scene),

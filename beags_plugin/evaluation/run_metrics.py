@@ -49,6 +49,7 @@ def evaluate_scene(
     protocol: Protocol | None = None,
     complete: bool = True,
     objects_alone: bool = False,
+    colors_fitted: bool = False,
     background: Tensor | None = None,
     shown: Sequence[Tensor] | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -58,6 +59,8 @@ def evaluate_scene(
     surfels: N Gaussians. members: of them; None scores images alone. classes: id to name; the background, 0, is not
     scored. complete: False where Gaussians were taken out of the scene, so that only extracted masks can be
     scored. objects_alone: the scene was trained on nothing but objects: of images, only their pixels are scored.
+    colors_fitted: the scene has learned exposures of photos, so its colours are brought to each photo by one fit of the
+    whole rendering; PSNR shown, PSNR objects and removals are taken after it.
     background: [3] behind the images; black if None. shown: per view [H, W] bool, see ``shown_pixels``.
     progress: receives (done, total) views.
     """
@@ -81,10 +84,16 @@ def evaluate_scene(
             image = ViewRecord(view.name, None, None)
             if complete and view.image is not None:
                 color, photo = renderer.image(surfels, background), view.image.to(surfels.means)
+                if (of_objects := object_pixels(view)) is not None:
+                    of_objects = of_objects.to(color.device)
+                # What is drawn outside of objects that were trained alone has no colour of the photo.
+                affine = affine_color_fit(color, photo, of_objects if objects_alone else None)
                 if not objects_alone:
-                    plain, fitted = psnr(color, photo), psnr_after_fit(color, photo)
-                    image = ViewRecord(view.name, plain, float(ssim(color, photo)), psnr_fit=fitted)
-                if (of_objects := object_pixels(view)) is not None and of_objects.any():
+                    fitted = psnr(fitted_colors(color, affine), photo)
+                    image = ViewRecord(view.name, psnr(color, photo), float(ssim(color, photo)), psnr_fit=fitted)
+                if colors_fitted:
+                    color = fitted_colors(color, affine).to(color)
+                if of_objects is not None and of_objects.any():
                     image = replace(image, psnr_objects=psnr(color[of_objects], photo[of_objects]))
                 if shown is not None and not objects_alone:
                     of_view = shown[index]
@@ -93,6 +102,8 @@ def evaluate_scene(
                 for class_id, exact, silhouette, known in removals(view, [] if objects_alone else objects):
                     assert members is not None
                     rest = renderer.image(remove_class(surfels, members, class_id)[0], background)
+                    if colors_fitted:  # by the fit with the object, lest a fit of its own hide remains
+                        rest = fitted_colors(rest, affine).to(rest)
                     known = None if known is None else known.to(rest.device)
                     metrics = removal_metrics(rest, photo, exact.to(rest), silhouette.to(rest.device), known)
                     masks.append(MaskRecord("removal", class_id, index, "silhouette", metrics))
@@ -110,8 +121,14 @@ def evaluate_scene(
         extracted_truth="both" if len(truths) == 2 else next(iter(truths), None),
         masks=tuple(masks),
         views=tuple(images),
+        colors_fitted=colors_fitted,
         **{name: mean(getattr(image, name) for image in images) for name in IMAGE_FIGURES},
     )
+
+
+def fitted_colors(rendered: Tensor, affine: Tensor) -> Tensor:
+    """Return a rendering [H, W, 3] under an affine colour map [3, 4], float64, clamped to 0..1."""
+    return apply_affine(rendered.double(), affine).clamp(0, 1)
 
 
 def psnr_after_fit(rendered: Tensor, photo: Tensor) -> float:
@@ -119,8 +136,7 @@ def psnr_after_fit(rendered: Tensor, photo: Tensor) -> float:
 
     rendered, photo: [H, W, 3] float in 0..1. A difference of exposure or white balance alone costs nothing.
     """
-    fitted = apply_affine(rendered.double(), affine_color_fit(rendered, photo))
-    return psnr(fitted.clamp(0, 1), photo)
+    return psnr(fitted_colors(rendered, affine_color_fit(rendered, photo)), photo)
 
 
 def average(masks: Iterable[MaskRecord], kind: Kind, protocol: Protocol, scene: Hashable = 0) -> Any:

@@ -104,13 +104,17 @@ def protocol_line(runs: Sequence[RunMetrics]) -> str:
         [run.after.extracted_truth for run in runs],
         removal=any(run.after.mean.removal is not None for run in runs),
         shown=any(run.after.shown is not None for run in runs),
+        fitted=any(run.after.colors_fitted for run in runs),
     )
 
 
-def protocol_sentence(protocol: Protocol, truths: Iterable[str | None], *, removal: bool, shown: bool) -> str:
+def protocol_sentence(
+    protocol: Protocol, truths: Iterable[str | None], *, removal: bool, shown: bool, fitted: bool
+) -> str:
     """Return a sentence with all choices behind figures.
 
-    truths: of each scene, as ``SceneMetrics.extracted_truth``. removal, shown: whether there are such figures.
+    truths: of each scene, as ``SceneMetrics.extracted_truth``. removal, shown: whether there are such figures. fitted:
+    whether a run has learned exposures.
     """
     known = {truth for truth in truths if truth is not None}
     truth = _TRUTHS[known.pop() if len(known) == 1 else "both"] if known else "no masks"
@@ -127,12 +131,18 @@ def protocol_sentence(protocol: Protocol, truths: Iterable[str | None], *, remov
             " PSNR shown: over the pixels whose surface (median depth before refinement, else of the run) some "
             f"training view shows within {100 * TAU:g} % of its depth."
         )
+    of_fitted = ""
+    if fitted:
+        of_fitted = (
+            " Of runs that have learned the photos' exposures, PSNR shown, PSNR objects and removals are taken after "
+            "the colour fit of the whole view."
+        )
     scenes = "over scenes" if protocol.data_set_average == "scenes" else "of all scenes pooled"
     return (
         f"Protocol: extracted masks against {truth}; above {protocol.threshold:g}; boundary band and margin of spill "
         f"{100 * protocol.band_share:g} % of the diagonal; the {protocol.resize} is resized; masks empty in truth and "
         f"prediction are left out, IoU and BIoU of those empty in truth alone are 0; means over "
-        f"{protocol.scene_average}, then {scenes}.{of_removal}{of_shown}"
+        f"{protocol.scene_average}, then {scenes}.{of_removal}{of_shown}{of_fitted}"
     )
 
 

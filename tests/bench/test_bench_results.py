@@ -149,6 +149,9 @@ def test_the_protocol_is_worded_as_by_beags_eval(rows):
     plain = [dataclasses.replace(row, figures={**row.figures, "shown_after": None, **gone}) for row in rows]
     bare = dataclasses.replace(scene, mean=ObjectMetrics(None, None), shown=None)
     assert protocol_of(plain) == protocol_line([dataclasses.replace(run, after=bare)])
+    fitted = [dataclasses.replace(row, colors_fitted=row.scene == "a") for row in rows]
+    exposed = dataclasses.replace(run, after=dataclasses.replace(scene, colors_fitted=True))
+    assert protocol_of(fitted) == protocol_line([run, exposed]) != protocol_line([run])
     mixed = [dataclasses.replace(row, truth="visible" if row.scene == "b" else row.truth) for row in rows]
     assert "against whole occlusion-free silhouettes, else visible masks" in protocol_of(mixed)
     assert protocol_of(rows[3:]) is None  # it failed

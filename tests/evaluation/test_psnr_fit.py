@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from known_masks import BOX, CLASSES, CUP, FLOOR, SETTINGS, SIZE, Squares, camera, scene, square_mask
+from known_masks import BOX, CLASSES, CUP, FLOOR, SETTINGS, SIZE, Squares, camera, scene, square_mask, truth
 from rich.console import Console
 
 from beags_plugin.core.membership import Membership
@@ -17,16 +17,17 @@ from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import EvalView, SceneMetrics
 from beags_plugin.evaluation.report import CSV_COLUMNS, RunMetrics, data_set
 from beags_plugin.evaluation.run_metrics import evaluate_scene, psnr_after_fit
-from beags_plugin.evaluation.table import render_data_set, render_run
+from beags_plugin.evaluation.table import protocol_line, render_data_set, render_run
 
 COLORS = torch.tensor([[0.9, 0.1, 0.4], [0.2, 0.7, 0.3], [0.5, 0.5, 0.8]])  # of cup, box and floor
 IDS = torch.tensor([1, 2, 0], dtype=torch.int32)
 
 
-def evaluated(photo: torch.Tensor) -> SceneMetrics:
+def evaluated(photo: torch.Tensor, **options) -> SceneMetrics:
     surfels = scene([CUP, BOX, FLOOR])
     surfels = replace(surfels, sh_dc=(COLORS - 0.5) / 0.28209479177387814)
-    return evaluate_scene(surfels, Membership(IDS), Squares(), SETTINGS, [EvalView(camera(), photo)], CLASSES)
+    view = EvalView(camera(), photo, truth())
+    return evaluate_scene(surfels, Membership(IDS), Squares(), SETTINGS, [view], CLASSES, **options)
 
 
 def warm_photo() -> torch.Tensor:
@@ -44,6 +45,25 @@ def test_exposure_and_white_balance_are_fitted_away_and_nothing_else():
     photo[:2, :2, 0] += 0.4  # four pixels show something else
     metrics, error = evaluated(photo), 4 * 0.4**2 / (3 * SIZE**2)
     assert metrics.psnr < 15 and metrics.psnr_fit == pytest.approx(-10 * math.log10(error), abs=0.1)
+
+
+@pytest.mark.parametrize("fitted", [False, True])
+def test_parts_of_images_are_scored_after_the_fit_where_exposures_were_learned(fitted):
+    shown = square_mask(*BOX)
+    metrics = evaluated(warm_photo(), shown=[shown], colors_fitted=fitted)
+    for value in (metrics.psnr_shown, metrics.psnr_objects):
+        assert value > 100 if fitted else value < 20
+    assert metrics.psnr < 15 and metrics.psnr_fit > 100 and metrics.colors_fitted == fitted
+    other = evaluated(warm_photo(), shown=[shown])
+    assert (metrics.psnr, metrics.psnr_fit, metrics.ssim) == (other.psnr, other.psnr_fit, other.ssim)
+
+
+def test_objects_trained_alone_are_fitted_by_their_own_pixels():
+    """What is drawn outside of them was never compared with the photo."""
+    photo, other = warm_photo(), 1 - warm_photo()
+    photo = torch.where((truth() > 0)[..., None], photo, other)
+    metrics = evaluated(photo, objects_alone=True, colors_fitted=True)
+    assert metrics.psnr_objects > 100 and metrics.psnr is metrics.psnr_fit is None
 
 
 def test_a_rendering_of_one_colour_is_fitted_to_the_mean():
@@ -66,6 +86,11 @@ def test_tables_and_files_say_which_is_which():
     before, after = evaluated(warm_photo().roll(6, 1)), evaluated(warm_photo().roll(3, 0))
     run = RunMetrics("lab", "c", Protocol(), CLASSES, before, after)
     found = data_set("labs", [run, run])
+    fitted = evaluated(warm_photo(), shown=[square_mask(*BOX)], colors_fitted=True)
+    exposed = RunMetrics("lab", "c", Protocol(), CLASSES, fitted, fitted)
+    words = "PSNR objects and removals are taken after the colour fit"
+    assert words in protocol_line([run, exposed]) and words not in protocol_line([run])
+    assert exposed.to_json()["colors_fitted"] and not run.to_json()["colors_fitted"]
     content = found.to_json()
     assert content["psnr_fit"] == content["scenes"][0]["psnr_fit"] == content["scenes"][0]["views"][0]["psnr_fit"]
     assert content["psnr_fit"] == {"before": before.psnr_fit, "after": after.psnr_fit} != content["psnr"]

@@ -125,6 +125,27 @@ def printed(table) -> str:
     return out.getvalue()
 
 
+def exposed(picture: torch.Tensor) -> torch.Tensor:
+    """Return a picture as a photo of less light and another white balance records it."""
+    return picture * torch.tensor([0.5, 0.6, 0.7]) + 0.3
+
+
+def test_of_learned_exposures_the_photos_own_is_taken_off_before_remains_are_told():
+    """The fit is that of the whole rendering, so that what stays is not fitted away."""
+    photo, rest = exposed(picture(PIECE, CUP)), {1: exposed(picture())}
+    plain = evaluated([PIECE, CUP], (1, 1), rest, photo)
+    fitted = evaluated([PIECE, CUP], (1, 1), rest, photo, colors_fitted=True)
+    assert plain.mean.removal.psnr < 20 and fitted.mean.removal.psnr > 80
+    assert fitted.mean.removal.ssim > 0.9999 > plain.mean.removal.ssim
+    assert fitted.mean.removal.remains == 0.0
+    assert fitted.psnr == plain.psnr < 20 and fitted.psnr_fit == plain.psnr_fit > 80
+    # What stays is told as without the exposure.
+    stays = evaluated([PIECE, CUP], (0, 1), rest, photo, colors_fitted=True).mean.removal
+    assert stays.remains == 16 / 64 and stays.psnr == pytest.approx(decibels(16, 64) + 4.4, abs=0.5)
+    nothing = evaluated([CUP], (0,), rest, exposed(picture(CUP)), colors_fitted=True).mean.removal
+    assert nothing.remains == 1.0
+
+
 def test_tables_and_files_show_removals_before_and_after():
     before, after = (evaluated([PIECE, CUP, BOX], (ids, 1, 2), {1: picture(BOX)}) for ids in (0, 1))
     run = RunMetrics("lab", "c", Protocol(), CLASSES, before, after)

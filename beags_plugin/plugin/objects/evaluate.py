@@ -44,8 +44,8 @@ class EvaluatedRun:
 
     name: of the scene in tables. data: if not where they were. stages: "before" and "after", or "after" alone, to the
     saved scenes. complete: False for a run of ``beags extract``, which holds a part of a scene. objects_alone: whether
-    it was trained on the objects' pixels alone. classes: id to name of
-    the classes that can be scored.
+    it was trained on the objects' pixels alone. colors_fitted: whether it has learned exposures of photos. classes: id
+    to name of the classes that can be scored.
     """
 
     def __init__(self, config_path: Path, name: str = "", data: Path | None = None) -> None:
@@ -62,6 +62,7 @@ class EvaluatedRun:
             present = after.members.present()
             self.classes = {c: each for c, each in after.classes.items() if c in present}
         self.name = name or scene_name(after.config)
+        self.colors_fitted = any(scene.exposures is not None for scene in self.stages.values())
         self.settings = raster_settings(after)
         self.rasterizer: Rasterizer = make_rasterizer(after.config.model_config.rasterizer)
 
@@ -100,6 +101,7 @@ class EvaluatedRun:
                 protocol=protocol,
                 complete=self.complete,
                 objects_alone=self.objects_alone,
+                colors_fitted=self.colors_fitted,
                 background=self.views.background,
                 shown=shown,
                 progress=None if progress is None else lambda done, _, former=former: progress(former + done, total),

@@ -87,8 +87,8 @@ def test_the_json_says_everything(trained, tmp_path):
     assert content["protocol"] == Protocol(threshold=0.4).to_json()
     (scene,) = content["scenes"]
     assert set(scene) == {
-        "scene", "config", "protocol", "extracted_truth", "notes", "mean", *IMAGE_FIGURES, "objects", "worst",
-        "masks", "views",
+        "scene", "config", "protocol", "extracted_truth", "colors_fitted", "notes", "mean", *IMAGE_FIGURES, "objects",
+        "worst", "masks", "views",
     }  # fmt: skip
     assert scene["extracted_truth"] == "both" and set(scene["objects"]) == {"cup", "box"}
     figures = {"before", "after"}
