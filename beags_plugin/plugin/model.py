@@ -13,6 +13,7 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import initial_surfels
+from beags_plugin.evaluation.run_metrics import psnr_after_fit
 from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.class_members import ClassMembers
@@ -163,9 +164,14 @@ class BeagsModel(SceneModel):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Any], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Return PSNR and SSIM of an evaluation view, and pictures for tensorboard."""
+        """Return PSNR and SSIM of an evaluation view, and pictures for tensorboard.
+
+        Of a scene with exposures of its photos also ``psnr_fit``, PSNR after the affine colour fit of the view.
+        """
         image = self._truth(batch, outputs["background"])
         metrics = {"psnr": float(psnr(outputs["rgb"], image)), "ssim": float(ssim(outputs["rgb"], image))}
+        if self.exposures is not None:
+            metrics["psnr_fit"] = psnr_after_fit(outputs["rgb"], image)
         images = {"img": torch.cat([image, outputs["rgb"]], dim=1)}
         if "class_map" in outputs:
             images["class_map"] = outputs["class_map"]

@@ -18,7 +18,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import mask_metrics
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import EvalView
-from beags_plugin.evaluation.run_metrics import MaskRenderer
+from beags_plugin.evaluation.run_metrics import MaskRenderer, psnr_after_fit
 from beags_plugin.evaluation.violations import boundary_errors, occupancy_violations
 from beags_plugin.extraction.select import select_class
 from beags_plugin.labels.class_ids import BACKGROUND
@@ -169,7 +169,8 @@ class HeldOutCurve:
 
     A record holds ``step`` (steps done), ``gaussians``, ``psnr`` (dB) and ``ssim`` of the held-out views (means over
     them), ``train_psnr`` of as many training views spread over all, and ``seconds`` and ``cpu_seconds`` of training so
-    far, without the measurements. Only colours are rendered: a view costs a fraction of a step.
+    far, without the measurements. Of a scene with exposures of its photos also ``psnr_fit`` and ``train_psnr_fit``,
+    after the affine colour fit of each view. Only colours are rendered: a view costs a fraction of a step.
     """
 
     def __init__(self, folder: Path, every: int, last: int, model: SceneModel, datamanager: BeagsDataManager) -> None:
@@ -208,18 +209,14 @@ class HeldOutCurve:
         views = [*self.held_out, *self.train]
         with progress_bar("Measuring held-out views", passing=True) as progress:
             qualities = [self._quality(view) for view in counted(views, len(views), progress)]
-        psnr, similarity = zip(*qualities[: len(self.held_out)], strict=True)
-        train_psnr = [quality for quality, _ in qualities[len(self.held_out) :]]
-        return {
-            "step": done,
-            "gaussians": self.model.num_points,
-            "psnr": sum(psnr) / len(psnr),
-            "ssim": sum(similarity) / len(similarity),
-            "train_psnr": sum(train_psnr) / len(train_psnr),
-        }
+        held_out, train = qualities[: len(self.held_out)], qualities[len(self.held_out) :]
+        means = {name: sum(each[name] for each in held_out) / len(held_out) for name in held_out[0]}
+        for name in means.keys() - {"ssim"}:
+            means[f"train_{name}"] = sum(each[name] for each in train) / len(train)
+        return {"step": done, "gaussians": self.model.num_points, **dict(sorted(means.items()))}
 
     @torch.no_grad()
-    def _quality(self, view: View) -> tuple[float, float]:
+    def _quality(self, view: View) -> dict[str, float]:
         model = self.model
         background = model.background_color.to(model.device)
         image = view.image_on(background)
@@ -229,7 +226,8 @@ class HeldOutCurve:
             model.settings(geometry=False),
             background,
         ).color.clamp(0.0, 1.0)
-        return float(psnr(color, image)), float(ssim(color, image))
+        found = {"psnr": float(psnr(color, image)), "ssim": float(ssim(color, image))}
+        return found if model.exposures is None else {**found, "psnr_fit": psnr_after_fit(color, image)}
 
 
 def _clocks() -> dict[str, float]:

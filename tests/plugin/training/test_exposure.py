@@ -26,6 +26,7 @@ from resumed_runs import (
 )
 
 from beags_plugin.core.exposure import Exposures
+from beags_plugin.plugin.objects.evaluate import evaluate_run
 from beags_plugin.plugin.objects.extract import extract_objects
 from beags_plugin.plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.presets import preset_config
@@ -219,6 +220,20 @@ def test_a_killed_run_ends_as_the_whole_one(folder, whole, tmp_path, monkeypatch
     assert_same_run(run, whole)
     part = checkpoint_of(run)["beags"]["parts"]["exposure"]
     assert part["adam"]["state"][0]["exp_avg"].any() and float(part["adam"]["state"][0]["step"]) == 57
+
+
+def test_curves_and_evaluation_take_the_fit_for_exposures(whole, short_run):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    (last,) = json.loads((whole / "held_out.json").read_text())[-1:]
+    assert last["psnr_fit"] > last["psnr"] and last["train_psnr_fit"] > last["train_psnr"]
+    events = EventAccumulator(str(whole))
+    events.Reload()
+    assert "Eval Images Metrics/psnr_fit" in events.Tags()["scalars"]
+    found = evaluate_run(whole / "config.yml")
+    assert found.before is not None and found.before.colors_fitted and found.after.colors_fitted
+    (plain,) = json.loads((short_run / "run/held_out.json").read_text())[-1:]
+    assert "psnr_fit" not in plain and not evaluate_run(short_run / "run/config.yml").after.colors_fitted
 
 
 def test_the_number_of_threads_is_no_matter(folder, whole, tmp_path):

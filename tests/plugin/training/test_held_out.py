@@ -10,6 +10,7 @@ import torch
 pytest.importorskip("nerfstudio")
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.exposure import Exposures
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.photometric import ssim
 from beags_plugin.plugin.options.schedule import PhaseSchedule
@@ -37,6 +38,7 @@ class Model:
         self.rasterizer, self.num_points, self.device = rasterizer, 9, torch.device("cpu")
         self.schedule = PhaseSchedule(base_steps=25, refine_steps=5)
         self.background_color = torch.zeros(3)
+        self.exposures = None
 
     def surfels(self):
         return self.scene
@@ -76,5 +78,16 @@ def test_it_measures_all_held_out_views_at_the_given_steps_and_where_phases_end(
     assert last["train_psnr"] == pytest.approx((psnr(0.1) + psnr(0.2)) / 2, rel=1e-5)  # as many views as are held out
     greys = [torch.full((20, 24, 3), grey) for grey in (0.4, 0.6)]
     assert last["ssim"] == pytest.approx(sum(float(ssim(color, grey)) for grey in greys) / 2, rel=1e-5)
-    assert last["gaussians"] == 9
+    assert last["gaussians"] == 9 and "psnr_fit" not in last
     assert all(0 <= records[0][clock] <= last[clock] for clock in ("seconds", "cpu_seconds"))
+
+
+def test_of_a_scene_with_exposures_psnr_after_the_colour_fit_stands_beside_the_plain_one(tmp_path):
+    """Grey photos are fitted by one colour: nothing is left but what rounding leaves."""
+    model = Model(make_rasterizer("torch"))
+    model.exposures = Exposures(("v",), torch.eye(3, 4)[None])
+    curve = HeldOutCurve(tmp_path, 10, 28, model, Data())
+    curve.after_step(9)
+    (record,) = json.loads((tmp_path / "held_out.json").read_text())
+    assert record["psnr"] < 30 and record["train_psnr"] < 30
+    assert record["psnr_fit"] > 100 and record["train_psnr_fit"] > 100
