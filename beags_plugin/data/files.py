@@ -195,6 +195,19 @@ def files_of_views(folder: Path, images: Sequence[Path], images_root: Path) -> l
     return files
 
 
+def unposed_note(posed: Sequence[Path]) -> str | None:
+    """Return a sentence about photos beside the posed ones that have no pose; None where all have one."""
+    known = {path.with_suffix("") for path in posed}
+    folders = sorted({path.parent for path in posed})
+    photos = [path for folder in folders for path in list_images(folder) if path.name not in OWN_PICTURES]
+    without = [path for path in photos if path.with_suffix("") not in known]
+    if not without:
+        return None
+    if len(without) == 1:
+        return f"The photo {without[0]} has no pose, so it is not used."
+    return f"{len(without)} photos have no pose, so they are not used; the first of them is {without[0]}."
+
+
 def same_proportions(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Return whether two images (width, height) may be copies of one: a smaller copy rounds each side by a pixel."""
     (width, height), (other_width, other_height) = size, other

@@ -16,8 +16,8 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserCo
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from tyro.conf import Suppress
 
-from beags_plugin.data.dataset import ColmapModel, Dataset, MaskKind, TransformsFile
-from beags_plugin.data.files import check_same_size, files_of_views, image_size
+from beags_plugin.data.dataset import ColmapModel, Dataset, MaskKind, PoseTable, TransformsFile
+from beags_plugin.data.files import check_same_size, files_of_views, image_size, unposed_note
 from beags_plugin.data.ground_truth import find_ground_truth, of_views, stray_note
 from beags_plugin.data.labels import read_class_names
 from beags_plugin.data.layout import read_dataset
@@ -265,8 +265,8 @@ class BeagsDataParser(DataParser):
                 f"Exact masks of {', '.join(map(repr, unknown))} do not count, as no class is called so: "
                 f'name the classes in {scene.root / self.config.classes_path}, {{"id": "name"}}.'
             )
-        if (stray := self._metadata["stray_truth"]) is not None:
-            notes.append(stray)
+        unposed = None if isinstance(scene.poses, PoseTable) else unposed_note(views.images)
+        notes += [note for note in (self._metadata["stray_truth"], unposed) if note is not None]
         masks = self._metadata["mask_filenames"]
         points = "random" if self._metadata["points3D_random"] else len(self._metadata["points3D_xyz"])
         line = (

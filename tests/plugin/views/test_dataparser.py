@@ -42,6 +42,22 @@ def test_what_it_says_stands_above_a_bar_not_on_it(tmp_path, monkeypatch):
     assert "Evaluating" in printed and printed.partition(line)[0].endswith("\x1b[2K")  # the bar's line is erased
 
 
+@pytest.mark.parametrize("write", [write_transforms, write_colmap])
+def test_photos_without_a_pose_are_told_and_left_out(tmp_path, write, capsys):
+    write(tmp_path)
+    for name in ("made.png", "v03.jpg"):  # no photo, and a copy of one that has a pose
+        write_image(tmp_path / "images" / name, noise(0))
+    assert names(parse(tmp_path, eval_interval=0)) == [f"v{i:02d}" for i in range(9)]
+    assert "no pose" not in capsys.readouterr().out
+    write_image(tmp_path / "images/w7.jpg", noise(0))
+    assert len(names(parse(tmp_path, eval_interval=0))) == 9
+    assert f"The photo {tmp_path}/images/w7.jpg has no pose, so it is not used." in capsys.readouterr().out
+    write_image(tmp_path / "images/u5.jpg", noise(0))
+    parse(tmp_path)
+    said = capsys.readouterr().out
+    assert f"2 photos have no pose, so they are not used; the first of them is {tmp_path}/images/u5.jpg." in said
+
+
 # --- poses and intrinsics -----------------------------------------------------------------------------------------
 
 
