@@ -25,9 +25,12 @@ from resumed_runs import (
     short_config,
 )
 
+from beags_plugin.core.color_fit import apply_affine
 from beags_plugin.core.exposure import Exposures
 from beags_plugin.plugin.objects.evaluate import evaluate_run
 from beags_plugin.plugin.objects.extract import extract_objects
+from beags_plugin.plugin.objects.photos import _image
+from beags_plugin.plugin.objects.shown import shown_scene
 from beags_plugin.plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.presets import preset_config
 from beags_plugin.plugin.runs.picked import write_picked
@@ -258,6 +261,19 @@ def test_the_base_extracted_and_picked_runs_keep_them(whole, tmp_path):
     assert torch.equal(transforms_of(run).affine, own.affine)
 
 
+def test_textures_and_exports_get_photos_of_the_mean_exposure(whole):
+    scene = read_run(whole / "config.yml")
+    shown = shown_scene(scene, whole / "config.yml")
+    for view, name in enumerate(shown.names):
+        (affine,) = (
+            own for own, known in zip(scene.exposures.affine, scene.exposures.names, strict=True) if known == name
+        )
+        photo, evened = shown.photos[view].image, _image(shown, view)
+        inside = ((evened > 0) & (evened < 1)).all(dim=-1)
+        assert inside.float().mean() > 0.5 and (photo - evened).abs().max() > 0.01
+        assert torch.allclose(apply_affine(evened, affine)[inside], photo[inside], atol=1e-4)
+
+
 def refined(data: Path, run: Path, base: Path, **options) -> Path:
     config = short_config(data, run, **{"pipeline.model.base_steps": 0, **options})
     config.load_dir = base / "nerfstudio_models"
@@ -301,26 +317,3 @@ def test_a_damaged_entry_is_told_in_one_sentence(whole, tmp_path):
     torch.save(content, path)
     with pytest.raises(UserError, match="the exposures of its photos are damaged.*name another, or train again"):
         read_run(run / "config.yml")
-
-
-# -- seed_tracks.json --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        ("{", "cannot be read"),
-        ("[]", "cannot be read"),
-        ('{"photos": ["a"]}', "cannot be read .*'points' is missing"),
-        ('{"photos": ["a"], "points": [[1]]}', "cannot be read"),
-        ('{"photos": ["a"], "points": [[-1]]}', "cannot be read .*negative"),
-        ('{"photos": ["a"], "points": [["a"]]}', "cannot be read"),
-        ('{"photos": ["a"], "points": 3}', "cannot be read"),
-        ('{"photos": ["a"], "points": [[0], []]}', "tells of 2 seed points, but there are 600: delete it"),
-    ],
-)
-def test_tracks_that_do_not_fit_are_told_in_one_sentence(folder, tmp_path, content, words):
-    data = shutil.copytree(folder(**EXPOSED), tmp_path / "data")
-    (data / "seed_tracks.json").write_text(content)
-    with pytest.raises(UserError, match=f"seed_tracks.json {words}"):
-        photo_gains(manager_of(data))
