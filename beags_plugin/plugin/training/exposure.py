@@ -38,6 +38,7 @@ class PhotoExposures:
         self.model = model
         self.affine = exposures.affine.to(model.device).clone().requires_grad_()
         self.start = self.affine.detach().clone()
+        self.identity = torch.eye(3, 4).to(self.affine)
         self.adam = torch.optim.Adam([self.affine], lr=RATES[0], eps=1e-15)
         model.exposures = Exposures(exposures.names, self.affine.detach())  # which shares the memory
         self._seen: int | None = None
@@ -67,7 +68,7 @@ class PhotoExposures:
             processes.average([gradient])
             self.adam.param_groups[0]["lr"] = log_linear(*RATES, self.model.schedule.progress(step))
             self.adam.step()
-            self.affine -= self.affine.mean(dim=0) - torch.eye(3, 4).to(self.affine)
+            self.affine -= self.affine.mean(dim=0) - self.identity
         self.affine.grad, self._seen = None, None
 
 
@@ -97,13 +98,16 @@ def photo_gains(datamanager: BeagsDataManager) -> Gains | None:
     tracks = cast(BeagsDataParser, datamanager.dataparser).tracks("train")
     if not any((ids >= 0).any() for ids, _ in tracks):
         return None
-    light = []
+    places, light = [], []
     with bar("Comparing exposures", passing=True) as progress:
         for index, view in enumerate(counted(datamanager.views("train"), len(tracks), progress)):
             image = view.image.cpu()
-            xy = datamanager.straightened(tracks[index][1], index, "train")[1]
+            ids, shares = tracks[index]
+            xy = datamanager.straightened(shares, index, "train")[1]
+            inside = ((xy >= 0) & (xy < image.shape[1::-1])).all(axis=1)  # without its lens a photo shows less
+            places.append(np.where(inside, ids, -1))
             light.append(linear_from_srgb(interpolated(image, xy)))
-    return gains(sightings([ids for ids, _ in tracks], light), len(tracks))
+    return gains(sightings(places, light), len(tracks))
 
 
 def _differ(found: Gains) -> bool:

@@ -111,6 +111,22 @@ def test_gains_of_a_generated_scene(folder, options):
     assert found.spread == pytest.approx(true.mean(axis=1).std(), abs=0.05)
 
 
+def test_points_beside_a_photo_without_its_lens_do_not_count(folder, monkeypatch):
+    manager = manager_of(folder(**EXPOSED))
+    found, straightened = photo_gains(manager), BeagsDataManager.straightened
+    tracks = [(np.tile(ids, 2), np.tile(places, (2, 1))) for ids, places in manager.dataparser.tracks("train")]
+    monkeypatch.setattr(manager.dataparser, "tracks", lambda split: [(ids[::-1], at) for ids, at in tracks])
+
+    def beside(self, places, index, split):
+        camera, xy = straightened(self, places, index, split)
+        xy = xy[: len(xy) // 2]
+        out = [-0.1, 1.0] if index % 2 else [1.0, camera.height]
+        return camera, np.concatenate([np.full_like(xy, out), xy[::-1]])
+
+    monkeypatch.setattr(BeagsDataManager, "straightened", beside)
+    assert np.array_equal(photo_gains(manager).stops, found.stops)
+
+
 @pytest.mark.parametrize("family", ["tabletop", "room"])
 def test_photos_that_are_alike_get_no_transforms(folder, family, capsys):
     data = folder(family=family)
