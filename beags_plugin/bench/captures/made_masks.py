@@ -41,9 +41,9 @@ def masked_scene(found: FoundCapture, kind: str, base: Trial, output: Path) -> T
     masks = masks_folder(found, kind, base, output)
     options = {} if masks is None else {"masks_path": str(masks / "masks"), "classes_path": str(masks / "classes.json")}
     digest = [found.photos.digest, kind, masks and masks.name]
-    if (truth := truth_link(found, kind, output)) is not None:
-        options["ground_truth_path"] = str(truth.parent)
-        digest.append(truth.parent.name)
+    if links := truth_links(found, kind, output):
+        options["ground_truth_path"] = str(links[0].parent)
+        digest.append(links[0].parent.name)
     name = f"{found.capture.name}, {kind}"
     return TrialScene(
         name, found.photos.data, found.photos.downscale, value_digest(digest), options=options, photos=found.photos
@@ -64,25 +64,28 @@ def masks_folder(found: FoundCapture, kind: str, base: Trial, output: Path) -> P
     return (output / "scenes" / f"{found.capture.name}-{kind}-{value_digest(made_of)[:12]}").absolute()
 
 
-def truth_link(found: FoundCapture, kind: str, output: Path) -> Path | None:
-    """Return the link to a capture's truth, in a folder laid out as ``ground_truth``; None if its own serves."""
+def truth_links(found: FoundCapture, kind: str, output: Path) -> list[Path]:
+    """Return the links to a capture's truth, in a folder laid out as ``ground_truth``; none if its own serves.
+
+    Nothing hides an object whose silhouette was traced, so that it is the visible mask too.
+    """
     if found.truth is not None:
-        source, name = found.truth, "silhouettes"
+        source, names = found.truth, ("silhouettes", "visible")
     elif found.capture.own_truth and kind == SALIENT:
-        source, name = found.photos.data / "masks", "masks"
+        source, names = found.photos.data / "masks", ("masks",)
     else:
-        return None
-    digest = value_digest([str(source), folder_digest(source)])[:12]
-    return (output / "scenes" / f"{found.capture.name}-truth-{digest}" / name).absolute()
+        return []
+    digest = value_digest([str(source), names, folder_digest(source)])[:12]
+    return [(output / "scenes" / f"{found.capture.name}-truth-{digest}" / name).absolute() for name in names]
 
 
 def link_truth(found: FoundCapture, kind: str, output: Path) -> None:
-    """Make the link to a capture's truth, unless it is there: nothing is copied."""
-    link = truth_link(found, kind, output)
-    if link is not None and not link.is_symlink():
-        with writing(link):
-            link.parent.mkdir(parents=True, exist_ok=True)
-            link.symlink_to(found.truth or found.photos.data / "masks")
+    """Make the links to a capture's truth, unless they are there: nothing is copied."""
+    for link in truth_links(found, kind, output):
+        if not link.is_symlink():
+            with writing(link):
+                link.parent.mkdir(parents=True, exist_ok=True)
+                link.symlink_to(found.truth or found.photos.data / "masks")
 
 
 def make_masks_once(found: FoundCapture, kind: str, folder: Path, run: Path | None) -> list[str]:

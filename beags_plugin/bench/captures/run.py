@@ -11,7 +11,6 @@ from rich.console import Console
 from beags_plugin.bench.captures import made_masks
 from beags_plugin.bench.captures.known import PICKED, SALIENT, FoundCapture, find_captures, kinds_of
 from beags_plugin.bench.captures.options import CapturesOptions
-from beags_plugin.bench.captures.scores import by_silhouettes_alone
 from beags_plugin.bench.captures.tables import groups, mean_rows, psnr_cost, tables
 from beags_plugin.bench.engines import open_engine
 from beags_plugin.bench.engines.interface import Engine, Outcome
@@ -67,7 +66,7 @@ def run_captures(options: CapturesOptions) -> list[ResultRow]:
         failed = _make_masks(captures, options.output, engine, forecast)
         possible = [run for run in runs if run.scene.name not in failed]
         outcomes = trained(possible, folder, engine, forecast)
-    rows = _rows(runs, captures, outcomes, failed)
+    rows = _rows(runs, outcomes, failed)
     wide = Console(width=max(CONSOLE.width, TABLE_WIDTH), highlight=False, markup=False)
     for table in tables(rows):
         (CONSOLE if isinstance(table, str) else wide).print(table)
@@ -136,25 +135,14 @@ def _make_masks(captures: Sequence[MaskedCapture], output: Path, engine: Engine,
     return failed
 
 
-def _rows(
-    runs: Sequence[VariantTrial],
-    captures: Sequence[MaskedCapture],
-    outcomes: Mapping[str, Outcome],
-    failed: Mapping[str, str],
-) -> list[ResultRow]:
-    """Return a row for every run, in order; those of traced captures by silhouettes alone."""
-    traced = {each.scene.name for each in captures if each.found.truth is not None}
-    scored = dict(outcomes)
-    for trial in (trial for run in runs if run.scene.name in traced - set(failed) for trial in run.trials):
-        outcome = outcomes[trial.digest]
-        if outcome.result is not None:
-            scored[trial.digest] = dataclasses.replace(outcome, result=by_silhouettes_alone(outcome.result))
+def _rows(runs: Sequence[VariantTrial], outcomes: Mapping[str, Outcome], failed: Mapping[str, str]) -> list[ResultRow]:
+    """Return a row for every run, in order."""
     rows = []
     for run in runs:
         if (reason := failed.get(run.scene.name)) is not None:
             rows.append(make_row(run.variant, run.scene.name, run.seed, None, None, reason))
         else:
-            rows += rows_of([run], scored)
+            rows += rows_of([run], outcomes)
     return rows
 
 

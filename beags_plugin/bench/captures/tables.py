@@ -36,7 +36,8 @@ def tables(rows: Sequence[ResultRow]) -> list[Table | str]:
         if len(names) > 1:
             printed.append(_table(f"{title}: mean over {'; '.join(names)}", mean_rows(rows, names)))
     printed += [_table(scene, [row for row in rows if row.scene == scene]) for scene in scenes]
-    printed.append("Worst object: the lowest extracted BIoU. Cost: PSNR of the row's control minus its own.")
+    printed.append("Worst object: the lowest extracted BIoU. Fitted: after the best colour fit of each photo.")
+    printed.append("Cost: fitted PSNR of the row's control minus its own.")
     printed.append("CPU: of the whole trial, all threads; what making the masks takes is in neither.")
     if (protocol := protocol_of(rows)) is not None:
         printed.append(protocol)
@@ -57,17 +58,17 @@ def mean_rows(rows: Sequence[ResultRow], scenes: Sequence[str]) -> list[ResultRo
 
 
 def psnr_cost(row: ResultRow, rows: Sequence[ResultRow]) -> float | None:
-    """Return the PSNR of a row's control in the same scene minus the row's own, dB; None where one is not known.
+    """Return the fitted PSNR of a row's control in the same scene minus the row's own, dB; None where unknown.
 
     Means over different numbers of scenes have none: they do not compare.
     """
     same = (row.scene, row.seed, row.count)
     of_control = (
-        other.figures["psnr_after"]
+        other.figures["psnr_fit_after"]
         for other in rows
         if other.variant.name == row.variant.control and (other.scene, other.seed, other.count) == same
     )
-    control, own = next(of_control, None), row.figures["psnr_after"]
+    control, own = next(of_control, None), row.figures["psnr_fit_after"]
     return None if control is None or own is None else control - own
 
 
