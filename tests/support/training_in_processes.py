@@ -56,6 +56,8 @@ def worker(local_rank: int, world_size: int, config, global_rank: int = 0) -> No
         ).hexdigest()
         own = {} if self._model.own_training is None else self._model.own_training.state()
         ended["own"] = hashlib.sha256(repr(_listed(own)).encode()).hexdigest()
+        known = self._model.exposures
+        ended["exposures"] = None if known is None else hashlib.sha256(known.affine.numpy().tobytes()).hexdigest()
         ended["folder"], ended["run"] = str(self.base_dir), str(self.run)
         after(self)
 

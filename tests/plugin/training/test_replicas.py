@@ -87,7 +87,7 @@ def test_a_gpu_that_is_not_there_ends_the_program_with_a_sentence(no_gpu, capsys
 def two(tmp_path_factory):
     """A short run of all phases in two processes: its folder, and what each process had."""
     out = tmp_path_factory.mktemp("several")
-    write_sample(out / "data", SampleConfig(seed=3, width=48, height=36, num_train=7, num_test=2))
+    write_sample(out / "data", SampleConfig(seed=3, width=48, height=36, num_train=7, num_test=2, exposure=1.5))
     train_in_two(out / "data", out)
     return out, [json.loads((out / f"rank{rank}.json").read_text()) for rank in (0, 1)]
 
@@ -102,6 +102,7 @@ def test_both_processes_have_the_same_scene_after_growth_and_refinement(two):
     for name in set(first["end"]) - {"folder"}:
         assert first["end"][name] == second["end"][name], name
     assert {"_model.gauss_params.means", "_model.class_ids", "adam"} <= set(first["end"])
+    assert first["end"]["exposures"] is not None
 
 
 @needs_gloo
