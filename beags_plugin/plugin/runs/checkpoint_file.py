@@ -107,8 +107,9 @@ def _is_exposures(value: Any) -> bool:
     names, affine = (value.get(key) for key in ("names", "affine")) if isinstance(value, dict) else (None, None)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         return False
-    right = isinstance(affine, Tensor) and affine.shape == (len(names), 3, 4) and affine.is_floating_point()
-    return right and bool(affine.isfinite().all())
+    if not isinstance(affine, Tensor) or affine.shape != (len(names), 3, 4):
+        return False
+    return affine.is_floating_point() and bool(affine.isfinite().all())
 
 
 def _is_index(value: Any, count: int) -> bool:

@@ -39,11 +39,12 @@ def test_every_preset_is_a_name_of_ns_train():
     assert points == {name: f"beags_plugin.plugin.methods:{name.replace('-', '_')}" for name in preset_names()}
 
 
-def test_the_papers_preset_changes_nothing_but_what_is_chosen_by_size():
-    """The documented base config is the paper's; extensions of ours are off."""
+def test_the_papers_preset_changes_nothing_but_what_is_chosen_by_size_and_exposure():
+    """The documented base config is the paper's; other extensions of ours are off."""
     model, documented = load_preset("beags-paper").config.pipeline.model, base_config().pipeline.model
     assert (model.prepare.reprojection, documented.prepare.reprojection) == ("pairwise", "auto")
-    assert replace(model, prepare=replace(model.prepare, reprojection="auto")) == documented
+    assert (model.exposure, documented.exposure) == ("off", "auto")
+    assert replace(model, exposure="auto", prepare=replace(model.prepare, reprojection="auto")) == documented
     assert (model.split.rounds, model.losses["silhouette"].weight, model.prepare.min_confidence) == (0, 0.0, 0.0)
     assert model.refine_position_lr_factor == 1.0
 
